@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compilation of the numerical kernels, with a cache that knows what it depends on.
+
+Numba keys a cached function by the contents of its own file, not by those of the functions it
+calls in other files, so an edit there would leave stale machine code behind. Here the cache folder
+is named after a digest of every source file of both packages' ground floor: any change of any
+kernel compiles afresh, and a reinstall of the same version finds its old cache again.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar, cast
+
+import numba
+
+F = TypeVar('F', bound=Callable[..., object])
+
+_PACKAGE_ROOT = Path(__file__).resolve().parents[2]
+_GROUND_FLOOR = ('blf_dsc_controller/core', 'blf_dsc_controller/simulation.py', 'sim_plant')
+
+
+def ground_floor_sources() -> list[Path]:
+    """Every source file a kernel can live in."""
+    sources: list[Path] = []
+    for entry in _GROUND_FLOOR:
+        path = _PACKAGE_ROOT / entry
+        sources += [path] if path.is_file() else path.glob('*.py')
+    return sorted(sources)
+
+
+@functools.cache
+def cache_folder() -> str:
+    """Folder of this version's machine code: below NUMBA_CACHE_DIR if set, else the user's cache."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    for source in ground_floor_sources():
+        digest.update(source.read_bytes())
+    base = os.environ.get('NUMBA_CACHE_DIR') or os.path.join(
+        os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache'), 'blf_dsc_controller'
+    )
+    return os.path.join(base, digest.hexdigest()[:16])
+
+
+def kernel(function: F) -> F:
+    """Compile `function` with numba: IEEE arithmetic (no fast-math), no exceptions, cached."""
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = cache_folder()
+    try:
+        return cast('F', numba.njit(function, cache=True, error_model='numpy', nogil=True))
+    finally:
+        numba.config.CACHE_DIR = before

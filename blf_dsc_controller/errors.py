@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The errors a user of the package can meet. One base, so one `except` catches them all."""
+
+
+class BlfDscError(Exception):
+    """Base of every error this package raises on purpose."""
+
+
+class ConfigurationError(BlfDscError):
+    """A configuration that cannot be run; the message lists every problem found."""
+
+    def __init__(self, problems: list[str], source: str = '') -> None:
+        self.problems = problems
+        self.source = source
+        where = f' in {source}' if source else ''
+        count = 'problem' if len(problems) == 1 else 'problems'
+        lines = ''.join(f'\n  - {problem}' for problem in problems)
+        super().__init__(f'{len(problems)} {count} with the configuration{where}:{lines}')
+
+
+class OutsideBarrierError(BlfDscError):
+    """The tracking error of a joint is not inside its bound, where the law is not defined."""
+
+    def __init__(self, joint: str, error: float, bound: float) -> None:
+        self.joint = joint
+        self.error = error
+        self.bound = bound
+        super().__init__(
+            f'joint {joint!r} starts {error:+.6g} rad from the reference, outside its bound of '
+            f'{bound:.6g} rad: start closer to the reference, or widen barrier.bound'
+        )
