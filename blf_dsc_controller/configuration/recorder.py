@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the bag recorder can be told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from blf_dsc_controller.configuration.parameter import parameter
+
+_AT_START = 'a bag is opened once, when the recorder starts'
+
+
+@dataclass(frozen=True)
+class RecorderConfig:
+    """Parameters of `bag_recorder`."""
+
+    output: str = parameter(
+        'bag',
+        'folder the bag is written into; it must not exist yet',
+        read_only=_AT_START,
+    )
+    topics: tuple[str, ...] = parameter(
+        (),
+        'topics to record; none named: all that appear',
+        may_be_empty=True,
+        read_only=_AT_START,
+    )
+    compression: str = parameter(
+        'none',
+        'compression of each message',
+        choices=('none', 'zstd'),
+        read_only=_AT_START,
+    )
+    queue_depth: int = parameter(
+        1000,
+        'messages of a topic that may wait while the disk is busy',
+        unit='messages',
+        at_least=1,
+        read_only=_AT_START,
+    )
+
+    def problems(self) -> list[str]:
+        """What is wrong between or beside the ranges of single parameters."""
+        return [] if self.output.strip() else ['output: got no folder name to write the bag into']
