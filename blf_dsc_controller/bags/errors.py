@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What can be wrong with a message or a bag; every error carries the data it speaks of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from blf_dsc_controller.errors import BlfDscError
+
+
+class MessageError(BlfDscError):
+    """A serialised message that cannot be used."""
+
+
+class MessageEncodingError(MessageError):
+    """The message is not in the plain CDR encoding that ROS 2 uses."""
+
+    def __init__(self, encapsulation: bytes) -> None:
+        self.encapsulation = encapsulation
+        super().__init__(
+            f'message starts with the bytes {encapsulation.hex(" ")}, not with 00 00 or 00 01: '
+            'it is not plain CDR; publish it with a ROS 2 middleware in its default encoding'
+        )
+
+
+class TruncatedMessageError(MessageError):
+    """The message ends before all that it announces has come."""
+
+    def __init__(self, needed: int, got: int) -> None:
+        self.needed = needed
+        self.got = got
+        super().__init__(
+            f'message of {got} bytes is cut off: its contents need at least {needed} bytes'
+        )
+
+
+class MissingJointError(MessageError):
+    """A joint that is asked for is not among the names of the message."""
+
+    def __init__(self, joint: str, names: tuple[str, ...]) -> None:
+        self.joint = joint
+        self.names = names
+        super().__init__(
+            f'joint {joint!r} is not in the message, which names {", ".join(names) or "nothing"}: '
+            'set the parameter `joints` to names from this list, or publish the joint'
+        )
+
+
+class DuplicatedJointError(MessageError):
+    """A joint that is asked for is named more than once."""
+
+    def __init__(self, joint: str, names: tuple[str, ...]) -> None:
+        self.joint = joint
+        self.names = names
+        super().__init__(
+            f'joint {joint!r} appears {names.count(joint)} times in the message '
+            f'({", ".join(names)}): name each joint once'
+        )
+
+
+class ShortArrayError(MessageError):
+    """An array of the message does not hold one value for each of its names."""
+
+    def __init__(self, field: str, needed: int, got: int) -> None:
+        self.field = field
+        self.needed = needed
+        self.got = got
+        super().__init__(
+            f'`{field}` of the message holds {got} values for {needed} names: '
+            'publish one value for each name'
+        )
+
+
+class BagExistsError(BlfDscError):
+    """The folder to record into is there already."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        super().__init__(
+            f'{path} exists already and is not overwritten: choose another folder or remove it'
+        )
+
+
+class UnknownTypeError(BlfDscError):
+    """A message type whose definition is not known here."""
+
+    def __init__(self, type_name: str) -> None:
+        self.type_name = type_name
+        super().__init__(
+            f'message type {type_name!r} is not known here: its definition is needed to record it'
+        )
+
+
+class UnreadableBagError(BlfDscError):
+    """A folder that is no bag, or a bag that cannot be read to its end."""
+
+    def __init__(self, path: Path, reason: str) -> None:
+        self.path = path
+        self.reason = reason
+        super().__init__(f'{path} cannot be read as a bag: {reason}')
+
+
+class MissingTopicError(BlfDscError):
+    """A topic that is essential to the result is not in the bag."""
+
+    def __init__(self, wanted: str, type_name: str, held: Iterable[tuple[str, str]]) -> None:
+        self.wanted = wanted
+        self.type_name = type_name
+        self.held = tuple(held)
+        listing = ''.join(f'\n  {name} ({type_})' for name, type_ in self.held) or ' no topic'
+        super().__init__(
+            f'the bag has no topic whose name ends in {wanted!r} of type {type_name}; '
+            f'it holds:{listing}'
+        )

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The topics of the package in one table: name, message type, quality of service.
+
+The nodes, the offline writer and the reader take them from here, so that a bag made without ROS
+holds the very topics that a recording of the running nodes holds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+CONTROLLER = 'blf_dsc_controller'
+PLANT = 'sim_plant'
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Quality of service as plain data, in the words of ROS 2."""
+
+    depth: int
+    reliability: Literal['reliable', 'best_effort'] = 'reliable'
+    durability: Literal['volatile', 'transient_local'] = 'volatile'
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic.
+
+    `name` is as its publisher `node` writes it: `~/x` is private to the node, `x` relative to the
+    namespace, `/x` absolute. `offered` is the publisher's quality, `requested` the subscriber's.
+    """
+
+    node: str
+    name: str
+    type: str
+    offered: Quality
+    requested: Quality
+
+    @property
+    def relative(self) -> str:
+        """Name as another node of the same namespace writes it, e.g. `sim_plant/truth`."""
+        return self.name.replace('~', self.node, 1)
+
+    @property
+    def resolved(self) -> str:
+        """Full name in the root namespace without remaps, e.g. `/sim_plant/truth`."""
+        return '/' + self.relative.lstrip('/')
+
+    @property
+    def leaf(self) -> str:
+        """Last part of the name, kept under any namespace and node name, e.g. `truth`."""
+        return self.name.rsplit('/', 1)[-1]
+
+
+JOINT_STATE = 'sensor_msgs/msg/JointState'
+FLOAT64_MULTI_ARRAY = 'std_msgs/msg/Float64MultiArray'
+
+# A late state or torque is worth nothing once the next one is there, so the two ends of the loop
+# keep one; publishers keep more, because a recorder beside the loop must not miss any.
+LATEST = Quality(depth=1)
+STREAM = Quality(depth=100)
+LATCHED = Quality(depth=1, durability='transient_local')
+DIAGNOSTIC = Quality(depth=10)
+
+# Subscriptions of the recorder: the depth costs memory only while the recorder lags behind.
+RECORDED = Quality(depth=100_000)
+
+JOINT_STATES = Topic(PLANT, 'joint_states', JOINT_STATE, STREAM, LATEST)
+COMMANDS = Topic(CONTROLLER, '~/commands', FLOAT64_MULTI_ARRAY, STREAM, LATEST)
+REFERENCE = Topic(CONTROLLER, '~/reference', JOINT_STATE, STREAM, STREAM)
+TRACKING_ERROR = Topic(CONTROLLER, '~/tracking_error', JOINT_STATE, STREAM, STREAM)
+LEARNING = Topic(CONTROLLER, '~/learning', JOINT_STATE, STREAM, STREAM)
+BOUND = Topic(CONTROLLER, '~/bound', JOINT_STATE, LATCHED, LATCHED)
+MONITOR = Topic(CONTROLLER, '~/monitor', JOINT_STATE, STREAM, STREAM)
+TRUTH = Topic(PLANT, '~/truth', JOINT_STATE, STREAM, STREAM)
+TIMING = Topic(PLANT, '~/timing', JOINT_STATE, STREAM, STREAM)
+CLOCK = Topic(PLANT, '/clock', 'rosgraph_msgs/msg/Clock', STREAM, LATEST)
+DIAGNOSTICS = Topic(
+    CONTROLLER, '/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', DIAGNOSTIC, DIAGNOSTIC
+)
+
+TOPICS = (
+    JOINT_STATES,
+    COMMANDS,
+    REFERENCE,
+    TRACKING_ERROR,
+    LEARNING,
+    BOUND,
+    MONITOR,
+    TRUTH,
+    TIMING,
+    CLOCK,
+    DIAGNOSTICS,
+)

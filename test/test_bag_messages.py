@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages to bytes and back: the same as ROS 2's own serialisation, and clear about bad ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from blf_dsc_controller.bags.decoders import Float64MultiArrayDecoder, JointStateDecoder
+from blf_dsc_controller.bags.encoders import (
+    Float64MultiArrayEncoder,
+    JointStateEncoder,
+    encode_clock,
+)
+from blf_dsc_controller.bags.errors import (
+    DuplicatedJointError,
+    MessageEncodingError,
+    MissingJointError,
+    ShortArrayError,
+    TruncatedMessageError,
+)
+from blf_dsc_controller.bags.types import typestore
+
+STAMP = 1_734_000_123_456_789_012
+NAMES = st.lists(st.text('abé/_ ', max_size=9), min_size=1, max_size=8, unique=True)
+FRAMES = st.text('base_', max_size=9)
+VALUES = st.floats(allow_nan=False)
+
+
+def joint_state(names, position, velocity, effort, stamp=STAMP, frame_id=''):
+    types = typestore().types
+    time = types['builtin_interfaces/msg/Time'](*divmod(stamp, 10**9))
+    header = types['std_msgs/msg/Header'](stamp=time, frame_id=frame_id)
+    arrays = [np.array(values, dtype=float) for values in (position, velocity, effort)]
+    return types['sensor_msgs/msg/JointState'](header, list(names), *arrays)
+
+
+def raw_joint_state(*arguments, little_endian=True, **options):
+    message = joint_state(*arguments, **options)
+    return bytes(
+        typestore().serialize_cdr(message, message.__msgtype__, little_endian=little_endian)
+    )
+
+
+@given(NAMES, FRAMES, st.sets(st.sampled_from(('position', 'velocity', 'effort'))), st.data())
+def test_encoded_joint_state_equals_full_serialisation(names, frame_id, fields, data):
+    arrays = {
+        field: data.draw(st.lists(VALUES, min_size=len(names), max_size=len(names)))
+        if field in fields
+        else []
+        for field in ('position', 'velocity', 'effort')
+    }
+    encoder = JointStateEncoder(names, fields, frame_id)
+    encoder.encode(7, *([0.5] * len(values) for values in arrays.values()))
+
+    assert encoder.encode(STAMP, **arrays) == raw_joint_state(
+        names, *arrays.values(), frame_id=frame_id
+    )
+
+
+@given(NAMES, FRAMES, st.booleans(), st.randoms(use_true_random=False))
+def test_decoder_matches_joints_by_name(names, frame_id, little_endian, random):
+    values = {name: [index + 0.25, -index, 1e3 * index] for index, name in enumerate(names)}
+    wanted = random.sample(names, random.randint(1, len(names)))
+    decoder = JointStateDecoder(wanted)
+    for _ in range(3):
+        random.shuffle(names)
+        columns = np.array([values[name] for name in names]).T
+        raw = raw_joint_state(names, *columns, frame_id=frame_id, little_endian=little_endian)
+
+        assert decoder.decode(raw) == STAMP
+        decoded = np.array([decoder.position, decoder.velocity, decoder.effort]).T
+        assert decoded.tolist() == [values[name] for name in wanted]
+
+
+def test_decoder_follows_a_change_of_layout():
+    decoder = JointStateDecoder(['a', 'b'])
+    decoder.decode(raw_joint_state('ab', [1, 2], [3, 4], [5, 6]))
+    decoder.decode(raw_joint_state('ba', [2, 1], [4, 3], [6, 5]))
+    assert decoder.position.tolist() == [1, 2]
+    decoder.decode(raw_joint_state('ba', [7, 8], [9, 10], []))
+    assert decoder.velocity.tolist() == [10, 9]
+    assert np.isnan(decoder.effort).all()
+
+
+def test_arrays_of_equal_total_length_are_told_apart():
+    decoder = JointStateDecoder(['a', 'b'], required=())
+    decoder.decode(raw_joint_state('ab', [1, 2], [3, 4], []))
+    decoder.decode(raw_joint_state('ab', [1, 2], [], [5, 6]))
+    assert np.isnan(decoder.velocity).all()
+    assert decoder.effort.tolist() == [5, 6]
+
+
+def test_garbage_in_padding_and_after_the_end_is_ignored():
+    clean = raw_joint_state(('ab', 'cde'), [1, 2], [3, 4], [5, 6])
+    dirty = bytearray(clean)
+    dirty[3] = dirty[17] = 0xFF  # option byte of the encapsulation, padding of the frame's name
+    decoder = JointStateDecoder(['cde', 'ab'])
+    for raw in (clean, bytes(dirty), clean + b'\xff' * 5, clean):
+        assert decoder.decode(raw) == STAMP
+        assert decoder.position.tolist() == [2, 1]
+        assert decoder.effort.tolist() == [6, 5]
+
+
+def test_missing_joint_is_named():
+    with pytest.raises(MissingJointError, match="'elbow'.*names shoulder, wrist") as caught:
+        JointStateDecoder(['elbow']).decode(
+            raw_joint_state(('shoulder', 'wrist'), [1, 2], [3, 4], [])
+        )
+    assert caught.value.joint == 'elbow'
+
+
+def test_duplicated_joint_is_named_only_when_asked_for():
+    raw = raw_joint_state('aab', [1, 2, 3], [4, 5, 6], [])
+    with pytest.raises(DuplicatedJointError, match="'a' appears 2 times"):
+        JointStateDecoder(['a']).decode(raw)
+    decoder = JointStateDecoder(['b'])
+    decoder.decode(raw)
+    assert decoder.position.tolist() == [3]
+
+
+@pytest.mark.parametrize('velocity', [[], [1.0], [1.0, 2.0, 3.0]])
+def test_velocity_of_another_length_is_refused(velocity):
+    decoder = JointStateDecoder('ab')
+    decoder.decode(raw_joint_state('ab', [1, 2], [3, 4], []))
+    with pytest.raises(ShortArrayError, match=f'`velocity`.* {len(velocity)} values for 2 names'):
+        decoder.decode(raw_joint_state('ab', [1, 2], velocity, []))
+
+
+@pytest.mark.parametrize('warm', [False, True])
+def test_every_truncation_is_refused(warm):
+    raw = raw_joint_state('ab', [1, 2], [3, 4], [5, 6])
+    decoder = JointStateDecoder('ab')
+    for length in range(len(raw)):
+        if warm:
+            decoder.decode(raw)
+        with pytest.raises(TruncatedMessageError):
+            decoder.decode(raw[:length])
+
+
+def test_other_encodings_are_refused():
+    raw = b'\x00\x07' + raw_joint_state('a', [1], [2], [])[2:]
+    with pytest.raises(MessageEncodingError, match='00 07'):
+        JointStateDecoder('a').decode(raw)
+
+
+def test_a_bad_message_does_not_disturb_the_next():
+    good = raw_joint_state('ab', [1, 2], [3, 4], [5, 6])
+    decoder = JointStateDecoder('ab')
+    decoder.decode(good)
+    with pytest.raises(MissingJointError):
+        decoder.decode(raw_joint_state('ac', [7, 7], [7, 7], [7, 7]))
+    assert decoder.position.tolist() == [1, 2]
+    assert decoder.decode(good) == STAMP
+
+
+def test_encoder_refuses_arrays_of_another_length():
+    encoder = JointStateEncoder(['a', 'b'], ('position',))
+    with pytest.raises(ValueError, match='shape'):
+        encoder.encode(0, [1, 2, 3])
+    with pytest.raises(ValueError, match='shape'):
+        encoder.encode(0, [1, 2], [3, 4])
+
+
+@given(st.lists(VALUES, max_size=9))
+def test_multi_array_round_trip(data):
+    types = typestore().types
+    layout = types['std_msgs/msg/MultiArrayLayout']([], 0)
+    message = types['std_msgs/msg/Float64MultiArray'](layout, np.array(data, dtype=float))
+    encoder = Float64MultiArrayEncoder(len(data))
+    decoder = Float64MultiArrayDecoder(len(data))
+
+    assert encoder.encode(data) == typestore().serialize_cdr(message, message.__msgtype__)
+    assert decoder.decode(encoder.encode(data)) == len(data)
+    assert decoder.data.tolist() == data
+
+
+@pytest.mark.parametrize('little_endian', [False, True])
+def test_multi_array_with_dimensions(little_endian):
+    types = typestore().types
+    dimension = types['std_msgs/msg/MultiArrayDimension']('joints', 3, 3)
+    layout = types['std_msgs/msg/MultiArrayLayout']([dimension], 0)
+    message = types['std_msgs/msg/Float64MultiArray'](layout, np.array([1.0, 2.0, 3.0]))
+    raw = bytes(
+        typestore().serialize_cdr(message, message.__msgtype__, little_endian=little_endian)
+    )
+    decoder = Float64MultiArrayDecoder(3)
+    assert decoder.decode(raw) == 3
+    assert decoder.data.tolist() == [1, 2, 3]
+
+
+def test_multi_array_of_another_size_is_told_by_its_length():
+    decoder = Float64MultiArrayDecoder(2)
+    decoder.decode(Float64MultiArrayEncoder(2).encode([1, 2]))
+    assert decoder.decode(Float64MultiArrayEncoder(3).encode([4, 5, 6])) == 3
+    assert decoder.data.tolist() == [1, 2]
+
+
+def test_truncated_multi_array_is_refused():
+    raw = Float64MultiArrayEncoder(2).encode([1, 2])
+    for length in range(len(raw)):
+        with pytest.raises(TruncatedMessageError):
+            Float64MultiArrayDecoder(2).decode(raw[:length])
+
+
+def test_clock_equals_full_serialisation():
+    types = typestore().types
+    clock = types['rosgraph_msgs/msg/Clock'](types['builtin_interfaces/msg/Time'](1, 5))
+    assert encode_clock(1_000_000_005) == typestore().serialize_cdr(clock, clock.__msgtype__)

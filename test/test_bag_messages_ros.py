@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Our bytes and those of rclpy say the same, in both directions."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from blf_dsc_controller.bags.cdr import JointStateLayout
+from blf_dsc_controller.bags.decoders import Float64MultiArrayDecoder, JointStateDecoder
+from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
+
+STAMP = 1_734_000_123_456_789_012
+CASES = [
+    ('', ['j']),
+    ('b', ['joint1', 'joint2']),
+    ('base', ['a', 'bc', 'def', 'ghij', 'klmno']),
+    ('world', ['disturbance joint1', '(m1+m2)*l1^2', '']),
+]
+
+
+def message_of(frame_id, names):
+    message = JointState()
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(STAMP, 10**9)
+    message.header.frame_id = frame_id
+    message.name = names
+    message.position = [0.1 + index for index in range(len(names))]
+    message.velocity = [-0.2 * index for index in range(len(names))]
+    message.effort = [1e300 / (index + 1) for index in range(len(names))]
+    return message
+
+
+def without_padding(raw):
+    """The meaningful pieces of a JointState: rclpy leaves its padding bytes uninitialised."""
+    layout = JointStateLayout.parse(raw)
+    arrays = (layout.position, layout.velocity, layout.effort)
+    return [raw[:2], raw[4:12], layout.frame_id, layout.names] + [
+        raw[array.offset : array.offset + 8 * array.size] for array in arrays
+    ]
+
+
+@pytest.mark.parametrize(('frame_id', 'names'), CASES)
+def test_rclpy_reads_what_is_encoded(frame_id, names):
+    message = message_of(frame_id, names)
+    raw = JointStateEncoder(names, frame_id=frame_id).encode(
+        STAMP, message.position, message.velocity, message.effort
+    )
+    assert deserialize_message(raw, JointState) == message
+    theirs = serialize_message(message)
+    assert len(raw) == len(theirs)
+    assert without_padding(raw) == without_padding(theirs)
+
+
+@pytest.mark.parametrize('fields', [(), ('position',), ('position', 'velocity'), ('effort',)])
+def test_rclpy_reads_empty_fields(fields):
+    values = {field: [1.5, 2.5] for field in fields}
+    raw = JointStateEncoder(['a', 'bcd'], fields).encode(STAMP, **values)
+    message = deserialize_message(raw, JointState)
+    for field in ('position', 'velocity', 'effort'):
+        assert list(getattr(message, field)) == values.get(field, [])
+
+
+@pytest.mark.parametrize(('frame_id', 'names'), CASES)
+def test_decoder_reads_what_rclpy_serialises(frame_id, names):
+    message = message_of(frame_id, names)
+    decoder = JointStateDecoder(names[::-1])
+    assert decoder.decode(serialize_message(message)) == STAMP
+    assert decoder.position.tolist() == list(message.position)[::-1]
+    assert decoder.velocity.tolist() == list(message.velocity)[::-1]
+    assert decoder.effort.tolist() == list(message.effort)[::-1]
+
+
+def test_multi_array_in_both_directions():
+    data = [1.5, -2.5, 1e-300]
+    raw = Float64MultiArrayEncoder(3).encode(data)
+    assert list(deserialize_message(raw, Float64MultiArray).data) == data
+    decoder = Float64MultiArrayDecoder(3)
+    assert decoder.decode(serialize_message(Float64MultiArray(data=data))) == 3
+    assert decoder.data.tolist() == data
