@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The controller as its users see it: an explicit state, `reset`, and `update` once a sample."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from blf_dsc_controller.core import law, reference
+from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.settings import settings_of
+from blf_dsc_controller.core.state import signals_of, signals_size, state_of, state_size
+from blf_dsc_controller.errors import OutsideBarrierError
+
+
+@kernel
+def respond(
+    settings_vector: np.ndarray,
+    reference_vector: np.ndarray,
+    state_vector: np.ndarray,
+    signals_vector: np.ndarray,
+    t: float,
+    dt: float,
+    measurement: np.ndarray,
+) -> None:
+    """Reference at t, then the law: everything between a measurement and its torque."""
+    signals = signals_of(signals_vector, settings_of(settings_vector))
+    reference.sinusoids(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
+    law.update(settings_vector, state_vector, signals_vector, t, dt, measurement)
+
+
+class Controller:
+    """A law with its settings, its reference and its state.
+
+    Attributes:
+        settings: names of the settings vector's parts.
+        state: views on `state_vector`, which is all the controller remembers.
+        signals: views on what the last sample computed; `signals.torque` is the answer.
+    """
+
+    def __init__(self, settings_vector: np.ndarray, reference_vector: np.ndarray) -> None:
+        """Allocate for packed settings (`settings.pack`) and reference; compile the kernels."""
+        self.settings_vector = settings_vector
+        self.reference_vector = reference_vector
+        self.settings = settings_of(settings_vector)
+        self.state_vector = np.zeros(state_size(self.settings))
+        self.signals_vector = np.zeros(signals_size(self.settings))
+        self.state = state_of(self.state_vector, self.settings)
+        self.signals = signals_of(self.signals_vector, self.settings)
+        self.reset()
+        self.update(0.0, 1e-3, np.zeros(3 * self.settings.n))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: estimates back to P^(0), filters and window empty."""
+        self.state_vector.fill(0.0)
+        self.state.estimate[:] = self.settings.initial_estimate
+        self.state.weakest.fill(self.settings.m**-0.5)
+
+    def check_start(self, joints: tuple[str, ...], q: np.ndarray, t: float = 0.0) -> None:
+        """Refuse a start outside the barrier, where the law is not defined.
+
+        Args:
+            joints: names of the joints, for the message.
+            q: measured positions (n,) [rad].
+            t: time since the start [s].
+
+        Raises:
+            OutsideBarrierError: some |xi1_i(0)| >= k_c,i; names joint, error and bound.
+        """
+        qr, dqr, ddqr = np.zeros((3, self.settings.n))
+        reference.sinusoids(self.reference_vector, t, qr, dqr, ddqr)
+        for joint, error, bound in zip(joints, q - qr, self.settings.bound, strict=True):
+            if not abs(error) < bound:
+                raise OutsideBarrierError(joint, float(error), float(bound))
+
+    def update(self, t: float, dt: float, measurement: np.ndarray) -> np.ndarray:
+        """Torque (n,) [N m] for a measurement; a view that the next update overwrites.
+
+        Args:
+            t: time since the start [s].
+            dt: time since the last sample [s].
+            measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
+        """
+        respond(
+            self.settings_vector,
+            self.reference_vector,
+            self.state_vector,
+            self.signals_vector,
+            t,
+            dt,
+            measurement,
+        )
+        return self.signals.torque
+
+    def save(self) -> np.ndarray:
+        """Copy of the whole state."""
+        return self.state_vector.copy()
+
+    def restore(self, saved: np.ndarray) -> None:
+        """Go back to a saved state; the loop continues from there bit for bit."""
+        self.state_vector[:] = saved

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The planar two-link arm of Section IV, linear in its parameters, for the controller.
+
+Point masses at the link ends, angles from the horizontal, q2 relative to q1:
+
+    P = [(m1 + m2) l1^2, m2 l2^2, m2 l1 l2]   [kg m^2]          constants = [r],  r = g / l1  [1/s^2]
+
+The masses and l2 appear in P alone; of the arm's geometry the regressor needs only r.  Equation
+(34) prints cos q2 in the first gravity term; it is cos q1 (see `potential`).
+"""
+
+from math import cos, sin
+
+import numpy as np
+
+from blf_dsc_controller.core.kernel import kernel
+
+JOINTS = 2
+PARAMETER_NAMES = ('(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2')
+
+
+@kernel
+def regressor(
+    constants: np.ndarray,
+    q: np.ndarray,
+    dq: np.ndarray,
+    v: np.ndarray,
+    a: np.ndarray,
+    H: np.ndarray,
+) -> None:
+    """Fill H (2 x 3) so that H P = M(q) a + C(q, dq) v + G(q)   [N m], Property III."""
+    r = constants[0]
+    c2 = cos(q[1])
+    s2 = sin(q[1])
+    c12 = cos(q[0] + q[1])
+    H[0, 0] = a[0] + r * cos(q[0])
+    H[0, 1] = a[0] + a[1]
+    H[0, 2] = c2 * (2.0 * a[0] + a[1]) - s2 * (dq[1] * v[0] + (dq[0] + dq[1]) * v[1]) + r * c12
+    H[1, 0] = 0.0
+    H[1, 1] = a[0] + a[1]
+    H[1, 2] = c2 * a[0] + s2 * dq[0] * v[0] + r * c12
+
+
+@kernel
+def momentum_regressor(
+    constants: np.ndarray, q: np.ndarray, dq: np.ndarray, Yp: np.ndarray, Yr: np.ndarray
+) -> None:
+    """Fill Yp, Yr (2 x 3) so that Yp P = M dq [kg m^2/s] and Yr P = G - C^T dq [N m].
+
+    Then d/dt(Yp P) + Yr P = tau - tau_dist: the dynamics without the acceleration.
+    """
+    r = constants[0]
+    c2 = cos(q[1])
+    c12 = cos(q[0] + q[1])
+    Yp[0, 0] = dq[0]
+    Yp[0, 1] = dq[0] + dq[1]
+    Yp[0, 2] = c2 * (2.0 * dq[0] + dq[1])
+    Yp[1, 0] = 0.0
+    Yp[1, 1] = dq[0] + dq[1]
+    Yp[1, 2] = c2 * dq[0]
+    Yr[0, 0] = r * cos(q[0])
+    Yr[0, 1] = 0.0
+    Yr[0, 2] = r * c12
+    Yr[1, 0] = 0.0
+    Yr[1, 1] = 0.0
+    Yr[1, 2] = sin(q[1]) * dq[0] * (dq[0] + dq[1]) + r * c12
+
+
+@kernel
+def inertia(P: np.ndarray, q: np.ndarray, M: np.ndarray) -> None:
+    """Fill the inertia matrix M (2 x 2) [kg m^2]."""
+    coupling = P[2] * cos(q[1])
+    M[0, 0] = P[0] + P[1] + 2.0 * coupling
+    M[0, 1] = P[1] + coupling
+    M[1, 0] = M[0, 1]
+    M[1, 1] = P[1]
+
+
+@kernel
+def coriolis(P: np.ndarray, q: np.ndarray, dq: np.ndarray, C: np.ndarray) -> None:
+    """Fill C (2 x 2) [N m s/rad] in Christoffel form, so that dM/dt - 2 C is skew (Property I)."""
+    c = P[2] * sin(q[1])
+    C[0, 0] = -c * dq[1]
+    C[0, 1] = -c * (dq[0] + dq[1])
+    C[1, 0] = c * dq[0]
+    C[1, 1] = 0.0
+
+
+@kernel
+def gravity(constants: np.ndarray, P: np.ndarray, q: np.ndarray, G: np.ndarray) -> None:
+    """Fill the gravity torque G (2,) [N m], the gradient of `potential`."""
+    r = constants[0]
+    G[1] = P[2] * r * cos(q[0] + q[1])
+    G[0] = P[0] * r * cos(q[0]) + G[1]
+
+
+@kernel
+def potential(constants: np.ndarray, P: np.ndarray, q: np.ndarray) -> float:
+    """Potential energy [J], zero with both links horizontal."""
+    r = constants[0]
+    return P[0] * r * sin(q[0]) + P[2] * r * sin(q[0] + q[1])
