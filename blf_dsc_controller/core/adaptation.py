@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Composite learning: the update law (20) with the latched prediction error (26).
 
-    eps = b_e - Phi_e theta^                                  theta^ = [P^; d^], the current one
-    theta^' = Proj( -Gamma (H^T xi2 - kappa W eps) )          W = I, or (Phi_e + rho I)^-1 ('newton')
+    eps = b_e - Phi_e theta^                                theta^ = [P^; d^], the current one
+    theta^' = Proj( -Gamma (H^T xi2 - kappa W eps) )        W = I, or (Phi_e + rho I)^-1 (newton)
 
-(20) prints + kappa eps, which drives P^ to the projection ball as soon as learning starts.  H^T xi2
-acts on P^ alone.  Newton's W makes every excited direction converge at the rate Gamma kappa, where
-the gradient's rates are spread as the eigenvalues of Phi_e.
+(20) prints + kappa eps, which drives P^ to the projection ball as soon as learning starts.
+H^T xi2 acts on P^ alone.  With Newton's W every excited direction converges at the rate
+Gamma kappa; the gradient's rates are spread as the eigenvalues of Phi_e.
 """
 
 from blf_dsc_controller.core import cholesky, projection
@@ -45,9 +45,7 @@ def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturat
                 tracking += signals.H[i, j] * signals.xi2[i]
         signals.rate[j] = settings.Gamma[j] * (settings.kappa * signals.rate[j] - tracking)
     p = settings.p
-    projection.project(
-        state.estimate[:p], signals.rate[:p], settings.Gamma[:p], settings.radius
-    )
+    projection.project(state.estimate[:p], signals.rate[:p], settings.Gamma[:p], settings.radius)
     for j in range(settings.m):
         state.estimate[j] += dt * signals.rate[j]
     projection.rescale(state.estimate, p, settings.radius)

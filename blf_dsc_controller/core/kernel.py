@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TypeVar, cast
 
 import numba
+from numba.core import config
 
 F = TypeVar('F', bound=Callable[..., object])
 
@@ -34,22 +35,22 @@ def ground_floor_sources() -> list[Path]:
 
 
 @functools.cache
-def cache_folder() -> str:
-    """Folder of this version's machine code: below NUMBA_CACHE_DIR if set, else the user's cache."""
+def cache_folder() -> Path:
+    """Folder of this version's machine code, below NUMBA_CACHE_DIR or else the user's cache."""
     digest = hashlib.sha256(numba.__version__.encode())
     for source in ground_floor_sources():
         digest.update(source.read_bytes())
-    base = os.environ.get('NUMBA_CACHE_DIR') or os.path.join(
-        os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache'), 'blf_dsc_controller'
-    )
-    return os.path.join(base, digest.hexdigest()[:16])
+    chosen = os.environ.get('NUMBA_CACHE_DIR')
+    users = os.environ.get('XDG_CACHE_HOME') or '~/.cache'
+    base = Path(chosen) if chosen else Path(users).expanduser() / 'blf_dsc_controller'
+    return base / digest.hexdigest()[:16]
 
 
 def kernel(function: F) -> F:
     """Compile `function` with numba: IEEE arithmetic (no fast-math), no exceptions, cached."""
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = cache_folder()
+    before = config.CACHE_DIR  # type: ignore[attr-defined]
+    config.CACHE_DIR = str(cache_folder())  # type: ignore[attr-defined]
     try:
         return cast('F', numba.njit(function, cache=True, error_model='numpy', nogil=True))
     finally:
-        numba.config.CACHE_DIR = before
+        config.CACHE_DIR = before  # type: ignore[attr-defined]

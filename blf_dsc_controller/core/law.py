@@ -12,6 +12,7 @@ from blf_dsc_controller.core import (
     surface,
     window,
 )
+from blf_dsc_controller.core.borrowed import borrowed
 from blf_dsc_controller.core.kernel import kernel
 from blf_dsc_controller.core.settings import EFFORT, Settings, settings_of
 from blf_dsc_controller.core.state import Signals, State, signals_of, state_of
@@ -24,9 +25,11 @@ def saturation(x: float) -> float:
 
 
 @kernel
-def track(settings: Settings, state: State, signals: Signals, q: np.ndarray, dq: np.ndarray) -> None:
+def track(
+    settings: Settings, state: State, signals: Signals, q: np.ndarray, dq: np.ndarray
+) -> None:
     """Errors xi1, xi2 and the surface: virtual control beta2 and alpha2' of the filter (13)."""
-    first = state.count[0] == 0.0
+    first = state.samples[0] == 0.0
     for i in range(settings.n):
         signals.xi1[i] = q[i] - signals.qr[i]
         signals.beta2[i] = surface.virtual_control(
@@ -54,14 +57,14 @@ def learn(
         settings.model, settings.constants, q, dq, signals.momentum, signals.rest
     )
     prediction.bias_columns(settings, signals.rest)
-    if state.count[0] > 0.0:
+    if state.samples[0] > 0.0:
         prediction.filter_row(settings, state, signals, dt, applied)
         cursor = window.push(
             state.ring, int(state.cursor[0]), state.running, state.fresh, signals.row
         )
         state.cursor[0] = cursor
         state.rows[0] = min(state.rows[0] + 1.0, float(settings.window))
-        if int(state.count[0]) % settings.interval == 0:
+        if int(state.samples[0]) % settings.interval == 0:
             excitation.look(settings, state, signals, t)
     prediction.remember(settings, state, signals)
 
@@ -112,9 +115,9 @@ def update(
         dt: time since the last sample [s] (at the first: until the next).
         measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
     """
-    settings = settings_of(settings_vector)
-    state = state_of(state_vector, settings)
-    signals = signals_of(signals_vector, settings)
+    settings = settings_of(borrowed(settings_vector))
+    state = state_of(borrowed(state_vector), settings)
+    signals = signals_of(borrowed(signals_vector), settings)
     n = settings.n
     q = measurement[:n]
     dq = measurement[n : 2 * n]
@@ -132,4 +135,4 @@ def update(
     for i in range(n):
         state.alpha2[i] += gain * (signals.beta2[i] - state.alpha2[i])
         state.torque[i] = signals.torque[i]
-    state.count[0] += 1.0
+    state.samples[0] += 1.0

@@ -2,8 +2,8 @@
 """Projection (4) of the parameter update onto a ball, in the metric of the adaptation gain.
 
 (4) as printed acts where |P^| equals the radius, which a sampled update never does: it steps over
-and never returns.  Here the outward part is removed on and beyond the sphere, in the metric that the
-Lyapunov function (29) measures P~ with, and the step ends inside the ball.
+and never returns.  Here the outward part is removed on and beyond the sphere, in the metric that
+the Lyapunov function (29) measures P~ with, and the step ends inside the ball.
 """
 
 from math import sqrt

@@ -18,7 +18,7 @@ from blf_dsc_controller.core.settings import Settings
 class State(NamedTuple):
     """Views on a state vector. One-element arrays are scalars that the kernels write."""
 
-    count: np.ndarray  # (1,) samples answered
+    samples: np.ndarray  # (1,) samples answered
     cursor: np.ndarray  # (1,) oldest row of the window
     rows: np.ndarray  # (1,) rows in the window
     latched: np.ndarray  # (1,) 1 once (Phi_e, b_e) is kept
@@ -67,10 +67,9 @@ class Signals(NamedTuple):
 def state_size(settings: Settings) -> int:
     """Length of a state vector."""
     n, p, m = settings.n, settings.p, settings.m
-    per_row = n * (m + 1)
-    return 6 + 3 * n + m + n * p + n * m + 2 * per_row + 2 * m * (m + 1) + 2 * m * (m + 1) + (
-        settings.window * per_row
-    )
+    row = n * (m + 1)
+    ring = settings.window * row
+    return 6 + 3 * n + m + n * p + n * m + 2 * row + 4 * m * (m + 1) + ring
 
 
 def signals_size(settings: Settings) -> int:
@@ -102,7 +101,7 @@ def state_of(vector: np.ndarray, settings: Settings) -> State:
     columns = vector[at : at + 2 * m].reshape(2, m)
     at += 2 * m
     return State(
-        count=vector[0:1],
+        samples=vector[0:1],
         cursor=vector[1:2],
         rows=vector[2:3],
         latched=vector[3:4],

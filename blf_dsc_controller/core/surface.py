@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The dynamic surface: virtual control (18) with (15), and the filter (13) that differentiates it."""
+"""The dynamic surface: virtual control (18) with (15), and the filter (13) that follows it."""
 
 from math import exp, pi, sin
 

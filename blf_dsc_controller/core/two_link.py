@@ -3,7 +3,8 @@
 
 Point masses at the link ends, angles from the horizontal, q2 relative to q1:
 
-    P = [(m1 + m2) l1^2, m2 l2^2, m2 l1 l2]   [kg m^2]          constants = [r],  r = g / l1  [1/s^2]
+    P = [(m1 + m2) l1^2, m2 l2^2, m2 l1 l2]   [kg m^2]
+    constants = [r],  r = g / l1              [1/s^2]
 
 The masses and l2 appear in P alone; of the arm's geometry the regressor needs only r.  Equation
 (34) prints cos q2 in the first gravity term; it is cos q1 (see `potential`).
@@ -98,4 +99,4 @@ def gravity(constants: np.ndarray, P: np.ndarray, q: np.ndarray, G: np.ndarray) 
 def potential(constants: np.ndarray, P: np.ndarray, q: np.ndarray) -> float:
     """Potential energy [J], zero with both links horizontal."""
     r = constants[0]
-    return P[0] * r * sin(q[0]) + P[2] * r * sin(q[0] + q[1])
+    return float(P[0] * r * sin(q[0]) + P[2] * r * sin(q[0] + q[1]))
