@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
-from llvmlite import ir
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
@@ -27,13 +26,13 @@ if TYPE_CHECKING or numba.config.DISABLE_JIT:
 else:
 
     @intrinsic
-    def borrowed(typingctx: Any, vector: Any) -> Any:
+    def borrowed(_typing: Any, vector: Any) -> Any:
         """Return the same vector without its owner."""
 
-        def generate(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             array = context.make_array(signature.return_type)(context, builder, args[0])
             array.meminfo = cgutils.get_null_value(array.meminfo.type)
             array.parent = cgutils.get_null_value(array.parent.type)
-            return array._getvalue()
+            return array._getvalue()  # noqa: SLF001 - as numba itself spells it
 
         return vector(vector), generate

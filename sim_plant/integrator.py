@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One fixed step of the equation of motion, the torque held, the disturbance free to vary.
+
+Two explicit Runge-Kutta methods: the classic one of order 4, and the fifth-order solution of
+Dormand and Prince (1980), which MATLAB calls ode5. A stage i is evaluated at t + c_i h and
+x + h sum_j a_ij k_j, the step ends at x + h sum_i b_i k_i.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.core.kernel import kernel
+from sim_plant.arm import Arm
+from sim_plant.motion import motion
+
+RK4 = 0
+DOPRI5 = 1
+INTEGRATORS = {'rk4': RK4, 'dopri5': DOPRI5}
+STAGES = 6
+
+_RK4_C = np.array([0, 1 / 2, 1 / 2, 1])
+_RK4_A = np.array([[0, 0, 0, 0], [1 / 2, 0, 0, 0], [0, 1 / 2, 0, 0], [0, 0, 1, 0]])
+_RK4_B = np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6])
+
+_DOPRI5_C = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1])
+_DOPRI5_A = np.array(
+    [
+        [0, 0, 0, 0, 0, 0],
+        [1 / 5, 0, 0, 0, 0, 0],
+        [3 / 40, 9 / 40, 0, 0, 0, 0],
+        [44 / 45, -56 / 15, 32 / 9, 0, 0, 0],
+        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
+        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
+    ]
+)
+_DOPRI5_B = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
+
+
+@kernel
+def scratch_size(n: int) -> int:
+    """Length of the work vector `integrate` needs for n joints: the stages and one point."""
+    return (STAGES + 1) * 2 * n
+
+
+@kernel
+def _explicit_step(
+    a: NDArray[np.float64],
+    b: NDArray[np.float64],
+    c: NDArray[np.float64],
+    arm: Arm,
+    disturbance: NDArray[np.float64],
+    t: float,
+    h: float,
+    torque: NDArray[np.float64],
+    x: NDArray[np.float64],
+    scratch: NDArray[np.float64],
+) -> None:
+    point = scratch[: x.size]
+    k = scratch[x.size :].reshape((STAGES, x.size))
+    for stage in range(b.size):
+        for i in range(x.size):
+            slope = 0.0
+            for j in range(stage):
+                slope += a[stage, j] * k[j, i]
+            point[i] = x[i] + h * slope
+        motion(arm, disturbance, t + c[stage] * h, point, torque, k[stage])
+    for i in range(x.size):
+        slope = 0.0
+        for j in range(b.size):
+            slope += b[j] * k[j, i]
+        x[i] += h * slope
+
+
+@kernel
+def integrate(
+    method: int,
+    arm: Arm,
+    disturbance: NDArray[np.float64],
+    t: float,
+    h: float,
+    torque: NDArray[np.float64],
+    x: NDArray[np.float64],
+    scratch: NDArray[np.float64],
+) -> None:
+    """Advance x = [q, dq], (2n,), in place from t to t + h seconds under a held torque.
+
+    `method` is RK4 or DOPRI5; `scratch` has `scratch_size(n)` entries, its contents do not matter.
+    """
+    if method == RK4:
+        _explicit_step(_RK4_A, _RK4_B, _RK4_C, arm, disturbance, t, h, torque, x, scratch)
+    else:
+        _explicit_step(_DOPRI5_A, _DOPRI5_B, _DOPRI5_C, arm, disturbance, t, h, torque, x, scratch)

@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The arm's equation of motion in first order: x = [q, dq], with held torque and disturbance."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.core.kernel import kernel
+from sim_plant.arm import Arm, acceleration
+from sim_plant.disturbance import disturbance_torque
+
+
+@kernel
+def motion(
+    arm: Arm,
+    disturbance: NDArray[np.float64],
+    t: float,
+    x: NDArray[np.float64],
+    torque: NDArray[np.float64],
+    dx: NDArray[np.float64],
+) -> None:
+    """Write dx/dt = [dq, M^-1 (torque - tau_dist(t, dq) - C dq - G)], (2n,)."""
+    n = torque.size
+    q, dq = x[:n], x[n:]
+    velocity, net_torque = dx[:n], dx[n:]
+    disturbance_torque(disturbance, t, dq, net_torque)
+    for i in range(n):
+        velocity[i] = dq[i]
+        net_torque[i] = torque[i] - net_torque[i]
+    acceleration(arm, q, dq, net_torque, dx[n:])  # in place
