@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The package for pip, colcon and ament: two Python packages, their commands and shared files."""
+
+import re
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = 'blf_dsc_controller'
+SHARE = f'share/{NAME}'
+
+
+def version() -> str:
+    """Read the version from where it is written, without importing the package."""
+    text = Path(NAME, '__init__.py').read_text(encoding='utf-8')
+    match = re.search(r"^__version__ = '(.+)'$", text, re.MULTILINE)
+    if match is None:
+        raise RuntimeError(f'{NAME}/__init__.py has no line __version__ = ...')
+    return match.group(1)
+
+
+def files(folder: str) -> list[str]:
+    """List the files of a folder, to be installed under the same name in the share folder."""
+    return sorted(str(path) for path in Path(folder).glob('*.*') if path.is_file())
+
+
+setup(
+    name=NAME,
+    version=version(),
+    description='Output-constrained tracking of robot arms with unknown dynamics, for ROS 2',
+    author='The blf_dsc_controller contributors',
+    maintainer='The blf_dsc_controller contributors',
+    maintainer_email='maintainers@example.org',
+    license='Apache-2.0',
+    python_requires='>=3.10',
+    packages=find_packages(include=[NAME, f'{NAME}.*', 'sim_plant', 'sim_plant.*']),
+    package_data={NAME: ['py.typed'], 'sim_plant': ['py.typed']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (SHARE, ['package.xml']),
+        (f'{SHARE}/config', files('config')),
+        (f'{SHARE}/launch', files('launch')),
+    ],
+    install_requires=[
+        'numpy',
+        'numba',
+        'mcap',
+        'rosbags>=0.10',
+        'matplotlib',
+        'pyyaml',
+        'tqdm',
+    ],
+    extras_require={
+        # ROS 2 Jazzy itself, as wheels. An extra, because a sourced Jazzy has its own.
+        'ros': [
+            'ros-jazzy-rclpy',
+            'ros-jazzy-rmw-fastrtps-cpp',
+            'ros-jazzy-common-interfaces',
+            'ros-jazzy-builtin-interfaces',
+            'ros-jazzy-lifecycle-msgs',
+            'ros-jazzy-rcl-interfaces',
+            'ros-jazzy-rosgraph-msgs',
+            'ros-jazzy-ament-index-python',
+        ],
+        # setuptools: test_package.py builds a wheel without going to the network.
+        'test': ['pytest>=7', 'hypothesis', 'scipy', 'coverage', 'setuptools>=70.1'],
+        # Fixed, because with nearly every rule on, each release of the linter finds something new.
+        'lint': ['ruff~=0.17.5', 'mypy~=2.4.1', 'types-PyYAML', 'types-tqdm', 'pre-commit'],
+    },
+    entry_points={
+        'console_scripts': [
+            'sim_plant = sim_plant.node:main',
+            'blf_dsc_controller = blf_dsc_controller.nodes.controller_node:main',
+            'bag_recorder = blf_dsc_controller.nodes.recorder_node:main',
+            'closed_loop = blf_dsc_controller.tools.closed_loop:main',
+            'bag_plot = blf_dsc_controller.tools.bag_plot:main',
+        ],
+    },
+    # The digest of the compiled kernels' cache is taken over the source files on disk.
+    zip_safe=False,
+)
