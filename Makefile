@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+# From a fresh clone with Python 3.10 or newer: `make demo`, `make test`. `make` alone lists all.
+#
+# Everything is installed into .venv. In a shell where ROS 2 Jazzy is sourced, that ROS is used;
+# elsewhere ROS 2 Jazzy comes as wheels, into .venv too. The two are never mixed: the stamp that
+# says .venv is ready carries which of them (and which Python) it was made for.
+
+PYTHON ?= python3
+CONFIG ?= recommended
+DURATION ?= 60
+
+.DEFAULT_GOAL := help
+MAKEFLAGS += --no-print-directory
+
+# The interpreter beneath, if PYTHON is one of a virtual environment (such as an activated .venv).
+BASE := $(shell $(PYTHON) -c 'import sys; print(sys._base_executable)' 2>/dev/null)
+VERSION := $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
+
+ifeq ($(ROS_DISTRO),jazzy)
+FLAVOUR := sourced
+else
+FLAVOUR := wheels
+# The wheels find their own libraries and packages; another ROS or environment must not get in.
+unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH PYTHONPATH RMW_IMPLEMENTATION
+ifneq ($(ROS_DISTRO),)
+unexport LD_LIBRARY_PATH ROS_DISTRO ROS_PYTHON_VERSION ROS_VERSION
+endif
+endif
+
+VENV := .venv
+READY := $(VENV)/.ready-$(FLAVOUR)-$(VERSION)
+LINT_READY := $(READY)-lint
+PIP := $(VENV)/bin/python -m pip --disable-pip-version-check -qq
+# This checkout comes first, also before a workspace that has the package installed.
+RUN := PYTHONPATH="$(CURDIR)$${PYTHONPATH:+:$$PYTHONPATH}" $(VENV)/bin/python
+PIP_FAILED := { echo 'The installation failed: see above. It needs a package index: behind a proxy' \
+  'set HTTPS_PROXY, for a mirror PIP_INDEX_URL, without a network PIP_FIND_LINKS and' \
+  'PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
+
+.PHONY: help venv demo test lint clean
+
+help: ## List what can be made
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1	\2/p' Makefile
+
+venv: $(READY) ## Install everything into .venv (the others do it when needed)
+
+demo: $(READY) ## Run the closed loop over ROS 2 (CONFIG, DURATION in s) and draw it, into out/
+	@mkdir -p out; out=out/demo; n=1; \
+	while [ -e "$$out" ]; do n=$$((n + 1)); out=out/demo-$$n; done; \
+	$(RUN) -m blf_dsc_controller.tools.closed_loop --mode lockstep --config "$(CONFIG)" \
+	    --duration "$(DURATION)" --out "$$out" && \
+	echo && echo "Pictures to look at:" && ls "$$out"/*.png && echo "The recording: $$out/bag"
+
+test: $(READY) ## Run the tests (TESTS=test/test_x.py for some)
+	@$(if $(filter sourced,$(FLAVOUR)),PYTEST_DISABLE_PLUGIN_AUTOLOAD=1) $(RUN) -m pytest $(TESTS)
+
+lint: $(LINT_READY) ## Check style and types
+	@$(VENV)/bin/python -m ruff check
+	@$(VENV)/bin/python -m ruff format --check
+	@$(VENV)/bin/python -m mypy
+
+clean: ## Remove what was installed and built; results in out/ stay
+	@rm -rf $(VENV) build install log *.egg-info .coverage .hypothesis .*_cache
+	@find blf_dsc_controller sim_plant test -name __pycache__ -prune -exec rm -rf {} +
+
+$(READY): setup.py
+	@$(check_python)
+	@$(check_$(FLAVOUR))
+	@test -e $@ || { echo 'Making $(VENV) with Python $(VERSION), for $(about_$(FLAVOUR))'; \
+	    "$(BASE)" -m venv --clear $(venv_options_$(FLAVOUR)) $(VENV); } || { \
+	    echo 'python -m venv failed: see above. On Debian and Ubuntu: apt install python3-venv' >&2; \
+	    exit 1; }
+	@echo 'Installing into $(VENV), which takes a minute or two'
+	@: > $(VENV)/constraints.txt; $(constrain_$(FLAVOUR))
+	@$(PIP) install 'pip>=22' && $(PIP) install -c $(VENV)/constraints.txt \
+	    -e '.[$(extras_$(FLAVOUR))]' || $(PIP_FAILED)
+	@touch $@
+
+$(LINT_READY): $(READY)
+	@$(PIP) install -c $(VENV)/constraints.txt -e '.[lint]' || $(PIP_FAILED)
+	@touch $@
+
+define check_python
+test -n '$(VERSION)' || { echo '$(PYTHON) does not run: install Python 3.10 or newer, or name one:' \
+    'make PYTHON=/path/to/python3' >&2; exit 1; }; \
+'$(PYTHON)' -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { \
+    echo '$(PYTHON) is Python $(VERSION), but 3.10 or newer is needed: name one:' \
+    'make PYTHON=/path/to/python3' >&2; exit 1; }
+endef
+
+about_wheels := ROS 2 Jazzy from wheels
+extras_wheels := ros,test
+venv_options_wheels :=
+constrain_wheels := :
+define check_wheels
+test "$$(uname -sm)" = 'Linux x86_64' || { echo "ROS 2 Jazzy as wheels exists for Linux on x86_64" \
+    "only, and this is $$(uname -sm): install ROS 2 Jazzy, source it, and run make again." >&2; \
+    exit 1; }; \
+test -z '$(ROS_DISTRO)' || echo 'ROS 2 $(ROS_DISTRO) is sourced here, but this package is for' \
+    'Jazzy: it is left aside, and Jazzy is taken from wheels.'
+endef
+
+# numpy stays as it is, because the sourced ROS's messages were compiled against it.
+about_sourced := the ROS 2 Jazzy sourced in this shell
+extras_sourced := test
+venv_options_sourced := --system-site-packages
+constrain_sourced := "$(BASE)" -c 'import numpy; print("numpy==" + numpy.__version__)' \
+    > $(VENV)/constraints.txt
+define check_sourced
+"$(BASE)" -c 'import rclpy' || { echo 'ROS 2 Jazzy is sourced here, but $(BASE) (Python $(VERSION))' \
+    'cannot import its rclpy: see above. Name the Python that this ROS was built for, as in' \
+    'make PYTHON=/usr/bin/python3, or use a shell without ROS.' >&2; exit 1; }
+endef
