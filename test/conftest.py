@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS environment of the test process and of the processes that tests start.
+
+It is set here, before any test module imports rclpy: a domain that no other run on this machine is
+likely to share, on this machine only, with the logs in a folder that goes away at the end.
+"""
+
+import atexit
+import os
+import shutil
+import tempfile
+import zlib
+
+# Domains 1 to 101 keep clear of the default 0 and of Linux's ephemeral ports.
+_RUN = f'{os.getpid()} {os.environ.get("PYTEST_XDIST_WORKER", "")}'
+_LOG_FOLDER = tempfile.mkdtemp(prefix='blf_dsc_controller_test_log_')
+
+os.environ['ROS_DOMAIN_ID'] = str(1 + zlib.crc32(_RUN.encode()) % 101)
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+os.environ['ROS_LOG_DIR'] = _LOG_FOLDER
+
+atexit.register(shutil.rmtree, _LOG_FOLDER, ignore_errors=True)
