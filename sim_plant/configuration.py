@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from blf_dsc_controller.configuration.parameter import parameter
 from blf_dsc_controller.configuration.sampling import (
@@ -204,7 +204,7 @@ class PlantConfig:
         0, 'seed of the noise: the same seed, the same run', at_least=0, read_only=_BUILT
     )
     publish_clock: bool = parameter(
-        False,  # noqa: FBT003
+        False,
         "publish the plant's time on /clock",
         read_only=_BUILT,
     )
@@ -225,7 +225,7 @@ class PlantConfig:
     disturbance: Disturbance = Disturbance()
     sensor: Sensor = Sensor()
     actuator: Actuator = Actuator()
-    realtime: Realtime = Realtime()
+    realtime: Realtime = field(default_factory=Realtime)
 
     @property
     def sample_time_ns(self) -> int:
@@ -233,7 +233,7 @@ class PlantConfig:
         return nanoseconds(self.sample_time)
 
     def problems(self) -> list[str]:
-        """What is wrong between or beside the ranges of single parameters."""
+        """Return what is wrong beside the ranges of single parameters, in words."""
         problems = joint_problems(self.joints) + sample_time_problems(self.sample_time)
         if len(self.joints) != _JOINTS:
             problems.append(

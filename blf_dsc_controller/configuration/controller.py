@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from blf_dsc_controller.configuration.learning import Learning
 from blf_dsc_controller.configuration.parameter import parameter
@@ -232,9 +232,9 @@ class ControllerConfig:
     feedback: Feedback = Feedback()
     disturbance: Disturbance = Disturbance()
     torque: Torque = Torque()
-    learning: Learning = Learning()
+    learning: Learning = field(default_factory=Learning)
     telemetry: Telemetry = Telemetry()
-    realtime: Realtime = Realtime()
+    realtime: Realtime = field(default_factory=Realtime)
 
     @property
     def sample_time_ns(self) -> int:
@@ -242,7 +242,7 @@ class ControllerConfig:
         return nanoseconds(self.sample_time)
 
     def problems(self) -> list[str]:
-        """What is wrong between or beside the ranges of single parameters."""
+        """Return what is wrong beside the ranges of single parameters, in words."""
         model = MODELS[self.model]
         problems = joint_problems(self.joints) + sample_time_problems(self.sample_time)
         if len(self.joints) != model.joints:

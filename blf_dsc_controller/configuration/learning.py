@@ -116,10 +116,11 @@ class Learning:
         samples = round(self.window / sample_time)
         if FEWEST_SAMPLES <= samples <= MOST_SAMPLES:
             return []
-        return [
+        problem = (
             f'learning.window: got {self.window:g} s, which is {samples} samples of '
             f'{sample_time:g} s: between {FEWEST_SAMPLES} and {MOST_SAMPLES} are allowed'
-        ]
+        )
+        return [problem]
 
     def estimate_problems(self, model: str, count: int) -> list[str]:
         """Whether the first estimate fits the model and lies in the ball."""

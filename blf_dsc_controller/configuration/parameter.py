@@ -62,7 +62,7 @@ class Rule:
     read_only: str
 
 
-def parameter(  # noqa: PLR0913 - each keyword is one fact of a parameter
+def parameter(
     default: Value,
     description: str,
     *,
@@ -76,7 +76,7 @@ def parameter(  # noqa: PLR0913 - each keyword is one fact of a parameter
     length: tuple[str, ...] = (),
     may_be_empty: bool = False,
     read_only: str = '',
-) -> Any:  # noqa: ANN401 - stands where the annotated type of the field is expected
+) -> Any:
     """Declare a field of a configuration dataclass; the arguments are those of `Rule`."""
     rule = Rule(
         description=description,
@@ -154,7 +154,7 @@ class Parameter:
             elif not self._allows(entry):
                 yield f'got {_shown(entry)}{place}, but {self._demand()}'
 
-    def _allows(self, entry: Any) -> bool:  # noqa: ANN401 - of the element's type by now
+    def _allows(self, entry: Any) -> bool:
         rule = self.rule
         if rule.choices and entry not in rule.choices:
             return False
@@ -186,7 +186,7 @@ def _shown(value: object) -> str:
     return 'nothing' if value is None else repr(value)
 
 
-def _remedy(entries: Any, kind: Kind) -> str:  # noqa: ANN401 - any sequence
+def _remedy(entries: Any, kind: Kind) -> str:
     """Say how to write it, where that can be told: ROS takes no 1 for 1.0, nor the text '1.0'."""
     for entry in entries:
         if kind.element is Kind.DOUBLE and _is(entry, Kind.INTEGER):

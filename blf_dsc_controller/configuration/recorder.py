@@ -40,5 +40,5 @@ class RecorderConfig:
     )
 
     def problems(self) -> list[str]:
-        """What is wrong between or beside the ranges of single parameters."""
+        """Return what is wrong beside the ranges of single parameters, in words."""
         return [] if self.output.strip() else ['output: got no folder name to write the bag into']

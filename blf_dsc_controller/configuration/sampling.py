@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 from blf_dsc_controller.configuration.parameter import parameter
 
+_ROUNDING = 1e-12
+"""Relative; the product of a decimal fraction and 1e9 is off by a few 1e-16."""
+
 _AT_START = 'the process asks for it once, before the first sample'
 
 
@@ -29,27 +32,24 @@ class Realtime:
 
 
 def nanoseconds(sample_time: float) -> int:
-    """The sample time [s] in nanoseconds, the unit that stamps are counted in."""
+    """Return the sample time [s] in nanoseconds, the unit that stamps are counted in."""
     return round(sample_time * 1e9)
 
 
 def sample_time_problems(sample_time: float) -> list[str]:
-    """A sample time must be whole nanoseconds, or stamps would drift from the time in the law."""
+    """Ask for whole nanoseconds, or stamps would drift from the time in the law."""
     whole = nanoseconds(sample_time)
     if abs(sample_time * 1e9 - whole) <= _ROUNDING * whole:
         return []
-    return [
-        f'sample_time: got {sample_time!r} s, which is not a whole number of nanoseconds: '
+    problem = (
+        f'sample_time: got {sample_time!r} s, no whole number of nanoseconds: '
         f'write {whole * 1e-9:.9f}'
-    ]
-
-
-_ROUNDING = 1e-12
-"""Relative; the product of a decimal fraction and 1e9 is off by a few 1e-16."""
+    )
+    return [problem]
 
 
 def joint_problems(joints: tuple[str, ...]) -> list[str]:
-    """Joints are matched by name, so each needs a name of its own."""
+    """Ask for a name of its own for each joint, since joints are matched by name."""
     repeated = sorted({name for name in joints if joints.count(name) > 1})
     problems = [f'joints: {name!r} is there more than once' for name in repeated]
     return problems + ['joints: a name is empty'] * ('' in joints)

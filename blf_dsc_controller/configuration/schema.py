@@ -38,7 +38,7 @@ def parameters(cls: type[Any]) -> list[Parameter]:
 
 
 def flatten(config: object) -> dict[str, Value]:
-    """The values of a configuration under their dotted names; `build` makes it whole again."""
+    """Return the values of a configuration under dotted names; `build` makes it whole again."""
     return {one.name: _value(config, one.name) for one in parameters(type(config))}
 
 
@@ -67,7 +67,7 @@ def build(cls: type[Config], given: Mapping[str, object], source: str = '') -> C
 
 
 def change(config: Config, given: Mapping[str, object], source: str = '') -> Config:
-    """A copy of a configuration with some parameters changed, validated as a whole."""
+    """Return a copy of a configuration with some parameters changed, validated as a whole."""
     return build(type(config), {**flatten(config), **given}, source)
 
 
@@ -85,7 +85,8 @@ def _walk(cls: type[Any], prefix: str) -> Iterator[Parameter]:
     for field in dataclasses.fields(cls):
         if 'rule' in field.metadata:
             kind = _KINDS[types[field.name]]
-            yield Parameter(prefix + field.name, kind, field.default, field.metadata['rule'])
+            default = typing.cast('Value', field.default)
+            yield Parameter(prefix + field.name, kind, default, field.metadata['rule'])
         else:
             yield from _walk(types[field.name], f'{prefix}{field.name}.')
 
