@@ -25,9 +25,9 @@ _PRESETS = 'config'
 def share_folder() -> Path:
     """Locate the folder that holds `config/` and `launch/`.
 
-    A source tree that the code itself runs from comes first, because an editable install copies
-    these files and would go on using the copy after an edit. Then what ROS's ament index knows
-    (colcon), then the data folder of this Python's packages (pip).
+    The source tree comes first if the code itself runs from one: an editable install leaves these
+    files there, and another folder would belong to another version. Then what ROS's ament index
+    knows (colcon), then the data folder of this Python's packages (pip).
 
     Raises BlfDscError, naming the places looked at, when it is in none of them.
     """

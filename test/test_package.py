@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The package as pip, colcon and ROS see it: what is installed, and that its papers agree."""
+
+import ast
+import configparser
+import re
+import shutil
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+import zipfile
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+
+import blf_dsc_controller
+
+ROOT = Path(__file__).resolve().parents[1]
+NAME = 'blf_dsc_controller'
+PACKAGES = (NAME, 'sim_plant')
+EXECUTABLES = {'sim_plant', 'blf_dsc_controller', 'bag_recorder', 'closed_loop', 'bag_plot'}
+
+# rosdep's names for what pip installs. rosdep has no key for mcap alone.
+ROSDEP_KEYS = {
+    'numpy': 'python3-numpy',
+    'numba': 'python3-numba',
+    'matplotlib': 'python3-matplotlib',
+    'pyyaml': 'python3-yaml',
+    'tqdm': 'python3-tqdm',
+    'mcap': 'mcap-ros2-support',
+    'rosbags': 'python3-rosbags-pip',
+}
+
+
+def manifest():
+    return ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314 - our own file
+
+
+def depends(kind):
+    return {element.text for element in manifest().findall(kind)}
+
+
+def sources():
+    return [path for package in PACKAGES for path in sorted((ROOT / package).rglob('*.py'))]
+
+
+@pytest.fixture(scope='module')
+def wheel(tmp_path_factory):
+    """Build the wheel from a copy of the sources, with what is installed and no network."""
+    copy = tmp_path_factory.mktemp('source') / NAME
+    unwanted = ('.*', 'build', 'install', 'log', 'out', '*.egg-info', '__pycache__')
+    shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*unwanted))
+    build = [sys.executable, '-m', 'pip', 'wheel', '--quiet', '--no-deps', '--no-index']
+    out = tmp_path_factory.mktemp('wheel')
+    subprocess.run(
+        [*build, '--no-build-isolation', '--wheel-dir', str(out), '.'], cwd=copy, check=True
+    )
+    (path,) = out.glob('*.whl')
+    return zipfile.ZipFile(path)
+
+
+@pytest.fixture(scope='module')
+def metadata(wheel):
+    """What the wheel tells pip, as a list of (field, value)."""
+    (name,) = (name for name in wheel.namelist() if name.endswith('.dist-info/METADATA'))
+    header = wheel.read(name).decode().split('\n\n')[0]
+    return [tuple(line.split(': ', 1)) for line in header.splitlines() if ': ' in line]
+
+
+@pytest.fixture(scope='module')
+def entry_points(wheel):
+    (name,) = (name for name in wheel.namelist() if name.endswith('entry_points.txt'))
+    parser = configparser.ConfigParser()
+    parser.read_string(wheel.read(name).decode())
+    return [
+        EntryPoint(command, target, 'console_scripts')
+        for command, target in parser['console_scripts'].items()
+    ]
+
+
+def requirements(metadata, extra=None):
+    lines = [value for field, value in metadata if field == 'Requires-Dist']
+    wanted = [
+        line for line in lines if (f'extra == "{extra}"' in line if extra else 'extra' not in line)
+    ]
+    return {re.match(r'[\w-]+', line).group().lower() for line in wanted}
+
+
+def test_one_version_everywhere(metadata):
+    version = blf_dsc_controller.__version__
+    citation = re.search(r'^version: (.+)$', (ROOT / 'CITATION.cff').read_text(), re.MULTILINE)
+    assert dict(metadata)['Version'] == version
+    assert manifest().findtext('version') == version
+    assert citation.group(1) == version
+    assert version in (ROOT / 'CHANGELOG.rst').read_text()
+
+
+def test_manifest_is_of_an_ament_python_package():
+    root = manifest()
+    assert root.get('format') == '3'
+    assert root.findtext('name') == NAME
+    assert root.findtext('export/build_type') == 'ament_python'
+    # colcon takes a package with an invalid address for plain Python, without a word.
+    assert re.fullmatch(r'[\w.+-]+@([\w-]+\.)+[a-zA-Z]{2,}', root.find('maintainer').get('email'))
+
+
+def test_wheel_holds_every_module_and_no_test(wheel):
+    installed = [name for name in wheel.namelist() if '.data/' not in name]
+    modules = {name for name in installed if name.endswith('.py')}
+    assert modules == {path.relative_to(ROOT).as_posix() for path in sources()}
+
+
+def test_every_folder_of_modules_is_a_package():
+    assert {path.parent for path in sources()} == {
+        path.parent for path in sources() if path.name == '__init__.py'
+    }
+
+
+def test_wheel_says_it_is_typed(wheel):
+    assert {f'{package}/py.typed' for package in PACKAGES} <= set(wheel.namelist())
+
+
+def test_wheel_shares_what_ros_looks_for(wheel):
+    start = f'{NAME}-{blf_dsc_controller.__version__}.data/data/share/'
+    shared = {name.removeprefix(start) for name in wheel.namelist() if name.startswith(start)}
+    assert {
+        f'ament_index/resource_index/packages/{NAME}',
+        f'{NAME}/package.xml',
+        f'{NAME}/launch/closed_loop.launch.py',
+        f'{NAME}/config/recommended.yaml',
+    } <= shared
+    assert {Path(name).name for name in shared if name.startswith(f'{NAME}/config/')} == {
+        path.name for path in (ROOT / 'config').iterdir() if path.is_file()
+    }
+
+
+def test_every_executable_has_its_main(entry_points):
+    assert {entry.name for entry in entry_points} == EXECUTABLES
+    for entry in entry_points:
+        source = ROOT / (entry.module.replace('.', '/') + '.py')
+        functions = [
+            node.name
+            for node in ast.parse(source.read_text()).body
+            if isinstance(node, ast.FunctionDef)
+        ]
+        assert entry.attr in functions, source
+
+
+def test_executables_go_where_ros2_run_looks():
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / 'setup.cfg')
+    assert setup['develop']['script_dir'] == f'$base/lib/{NAME}'
+    assert setup['install']['install_scripts'] == f'$base/lib/{NAME}'
+
+
+def test_ros_wheels_are_an_extra(metadata):
+    assert not any(name.startswith('ros-') for name in requirements(metadata))
+    assert {'ros-jazzy-rclpy', 'ros-jazzy-rmw-fastrtps-cpp'} <= requirements(metadata, 'ros')
+
+
+def test_colcon_finds_pytest(metadata):
+    assert 'pytest' in requirements(metadata, 'test')
+
+
+def imports(path):
+    """Top-level names of the packages a source file imports, wherever it does."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.split('.')[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            yield node.module.split('.')[0]
+
+
+def test_all_that_is_imported_is_declared(metadata):
+    used = {name for path in sources() for name in imports(path)}
+    used |= set(imports(ROOT / 'launch/closed_loop.launch.py'))
+    foreign = used - set(sys.stdlib_module_names) - set(PACKAGES)
+    distributions = {'pyyaml' if name == 'yaml' else name for name in foreign}
+    assert distributions <= requirements(metadata) | depends('exec_depend')
+
+
+def test_rosdep_installs_what_pip_would(metadata):
+    assert requirements(metadata) == set(ROSDEP_KEYS)
+    assert set(ROSDEP_KEYS.values()) <= depends('exec_depend')
+
+
+def test_launch_file_starts_executables_there_are(entry_points):
+    source = ROOT / 'launch/closed_loop.launch.py'
+    code = ast.parse(source.read_text())
+    compile(code, str(source), 'exec')
+    started = {
+        keyword.value.value
+        for node in ast.walk(code)
+        if isinstance(node, ast.Call)
+        for keyword in node.keywords
+        if keyword.arg == 'executable'
+    }
+    assert started == {'sim_plant', 'blf_dsc_controller', 'bag_recorder'}
+    assert started <= {entry.name for entry in entry_points}
+
+
+def test_launch_file_sets_parameters_there_are():
+    from blf_dsc_controller.configuration.nodes import known_names
+
+    code = ast.parse((ROOT / 'launch/closed_loop.launch.py').read_text())
+    keys = {
+        key.value
+        for node in ast.walk(code)
+        if isinstance(node, ast.Dict)
+        for key in node.keys
+        if isinstance(key, ast.Constant)
+    }
+    arguments_of_node = {'package', 'namespace'}
+    assert {'mode', 'output', 'wait_for_subscribers'} <= keys
+    assert keys - arguments_of_node <= known_names()
