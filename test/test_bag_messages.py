@@ -105,7 +105,7 @@ def test_garbage_in_padding_and_after_the_end_is_ignored():
 
 
 def test_missing_joint_is_named():
-    with pytest.raises(MissingJointError, match="'elbow'.*names shoulder, wrist") as caught:
+    with pytest.raises(MissingJointError, match=r"'elbow'.*names shoulder, wrist") as caught:
         JointStateDecoder(['elbow']).decode(
             raw_joint_state(('shoulder', 'wrist'), [1, 2], [3, 4], [])
         )

@@ -8,19 +8,25 @@ holds the very topics that a recording of the running nodes holds.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 CONTROLLER = 'blf_dsc_controller'
 PLANT = 'sim_plant'
 
+FOREVER = 2**63 - 1  # ns
+
 
 @dataclass(frozen=True)
 class Quality:
-    """Quality of service as plain data, in the words of ROS 2."""
+    """Quality of service as plain data, in the words of ROS 2; durations in ns."""
 
     depth: int
-    reliability: Literal['reliable', 'best_effort'] = 'reliable'
-    durability: Literal['volatile', 'transient_local'] = 'volatile'
+    reliability: str = 'reliable'
+    durability: str = 'volatile'
+    history: str = 'keep_last'
+    deadline: int = FOREVER
+    lifespan: int = FOREVER
+    liveliness: str = 'automatic'
+    liveliness_lease_duration: int = FOREVER
 
 
 @dataclass(frozen=True)
@@ -62,9 +68,6 @@ LATEST = Quality(depth=1)
 STREAM = Quality(depth=100)
 LATCHED = Quality(depth=1, durability='transient_local')
 DIAGNOSTIC = Quality(depth=10)
-
-# Subscriptions of the recorder: the depth costs memory only while the recorder lags behind.
-RECORDED = Quality(depth=100_000)
 
 JOINT_STATES = Topic(PLANT, 'joint_states', JOINT_STATE, STREAM, LATEST)
 COMMANDS = Topic(CONTROLLER, '~/commands', FLOAT64_MULTI_ARRAY, STREAM, LATEST)
