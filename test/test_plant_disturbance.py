@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Each kind of disturbance does what its name says, on the arm's side of the equation."""
+
+import numpy as np
+import pytest
+from plants import disturbance, plant, rough_disturbance
+
+from sim_plant.disturbance import disturbance_torque
+
+
+def torque(vector, t, dq):
+    out = np.empty(2)
+    disturbance_torque(vector, t, np.array(dq, dtype=float), out)
+    return out
+
+
+def test_all_kinds_add_up_joint_by_joint():
+    t, dq = 1.7, np.array([0.4, -0.9])
+    expected = [
+        0.1 + 0.1 * np.sin(1.7) + 0.05 * 0.4 + 0.2 * np.tanh(0.8),
+        -0.2 + 0.3 * np.sin(7.0 * 1.7 + 0.4) - 0.1 * 0.9 - 0.1 * np.tanh(1.8),
+    ]
+    assert torque(rough_disturbance(), t, dq) == pytest.approx(expected, rel=1e-14)
+
+
+def test_nothing_asked_for_is_nothing():
+    assert (torque(disturbance(), 3.0, [1.0, -1.0]) == 0).all()
+
+
+def test_coulomb_friction_is_full_and_against_the_motion_well_above_its_velocity():
+    friction = disturbance(coulomb=[0.3, 0.5], coulomb_velocity=0.01)
+    # tanh(20) is 1 to the last bit
+    assert torque(friction, 0.0, [0.2, -0.2]).tolist() == [0.3, -0.5]
+    assert torque(friction, 0.0, [0.0, 0.0]).tolist() == [0.0, 0.0]
+
+
+def test_friction_takes_energy_out_of_the_arm():
+    free, rubbing = plant(), plant(load=disturbance(viscous=0.1, coulomb=0.1))
+    for _ in range(200):
+        free.step(np.zeros(2))
+        rubbing.step(np.zeros(2))
+    speed = [np.abs(each.truth()[-2:]) for each in (free, rubbing)]
+    assert (speed[1] < speed[0]).all()
+
+
+def test_a_push_moves_the_joint_against_its_sign():
+    """tau_dist stands beside M ddq, so a positive one decelerates."""
+    calm, pushed = plant(), plant(load=disturbance(constant=[0.0, 1.0]))
+    calm.step(np.zeros(2))
+    pushed.step(np.zeros(2))
+    assert pushed.truth()[-1] < calm.truth()[-1]
+
+
+def test_the_truth_tells_the_disturbance_of_the_moment():
+    arm = plant(load=rough_disturbance(), velocity=(0.3, -0.2))
+    for _ in range(100):
+        arm.step(np.array([-6.0, -2.0]))
+    told = arm.truth()
+    assert told[:3] == pytest.approx([1.0, 0.32, 0.4])
+    assert (told[3:5] == torque(rough_disturbance(), 100_000_000 * 1e-9, told[7:9])).all()

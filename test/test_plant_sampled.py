@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sampled plant as a whole: repeatable, restorable, and the same however it is called."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+from numba.core.runtime import _nrt_python, rtsys
+from plants import START, commands, plant, rough_disturbance, run, settings
+
+from blf_dsc_controller.core.kernel import kernel
+from sim_plant.integrator import DOPRI5, RK4
+from sim_plant.plant import initial_state, measure, settings_vector, settings_view, step
+from sim_plant.sensors import DIFFERENCED, MEASURED, generator
+
+EVERYTHING = {
+    'position_noise': 1e-5,
+    'velocity_noise': 1e-3,
+    'resolution': 1e-5,
+    'torque_limit': (8.0, 3.0),
+    'delay': 2,
+}
+REPOSITORY = Path(__file__).parents[1]
+
+
+def full_plant(**changes):
+    """A plant with every imperfection there is."""
+    return plant(load=rough_disturbance(), **{**EVERYTHING, **changes})
+
+
+@kernel
+def compiled_run(settings, state, rng, torques, rows):
+    for k in range(len(torques)):
+        measure(settings, state, rng, rows[k])
+        step(settings, state, torques[k])
+
+
+@pytest.mark.parametrize('source', [MEASURED, DIFFERENCED])
+@pytest.mark.parametrize('integrator', [RK4, DOPRI5])
+@pytest.mark.parametrize('noise', [0.0, 1e-5])
+def test_a_compiled_loop_and_python_calls_give_the_same_bits(source, integrator, noise):
+    changes = {'velocity_source': source, 'integrator': integrator, 'position_noise': noise}
+    arm = full_plant(seed=11, **changes)
+    flat = arm.settings.copy()
+    state, rows = initial_state(flat, START, np.zeros(2)), np.empty((300, 6))
+    compiled_run(flat, state, generator(11), commands(300), rows)
+    assert (run(arm, commands(300)) == rows).all()
+    assert (arm.state == state).all()
+
+
+def test_settings_survive_their_vector():
+    given = settings(load=rough_disturbance(), velocity_source=DIFFERENCED, **EVERYTHING)
+    found = settings_view(settings_vector(given))
+    assert (found.period_ns, found.integrator) == (given.period_ns, given.integrator)
+    assert (found.arm, found.sensor) == (given.arm, given.sensor)
+    assert (found.disturbance == given.disturbance).all()
+    assert (found.actuator.torque_limit == given.actuator.torque_limit).all()
+    assert found.actuator.delay == given.actuator.delay
+
+
+def test_a_reset_plant_repeats_its_run():
+    arm = full_plant(seed=2)
+    first = run(arm, commands(50))
+    arm.reset()
+    assert arm.sample == 0
+    assert (run(arm, commands(50)) == first).all()
+
+
+@pytest.mark.parametrize('source', [MEASURED, DIFFERENCED])
+def test_a_restored_plant_goes_on_as_if_nothing_had_happened(source):
+    torques = commands(120)
+    arm = full_plant(velocity_source=source)
+    run(arm, torques[:60])
+    saved = arm.save()
+    expected = run(arm, torques[60:])
+    other = full_plant(velocity_source=source, seed=99)
+    run(other, torques[:7])
+    other.restore(saved)
+    assert (run(other, torques[60:]) == expected).all()
+    assert (other.state == arm.state).all()
+
+
+def test_time_is_counted_in_whole_nanoseconds():
+    arm = plant()
+    run(arm, commands(3))
+    assert (arm.sample, arm.elapsed_ns) == (3, 3_000_000)
+
+
+@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason='compares compiled code with Python')
+def test_without_compilation_the_numbers_are_the_same():
+    """The interpreter's libm and order of operations are the compiler's, to rounding."""
+    program = (
+        'import json, sys\n'
+        'from plants import commands, run\n'
+        'from test_plant_sampled import full_plant\n'
+        'json.dump(run(full_plant(seed=6), commands(100)).tolist(), sys.stdout)\n'
+    )
+    paths = os.pathsep.join([str(REPOSITORY), str(REPOSITORY / 'test')])
+    environment = {**os.environ, 'NUMBA_DISABLE_JIT': '1', 'PYTHONPATH': paths}
+    output = subprocess.run(
+        [sys.executable, '-c', program], env=environment, check=True, stdout=subprocess.PIPE
+    ).stdout
+    interpreted = np.array(json.loads(output))
+    assert run(full_plant(seed=6), commands(100)) == pytest.approx(interpreted, rel=1e-10)
+
+
+@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason='counts allocations of compiled code')
+def test_a_step_allocates_nothing():
+    arm = full_plant()
+
+    def allocations(samples):
+        torques, rows = commands(samples), np.empty((samples, 6))
+        before = rtsys.get_allocation_stats()
+        compiled_run(arm.settings, arm.state, arm.rng, torques, rows)
+        return rtsys.get_allocation_stats().mi_alloc - before.mi_alloc
+
+    counting = _nrt_python.memsys_stats_enabled()
+    _nrt_python.memsys_enable_stats()
+    try:
+        assert allocations(2000) == allocations(1)
+    finally:
+        if not counting:
+            _nrt_python.memsys_disable_stats()
