@@ -237,7 +237,8 @@ class PlantConfig:
         problems = joint_problems(self.joints) + sample_time_problems(self.sample_time)
         if len(self.joints) != _JOINTS:
             problems.append(
-                f'joints: got {len(self.joints)} names, but the simulated arm has {_JOINTS} joints'
+                f'joints: got {len(self.joints)} {"name" if len(self.joints) == 1 else "names"}, '
+                f'but the simulated arm has {_JOINTS} joints'
             )
         if 0.0 < self.duration < self.sample_time:
             problems.append(

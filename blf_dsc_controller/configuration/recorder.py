@@ -27,12 +27,12 @@ class RecorderConfig:
     )
     compression: str = parameter(
         'none',
-        'compression of each message',
+        'compression of the chunks of the bag',
         choices=('none', 'zstd'),
         read_only=_AT_START,
     )
     queue_depth: int = parameter(
-        1000,
+        100_000,
         'messages of a topic that may wait while the disk is busy',
         unit='messages',
         at_least=1,

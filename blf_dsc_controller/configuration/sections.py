@@ -74,12 +74,15 @@ class _Composer(yaml.BaseLoader):
 
     def resolve(self, kind: Any, value: Any, implicit: Any) -> str:
         """Give no type to what carries no tag: see `scalars`."""
-        return _UNTAGGED if kind is yaml.ScalarNode else super().resolve(kind, value, implicit)
+        if kind is yaml.ScalarNode:
+            return _UNTAGGED
+        tag: str = super().resolve(kind, value, implicit)  # type: ignore[no-untyped-call]
+        return tag
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         """Compose a node of the tree, which must not be a reference to another one."""
         if self.check_event(yaml.AliasEvent):
-            event: Any = self.get_event()
+            event: Any = self.get_event()  # type: ignore[no-untyped-call]
             raise SectionError(_line(event), f'ROS does not support the reference *{event.anchor}')
         return super().compose_node(parent, index)
 
@@ -91,7 +94,9 @@ def _sections(node: yaml.Node, name: str) -> Iterator[Section]:
     keys = dict(_pairs(node))
     if _PARAMETERS in keys and len(keys) > 1:
         other = next(key for key in keys if key != _PARAMETERS)
-        raise SectionError(_line(node), f'{other} cannot stand beside {_PARAMETERS} of {name}')
+        raise SectionError(
+            _line(keys[other]), f'{other} cannot stand beside {_PARAMETERS} of {name}'
+        )
     for key, value in keys.items():
         if key == _PARAMETERS:
             yield _section(value, name)

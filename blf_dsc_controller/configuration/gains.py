@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The gains of the law (28), all of which may be changed while the controller runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from blf_dsc_controller.configuration.parameter import parameter
+
+_PER_JOINT = ('joints',)
+
+
+@dataclass(frozen=True)
+class Barrier:
+    """The bound on the tracking error and the torque that keeps it."""
+
+    bound: tuple[float, ...] = parameter(
+        (0.002, 0.002),
+        'bound on the tracking error',
+        unit='rad',
+        symbol='k_c',
+        above=0.0,
+        length=_PER_JOINT,
+    )
+    weight: tuple[float, ...] = parameter(
+        (1000.0, 1000.0),
+        'stiffness of the barrier at no error; the paper has 1',
+        unit='N m/rad',
+        symbol='w',
+        above=0.0,
+        length=_PER_JOINT,
+    )
+    slope_limit: tuple[float, ...] = parameter(
+        (2e4, 2e4),
+        'stiffness from which on the barrier continues along a line',
+        unit='N m/rad',
+        symbol='S_lim',
+        above=0.0,
+        length=_PER_JOINT,
+    )
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The virtual control (15), (18) and the filter (13) that it passes through."""
+
+    gain: tuple[float, ...] = parameter(
+        (150.0, 150.0),
+        'gain of the virtual control on the tracking error',
+        unit='1/s',
+        symbol='K',
+        at_least=0.0,
+        length=_PER_JOINT,
+    )
+    mu: tuple[float, ...] = parameter(
+        (20.0, 20.0),
+        'what is left of that gain at the bound',
+        unit='1/s',
+        symbol='mu',
+        at_least=0.0,
+        length=_PER_JOINT,
+    )
+    time_constant: float = parameter(
+        0.002, 'time constant of the surface filter', unit='s', symbol='lambda', above=0.0
+    )
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """The feedback terms of the law (28)."""
+
+    gain: tuple[float, ...] = parameter(
+        (60.0, 20.0),
+        'gain on the velocity error',
+        unit='N m s/rad',
+        symbol='K_p',
+        at_least=0.0,
+        length=_PER_JOINT,
+    )
+    damping: tuple[float, ...] = parameter(
+        (0.0, 0.0),
+        'gain of the robust term d2 |xi1| sat(xi2/b)',
+        unit='N m/rad',
+        symbol='d2',
+        at_least=0.0,
+        length=_PER_JOINT,
+    )
+    boundary_layer: float = parameter(
+        0.01,
+        'velocity error at which the robust term saturates',
+        unit='rad/s',
+        symbol='b',
+        above=0.0,
+    )
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """The disturbance estimate (30)."""
+
+    gain: tuple[float, ...] = parameter(
+        (1.0, 1.0),
+        'adaptation gain of the disturbance estimate; 0: none',
+        unit='N m/rad',
+        symbol='gamma',
+        at_least=0.0,
+        length=_PER_JOINT,
+    )
+    leakage: float = parameter(
+        0.0,
+        'leakage that draws the disturbance estimate to zero',
+        unit='rad/(N m s)',
+        symbol='eta',
+        at_least=0.0,
+    )
+
+
+@dataclass(frozen=True)
+class Torque:
+    """What the motors can give."""
+
+    limit: tuple[float, ...] = parameter(
+        (20.0, 20.0),
+        'largest torque commanded; learning sees the limited torque',
+        unit='N m',
+        above=0.0,
+        length=_PER_JOINT,
+    )

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameter files as the record of a run: what is written loads back equal."""
+
+from __future__ import annotations
+
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.dump import dump, written
+from blf_dsc_controller.configuration.nodes import LoopConfig
+from blf_dsc_controller.configuration.params_file import load, load_loop
+from blf_dsc_controller.configuration.recorder import RecorderConfig
+from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.configuration.sections import parse
+from sim_plant.configuration import PlantConfig
+
+CHANGED = LoopConfig(
+    build(
+        PlantConfig,
+        {'sensor.position_noise': 1e-5, 'arm.l1': 1 / 3, 'seed': 2**62, 'mode': 'lockstep'},
+    ),
+    build(
+        ControllerConfig,
+        {
+            'barrier.slope_limit': [1e300, 12345.678901234567],
+            'learning.regularization': 5e-324,
+            'learning.bias': False,
+        },
+    ),
+    build(RecorderConfig, {'output': "it's a 'bag': #1", 'topics': ['/clock', '~/größe']}),
+)
+
+
+def test_a_run_is_written_so_that_it_loads_back_equal(tmp_path):
+    path = tmp_path / 'run.yaml'
+    loop = CHANGED._replace(controller=build(ControllerConfig, {'learning.regularization': 3e-300}))
+    dump(path, loop.by_node)
+    assert load_loop(path) == loop
+
+
+def test_a_node_in_a_namespace_is_written_under_its_full_name(tmp_path):
+    path = tmp_path / 'run.yaml'
+    dump(path, {'/left/sim_plant': CHANGED.plant})
+    assert load(path, '/left/sim_plant', PlantConfig) == CHANGED.plant
+    assert load(path, '/right/sim_plant', PlantConfig) == PlantConfig()
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.one_of(
+        # Subnormal numbers are texts to ROS, and no parameter needs them.
+        st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False),
+        st.integers(-(2**63), 2**63 - 1),
+        st.booleans(),
+        st.text(st.characters(exclude_categories=['Cs', 'Cc'])),
+        st.lists(st.floats(0.001, 1e9), min_size=1).map(tuple),
+    )
+)
+def test_a_value_is_read_back_as_itself_here_and_by_any_yaml_library(value):
+    text = f'n:\n  ros__parameters:\n    a: {written(value)}\n'
+    here = parse(text)[0].entries['a'].value
+    there = yaml.safe_load(text)['n']['ros__parameters']['a']
+    for found in (here, there):
+        same = tuple(found) if isinstance(value, tuple) else found
+        assert same == value
+        assert type(same) is type(value)

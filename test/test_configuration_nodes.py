@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The configurations of the package: presets, agreement with the law, and what is refused."""
+
+from __future__ import annotations
+
+import pytest
+
+from blf_dsc_controller.configuration.controller import MODELS, ControllerConfig
+from blf_dsc_controller.configuration.nodes import NODES, LoopConfig, known_names
+from blf_dsc_controller.configuration.params_file import load_loop, locate, read
+from blf_dsc_controller.configuration.recorder import RecorderConfig
+from blf_dsc_controller.configuration.schema import build, change, parameters
+from blf_dsc_controller.core import settings, two_link
+from blf_dsc_controller.errors import ConfigurationError
+from sim_plant.configuration import PlantConfig
+
+DEFAULTS = LoopConfig(PlantConfig(), ControllerConfig(), RecorderConfig())
+
+
+def complaints(cls, given):
+    with pytest.raises(ConfigurationError) as caught:
+        build(cls, given)
+    return caught.value.problems
+
+
+@pytest.mark.parametrize('cls', NODES.values(), ids=NODES)
+def test_the_defaults_are_valid(cls):
+    assert build(cls, {}) == cls()
+
+
+def test_the_recommended_preset_is_the_defaults():
+    assert load_loop(locate('recommended')) == DEFAULTS
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_the_recommended_preset_shows_every_parameter(node):
+    sections = read(locate('recommended'))
+    shown = {
+        name for section in sections if section.matches(f'/{node}') for name in section.entries
+    }
+    assert shown >= {one.name for one in parameters(NODES[node])}
+
+
+def test_the_noisy_preset_changes_sensors_and_delay_alone():
+    noisy = load_loop(locate('noisy'))
+    assert noisy.controller == DEFAULTS.controller
+    assert noisy.plant == change(
+        DEFAULTS.plant,
+        {'sensor.position_noise': 1e-5, 'sensor.velocity': 'differenced', 'actuator.delay': 1},
+    )
+
+
+def test_models_and_choices_are_those_of_the_law():
+    assert MODELS['two_link'].joints == two_link.JOINTS
+    assert MODELS['two_link'].parameters == len(two_link.PARAMETER_NAMES)
+    choices = {one.name: one.rule.choices for one in parameters(ControllerConfig)}
+    assert choices['law'] == settings.LAWS
+    assert sorted(choices['learning.update']) == sorted(settings.UPDATES)
+    assert sorted(choices['learning.torque_source']) == sorted(settings.TORQUE_SOURCES)
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_every_parameter_is_described_and_no_number_goes_without_its_limits(node):
+    for one in parameters(NODES[node]):
+        assert one.rule.description
+        if one.kind.value == 'integer':
+            assert one.rule.at_least is not None, one.name
+
+
+def test_a_whole_number_of_nanoseconds():
+    assert build(PlantConfig, {'sample_time': 0.0003}).sample_time_ns == 300_000
+    assert build(ControllerConfig, {'sample_time': 0.01}).sample_time_ns == 10_000_000
+    for cls in (PlantConfig, ControllerConfig):
+        (complaint,) = complaints(cls, {'sample_time': 1 / 3000})
+        assert complaint.endswith('no whole number of nanoseconds: write 0.000333333')
+
+
+@pytest.mark.parametrize('cls', [PlantConfig, ControllerConfig])
+def test_joints_have_names_of_their_own_and_the_arm_has_two(cls):
+    assert complaints(cls, {'joints': ['elbow', 'elbow']}) == [
+        "joints: 'elbow' is there more than once"
+    ]
+    assert complaints(cls, {'joints': ['elbow', '']}) == ['joints: a name is empty']
+    one = {
+        one.name: one.default[:1]
+        for one in parameters(cls)
+        if 'joints' in one.rule.length or one.name == 'joints'
+    }
+    (complaint,) = complaints(cls, one)
+    assert complaint.startswith('joints: got 1 name, but')
+
+
+@pytest.mark.parametrize(
+    ('given', 'said'),
+    [
+        ({'barrier.bound': [0.002, 0.0]}, 'barrier.bound: got 0.0 at entry 2'),
+        ({'barrier.bound': [0.002]}, 'barrier.bound: got 1 entry, but 2 are needed (2 of joints)'),
+        ({'feedback.gain': [-60.0, 20.0]}, 'feedback.gain: got -60.0 at entry 1'),
+        (
+            {'feedback.boundary_layer': 0.0},
+            'feedback.boundary_layer: got 0.0, but it must be above',
+        ),
+        (
+            {'reference.frequency': [1.0, 2.0], 'reference.phase': [0.0, 0.0]},
+            'reference.amplitude: got 2 entries, but 4 are needed (2 of joints times 2 of ref',
+        ),
+        ({'reference.phase': [0.0, 1.0]}, 'reference.phase: got 2 entries, but 1 are needed'),
+        (
+            {'learning.initial_estimate': [1.0, 1.0], 'learning.adaptation_gain': [1.0, 1.0]},
+            'learning.initial_estimate: got 2 entries, but model two_link has 3 parameters',
+        ),
+        ({'learning.adaptation_gain': [1.0]}, 'learning.adaptation_gain: got 1 entry, but 3 are'),
+        # |P^(0)| = |(3, 0, 4)| = 5 by Pythagoras: on the ball is not inside it.
+        (
+            {'learning.initial_estimate': [3.0, 0.0, 4.0], 'learning.radius': 5.0},
+            'learning.radius: got 5 kg m^2, but learning.initial_estimate lies at 5 kg m^2',
+        ),
+        (
+            {'learning.window': 0.009},
+            'learning.window: got 0.009 s, which is 9 samples of 0.001 s: between 10 and',
+        ),
+        ({'learning.window': 1000.001}, 'learning.window: got 1000 s, which is 1000001 samples'),
+        (
+            {'barrier.weight': [1000.0, 2e4]},
+            'barrier.slope_limit: got 20000 N m/rad for joint2, but it must be above barrier.w',
+        ),
+        (
+            {'barier.bound': [1.0, 1.0]},
+            'barier.bound: there is no parameter of this name: did you ',
+        ),
+    ],
+)
+def test_a_controller_that_cannot_run_is_refused(given, said):
+    (complaint,) = complaints(ControllerConfig, given)
+    assert complaint.startswith(said)
+
+
+def test_the_shortest_window_and_a_two_tone_reference_are_accepted():
+    assert build(ControllerConfig, {'learning.window': 0.01}).learning.window == 0.01
+    two_tones = {
+        'reference.frequency': [1.0, 2.0],
+        'reference.phase': [0.0, 0.5],
+        'reference.amplitude': [0.3, 0.1, 0.2, 0.4],
+    }
+    assert build(ControllerConfig, two_tones).reference.amplitude == (0.3, 0.1, 0.2, 0.4)
+
+
+def test_a_plant_that_ends_within_its_first_sample_is_refused():
+    (complaint,) = complaints(PlantConfig, {'duration': 0.0005})
+    assert complaint.startswith('duration: got 0.0005 s, shorter than one sample of 0.001 s')
+
+
+def test_a_recorder_without_a_folder_is_refused():
+    assert complaints(RecorderConfig, {'output': ' '}) == [
+        'output: got no folder name to write the bag into'
+    ]
+
+
+def test_plant_and_controller_must_agree():
+    assert DEFAULTS.problems() == []
+    faster = DEFAULTS._replace(plant=change(DEFAULTS.plant, {'sample_time': 0.0005}))
+    (complaint,) = faster.problems()
+    assert complaint.startswith('sample_time: sim_plant has 0.0005 s, but blf_dsc_controller has')
+    swapped = DEFAULTS._replace(plant=change(DEFAULTS.plant, {'joints': ['joint2', 'joint1']}))
+    assert swapped.problems() == []
+    other = DEFAULTS._replace(plant=change(DEFAULTS.plant, {'joints': ['joint1', 'elbow']}))
+    (complaint,) = other.problems()
+    assert complaint.startswith('joints: sim_plant has joint1, elbow, but blf_dsc_controller has')
+
+
+def test_known_names_are_those_of_all_nodes():
+    assert {'arm.m2', 'barrier.bound', 'compression'} <= known_names()
+    assert 'arm' not in known_names()

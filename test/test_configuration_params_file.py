@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameter files without ROS: which section counts for which node, and what is refused where."""
+
+from __future__ import annotations
+
+import pytest
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.params_file import load, load_loop, locate, read
+from blf_dsc_controller.errors import ConfigurationError
+from sim_plant.configuration import PlantConfig
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / 'arm.yaml'
+
+    def write(text):
+        path.write_text(text, encoding='utf-8')
+        return path
+
+    return write
+
+
+def section(pattern, content):
+    return f'{pattern}:\n  ros__parameters: {{{content}}}\n'
+
+
+def seed_of(path, node='sim_plant'):
+    return load(path, node, PlantConfig).seed
+
+
+def complaints(path, node='sim_plant', cls=PlantConfig):
+    with pytest.raises(ConfigurationError) as caught:
+        load(path, node, cls)
+    assert str(path) in str(caught.value)
+    return caught.value.problems
+
+
+@pytest.mark.parametrize(
+    ('pattern', 'node'),
+    [
+        ('sim_plant', '/sim_plant'),
+        ('/sim_plant', 'sim_plant'),
+        ('/**', '/left/sim_plant'),
+        ('/*', '/sim_plant'),
+        ('/*/sim_plant', '/left/sim_plant'),
+        ('/**/sim_plant', '/sim_plant'),
+        ('/**/sim_plant', '/lab/left/sim_plant'),
+        ('/left/*', '/left/sim_plant'),
+        ('/left/**', '/left/arm/sim_plant'),
+        ('left/sim_plant', '/left/sim_plant'),
+        ('left:\n  sim_plant', '/left/sim_plant'),
+    ],
+)
+def test_a_section_that_matches_counts(file, pattern, node):
+    head, _, nested = pattern.partition('\n')
+    if nested:
+        text = f'{head}\n{nested}:\n    ros__parameters: {{seed: 7}}\n'
+    else:
+        text = section(pattern, 'seed: 7')
+    assert seed_of(file(text), node) == 7
+
+
+@pytest.mark.parametrize(
+    ('pattern', 'node'),
+    [
+        ('sim_plant', '/left/sim_plant'),
+        ('/*', '/left/sim_plant'),
+        ('/*/sim_plant', '/sim_plant'),
+        ('/left/*', '/left/arm/sim_plant'),
+        ('/left/**', '/right/sim_plant'),
+        ('other', '/sim_plant'),
+    ],
+)
+def test_a_section_that_does_not_match_does_not_count(file, pattern, node):
+    assert seed_of(file(section(pattern, 'seed: 7')), node) == 0
+
+
+def test_the_later_of_two_sections_wins_whichever_is_more_specific(file):
+    wild, own = section('/**', 'seed: 1, duration: 2.0'), section('sim_plant', 'seed: 3')
+    assert seed_of(file(wild + own)) == 3
+    assert seed_of(file(own + wild)) == 1
+    assert load(file(wild + own), 'sim_plant', PlantConfig).duration == 2.0
+
+
+def test_dots_and_nesting_are_the_same(file):
+    nested = load(file(section('/**', 'arm: {l1: 2.0}, arm.l2: 3.0')), 'sim_plant', PlantConfig)
+    assert (nested.arm.l1, nested.arm.l2) == (2.0, 3.0)
+
+
+def test_a_power_of_ten_needs_no_point(file):
+    path = file(section('sim_plant', 'sensor: {position_noise: 1e-5}'))
+    assert load(path, 'sim_plant', PlantConfig).sensor.position_noise == 1e-5
+
+
+def test_an_integer_for_a_double_is_refused_with_its_line(file):
+    path = file('sim_plant:\n  ros__parameters:\n    seed: 3\n    arm:\n      l1: 1\n')
+    assert complaints(path) == [
+        'line 5: arm.l1: got 1, but a double is expected: write 1.0 instead of 1'
+    ]
+
+
+def test_overrides_count_more_than_the_file(file):
+    path = file(section('sim_plant', 'seed: 3, duration: -1.0'))
+    plant = load(path, 'sim_plant', PlantConfig, {'duration': 5.0})
+    assert (plant.seed, plant.duration) == (3, 5.0)
+    with pytest.raises(ConfigurationError) as caught:
+        load(path, 'sim_plant', PlantConfig, {'duration': -2.0})
+    assert caught.value.problems == ['duration: got -2.0, but it must be at least 0 s']
+
+
+def test_an_unknown_name_in_the_section_of_the_node_is_refused(file):
+    path = file(section('sim_plant', 'barrier.bound: [1.0, 1.0], sed: 1'))
+    assert complaints(path) == [
+        'line 2: barrier.bound: there is no parameter of this name',
+        'line 2: sed: there is no parameter of this name: did you mean seed?',
+    ]
+
+
+def test_a_shared_section_may_name_what_only_another_node_has(file):
+    path = file(section('/**', 'barrier.bound: [1.0, 1.0], seed: 4'))
+    assert seed_of(path) == 4
+    assert load(path, 'blf_dsc_controller', ControllerConfig).barrier.bound == (1.0, 1.0)
+    path = file(section('/**', 'barrier.bond: [1.0, 1.0], seed: 4'))
+    assert complaints(path) == [
+        'line 2: barrier.bond: there is no parameter of this name: did you mean barrier.bound?'
+    ]
+
+
+def test_the_parameters_of_ros_itself_are_nobodys_mistake(file):
+    content = 'use_sim_time: true, qos_overrides: {/clock: {subscription: {depth: 1}}}, seed: 2'
+    assert seed_of(file(section('sim_plant', content))) == 2
+    assert seed_of(file(section('/**', content))) == 2
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('', 'line 1: the file is empty'),
+        ('# a comment\n', 'line 1: the file is empty'),
+        ('- 1\n', 'line 1: expected node names or ros__parameters at the top'),
+        ('a: [1\n', 'line 2: no valid YAML'),
+        ('a:\n\tb: 1\n', 'line 2: no valid YAML'),
+        ('sim_plant:\n  seed: 1\n', 'line 2: seed has a value, but stands outside of ros__para'),
+        ('sim_plant:\n', 'line 1: sim_plant has a value, but stands outside of ros__parameters'),
+        ('sim_plant:\n  ros_parameters: {seed: 1}\n', 'line 2: ros_parameters should be ros__par'),
+        ('sim_plant:\n  ros__parameters:\n', 'line 2: ros__parameters of /sim_plant holds no'),
+        ('sim_plant:\n  ros__parameters:\n    seed:\n', 'line 3: seed has no value'),
+        ('n:\n  ros__parameters:\n    a: 1\n    a: 2\n', 'line 4: a was given before, on line 3'),
+        ('n:\n  ros__parameters:\n    a.b: 1\n    a:\n      b: 2\n', 'line 5: a.b was given bef'),
+        ('n:\n  ros__parameters: {a: 1}\nn:\n  ros__parameters: {b: 1}\n', 'line 3: n was given'),
+        ('n:\n  ros__parameters: {a: [1, 2.0]}\n', 'line 2: a mixes types'),
+        ('n:\n  ros__parameters: {a: [[1]]}\n', 'line 2: a holds a list in a list'),
+        ('n:\n  ros__parameters: {a: &x 1, b: *x}\n', 'line 2: ROS does not support the ref'),
+        ('n-1:\n  ros__parameters: {a: 1}\n', 'line 2: /n-1 is not a name that a node can have'),
+        ('n:\n  ros__parameters: {a: 1}\n  m: {}\n', 'line 3: m cannot stand beside ros__para'),
+        ('n:\n  ros__parameters: {a: {}}\n', 'line 2: a holds no parameters'),
+        ('n:\n  ros__parameters: {a: 1}\n---\nm: {}\n', 'line 3: no valid YAML'),
+    ],
+)
+def test_a_broken_file_is_refused_with_its_line(file, text, said):
+    (complaint,) = complaints(file(text))
+    assert complaint.startswith(said)
+
+
+def test_a_file_of_bytes_is_refused(tmp_path):
+    path = tmp_path / 'arm.yaml'
+    path.write_bytes(b'\xff\xfe\x00')
+    with pytest.raises(ConfigurationError, match=r'arm\.yaml'):
+        read(path)
+
+
+def test_a_missing_file_names_the_presets(tmp_path):
+    assert locate('recommended') == locate('recommended.yaml')
+    assert locate('recommended').is_file()
+    for given in ('recomended', tmp_path / 'absent.yaml', tmp_path):
+        with pytest.raises(ConfigurationError) as caught:
+            locate(given)
+        assert str(given) in str(caught.value)
+        assert 'a preset: noisy, recommended' in str(caught.value)
+    with pytest.raises(ConfigurationError, match=r'absent\.yaml'):
+        read(tmp_path / 'absent.yaml')
+
+
+def test_a_loop_collects_the_problems_of_all_nodes(file):
+    path = file(
+        section('/**', 'sample_time: 1')
+        + section('sim_plant', 'seed: -1')
+        + section('bag_recorder', 'compression: zip')
+    )
+    with pytest.raises(ConfigurationError) as caught:
+        load_loop(path)
+    assert [complaint.split(', but')[0] for complaint in caught.value.problems] == [
+        'sim_plant: line 2: sample_time: got 1',
+        'sim_plant: line 4: seed: got -1',
+        'blf_dsc_controller: line 2: sample_time: got 1',
+        "bag_recorder: line 6: compression: got 'zip'",
+    ]
+
+
+def test_a_loop_refuses_nodes_that_do_not_agree_and_takes_overrides(file):
+    path = file(section('sim_plant', 'sample_time: 0.002'))
+    with pytest.raises(ConfigurationError, match=r'sim_plant has 0\.002 s, but'):
+        load_loop(path)
+    loop = load_loop(
+        path,
+        {'blf_dsc_controller': {'sample_time': 0.002}, 'sim_plant': {'mode': 'lockstep'}},
+    )
+    assert (loop.controller.sample_time, loop.plant.mode) == (0.002, 'lockstep')
+
+
+def test_a_misspelt_node_is_named(file):
+    with pytest.raises(ConfigurationError) as caught:
+        load_loop(file(section('sim_plnat', 'seed: 1')))
+    assert caught.value.problems == ['line 2: no node is called sim_plnat: did you mean sim_plant?']
+    loop = load_loop(file(section('sim_plant', 'seed: 1') + section('sim_plant2', 'seed: 2')))
+    assert loop.plant.seed == 1
+    assert load_loop(file(section('robot_state_publisher', 'a: 1'))).plant == PlantConfig()

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The documented table of parameters against the code it is made from."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from blf_dsc_controller.configuration.nodes import known_names
+from blf_dsc_controller.configuration.reference_table import reference_table
+
+COMMITTED = Path(__file__).parents[1] / 'doc' / 'parameters.md'
+
+
+def test_the_committed_table_is_up_to_date():
+    assert COMMITTED.read_text(encoding='utf-8') == reference_table(), (
+        'run: python -m blf_dsc_controller.configuration.reference_table doc/parameters.md'
+    )
+
+
+def test_the_command_it_names_writes_it(tmp_path):
+    page = tmp_path / 'parameters.md'
+    module = 'blf_dsc_controller.configuration.reference_table'
+    subprocess.run([sys.executable, '-m', module, str(page)], check=True, cwd=COMMITTED.parents[1])
+    assert page.read_text(encoding='utf-8') == reference_table()
+
+
+def test_every_parameter_has_a_row_of_eight_cells():
+    rows = [row for row in reference_table().splitlines() if row.startswith('| `')]
+    assert {row.split('`')[1] for row in rows} == known_names()
+    assert {row.replace('\\|', '').count('|') for row in rows} == {9}
