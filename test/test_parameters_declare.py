@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A configuration as the parameters of a real node: declared, described, read, refused."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from rcl_interfaces.msg import ParameterType
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import NODES
+from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.configuration.recorder import RecorderConfig
+from blf_dsc_controller.configuration.schema import change, flatten, parameters
+from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.nodes.parameters import declare, read
+from sim_plant.configuration import PlantConfig
+
+
+@pytest.fixture
+def start(tmp_path):
+    context = Context()
+    context.init()
+    nodes = []
+
+    def node(name='sim_plant', text='', overrides=None, path=None):
+        if text:
+            path = tmp_path / 'arm.yaml'
+            path.write_text(text)
+        told = [Parameter(key, value=value) for key, value in (overrides or {}).items()]
+        started = Node(
+            name,
+            context=context,
+            cli_args=['--ros-args', '--params-file', str(path)] if path else None,
+            parameter_overrides=told,
+            enable_rosout=False,
+        )
+        nodes.append(started)
+        return started
+
+    yield node
+    for started in nodes:
+        started.destroy_node()
+    context.shutdown()
+
+
+def refused(node, cls):
+    with pytest.raises(ConfigurationError) as caught:
+        declare(node, cls)
+    assert f'/{node.get_name()}' in str(caught.value)
+    return caught.value.problems
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_a_node_told_nothing_has_the_defaults(start, name):
+    node, cls = start(name), NODES[name]
+    assert declare(node, cls) == cls()
+    assert read(node, cls) == cls()
+    assert {one.name for one in parameters(cls)} <= node._parameters.keys()
+
+
+@pytest.mark.parametrize('preset', ['recommended', 'noisy'])
+def test_a_node_reads_a_preset_as_a_run_without_ros_does(start, preset):
+    loop = load_loop(locate(preset))
+    for name, config in loop.by_node.items():
+        node = start(name, path=locate(preset))
+        assert declare(node, type(config)) == config
+        assert read(node, type(config)) == config
+
+
+def test_a_parameter_describes_itself(start):
+    node = start('blf_dsc_controller')
+    declare(node, ControllerConfig)
+    bound = node.describe_parameter('barrier.bound')
+    assert bound.description == 'k_c: bound on the tracking error [rad]'
+    assert bound.type == ParameterType.PARAMETER_DOUBLE_ARRAY
+    assert not bound.read_only
+    assert bound.additional_constraints == 'above 0; as many entries as joints'
+    window = node.describe_parameter('learning.window')
+    assert window.read_only
+    assert 'fixed at the start: it sizes the memory' in window.additional_constraints
+    (limits,) = node.describe_parameter('sample_time').floating_point_range
+    assert (limits.from_value, limits.to_value) == (1e-5, 1.0)
+    (limits,) = node.describe_parameter('realtime.priority').integer_range
+    assert (limits.from_value, limits.to_value) == (0, 99)
+    assert node.describe_parameter('surface.time_constant').floating_point_range[0].from_value == 0
+
+
+def test_an_empty_list_is_taken_as_empty(start):
+    text = 'bag_recorder:\n  ros__parameters: {topics: [], output: here}\n'
+    node = start('bag_recorder', text)
+    assert declare(node, RecorderConfig) == RecorderConfig(output='here')
+    assert read(node, RecorderConfig).topics == ()
+    node = start('bag_recorder', overrides={'topics': ['/clock']})
+    assert declare(node, RecorderConfig).topics == ('/clock',)
+
+
+def test_everything_wrong_is_told_at_once_and_nothing_is_declared(start):
+    content = 'arm: {l1: 1}, seed: -1, integrator: euler, sensr.resolution: 1.0, initial: {v: x}'
+    node = start(text=f'sim_plant:\n  ros__parameters: {{{content}}}\n')
+    assert refused(node, PlantConfig) == [
+        'sensr.resolution: there is no parameter of this name: did you mean sensor.resolution?',
+        'initial.v: there is no parameter of this name: did you mean initial.velocity?',
+        'seed: got -1, but it must be at least 0',
+        "integrator: got 'euler', but it must be one of dopri5, rk4",
+        'arm.l1: got 1, but a double is expected: write 1.0 instead of 1',
+    ]
+    assert not node.has_parameter('seed')
+
+
+@pytest.mark.parametrize(
+    ('overrides', 'said'),
+    [
+        ({'initial.position': [1.0]}, 'initial.position: got 1 entry, but 2 are needed'),
+        ({'initial.position': [1, 2]}, 'initial.position: got [1, 2], but a double array is'),
+        ({'sample_time': float('nan')}, 'sample_time: got nan, but a finite number is needed'),
+        ({'sample_time': 1 / 3000}, 'sample_time: got 0.0003333333333333333 s, no whole number'),
+        ({'joints': ['a', 'a']}, "joints: 'a' is there more than once"),
+        ({'mode': True}, 'mode: got true, but a string is expected'),
+    ],
+)
+def test_a_plant_that_cannot_run_is_refused(start, overrides, said):
+    (complaint,) = refused(start(overrides=overrides), PlantConfig)
+    assert complaint.startswith(said)
+
+
+def test_what_other_nodes_or_ros_itself_are_told_is_nobodys_mistake(start):
+    overrides = {
+        'barrier.bound': [1.0, 1.0],
+        'use_sim_time': True,
+        'start_type_description_service': False,
+        'qos_overrides./clock.subscription.depth': 1,
+        'seed': 5,
+    }
+    node = start(overrides=overrides)
+    assert declare(node, PlantConfig) == change(PlantConfig(), {'seed': 5})
+    assert node.get_parameter('use_sim_time').value is True
+
+
+def test_ros_has_the_values_under_the_types_of_the_schema(start):
+    node = start('blf_dsc_controller')
+    declare(node, ControllerConfig)
+    values = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in ((one, node.get_parameter(one).value) for one in node._parameters)
+        if name in flatten(ControllerConfig())
+    }
+    assert values == flatten(ControllerConfig())
+    assert node.get_parameter('joints').type_ is Parameter.Type.STRING_ARRAY
+    assert node.get_parameter('learning.interval').type_ is Parameter.Type.INTEGER
+    assert node.get_parameter('learning.bias').type_ is Parameter.Type.BOOL
