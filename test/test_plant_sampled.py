@@ -11,12 +11,13 @@ import numba
 import numpy as np
 import pytest
 from numba.core.runtime import _nrt_python, rtsys
-from plants import START, commands, plant, rough_disturbance, run, settings
+from plants import ARM, START, commands, plant, rough_disturbance, run, settings
 
 from blf_dsc_controller.core.kernel import kernel
-from sim_plant.integrator import DOPRI5, RK4
+from sim_plant.integrator import DOPRI5, RK4, integrate, scratch_size
 from sim_plant.plant import initial_state, measure, settings_vector, settings_view, step
 from sim_plant.sensors import DIFFERENCED, MEASURED, generator
+from sim_plant.simulated import Plant
 
 EVERYTHING = {
     'position_noise': 1e-5,
@@ -46,11 +47,30 @@ def compiled_run(settings, state, rng, torques, rows):
 def test_a_compiled_loop_and_python_calls_give_the_same_bits(source, integrator, noise):
     changes = {'velocity_source': source, 'integrator': integrator, 'position_noise': noise}
     arm = full_plant(seed=11, **changes)
-    flat = arm.settings.copy()
+    flat, rng = arm.settings.copy(), generator(11)
     state, rows = initial_state(flat, START, np.zeros(2)), np.empty((300, 6))
-    compiled_run(flat, state, generator(11), commands(300), rows)
+    compiled_run(flat, state, rng, commands(300), rows)
     assert (run(arm, commands(300)) == rows).all()
     assert (arm.state == state).all()
+    assert arm.rng.bit_generator.state == rng.bit_generator.state
+
+
+def test_without_noise_a_compiled_loop_draws_nothing():
+    arm = plant()
+    before = arm.rng.bit_generator.state
+    compiled_run(arm.settings, arm.state, arm.rng, commands(10), np.empty((10, 6)))
+    assert arm.rng.bit_generator.state == before
+
+
+def test_a_sample_begins_when_whole_nanoseconds_say():
+    """The disturbance is that of t_k = (k T_ns) 1e-9 s, to the last bit."""
+    period_ns, load = 333_333, rough_disturbance()
+    arm = Plant(settings(load=load)._replace(period_ns=period_ns), START, (0.0, 0.0))
+    x, scratch = np.array([*START, 0.0, 0.0]), np.empty(scratch_size(2))
+    for k, torque in enumerate(commands(100)):
+        arm.step(torque)
+        integrate(DOPRI5, ARM, load, (k * period_ns) * 1e-9, period_ns * 1e-9, torque, x, scratch)
+    assert (arm.truth()[5:] == x).all()
 
 
 def test_settings_survive_their_vector():
