@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 
 from blf_dsc_controller.configuration.controller import MODELS, ControllerConfig
@@ -171,3 +174,15 @@ def test_plant_and_controller_must_agree():
 def test_known_names_are_those_of_all_nodes():
     assert {'arm.m2', 'barrier.bound', 'compression'} <= known_names()
     assert 'arm' not in known_names()
+
+
+def test_configurations_are_read_where_there_is_no_ros():
+    program = (
+        'import sys; sys.modules.update(rclpy=None, rcl_interfaces=None, ament_index_python=None)\n'
+        'from blf_dsc_controller.configuration.params_file import load_loop, locate\n'
+        'print(load_loop(locate("noisy")).plant.actuator.delay)'
+    )
+    run = subprocess.run(
+        [sys.executable, '-c', program], capture_output=True, text=True, check=True
+    )
+    assert run.stdout == '1\n'

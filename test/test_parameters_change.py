@@ -101,6 +101,8 @@ def test_two_changes_that_are_right_only_together_are_taken_together(tuned):
     assert not tuned.ask(barrier__weight=[3e4, 3e4]).successful
     assert tuned.ask(barrier__weight=[3e4, 3e4], barrier__slope_limit=[5e4, 5e4]).successful
     assert tuned.taken[-1].barrier.weight == (3e4, 3e4)
+    # From here on the limit is judged against the weight in force, not against the first one.
+    assert not tuned.ask(barrier__slope_limit=[2.5e4, 2.5e4]).successful
 
 
 def test_a_node_can_object_to_what_it_cannot_take_now(tuned):
