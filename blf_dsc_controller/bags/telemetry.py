@@ -18,7 +18,7 @@ from blf_dsc_controller.bags.encoders import (
     JointStateEncoder,
     encode_clock,
 )
-from blf_dsc_controller.core.state import Signals, State
+from blf_dsc_controller.core.sample import Sample
 
 Message: TypeAlias = tuple[topics.Topic, bytes]
 
@@ -53,7 +53,6 @@ class ControllerTelemetry:
         self._learning = JointStateEncoder(learning, ('position',))
         self._monitor = JointStateEncoder((*ratios, *estimates, LAMBDA_MIN, LATCHED), ('position',))
         self._values = np.zeros(len(learning))
-        self._ratio = np.zeros(len(joints))
 
     def command(self, torque: np.ndarray) -> Message:
         """Commanded torque (n,) [N m]."""
@@ -64,35 +63,33 @@ class ControllerTelemetry:
         message = self._bound.encode(stamp, position=bound, effort=torque_limit)
         return topics.BOUND, message
 
-    def sample(
-        self, stamp: int, bound: np.ndarray, state: State, signals: Signals, compute_time: float
-    ) -> Iterator[Message]:
-        """Messages of one sample, to be asked for after the law has answered it.
+    def sample(self, stamp: int, told: Sample, compute_time: float) -> Iterator[Message]:
+        """Messages of one sample.
 
         Args:
             stamp: of the answered state [ns].
-            bound: k_c (n,) [rad].
-            state: the law's state after the sample.
-            signals: what the law computed in it.
+            told: what the law tells of it.
             compute_time: time the law took [s].
         """
-        yield topics.REFERENCE, self._reference.encode(stamp, signals.qr, signals.dqr)
+        yield topics.REFERENCE, self._reference.encode(stamp, told.qr, told.dqr)
         yield (
             topics.TRACKING_ERROR,
-            self._error.encode(stamp, signals.xi1, signals.xi2, signals.torque),
+            self._error.encode(stamp, told.xi1, told.xi2, told.torque),
         )
-        m = state.estimate.size
-        n = signals.xi1.size
-        self._values[:m] = state.estimate
-        self._values[m : m + n] = state.disturbance
-        self._values[m + n] = state.lambda_min[0]
-        self._values[m + n + 1] = state.latched[0]
-        self._values[m + n + 2] = compute_time
-        yield topics.LEARNING, self._learning.encode(stamp, self._values)
-        np.maximum(self._ratio, np.abs(signals.xi1) / bound, out=self._ratio)
-        if (state.samples[0] - 1.0) % DECIMATION == 0.0:
-            summary = (*self._ratio, *state.estimate, state.lambda_min[0], state.latched[0])
-            yield topics.MONITOR, self._monitor.encode(stamp, summary)
+        n = told.xi1.size
+        m = told.estimate.size
+        values = self._values
+        values[:m] = told.estimate
+        values[m : m + n] = told.disturbance
+        values[m + n] = told.lambda_min[0]
+        values[m + n + 1] = told.latched[0]
+        values[m + n + 2] = compute_time
+        yield topics.LEARNING, self._learning.encode(stamp, values)
+
+    def monitor(self, stamp: int, told: Sample, ratio: np.ndarray) -> Message:
+        """Slow summary: largest |xi1| / k_c so far (n,), estimates, excitation."""
+        values = (*ratio, *told.estimate, told.lambda_min[0], told.latched[0])
+        return topics.MONITOR, self._monitor.encode(stamp, values)
 
 
 class PlantTelemetry:

@@ -65,7 +65,8 @@ FLOAT64_MULTI_ARRAY = 'std_msgs/msg/Float64MultiArray'
 # A late state or torque is worth nothing once the next one is there, so the two ends of the loop
 # keep one; publishers keep more, because a recorder beside the loop must not miss any.
 LATEST = Quality(depth=1)
-STREAM = Quality(depth=100)
+STREAM = Quality(depth=5000)
+HISTORY = Quality(depth=5000, durability='transient_local')
 LATCHED = Quality(depth=1, durability='transient_local')
 DIAGNOSTIC = Quality(depth=10)
 
@@ -75,8 +76,8 @@ REFERENCE = Topic(CONTROLLER, '~/reference', JOINT_STATE, STREAM, STREAM)
 TRACKING_ERROR = Topic(CONTROLLER, '~/tracking_error', JOINT_STATE, STREAM, STREAM)
 LEARNING = Topic(CONTROLLER, '~/learning', JOINT_STATE, STREAM, STREAM)
 BOUND = Topic(CONTROLLER, '~/bound', JOINT_STATE, LATCHED, LATCHED)
-MONITOR = Topic(CONTROLLER, '~/monitor', JOINT_STATE, STREAM, STREAM)
-TRUTH = Topic(PLANT, '~/truth', JOINT_STATE, STREAM, STREAM)
+MONITOR = Topic(CONTROLLER, '~/monitor', JOINT_STATE, HISTORY, STREAM)
+TRUTH = Topic(PLANT, '~/truth', JOINT_STATE, HISTORY, STREAM)
 TIMING = Topic(PLANT, '~/timing', JOINT_STATE, STREAM, STREAM)
 CLOCK = Topic(PLANT, '/clock', 'rosgraph_msgs/msg/Clock', STREAM, LATEST)
 DIAGNOSTICS = Topic(

@@ -6,7 +6,9 @@ from __future__ import annotations
 import numpy as np
 
 from blf_dsc_controller.core import law, reference
+from blf_dsc_controller.core.borrowed import borrowed
 from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.sample import sample_of, sample_size, tell
 from blf_dsc_controller.core.settings import settings_of
 from blf_dsc_controller.core.state import signals_of, signals_size, state_of, state_size
 from blf_dsc_controller.errors import OutsideBarrierError
@@ -21,11 +23,26 @@ def respond(
     t: float,
     dt: float,
     measurement: np.ndarray,
+    sample_vector: np.ndarray,
 ) -> None:
-    """Reference at t, then the law: everything between a measurement and its torque."""
-    signals = signals_of(signals_vector, settings_of(settings_vector))
-    reference.sinusoids(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
+    """Reference at t, then the law: everything between a measurement and its torque.
+
+    Args:
+        settings_vector: packed `Settings`.
+        reference_vector: of `reference.sinusoids_vector`.
+        state_vector: packed `State`, moved on by one sample.
+        signals_vector: packed `Signals`, overwritten.
+        t: time since the start [s].
+        dt: time since the last sample [s].
+        measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
+        sample_vector: packed `Sample`, filled.
+    """
+    settings = settings_of(borrowed(settings_vector))
+    state = state_of(borrowed(state_vector), settings)
+    signals = signals_of(borrowed(signals_vector), settings)
+    reference.sinusoids(borrowed(reference_vector), t, signals.qr, signals.dqr, signals.ddqr)
     law.update(settings_vector, state_vector, signals_vector, t, dt, measurement)
+    tell(state, signals, sample_of(borrowed(sample_vector), settings.n, settings.m))
 
 
 class Controller:
@@ -34,7 +51,8 @@ class Controller:
     Attributes:
         settings: names of the settings vector's parts.
         state: views on `state_vector`, which is all the controller remembers.
-        signals: views on what the last sample computed; `signals.torque` is the answer.
+        signals: views on what the last update computed.
+        sample: views on what is told of it; `sample.torque` is the answer.
     """
 
     def __init__(self, settings_vector: np.ndarray, reference_vector: np.ndarray) -> None:
@@ -46,9 +64,16 @@ class Controller:
         self.signals_vector = np.zeros(signals_size(self.settings))
         self.state = state_of(self.state_vector, self.settings)
         self.signals = signals_of(self.signals_vector, self.settings)
+        self.sample_vector = np.zeros(sample_size(self.settings.n, self.settings.m))
+        self.sample = sample_of(self.sample_vector, self.settings.n, self.settings.m)
         self.reset()
         self.update(0.0, 1e-3, np.zeros(3 * self.settings.n))
         self.reset()
+
+    @property
+    def samples(self) -> int:
+        """Samples answered since the start."""
+        return int(self.state.samples[0])
 
     def reset(self) -> None:
         """Forget everything: estimates back to P^(0), filters and window empty."""
@@ -89,8 +114,9 @@ class Controller:
             t,
             dt,
             measurement,
+            self.sample_vector,
         )
-        return self.signals.torque
+        return self.sample.torque
 
     def save(self) -> np.ndarray:
         """Copy of the whole state."""

@@ -19,19 +19,21 @@ from typing import TypeVar, cast
 import numba
 from numba.core import config
 
+# An optional vector library of Intel's rounds differently from call to call: bits would depend on
+# what is installed.
+config.DISABLE_INTEL_SVML = True  # type: ignore[attr-defined]
+
 F = TypeVar('F', bound=Callable[..., object])
 
 _PACKAGE_ROOT = Path(__file__).resolve().parents[2]
-_GROUND_FLOOR = ('blf_dsc_controller/core', 'blf_dsc_controller/simulation.py', 'sim_plant')
+_GROUND_FLOOR = ('blf_dsc_controller/core/*.py', 'blf_dsc_controller/simulation.py', 'sim_plant/*.py')
+_ABOVE = {'assembly.py', 'configuration.py', 'node.py'}
 
 
 def ground_floor_sources() -> list[Path]:
     """Every source file a kernel can live in."""
-    sources: list[Path] = []
-    for entry in _GROUND_FLOOR:
-        path = _PACKAGE_ROOT / entry
-        sources += [path] if path.is_file() else path.glob('*.py')
-    return sorted(sources)
+    found = (path for pattern in _GROUND_FLOOR for path in _PACKAGE_ROOT.glob(pattern))
+    return sorted(path for path in found if path.name not in _ABOVE)
 
 
 @functools.cache
