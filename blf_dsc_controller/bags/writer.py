@@ -21,7 +21,7 @@ class BagWriter:
     """Writes serialised messages into a new bag.
 
     All that is written leaves the process within `flush_interval` and the time to the next call
-    of `write` or `flush`; what has left it survives the process being killed.
+    of `write` or `flush_if_due`; what has left it survives the process being killed.
 
     Args:
         path: folder of the bag, which must not exist yet.
@@ -100,6 +100,10 @@ class BagWriter:
             handle, raw, log_time, log_time if publish_time is None else publish_time, sequence
         )
         self._bag.topics[handle - 1].message_count += 1
+        self.flush_if_due()
+
+    def flush_if_due(self) -> None:
+        """Flush if the flush interval has passed, for use in a pause of the messages."""
         if self._clock() - self._flushed >= self._flush_interval:
             self.flush()
 

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `bag_recorder`: every message of the chosen topics into a bag, undecoded."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+from rclpy.node import Node
+
+from blf_dsc_controller.bags.errors import UnknownTypeError
+from blf_dsc_controller.bags.topics import Quality
+from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.configuration.recorder import RecorderConfig
+from blf_dsc_controller.nodes.definitions import learn
+from blf_dsc_controller.nodes.endpoints import message_class
+from blf_dsc_controller.nodes.executor import run
+from blf_dsc_controller.nodes.intake import Intake, quality_of
+from blf_dsc_controller.nodes.losses import Losses
+from blf_dsc_controller.nodes.parameters import declare
+
+_DISCOVERY_PERIOD = 0.1  # s
+_TAKE_PERIOD = 0.01  # s
+_FLUSH_INTERVAL = 0.05  # s; with the period above, data is in the process for less than 0.1 s
+
+
+class BagRecorderNode(Node):
+    """Subscribes to topics as they appear and writes what comes.
+
+    Args:
+        options: of rclpy's Node (context, namespace, parameter_overrides, ...).
+
+    Raises:
+        ConfigurationError: a parameter is wrong.
+        BagExistsError: the folder of the bag is there already.
+    """
+
+    finished = False
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('bag_recorder', enable_rosout=False, **options)
+        self._config = declare(self, RecorderConfig)
+        self._chosen = {self.resolve_topic_name(name) for name in self._config.topics}
+        hidden_name = f'_{self.get_name()}_intake'
+        self._intake = Intake(self.context, hidden_name, self._config.queue_depth)
+        self._losses: dict[str, Losses] = {}
+        self._by_handle: dict[int, Losses] = {}
+        self._passed_over: set[str] = set()
+        self.create_timer(_DISCOVERY_PERIOD, self._discover)
+        self.create_timer(_TAKE_PERIOD, self._record)
+        # The folder comes last: whatever ends the node from here on also completes the bag.
+        self._writer = BagWriter(
+            self._config.output,
+            compression=self._config.compression,
+            flush_interval=_FLUSH_INTERVAL,
+        )
+        self.get_logger().info(f'recording into {self._writer.path}')
+
+    def close(self) -> None:
+        """Write what still waits, complete the bag and tell what is in it."""
+        self._record()
+        self._intake.close()
+        self._writer.close()
+        for line in self._summary():
+            self.get_logger().info(line)
+
+    def _discover(self) -> None:
+        for topic, types in self.get_topic_names_and_types():
+            if topic in self._losses:
+                self._losses[topic].publishers_seen(self.count_publishers(topic))
+            elif topic not in self._passed_over and self._wanted(topic):
+                self._consider(topic, types)
+
+    def _wanted(self, topic: str) -> bool:
+        if self._chosen:
+            return topic in self._chosen
+        return not any(part.startswith('_') for part in topic.split('/'))
+
+    def _consider(self, topic: str, types: list[str]) -> None:
+        publishers = self.get_publishers_info_by_topic(topic)
+        if not publishers:
+            return
+        if len(types) > 1:
+            self._pass_over(topic, f'it has several types, {" and ".join(types)}')
+            return
+        offered = [quality_of(publisher.qos_profile) for publisher in publishers]
+        try:
+            message_class(types[0])
+            learn(types[0])
+        except (ImportError, AttributeError, UnknownTypeError):
+            self._pass_over(topic, f'its type {types[0]} is not installed here')
+            return
+        self._start(topic, types[0], offered)
+
+    def _start(self, topic: str, type_name: str, offered: list[Quality]) -> None:
+        handle = self._writer.add_topic(topic, type_name, offered)
+        self._losses[topic] = self._by_handle[handle] = Losses(len(offered))
+        self._intake.subscribe(topic, type_name, offered, handle)
+        self.get_logger().info(f'recording {topic} ({type_name})')
+
+    def _pass_over(self, topic: str, reason: str) -> None:
+        self._passed_over.add(topic)
+        self.get_logger().warning(f'{topic} is not recorded: {reason}')
+
+    def _record(self) -> None:
+        for arrival in self._intake.take():
+            self._by_handle[arrival.handle].count(arrival.sequence)
+            self._writer.write(
+                arrival.handle, arrival.raw, arrival.received, arrival.published, arrival.sequence
+            )
+        self._writer.flush_if_due()
+
+    def _summary(self) -> Iterator[str]:
+        for topic in self._chosen.difference(self._losses, self._passed_over):
+            yield f'{topic}: never appeared'
+        for topic, count in self._writer.message_counts.items():
+            yield f'{topic}: {count} messages{self._losses[topic].text()}'
+
+
+def main() -> int:
+    """Run the recorder as a process."""
+    return run(BagRecorderNode)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

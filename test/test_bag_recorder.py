@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The recorder in one process with its publishers: what it takes, and what it says."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+
+import rclpy
+from nav_msgs.msg import Goals
+from rclpy.context import Context
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.rosbag2 import Reader
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from blf_dsc_controller.bags.encoders import JointStateEncoder
+from blf_dsc_controller.bags.errors import BagExistsError
+from blf_dsc_controller.bags.topics import FOREVER, JOINT_STATES, Quality
+from blf_dsc_controller.bags.types import type_hash
+from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.nodes import recorder_node
+from blf_dsc_controller.nodes.intake import quality_of
+from blf_dsc_controller.nodes.losses import Losses
+from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
+
+PATIENCE = 20.0  # s, until a test gives up on what should take a moment
+
+
+class Loop:
+    """A recorder and a publishing node on one executor."""
+
+    def __init__(self, bag, **values):
+        self.context = Context()
+        rclpy.init(context=self.context)
+        self.source = Node('source', context=self.context, start_parameter_services=False)
+        self.executor = EventsExecutor(context=self.context)
+        self.executor.add_node(self.source)
+        self.recorder = None
+        self.bag = bag
+        overrides = {'output': str(bag), **values}
+        self.recorder = BagRecorderNode(
+            context=self.context,
+            parameter_overrides=[Parameter(name, value=v) for name, v in overrides.items()],
+        )
+        self.executor.add_node(self.recorder)
+
+    def spin_until(self, condition):
+        """Let both nodes work until the condition holds."""
+        deadline = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < deadline, 'still waiting'
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def spin_until_recorded(self, **counts):
+        """Let both nodes work until the recorder has that many messages of these topics."""
+        self.spin_until(
+            lambda: all(
+                self.recorder._writer.message_counts.get(f'/{topic}', 0) >= count
+                for topic, count in counts.items()
+            )
+        )
+
+    def close(self):
+        """End the recording."""
+        if self.recorder is not None:
+            self.recorder.close()
+            self.executor.remove_node(self.recorder)
+            self.recorder.destroy_node()
+            self.recorder = None
+
+    def messages(self):
+        """End the recording and read it."""
+        self.close()
+        with Reader(self.bag) as reader:
+            return [(c.topic, stamp, bytes(raw)) for c, stamp, raw in reader.messages()]
+
+
+@pytest.fixture
+def loop(tmp_path):
+    loops = []
+
+    def make(**values):
+        loops.append(Loop(tmp_path / 'bag', **values))
+        return loops[-1]
+
+    yield make
+    for one in loops:
+        one.close()
+        one.executor.remove_node(one.source)
+        one.source.destroy_node()
+        one.context.try_shutdown()
+
+
+def test_bytes_are_recorded_as_they_were_published(loop):
+    run = loop()
+    publisher = run.source.create_publisher(JointState, 'joint_states', 100)
+    encoder = JointStateEncoder(['joint1', 'joint2'])
+    sent = [encoder.encode(k, [k, 1], [2, 3], [4, 5]) for k in range(1000)]
+    run.spin_until(lambda: publisher.get_subscription_count() > 0)
+    before = time.time_ns()
+    for k, raw in enumerate(sent):
+        publisher.publish(raw)
+        if k % 50 == 49:
+            run.spin_until_recorded(joint_states=k + 1)
+    after = time.time_ns()
+
+    states = [entry for entry in run.messages() if entry[0] == '/joint_states']
+    assert [raw for _, _, raw in states] == sent
+    stamps = [stamp for _, stamp, _ in states]
+    assert stamps == sorted(stamps)
+    assert before <= stamps[0] <= stamps[-1] <= after
+
+
+def test_only_chosen_topics_are_recorded(loop):
+    run = loop(topics=['chosen', '/never'])
+    chosen = run.source.create_publisher(JointState, 'chosen', 10)
+    other = run.source.create_publisher(JointState, 'other', 10)
+    run.spin_until(lambda: chosen.get_subscription_count() > 0)
+    chosen.publish(JointState())
+    run.spin_until_recorded(chosen=1)
+    assert other.get_subscription_count() == 0
+    assert [topic for topic, _, _ in run.messages()] == ['/chosen']
+
+
+def test_a_latched_message_from_before_the_recorder_is_recorded(loop):
+    run = loop()
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    run.source.create_publisher(JointState, 'bound', latched).publish(JointState(name=['early']))
+    run.spin_until_recorded(bound=1)
+    assert [b'early' in raw for topic, _, raw in run.messages() if topic == '/bound'] == [True]
+
+
+def test_a_best_effort_publisher_is_recorded(loop):
+    run = loop()
+    quality = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    publisher = run.source.create_publisher(JointState, 'sensor', quality)
+    run.spin_until(lambda: publisher.get_subscription_count() > 0)
+    publisher.publish(JointState())
+    run.spin_until_recorded(sensor=1)
+
+
+def test_publishers_of_unlike_quality_are_both_recorded(loop):
+    run = loop()
+    publishers = [
+        run.source.create_publisher(JointState, 'mixed', QoSProfile(depth=10, **policies))
+        for policies in (
+            {'durability': DurabilityPolicy.TRANSIENT_LOCAL},
+            {'reliability': ReliabilityPolicy.BEST_EFFORT},
+        )
+    ]
+    run.spin_until(lambda: run.source.count_publishers('mixed') == len(publishers))
+    run.spin_until(lambda: all(one.get_subscription_count() > 0 for one in publishers))
+    for publisher in publishers:
+        publisher.publish(JointState())
+    run.spin_until_recorded(mixed=2)
+
+
+def test_quality_and_type_are_those_of_the_graph(loop):
+    run = loop()
+    quality = QoSProfile(depth=7, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    run.source.create_publisher(Float64MultiArray, 'commands', quality)
+    run.spin_until(lambda: '/commands' in run.recorder._writer.message_counts)
+    (seen,) = run.recorder.get_publishers_info_by_topic('/commands')
+    run.close()
+    with Reader(run.bag) as reader:
+        (found,) = [c for c in reader.connections if c.topic == '/commands']
+    assert str(seen.topic_type_hash) == found.digest == type_hash(found.msgtype)
+    assert [profile.durability.name for profile in found.ext.offered_qos_profiles] == [
+        'TRANSIENT_LOCAL'
+    ]
+    # The graph tells neither history nor depth.
+    assert quality_of(seen.qos_profile) == Quality(
+        depth=0, durability='transient_local', history='unknown', deadline=FOREVER
+    )
+
+
+def test_a_type_that_is_not_common_is_read_from_its_package(loop):
+    run = loop()
+    publisher = run.source.create_publisher(Goals, 'goals', 10)
+    run.spin_until(lambda: publisher.get_subscription_count() > 0)
+    publisher.publish(Goals())
+    run.spin_until_recorded(goals=1)
+    (seen,) = run.recorder.get_publishers_info_by_topic('/goals')
+    run.close()
+    with Reader(run.bag) as reader:
+        (found,) = [c for c in reader.connections if c.topic == '/goals']
+    assert found.digest == str(seen.topic_type_hash)
+    assert 'geometry_msgs/Quaternion' in found.msgdef.data
+
+
+def test_a_type_that_is_not_installed_is_warned_of_once(loop, monkeypatch, capfd):
+    def not_installed(type_name):
+        if type_name == JOINT_STATES.type:
+            raise ModuleNotFoundError
+        return original(type_name)
+
+    original = recorder_node.message_class
+    monkeypatch.setattr(recorder_node, 'message_class', not_installed)
+    run = loop()
+    run.source.create_publisher(JointState, 'joint_states', 10)
+    other = run.source.create_publisher(Float64MultiArray, 'commands', 10)
+    run.spin_until(lambda: other.get_subscription_count() > 0)
+    for _ in range(10):
+        run.recorder._discover()
+    other.publish(Float64MultiArray())
+    run.spin_until_recorded(commands=1)
+    assert '/joint_states' not in {topic for topic, _, _ in run.messages()}
+    said = capfd.readouterr().err
+    assert said.count('/joint_states is not recorded') == 1
+    assert 'its type sensor_msgs/msg/JointState is not installed here' in said
+
+
+def test_the_end_tells_what_was_recorded(loop, capfd):
+    run = loop(topics=['joint_states', 'commands'])
+    publisher = run.source.create_publisher(JointState, 'joint_states', 100)
+    run.spin_until(lambda: publisher.get_subscription_count() > 0)
+    for _ in range(3):
+        publisher.publish(JointState())
+    run.spin_until_recorded(joint_states=3)
+    run.close()
+    said = capfd.readouterr().err
+    assert '/joint_states: 3 messages, 0 missed' in said
+    assert '/commands: never appeared' in said
+
+
+def test_messages_that_the_queue_could_not_hold_are_counted_as_missed(loop):
+    run = loop(topics=['joint_states'], queue_depth=5)
+    publisher = run.source.create_publisher(JointState, 'joint_states', 100)
+    run.spin_until(lambda: publisher.get_subscription_count() > 0)
+    publisher.publish(JointState())
+    run.spin_until_recorded(joint_states=1)
+    for _ in range(50):
+        publisher.publish(JointState())
+        time.sleep(0.001)
+    run.spin_until_recorded(joint_states=6)
+    losses = run.recorder._losses['/joint_states']
+    assert len(run.messages()) == 51 - losses.missed
+    assert losses.missed > 0
+
+
+def test_losses_are_gaps_in_the_numbers():
+    losses = Losses(publishers=1)
+    for sequence in (4, 5, 8, 9, 1, 2):  # the first is not a loss, the 1 a new publisher
+        losses.count(sequence)
+    assert losses.missed == 2
+    losses.publishers_seen(2)
+    losses.count(100)
+    assert losses.text() == ''
+
+
+def test_an_existing_folder_is_refused(loop, tmp_path):
+    (tmp_path / 'bag').mkdir()
+    with pytest.raises(BagExistsError, match='bag exists already'):
+        loop()
+
+
+def test_a_wrong_parameter_is_refused(loop):
+    with pytest.raises(ConfigurationError, match='compression'):
+        loop(compression='zip')
