@@ -99,7 +99,7 @@ class Disturbance:
     """The disturbance estimate (30)."""
 
     gain: tuple[float, ...] = parameter(
-        (1.0, 1.0),
+        (100.0, 100.0),
         'adaptation gain of the disturbance estimate; 0: none',
         unit='N m/rad',
         symbol='gamma',

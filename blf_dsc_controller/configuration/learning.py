@@ -33,14 +33,14 @@ class Learning:
         read_only=_FIRST,
     )
     adaptation_gain: tuple[float, ...] = parameter(
-        (1.0, 1.0, 1.0),
+        (0.5, 0.5, 0.5),
         'diagonal of the adaptation gain',
         symbol='Gamma',
         at_least=0.0,
         length=_PER_PARAMETER,
     )
     weight: float = parameter(
-        5.0,
+        100.0,
         'weight of the prediction error against the tracking error; 0: no composite learning',
         symbol='kappa',
         at_least=0.0,
@@ -54,7 +54,7 @@ class Learning:
         1e-5,
         'added to the excitation matrix before the Newton step divides by it',
         symbol='rho',
-        at_least=0.0,
+        above=0.0,
     )
     excitation_threshold: float = parameter(
         0.003,

@@ -19,14 +19,14 @@ from typing import TypeVar, cast
 import numba
 from numba.core import config
 
-# An optional vector library of Intel's rounds differently from call to call: bits would depend on
-# what is installed.
-config.DISABLE_INTEL_SVML = True  # type: ignore[attr-defined]
-
 F = TypeVar('F', bound=Callable[..., object])
 
 _PACKAGE_ROOT = Path(__file__).resolve().parents[2]
-_GROUND_FLOOR = ('blf_dsc_controller/core/*.py', 'blf_dsc_controller/simulation.py', 'sim_plant/*.py')
+_GROUND_FLOOR = (
+    'blf_dsc_controller/core/*.py',
+    'blf_dsc_controller/simulation.py',
+    'sim_plant/*.py',
+)
 _ABOVE = {'assembly.py', 'configuration.py', 'node.py'}
 
 

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The closed loop without ROS: the kernels that the nodes run, in one compiled loop.
+
+A lock-step run over ROS and an offline run of the same configuration agree bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from blf_dsc_controller.assembly import controller_of
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.core.controller import Controller, respond
+from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.sample import Sample, sample_of
+from sim_plant import plant as plants
+from sim_plant.assembly import plant_of, steps_of
+from sim_plant.configuration import PlantConfig
+from sim_plant.simulated import Plant
+
+_CHUNK = 1000  # samples between two reports of progress
+
+
+@dataclass(frozen=True)
+class Record:
+    """All samples of a run, a row each.
+
+    Attributes:
+        stamps: time since the start (k,) [ns].
+        measurements: [q, dq, applied torque of the last interval] (k, 3 n).
+        samples: rows of `core.sample` (k, s).
+        truths: [P, tau_dist, q, dq] (k, p + 3 n).
+        joints: number of joints n.
+        estimates: number of estimates m.
+    """
+
+    stamps: np.ndarray
+    measurements: np.ndarray
+    samples: np.ndarray
+    truths: np.ndarray
+    joints: int
+    estimates: int
+
+    def sample(self, row: int) -> Sample:
+        """Names for one row of `samples`."""
+        return sample_of(self.samples[row], self.joints, self.estimates)
+
+
+@kernel
+def loop(
+    plant_settings: np.ndarray,
+    plant_state: np.ndarray,
+    rng: np.random.Generator,
+    settings: np.ndarray,
+    reference: np.ndarray,
+    state: np.ndarray,
+    signals: np.ndarray,
+    stamps: np.ndarray,
+    measurements: np.ndarray,
+    samples: np.ndarray,
+    truths: np.ndarray,
+    is_last: bool,
+) -> None:
+    """Run as many samples as there are rows; the torque of the last row of all is not applied."""
+    joints = measurements.shape[1] // 3
+    period = plant_settings[0]
+    rows = stamps.size
+    for k in range(rows):
+        plants.measure(plant_settings, plant_state, rng, measurements[k])
+        plants.truth(plant_settings, plant_state, truths[k])
+        respond(
+            settings,
+            reference,
+            state,
+            signals,
+            stamps[k] * 1e-9,
+            period * 1e-9,
+            measurements[k],
+            samples[k],
+        )
+        if not (is_last and k == rows - 1):
+            torque = sample_of(samples[k], joints, samples.shape[1] - 6 * joints - 2).torque
+            plants.step(plant_settings, plant_state, torque)
+
+
+def simulate(
+    controller_config: ControllerConfig,
+    plant_config: PlantConfig,
+    progress: Callable[[Record, int], None] | None = None,
+) -> Record:
+    """Run both configurations against each other for `duration` and return every sample.
+
+    Args:
+        controller_config: of the law.
+        plant_config: of the arm; its duration must not be 0.
+        progress: called now and then with the record and the number of rows that are filled.
+
+    Raises:
+        OutsideBarrierError: the arm starts outside the bound.
+    """
+    controller = controller_of(controller_config)
+    plant = plant_of(plant_config)
+    n = controller.settings.n
+    controller.check_start(controller_config.joints, plant.measure()[:n])
+    record = _empty_record(controller, plant, steps_of(plant_config) + 1)
+    rows = record.stamps.size
+    for first in range(0, rows, _CHUNK):
+        part = slice(first, min(first + _CHUNK, rows))
+        loop(
+            plant.settings,
+            plant.state,
+            plant.rng,
+            controller.settings_vector,
+            controller.reference_vector,
+            controller.state_vector,
+            controller.signals_vector,
+            record.stamps[part],
+            record.measurements[part],
+            record.samples[part],
+            record.truths[part],
+            part.stop == rows,
+        )
+        if progress is not None:
+            progress(record, part.stop)
+    return record
+
+
+def _empty_record(controller: Controller, plant: Plant, rows: int) -> Record:
+    n = controller.settings.n
+    return Record(
+        stamps=np.arange(rows, dtype=np.int64) * plant.period_ns,
+        measurements=np.zeros((rows, 3 * n)),
+        samples=np.zeros((rows, controller.sample_vector.size)),
+        truths=np.zeros((rows, plant.truth().size)),
+        joints=n,
+        estimates=controller.settings.m,
+    )
