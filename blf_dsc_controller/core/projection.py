@@ -12,6 +12,8 @@ import numpy as np
 
 from blf_dsc_controller.core.kernel import kernel
 
+_ON_SPHERE = 1.0 - 1e-12  # of radius^2: `rescale` ends a rounding inside or outside
+
 
 @kernel
 def project(estimate: np.ndarray, rate: np.ndarray, gain: np.ndarray, radius: float) -> None:
@@ -30,7 +32,7 @@ def project(estimate: np.ndarray, rate: np.ndarray, gain: np.ndarray, radius: fl
         square += estimate[j] * estimate[j]
         outward += estimate[j] * rate[j]
         metric += estimate[j] * gain[j] * estimate[j]
-    if square >= radius * radius and outward > 0.0 and metric > 0.0:
+    if square >= _ON_SPHERE * radius * radius and outward > 0.0 and metric > 0.0:
         for j in range(gain.size):
             rate[j] -= gain[j] * estimate[j] * outward / metric
 
