@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings, state and signals full of random numbers, for kernels that know no arm: any n and p."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.core.settings import NEWTON, Settings
+from blf_dsc_controller.core.state import (
+    Signals,
+    State,
+    signals_of,
+    signals_size,
+    state_of,
+    state_size,
+)
+
+
+class Case(NamedTuple):
+    """What a kernel is called with."""
+
+    settings: Settings
+    state: State
+    signals: Signals
+
+
+def arbitrary_settings(random: np.random.Generator, n: int, p: int, **changes) -> Settings:
+    """Positive gains for n joints, p parameters and a bias column for each joint."""
+    joint = dict(
+        zip(
+            ('bound', 'weight', 'slope_limit', 'knee', 'K', 'mu', 'Kp', 'd2', 'gamma'),
+            random.uniform(0.5, 2.0, (9, n)),
+            strict=True,
+        )
+    )
+    settings = Settings(
+        n=n,
+        p=p,
+        m=p + n,
+        model=-1,
+        law=0,
+        update=NEWTON,
+        torque_source=0,
+        window=8,
+        interval=1,
+        time_constant=0.002,
+        boundary_layer=0.01,
+        eta=0.3,
+        kappa=5.0,
+        rho=1e-5,
+        sigma=1e-9,
+        learning_start=0.0,
+        pole=10.0,
+        radius=1e3,
+        torque_limit=np.full(n, 1e3),
+        Gamma=random.uniform(0.5, 2.0, p + n),
+        initial_estimate=random.normal(size=p + n),
+        constants=np.zeros(0),
+        **joint,
+    )
+    return settings._replace(**changes)
+
+
+def arbitrary(seed: int, n: int = 3, p: int = 4, **changes) -> Case:
+    """Case of a seed, its state and signals standard normal."""
+    random = np.random.default_rng(seed)
+    settings = arbitrary_settings(random, n, p, **changes)
+    state = state_of(random.normal(size=state_size(settings)), settings)
+    signals = signals_of(random.normal(size=signals_size(settings)), settings)
+    return Case(settings, state, signals)

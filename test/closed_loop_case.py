@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the core's tests share: Section IV with the recommended gains, and its sampled loop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from math import pi
+from typing import NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.core import barrier, models, reference
+from blf_dsc_controller.core.controller import Controller
+from blf_dsc_controller.core.settings import NEWTON, Settings, pack
+from sim_plant.actuator import Actuator
+from sim_plant.arm import Arm
+from sim_plant.disturbance import disturbance_vector
+from sim_plant.integrator import DOPRI5
+from sim_plant.plant import PlantSettings
+from sim_plant.sensors import DIFFERENCED, MEASURED, Sensor
+from sim_plant.simulated import Plant
+
+T = 1e-3
+P = np.array([1.0, 0.32, 0.4])
+ARM = Arm(l1=1.0, l2=0.8, m1=0.5, m2=0.5, g=9.8)
+MODEL = models.two_link_arm(1.0, 9.8)
+CONSTANTS = np.array(MODEL.constants)
+REFERENCE = reference.sinusoids_vector((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))
+JOINTS = ('shoulder', 'elbow')
+START = (2.293, 1.696)
+QUIET = (0.0, 0.0)
+
+
+def recommended(*, bias: bool = True, **changes) -> Settings:
+    """Recommended settings of the two-link arm, with changes; the knee follows the barrier's."""
+    columns = 2 if bias else 0
+    settings = Settings(
+        n=2,
+        p=3,
+        m=3 + columns,
+        model=MODEL.code,
+        law=0,
+        update=NEWTON,
+        torque_source=0,
+        window=round(2.0 * pi / T),
+        interval=10,
+        time_constant=0.002,
+        boundary_layer=0.01,
+        eta=0.0,
+        kappa=100.0,
+        rho=1e-5,
+        sigma=0.003,
+        learning_start=2.0 * pi + 0.5,
+        pole=10.0,
+        radius=3.0,
+        bound=np.full(2, 0.002),
+        weight=np.full(2, 1000.0),
+        slope_limit=np.full(2, 2e4),
+        knee=np.zeros(2),
+        K=np.full(2, 150.0),
+        mu=np.full(2, 20.0),
+        Kp=np.array([60.0, 20.0]),
+        d2=np.zeros(2),
+        gamma=np.full(2, 100.0),
+        torque_limit=np.full(2, 20.0),
+        Gamma=np.array([0.5] * 3 + [1.0] * columns),
+        initial_estimate=np.concatenate([P / 2.0, np.zeros(columns)]),
+        constants=CONSTANTS,
+    )._replace(**changes)
+    barriers = zip(settings.bound, settings.weight, settings.slope_limit, strict=True)
+    return settings._replace(knee=np.array([barrier.knee(*each) for each in barriers]))
+
+
+def quick(**changes) -> Settings:
+    """Settings that learn within seconds: a window of 1 s, which this excites less."""
+    return recommended(**{'window': 1000, 'learning_start': 1.2, 'sigma': 1e-6} | changes)
+
+
+def controller(settings: Settings) -> Controller:
+    """Controller of the paper's reference."""
+    return Controller(pack(settings), REFERENCE)
+
+
+def plant(
+    *,
+    sample_time: float = T,
+    noise: float = 0.0,
+    differenced: bool = False,
+    delay: int = 0,
+    torque_limit: tuple[float, float] = QUIET,
+    constant: tuple[float, float] = (0.1, 0.1),
+    amplitude: tuple[float, float] = (0.1, 0.1),
+    viscous: float = 0.0,
+    start: tuple[float, float] = START,
+    seed: int = 0,
+) -> Plant:
+    """Section IV's arm at its start, with its disturbance 0.1 + 0.1 sin t on each joint."""
+    settings = PlantSettings(
+        period_ns=round(sample_time * 1e9),
+        integrator=DOPRI5,
+        arm=ARM,
+        sensor=Sensor(noise, 0.0, 0.0, DIFFERENCED if differenced else MEASURED),
+        disturbance=disturbance_vector(
+            constant=constant,
+            amplitude=amplitude,
+            frequency=1.0,
+            phase=0.0,
+            viscous=viscous,
+            coulomb=0.0,
+            coulomb_velocity=0.01,
+        ),
+        actuator=Actuator(np.array(torque_limit), delay),
+    )
+    return Plant(settings, start, QUIET, seed)
+
+
+class Sample(NamedTuple):
+    """One sample of a loop, answered by the controller and not yet applied to the plant."""
+
+    k: int
+    t: float  # s
+    measurement: np.ndarray  # (6,) view
+
+
+def closed_loop(law: Controller, arm: Plant, duration: float) -> Iterator[Sample]:
+    """Run the loop for `duration` [s], stopping at each sample to let the test look."""
+    dt = arm.period_ns * 1e-9
+    for k in range(round(duration / dt)):
+        t = k * arm.period_ns * 1e-9
+        measurement = arm.measure()
+        law.update(t, dt, measurement)
+        yield Sample(k, t, measurement)
+        arm.step(law.signals.torque)
+
+
+class Record(NamedTuple):
+    """A whole loop; the first axis is the sample."""
+
+    t: np.ndarray  # s
+    xi1: np.ndarray  # (., 2) rad
+    torque: np.ndarray  # (., 2) N m
+    estimate: np.ndarray  # (., m)
+
+    @property
+    def parameter_error(self) -> np.ndarray:
+        """|P^ - P| / |P| of each sample."""
+        return np.linalg.norm(self.estimate[:, :3] - P, axis=1) / np.linalg.norm(P)
+
+
+def record(law: Controller, arm: Plant, duration: float) -> Record:
+    """Run a loop and keep what the tests ask of it."""
+    rows = [
+        (
+            sample.t,
+            law.signals.xi1.copy(),
+            law.signals.torque.copy(),
+            law.state.estimate.copy(),
+        )
+        for sample in closed_loop(law, arm, duration)
+    ]
+    return Record(*map(np.array, zip(*rows, strict=True)))
+
+
+@cache
+def recommended_minute() -> Record:
+    """Sixty noise-free seconds of the recommended configuration, run once for all tests."""
+    return record(controller(recommended()), plant(), 60.0)

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole law once more, in plain numpy and sharing nothing with the package: the tests' oracle.
+
+Written for reading: the regressors are found by putting unit vectors for P into M, C and G, the
+window is the list of its rows, the Newton step solves its equations.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def dynamics(P, r, q, dq):
+    """M, C, G of the two-link arm."""
+    c = P[2] * np.sin(q[1])
+    coupling = P[2] * np.cos(q[1])
+    M = np.array([[P[0] + P[1] + 2.0 * coupling, P[1] + coupling], [P[1] + coupling, P[1]]])
+    C = np.array([[-c * dq[1], -c * (dq[0] + dq[1])], [c * dq[0], 0.0]])
+    outer = P[2] * r * np.cos(q[0] + q[1])
+    return M, C, np.array([P[0] * r * np.cos(q[0]) + outer, outer])
+
+
+class PlainLaw:
+    """Answers samples as the law is written, with settings under the package's names."""
+
+    def __init__(self, settings):
+        self.gains = settings
+        self.newton = settings.update == 1
+        self.effort = settings.torque_source == 1
+        self.theta = settings.initial_estimate.copy()
+        self.d3 = np.zeros(2)
+        self.tau = np.zeros(2)
+        self.alpha2 = None
+        self.previous = None
+        self.window = []
+        self.latched = None
+        self.samples = 0
+        self.pole1 = self.pole2 = np.zeros((2, settings.m + 1))
+
+    def barrier_torque(self, xi1):
+        """tau_c of (16) with its weight, a straight line from the knee on."""
+        g = self.gains
+        edge = np.minimum(np.abs(xi1), g.knee)
+        inside = g.weight * edge / np.cos(np.pi * edge**2 / (2.0 * g.bound**2)) ** 2
+        return -np.sign(xi1) * (inside + g.slope_limit * (np.abs(xi1) - edge))
+
+    def virtual_control(self, xi1, dqr):
+        """beta2 of (18) with (15) as printed: it needs an error that is not zero."""
+        g = self.gains
+        s = np.pi * xi1**2 / (2.0 * g.bound**2)
+        tau_aux = -g.K * g.bound**2 / (xi1 * np.pi) * np.sin(s) * np.cos(s)
+        return np.where(np.abs(xi1) < g.bound, tau_aux, 0.0) - g.mu * xi1 + dqr
+
+    def regressor(self, q, dq, v, a):
+        """H, column by column: M a + C v + G of each unit parameter."""
+        columns = (dynamics(e, self.gains.constants[0], q, dq) for e in np.eye(3))
+        return np.column_stack([M @ a + C @ v + G for M, C, G in columns])
+
+    def take_in(self, t, dt, q, dq, applied):
+        """Filter and keep the row of the last interval; latch the window when it is time."""
+        g = self.gains
+        columns = [dynamics(e, g.constants[0], q, dq) for e in np.eye(3)]
+        Yp = np.column_stack([M @ dq for M, _, _ in columns])
+        Yr = np.column_stack([G - C.T @ dq for _, C, G in columns])
+        if self.previous is not None:
+            X = (Yp - self.previous[0]) / dt + (Yr + self.previous[1]) / 2.0
+            raw = np.column_stack([X, np.eye(2)[:, : g.m - 3], applied])
+            share = 1.0 - np.exp(-g.pole * dt)
+            self.pole1 = self.pole1 + share * (raw - self.pole1)
+            self.pole2 = self.pole2 + share * (self.pole1 - self.pole2)
+            self.window = [*self.window, self.pole2][-g.window :]
+            if self.samples % g.interval == 0 and t >= g.learning_start:
+                self.look()
+        self.previous = Yp, Yr
+
+    def look(self):
+        """(21), (22), (26), (27)."""
+        rows = np.array(self.window).reshape(-1, self.gains.m + 1)
+        Phi = rows[:, :-1].T @ rows[:, :-1] / len(self.window)
+        if np.linalg.eigvalsh(Phi)[0] >= self.gains.sigma:
+            self.latched = Phi, rows[:, :-1].T @ rows[:, -1] / len(self.window)
+
+    def adapt(self, dt, H, xi2, *, saturated):
+        """(20) with its sign corrected and projected in the Gamma metric, (30)."""
+        g = self.gains
+        v = np.zeros(g.m)
+        if self.latched is not None:
+            Phi, b = self.latched
+            eps = b - Phi @ self.theta
+            if self.newton:
+                eps = np.linalg.solve(Phi + g.rho * np.eye(g.m), eps)
+            v += g.kappa * eps
+        if not saturated:
+            v[:3] -= H.T @ xi2
+            self.d3 = self.d3 - dt * g.gamma * (xi2 + g.eta * self.d3)
+        v *= g.Gamma
+        w = self.theta[:3].copy()
+        if w @ w >= g.radius**2 * (1.0 - 1e-12) and w @ v[:3] > 0.0:
+            v[:3] -= g.Gamma[:3] * w * (w @ v[:3]) / (w @ (g.Gamma[:3] * w))
+        self.theta = self.theta + dt * v
+        norm = np.linalg.norm(self.theta[:3])
+        if norm > g.radius:
+            self.theta[:3] *= g.radius / norm
+
+    def update(self, t, dt, qr, dqr, measurement):
+        """Torque (28) for a measurement; `tau`, what went out last, is the caller's to set."""
+        g = self.gains
+        q, dq, effort = measurement.reshape(3, 2).copy()
+        xi1 = q - qr
+        beta2 = self.virtual_control(xi1, dqr)
+        if self.alpha2 is None:
+            self.alpha2 = beta2
+        dalpha2 = (beta2 - self.alpha2) / g.time_constant
+        xi2 = dq - self.alpha2
+        self.take_in(t, dt, q, dq, effort if self.effort else self.tau)
+        H = self.regressor(q, dq, self.alpha2, dalpha2)
+        demand = (
+            self.barrier_torque(xi1)
+            - g.d2 * np.abs(xi1) * np.clip(xi2 / g.boundary_layer, -1.0, 1.0)
+            - g.Kp * xi2
+            + H @ self.theta[:3]
+            + self.d3
+        )
+        torque = np.clip(demand, -g.torque_limit, g.torque_limit)
+        self.adapt(dt, H, xi2, saturated=np.any(torque != demand))
+        self.alpha2 = beta2 + (self.alpha2 - beta2) * np.exp(-dt / g.time_constant)
+        self.samples += 1
+        return torque

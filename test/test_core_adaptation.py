@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The update laws (20) and (30) against numpy on random states, and what freezes them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from arbitrary_case import arbitrary
+from closed_loop_case import controller, plant, quick, record
+
+from blf_dsc_controller.core import adaptation, cholesky
+from blf_dsc_controller.core.settings import UPDATES
+
+DT = 1e-3
+SHAPES = [(1, 1), (2, 3), (3, 4)]
+
+
+def case(seed, n, p, *, latched=True, update='newton', **changes):
+    """Random case whose latched window belongs to random regressor rows."""
+    settings, state, signals = arbitrary(seed, n, p, update=UPDATES.index(update), **changes)
+    rows = np.random.default_rng(seed).normal(size=(40, settings.m))
+    state.Phi[:] = rows.T @ rows / len(rows)
+    cholesky.factor(state.Phi, settings.rho, state.factor)
+    state.latched[0] = latched
+    return settings, state, signals
+
+
+def tracking_part(settings, signals):
+    """-Gamma H^T xi2 on the parameters, nothing on the columns."""
+    rate = np.zeros(settings.m)
+    rate[: settings.p] = -signals.H.T @ signals.xi2
+    return settings.Gamma * rate
+
+
+def prediction_part(settings, state):
+    """Gamma kappa W (b - Phi theta^)."""
+    eps = state.b - state.Phi @ state.estimate
+    if settings.update == UPDATES.index('newton'):
+        eps = np.linalg.solve(state.Phi + settings.rho * np.eye(settings.m), eps)
+    return settings.Gamma * settings.kappa * eps
+
+
+def estimates_after(settings, state, signals, *, saturated=False):
+    adaptation.adapt(settings, state, signals, DT, saturated)
+    return state.estimate.copy(), state.disturbance.copy()
+
+
+@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize(('n', 'p'), SHAPES)
+@pytest.mark.parametrize('update', UPDATES)
+def test_update_is_the_written_law(seed, n, p, update):
+    settings, state, signals = random_case = case(seed, n, p, update=update)
+    rate = tracking_part(settings, signals) + prediction_part(settings, state)
+    expected = state.estimate + DT * rate
+    d3_rate = -settings.gamma * (signals.xi2 + settings.eta * state.disturbance)
+    d3 = state.disturbance + DT * d3_rate
+
+    estimate, disturbance = estimates_after(*random_case)
+
+    np.testing.assert_allclose(estimate, expected, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(signals.rate, rate, rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(disturbance, d3, rtol=0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize(('n', 'p'), SHAPES)
+def test_before_the_latch_only_the_tracking_error_teaches(n, p):
+    settings, state, signals = random_case = case(1, n, p, latched=False)
+    expected = state.estimate + DT * tracking_part(settings, signals)
+
+    estimate, _ = estimates_after(*random_case)
+
+    np.testing.assert_allclose(estimate, expected, rtol=0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize(('n', 'p'), SHAPES)
+def test_at_a_torque_limit_only_the_prediction_error_teaches(n, p):
+    settings, state, _ = random_case = case(2, n, p)
+    expected = state.estimate + DT * prediction_part(settings, state)
+    d3 = state.disturbance.copy()
+
+    estimate, disturbance = estimates_after(*random_case, saturated=True)
+
+    np.testing.assert_allclose(estimate, expected, rtol=0.0, atol=1e-12)
+    np.testing.assert_array_equal(disturbance, d3)
+
+
+def test_newton_converges_at_one_rate_in_every_direction_and_gradient_does_not():
+    """theta~ shrinks by 1 - Gamma kappa T a step, where Phi's eigenvalues are 1e-2 to 1e2."""
+    shrunk = {}
+    for update in UPDATES:
+        settings, state, signals = case(
+            3, 2, 3, update=update, rho=1e-12, Gamma=np.full(5, 2.0), kappa=2.0
+        )
+        state.Phi[:] = np.diag([1e-2, 0.1, 1.0, 10.0, 100.0])
+        cholesky.factor(state.Phi, settings.rho, state.factor)
+        state.b[:] = 0.0  # the truth is zero
+        state.estimate[:] = 1.0
+        signals.xi2[:] = 0.0
+        shrunk[update] = estimates_after(settings, state, signals)[0]
+    np.testing.assert_allclose(shrunk['newton'], 1.0 - 2.0 * 2.0 * DT, rtol=1e-9)
+    np.testing.assert_allclose(
+        shrunk['gradient'], 1.0 - 2.0 * 2.0 * DT * np.array([1e-2, 0.1, 1.0, 10.0, 100.0])
+    )
+
+
+def test_update_is_projected_in_the_parameters_and_free_in_the_columns():
+    settings, state, signals = case(4, 2, 3, latched=False, radius=1.0)
+    p = settings.p
+    state.estimate[:p] /= np.linalg.norm(state.estimate[:p]) * (1.0 - 1e-12)
+    state.estimate[p:] = 50.0  # far outside, were they counted
+    signals.xi2[:] *= -np.sign(signals.xi2 @ signals.H @ state.estimate[:p])  # outward
+    v, w, Gamma = tracking_part(settings, signals)[:p], state.estimate[:p].copy(), settings.Gamma
+
+    estimate, _ = estimates_after(settings, state, signals)
+
+    assert w @ v > 0.0
+    tangential = v - Gamma[:p] * w * (w @ v) / (w @ (Gamma[:p] * w))
+    np.testing.assert_allclose(signals.rate[:p], tangential, atol=1e-12)
+    assert np.linalg.norm(estimate[:p]) <= 1.0 + 1e-15
+    np.testing.assert_array_equal(estimate[p:], 50.0)
+
+
+def test_without_weight_a_latched_window_changes_nothing():
+    """kappa = 0 is the law without learning, bit for bit."""
+    latched, never = controller(quick(kappa=0.0)), controller(quick(sigma=np.inf))
+    with_latch, without = (record(law, plant(), 1.5) for law in (latched, never))
+
+    assert latched.state.latched[0] == 1.0
+    assert never.state.latched[0] == 0.0
+    np.testing.assert_array_equal(with_latch.torque, without.torque)
+    np.testing.assert_array_equal(with_latch.estimate, without.estimate)

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tan barrier: the gradient of its potential, the paper's inside the knee, a spring past it."""
+
+from __future__ import annotations
+
+from cmath import cos as complex_cos
+from cmath import tan as complex_tan
+from math import pi
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.core import barrier
+
+BOUND, WEIGHT, LIMIT = 0.002, 1000.0, 2e4
+KNEE = barrier.knee(BOUND, WEIGHT, LIMIT)
+INSIDE = np.linspace(0.01, 0.99, 25) * KNEE
+PAST = KNEE + np.linspace(0.01, 3.0, 25) * BOUND
+RECOMMENDED = (BOUND, WEIGHT, LIMIT, KNEE)
+
+
+def printed_potential(xi, bound):
+    """Equation (3); takes complex xi."""
+    return bound**2 / pi * complex_tan(pi * xi * xi / (2.0 * bound**2))
+
+
+def printed_torque(xi, bound):
+    """The entries of -tau_c below (16); takes complex xi."""
+    return xi / complex_cos(pi * xi * xi / (2.0 * bound**2)) ** 2
+
+
+def complex_step(function, xi):
+    """Derivative to rounding: no difference is taken."""
+    return function(xi + 1e-30j).imag / 1e-30
+
+
+@pytest.mark.parametrize('xi', INSIDE)
+def test_inside_the_knee_it_is_the_paper_s_times_the_weight(xi):
+    assert barrier.potential(xi, *RECOMMENDED) == pytest.approx(
+        WEIGHT * printed_potential(xi, BOUND).real, rel=1e-12
+    )
+    assert barrier.gradient(xi, *RECOMMENDED) == pytest.approx(
+        WEIGHT * printed_torque(xi, BOUND).real, rel=1e-12
+    )
+
+
+@pytest.mark.parametrize('xi', INSIDE)
+def test_gradient_and_slope_are_the_first_two_derivatives_inside_the_knee(xi):
+    assert barrier.gradient(xi, *RECOMMENDED) == pytest.approx(
+        WEIGHT * complex_step(lambda x: printed_potential(x, BOUND), xi), rel=1e-12
+    )
+    assert barrier.slope(xi, BOUND, WEIGHT) == pytest.approx(
+        WEIGHT * complex_step(lambda x: printed_torque(x, BOUND), xi), rel=1e-12
+    )
+
+
+@pytest.mark.parametrize('xi', [*INSIDE, KNEE, *PAST])
+@pytest.mark.parametrize('sign', [-1.0, 1.0])
+def test_gradient_is_the_finite_difference_of_the_potential(xi, sign):
+    # Over h = 1e-8 rad the third derivative (below 1e11 N m/rad^3 here) leaves 1e-6 N m of ~10.
+    h = 1e-8
+    around = [barrier.potential(sign * xi + side, *RECOMMENDED) for side in (-h, h)]
+    assert np.diff(around)[0] / (2.0 * h) == pytest.approx(
+        barrier.gradient(sign * xi, *RECOMMENDED), rel=1e-6, abs=1e-6
+    )
+
+
+def test_torque_and_slope_are_continuous_at_the_knee():
+    h = 1e-10
+    below, at, above = (barrier.gradient(KNEE + side, *RECOMMENDED) for side in (-h, 0.0, h))
+
+    assert at == pytest.approx(WEIGHT * printed_torque(KNEE, BOUND).real, rel=1e-12)
+    assert (at - below) / h == pytest.approx(LIMIT, rel=1e-4)  # rounding of 10 N m over h
+    assert (above - at) / h == pytest.approx(LIMIT, rel=1e-4)
+
+
+@pytest.mark.parametrize('weight', [1.0, 1000.0, 2e4])
+def test_knee_is_where_the_slope_reaches_its_limit(weight):
+    knee = barrier.knee(BOUND, weight, LIMIT)
+
+    assert 0.0 <= knee < BOUND
+    assert barrier.slope(knee, BOUND, weight) == pytest.approx(LIMIT, rel=1e-9)
+
+
+def test_slope_never_exceeds_its_limit_and_reaches_it_past_the_knee():
+    xi = np.linspace(-3.0 * BOUND, 3.0 * BOUND, 4001)
+    slope = np.diff([barrier.gradient(x, *RECOMMENDED) for x in xi]) / np.diff(xi)
+    past = np.minimum(np.abs(xi[1:]), np.abs(xi[:-1])) >= KNEE
+
+    assert slope.min() >= WEIGHT * (1.0 - 1e-9)
+    assert slope.max() <= LIMIT * (1.0 + 1e-9)
+    np.testing.assert_allclose(slope[past], LIMIT, rtol=1e-9)
+
+
+@pytest.mark.parametrize('xi', [0.0, *INSIDE, KNEE, *PAST])
+def test_barrier_is_symmetric(xi):
+    assert barrier.gradient(-xi, *RECOMMENDED) == -barrier.gradient(xi, *RECOMMENDED)
+    assert barrier.potential(-xi, *RECOMMENDED) == barrier.potential(xi, *RECOMMENDED)
+
+
+def test_near_zero_it_is_a_spring_of_the_weight():
+    xi = 1e-9  # s = 4e-13, so the correction 2 s^2 is below rounding
+    assert barrier.gradient(0.0, *RECOMMENDED) == 0.0
+    assert barrier.potential(0.0, *RECOMMENDED) == 0.0
+    assert barrier.gradient(xi, *RECOMMENDED) == pytest.approx(WEIGHT * xi, rel=1e-12)
+    assert barrier.potential(xi, *RECOMMENDED) == pytest.approx(0.5 * WEIGHT * xi**2, rel=1e-12)
+
+
+def test_without_a_limit_the_potential_grows_beyond_any_value_at_the_bound():
+    """With s = pi/2 (1 - e)^2, tan s is 1 / (pi e) to first order in the distance e."""
+    knee = barrier.knee(BOUND, 1.0, 1e300)
+    for distance in (1e-4, 1e-5, 1e-6):
+        potential = barrier.potential(BOUND * (1.0 - distance), BOUND, 1.0, 1e300, knee)
+        assert potential == pytest.approx(BOUND**2 / pi / (pi * distance), rel=2.0 * distance)
+
+
+def test_at_and_beyond_the_bound_it_is_finite_and_pushes_back():
+    torques = [barrier.gradient(xi, *RECOMMENDED) for xi in (BOUND, 2.0 * BOUND, 1.0)]
+    assert np.all(np.isfinite(torques))
+    assert 0.0 < torques[0] < torques[1] < torques[2]

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The factor and the smallest eigenvalue, against numpy; the latch (27) and when it closes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from arbitrary_case import arbitrary
+from closed_loop_case import closed_loop, controller, plant, quick
+
+from blf_dsc_controller.core import cholesky, excitation, window
+
+
+def excitation_matrix(random, m, rank):
+    rows = random.normal(size=(rank, m))
+    return rows.T @ rows
+
+
+@pytest.mark.parametrize(('m', 'rank'), [(1, 1), (5, 12), (5, 5), (5, 2), (7, 1), (6, 0)])
+@pytest.mark.parametrize('shift', [1e-5, 1.0])
+def test_factor_is_numpy_s_and_solves(m, rank, shift):
+    """Singular matrices included: the factor is of Phi + rho I."""
+    random = np.random.default_rng(m)
+    A = excitation_matrix(random, m, rank)
+    x = random.normal(size=m)
+    L, y = np.zeros((m, m)), x.copy()
+
+    cholesky.factor(A, shift, L)
+    cholesky.solve(L, y)
+
+    # Backward stable: the residual, and not the solution, is at the level of rounding.
+    shifted = A + shift * np.eye(m)
+    np.testing.assert_allclose(L @ L.T, shifted, atol=1e-14 * np.linalg.norm(shifted))
+    np.testing.assert_allclose(L, np.linalg.cholesky(shifted), rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(
+        shifted @ y, x, atol=1e-14 * np.linalg.norm(shifted) * np.linalg.norm(y)
+    )
+
+
+def test_factor_exists_where_rounding_takes_a_pivot_below_the_shift():
+    """Rank one at 1e12 rounds at 1e-4, so the other two pivots of Phi + 1e-5 I are noise."""
+    clamped = 0
+    for seed in range(20):
+        row = 1e6 * np.random.default_rng(seed).normal(size=3)
+        L = np.zeros((3, 3))
+        cholesky.factor(np.outer(row, row), 1e-5, L)
+        assert np.all(np.isfinite(L))
+        assert np.all(np.diag(L) >= np.sqrt(1e-5))
+        clamped += np.count_nonzero(np.diag(L) == np.sqrt(1e-5))
+    assert clamped > 0
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_inverse_iteration_finds_the_smallest_eigenvalue_and_its_direction(seed):
+    random = np.random.default_rng(seed)
+    Phi = excitation_matrix(random, 5, 9)
+    L, direction = np.zeros((5, 5)), np.full(5, 5**-0.5)
+    cholesky.factor(Phi, 1e-5, L)
+    for _ in range(25):
+        smallest = excitation.weakest_direction(Phi, L, direction, np.zeros(5))
+
+    values, vectors = np.linalg.eigh(Phi)
+    assert smallest == pytest.approx(values[0], rel=1e-10)
+    assert abs(vectors[:, 0] @ direction) == pytest.approx(1.0, rel=1e-10)
+    assert np.linalg.norm(direction) == pytest.approx(1.0, rel=1e-14)
+
+
+def test_warm_started_iteration_follows_the_smallest_eigenvalue_along_a_loop():
+    """Never below it (a Rayleigh quotient cannot be), and close once the window has filled."""
+    settings = quick()
+    law = controller(settings)
+    looks = [
+        (law.state.lambda_min[0], np.linalg.eigvalsh(law.signals.Phi)[0], sample.t)
+        for sample in closed_loop(law, plant(), 4.0)
+        if sample.k > 0 and sample.k % settings.interval == 0
+    ]
+    found, exact, t = np.array(looks).T
+
+    assert np.all(found >= exact - 1e-13)
+    filled = t > 1.0
+    np.testing.assert_allclose(found[filled], exact[filled], rtol=1e-3)
+    assert np.median(found[filled] / exact[filled] - 1.0) < 1e-6
+
+
+@pytest.fixture
+def excited():
+    """Case with a window of eight excited rows, which has not been looked at yet."""
+    case = arbitrary(1, sigma=0.01, learning_start=2.0)
+    settings, state, signals = case
+    state.running[:] = state.fresh[:] = state.ring[:] = 0.0
+    state.latched[0] = 0.0
+    state.rows[0] = settings.window
+    cursor = 0
+    random = np.random.default_rng(2)
+    for _ in range(settings.window):
+        signals.row[:] = random.normal(size=signals.row.shape)
+        cursor = window.push(state.ring, cursor, state.running, state.fresh, signals.row)
+    return case
+
+
+def settled_look(case, t):
+    for _ in range(50):  # the first of a loop start from no direction in particular
+        excitation.look(*case, t)
+
+
+def test_latch_keeps_the_whole_window_when_time_and_excitation_suffice(excited):
+    settings, state, _ = excited
+    settled_look(excited, settings.learning_start)
+
+    rows = state.ring
+    Phi = np.einsum('kia,kib->ab', rows[:, :, :-1], rows[:, :, :-1]) / settings.window
+    b = np.einsum('kia,ki->a', rows[:, :, :-1], rows[:, :, -1]) / settings.window
+    factor = np.linalg.cholesky(Phi + settings.rho * np.eye(settings.m))
+    assert (state.latched[0], state.latch_time[0]) == (1.0, settings.learning_start)
+    np.testing.assert_allclose(state.Phi, Phi, atol=1e-14)
+    np.testing.assert_allclose(state.b, b, atol=1e-14)
+    np.testing.assert_allclose(np.tril(state.factor), factor, atol=1e-13)
+
+
+@pytest.mark.parametrize('early', [True, False])
+def test_latch_stays_open_too_early_or_with_too_little(excited, early):
+    settings, state, signals = excited
+    if not early:
+        excited = (settings._replace(sigma=1e3), state, signals)
+    before = state.Phi.copy(), state.b.copy()
+
+    settled_look(excited, settings.learning_start - (1e-9 if early else 0.0))
+
+    assert state.latched[0] == 0.0
+    np.testing.assert_array_equal(state.Phi, before[0])
+    np.testing.assert_array_equal(state.b, before[1])
+
+
+def test_a_latched_window_outlives_the_excitation(excited):
+    settings, state, signals = excited
+    settled_look(excited, settings.learning_start)
+    kept = state.Phi.copy()
+
+    state.running[:] = 0.0
+    settled_look(excited, settings.learning_start + 1.0)
+
+    assert state.lambda_min[0] == 0.0
+    assert (state.latched[0], state.latch_time[0]) == (1.0, settings.learning_start)
+    np.testing.assert_array_equal(state.Phi, kept)
+    np.testing.assert_array_equal(signals.Phi, 0.0)
+
+
+def test_law_looks_once_an_interval_and_not_before_learning_may_start():
+    settings = quick(interval=7, sigma=1e-12)
+    law = controller(settings)
+    times = [
+        (sample.t, law.state.latch_time[0])
+        for sample in closed_loop(law, plant(), 1.5)
+        if law.state.latched[0]
+    ]
+    t, latch_time = np.array(times).T
+
+    first = np.ceil(settings.learning_start / 7e-3) * 7e-3
+    assert t[0] == latch_time[0] == pytest.approx(first)
+    np.testing.assert_allclose(np.unique(np.diff(np.unique(latch_time))), 7e-3, rtol=1e-9)

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The torque (28) over whole closed loops, against the law written in plain numpy; its limit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from closed_loop_case import closed_loop, controller, plant, quick, record
+from plain_law import PlainLaw
+
+from blf_dsc_controller.core.settings import EFFORT, UPDATES
+
+# A window that is no multiple of the interval, and nearly a second more to learn in. So short a
+# window conditions Phi as 1e7; rho = 1 keeps the rounding that this multiplies below 1e-12.
+SHORT = {'window': 497, 'interval': 7, 'learning_start': 0.6, 'rho': 1.0}
+ROUNDING = 1e-12
+GRADIENT = UPDATES.index('gradient')
+
+CASES = {
+    'newton': ({}, {}),
+    'gradient': ({'update': GRADIENT, 'kappa': 2.0}, {}),
+    'no bias columns': ({'bias': False}, {}),
+    'damping and leakage': ({'d2': np.array([300.0, 200.0]), 'eta': 0.5}, {}),
+    'effort': ({'torque_source': EFFORT}, {'delay': 2, 'noise': 1e-6}),
+    'torque limit': ({'torque_limit': np.array([10.0, 4.0])}, {}),
+    'at the ball': ({'radius': 0.9, 'Gamma': np.array([0.2, 1.0, 3.0, 0.5, 0.5])}, {}),
+    'past the bound': ({'slope_limit': np.full(2, 5e3)}, {'start': (2.297, 1.692)}),
+}
+
+
+def differences(settings, arm, duration=1.5):
+    """Largest difference of torque, estimate and d^3 between the law and its oracle in a loop."""
+    law, plain = controller(settings), PlainLaw(settings)
+    worst = np.zeros(3)
+    for sample in closed_loop(law, arm, duration):
+        torque = plain.update(sample.t, 1e-3, law.signals.qr, law.signals.dqr, sample.measurement)
+        plain.tau = law.signals.torque.copy()
+        pairs = (
+            (law.signals.torque, torque),
+            (law.state.estimate, plain.theta),
+            (law.state.disturbance, plain.d3),
+        )
+        worst = np.maximum(worst, [np.abs(mine - other).max() for mine, other in pairs])
+    assert law.state.latched[0] == 1.0
+    assert plain.latched is not None
+    return worst
+
+
+@pytest.mark.parametrize(('gains', 'arm'), CASES.values(), ids=CASES)
+def test_torque_and_estimates_are_the_written_law_s_over_a_closed_loop(gains, arm):
+    np.testing.assert_array_less(differences(quick(**SHORT | gains), plant(**arm)), ROUNDING)
+
+
+def test_recommended_gains_give_the_written_law_s_torque_up_to_the_conditioning():
+    """With rho = 1e-5 the same 1e-16 of the window's terms comes out 1e7 times as large."""
+    np.testing.assert_array_less(differences(quick(**SHORT | {'rho': 1e-5}), plant()), 1e-8)
+
+
+def test_torque_never_exceeds_its_limit_and_the_demand_is_told():
+    limit = np.array([8.0, 5.0])
+    law = controller(quick(torque_limit=limit))
+    cut = 0
+    for _ in closed_loop(law, plant(), 1.0):
+        np.testing.assert_array_equal(
+            law.signals.torque, np.clip(law.signals.demand, -limit, limit)
+        )
+        cut += np.any(law.signals.torque != law.signals.demand)
+    assert cut > 0
+
+
+def test_at_its_limit_the_torque_stops_the_learning_from_the_tracking_error():
+    """One joint at its limit freezes d^3 and, without a latched window, all parameters."""
+    law = controller(quick(torque_limit=np.array([1e-3, 20.0])))
+    estimate = law.state.estimate.copy()
+    for _ in closed_loop(law, plant(), 0.5):
+        assert abs(law.signals.demand[0]) > 1e-3
+    np.testing.assert_array_equal(law.state.estimate, estimate)
+    np.testing.assert_array_equal(law.state.disturbance, 0.0)
+
+
+def test_same_run_twice_is_the_same_bit_for_bit():
+    runs = [record(controller(quick()), plant(noise=1e-5, seed=3), 1.5) for _ in range(2)]
+    np.testing.assert_array_equal(runs[0].torque, runs[1].torque)
+
+
+def test_reset_forgets_everything():
+    law = controller(quick())
+    first = record(law, plant(), 1.5)
+    law.reset()
+    again = record(law, plant(), 1.5)
+    np.testing.assert_array_equal(first.torque, again.torque)

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The two-link regressors are those of one arm: identities on random states, and against physics.
+
+Derivatives are taken by a five-point stencil of step 1e-3, whose truncation h^4 / 30 and rounding
+1e-16 / h both stay below 1e-12 for functions of size one; hence 1e-9 where terms reach 1e2.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from closed_loop_case import ARM, CONSTANTS, MODEL, P, plant
+
+import sim_plant.arm as physics
+from blf_dsc_controller.core import models, two_link
+
+STATES = range(20)
+CLOSE = {'rtol': 0.0, 'atol': 1e-9}
+
+
+def derivative(function, h=1e-3):
+    """d/ds of function(s) at s = 0."""
+    return (8.0 * (function(h) - function(-h)) - (function(2.0 * h) - function(-2.0 * h))) / (
+        12.0 * h
+    )
+
+
+def filled(kernel, shape, *arguments):
+    out = np.full(shape, np.nan)
+    kernel(*arguments, out)
+    return out
+
+
+def inertia(P, q):
+    return filled(two_link.inertia, (2, 2), P, q)
+
+
+def coriolis(P, q, dq):
+    return filled(two_link.coriolis, (2, 2), P, q, dq)
+
+
+def gravity(P, q):
+    return filled(two_link.gravity, 2, CONSTANTS, P, q)
+
+
+def momentum_regressor(q, dq):
+    Yp, Yr = np.full((2, 2, 3), np.nan)
+    models.momentum_regressor(MODEL.code, CONSTANTS, q, dq, Yp, Yr)
+    return Yp, Yr
+
+
+@pytest.fixture(params=STATES)
+def random(request):
+    return np.random.default_rng(request.param)
+
+
+@pytest.fixture
+def state(random):
+    """P, q [rad], dq [rad/s]: parameters of no arm in particular, to leave no term out."""
+    return random.normal(size=3), random.uniform(-np.pi, np.pi, 2), random.uniform(-3.0, 3.0, 2)
+
+
+def test_regressor_times_parameters_is_the_dynamics(state, random):
+    P, q, dq = state
+    v, a = random.uniform(-5.0, 5.0, (2, 2))
+    H = filled(models.regressor, (2, 3), MODEL.code, CONSTANTS, q, dq, v, a)
+
+    np.testing.assert_allclose(
+        H @ P, inertia(P, q) @ a + coriolis(P, q, dq) @ v + gravity(P, q), rtol=0.0, atol=1e-12
+    )
+
+
+def test_momentum_regressor_times_parameters_is_the_momentum_and_the_rest(state):
+    P, q, dq = state
+    Yp, Yr = momentum_regressor(q, dq)
+
+    np.testing.assert_allclose(Yp @ P, inertia(P, q) @ dq, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        Yr @ P, gravity(P, q) - coriolis(P, q, dq).T @ dq, rtol=0.0, atol=1e-12
+    )
+
+
+def test_both_regressors_describe_the_same_motion(state, random):
+    _, q, dq = state
+    ddq = random.uniform(-5.0, 5.0, 2)
+    H = filled(models.regressor, (2, 3), MODEL.code, CONSTANTS, q, dq, dq, ddq)
+    _, Yr = momentum_regressor(q, dq)
+
+    rate = derivative(lambda s: momentum_regressor(q + s * dq + 0.5 * s * s * ddq, dq + s * ddq)[0])
+
+    np.testing.assert_allclose(rate + Yr, H, **CLOSE)
+
+
+def test_inertia_rate_minus_twice_coriolis_is_skew(state):
+    P, q, dq = state
+
+    S = derivative(lambda s: inertia(P, q + s * dq)) - 2.0 * coriolis(P, q, dq)
+
+    np.testing.assert_allclose(S, -S.T, **CLOSE)
+
+
+def test_gravity_is_the_gradient_of_the_potential(state):
+    P, q, _ = state
+
+    gradient = [
+        derivative(lambda s, axis=axis: two_link.potential(CONSTANTS, P, q + s * axis))
+        for axis in np.eye(2)
+    ]
+
+    np.testing.assert_allclose(gradient, gravity(P, q), **CLOSE)
+
+
+def test_parameters_are_those_of_the_simulated_arm(state):
+    _, q, dq = state
+
+    np.testing.assert_allclose(filled(physics.parameters, 3, ARM), P, rtol=1e-15)
+    np.testing.assert_allclose(inertia(P, q), filled(physics.mass_matrix, (2, 2), ARM, q), **CLOSE)
+    np.testing.assert_allclose(
+        coriolis(P, q, dq), filled(physics.coriolis, (2, 2), ARM, q, dq), **CLOSE
+    )
+    np.testing.assert_allclose(gravity(P, q), filled(physics.gravity, 2, ARM, q), **CLOSE)
+    assert two_link.potential(CONSTANTS, P, q) == pytest.approx(
+        physics.potential_energy(ARM, q), abs=1e-12
+    )
+
+
+def test_momentum_balance_holds_along_a_simulated_motion():
+    """d/dt(Yp P) + Yr P = tau - tau_dist: the torque is held, so that the motion is smooth."""
+    arm = plant(viscous=0.3)
+    tau = np.array([-2.0, 1.0])
+    motion = []
+    for _ in range(300):
+        truth = arm.truth()
+        motion.append((truth[3:5].copy(), *momentum_regressor(truth[5:7], truth[7:9])))
+        arm.step(tau)
+    tau_dist, Yp, Yr = map(np.array, zip(*motion, strict=True))
+    momentum = Yp @ P
+
+    rate = (8.0 * (momentum[3:-1] - momentum[1:-3]) - (momentum[4:] - momentum[:-4])) / 12e-3
+
+    np.testing.assert_allclose(rate + (Yr @ P)[2:-2], tau - tau_dist[2:-2], **CLOSE)
+
+
+def test_model_names_its_parameters():
+    assert MODEL.parameter_names == ('(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2')
+    assert (MODEL.n, MODEL.p) == (2, 3)
+    assert models.two_link_arm(0.5, 9.8).constants == (19.6,)

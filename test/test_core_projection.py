@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The projection keeps P^ in its ball, and keeps the Lyapunov function (29) falling."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as examples
+from hypothesis import strategies as st
+
+from blf_dsc_controller.core import projection
+
+RADIUS = 3.0
+GAIN = np.array([0.05, 1.0, 20.0])
+
+
+def projected(estimate, rate, gain=GAIN):
+    rate = rate.copy()
+    projection.project(estimate, rate, gain, RADIUS)
+    return rate
+
+
+def on_sphere(random, size=3):
+    w = random.normal(size=size)
+    return w * RADIUS / np.linalg.norm(w) * (1.0 + 1e-15)
+
+
+@examples(deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(1, 9),
+    st.sampled_from([1e-3, 1.0, 1e6]),
+    st.floats(0.1, 100.0),
+)
+def test_no_step_leaves_the_ball(seed, size, speed, radius):
+    random = np.random.default_rng(seed)
+    gain = 10.0 ** random.uniform(-3.0, 3.0, size)
+    estimate = random.normal(size=size) * radius
+    projection.rescale(estimate, size, radius)
+    for _ in range(20):
+        rate = random.normal(size=size) * speed
+        projection.project(estimate, rate, gain, radius)
+        estimate += 1e-2 * rate
+        projection.rescale(estimate, size, radius)
+        assert np.linalg.norm(estimate) <= radius * (1.0 + 1e-15)
+
+
+def test_inside_the_ball_nothing_is_changed():
+    estimate, rate = np.array([1.0, -2.0, 1.9]), np.array([1e3, -5.0, 7.0])
+    np.testing.assert_array_equal(projected(estimate, rate), rate)
+    before = estimate.copy()
+    projection.rescale(estimate, 3, RADIUS)
+    np.testing.assert_array_equal(estimate, before)
+
+
+def test_at_the_ball_what_leads_inward_or_along_is_kept():
+    estimate = np.array([RADIUS, 0.0, 0.0])
+    for rate in (np.array([-1.0, 4.0, 2.0]), np.array([0.0, 4.0, 2.0])):
+        np.testing.assert_array_equal(projected(estimate, rate), rate)
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_at_the_ball_nothing_outward_is_left(seed):
+    random = np.random.default_rng(seed)
+    w = on_sphere(random)
+    v = random.normal(size=3)
+    v *= np.sign(w @ v)
+
+    rate = projected(w, v)
+
+    metric = w @ (GAIN * w)
+    np.testing.assert_allclose(rate, v - GAIN * w * (w @ v) / metric, atol=1e-13)
+    assert w @ rate == pytest.approx(0.0, abs=1e-13)
+
+
+def test_a_rescaled_estimate_counts_as_on_the_sphere():
+    """It is there up to a rounding, either way: or half the steps would go unprojected."""
+    for seed in range(100):
+        random = np.random.default_rng(seed)
+        w, v = random.normal(size=(2, 3))
+        w *= 2.0 * RADIUS / np.linalg.norm(w)
+        v *= np.sign(w @ v)
+
+        projection.rescale(w, 3, RADIUS)
+
+        assert w @ projected(w, v) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize('seed', range(200))
+def test_projection_never_slows_the_fall_of_the_lyapunov_function(seed):
+    """d/dt (1/2 P~^T Gamma^-1 P~) = -P~^T Gamma^-1 P^', for any true P inside the ball."""
+    random = np.random.default_rng(seed)
+    w, v = on_sphere(random), random.normal(size=3)
+    true = on_sphere(random) * random.uniform()
+    slope = [-(true - w) @ (rate / GAIN) for rate in (projected(w, v), v)]
+
+    assert slope[0] <= slope[1] + 1e-12
+
+
+def test_rescale_touches_the_parameters_alone():
+    estimate = np.array([3.0, 4.0, 100.0, -100.0])
+    projection.rescale(estimate, 2, 2.5)
+    np.testing.assert_allclose(estimate, [1.5, 2.0, 100.0, -100.0], rtol=1e-15)

@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""State, signals and settings as flat vectors: exact layouts, save and restore, no allocation."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+from arbitrary_case import arbitrary_settings
+from closed_loop_case import (
+    JOINTS,
+    START,
+    closed_loop,
+    controller,
+    plant,
+    quick,
+    recommended,
+    record,
+)
+from numba.core.runtime import _nrt_python, rtsys
+
+from blf_dsc_controller.core import law as kernels
+from blf_dsc_controller.core.sample import sample_of, sample_size
+from blf_dsc_controller.core.settings import Settings, pack, settings_of
+from blf_dsc_controller.core.state import (
+    Signals,
+    State,
+    signals_of,
+    signals_size,
+    state_of,
+    state_size,
+)
+from blf_dsc_controller.errors import BlfDscError, OutsideBarrierError
+
+SHAPES = [(1, 1), (2, 3), (3, 4), (6, 30)]
+INTEGERS = ('n', 'p', 'm', 'model', 'law', 'update', 'torque_source', 'window', 'interval')
+
+
+def distinct_settings(n, p):
+    """Settings in which no two numbers are the same, but n, p and m are what they must be."""
+    settings = arbitrary_settings(np.random.default_rng(0), n, p, constants=np.zeros(2))
+    number = iter(range(1000, 10_000))
+    values = {}
+    for name, value in settings._asdict().items():
+        if name in ('n', 'p', 'm'):
+            continue
+        if isinstance(value, np.ndarray):
+            values[name] = np.array([float(next(number)) for _ in value])
+        else:
+            values[name] = next(number) + (0 if name in INTEGERS else 0.5)
+    return settings._replace(**values)
+
+
+@pytest.mark.parametrize(('n', 'p'), SHAPES)
+def test_settings_come_out_of_their_vector_as_they_went_in(n, p):
+    settings = distinct_settings(n, p)
+
+    unpacked = settings_of(pack(settings))
+
+    for name in Settings._fields:
+        np.testing.assert_array_equal(
+            getattr(unpacked, name), getattr(settings, name), err_msg=name
+        )
+        if name in INTEGERS:
+            assert isinstance(getattr(unpacked, name), int), name
+
+
+@pytest.mark.parametrize(('n', 'p'), SHAPES)
+def test_views_cover_their_vectors_exactly_once(n, p):
+    settings = arbitrary_settings(np.random.default_rng(0), n, p)
+    sizes = state_size(settings), signals_size(settings), sample_size(n, settings.m)
+    state, signals, sample = (np.arange(float(size)) for size in sizes)
+
+    for places, size in zip(
+        (
+            state_of(state, settings),
+            signals_of(signals, settings),
+            sample_of(sample, n, settings.m),
+        ),
+        sizes,
+        strict=True,
+    ):
+        np.testing.assert_array_equal(
+            np.sort(np.concatenate([part.ravel() for part in places])), np.arange(size)
+        )
+
+
+def test_views_have_the_shapes_they_are_documented_with():
+    n, p, m, N = 3, 4, 7, 8
+    settings = arbitrary_settings(np.random.default_rng(0), n, p)
+    state = state_of(np.zeros(state_size(settings)), settings)
+    signals = signals_of(np.zeros(signals_size(settings)), settings)
+
+    assert {name: part.shape for name, part in zip(State._fields, state, strict=True)} == {
+        **dict.fromkeys(('samples', 'cursor', 'rows', 'latched', 'latch_time'), (1,)),
+        'lambda_min': (1,),
+        **dict.fromkeys(('alpha2', 'torque', 'disturbance'), (n,)),
+        **dict.fromkeys(('estimate', 'b', 'weakest'), (m,)),
+        'momentum': (n, p),
+        'rest': (n, m),
+        **dict.fromkeys(('filter1', 'filter2'), (n, m + 1)),
+        **dict.fromkeys(('running', 'fresh'), (m, m + 1)),
+        **dict.fromkeys(('Phi', 'factor'), (m, m)),
+        'ring': (N, n, m + 1),
+    }
+    assert {name: part.shape for name, part in zip(Signals._fields, signals, strict=True)} == {
+        **dict.fromkeys(('qr', 'dqr', 'ddqr', 'xi1', 'beta2', 'dalpha2', 'xi2'), (n,)),
+        **dict.fromkeys(('demand', 'torque'), (n,)),
+        **dict.fromkeys(('H', 'momentum'), (n, p)),
+        'rest': (n, m),
+        'row': (n, m + 1),
+        **dict.fromkeys(('Phi', 'factor'), (m, m)),
+        **dict.fromkeys(('b', 'rate', 'look'), (m,)),
+    }
+
+
+def test_sample_tells_what_the_update_computed():
+    law = controller(quick(sigma=-1.0))
+    record(law, plant(), 1.3)
+    assert law.state.latched[0] == 1.0
+    for part, name in (
+        *((law.signals, name) for name in ('qr', 'dqr', 'xi1', 'xi2', 'torque')),
+        *((law.state, name) for name in ('disturbance', 'estimate', 'lambda_min', 'latched')),
+    ):
+        np.testing.assert_array_equal(getattr(law.sample, name), getattr(part, name), err_msg=name)
+        assert np.all(getattr(law.sample, name) != 0.0), name
+
+
+def test_a_restored_loop_continues_bit_for_bit():
+    """From any sample, also in another controller; the state vector is all there is."""
+    law, arm = controller(quick()), plant(noise=1e-5, differenced=True, delay=2)
+    record(law, arm, 1.337)
+    saved, saved_arm = law.save(), arm.save()
+
+    def rest_of(law):
+        arm.restore(saved_arm)
+        torques = []
+        for k in range(1337, 2000):
+            torques.append(law.update(k * 1e-3, 1e-3, arm.measure()).copy())
+            arm.step(torques[-1])
+        return np.array(torques)
+
+    first = rest_of(law)
+    law.restore(saved)
+    other = controller(quick())
+    other.restore(saved)
+
+    np.testing.assert_array_equal(rest_of(law), first)
+    np.testing.assert_array_equal(rest_of(other), first)
+    assert np.any(saved != law.state_vector)
+
+
+@pytest.mark.parametrize('error', [0.002, -0.0021, 1.5, np.nan])
+@pytest.mark.parametrize('joint', [0, 1])
+def test_a_start_outside_the_barrier_is_refused_by_name(joint, error):
+    law = controller(recommended())
+    q = np.array([1.9935, 1.3961]) + 0.3  # the reference at t = 0
+    law.check_start(JOINTS, q)
+    q[joint] += error * (1.0 + 1e-9)
+
+    with pytest.raises(OutsideBarrierError) as refusal:
+        law.check_start(JOINTS, q)
+
+    assert isinstance(refusal.value, BlfDscError)
+    assert (refusal.value.joint, refusal.value.bound) == (JOINTS[joint], 0.002)
+    assert refusal.value.error == pytest.approx(error, rel=1e-6, nan_ok=True)
+    for part in (JOINTS[joint], f'{error:+.6g} rad', '0.002 rad'):
+        assert part in str(refusal.value)
+
+
+def test_a_start_is_judged_by_the_reference_of_its_time():
+    law = controller(recommended())
+    law.check_start(JOINTS, np.array(START))
+    with pytest.raises(OutsideBarrierError):
+        law.check_start(JOINTS, np.array(START), t=0.2)
+
+
+@numba.njit
+def many_updates(settings, state, signals, measurement, count):
+    for k in range(count):
+        kernels.update(settings, state, signals, k * 1e-3, 1e-3, measurement)
+
+
+def test_updates_in_a_compiled_loop_allocate_nothing():
+    """Handing over the vectors costs a few, the same however many updates there are."""
+    settings = pack(quick(window=50, learning_start=0.01, sigma=-1.0))
+    law = controller(settings_of(settings))
+    measurement = np.array([*START, *np.zeros(4)])
+    arguments = (settings, law.state_vector, law.signals_vector, measurement)
+    many_updates(*arguments, 1)
+    allocations = []
+    _nrt_python.memsys_enable_stats()
+    try:
+        for count in (100, 5000):
+            before = rtsys.get_allocation_stats()
+            many_updates(*arguments, count)
+            after = rtsys.get_allocation_stats()
+            allocations.append((after.alloc - before.alloc, after.mi_alloc - before.mi_alloc))
+    finally:
+        _nrt_python.memsys_disable_stats()
+
+    assert law.state.latched[0] == 1.0
+    assert allocations[0] == allocations[1]
+
+
+INTERPRETED = """
+from closed_loop_case import controller, plant, quick, record
+settings = quick(window=100, learning_start=0.2, sigma=-1.0)
+print(*record(controller(settings), plant(), 0.4).torque[-1])
+"""
+
+
+def test_interpreted_kernels_compute_the_same():
+    """Without numba's compiler the last bits differ (its libm, its order), and no more."""
+    here = Path(__file__).parent
+    environment = os.environ | {
+        'NUMBA_DISABLE_JIT': '1',
+        'PYTHONPATH': os.pathsep.join([str(here), str(here.parent)]),
+    }
+    run = subprocess.run(
+        [sys.executable, '-c', INTERPRETED],
+        env=environment,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    law = controller(quick(window=100, learning_start=0.2, sigma=-1.0))
+    torque = record(law, plant(), 0.4).torque[-1]
+
+    assert law.state.latched[0] == 1.0
+    np.testing.assert_allclose(np.array(run.stdout.split(), dtype=float), torque, rtol=1e-9)
+
+
+def test_the_first_answer_holds_the_virtual_control():
+    """alpha2(0) = beta2(0) is set by the first sample and not by the constructor's warm-up."""
+    law = controller(recommended())
+    next(closed_loop(law, plant(), 1.0))
+    np.testing.assert_array_equal(law.signals.dalpha2, 0.0)
+    assert law.state.samples[0] == 1.0

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sliding window is the direct sum over what it holds: always, for any shape, without drift."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as examples
+from hypothesis import strategies as st
+
+from blf_dsc_controller.core import window
+
+
+class Window:
+    """A window beside its history, and beside the running sum that never starts afresh."""
+
+    def __init__(self, n, m, length):
+        self.ring = np.zeros((length, n, m + 1))
+        self.running, self.fresh, self.naive = np.zeros((3, m, m + 1))
+        self.cursor = 0
+        self.history = []
+
+    def push(self, row):
+        oldest = self.ring[self.cursor].copy()
+        self.naive += terms(row) - terms(oldest)
+        self.cursor = window.push(self.ring, self.cursor, self.running, self.fresh, row)
+        self.history = [*self.history, row][-len(self.ring) :]
+
+    def direct(self):
+        """Sum over the rows in the window, in the order they came."""
+        return sum(map(terms, self.history))
+
+    def average(self):
+        m = len(self.running)
+        Phi, b = np.full((m, m), np.nan), np.full(m, np.nan)
+        window.average(self.running, len(self.history), Phi, b)
+        return Phi, b
+
+
+def terms(row):
+    """X^T [X | u] (m, m + 1), of which the window keeps the upper triangle and the last column."""
+    return np.triu(sum(np.outer(joint[:-1], joint) for joint in row))
+
+
+@examples(deadline=None, max_examples=40)
+@given(
+    st.integers(1, 4), st.integers(1, 7), st.integers(1, 9), st.integers(1, 40), st.integers(0, 99)
+)
+def test_window_is_the_direct_sum_filled_or_not(n, m, length, pushes, seed):
+    random = np.random.default_rng(seed)
+    sliding = Window(n, m, length)
+    for _ in range(pushes):
+        sliding.push(random.normal(size=(n, m + 1)))
+        np.testing.assert_allclose(sliding.running, sliding.direct(), atol=1e-13 * n * pushes)
+
+    assert sliding.cursor == pushes % length
+    rows = np.array(sliding.history)
+    X, u = rows[:, :, :-1], rows[:, :, -1]
+    Phi, b = sliding.average()
+    np.testing.assert_allclose(
+        Phi, np.einsum('kia,kib->ab', X, X) / len(rows), atol=1e-13 * n * pushes
+    )
+    np.testing.assert_array_equal(Phi, Phi.T)
+    np.testing.assert_allclose(b, np.einsum('kia,ki->a', X, u) / len(rows), atol=1e-13 * n * pushes)
+
+
+def test_at_every_wrap_the_sum_is_exactly_that_of_the_ring():
+    """However long it has run: the last bit is that of summing the ring, so nothing can drift."""
+    random = np.random.default_rng(3)
+    sliding = Window(2, 3, 25)
+    for push in range(1, 200 * 25 + 1):
+        sliding.push(random.normal(size=(2, 4)))
+        if push % 25 == 0:
+            np.testing.assert_array_equal(sliding.running, sliding.direct())
+            np.testing.assert_array_equal(sliding.fresh, 0.0)
+    assert not np.array_equal(sliding.naive, sliding.direct())
+
+
+def test_a_large_transient_leaves_no_trace_after_a_wrap():
+    """Terms of 1e16 round at 1; a running sum keeps that error for ever, the window one wrap."""
+    random = np.random.default_rng(4)
+    sliding = Window(2, 3, 10)
+    for push in range(60):
+        sliding.push(random.normal(size=(2, 4)) * (1e8 if push < 15 else 1.0))
+    exact = sliding.direct()
+
+    assert np.abs(sliding.naive - exact).max() > 1.0
+    np.testing.assert_array_equal(sliding.running, exact)
+
+
+@pytest.mark.parametrize('length', [1, 7])
+def test_constant_rows_average_to_themselves_from_the_first_on(length):
+    row = np.array([[1.0, 2.0, 5.0], [0.5, -1.0, 3.0]])
+    sliding = Window(2, 2, length)
+    for _ in range(3 * length):
+        sliding.push(row)
+        Phi, b = sliding.average()
+        np.testing.assert_allclose(Phi, row[:, :2].T @ row[:, :2], rtol=1e-14)
+        np.testing.assert_allclose(b, row[:, :2].T @ row[:, 2], rtol=1e-14)
