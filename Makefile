@@ -22,6 +22,7 @@ else
 FLAVOUR := wheels
 # The wheels find their own libraries and packages; another ROS or environment must not get in.
 unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH PYTHONPATH RMW_IMPLEMENTATION
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 ifneq ($(ROS_DISTRO),)
 unexport LD_LIBRARY_PATH ROS_DISTRO ROS_PYTHON_VERSION ROS_VERSION
 endif
@@ -55,9 +56,8 @@ test: $(READY) ## Run the tests (TESTS=test/test_x.py for some)
 	@$(if $(filter sourced,$(FLAVOUR)),PYTEST_DISABLE_PLUGIN_AUTOLOAD=1) $(RUN) -m pytest $(TESTS)
 
 lint: $(LINT_READY) ## Check style and types
-	@$(VENV)/bin/python -m ruff check
-	@$(VENV)/bin/python -m ruff format --check
-	@$(VENV)/bin/python -m mypy
+	@good=1; for check in 'ruff check' 'ruff format --check' mypy; do \
+	    $(VENV)/bin/python -m $$check || good=0; done; test $$good = 1
 
 clean: ## Remove what was installed and built; results in out/ stay
 	@rm -rf $(VENV) build install log *.egg-info .coverage .hypothesis .*_cache

@@ -25,9 +25,9 @@ def generate_launch_description() -> LaunchDescription:
             ),
             DeclareLaunchArgument(
                 'mode',
-                default_value='realtime',
-                choices=['realtime', 'lockstep'],
-                description='whether the plant steps on the wall clock or waits for each torque',
+                default_value='',
+                choices=['', 'realtime', 'lockstep'],
+                description='step on the wall clock, or wait for each torque; empty: as configured',
             ),
             DeclareLaunchArgument(
                 'namespace',
@@ -52,18 +52,15 @@ def nodes(context: LaunchContext) -> list[Node]:
         for name in ('config', 'mode', 'namespace', 'bag')
     )
     common = {'package': PACKAGE, 'namespace': namespace, 'output': 'screen'}
-    file = str(locate(config))
-    # A bag is to have the first sample too: nobody starts before the recorder listens.
-    observers = {'wait_for_subscribers': 1 if bag else 0}
+    parameters = [str(locate(config))]
+    if bag:  # The first sample is to be in it too: nobody starts before the recorder listens.
+        parameters.append({'wait_for_subscribers': 1})
+    of_plant = [*parameters, {'mode': mode}] if mode else parameters
     loop = [
-        Node(
-            executable='sim_plant',
-            parameters=[file, observers, {'mode': mode}],
-            on_exit=Shutdown(),
-            **common,
-        ),
-        Node(executable='blf_dsc_controller', parameters=[file, observers], **common),
+        Node(executable='sim_plant', parameters=of_plant, on_exit=Shutdown(), **common),
+        Node(executable='blf_dsc_controller', parameters=parameters, **common),
     ]
     if bag:
-        loop.append(Node(executable='bag_recorder', parameters=[file, {'output': bag}], **common))
+        of_recorder = [parameters[0], {'output': bag}]
+        loop.append(Node(executable='bag_recorder', parameters=of_recorder, **common))
     return loop
