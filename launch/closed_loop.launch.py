@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start the simulated arm, the controller and, if a bag is asked for, the recorder.
 
-For instance: ros2 launch blf_dsc_controller closed_loop.launch.py mode:=lockstep bag:=/tmp/run1
+For instance: ros2 launch blf_dsc_controller closed_loop.launch.py mode:=lockstep bag:=run1
 """
 
 from launch import LaunchContext, LaunchDescription
