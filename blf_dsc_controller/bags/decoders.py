@@ -47,6 +47,7 @@ class JointStateDecoder:
         position: (n,) of the last message.
         velocity: (n,) of the last message.
         effort: (n,) of the last message.
+        values: (3 n,) all of these in turn.
     """
 
     def __init__(
@@ -54,8 +55,8 @@ class JointStateDecoder:
     ) -> None:
         self._joints = tuple(joints)
         self._required = frozenset(required)
-        self._values = np.full(3 * len(self._joints), np.nan)
-        fields = self._values.reshape(3, -1)
+        self.values = np.full(3 * len(self._joints), np.nan)
+        fields = self.values.reshape(3, -1)
         self.position: NDArray[np.float64] = fields[0]
         self.velocity: NDArray[np.float64] = fields[1]
         self.effort: NDArray[np.float64] = fields[2]
@@ -80,7 +81,7 @@ class JointStateDecoder:
         ):
             self._learn(raw)
         self._buffer[12:] = raw
-        np.take(self._grid, self._index, out=self._values, mode='clip')
+        np.take(self._grid, self._index, out=self.values, mode='clip')
         seconds, nanoseconds = self._stamp.unpack_from(raw, STAMP_OFFSET)
         return int(seconds * NANOSECONDS + nanoseconds)
 

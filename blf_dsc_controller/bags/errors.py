@@ -113,3 +113,24 @@ class MissingTopicError(BlfDscError):
             f'the bag has no topic whose name ends in {wanted!r} of type {type_name}; '
             f'it holds:{listing}'
         )
+
+
+class AmbiguousTopicError(BlfDscError):
+    """Several topics of a bag could be the one that is wanted."""
+
+    def __init__(self, wanted: str, candidates: Iterable[str]) -> None:
+        self.wanted = wanted
+        self.candidates = tuple(candidates)
+        super().__init__(
+            f'the bag has {len(self.candidates)} topics that could be {wanted!r}: '
+            f'{", ".join(self.candidates)}; name the namespace of the one robot to look at'
+        )
+
+
+class UnreadableMessageError(BlfDscError):
+    """A message of a bag that cannot be decoded."""
+
+    def __init__(self, topic: str, index: int, error: MessageError) -> None:
+        self.topic = topic
+        self.index = index
+        super().__init__(f'message {index + 1} of {topic} cannot be read: {error}')

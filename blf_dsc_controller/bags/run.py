@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One run of the closed loop as arrays over the samples of its joint states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Series:
+    """Values by name over stamps of their own."""
+
+    names: tuple[str, ...]
+    stamp: Stamps  # (m,) ns, increasing
+    values: Floats  # (m, number of names)
+
+    def select(self, names: Sequence[str]) -> Floats:
+        """Columns of these names, (m, number of `names`)."""
+        return self.values[:, [self.names.index(name) for name in names]]
+
+    def column(self, name: str) -> Floats:
+        """Values of one name, (m,)."""
+        return self.values[:, self.names.index(name)]
+
+    def held(self, stamp: Stamps) -> Floats:
+        """Last values up to each of the given stamps; the first ones before they begin."""
+        index = np.searchsorted(self.stamp, stamp, side='right') - 1
+        return self.values[np.maximum(index, 0)]
+
+    def exact(self, stamp: Stamps) -> Floats:
+        """Values at exactly these stamps, NaN where there are none."""
+        index = np.minimum(np.searchsorted(self.stamp, stamp), self.stamp.size - 1)
+        values = self.values[index]
+        values[self.stamp[index] != stamp] = np.nan
+        return values
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a bag tells of N samples of n joints; None or NaN is what it does not tell."""
+
+    joints: tuple[str, ...]
+    stamp: Stamps  # (N,) ns, of the joint states
+    received: Stamps  # (N,) ns, when the recorder got them
+    position: Floats  # (N, n) rad, q as measured
+    velocity: Floats  # (N, n) rad/s, as measured
+    torque: Floats  # (N, n) N m, applied from this sample to the next
+    reference: Floats | None  # (N, n) rad, qr
+    error: Floats | None  # (N, n) rad, xi1 = q - qr
+    bound: Floats | None  # (N, n) rad, kc
+    torque_limit: Floats | None  # (N, n) N m
+    learning: Series | None
+    truth: Series | None
+    timing: Series | None
+    message_counts: Mapping[str, int]
+
+    @property
+    def time(self) -> Floats:
+        """Time since the first sample (N,) [s]."""
+        return self.time_of(self.stamp)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample to the last [s]."""
+        return float(self.time[-1])
+
+    def time_of(self, stamp: Stamps) -> Floats:
+        """Time since the first sample of any stamps [s]."""
+        return np.asarray((stamp - self.stamp[0]) * 1e-9, dtype=np.float64)
