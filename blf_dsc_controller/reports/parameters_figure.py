@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The picture of the learning, after the paper's Fig. 3: estimates beside the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.ticker import PercentFormatter
+
+from blf_dsc_controller.bags.names import DISTURBANCE, LAMBDA_MIN
+from blf_dsc_controller.bags.run import Run, Series
+from blf_dsc_controller.reports.envelope import envelope
+from blf_dsc_controller.reports.estimation import Estimation, latch_time
+from blf_dsc_controller.reports.style import (
+    BLUE,
+    COLOURS,
+    GREEN,
+    INK,
+    MUTED,
+    Picture,
+    formula,
+    head,
+)
+
+_COLUMNS = 2
+_PANEL = (6.2, 3.2)  # inches
+_GOAL = 0.01  # relative error
+
+
+def draw_parameters(run: Run, path: Path) -> bool:
+    """Draw what the run tells of the learning; False, and no picture, if there was none."""
+    estimation = Estimation.of(run)
+    if estimation is None or not estimation.names:
+        return False
+    panels = list(_panels(run, estimation))
+    rows = -(-len(panels) // _COLUMNS)
+    picture = Picture(rows, min(len(panels), _COLUMNS), _title(estimation), _PANEL)
+    latched = latch_time(run)
+    for axes, panel in zip(picture.axes.flat, panels, strict=False):
+        panel(axes)
+        if latched is not None:
+            axes.axvline(latched, color=INK, lw=1.1, ls=(0, (1, 2)), zorder=1)
+    for axes in picture.axes.flat[len(panels) :]:
+        axes.set_visible(False)
+    picture.save(path)
+    return True
+
+
+def _title(estimation: Estimation) -> str:
+    error = estimation.relative_error
+    if error is None:
+        return 'Learning'
+    return f'Learning: relative parameter error {_percent(error[-1])} at the end'
+
+
+def _panels(run: Run, estimation: Estimation) -> Iterator[Callable[[Axes], None]]:
+    assert run.learning is not None  # noqa: S101 - there is an estimation
+    yield partial(_estimates, estimation)
+    if estimation.relative_error is not None:
+        yield partial(_relative_error, estimation)
+    if any(name.startswith(DISTURBANCE) for name in run.learning.names):
+        yield partial(_disturbance, run, run.learning)
+    if LAMBDA_MIN in run.learning.names:
+        yield partial(_excitation, run, run.learning)
+
+
+def _estimates(estimation: Estimation, axes: Axes) -> None:
+    for j, name in enumerate(estimation.names):
+        colour = COLOURS[j % len(COLOURS)]
+        values = envelope(estimation.time, estimation.estimate[:, j])
+        axes.plot(*values, color=colour, lw=1.8, label=formula(name))
+        if estimation.true is not None:
+            true = envelope(estimation.time, estimation.true[:, j])
+            axes.plot(*true, color=colour, lw=1.4, ls='--')
+    axes.set_ylabel('parameters [kg m²]')
+    head(axes, 'estimates' if estimation.true is None else 'estimates, true values dashed')
+
+
+def _relative_error(estimation: Estimation, axes: Axes) -> None:
+    error = estimation.relative_error
+    assert error is not None  # noqa: S101 - the panel is drawn only then
+    axes.semilogy(*envelope(estimation.time, error), color=BLUE)
+    axes.axhline(_GOAL, color=MUTED, lw=1.2, ls='--')
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=' %'))
+    axes.set_ylabel(r'$\|\hat P - P\| \;/\; \|P\|$')
+    head(axes, f'relative parameter error, {_percent(_GOAL)} dashed')
+
+
+def _disturbance(run: Run, learning: Series, axes: Axes) -> None:
+    truth = run.truth
+    names = [name for name in learning.names if name.startswith(DISTURBANCE)]
+    known = [] if truth is None else [name for name in names if name in truth.names]
+    for j, name in enumerate(names):
+        colour = COLOURS[j % len(COLOURS)]
+        values = envelope(run.time_of(learning.stamp), learning.column(name))
+        axes.plot(*values, color=colour, lw=1.1, label=name.removeprefix(DISTURBANCE))
+    for name in known:
+        assert truth is not None  # noqa: S101
+        true = envelope(run.time_of(truth.stamp), truth.column(name))
+        colour = COLOURS[names.index(name) % len(COLOURS)]
+        axes.plot(*true, color=INK, lw=2.6)
+        axes.plot(*true, color=colour, lw=1.6, ls='--')
+    axes.set_ylabel('disturbance [N m]')
+    head(axes, 'disturbance estimates' + (', true values dashed' if known else ''))
+
+
+def _excitation(run: Run, learning: Series, axes: Axes) -> None:
+    values = envelope(run.time_of(learning.stamp), learning.column(LAMBDA_MIN))
+    axes.plot(*values, color=GREEN)
+    axes.set_ylabel(r'$\lambda_{\min}(\Phi)$')
+    latched = latch_time(run)
+    began = 'learning never began' if latched is None else f'learning began at {latched:.4g} s'
+    head(axes, f'excitation; {began}')
+
+
+def _percent(value: float) -> str:
+    return f'{100 * value:.2g} %'

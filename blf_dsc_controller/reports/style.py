@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the pictures look: colours that the colour-blind can tell apart, legends beside the data."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+BLUE = '#0072B2'
+ORANGE = '#D55E00'
+GREEN = '#009E73'
+COLOURS = (BLUE, ORANGE, GREEN, '#CC79A7', '#E69F00', '#56B4E9', '#7F3C8D', '#000000')
+INK = '#22272E'
+MUTED = '#6B7280'
+SHADE = '#DCE9F5'
+ALARM = '#B3001B'
+
+_DPI = 130
+_SETTINGS: Any = {
+    'font.family': 'DejaVu Sans',
+    'font.size': 11,
+    'mathtext.fontset': 'dejavusans',
+    'axes.edgecolor': MUTED,
+    'axes.labelcolor': INK,
+    'axes.titlecolor': INK,
+    'text.color': INK,
+    'xtick.color': MUTED,
+    'ytick.color': MUTED,
+    'xtick.labelcolor': INK,
+    'ytick.labelcolor': INK,
+    'lines.linewidth': 1.4,
+    'lines.solid_joinstyle': 'round',
+    'path.simplify': False,
+}
+
+
+class Picture:
+    """A figure of panels, made with these settings and without pyplot's global state."""
+
+    def __init__(self, rows: int, columns: int, title: str, panel: tuple[float, float]) -> None:
+        with rc_context(_SETTINGS):
+            width, height = panel
+            self._figure = Figure(
+                figsize=(width * columns, height * rows + 0.5),
+                layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08, hspace=0.04),
+            )
+            FigureCanvasAgg(self._figure)
+            self._figure.suptitle(title, x=0.01, ha='left', fontsize=14, fontweight='bold')
+            self.axes = self._figure.subplots(rows, columns, sharex=True, squeeze=False)
+            for axes in self.axes.flat:
+                _dress(axes)
+
+    def save(self, path: Path) -> None:
+        """Write the picture as PNG."""
+        with rc_context(_SETTINGS):
+            for axes in self.axes[-1]:
+                axes.set_xlabel('time [s]')
+            self._figure.savefig(path, dpi=_DPI, facecolor='white')
+
+
+def head(axes: Axes, title: str) -> None:
+    """Put the title left above a panel and its legend right of it, off the data."""
+    axes.set_title(title, loc='left', fontsize=11.5)
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(
+            loc='lower right',
+            bbox_to_anchor=(1.0, 1.0),
+            ncols=4,
+            frameon=False,
+            fontsize=10,
+            borderaxespad=0.15,
+            handlelength=1.6,
+            columnspacing=1.2,
+        )
+
+
+def formula(name: str) -> str:
+    """Name of a parameter in mathematical type if it is a formula such as `m2*l1*l2`."""
+    if not re.fullmatch(r'(?:[A-Za-z]\d*|[()+*^-]|\d)+', name) or not re.search(r'\d', name):
+        return name
+    indexed = re.sub(r'([A-Za-z])(\d+)', r'\1_{\2}', name)
+    return f'${indexed.replace("*", chr(92) + ",")}$'
+
+
+def _dress(axes: Axes) -> None:
+    axes.spines[['top', 'right']].set_visible(False)
+    axes.grid(visible=True, color='#E5E7EB', linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.margins(x=0.01)
