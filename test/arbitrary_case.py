@@ -6,8 +6,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from closed_loop_case import recommended
 
-from blf_dsc_controller.core.settings import NEWTON, Settings
+from blf_dsc_controller.core.settings import Settings
 from blf_dsc_controller.core.state import (
     Signals,
     State,
@@ -28,37 +29,24 @@ class Case(NamedTuple):
 
 def arbitrary_settings(random: np.random.Generator, n: int, p: int, **changes) -> Settings:
     """Positive gains for n joints, p parameters and a bias column for each joint."""
-    joint = dict(
-        zip(
-            ('bound', 'weight', 'slope_limit', 'knee', 'K', 'mu', 'Kp', 'd2', 'gamma'),
-            random.uniform(0.5, 2.0, (9, n)),
-            strict=True,
-        )
-    )
-    settings = Settings(
+    joint = ('bound', 'weight', 'slope_limit', 'knee', 'K', 'mu', 'Kp', 'd2', 'gamma')
+    settings = recommended()._replace(
         n=n,
         p=p,
         m=p + n,
         model=-1,
-        law=0,
-        update=NEWTON,
-        torque_source=0,
         window=8,
         interval=1,
-        time_constant=0.002,
-        boundary_layer=0.01,
         eta=0.3,
         kappa=5.0,
-        rho=1e-5,
         sigma=1e-9,
         learning_start=0.0,
-        pole=10.0,
         radius=1e3,
         torque_limit=np.full(n, 1e3),
         Gamma=random.uniform(0.5, 2.0, p + n),
         initial_estimate=random.normal(size=p + n),
         constants=np.zeros(0),
-        **joint,
+        **dict(zip(joint, random.uniform(0.5, 2.0, (len(joint), n)), strict=True)),
     )
     return settings._replace(**changes)
 

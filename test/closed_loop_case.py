@@ -4,15 +4,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
-from math import pi
 from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.assembly import settings_of_config
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.core import barrier, models, reference
 from blf_dsc_controller.core.controller import Controller
-from blf_dsc_controller.core.settings import NEWTON, Settings, pack
+from blf_dsc_controller.core.settings import Settings, pack
 from sim_plant.actuator import Actuator
 from sim_plant.arm import Arm
 from sim_plant.disturbance import disturbance_vector
@@ -33,41 +35,10 @@ QUIET = (0.0, 0.0)
 
 
 def recommended(*, bias: bool = True, **changes) -> Settings:
-    """Recommended settings of the two-link arm, with changes; the knee follows the barrier's."""
-    columns = 2 if bias else 0
-    settings = Settings(
-        n=2,
-        p=3,
-        m=3 + columns,
-        model=MODEL.code,
-        law=0,
-        update=NEWTON,
-        torque_source=0,
-        window=round(2.0 * pi / T),
-        interval=10,
-        time_constant=0.002,
-        boundary_layer=0.01,
-        eta=0.0,
-        kappa=100.0,
-        rho=1e-5,
-        sigma=0.003,
-        learning_start=2.0 * pi + 0.5,
-        pole=10.0,
-        radius=3.0,
-        bound=np.full(2, 0.002),
-        weight=np.full(2, 1000.0),
-        slope_limit=np.full(2, 2e4),
-        knee=np.zeros(2),
-        K=np.full(2, 150.0),
-        mu=np.full(2, 20.0),
-        Kp=np.array([60.0, 20.0]),
-        d2=np.zeros(2),
-        gamma=np.full(2, 100.0),
-        torque_limit=np.full(2, 20.0),
-        Gamma=np.array([0.5] * 3 + [1.0] * columns),
-        initial_estimate=np.concatenate([P / 2.0, np.zeros(columns)]),
-        constants=CONSTANTS,
-    )._replace(**changes)
+    """Settings of the default configuration, with changes; the knee follows the barrier's."""
+    config = ControllerConfig()
+    config = replace(config, learning=replace(config.learning, bias=bias))
+    settings = settings_of_config(config)._replace(**changes)
     barriers = zip(settings.bound, settings.weight, settings.slope_limit, strict=True)
     return settings._replace(knee=np.array([barrier.knee(*each) for each in barriers]))
 

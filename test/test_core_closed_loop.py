@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the recommended configuration promises of Section IV's case over a minute, without ROS."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from closed_loop_case import (
+    P,
+    closed_loop,
+    controller,
+    plant,
+    recommended,
+    recommended_minute,
+    record,
+)
+
+from blf_dsc_controller.core import barrier, two_link
+
+BOUND = 2e-3  # rad
+DISTURBANCE = 0.1  # N m, the constant part of the case's
+
+
+def test_tracking_stays_within_half_the_bound():
+    assert np.abs(recommended_minute().xi1).max(axis=0) == pytest.approx(0.0, abs=0.5 * BOUND)
+
+
+def test_parameters_are_within_one_percent_from_15_s_on_and_half_a_percent_at_the_end():
+    run = recommended_minute()
+    assert run.parameter_error[0] == pytest.approx(0.5, abs=0.01)  # P^(0) = P / 2
+    assert run.parameter_error[run.t >= 15.0].max() < 0.01
+    assert run.parameter_error[-1] < 0.005
+
+
+def test_bias_columns_find_the_constant_disturbance():
+    """Of 0.1 + 0.1 sin t the window of one period leaves the constant."""
+    np.testing.assert_allclose(recommended_minute().estimate[-1, 3:], DISTURBANCE, atol=0.01)
+
+
+def test_torque_is_never_cut():
+    assert np.abs(recommended_minute().torque).max() < recommended().torque_limit.min()
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+def test_noise_differenced_velocity_and_delay_are_tolerated(seed):
+    """Encoders of 1e-5 rad, velocities by difference, torque a sample late: all at once."""
+    arm = plant(noise=1e-5, differenced=True, delay=1, seed=seed)
+    run = record(controller(recommended()), arm, 60.0)
+
+    assert np.abs(run.xi1).max() < BOUND
+    assert run.parameter_error[-1] < 0.01
+
+
+def test_arm_driven_past_its_bound_comes_back():
+    """Beyond the bound, where the paper's law is not defined, the straight line takes over."""
+    law = controller(recommended())
+    arm = plant(start=(2.2935 + 0.004, 1.6961 - 0.004))
+    run = record(law, arm, 1.0)
+
+    assert np.abs(run.xi1[0]).min() > 1.9 * BOUND
+    assert np.abs(run.xi1[run.t > 0.1]).max() < 0.5 * BOUND
+
+
+def lyapunov_function(law, measurement):
+    """V [J] of (29) without a disturbance: barrier, xi2, P~ and d^3."""
+    settings, xi2 = law.settings, law.signals.xi2
+    joints = zip(
+        law.signals.xi1,
+        settings.bound,
+        settings.weight,
+        settings.slope_limit,
+        settings.knee,
+        strict=True,
+    )
+    M = np.zeros((2, 2))
+    two_link.inertia(P, measurement[:2], M)
+    error = law.state.estimate[:3] - P
+    return (
+        sum(barrier.potential(*joint) for joint in joints)
+        + 0.5 * xi2 @ M @ xi2
+        + 0.5 * error @ (error / settings.Gamma[:3])
+        + 0.5 * np.sum(law.state.disturbance**2 / settings.gamma)
+    )
+
+
+@pytest.mark.parametrize('kappa', [0.0, 100.0], ids=['tracking alone', 'learning too'])
+def test_lyapunov_function_falls_from_sample_to_sample(kappa):
+    """(31), (32) without a disturbance; before the latch at 6.8 s both cases are the same."""
+    law = controller(recommended(kappa=kappa, gamma=np.full(2, 1.0), bias=False))
+    arm = plant(constant=(0.0, 0.0), amplitude=(0.0, 0.0))
+    V = np.array([lyapunov_function(law, s.measurement) for s in closed_loop(law, arm, 10.0)])
+
+    # A sampled loop may ripple where V' is next to nothing: a millionth of the start's.
+    assert np.diff(V).max() < 1e-6 * V[0]
+    assert V[6000] < 0.5 * V[0]
+    if kappa > 0.0:
+        assert V[-1] < 0.1 * V[6000]
