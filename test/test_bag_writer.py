@@ -61,8 +61,8 @@ def write_some(path, count=50, **options):
     states = JointStateEncoder(['joint1', 'elbow'])
     torques = Float64MultiArrayEncoder(2)
     with BagWriter(path, **options) as bag:
-        first = bag.add_topic(JOINT_STATES.resolved, JOINT_STATES.type, [JOINT_STATES.offered])
-        second = bag.add_topic(COMMANDS.resolved, COMMANDS.type, [COMMANDS.offered])
+        first = bag.add_topic(JOINT_STATES.resolved, JOINT_STATES.type, [Quality(depth=100)])
+        second = bag.add_topic(COMMANDS.resolved, COMMANDS.type, [Quality(depth=100)])
         for k in range(count):
             stamp = START + k * MILLISECOND
             bag.write(first, states.encode(stamp, [k, -k], [0, 1], [2, 3]), stamp, stamp - 5)

@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import FuncFormatter
 
 from blf_dsc_controller.bags.names import DISTURBANCE, LAMBDA_MIN
-from blf_dsc_controller.bags.run import Run, Series
+from blf_dsc_controller.bags.run import Floats, Run, Series
 from blf_dsc_controller.reports.envelope import envelope
 from blf_dsc_controller.reports.estimation import Estimation, latch_time
 from blf_dsc_controller.reports.style import (
@@ -28,6 +29,7 @@ from blf_dsc_controller.reports.style import (
 _COLUMNS = 2
 _PANEL = (6.2, 3.2)  # inches
 _GOAL = 0.01  # relative error
+_LEAST = 1e-7  # relative error that is drawn
 
 
 def draw_parameters(run: Run, path: Path) -> bool:
@@ -69,42 +71,34 @@ def _panels(run: Run, estimation: Estimation) -> Iterator[Callable[[Axes], None]
 
 def _estimates(estimation: Estimation, axes: Axes) -> None:
     for j, name in enumerate(estimation.names):
-        colour = COLOURS[j % len(COLOURS)]
-        values = envelope(estimation.time, estimation.estimate[:, j])
-        axes.plot(*values, color=colour, lw=1.8, label=formula(name))
-        if estimation.true is not None:
-            true = envelope(estimation.time, estimation.true[:, j])
-            axes.plot(*true, color=colour, lw=1.4, ls='--')
+        _estimate(axes, j, formula(name), envelope(estimation.time, estimation.estimate[:, j]))
+    if estimation.true is not None:
+        for true in estimation.true.T:
+            _true(axes, envelope(estimation.time, true))
     axes.set_ylabel('parameters [kg m²]')
-    head(axes, 'estimates' if estimation.true is None else 'estimates, true values dashed')
+    head(axes, 'estimates')
 
 
 def _relative_error(estimation: Estimation, axes: Axes) -> None:
     error = estimation.relative_error
     assert error is not None  # noqa: S101 - the panel is drawn only then
-    axes.semilogy(*envelope(estimation.time, error), color=BLUE)
-    axes.axhline(_GOAL, color=MUTED, lw=1.2, ls='--')
-    axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=' %'))
+    axes.semilogy(*envelope(estimation.time, np.maximum(error, _LEAST)), color=BLUE)
+    axes.axhline(_GOAL, color=MUTED, lw=1.2, ls='--', label=_percent(_GOAL))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{100 * value:g} %'))
     axes.set_ylabel(r'$\|\hat P - P\| \;/\; \|P\|$')
-    head(axes, f'relative parameter error, {_percent(_GOAL)} dashed')
+    head(axes, 'relative parameter error')
 
 
 def _disturbance(run: Run, learning: Series, axes: Axes) -> None:
-    truth = run.truth
     names = [name for name in learning.names if name.startswith(DISTURBANCE)]
-    known = [] if truth is None else [name for name in names if name in truth.names]
     for j, name in enumerate(names):
-        colour = COLOURS[j % len(COLOURS)]
         values = envelope(run.time_of(learning.stamp), learning.column(name))
-        axes.plot(*values, color=colour, lw=1.1, label=name.removeprefix(DISTURBANCE))
-    for name in known:
-        assert truth is not None  # noqa: S101
-        true = envelope(run.time_of(truth.stamp), truth.column(name))
-        colour = COLOURS[names.index(name) % len(COLOURS)]
-        axes.plot(*true, color=INK, lw=2.6)
-        axes.plot(*true, color=colour, lw=1.6, ls='--')
+        _estimate(axes, j, name.removeprefix(DISTURBANCE), values)
+    if run.truth is not None:
+        for name in sorted(set(names).intersection(run.truth.names)):
+            _true(axes, envelope(run.time_of(run.truth.stamp), run.truth.column(name)))
     axes.set_ylabel('disturbance [N m]')
-    head(axes, 'disturbance estimates' + (', true values dashed' if known else ''))
+    head(axes, 'disturbance estimates')
 
 
 def _excitation(run: Run, learning: Series, axes: Axes) -> None:
@@ -112,8 +106,17 @@ def _excitation(run: Run, learning: Series, axes: Axes) -> None:
     axes.plot(*values, color=GREEN)
     axes.set_ylabel(r'$\lambda_{\min}(\Phi)$')
     latched = latch_time(run)
-    began = 'learning never began' if latched is None else f'learning began at {latched:.4g} s'
+    began = 'learning never began' if latched is None else f'learning begins at {latched:.4g} s'
     head(axes, f'excitation; {began}')
+
+
+def _estimate(axes: Axes, j: int, label: str, values: tuple[Floats, Floats]) -> None:
+    axes.plot(*values, color=COLOURS[j % len(COLOURS)], lw=2.4, alpha=0.75, label=label)
+
+
+def _true(axes: Axes, values: tuple[Floats, Floats]) -> None:
+    is_first = 'true' not in axes.get_legend_handles_labels()[1]
+    axes.plot(*values, color=INK, lw=1.2, ls='--', label='true' if is_first else None)
 
 
 def _percent(value: float) -> str:

@@ -23,6 +23,7 @@ SHADE = '#DCE9F5'
 ALARM = '#B3001B'
 
 _DPI = 130
+_MOST_ABOVE = 4  # entries of a legend that fit beside a title
 _SETTINGS: Any = {
     'font.family': 'DejaVu Sans',
     'font.size': 11,
@@ -66,19 +67,22 @@ class Picture:
 
 
 def head(axes: Axes, title: str) -> None:
-    """Put the title left above a panel and its legend right of it, off the data."""
+    """Put the title above a panel and its legend off the data: above as well, or beside it."""
     axes.set_title(title, loc='left', fontsize=11.5)
-    if axes.get_legend_handles_labels()[1]:
-        axes.legend(
-            loc='lower right',
-            bbox_to_anchor=(1.0, 1.0),
-            ncols=4,
-            frameon=False,
-            fontsize=10,
-            borderaxespad=0.15,
-            handlelength=1.6,
-            columnspacing=1.2,
-        )
+    entries = len(axes.get_legend_handles_labels()[1])
+    if entries == 0:
+        return
+    above = entries <= _MOST_ABOVE
+    axes.legend(
+        loc='lower right' if above else 'center left',
+        bbox_to_anchor=(1.0, 1.0) if above else (1.0, 0.5),
+        ncols=entries if above else 1,
+        frameon=False,
+        fontsize=10,
+        borderaxespad=0.15,
+        handlelength=1.6,
+        columnspacing=1.2,
+    )
 
 
 def formula(name: str) -> str:

@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag comes back as the arrays it was made of, whatever its topics were called."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import synthetic_bag
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from synthetic_bag import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthetic
+
+from blf_dsc_controller.bags.encoders import JointStateEncoder
+from blf_dsc_controller.bags.errors import (
+    AmbiguousTopicError,
+    MissingTopicError,
+    UnreadableBagError,
+    UnreadableMessageError,
+)
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.bags.topics import (
+    COMMANDS,
+    DIAGNOSTICS,
+    JOINT_STATES,
+    LEARNING,
+    REFERENCE,
+    TRACKING_ERROR,
+)
+from blf_dsc_controller.bags.types import typestore
+
+SAMPLES = 200
+
+
+@pytest.fixture(scope='module')
+def made():
+    return Synthetic(SAMPLES)
+
+
+@pytest.fixture(scope='module')
+def messages(made):
+    return list(made.messages(with_timing=True))
+
+
+def without(messages, *topics):
+    return [entry for entry in messages if entry[0] not in topics]
+
+
+def test_arrays_come_back(tmp_path, made, messages):
+    run = read_run(synthetic_bag.write(tmp_path / 'bag', messages))
+    assert run.joints == JOINTS
+    assert run.stamp.tolist() == made.stamp.tolist()
+    np.testing.assert_array_equal(run.position, made.position)  # joints matched by name
+    np.testing.assert_array_equal(run.reference, made.reference)
+    np.testing.assert_array_equal(run.error, made.error)
+    np.testing.assert_array_equal(run.torque, made.torque)
+    np.testing.assert_array_equal(run.learning.select(PARAMETERS), made.estimate)
+    np.testing.assert_array_equal(run.truth.select(PARAMETERS), np.tile(TRUE, (20, 1)))
+    np.testing.assert_array_equal(run.timing.column('late_steps'), np.arange(SAMPLES) // 100)
+    assert np.all(run.bound == BOUND_RAD)
+    assert np.all(run.torque_limit == LIMIT_NM)
+    assert run.duration == pytest.approx(0.199)
+    assert run.message_counts['/joint_states'] == SAMPLES
+    assert run.message_counts['/sim_plant/truth'] == SAMPLES / 10
+
+
+@pytest.mark.parametrize(
+    'rename',
+    [
+        lambda topic: '/left/arm' + topic.resolved,
+        lambda topic: '/' + topic.leaf,
+        lambda topic: f'/another_node/{topic.leaf}',
+    ],
+)
+def test_topics_under_other_names_are_found(tmp_path, made, messages, rename):
+    run = read_run(synthetic_bag.write(tmp_path / 'bag', messages, rename))
+    np.testing.assert_array_equal(run.error, made.error)
+    np.testing.assert_array_equal(run.torque, made.torque)
+    assert run.truth is not None
+    assert run.bound is not None
+
+
+def test_a_topic_of_another_type_is_not_taken(tmp_path, messages):
+    with_decoy = [(DIAGNOSTICS, 0, b'\0\1\0\0'), *without(messages, LEARNING)]
+    path = synthetic_bag.write(
+        tmp_path / 'bag',
+        with_decoy,
+        lambda topic: '/x/learning' if topic is DIAGNOSTICS else topic.resolved,
+    )
+    assert read_run(path).learning is None
+
+
+def test_one_of_several_robots_is_read_by_its_namespace(tmp_path, messages):
+    with synthetic_bag.BagWriter(tmp_path / 'bag') as bag:
+        for side, stamps in (('left', 0), ('right', 7)):
+            handles = {}
+            for topic, stamp, raw in messages[stamps:]:
+                if topic not in handles:
+                    name = f'/{side}{topic.resolved}'
+                    handles[topic] = bag.add_topic(name, topic.type, [topic.offered])
+                bag.write(handles[topic], raw, stamp)
+    with pytest.raises(AmbiguousTopicError, match='/left/joint_states, /right/joint_states'):
+        read_run(tmp_path / 'bag')
+    assert read_run(tmp_path / 'bag', 'left').stamp.size == SAMPLES
+    assert read_run(tmp_path / 'bag', '/right').stamp.size < SAMPLES
+
+
+def test_without_joint_states_the_bag_is_refused_with_what_it_holds(tmp_path, messages):
+    path = synthetic_bag.write(tmp_path / 'bag', without(messages, JOINT_STATES))
+    with pytest.raises(MissingTopicError) as caught:
+        read_run(path)
+    said = str(caught.value)
+    assert "'joint_states' of type sensor_msgs/msg/JointState" in said
+    assert '/blf_dsc_controller/commands (std_msgs/msg/Float64MultiArray)' in said
+
+
+def test_only_joint_states_are_essential(tmp_path, made, messages):
+    states = [entry for entry in messages if entry[0] is JOINT_STATES]
+    run = read_run(synthetic_bag.write(tmp_path / 'bag', states))
+    assert run.joints == JOINTS[::-1]
+    np.testing.assert_array_equal(run.position, made.position[:, ::-1])
+    unknown = (run.reference, run.error, run.bound, run.learning, run.truth, run.timing)
+    assert unknown == (None,) * len(unknown)
+
+
+def test_the_error_follows_from_the_reference(tmp_path, made, messages):
+    path = synthetic_bag.write(tmp_path / 'bag', without(messages, TRACKING_ERROR))
+    np.testing.assert_allclose(read_run(path).error, made.error, atol=1e-15)
+
+
+def test_torque_without_a_command_for_each_state(tmp_path, made, messages):
+    lost = next(k for k, entry in enumerate(messages) if entry[0] is COMMANDS)
+    path = synthetic_bag.write(tmp_path / 'one', messages[:lost] + messages[lost + 1 :])
+    np.testing.assert_array_equal(read_run(path).torque, made.torque)
+
+    states = JointStateEncoder(JOINTS)
+    with_effort = [
+        (JOINT_STATES, k, states.encode(k, [0, 0], [0, 0], [k, -k])) for k in range(SAMPLES)
+    ]
+    torque = read_run(synthetic_bag.write(tmp_path / 'none', with_effort)).torque
+    # The effort of a state is the torque that led to it.
+    assert torque[:-1, 0].tolist() == list(range(1, SAMPLES))
+    assert np.isnan(torque[-1]).all()
+
+
+def test_a_sample_that_was_lost_is_a_gap_and_shifts_nothing(tmp_path, made, messages):
+    lost = [
+        entry for entry in messages if not (entry[0] is REFERENCE and entry[1] == made.stamp[5])
+    ]
+    reference = read_run(synthetic_bag.write(tmp_path / 'bag', lost)).reference
+    assert np.isnan(reference[5]).all()
+    np.testing.assert_array_equal(reference[6:], made.reference[6:])
+
+
+def test_messages_out_of_order_and_twice_are_put_right(tmp_path, made, messages):
+    shuffled = without(messages, COMMANDS)  # which have no stamp to go by
+    shuffled = shuffled[::-1] + shuffled[:40]
+    run = read_run(synthetic_bag.write(tmp_path / 'bag', shuffled))
+    np.testing.assert_array_equal(run.stamp, made.stamp)
+    np.testing.assert_array_equal(run.torque, made.torque)
+
+
+@pytest.mark.parametrize('storage', [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_bags_of_another_writer_are_read(tmp_path, made, messages, storage):
+    with Writer(tmp_path / 'bag', version=9, storage_plugin=storage) as writer:
+        connections = {}
+        for topic, stamp, raw in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(
+                    topic.resolved, topic.type, typestore=typestore()
+                )
+            writer.write(connections[topic], stamp, raw)
+    run = read_run(tmp_path / 'bag')
+    np.testing.assert_array_equal(run.error, made.error)
+    np.testing.assert_array_equal(run.torque, made.torque)
+
+
+def test_no_bag_is_told_apart_from_a_broken_one(tmp_path, messages):
+    with pytest.raises(UnreadableBagError, match='there is no such folder'):
+        read_run(tmp_path / 'nowhere')
+    path = synthetic_bag.write(tmp_path / 'bag', messages)
+    (path / 'bag_0.mcap').write_bytes((path / 'bag_0.mcap').read_bytes()[:-1000])
+    with pytest.raises(UnreadableBagError):
+        read_run(path)
+    (path / 'metadata.yaml').unlink()
+    with pytest.raises(UnreadableBagError, match=r'no metadata\.yaml'):
+        read_run(path)
+
+
+def test_a_message_that_cannot_be_decoded_is_told_by_topic_and_number(tmp_path, messages):
+    bad = [*messages[:100], (LEARNING, messages[100][1], b'\0\1\0\0'), *messages[100:]]
+    path = synthetic_bag.write(tmp_path / 'bag', bad)
+    with Reader(path) as reader:
+        (learning,) = [c for c in reader.connections if c.topic == LEARNING.resolved]
+        place = [bytes(raw) for _, _, raw in reader.messages([learning])].index(b'\0\1\0\0')
+    with pytest.raises(UnreadableMessageError, match=f'message {place + 1} of /blf.*/learning'):
+        read_run(path)

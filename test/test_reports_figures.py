@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pictures show the run: all of its panels, and no peak lost."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import matplotlib.image
+import numpy as np
+import pytest
+import synthetic_bag
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib import pyplot as plt
+from matplotlib import rcParams
+from matplotlib.colors import to_hex, to_rgb
+from synthetic_bag import Synthetic
+
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.reports.envelope import envelope
+from blf_dsc_controller.reports.figures import draw
+from blf_dsc_controller.reports.style import COLOURS, formula
+
+
+@pytest.fixture(scope='module')
+def run(tmp_path_factory):
+    messages = Synthetic(5000).messages()
+    return read_run(synthetic_bag.write(tmp_path_factory.mktemp('made') / 'bag', messages))
+
+
+def pixels(path):
+    return matplotlib.image.imread(path)[..., :3]
+
+
+def amount(image, colour):
+    """Number of pixels of about this colour."""
+    wanted = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    return int((np.abs(image - wanted).max(axis=2) < 0.08).sum())
+
+
+def lightened(colour, opacity=0.75):
+    """Colour of a line of that opacity on white."""
+    return to_hex(np.array(to_rgb(colour)) * opacity + 1.0 - opacity)
+
+
+def test_both_pictures_are_drawn(run, tmp_path):
+    assert draw(run, tmp_path) == [tmp_path / 'tracking.png', tmp_path / 'parameters.png']
+    tracking = pixels(tmp_path / 'tracking.png')
+    parameters = pixels(tmp_path / 'parameters.png')
+    # Wide enough that its labels can be read on a page.
+    assert tracking.shape[1] > 1200
+    assert parameters.shape[1] > 1200
+    # The shaded bound, the error and the torque; the lines of three parameters.
+    assert amount(tracking, '#DCE9F5') > 20_000
+    assert amount(tracking, '#0072B2') > 1000
+    assert amount(tracking, '#D55E00') > 1000
+    for colour in COLOURS[:3]:
+        assert amount(parameters, lightened(colour)) > 500
+
+
+def test_a_violation_is_marked(run, tmp_path):
+    error = run.error.copy()
+    error[2000, 1] = 0.003
+    alarm = '#B3001B'
+    draw(run, tmp_path)
+    assert amount(pixels(tmp_path / 'tracking.png'), alarm) == 0
+    draw(dataclasses.replace(run, error=error), tmp_path)
+    assert amount(pixels(tmp_path / 'tracking.png'), alarm) > 100
+
+
+def test_less_in_the_bag_is_a_smaller_picture(run, tmp_path):
+    draw(run, tmp_path)
+    full = [pixels(tmp_path / name).shape for name in ('tracking.png', 'parameters.png')]
+    unknown_torque = np.full_like(run.torque, np.nan)
+    little = dataclasses.replace(run, error=None, truth=None, torque=unknown_torque)
+    assert len(draw(little, tmp_path)) == 2
+    assert pixels(tmp_path / 'tracking.png').shape[0] < full[0][0] / 2
+
+    (tmp_path / 'alone').mkdir()
+    least = dataclasses.replace(little, reference=None, bound=None, learning=None)
+    assert draw(least, tmp_path / 'alone') == [tmp_path / 'alone' / 'tracking.png']
+    assert not (tmp_path / 'alone' / 'parameters.png').exists()
+
+
+def test_gaps_and_a_single_sample_are_drawn(run, tmp_path):
+    error = run.error.copy()
+    error[100:200] = np.nan
+    assert draw(dataclasses.replace(run, error=error), tmp_path)
+    optional = ('reference', 'error', 'bound', 'torque_limit')
+    one = dataclasses.replace(
+        run,
+        **{
+            name: getattr(run, name)[:1]
+            for name in ('stamp', 'received', 'position', 'velocity', 'torque', *optional)
+        },
+    )
+    assert draw(one, tmp_path)
+
+
+def test_drawing_leaves_no_trace_in_the_process(run, tmp_path):
+    before = dict(rcParams)
+    draw(run, tmp_path)
+    assert dict(rcParams) == before
+    assert plt.get_fignums() == []
+
+
+@given(st.integers(1, 400), st.integers(1, 50), st.randoms(use_true_random=False))
+def test_envelope_keeps_the_peaks_of_every_piece(size, pieces, random):
+    values = np.array([random.choice([random.gauss(0, 1), np.nan]) for _ in range(size)])
+    time = np.arange(size) * 0.5
+    thin_time, thin = envelope(time, values, pieces)
+    assert thin.size <= max(2 * pieces, size if size <= 2 * pieces else 0)
+    kept = (thin_time / 0.5).astype(int)
+    assert np.all(np.diff(kept) >= 0)
+    np.testing.assert_array_equal(thin, values[kept])
+    for piece in np.split(np.arange(size), np.linspace(0, size, pieces + 1).astype(int)[1:-1]):
+        known = values[piece][~np.isnan(values[piece])]
+        there = thin[np.isin(kept, piece)]
+        if known.size:
+            assert np.nanmax(there) == known.max()
+            assert np.nanmin(there) == known.min()
+
+
+@pytest.mark.parametrize(
+    ('name', 'shown'),
+    [
+        ('(m1+m2)*l1^2', r'$(m_{1}+m_{2})\,l_{1}^2$'),
+        ('m2*l1*l2', r'$m_{2}\,l_{1}\,l_{2}$'),
+        ('mass of link 2', 'mass of link 2'),
+        ('inertia', 'inertia'),
+    ],
+)
+def test_formulas_are_set_as_such(name, shown):
+    assert formula(name) == shown

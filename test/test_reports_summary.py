@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The summary of a made-up run has the numbers it was made of."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import synthetic_bag
+from synthetic_bag import BOUND_RAD, JOINTS, LATCH_S, LIMIT_NM, PARAMETERS, TRUE, Synthetic
+
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.bags.topics import BOUND, JOINT_STATES, LEARNING, TRUTH
+from blf_dsc_controller.reports.summary import summarize, write_summary
+from blf_dsc_controller.reports.table import format_table
+
+SAMPLES = 10_000
+
+
+@pytest.fixture(scope='module')
+def run(tmp_path_factory):
+    messages = Synthetic(SAMPLES).messages(with_timing=True)
+    return read_run(synthetic_bag.write(tmp_path_factory.mktemp('made') / 'bag', messages))
+
+
+def test_tracking(run):
+    summary = summarize(run)
+    assert summary['duration_s'] == pytest.approx(9.999)
+    assert summary['samples'] == SAMPLES
+    assert summary['tracking']['held'] is True
+    assert summary['tracking']['first_violation'] is None
+    shoulder, elbow = (summary['tracking']['joints'][joint] for joint in JOINTS)
+    # Whole periods of sinusoids: the rms is the amplitude over the root of two.
+    assert shoulder['max_abs_error_rad'] == pytest.approx(0.0008)
+    assert shoulder['rms_error_rad'] == pytest.approx(0.0008 / np.sqrt(2))
+    assert elbow['max_abs_error_rad'] == pytest.approx(0.0005)
+    assert elbow['peak_torque_nm'] == pytest.approx(3.0)
+    assert elbow['rms_torque_nm'] == pytest.approx(3.0 / np.sqrt(2))
+    assert shoulder['bound_rad'] == BOUND_RAD
+    assert shoulder['torque_limit_nm'] == LIMIT_NM
+
+
+def test_first_violation_is_the_earliest_of_all_joints(run):
+    error = run.error.copy()
+    error[4000, 0] = 0.0021
+    error[3000, 1] = -BOUND_RAD  # on the bound is outside: the barrier is infinite there
+    tracking = summarize(dataclasses.replace(run, error=error))['tracking']
+    assert tracking['held'] is False
+    assert tracking['first_violation'] == {'time_s': pytest.approx(3.0), 'joint': 'elbow'}
+
+
+def test_learning(run):
+    learning = summarize(run)['learning']
+    assert learning['latch_time_s'] == pytest.approx(LATCH_S)
+    errors = learning['relative_error_at_s']
+    # The run ends one sample before 10 s, which counts as having reached it.
+    assert list(errors) == ['5', '10']
+    assert errors['5'] == pytest.approx(0.5 * np.exp(-3.5))
+    assert errors['10'] == learning['final_relative_error']
+    assert learning['final_relative_error'] == pytest.approx(0.5 * np.exp(-8.499))
+    # 0.5 exp(-t) = 0.01 at t = ln 50 after the latch, seen at the next sample.
+    assert learning['time_to_1_percent_s'] == pytest.approx(LATCH_S + np.log(50), abs=1e-3)
+    assert learning['true'] == dict(zip(PARAMETERS, TRUE, strict=True))
+    assert list(learning['final_estimate']) == list(PARAMETERS)
+
+
+def test_one_percent_counts_only_if_it_lasts(run):
+    values = run.learning.values.copy()
+    values[-1, 0] = 0.0
+    learning = dataclasses.replace(run.learning, values=values)
+    summary = summarize(dataclasses.replace(run, learning=learning))
+    assert summary['learning']['time_to_1_percent_s'] is None
+
+
+def test_timing(run):
+    timing = summarize(run)['timing']
+    assert timing['rate_hz'] == pytest.approx(1000.0)
+    # Latencies of 0, 1, 2 ... 9999 us.
+    expected = {'p50': 4999.5, 'p99': 9899.01, 'p99.9': 9989.001, 'max': 9999.0}
+    assert timing['latency_us'] == pytest.approx(expected)
+    assert timing['late_steps'] == 99
+    assert summarize(run)['compute_time_us']['p50'] == pytest.approx(4.9995)
+
+
+def test_rate_is_that_of_the_wall_clock(run):
+    slow = dataclasses.replace(run, received=run.received * 2)
+    assert summarize(slow)['timing']['rate_hz'] == pytest.approx(500.0)
+
+
+def test_messages_are_counted(run):
+    messages = summarize(run)['messages']
+    assert messages[JOINT_STATES.resolved] == SAMPLES
+    assert messages[TRUTH.resolved] == SAMPLES / 10
+    assert messages[BOUND.resolved] == 1
+
+
+def test_what_is_not_known_is_null_and_never_nan(run, tmp_path):
+    nothing = dataclasses.replace(
+        run,
+        reference=None,
+        error=None,
+        bound=None,
+        torque_limit=None,
+        learning=None,
+        truth=None,
+        timing=None,
+        torque=np.full_like(run.torque, np.nan),
+    )
+    summary = summarize(nothing)
+    write_summary(summary, tmp_path / 'summary.json')
+    assert json.loads((tmp_path / 'summary.json').read_text()) == summary
+    assert summary['learning'] is None
+    assert summary['tracking']['held'] is None
+    assert set(summary['tracking']['joints']['elbow'].values()) == {None}
+
+
+def test_unknown_truth_leaves_the_estimates(tmp_path):
+    messages = [entry for entry in Synthetic(100).messages() if entry[0] is not TRUTH]
+    summary = summarize(read_run(synthetic_bag.write(tmp_path / 'bag', messages)))
+    assert summary['learning']['final_relative_error'] is None
+    assert summary['learning']['true'] is None
+    assert list(summary['learning']['final_estimate']) == list(PARAMETERS)
+    assert summary['learning']['latch_time_s'] is None  # too short a run
+
+
+def test_compute_time_that_was_not_measured_is_null(run):
+    learning = run.learning
+    values = learning.values.copy()
+    values[:, learning.names.index('compute_time')] = np.nan
+    unmeasured = dataclasses.replace(run, learning=dataclasses.replace(learning, values=values))
+    assert summarize(unmeasured)['compute_time_us'] is None
+
+
+def test_the_table_tells_it_in_words(run):
+    table = format_table(summarize(run))
+    for words in (
+        'shoulder  0.800 mrad  0.566 mrad  2.000 mrad     8.00 N m    5.66 N m  20.00 N m',
+        'held by every joint',
+        'began at 1.500 s',
+        '5 s 1.51 %',
+        'below 1 % from 5.413 s on',
+        '1000.00 Hz',
+        '99 late steps',
+    ):
+        assert words in table
+    assert max(map(len, table.splitlines())) <= 120
+
+
+def test_the_table_tells_a_violation_and_copes_with_little(run):
+    error = run.error + 1.0
+    assert 'VIOLATED, first by shoulder at 0.000 s' in format_table(
+        summarize(dataclasses.replace(run, error=error))
+    )
+    little = dataclasses.replace(run, error=None, learning=None, timing=None)
+    assert 'bound       not told' in format_table(summarize(little))
+
+
+def test_learning_is_optional_in_a_bag(tmp_path):
+    messages = [entry for entry in Synthetic(100).messages() if entry[0] is not LEARNING]
+    summary = summarize(read_run(synthetic_bag.write(tmp_path / 'bag', messages)))
+    assert summary['learning'] is None
+    assert summary['compute_time_us'] is None
