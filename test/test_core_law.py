@@ -24,6 +24,8 @@ CASES = {
     'effort': ({'torque_source': EFFORT}, {'delay': 2, 'noise': 1e-6}),
     'torque limit': ({'torque_limit': np.array([10.0, 4.0])}, {}),
     'at the ball': ({'radius': 0.9, 'Gamma': np.array([0.2, 1.0, 3.0, 0.5, 0.5])}, {}),
+    'window not full': ({'window': 2000, 'learning_start': 0.5}, {}),
+    'half the rate': ({}, {'sample_time': 2e-3}),
     'past the bound': ({'slope_limit': np.full(2, 5e3)}, {'start': (2.297, 1.692)}),
 }
 
@@ -31,9 +33,9 @@ CASES = {
 def differences(settings, arm, duration=1.5):
     """Largest difference of torque, estimate and d^3 between the law and its oracle in a loop."""
     law, plain = controller(settings), PlainLaw(settings)
-    worst = np.zeros(3)
+    worst, dt = np.zeros(3), arm.period_ns * 1e-9
     for sample in closed_loop(law, arm, duration):
-        torque = plain.update(sample.t, 1e-3, law.signals.qr, law.signals.dqr, sample.measurement)
+        torque = plain.update(sample.t, dt, law.signals.qr, law.signals.dqr, sample.measurement)
         plain.tau = law.signals.torque.copy()
         pairs = (
             (law.signals.torque, torque),
