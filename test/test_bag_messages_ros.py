@@ -3,10 +3,15 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -14,6 +19,9 @@ from std_msgs.msg import Float64MultiArray
 from blf_dsc_controller.bags.cdr import JointStateLayout
 from blf_dsc_controller.bags.decoders import Float64MultiArrayDecoder, JointStateDecoder
 from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.bags.topics import TOPICS
+from blf_dsc_controller.bags.types import type_hash
+from blf_dsc_controller.nodes.endpoints import message_class
 
 STAMP = 1_734_000_123_456_789_012
 CASES = [
@@ -22,6 +30,27 @@ CASES = [
     ('base', ['a', 'bc', 'def', 'ghij', 'klmno']),
     ('world', ['disturbance joint1', '(m1+m2)*l1^2', '']),
 ]
+
+
+@pytest.fixture
+def node():
+    context = Context()
+    rclpy.init(context=context)
+    node = Node('types', context=context, start_parameter_services=False)
+    yield node
+    node.destroy_node()
+    context.try_shutdown()
+
+
+@pytest.mark.parametrize('type_name', sorted({topic.type for topic in TOPICS}))
+def test_type_hashes_are_those_of_ros(node, type_name):
+    topic = '/hashed/' + type_name
+    node.create_publisher(message_class(type_name), topic, 1)
+    deadline = time.monotonic() + 10.0
+    while not (publishers := node.get_publishers_info_by_topic(topic)):
+        assert time.monotonic() < deadline, 'the graph does not show the publisher'
+        time.sleep(0.01)
+    assert str(publishers[0].topic_type_hash) == type_hash(type_name)
 
 
 def message_of(frame_id, names):

@@ -118,6 +118,17 @@ def test_bytes_are_recorded_as_they_were_published(loop):
     assert before <= stamps[0] <= stamps[-1] <= after
 
 
+def test_what_has_arrived_by_the_end_is_recorded(loop):
+    run = loop()
+    publisher = run.source.create_publisher(JointState, 'joint_states', 100)
+    run.spin_until(lambda: publisher.get_subscription_count() > 0)
+    for _ in range(50):
+        publisher.publish(JointState())
+    assert publisher.wait_for_all_acked()
+    topics = [topic for topic, _, _ in run.messages()]  # without one more turn of the executor
+    assert topics.count('/joint_states') == 50
+
+
 def test_only_chosen_topics_are_recorded(loop):
     run = loop(topics=['chosen', '/never'])
     chosen = run.source.create_publisher(JointState, 'chosen', 10)

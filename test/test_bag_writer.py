@@ -273,6 +273,21 @@ def test_what_was_flushed_survives_a_kill(tmp_path, compression):
 def test_an_empty_bag_is_a_bag(tmp_path):
     BagWriter(tmp_path / 'bag').close()
     assert seen_by_a_stranger(tmp_path / 'bag')['counts'] == {}
+    information = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
+    information = information['rosbag2_bagfile_information']
+    assert information['duration'] == {'nanoseconds': 0}  # rosbag2 reads it as unsigned
+    assert information['files'][0]['duration'] == {'nanoseconds': 0}
+
+
+def test_topics_of_one_type_share_its_definition(tmp_path):
+    with BagWriter(tmp_path / 'bag') as bag:
+        for topic in ('/a', '/b'):
+            handle = bag.add_topic(topic, JOINT_STATES.type, [JOINT_STATES.offered])
+            bag.write(handle, JointStateEncoder(['x']).encode(0, [0], [0], [0]), START)
+    with (tmp_path / 'bag' / 'bag_0.mcap').open('rb') as stream:
+        summary = make_reader(stream).get_summary()
+    assert len(summary.schemas) == 1
+    assert len(summary.channels) == 2
 
 
 def test_closing_twice_is_harmless(tmp_path):

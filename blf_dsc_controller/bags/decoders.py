@@ -86,7 +86,6 @@ class JointStateDecoder:
         return int(seconds * NANOSECONDS + nanoseconds)
 
     def _learn(self, raw: bytes) -> None:
-        self._length = -1
         layout = JointStateLayout.parse(raw)
         # The message lies in the buffer such that its doubles stand on the float64 grid, of which
         # the first value is the NaN of the empty fields and the third the message's fifth byte.

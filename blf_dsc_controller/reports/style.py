@@ -61,8 +61,10 @@ class Picture:
     def save(self, path: Path) -> None:
         """Write the picture as PNG."""
         with rc_context(_SETTINGS):
-            for axes in self.axes[-1]:
-                axes.set_xlabel('time [s]')
+            for column in self.axes.T:
+                lowest = [axes for axes in column if axes.get_visible()][-1]
+                lowest.set_xlabel('time [s]')
+                lowest.tick_params(labelbottom=True)
             self._figure.savefig(path, dpi=_DPI, facecolor='white')
 
 
