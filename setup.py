@@ -44,8 +44,8 @@ setup(
     install_requires=[
         'numpy',
         'numba',
-        'mcap',
-        'rosbags>=0.10',
+        'mcap>=1.6',
+        'rosbags>=0.11',
         'matplotlib',
         'pyyaml',
         'tqdm',
@@ -69,9 +69,9 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            'sim_plant = sim_plant.node:main',
-            'blf_dsc_controller = blf_dsc_controller.nodes.controller_node:main',
-            'bag_recorder = blf_dsc_controller.nodes.recorder_node:main',
+            'sim_plant = blf_dsc_controller.tools.entry:sim_plant',
+            'blf_dsc_controller = blf_dsc_controller.tools.entry:blf_dsc_controller',
+            'bag_recorder = blf_dsc_controller.tools.entry:bag_recorder',
             'closed_loop = blf_dsc_controller.tools.closed_loop:main',
             'bag_plot = blf_dsc_controller.tools.bag_plot:main',
         ],

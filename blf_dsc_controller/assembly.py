@@ -1,7 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a configuration to what runs: the model, the packed settings, the controller."""
+"""From a configuration to what runs: the model, the packed settings, the controller.
+
+Here a law's name becomes gains.  All laws share one kernel; they differ in the surface and in which
+gains are zero:
+
+    blf_dsc       (28): filtered surface, barrier, composite learning, d^3
+    model_based   (16): the same with P^ = P and the disturbance known, nothing adapted
+    backstepping  (35): linear surface, position gain, leaky adaptation by the tracking error
+    slotine_li    tau = H P^ - K_p s, P^' = -Gamma H^T s: (35) without its extra terms
+"""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
@@ -9,9 +20,18 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.core import barrier, models
 from blf_dsc_controller.core.controller import Controller
 from blf_dsc_controller.core.reference import sinusoids_vector
-from blf_dsc_controller.core.settings import LAWS, TORQUE_SOURCES, UPDATES, Settings, pack
+from blf_dsc_controller.core.settings import (
+    LATCHES,
+    PREDICTIONS,
+    SURFACES,
+    TORQUE_SOURCES,
+    UPDATES,
+    Settings,
+    pack,
+)
 
-COLUMN_GAIN = 1.0  # Gamma of the disturbance columns [1/s per kappa]
+COLUMN_GAIN = 1.0
+"""Entry of Gamma for the disturbance columns: they do not act on the torque."""
 
 
 def model_of(config: ControllerConfig) -> models.Model:
@@ -19,30 +39,47 @@ def model_of(config: ControllerConfig) -> models.Model:
     return models.two_link_arm(config.arm.l1, config.arm.gravity)
 
 
+def column_names(config: ControllerConfig) -> tuple[str, ...]:
+    """Name of each disturbance column, in the order of `core.columns`."""
+    learning = config.learning
+    switched = {'bias': learning.bias, 'viscous': learning.viscous, 'coulomb': learning.coulomb}
+    blocks = [name for name, is_on in switched.items() if is_on]
+    blocks += [f'{wave} {w:g} rad/s' for w in learning.frequencies for wave in ('sin', 'cos')]
+    return tuple(f'{block} {joint}' for block in blocks for joint in config.joints)
+
+
 def estimate_names(config: ControllerConfig) -> tuple[str, ...]:
     """Name of each entry of theta^: the model's parameters, then the disturbance columns."""
-    columns = tuple(f'bias {joint}' for joint in config.joints) if config.learning.bias else ()
-    return model_of(config).parameter_names + columns
+    return model_of(config).parameter_names + column_names(config)
 
 
 def settings_of_config(config: ControllerConfig) -> Settings:
     """Translate the configuration's words into the paper's symbols."""
     model = model_of(config)
     learning = config.learning
-    columns = len(estimate_names(config)) - model.p
+    columns = len(column_names(config))
+    truth = config.truth
     per_joint = zip(
         config.barrier.bound, config.barrier.weight, config.barrier.slope_limit, strict=True
     )
-    return Settings(
+    settings = Settings(
         n=model.n,
         p=model.p,
         m=model.p + columns,
         model=model.code,
-        law=LAWS.index(config.law),
+        surface=SURFACES.index('filtered'),
+        prediction=PREDICTIONS.index(learning.prediction),
+        latch=LATCHES.index(learning.latch),
         update=UPDATES.index(learning.update),
         torque_source=TORQUE_SOURCES.index(learning.torque_source),
         window=round(learning.window / config.sample_time),
         interval=learning.interval,
+        bias=int(learning.bias),
+        viscous=int(learning.viscous),
+        coulomb=int(learning.coulomb),
+        tones=len(learning.frequencies),
+        truth_known=int(bool(truth.parameters)),
+        feed_forward=int(truth.feed_forward),
         time_constant=config.surface.time_constant,
         boundary_layer=config.feedback.boundary_layer,
         eta=config.disturbance.leakage,
@@ -51,7 +88,10 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         sigma=learning.excitation_threshold,
         learning_start=learning.window + learning.settling_time,
         pole=learning.filter_pole,
+        omega=learning.derivative_filter,
+        coulomb_velocity=learning.coulomb_velocity,
         radius=learning.radius,
+        Wc=0.0,
         bound=np.array(config.barrier.bound),
         weight=np.array(config.barrier.weight),
         slope_limit=np.array(config.barrier.slope_limit),
@@ -60,12 +100,49 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         mu=np.array(config.surface.mu),
         Kp=np.array(config.feedback.gain),
         d2=np.array(config.feedback.damping),
+        mu_bar=np.zeros(model.n),
         gamma=np.array(config.disturbance.gain),
         torque_limit=np.array(config.torque.limit),
+        true_disturbance=np.array((truth.constant, truth.amplitude, truth.frequency, truth.phase)),
         Gamma=np.array(learning.adaptation_gain + (COLUMN_GAIN,) * columns),
         initial_estimate=np.array(learning.initial_estimate + (0.0,) * columns),
+        true_parameters=np.array(truth.parameters or (0.0,) * model.p),
+        frequencies=np.array(learning.frequencies),
         constants=np.array(model.constants),
     )
+    return settings._replace(**_of_law(config, settings))
+
+
+def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
+    comparison = config.comparison
+    nothing = np.zeros(settings.n)
+    linear = {
+        'surface': SURFACES.index('linear'),
+        'K': np.array(comparison.surface_gain),
+        'd2': nothing,
+        'gamma': nothing,
+        'kappa': 0.0,
+    }
+    laws: dict[str, dict[str, Any]] = {
+        'blf_dsc': {},
+        'model_based': {
+            'initial_estimate': np.concatenate(
+                (settings.true_parameters, settings.initial_estimate[settings.p :])
+            ),
+            'feed_forward': 1,
+            'd2': nothing,
+            'gamma': nothing,
+            'Gamma': np.zeros(settings.m),
+        },
+        'backstepping': linear
+        | {
+            'weight': np.array(comparison.position_gain),
+            'mu_bar': np.array(comparison.robust_gain),
+            'Wc': comparison.leakage,
+        },
+        'slotine_li': linear | {'weight': nothing},
+    }
+    return laws[config.law]
 
 
 def controller_of(config: ControllerConfig) -> Controller:

@@ -15,7 +15,7 @@ from blf_dsc_controller.assembly import controller_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.core.controller import Controller, respond
 from blf_dsc_controller.core.kernel import kernel
-from blf_dsc_controller.core.sample import Sample, sample_of
+from blf_dsc_controller.core.sample import Sample, sample_of, sample_size
 from sim_plant import plant as plants
 from sim_plant.assembly import plant_of, steps_of
 from sim_plant.configuration import PlantConfig
@@ -82,7 +82,7 @@ def loop(
             samples[k],
         )
         if not (is_last and k == rows - 1):
-            torque = sample_of(samples[k], joints, samples.shape[1] - 6 * joints - 2).torque
+            torque = sample_of(samples[k], joints, samples.shape[1] - sample_size(joints, 0)).torque
             plants.step(plant_settings, plant_state, torque)
 
 

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from rclpy.timer import Timer
 
 from blf_dsc_controller.bags import topics
@@ -37,7 +36,7 @@ _REPEAT_PERIOD = 1.0  # s, for a first state that nobody has answered
 _EARLY = 0.05  # of a sample: a timer that fires this much early is on time
 
 
-class PlantNode(Node):
+class PlantNode(executor.RunnableNode):
     """Publishes measured joint states and applies the torques that answer them.
 
     Attributes:
@@ -58,7 +57,6 @@ class PlantNode(Node):
         self.config = parameters.declare(self, PlantConfig)
         self.plant = plant_of(self.config)
         self._compile()
-        self.finished = False
         self.rejected = 0
         self.late_steps = 0
         realtime.request(self.config.realtime, self.get_logger())

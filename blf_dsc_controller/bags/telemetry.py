@@ -18,6 +18,17 @@ from blf_dsc_controller.bags.encoders import (
     JointStateEncoder,
     encode_clock,
 )
+from blf_dsc_controller.bags.names import (
+    COMPUTE_TIME,
+    DISTURBANCE,
+    LAMBDA_MIN,
+    LATCHED,
+    LATE_STEPS,
+    LATENCY,
+    LATENESS,
+    POSITION,
+    VELOCITY,
+)
 from blf_dsc_controller.core.sample import Sample
 
 Message: TypeAlias = tuple[topics.Topic, bytes]
@@ -25,14 +36,10 @@ Message: TypeAlias = tuple[topics.Topic, bytes]
 DECIMATION = 10
 """Samples from one slow message (monitor, truth) to the next."""
 
-LAMBDA_MIN = 'lambda_min'
-LATCHED = 'latched'
-COMPUTE_TIME = 'compute_time'
-
 
 def disturbance_names(joints: Sequence[str]) -> tuple[str, ...]:
     """Names of the disturbance torques, estimated or true."""
-    return tuple(f'disturbance {joint}' for joint in joints)
+    return tuple(DISTURBANCE + joint for joint in joints)
 
 
 class ControllerTelemetry:
@@ -101,13 +108,13 @@ class PlantTelemetry:
     """
 
     def __init__(self, joints: Sequence[str], parameters: Sequence[str]) -> None:
-        true_state = [f'{what} {joint}' for what in ('position', 'velocity') for joint in joints]
+        true_state = [what + joint for what in (POSITION, VELOCITY) for joint in joints]
         self._joints = len(joints)
         self._joint_states = JointStateEncoder(joints)
         self._truth = JointStateEncoder(
             (*parameters, *disturbance_names(joints), *true_state), ('position',)
         )
-        self._timing = JointStateEncoder(('latency', 'lateness', 'late_steps'), ('position',))
+        self._timing = JointStateEncoder((LATENCY, LATENESS, LATE_STEPS), ('position',))
 
     def joint_states(self, stamp: int, measurement: np.ndarray) -> Message:
         """Measured [q, dq, applied torque of the last interval] (3 n,)."""

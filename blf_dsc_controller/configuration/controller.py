@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from blf_dsc_controller.configuration.comparison import Comparison, Truth
 from blf_dsc_controller.configuration.gains import (
     Barrier,
     Disturbance,
@@ -36,6 +37,8 @@ class Model:
     joints: int
     parameters: int
 
+
+LAWS = ('blf_dsc', 'model_based', 'backstepping', 'slotine_li')
 
 MODELS = {'two_link': Model(joints=2, parameters=3)}
 
@@ -104,7 +107,7 @@ class ControllerConfig:
         at_most=1.0,
         read_only=_LAID_OUT,
     )
-    law: str = parameter('blf_dsc', 'control law', choices=('blf_dsc',), read_only=_LAID_OUT)
+    law: str = parameter('blf_dsc', 'control law', choices=LAWS, read_only=_LAID_OUT)
     model: str = parameter(
         'two_link', 'model of the arm', choices=tuple(MODELS), read_only=_LAID_OUT
     )
@@ -122,6 +125,8 @@ class ControllerConfig:
     disturbance: Disturbance = field(default_factory=Disturbance)
     torque: Torque = field(default_factory=Torque)
     learning: Learning = field(default_factory=Learning)
+    comparison: Comparison = field(default_factory=Comparison)
+    truth: Truth = field(default_factory=Truth)
     telemetry: Telemetry = Telemetry()
     realtime: Realtime = field(default_factory=Realtime)
 
@@ -141,6 +146,7 @@ class ControllerConfig:
             )
         problems += self._slope_problems()
         problems += self.learning.window_problems(self.sample_time)
+        problems += self.truth.problems(self.law, self.model, model.parameters)
         return problems + self.learning.estimate_problems(self.model, model.parameters)
 
     def _slope_problems(self) -> list[str]:

@@ -50,6 +50,17 @@ class Learning:
         'direction of the prediction-error step: regularised Newton, or the gradient (paper)',
         choices=('newton', 'gradient'),
     )
+    prediction: str = parameter(
+        'filtered',
+        'prediction error: filtered regressor, Lambda of (24), or estimated acceleration',
+        choices=('filtered', 'acceleration', 'lambda'),
+        read_only=_FILTERED,
+    )
+    latch: str = parameter(
+        'last',
+        'window learned from: the last excited one (paper), or the best excited one',
+        choices=('last', 'max'),
+    )
     regularization: float = parameter(
         1e-5,
         'added to the excitation matrix before the Newton step divides by it',
@@ -89,6 +100,39 @@ class Learning:
         True,  # noqa: FBT003
         'also estimate a constant disturbance of each joint',
         read_only=_SIZES,
+    )
+    viscous: bool = parameter(
+        False,  # noqa: FBT003
+        'also estimate the viscous friction of each joint',
+        read_only=_SIZES,
+    )
+    coulomb: bool = parameter(
+        False,  # noqa: FBT003
+        'also estimate the Coulomb friction of each joint',
+        read_only=_SIZES,
+    )
+    coulomb_velocity: float = parameter(
+        0.01,
+        'velocity scale over which the Coulomb column changes sign',
+        unit='rad/s',
+        above=0.0,
+        read_only=_MEASURED,
+    )
+    frequencies: tuple[float, ...] = parameter(
+        (),
+        'also estimate a sinusoidal disturbance of each of these frequencies on each joint',
+        unit='rad/s',
+        above=0.0,
+        may_be_empty=True,
+        read_only=_SIZES,
+    )
+    derivative_filter: float = parameter(
+        100.0,
+        'frequency of the filter (8) behind the predictions lambda and acceleration',
+        unit='rad/s',
+        symbol='omega',
+        above=0.0,
+        read_only=_FILTERED,
     )
     radius: float = parameter(
         3.0,

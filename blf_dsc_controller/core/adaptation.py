@@ -5,17 +5,19 @@
     theta^' = Proj( -Gamma (H^T xi2 - kappa W eps) )        W = I, or (Phi_e + rho I)^-1 (newton)
 
 (20) prints + kappa eps, which drives P^ to the projection ball as soon as learning starts.
-H^T xi2 acts on P^ alone.  With Newton's W every excited direction converges at the rate
-Gamma kappa; the gradient's rates are spread as the eigenvalues of Phi_e.
+H^T xi2, with the leakage W_c P^ of the comparison law (35), acts on P^ alone.  With Newton's W
+every excited direction converges at the rate Gamma kappa; the gradient's rates are spread as the
+eigenvalues of Phi_e.
 """
 
 from blf_dsc_controller.core import cholesky, projection
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.borrowed import part
+from blf_dsc_controller.core.kernel import inner
 from blf_dsc_controller.core.settings import NEWTON, Settings
 from blf_dsc_controller.core.state import Signals, State
 
 
-@kernel
+@inner
 def prediction_error(settings: Settings, state: State, signals: Signals) -> None:
     """Leave W eps (m,) in `signals.rate`; zero before the first latch."""
     for i in range(settings.m):
@@ -30,7 +32,7 @@ def prediction_error(settings: Settings, state: State, signals: Signals) -> None
         cholesky.solve(state.factor, signals.rate)
 
 
-@kernel
+@inner
 def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturated: bool) -> None:
     """Step theta^ and d^3 by `dt` [s]: (20), (30).
 
@@ -43,9 +45,15 @@ def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturat
         if j < settings.p and not saturated:
             for i in range(settings.n):
                 tracking += signals.H[i, j] * signals.xi2[i]
+            tracking += settings.Wc * state.estimate[j]
         signals.rate[j] = settings.Gamma[j] * (settings.kappa * signals.rate[j] - tracking)
     p = settings.p
-    projection.project(state.estimate[:p], signals.rate[:p], settings.Gamma[:p], settings.radius)
+    projection.project(
+        part(state.estimate, 0, (p,)),
+        part(signals.rate, 0, (p,)),
+        part(settings.Gamma, 0, (p,)),
+        settings.radius,
+    )
     for j in range(settings.m):
         state.estimate[j] += dt * signals.rate[j]
     projection.rescale(state.estimate, p, settings.radius)

@@ -13,12 +13,12 @@ slope: continuous with its derivative, strong enough to throw the arm back, and 
 
 from math import cos, pi, tan
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.kernel import inner
 
 _BISECTIONS = 60
 
 
-@kernel
+@inner
 def slope(xi: float, bound: float, weight: float) -> float:
     """Stiffness w (1 + 4 s tan s) / cos^2 s   [N m/rad] of the barrier at |xi| < bound [rad]."""
     s = 0.5 * pi * (xi / bound) ** 2
@@ -26,7 +26,7 @@ def slope(xi: float, bound: float, weight: float) -> float:
     return weight * (1.0 + 4.0 * s * tan(s)) / (c * c)
 
 
-@kernel
+@inner
 def knee(bound: float, weight: float, slope_limit: float) -> float:
     """Error [rad] at which the stiffness reaches `slope_limit` [N m/rad] (>= weight)."""
     low = 0.0
@@ -40,7 +40,7 @@ def knee(bound: float, weight: float, slope_limit: float) -> float:
     return low
 
 
-@kernel
+@inner
 def gradient(xi: float, bound: float, weight: float, slope_limit: float, knee: float) -> float:
     """dV/dxi [N m]; the barrier torque tau_c of (16), (28) is its negative."""
     edge = min(abs(xi), knee)
@@ -49,7 +49,7 @@ def gradient(xi: float, bound: float, weight: float, slope_limit: float, knee: f
     return torque if xi >= 0.0 else -torque
 
 
-@kernel
+@inner
 def potential(xi: float, bound: float, weight: float, slope_limit: float, knee: float) -> float:
     """V [J]: (3) up to the knee, a parabola past it."""
     edge = min(abs(xi), knee)

@@ -1,38 +1,77 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Vectors that compiled code uses without counting references to them.
+"""Parts of vectors that compiled code uses without counting references to them.
 
-Numba counts the references to every slice of an array with an atomic operation, which in a step of
-a few hundred floating point operations costs more than the arithmetic. The vectors of a kernel
-belong to its caller, who keeps them alive during the call, so nothing needs counting.
+Numba counts the references to every slice of an array with an atomic operation, and checks every
+slice and reshape, which in a step of a few hundred floating point operations costs more than the
+arithmetic. The vectors of a kernel belong to its caller, who keeps them alive during the call, and
+their layout is fixed, so nothing needs counting or checking.
 """
 
-from typing import TYPE_CHECKING, Any
+from math import prod
+from typing import Any
 
-import numba
 import numpy as np
-from numba.core import cgutils
-from numba.extending import intrinsic
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic, overload
+from numba.np.arrayobj import populate_array
 from numpy.typing import NDArray
 
-if TYPE_CHECKING or numba.config.DISABLE_JIT:
 
-    def borrowed(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the same vector; its slices are not reference-counted in compiled code.
+def borrowed(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the same vector; its slices are not reference-counted in compiled code.
 
-        Never return it, or a slice of it, from a kernel that Python calls.
-        """
-        return vector
+    Never return it, or a slice of it, from a kernel that Python calls.
+    """
+    return vector
 
-else:
 
-    @intrinsic
-    def borrowed(_typing: Any, vector: Any) -> Any:
-        """Return the same vector without its owner."""
+def part(vector: NDArray[np.float64], at: int, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return the part of this shape that starts at entry `at`, under the same conditions."""
+    return vector[at : at + prod(shape)].reshape(shape)
 
-        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            array = context.make_array(signature.return_type)(context, builder, args[0])
-            array.meminfo = cgutils.get_null_value(array.meminfo.type)
-            array.parent = cgutils.get_null_value(array.parent.type)
-            return array._getvalue()  # noqa: SLF001 - as numba itself spells it
 
-        return vector(vector), generate
+@intrinsic
+def _borrowed(_typing: Any, vector: Any) -> Any:
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+        array = context.make_array(signature.return_type)(context, builder, args[0])
+        array.meminfo = cgutils.get_null_value(array.meminfo.type)
+        array.parent = cgutils.get_null_value(array.parent.type)
+        return array._getvalue()  # noqa: SLF001 - numba's own way to read a structure
+
+    return vector(vector), generate
+
+
+@intrinsic
+def _part(_typing: Any, vector: Any, at: Any, shape: Any) -> Any:  # noqa: ARG001
+    view = types.Array(vector.dtype, len(shape), 'C')
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+        source = context.make_array(signature.args[0])(context, builder, args[0])
+        result = context.make_array(signature.return_type)(context, builder)
+        lengths = cgutils.unpack_tuple(builder, args[2])
+        itemsize = context.get_constant(types.intp, 8)
+        strides = [itemsize]
+        for length in lengths[:0:-1]:
+            strides.insert(0, builder.mul(strides[0], length))
+        populate_array(
+            result,
+            data=builder.gep(source.data, [args[1]]),
+            shape=lengths,
+            strides=strides,
+            itemsize=itemsize,
+            meminfo=None,
+        )
+        return result._getvalue()  # noqa: SLF001
+
+    return view(vector, types.intp, types.UniTuple(types.intp, len(shape))), generate
+
+
+@overload(borrowed, strict=False)
+def _compiled_borrowed(vector: Any) -> Any:  # noqa: ARG001 - numba looks at the names
+    return lambda vector: _borrowed(vector)  # noqa: PLW0108
+
+
+@overload(part, strict=False)
+def _compiled_part(vector: Any, at: Any, shape: Any) -> Any:  # noqa: ARG001
+    return lambda vector, at, shape: _part(vector, at, shape)  # noqa: PLW0108

@@ -5,10 +5,10 @@ from math import sqrt
 
 import numpy as np
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.kernel import inner
 
 
-@kernel
+@inner
 def factor(A: np.ndarray, shift: float, L: np.ndarray) -> None:
     """Fill lower L (m x m) with L L^T = A + shift I; A symmetric >= 0, shift > 0.
 
@@ -28,7 +28,7 @@ def factor(A: np.ndarray, shift: float, L: np.ndarray) -> None:
             L[i, j] = value / L[j, j]
 
 
-@kernel
+@inner
 def solve(L: np.ndarray, x: np.ndarray) -> None:
     """Solve L L^T y = x, leaving y in x (m,)."""
     m = x.size

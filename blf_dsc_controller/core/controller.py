@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from blf_dsc_controller.core import law, reference
-from blf_dsc_controller.core.borrowed import borrowed
+from blf_dsc_controller.core.borrowed import part
 from blf_dsc_controller.core.kernel import kernel
 from blf_dsc_controller.core.sample import sample_of, sample_size, tell
 from blf_dsc_controller.core.settings import settings_of
@@ -37,12 +37,13 @@ def respond(
         measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
         sample_vector: packed `Sample`, filled.
     """
-    settings = settings_of(borrowed(settings_vector))
-    state = state_of(borrowed(state_vector), settings)
-    signals = signals_of(borrowed(signals_vector), settings)
-    reference.sinusoids(borrowed(reference_vector), t, signals.qr, signals.dqr, signals.ddqr)
-    law.update(settings_vector, state_vector, signals_vector, t, dt, measurement)
-    tell(state, signals, sample_of(borrowed(sample_vector), settings.n, settings.m))
+    settings = settings_of(settings_vector)
+    state = state_of(state_vector, settings)
+    signals = signals_of(signals_vector, settings)
+    reference.sinusoids(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
+    law.answer(settings, state, signals, t, dt, measurement)
+    sample = sample_of(sample_vector, settings.n, settings.m)
+    tell(settings, state, signals, part(measurement, 0, (settings.n,)), sample)
 
 
 class Controller:
@@ -80,6 +81,7 @@ class Controller:
         self.state_vector.fill(0.0)
         self.state.estimate[:] = self.settings.initial_estimate
         self.state.weakest.fill(self.settings.m**-0.5)
+        self.state.active.fill(1.0)
 
     def check_start(self, joints: tuple[str, ...], q: np.ndarray, t: float = 0.0) -> None:
         """Refuse a start outside the barrier, where the law is not defined.

@@ -18,6 +18,7 @@ from typing import TypeVar, cast
 
 import numba
 from numba.core import config
+from numba.extending import register_jitable
 
 F = TypeVar('F', bound=Callable[..., object])
 
@@ -48,11 +49,20 @@ def cache_folder() -> Path:
     return base / digest.hexdigest()[:16]
 
 
+def inner(function: F) -> F:
+    """Let kernels call `function`, which is compiled into them; in Python it stays what it is."""
+    register_jitable(error_model='numpy', forceinline=True)(function)
+    return function
+
+
 def kernel(function: F) -> F:
-    """Compile `function` with numba: IEEE arithmetic (no fast-math), no exceptions, cached."""
+    """Compile `function`, which Python calls: IEEE arithmetic (no fast-math), cached."""
     before = config.CACHE_DIR  # type: ignore[attr-defined]
     config.CACHE_DIR = str(cache_folder())  # type: ignore[attr-defined]
     try:
-        return cast('F', numba.njit(function, cache=True, error_model='numpy', nogil=True))
+        compiled = numba.njit(
+            function, cache=True, error_model='numpy', nogil=True, no_cfunc_wrapper=True
+        )
+        return cast('F', compiled)
     finally:
         config.CACHE_DIR = before  # type: ignore[attr-defined]

@@ -1,47 +1,82 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One sample of the proposed law: (13), (15), (18), (28) with the learning (20)-(27), (30)."""
+"""One sample of a law: surface, regressor, learning, torque, adaptation.
+
+The proposed law (28) has the filtered surface (13), (15), (18) and the barrier torque; the
+comparison law (35) the linear surface and a position gain.  Every other difference between the laws
+that can be configured is a gain that is zero (see `assembly`).
+"""
+
+from math import sin
 
 import numpy as np
 
 from blf_dsc_controller.core import (
     adaptation,
     barrier,
+    columns,
     excitation,
     models,
     prediction,
     surface,
     window,
 )
-from blf_dsc_controller.core.borrowed import borrowed
-from blf_dsc_controller.core.kernel import kernel
-from blf_dsc_controller.core.settings import EFFORT, Settings, settings_of
-from blf_dsc_controller.core.state import Signals, State, signals_of, state_of
+from blf_dsc_controller.core.borrowed import part
+from blf_dsc_controller.core.kernel import inner
+from blf_dsc_controller.core.settings import EFFORT, LINEAR, Settings
+from blf_dsc_controller.core.state import Signals, State
 
 
-@kernel
+@inner
 def saturation(x: float) -> float:
     """Smooth stand-in for the sign: x, cut at -1 and 1."""
     return min(1.0, max(-1.0, x))
 
 
-@kernel
-def track(
-    settings: Settings, state: State, signals: Signals, q: np.ndarray, dq: np.ndarray
-) -> None:
-    """Errors xi1, xi2 and the surface: virtual control beta2 and alpha2' of the filter (13)."""
-    first = state.samples[0] == 0.0
+@inner
+def known_disturbance(settings: Settings, signals: Signals, t: float) -> None:
+    """Leave the disturbance that the law is told of in `signals.known` (n,) [N m]."""
+    told = settings.true_disturbance
     for i in range(settings.n):
-        signals.xi1[i] = q[i] - signals.qr[i]
+        signals.known[i] = told[0, i] + told[1, i] * sin(told[2, i] * t + told[3, i])
+
+
+@inner
+def filtered_surface(settings: Settings, state: State, signals: Signals) -> None:
+    """beta2 of (18) and alpha2' of the filter (13); alpha2 itself is moved on by `advance`."""
+    for i in range(settings.n):
         signals.beta2[i] = surface.virtual_control(
             signals.xi1[i], settings.bound[i], settings.K[i], settings.mu[i], signals.dqr[i]
         )
-        if first:
+        if state.samples[0] == 0.0:
             state.alpha2[i] = signals.beta2[i]
         signals.dalpha2[i] = (signals.beta2[i] - state.alpha2[i]) / settings.time_constant
+
+
+@inner
+def linear_surface(settings: Settings, state: State, signals: Signals, dq: np.ndarray) -> None:
+    """alpha2 = dqr - lambda_s z1 of (35), and its derivative, which needs ddqr."""
+    for i in range(settings.n):
+        state.alpha2[i] = signals.dqr[i] - settings.K[i] * signals.xi1[i]
+        signals.beta2[i] = state.alpha2[i]
+        signals.dalpha2[i] = signals.ddqr[i] - settings.K[i] * (dq[i] - signals.dqr[i])
+
+
+@inner
+def track(
+    settings: Settings, state: State, signals: Signals, q: np.ndarray, dq: np.ndarray
+) -> None:
+    """Errors xi1 and xi2, and the surface between them."""
+    for i in range(settings.n):
+        signals.xi1[i] = q[i] - signals.qr[i]
+    if settings.surface == LINEAR:
+        linear_surface(settings, state, signals, dq)
+    else:
+        filtered_surface(settings, state, signals)
+    for i in range(settings.n):
         signals.xi2[i] = dq[i] - state.alpha2[i]
 
 
-@kernel
+@inner
 def learn(
     settings: Settings,
     state: State,
@@ -53,40 +88,42 @@ def learn(
     applied: np.ndarray,
 ) -> None:
     """Take the last interval into the window, and look at the excitation when it is time."""
-    models.momentum_regressor(
-        settings.model, settings.constants, q, dq, signals.momentum, signals.rest
+    columns.fill(settings, t, dq, signals.rest)
+    prediction.form_row(settings, state, signals, dt, q, dq, applied)
+    if state.samples[0] == 0.0:
+        return
+    cursor = window.push(state.ring, int(state.cursor[0]), state.running, state.fresh, signals.row)
+    state.cursor[0] = cursor
+    state.rows[0] = min(state.rows[0] + 1.0, float(settings.window))
+    if int(state.samples[0]) % settings.interval == 0:
+        excitation.look(settings, state, signals, t)
+
+
+@inner
+def error_torque(settings: Settings, signals: Signals, i: int) -> float:
+    """Torque of joint i against its errors: barrier (16), robust term and damping of (28), (35)."""
+    robust = settings.d2[i] * abs(signals.xi1[i]) + settings.mu_bar[i]
+    torque = settings.Kp[i] * signals.xi2[i]
+    torque += robust * saturation(signals.xi2[i] / settings.boundary_layer)
+    if settings.surface == LINEAR:
+        return -torque - settings.weight[i] * signals.xi1[i]
+    return -torque - barrier.gradient(
+        signals.xi1[i],
+        settings.bound[i],
+        settings.weight[i],
+        settings.slope_limit[i],
+        settings.knee[i],
     )
-    prediction.bias_columns(settings, signals.rest)
-    if state.samples[0] > 0.0:
-        prediction.filter_row(settings, state, signals, dt, applied)
-        cursor = window.push(
-            state.ring, int(state.cursor[0]), state.running, state.fresh, signals.row
-        )
-        state.cursor[0] = cursor
-        state.rows[0] = min(state.rows[0] + 1.0, float(settings.window))
-        if int(state.samples[0]) % settings.interval == 0:
-            excitation.look(settings, state, signals, t)
-    prediction.remember(settings, state, signals)
 
 
-@kernel
+@inner
 def command(settings: Settings, state: State, signals: Signals) -> bool:
-    """Torque (28), cut at its limit; True if any joint was cut."""
+    """Torque (28) or (35), cut at its limit; True if any joint was cut."""
     saturated = False
     for i in range(settings.n):
-        torque = state.disturbance[i] - settings.Kp[i] * signals.xi2[i]
-        torque -= barrier.gradient(
-            signals.xi1[i],
-            settings.bound[i],
-            settings.weight[i],
-            settings.slope_limit[i],
-            settings.knee[i],
-        )
-        torque -= (
-            settings.d2[i]
-            * abs(signals.xi1[i])
-            * saturation(signals.xi2[i] / settings.boundary_layer)
-        )
+        torque = error_torque(settings, signals, i) + state.disturbance[i]
+        if settings.feed_forward == 1:
+            torque += signals.known[i]
         for j in range(settings.p):
             torque += signals.H[i, j] * state.estimate[j]
         limit = settings.torque_limit[i]
@@ -96,34 +133,42 @@ def command(settings: Settings, state: State, signals: Signals) -> bool:
     return saturated
 
 
-@kernel
-def update(
-    settings_vector: np.ndarray,
-    state_vector: np.ndarray,
-    signals_vector: np.ndarray,
+@inner
+def advance(settings: Settings, state: State, signals: Signals, dt: float) -> None:
+    """Move the surface filter (13) on to the next sample, exactly for the held beta2."""
+    gain = surface.filter_gain(settings.time_constant, dt)
+    for i in range(settings.n):
+        state.alpha2[i] += gain * (signals.beta2[i] - state.alpha2[i])
+        state.torque[i] = signals.torque[i]
+    state.samples[0] += 1.0
+
+
+@inner
+def answer(
+    settings: Settings,
+    state: State,
+    signals: Signals,
     t: float,
     dt: float,
     measurement: np.ndarray,
 ) -> None:
-    """Answer one sample.
+    """Answer one sample: the torque is left in `signals.torque`, and `state` moved on.
 
     Args:
-        settings_vector: packed `Settings`.
-        state_vector: packed `State`, moved on by one sample.
-        signals_vector: packed `Signals`; qr and dqr are read, the torque is left in `torque`.
+        settings: gains and choices.
+        state: moved on by one sample.
+        signals: qr, dqr and ddqr are read, everything else is computed.
         t: time since the start [s].
         dt: time since the last sample [s] (at the first: until the next).
         measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
     """
-    settings = settings_of(borrowed(settings_vector))
-    state = state_of(borrowed(state_vector), settings)
-    signals = signals_of(borrowed(signals_vector), settings)
     n = settings.n
-    q = measurement[:n]
-    dq = measurement[n : 2 * n]
+    q = part(measurement, 0, (n,))
+    dq = part(measurement, n, (n,))
     applied = state.torque
     if settings.torque_source == EFFORT:
-        applied = measurement[2 * n : 3 * n]
+        applied = part(measurement, 2 * n, (n,))
+    known_disturbance(settings, signals, t)
     track(settings, state, signals, q, dq)
     models.regressor(
         settings.model, settings.constants, q, dq, state.alpha2, signals.dalpha2, signals.H
@@ -131,8 +176,4 @@ def update(
     learn(settings, state, signals, t, dt, q, dq, applied)
     saturated = command(settings, state, signals)
     adaptation.adapt(settings, state, signals, dt, saturated)
-    gain = surface.filter_gain(settings.time_constant, dt)
-    for i in range(n):
-        state.alpha2[i] += gain * (signals.beta2[i] - state.alpha2[i])
-        state.torque[i] = signals.torque[i]
-    state.samples[0] += 1.0
+    advance(settings, state, signals, dt)

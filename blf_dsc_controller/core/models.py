@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from blf_dsc_controller.core import two_link
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.kernel import inner
 
 TWO_LINK = 0
 
@@ -45,7 +45,7 @@ def two_link_arm(l1: float, gravity: float) -> Model:
     return Model(TWO_LINK, two_link.JOINTS, two_link.PARAMETER_NAMES, (gravity / l1,))
 
 
-@kernel
+@inner
 def regressor(
     code: int,
     constants: np.ndarray,
@@ -60,7 +60,7 @@ def regressor(
         two_link.regressor(constants, q, dq, v, a, H)
 
 
-@kernel
+@inner
 def momentum_regressor(
     code: int,
     constants: np.ndarray,

@@ -1,33 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prediction error without accelerations: the filtered momentum regressor.
+"""Rows [X | u] of the prediction error: X theta = u holds for the true theta = [P; d].
 
-The dynamics d/dt(Yp P) + Yr P + tau_dist = tau, integrated over one sample of held torque, give
+`filtered` (default).  d/dt(Yp P) + Yr P + D d = tau, integrated over a sample of held torque, is
 
     X_k = (Yp_k - Yp_{k-1}) / T + (Yr_k + Yr_{k-1}) / 2,      X_k P + D_k d = tau on [k-1, k]
 
 up to O(T^2).  Both sides pass the same two cascaded poles, which leaves the identity untouched and
-takes the noise off the difference quotient.  (22)-(24) need xi2' instead and subtract the estimated
-disturbance, which hides the parameter error; here the disturbance is estimated along with P, as the
-coefficients d of the columns D.
+takes the noise off the difference quotient.  No acceleration is needed.
+
+`acceleration`.  ddq^ = alpha2' + xi2'^ with xi2'^ from the filter (8): X = H(q, dq, dq, ddq^).
+
+`lambda`.  The paper's (24): X = H(q, dq, alpha2, alpha2'), u = Lambda tau with the scalar
+Lambda = x^T y / x^T x,  x = [xi2'^ + alpha2'; xi2 + alpha2; 1],  y = [alpha2'; alpha2; 1].  Since
+tau = [M C G] x and H P = [M C G] y, this is exact only where y is parallel to x: its error is of
+first order in xi2 and xi2', and changes with the units.
 """
+
+from math import exp
 
 import numpy as np
 
-from blf_dsc_controller.core import surface
-from blf_dsc_controller.core.kernel import kernel
-from blf_dsc_controller.core.settings import Settings
+from blf_dsc_controller.core import models, surface
+from blf_dsc_controller.core.kernel import inner
+from blf_dsc_controller.core.settings import FILTERED, LAMBDA, Settings
 from blf_dsc_controller.core.state import Signals, State
 
 
-@kernel
-def bias_columns(settings: Settings, rest: np.ndarray) -> None:
-    """Fill columns p.. of `rest` (n, m): one constant torque per joint."""
-    for i in range(settings.n):
-        for j in range(settings.p, settings.m):
-            rest[i, j] = 1.0 if j - settings.p == i else 0.0
-
-
-@kernel
+@inner
 def filter_row(
     settings: Settings, state: State, signals: Signals, dt: float, torque: np.ndarray
 ) -> None:
@@ -54,7 +53,7 @@ def filter_row(
             signals.row[i, j] = state.filter2[i, j]
 
 
-@kernel
+@inner
 def remember(settings: Settings, state: State, signals: Signals) -> None:
     """Keep this sample's Yp and [Yr | D] for the next interval."""
     for i in range(settings.n):
@@ -62,3 +61,86 @@ def remember(settings: Settings, state: State, signals: Signals) -> None:
             state.rest[i, j] = signals.rest[i, j]
             if j < settings.p:
                 state.momentum[i, j] = signals.momentum[i, j]
+
+
+@inner
+def differentiate(settings: Settings, state: State, signals: Signals, dt: float) -> None:
+    """Filter (8) with damping 1, exact for xi2 held over the interval; leaves ddq^ in `signals`."""
+    decay = exp(-settings.omega * dt)
+    for i in range(settings.n):
+        if state.samples[0] == 0.0:
+            state.observed[i] = signals.xi2[i]
+            state.observed_rate[i] = 0.0
+        else:
+            offset = state.observed[i] - signals.xi2[i]
+            slope = state.observed_rate[i] + settings.omega * offset
+            state.observed[i] = signals.xi2[i] + (offset + slope * dt) * decay
+            state.observed_rate[i] = (state.observed_rate[i] - settings.omega * slope * dt) * decay
+        signals.acceleration[i] = signals.dalpha2[i] + state.observed_rate[i]
+
+
+@inner
+def heuristic_factor(settings: Settings, state: State, signals: Signals, dq: np.ndarray) -> float:
+    """Lambda of (24), dimensionless only by neglect of the units."""
+    products = 1.0
+    squares = 1.0
+    for i in range(settings.n):
+        products += signals.acceleration[i] * signals.dalpha2[i] + dq[i] * state.alpha2[i]
+        squares += signals.acceleration[i] ** 2 + dq[i] ** 2
+    return products / squares
+
+
+@inner
+def accelerated_row(
+    settings: Settings,
+    state: State,
+    signals: Signals,
+    q: np.ndarray,
+    dq: np.ndarray,
+    torque: np.ndarray,
+) -> None:
+    """Rows `acceleration` and `lambda`, from ddq^ of `differentiate`, into `signals.row`."""
+    scale = 1.0
+    X = signals.H
+    if settings.prediction == LAMBDA:
+        scale = heuristic_factor(settings, state, signals, dq)
+    else:
+        X = signals.momentum
+        models.regressor(settings.model, settings.constants, q, dq, dq, signals.acceleration, X)
+    for i in range(settings.n):
+        for j in range(settings.m):
+            signals.row[i, j] = X[i, j] if j < settings.p else scale * signals.rest[i, j]
+        signals.row[i, settings.m] = scale * torque[i]
+
+
+@inner
+def form_row(
+    settings: Settings,
+    state: State,
+    signals: Signals,
+    dt: float,
+    q: np.ndarray,
+    dq: np.ndarray,
+    torque: np.ndarray,
+) -> None:
+    """Leave the configured row of the last interval in `signals.row` (n, m + 1).
+
+    Args:
+        settings: the law's settings.
+        state: the law's state.
+        signals: of this sample: H, alpha2', xi2 and the columns D are read.
+        dt: length of the interval [s].
+        q: joint positions (n,) [rad].
+        dq: joint velocities (n,) [rad/s].
+        torque: torque applied over the interval (n,) [N m].
+    """
+    if settings.prediction != FILTERED:
+        differentiate(settings, state, signals, dt)
+        accelerated_row(settings, state, signals, q, dq, torque)
+        return
+    models.momentum_regressor(
+        settings.model, settings.constants, q, dq, signals.momentum, signals.rest
+    )
+    if state.samples[0] > 0.0:
+        filter_row(settings, state, signals, dt, torque)
+    remember(settings, state, signals)

@@ -10,12 +10,12 @@ from math import sqrt
 
 import numpy as np
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.kernel import inner
 
 _ON_SPHERE = 1.0 - 1e-12  # of radius^2: `rescale` ends a rounding inside or outside
 
 
-@kernel
+@inner
 def project(estimate: np.ndarray, rate: np.ndarray, gain: np.ndarray, radius: float) -> None:
     """Remove from `rate` (p,) what leads out of the ball:  v - Gamma w w^T v / (w^T Gamma w).
 
@@ -37,7 +37,7 @@ def project(estimate: np.ndarray, rate: np.ndarray, gain: np.ndarray, radius: fl
             rate[j] -= gain[j] * estimate[j] * outward / metric
 
 
-@kernel
+@inner
 def rescale(estimate: np.ndarray, size: int, radius: float) -> None:
     """Bring the first `size` entries of `estimate` back onto the ball, if a step has left it."""
     square = 0.0

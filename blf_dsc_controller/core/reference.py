@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.borrowed import part
+from blf_dsc_controller.core.kernel import inner
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,17 +33,17 @@ def sinusoids_vector(
     return np.array((*counts, *offset, *frequency, *phase, *amplitude), dtype=np.float64)
 
 
-@kernel
+@inner
 def sinusoids(
     vector: np.ndarray, t: float, qr: np.ndarray, dqr: np.ndarray, ddqr: np.ndarray
 ) -> None:
     """qr_i = offset_i + sum_k amplitude_ik cos(frequency_k t + phase_k), and two derivatives."""
     n = int(vector[0])
     tones = int(vector[1])
-    offset = vector[2 : 2 + n]
-    frequency = vector[2 + n : 2 + n + tones]
-    phase = vector[2 + n + tones : 2 + n + 2 * tones]
-    amplitude = vector[2 + n + 2 * tones :].reshape(n, tones)
+    offset = part(vector, 2, (n,))
+    frequency = part(vector, 2 + n, (tones,))
+    phase = part(vector, 2 + n + tones, (tones,))
+    amplitude = part(vector, 2 + n + 2 * tones, (n, tones))
     for i in range(n):
         qr[i] = offset[i]
         dqr[i] = 0.0

@@ -3,11 +3,15 @@
 
 from __future__ import annotations
 
+from math import nan
 from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core import lyapunov
+from blf_dsc_controller.core.borrowed import part
+from blf_dsc_controller.core.kernel import inner
+from blf_dsc_controller.core.settings import Settings
 from blf_dsc_controller.core.state import Signals, State
 
 
@@ -21,43 +25,54 @@ class Sample(NamedTuple):
     torque: np.ndarray  # (n,) commanded, after the limit, N m
     disturbance: np.ndarray  # (n,) d^3, N m
     estimate: np.ndarray  # (m,) theta^
+    lyapunov: np.ndarray  # (4,) terms of (29): error, kinetic, parameters, disturbance; or NaN
     lambda_min: np.ndarray  # (1,) of the present window's Phi
     latched: np.ndarray  # (1,) 0 or 1
 
 
+@inner
 def sample_size(n: int, m: int) -> int:
     """Length of a sample vector."""
-    return 6 * n + m + 2
+    return 6 * n + m + 6
 
 
-@kernel
+@inner
 def sample_of(vector: np.ndarray, n: int, m: int) -> Sample:
     """Name the parts of a sample vector."""
     at = 6 * n + m
     return Sample(
-        qr=vector[0:n],
-        dqr=vector[n : 2 * n],
-        xi1=vector[2 * n : 3 * n],
-        xi2=vector[3 * n : 4 * n],
-        torque=vector[4 * n : 5 * n],
-        disturbance=vector[5 * n : 6 * n],
-        estimate=vector[6 * n : at],
-        lambda_min=vector[at : at + 1],
-        latched=vector[at + 1 : at + 2],
+        qr=part(vector, 0, (n,)),
+        dqr=part(vector, n, (n,)),
+        xi1=part(vector, 2 * n, (n,)),
+        xi2=part(vector, 3 * n, (n,)),
+        torque=part(vector, 4 * n, (n,)),
+        disturbance=part(vector, 5 * n, (n,)),
+        estimate=part(vector, 6 * n, (m,)),
+        lyapunov=part(vector, at, (4,)),
+        lambda_min=part(vector, at + 4, (1,)),
+        latched=part(vector, at + 5, (1,)),
     )
 
 
-@kernel
-def tell(state: State, signals: Signals, sample: Sample) -> None:
-    """Fill a sample from what the law has just computed."""
-    for i in range(sample.qr.size):
+@inner
+def tell(settings: Settings, state: State, signals: Signals, q: np.ndarray, sample: Sample) -> None:
+    """Fill a sample from what the law has just computed at the positions q (n,) [rad]."""
+    for i in range(settings.n):
         sample.qr[i] = signals.qr[i]
         sample.dqr[i] = signals.dqr[i]
         sample.xi1[i] = signals.xi1[i]
         sample.xi2[i] = signals.xi2[i]
         sample.torque[i] = signals.torque[i]
         sample.disturbance[i] = state.disturbance[i]
-    for j in range(sample.estimate.size):
+    for j in range(settings.m):
         sample.estimate[j] = state.estimate[j]
     sample.lambda_min[0] = state.lambda_min[0]
     sample.latched[0] = state.latched[0]
+    sample.lyapunov[0] = lyapunov.error_term(settings, signals)
+    if settings.truth_known == 1:
+        sample.lyapunov[1] = lyapunov.kinetic_term(settings, signals, q)
+        sample.lyapunov[2] = lyapunov.parameter_term(settings, state)
+        sample.lyapunov[3] = lyapunov.disturbance_term(settings, state, signals)
+    else:
+        for k in range(1, 4):
+            sample.lyapunov[k] = nan

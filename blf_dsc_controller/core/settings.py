@@ -7,13 +7,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.borrowed import part
+from blf_dsc_controller.core.kernel import inner
 
-# What `law`, `update` and `torque_source` may be called; a setting holds the index.
-LAWS = ('blf_dsc',)
+# What these settings may be called; the vector holds the index.
+SURFACES = ('filtered', 'linear')
+PREDICTIONS = ('filtered', 'acceleration', 'lambda')
+LATCHES = ('last', 'max')
 UPDATES = ('gradient', 'newton')
 TORQUE_SOURCES = ('command', 'effort')
 
+LINEAR = SURFACES.index('linear')
+FILTERED = PREDICTIONS.index('filtered')
+LAMBDA = PREDICTIONS.index('lambda')
+BEST = LATCHES.index('max')
 NEWTON = UPDATES.index('newton')
 EFFORT = TORQUE_SOURCES.index('effort')
 
@@ -28,11 +35,19 @@ class Settings(NamedTuple):
     p: int
     m: int
     model: int  # code of the model
-    law: int
+    surface: int
+    prediction: int
+    latch: int
     update: int
     torque_source: int
     window: int  # N, samples in tau_d
     interval: int  # samples between two looks at the excitation
+    bias: int  # 1: a constant column per joint
+    viscous: int  # 1: a column dq_i per joint
+    coulomb: int  # 1: a column tanh(dq_i / coulomb_velocity) per joint
+    tones: int  # sine and cosine columns per joint, for as many frequencies
+    truth_known: int  # 1: true_parameters and true_disturbance hold
+    feed_forward: int  # 1: the true disturbance is compensated
     time_constant: float  # lambda of (13), s
     boundary_layer: float  # b, rad/s
     eta: float  # leakage of (30)
@@ -41,19 +56,26 @@ class Settings(NamedTuple):
     sigma: float  # excitation threshold on lambda_min(Phi)
     learning_start: float  # tau_d + T_a, s
     pole: float  # of the regressor filter, rad/s
+    omega: float  # of the differentiating filter (8), rad/s
+    coulomb_velocity: float  # rad/s
     radius: float  # omega_a of (4)
+    Wc: float  # leakage of P^ in (35)
     bound: np.ndarray  # (n,) k_c, rad
-    weight: np.ndarray  # (n,) w, N m/rad
+    weight: np.ndarray  # (n,) w, N m/rad; of z1 in (35)
     slope_limit: np.ndarray  # (n,) S_lim, N m/rad
     knee: np.ndarray  # (n,) where the barrier's slope reaches S_lim, rad
-    K: np.ndarray  # (n,) 1/s
+    K: np.ndarray  # (n,) 1/s; lambda_s of (35)
     mu: np.ndarray  # (n,) 1/s
     Kp: np.ndarray  # (n,) N m s/rad
     d2: np.ndarray  # (n,) N m/rad
+    mu_bar: np.ndarray  # (n,) N m
     gamma: np.ndarray  # (n,) gain of (30)
     torque_limit: np.ndarray  # (n,) N m
+    true_disturbance: np.ndarray  # (4, n) constant, amplitude [N m], frequency, phase of a sine
     Gamma: np.ndarray  # (m,) diagonal of the adaptation gain
     initial_estimate: np.ndarray  # (m,) P^(0), zeros for the columns
+    true_parameters: np.ndarray  # (p,)
+    frequencies: np.ndarray  # (tones,) of the sine and cosine columns, rad/s
     constants: np.ndarray  # what the model's regressors know of the geometry
 
 
@@ -62,43 +84,60 @@ def pack(settings: Settings) -> np.ndarray:
     return np.concatenate([np.ravel(np.asarray(value, dtype=np.float64)) for value in settings])
 
 
-@kernel
+@inner
 def settings_of(vector: np.ndarray) -> Settings:
     """Name the parts of a packed vector; the arrays are views on it."""
     n = int(vector[0])
+    p = int(vector[1])
     m = int(vector[2])
-    joint = vector[18 : 18 + 10 * n].reshape(10, n)
-    rest = vector[18 + 10 * n :]
+    tones = int(vector[14])
+    at = 29 + 15 * n
+    tail = at + 2 * m + p + tones
     return Settings(
         n=n,
-        p=int(vector[1]),
+        p=p,
         m=m,
         model=int(vector[3]),
-        law=int(vector[4]),
-        update=int(vector[5]),
-        torque_source=int(vector[6]),
-        window=int(vector[7]),
-        interval=int(vector[8]),
-        time_constant=vector[9],
-        boundary_layer=vector[10],
-        eta=vector[11],
-        kappa=vector[12],
-        rho=vector[13],
-        sigma=vector[14],
-        learning_start=vector[15],
-        pole=vector[16],
-        radius=vector[17],
-        bound=joint[0],
-        weight=joint[1],
-        slope_limit=joint[2],
-        knee=joint[3],
-        K=joint[4],
-        mu=joint[5],
-        Kp=joint[6],
-        d2=joint[7],
-        gamma=joint[8],
-        torque_limit=joint[9],
-        Gamma=rest[:m],
-        initial_estimate=rest[m : 2 * m],
-        constants=rest[2 * m :],
+        surface=int(vector[4]),
+        prediction=int(vector[5]),
+        latch=int(vector[6]),
+        update=int(vector[7]),
+        torque_source=int(vector[8]),
+        window=int(vector[9]),
+        interval=int(vector[10]),
+        bias=int(vector[11]),
+        viscous=int(vector[12]),
+        coulomb=int(vector[13]),
+        tones=tones,
+        truth_known=int(vector[15]),
+        feed_forward=int(vector[16]),
+        time_constant=vector[17],
+        boundary_layer=vector[18],
+        eta=vector[19],
+        kappa=vector[20],
+        rho=vector[21],
+        sigma=vector[22],
+        learning_start=vector[23],
+        pole=vector[24],
+        omega=vector[25],
+        coulomb_velocity=vector[26],
+        radius=vector[27],
+        Wc=vector[28],
+        bound=part(vector, 29, (n,)),
+        weight=part(vector, 29 + n, (n,)),
+        slope_limit=part(vector, 29 + 2 * n, (n,)),
+        knee=part(vector, 29 + 3 * n, (n,)),
+        K=part(vector, 29 + 4 * n, (n,)),
+        mu=part(vector, 29 + 5 * n, (n,)),
+        Kp=part(vector, 29 + 6 * n, (n,)),
+        d2=part(vector, 29 + 7 * n, (n,)),
+        mu_bar=part(vector, 29 + 8 * n, (n,)),
+        gamma=part(vector, 29 + 9 * n, (n,)),
+        torque_limit=part(vector, 29 + 10 * n, (n,)),
+        true_disturbance=part(vector, 29 + 11 * n, (4, n)),
+        Gamma=part(vector, at, (m,)),
+        initial_estimate=part(vector, at + m, (m,)),
+        true_parameters=part(vector, at + 2 * m, (p,)),
+        frequencies=part(vector, at + 2 * m + p, (tones,)),
+        constants=part(vector, tail, (vector.size - tail,)),
     )

@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.borrowed import part
+from blf_dsc_controller.core.kernel import inner
 from blf_dsc_controller.core.settings import Settings
 
 
@@ -24,9 +25,13 @@ class State(NamedTuple):
     latched: np.ndarray  # (1,) 1 once (Phi_e, b_e) is kept
     latch_time: np.ndarray  # (1,) T_e, s
     lambda_min: np.ndarray  # (1,) of Phi at the last look
+    latched_lambda: np.ndarray  # (1,) lambda_min of the latched window
+    judged: np.ndarray  # (1,) 1 once the disturbance columns are accepted or refused
     alpha2: np.ndarray  # (n,) rad/s
     torque: np.ndarray  # (n,) torque commanded last, N m
     disturbance: np.ndarray  # (n,) d^3, N m
+    observed: np.ndarray  # (n,) xi2 through the filter (8), rad/s
+    observed_rate: np.ndarray  # (n,) its derivative, rad/s^2
     estimate: np.ndarray  # (m,) theta^ = [P^; columns]
     momentum: np.ndarray  # (n, p) Yp of the last sample
     rest: np.ndarray  # (n, m) [Yr | columns] of the last sample
@@ -38,6 +43,7 @@ class State(NamedTuple):
     b: np.ndarray  # (m,) latched b_e
     factor: np.ndarray  # (m, m) Cholesky factor of Phi_e + rho I
     weakest: np.ndarray  # (m,) unit vector of the least excited direction
+    active: np.ndarray  # (m,) 0 where a disturbance column has been refused
     ring: np.ndarray  # (N, n, m + 1) the window's rows
 
 
@@ -51,6 +57,8 @@ class Signals(NamedTuple):
     beta2: np.ndarray  # (n,) rad/s
     dalpha2: np.ndarray  # (n,) rad/s^2
     xi2: np.ndarray  # (n,) rad/s
+    known: np.ndarray  # (n,) disturbance known to the law, N m
+    acceleration: np.ndarray  # (n,) estimated ddq, rad/s^2
     demand: np.ndarray  # (n,) torque (28) before the limit, N m
     torque: np.ndarray  # (n,) torque commanded, N m
     H: np.ndarray  # (n, p)
@@ -69,96 +77,89 @@ def state_size(settings: Settings) -> int:
     n, p, m = settings.n, settings.p, settings.m
     row = n * (m + 1)
     ring = settings.window * row
-    return 6 + 3 * n + m + n * p + n * m + 2 * row + 4 * m * (m + 1) + ring
+    return 8 + 5 * n + m + n * p + n * m + 2 * row + 4 * m * (m + 1) + m + ring
 
 
 def signals_size(settings: Settings) -> int:
     """Length of a signals vector."""
     n, p, m = settings.n, settings.p, settings.m
-    return 9 * n + 2 * n * p + n * m + n * (m + 1) + 2 * m * m + 3 * m
+    return 11 * n + 2 * n * p + n * m + n * (m + 1) + 2 * m * m + 3 * m
 
 
-@kernel
+@inner
 def state_of(vector: np.ndarray, settings: Settings) -> State:
     """Name the parts of a state vector."""
     n = settings.n
     p = settings.p
     m = settings.m
-    joint = vector[6 : 6 + 3 * n].reshape(3, n)
-    at = 6 + 3 * n
-    estimate = vector[at : at + m]
-    at += m
-    momentum = vector[at : at + n * p].reshape(n, p)
-    at += n * p
-    rest = vector[at : at + n * m].reshape(n, m)
-    at += n * m
-    filters = vector[at : at + 2 * n * (m + 1)].reshape(2, n, m + 1)
-    at += 2 * n * (m + 1)
-    sums = vector[at : at + 2 * m * (m + 1)].reshape(2, m, m + 1)
-    at += 2 * m * (m + 1)
-    squares = vector[at : at + 2 * m * m].reshape(2, m, m)
-    at += 2 * m * m
-    columns = vector[at : at + 2 * m].reshape(2, m)
-    at += 2 * m
+    row = n * (m + 1)
+    estimate = 8 + 5 * n
+    momentum = estimate + m
+    rest = momentum + n * p
+    filters = rest + n * m
+    sums = filters + 2 * row
+    squares = sums + 2 * m * (m + 1)
+    columns = squares + 2 * m * m
     return State(
-        samples=vector[0:1],
-        cursor=vector[1:2],
-        rows=vector[2:3],
-        latched=vector[3:4],
-        latch_time=vector[4:5],
-        lambda_min=vector[5:6],
-        alpha2=joint[0],
-        torque=joint[1],
-        disturbance=joint[2],
-        estimate=estimate,
-        momentum=momentum,
-        rest=rest,
-        filter1=filters[0],
-        filter2=filters[1],
-        running=sums[0],
-        fresh=sums[1],
-        Phi=squares[0],
-        factor=squares[1],
-        b=columns[0],
-        weakest=columns[1],
-        ring=vector[at:].reshape(settings.window, n, m + 1),
+        samples=part(vector, 0, (1,)),
+        cursor=part(vector, 1, (1,)),
+        rows=part(vector, 2, (1,)),
+        latched=part(vector, 3, (1,)),
+        latch_time=part(vector, 4, (1,)),
+        lambda_min=part(vector, 5, (1,)),
+        latched_lambda=part(vector, 6, (1,)),
+        judged=part(vector, 7, (1,)),
+        alpha2=part(vector, 8, (n,)),
+        torque=part(vector, 8 + n, (n,)),
+        disturbance=part(vector, 8 + 2 * n, (n,)),
+        observed=part(vector, 8 + 3 * n, (n,)),
+        observed_rate=part(vector, 8 + 4 * n, (n,)),
+        estimate=part(vector, estimate, (m,)),
+        momentum=part(vector, momentum, (n, p)),
+        rest=part(vector, rest, (n, m)),
+        filter1=part(vector, filters, (n, m + 1)),
+        filter2=part(vector, filters + row, (n, m + 1)),
+        running=part(vector, sums, (m, m + 1)),
+        fresh=part(vector, sums + m * (m + 1), (m, m + 1)),
+        Phi=part(vector, squares, (m, m)),
+        factor=part(vector, squares + m * m, (m, m)),
+        b=part(vector, columns, (m,)),
+        weakest=part(vector, columns + m, (m,)),
+        active=part(vector, columns + 2 * m, (m,)),
+        ring=part(vector, columns + 3 * m, (settings.window, n, m + 1)),
     )
 
 
-@kernel
+@inner
 def signals_of(vector: np.ndarray, settings: Settings) -> Signals:
     """Name the parts of a signals vector."""
     n = settings.n
     p = settings.p
     m = settings.m
-    joint = vector[0 : 9 * n].reshape(9, n)
-    at = 9 * n
-    models = vector[at : at + 2 * n * p].reshape(2, n, p)
-    at += 2 * n * p
-    rest = vector[at : at + n * m].reshape(n, m)
-    at += n * m
-    row = vector[at : at + n * (m + 1)].reshape(n, m + 1)
-    at += n * (m + 1)
-    squares = vector[at : at + 2 * m * m].reshape(2, m, m)
-    at += 2 * m * m
-    columns = vector[at : at + 3 * m].reshape(3, m)
+    regressor = 11 * n
+    rest = regressor + 2 * n * p
+    row = rest + n * m
+    squares = row + n * (m + 1)
+    columns = squares + 2 * m * m
     return Signals(
-        qr=joint[0],
-        dqr=joint[1],
-        ddqr=joint[2],
-        xi1=joint[3],
-        beta2=joint[4],
-        dalpha2=joint[5],
-        xi2=joint[6],
-        demand=joint[7],
-        torque=joint[8],
-        H=models[0],
-        momentum=models[1],
-        rest=rest,
-        row=row,
-        Phi=squares[0],
-        factor=squares[1],
-        b=columns[0],
-        rate=columns[1],
-        look=columns[2],
+        qr=part(vector, 0, (n,)),
+        dqr=part(vector, n, (n,)),
+        ddqr=part(vector, 2 * n, (n,)),
+        xi1=part(vector, 3 * n, (n,)),
+        beta2=part(vector, 4 * n, (n,)),
+        dalpha2=part(vector, 5 * n, (n,)),
+        xi2=part(vector, 6 * n, (n,)),
+        known=part(vector, 7 * n, (n,)),
+        acceleration=part(vector, 8 * n, (n,)),
+        demand=part(vector, 9 * n, (n,)),
+        torque=part(vector, 10 * n, (n,)),
+        H=part(vector, regressor, (n, p)),
+        momentum=part(vector, regressor + n * p, (n, p)),
+        rest=part(vector, rest, (n, m)),
+        row=part(vector, row, (n, m + 1)),
+        Phi=part(vector, squares, (m, m)),
+        factor=part(vector, squares + m * m, (m, m)),
+        b=part(vector, columns, (m,)),
+        rate=part(vector, columns + m, (m,)),
+        look=part(vector, columns + 2 * m, (m,)),
     )

@@ -3,10 +3,10 @@
 
 from math import exp, pi, sin
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.kernel import inner
 
 
-@kernel
+@inner
 def sinc(x: float) -> float:
     """sin(x) / x, by its series where the quotient would lose its digits."""
     if abs(x) < 1e-4:
@@ -14,7 +14,7 @@ def sinc(x: float) -> float:
     return sin(x) / x
 
 
-@kernel
+@inner
 def virtual_control(
     xi1: float, bound: float, barrier_gain: float, linear_gain: float, reference_velocity: float
 ) -> float:
@@ -31,7 +31,7 @@ def virtual_control(
     return reference_velocity - barrier_part - linear_gain * xi1
 
 
-@kernel
+@inner
 def filter_gain(time_constant: float, dt: float) -> float:
     """Share of the way to its held input that a first-order lag goes in `dt` [s], exactly."""
     return 1.0 - exp(-dt / time_constant)

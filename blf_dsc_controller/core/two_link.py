@@ -14,13 +14,13 @@ from math import cos, sin
 
 import numpy as np
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.kernel import inner
 
 JOINTS = 2
 PARAMETER_NAMES = ('(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2')
 
 
-@kernel
+@inner
 def regressor(
     constants: np.ndarray,
     q: np.ndarray,
@@ -42,7 +42,7 @@ def regressor(
     H[1, 2] = c2 * a[0] + s2 * dq[0] * v[0] + r * c12
 
 
-@kernel
+@inner
 def momentum_regressor(
     constants: np.ndarray, q: np.ndarray, dq: np.ndarray, Yp: np.ndarray, Yr: np.ndarray
 ) -> None:
@@ -67,7 +67,7 @@ def momentum_regressor(
     Yr[1, 2] = sin(q[1]) * dq[0] * (dq[0] + dq[1]) + r * c12
 
 
-@kernel
+@inner
 def inertia(P: np.ndarray, q: np.ndarray, M: np.ndarray) -> None:
     """Fill the inertia matrix M (2 x 2) [kg m^2]."""
     coupling = P[2] * cos(q[1])
@@ -77,7 +77,7 @@ def inertia(P: np.ndarray, q: np.ndarray, M: np.ndarray) -> None:
     M[1, 1] = P[1]
 
 
-@kernel
+@inner
 def coriolis(P: np.ndarray, q: np.ndarray, dq: np.ndarray, C: np.ndarray) -> None:
     """Fill C (2 x 2) [N m s/rad] in Christoffel form, so that dM/dt - 2 C is skew (Property I)."""
     c = P[2] * sin(q[1])
@@ -87,7 +87,7 @@ def coriolis(P: np.ndarray, q: np.ndarray, dq: np.ndarray, C: np.ndarray) -> Non
     C[1, 1] = 0.0
 
 
-@kernel
+@inner
 def gravity(constants: np.ndarray, P: np.ndarray, q: np.ndarray, G: np.ndarray) -> None:
     """Fill the gravity torque G (2,) [N m], the gradient of `potential`."""
     r = constants[0]
@@ -95,7 +95,7 @@ def gravity(constants: np.ndarray, P: np.ndarray, q: np.ndarray, G: np.ndarray) 
     G[0] = P[0] * r * cos(q[0]) + G[1]
 
 
-@kernel
+@inner
 def potential(constants: np.ndarray, P: np.ndarray, q: np.ndarray) -> float:
     """Potential energy [J], zero with both links horizontal."""
     r = constants[0]

@@ -8,10 +8,10 @@ wrapped; at the wrap F is the exact content of the ring and replaces S.
 
 import numpy as np
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.kernel import inner
 
 
-@kernel
+@inner
 def push(
     ring: np.ndarray, cursor: int, running: np.ndarray, fresh: np.ndarray, row: np.ndarray
 ) -> int:
@@ -49,7 +49,7 @@ def push(
     return 0
 
 
-@kernel
+@inner
 def average(running: np.ndarray, samples: int, Phi: np.ndarray, b: np.ndarray) -> None:
     """Fill Phi (m, m), whole, and b (m,): both integrals over the window, by the same 1/tau_d."""
     m = Phi.shape[0]

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 
 from blf_dsc_controller import assembly
 from blf_dsc_controller.bags import topics
@@ -36,7 +35,7 @@ OUTPUTS = (
 )
 
 
-class ControllerNode(Node):
+class ControllerNode(executor.RunnableNode):
     """Answers each joint state with a torque on `~/commands`, and tells how it goes.
 
     Attributes:
@@ -56,7 +55,6 @@ class ControllerNode(Node):
         self.config = parameters.declare(self, ControllerConfig)
         self.controller = assembly.controller_of(self.config)
         self.stopped = ''
-        self.finished = False
         realtime.request(self.config.realtime, self.get_logger())
         joints = self.config.joints
         self._telemetry = ControllerTelemetry(joints, assembly.estimate_names(self.config))

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from rclpy.node import Node
 
 from blf_dsc_controller.bags.errors import UnknownTypeError
 from blf_dsc_controller.bags.topics import Quality
@@ -15,7 +14,7 @@ from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.recorder import RecorderConfig
 from blf_dsc_controller.nodes.definitions import learn
 from blf_dsc_controller.nodes.endpoints import message_class
-from blf_dsc_controller.nodes.executor import run
+from blf_dsc_controller.nodes.executor import RunnableNode, run
 from blf_dsc_controller.nodes.intake import Intake, quality_of
 from blf_dsc_controller.nodes.losses import Losses
 from blf_dsc_controller.nodes.parameters import declare
@@ -25,7 +24,7 @@ _TAKE_PERIOD = 0.01  # s
 _FLUSH_INTERVAL = 0.05  # s; with the period above, data is in the process for less than 0.1 s
 
 
-class BagRecorderNode(Node):
+class BagRecorderNode(RunnableNode):
     """Subscribes to topics as they appear and writes what comes.
 
     Args:
@@ -35,8 +34,6 @@ class BagRecorderNode(Node):
         ConfigurationError: a parameter is wrong.
         BagExistsError: the folder of the bag is there already.
     """
-
-    finished = False
 
     def __init__(self, **options: Any) -> None:
         super().__init__('bag_recorder', enable_rosout=False, **options)

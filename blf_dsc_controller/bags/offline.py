@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The bag of an offline run: the topics and messages that the nodes would have published."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from blf_dsc_controller.assembly import estimate_names, model_of
+from blf_dsc_controller.bags import topics
+from blf_dsc_controller.bags.telemetry import (
+    DECIMATION,
+    ControllerTelemetry,
+    Message,
+    PlantTelemetry,
+)
+from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.simulation import Record
+
+START = 1_000_000_000
+"""Stamp of the first sample [ns], as in lock-step."""
+
+
+def write_bag(path: Path, record: Record, config: ControllerConfig, compression: str) -> None:
+    """Write a run as a bag.
+
+    Args:
+        path: folder of the bag, which must not exist yet.
+        record: the run.
+        config: of the controller that ran.
+        compression: `none` or `zstd`.
+
+    Raises:
+        BagExistsError: `path` is there already.
+    """
+    with BagWriter(path, compression=compression, flush_interval=None) as bag:
+        handles: dict[topics.Topic, int] = {}
+        for stamp, (topic, raw) in _messages(record, config):
+            if topic not in handles:
+                handles[topic] = bag.add_topic(topic.resolved, topic.type, [topic.offered])
+            bag.write(handles[topic], raw, stamp)
+
+
+def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, Message]]:
+    plant = PlantTelemetry(config.joints, model_of(config).parameter_names)
+    controller = ControllerTelemetry(config.joints, estimate_names(config))
+    bound = np.array(config.barrier.bound)
+    ratio = np.zeros_like(bound)
+    yield START, controller.bound(START, bound, np.array(config.torque.limit))
+    for row, elapsed in enumerate(record.stamps.tolist()):
+        stamp = START + elapsed
+        told = record.sample(row)
+        np.maximum(ratio, np.abs(told.xi1) / bound, out=ratio)
+        yield stamp, plant.joint_states(stamp, record.measurements[row])
+        yield stamp, controller.command(told.torque)
+        for message in controller.sample(stamp, told, float('nan')):
+            yield stamp, message
+        if row % DECIMATION == 0:
+            yield stamp, plant.truth(stamp, record.truths[row])
+            yield stamp, controller.monitor(stamp, told, ratio)
