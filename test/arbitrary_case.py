@@ -28,27 +28,28 @@ class Case(NamedTuple):
 
 
 def arbitrary_settings(random: np.random.Generator, n: int, p: int, **changes) -> Settings:
-    """Positive gains for n joints, p parameters and a bias column for each joint."""
-    joint = ('bound', 'weight', 'slope_limit', 'knee', 'K', 'mu', 'Kp', 'd2', 'gamma')
-    settings = recommended()._replace(
-        n=n,
-        p=p,
-        m=p + n,
-        model=-1,
-        window=8,
-        interval=1,
-        eta=0.3,
-        kappa=5.0,
-        sigma=1e-9,
-        learning_start=0.0,
-        radius=1e3,
-        torque_limit=np.full(n, 1e3),
-        Gamma=random.uniform(0.5, 2.0, p + n),
-        initial_estimate=random.normal(size=p + n),
-        constants=np.zeros(0),
-        **dict(zip(joint, random.uniform(0.5, 2.0, (len(joint), n)), strict=True)),
-    )
-    return settings._replace(**changes)
+    """Gains between 0.5 and 2 for n joints, p parameters and a bias column for each joint."""
+    settings = recommended()
+    length = {settings.n: n, settings.p: p, settings.m: p + n}
+    arrays = {
+        name: random.uniform(0.5, 2.0, [length.get(size, size) for size in value.shape])
+        for name, value in settings._asdict().items()
+        if isinstance(value, np.ndarray)
+    }
+    case = {
+        'n': n,
+        'p': p,
+        'm': p + n,
+        'model': -1,
+        'window': 8,
+        'interval': 1,
+        'eta': 0.3,
+        'kappa': 5.0,
+        'sigma': 1e-9,
+        'learning_start': 0.0,
+        'radius': 1e3,
+    }
+    return settings._replace(**arrays | case | changes)
 
 
 def arbitrary(seed: int, n: int = 3, p: int = 4, **changes) -> Case:

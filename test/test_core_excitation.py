@@ -50,19 +50,41 @@ def test_factor_exists_where_rounding_takes_a_pivot_below_the_shift():
     assert clamped > 0
 
 
+def excited_case(seed):
+    """Case with a window of eight excited rows, which has not been looked at yet."""
+    case = arbitrary(seed, sigma=0.01, learning_start=2.0)
+    settings, state, signals = case
+    state.running[:] = state.fresh[:] = state.ring[:] = 0.0
+    state.latched[0] = 0.0
+    state.rows[0] = settings.window
+    cursor = 0
+    random = np.random.default_rng(seed)
+    for _ in range(settings.window):
+        signals.row[:] = random.normal(size=signals.row.shape)
+        cursor = window.push(state.ring, cursor, state.running, state.fresh, signals.row)
+    return case
+
+
+@pytest.fixture
+def excited():
+    return excited_case(2)
+
+
+def settled_look(case, t):
+    """The looks of a while: the first starts from no direction in particular."""
+    for _ in range(50):
+        excitation.look(*case, t)
+
+
 @pytest.mark.parametrize('seed', range(5))
 def test_inverse_iteration_finds_the_smallest_eigenvalue_and_its_direction(seed):
-    random = np.random.default_rng(seed)
-    Phi = excitation_matrix(random, 5, 9)
-    L, direction = np.zeros((5, 5)), np.full(5, 5**-0.5)
-    cholesky.factor(Phi, 1e-5, L)
-    for _ in range(25):
-        smallest = excitation.weakest_direction(Phi, L, direction, np.zeros(5))
+    case = excited_case(seed)
+    settled_look(case, 0.0)
 
-    values, vectors = np.linalg.eigh(Phi)
-    assert smallest == pytest.approx(values[0], rel=1e-10)
-    assert abs(vectors[:, 0] @ direction) == pytest.approx(1.0, rel=1e-10)
-    assert np.linalg.norm(direction) == pytest.approx(1.0, rel=1e-14)
+    values, vectors = np.linalg.eigh(case.signals.Phi)
+    assert case.state.lambda_min[0] == pytest.approx(values[0], rel=1e-10)
+    assert abs(vectors[:, 0] @ case.state.weakest) == pytest.approx(1.0, rel=1e-10)
+    assert np.linalg.norm(case.state.weakest) == pytest.approx(1.0, rel=1e-14)
 
 
 def test_warm_started_iteration_follows_the_smallest_eigenvalue_along_a_loop():
@@ -80,27 +102,6 @@ def test_warm_started_iteration_follows_the_smallest_eigenvalue_along_a_loop():
     filled = t > 1.0
     np.testing.assert_allclose(found[filled], exact[filled], rtol=1e-3)
     assert np.median(found[filled] / exact[filled] - 1.0) < 1e-6
-
-
-@pytest.fixture
-def excited():
-    """Case with a window of eight excited rows, which has not been looked at yet."""
-    case = arbitrary(1, sigma=0.01, learning_start=2.0)
-    settings, state, signals = case
-    state.running[:] = state.fresh[:] = state.ring[:] = 0.0
-    state.latched[0] = 0.0
-    state.rows[0] = settings.window
-    cursor = 0
-    random = np.random.default_rng(2)
-    for _ in range(settings.window):
-        signals.row[:] = random.normal(size=signals.row.shape)
-        cursor = window.push(state.ring, cursor, state.running, state.fresh, signals.row)
-    return case
-
-
-def settled_look(case, t):
-    for _ in range(50):  # the first of a loop start from no direction in particular
-        excitation.look(*case, t)
 
 
 def test_latch_keeps_the_whole_window_when_time_and_excitation_suffice(excited):

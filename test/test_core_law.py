@@ -11,8 +11,8 @@ from plain_law import PlainLaw
 from blf_dsc_controller.core.settings import EFFORT, UPDATES
 
 # A window that is no multiple of the interval, and nearly a second more to learn in. So short a
-# window conditions Phi as 1e7; rho = 1 keeps the rounding that this multiplies below 1e-12.
-SHORT = {'window': 497, 'interval': 7, 'learning_start': 0.6, 'rho': 1.0}
+# window conditions Phi as 1e7; rho = 10 keeps the rounding that this multiplies below 1e-12.
+SHORT = {'window': 497, 'interval': 7, 'learning_start': 0.6, 'rho': 10.0}
 ROUNDING = 1e-12
 GRADIENT = UPDATES.index('gradient')
 

@@ -18,9 +18,8 @@ from closed_loop_case import (
     record,
 )
 
-from blf_dsc_controller.core import models, prediction
+from blf_dsc_controller.core import prediction
 from blf_dsc_controller.core.settings import EFFORT
-from blf_dsc_controller.core.state import signals_of, signals_size, state_of, state_size
 
 BIAS = (0.3, -0.2)
 
@@ -49,32 +48,25 @@ def test_both_sides_pass_two_exact_poles(n, p):
         np.testing.assert_allclose(signals.row, two, atol=1e-9)  # the quotient is of size 1e3
 
 
-def test_bias_columns_are_one_torque_for_each_joint():
-    settings, _, signals = arbitrary(7)
-    prediction.bias_columns(settings, signals.rest)
-    np.testing.assert_array_equal(signals.rest[:, settings.p :], np.eye(settings.n))
-
-
 def filtered_rows(sample_time, duration=2.0):
     """Rows [X | u] of the arm swinging about its lowest point under held, varying torques."""
-    settings = recommended()
-    state = state_of(np.zeros(state_size(settings)), settings)
-    signals = signals_of(np.zeros(signals_size(settings)), settings)
+    law = controller(recommended(torque_source=EFFORT))
     arm = plant(sample_time=sample_time, start=(-1.2, 0.4), constant=BIAS, amplitude=(0.0, 0.0))
     rows = []
     for k in range(round(duration / sample_time)):
-        q, dq, applied = arm.measure().reshape(3, 2)
-        models.momentum_regressor(
-            settings.model, settings.constants, q, dq, signals.momentum, signals.rest
-        )
-        prediction.bias_columns(settings, signals.rest)
-        if k > 0:
-            prediction.filter_row(settings, state, signals, sample_time, applied)
-            rows.append(signals.row.copy())
-        prediction.remember(settings, state, signals)
         t = k * sample_time
+        law.update(t, sample_time, arm.measure())  # its torque is not asked for
         arm.step(np.array([2.0 * np.sin(3.0 * t), 1.5 * np.cos(5.0 * t)]))
-    return np.array(rows)
+        rows.append(law.signals.row.copy())
+    return np.array(rows[1:])
+
+
+def test_bias_columns_are_one_torque_for_each_joint():
+    """Constant columns come out of both poles as what the poles have let through so far."""
+    rows = filtered_rows(1e-3)
+    passed = 1.0 - np.exp(-10.0) * (1.0 + 10.0)  # of a step after 1 s, up to the pole's T
+    np.testing.assert_allclose(rows[999, :, 3:5], passed * np.eye(2), atol=1e-4)
+    np.testing.assert_allclose(rows[-1, :, 3:5], np.eye(2), atol=1e-6)
 
 
 def test_filtered_identity_holds_up_to_the_square_of_the_sample_time():

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from arbitrary_case import arbitrary_settings
 from closed_loop_case import (
-    JOINTS,
     START,
     closed_loop,
     controller,
@@ -28,14 +27,11 @@ from blf_dsc_controller.core import law as kernels
 from blf_dsc_controller.core.sample import sample_of, sample_size
 from blf_dsc_controller.core.settings import Settings, pack, settings_of
 from blf_dsc_controller.core.state import (
-    Signals,
-    State,
     signals_of,
     signals_size,
     state_of,
     state_size,
 )
-from blf_dsc_controller.errors import BlfDscError, OutsideBarrierError
 
 SHAPES = [(1, 1), (2, 3), (3, 4), (6, 30)]
 SIZES = ('n', 'p', 'm')
@@ -43,14 +39,14 @@ SIZES = ('n', 'p', 'm')
 
 def distinct_settings(n, p):
     """Settings in which no two numbers are the same, but n, p and m are what they must be."""
-    settings = arbitrary_settings(np.random.default_rng(0), n, p, constants=np.zeros(2))
+    settings = arbitrary_settings(np.random.default_rng(0), n, p)
     number = iter(range(1000, 10_000))
     values = {}
     for name, value in settings._asdict().items():
         if name in SIZES:
             continue
         if isinstance(value, np.ndarray):
-            values[name] = np.array([float(next(number)) for _ in value])
+            values[name] = np.reshape([float(next(number)) for _ in range(value.size)], value.shape)
         else:
             values[name] = next(number) + (0 if isinstance(value, int) else 0.5)
     return settings._replace(**values)
@@ -89,33 +85,45 @@ def test_views_cover_their_vectors_exactly_once(n, p):
         )
 
 
-def test_views_have_the_shapes_they_are_documented_with():
+def assert_shapes(view, named):
+    for shape, names in named.items():
+        for name in names.split():
+            assert getattr(view, name).shape == shape, name
+
+
+def test_state_has_the_shapes_it_is_documented_with():
     n, p, m, N = 3, 4, 7, 8
     settings = arbitrary_settings(np.random.default_rng(0), n, p)
-    state = state_of(np.zeros(state_size(settings)), settings)
-    signals = signals_of(np.zeros(signals_size(settings)), settings)
+    assert_shapes(
+        state_of(np.zeros(state_size(settings)), settings),
+        {
+            (1,): 'samples cursor rows latched latch_time lambda_min',
+            (n,): 'alpha2 torque disturbance',
+            (m,): 'estimate b weakest',
+            (n, p): 'momentum',
+            (n, m): 'rest',
+            (n, m + 1): 'filter1 filter2',
+            (m, m + 1): 'running fresh',
+            (m, m): 'Phi factor',
+            (N, n, m + 1): 'ring',
+        },
+    )
 
-    assert {name: part.shape for name, part in zip(State._fields, state, strict=True)} == {
-        **dict.fromkeys(('samples', 'cursor', 'rows', 'latched', 'latch_time'), (1,)),
-        'lambda_min': (1,),
-        **dict.fromkeys(('alpha2', 'torque', 'disturbance'), (n,)),
-        **dict.fromkeys(('estimate', 'b', 'weakest'), (m,)),
-        'momentum': (n, p),
-        'rest': (n, m),
-        **dict.fromkeys(('filter1', 'filter2'), (n, m + 1)),
-        **dict.fromkeys(('running', 'fresh'), (m, m + 1)),
-        **dict.fromkeys(('Phi', 'factor'), (m, m)),
-        'ring': (N, n, m + 1),
-    }
-    assert {name: part.shape for name, part in zip(Signals._fields, signals, strict=True)} == {
-        **dict.fromkeys(('qr', 'dqr', 'ddqr', 'xi1', 'beta2', 'dalpha2', 'xi2'), (n,)),
-        **dict.fromkeys(('demand', 'torque'), (n,)),
-        **dict.fromkeys(('H', 'momentum'), (n, p)),
-        'rest': (n, m),
-        'row': (n, m + 1),
-        **dict.fromkeys(('Phi', 'factor'), (m, m)),
-        **dict.fromkeys(('b', 'rate', 'look'), (m,)),
-    }
+
+def test_signals_have_the_shapes_they_are_documented_with():
+    n, p, m = 3, 4, 7
+    settings = arbitrary_settings(np.random.default_rng(0), n, p)
+    assert_shapes(
+        signals_of(np.zeros(signals_size(settings)), settings),
+        {
+            (n,): 'qr dqr ddqr xi1 beta2 dalpha2 xi2 demand torque',
+            (n, p): 'H momentum',
+            (n, m): 'rest',
+            (n, m + 1): 'row',
+            (m, m): 'Phi factor',
+            (m,): 'b rate look',
+        },
+    )
 
 
 def test_sample_tells_what_the_update_computed():
@@ -152,31 +160,6 @@ def test_a_restored_loop_continues_bit_for_bit():
     np.testing.assert_array_equal(rest_of(law), first)
     np.testing.assert_array_equal(rest_of(other), first)
     assert np.any(saved != law.state_vector)
-
-
-@pytest.mark.parametrize('error', [0.002, -0.0021, 1.5, np.nan])
-@pytest.mark.parametrize('joint', [0, 1])
-def test_a_start_outside_the_barrier_is_refused_by_name(joint, error):
-    law = controller(recommended())
-    q = np.array([1.9935, 1.3961]) + 0.3  # the reference at t = 0
-    law.check_start(JOINTS, q)
-    q[joint] += error * (1.0 + 1e-9)
-
-    with pytest.raises(OutsideBarrierError) as refusal:
-        law.check_start(JOINTS, q)
-
-    assert isinstance(refusal.value, BlfDscError)
-    assert (refusal.value.joint, refusal.value.bound) == (JOINTS[joint], 0.002)
-    assert refusal.value.error == pytest.approx(error, rel=1e-6, nan_ok=True)
-    for part in (JOINTS[joint], f'{error:+.6g} rad', '0.002 rad'):
-        assert part in str(refusal.value)
-
-
-def test_a_start_is_judged_by_the_reference_of_its_time():
-    law = controller(recommended())
-    law.check_start(JOINTS, np.array(START))
-    with pytest.raises(OutsideBarrierError):
-        law.check_start(JOINTS, np.array(START), t=0.2)
 
 
 @numba.njit
