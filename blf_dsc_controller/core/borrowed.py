@@ -43,7 +43,7 @@ def _borrowed(_typing: Any, vector: Any) -> Any:
 
 
 @intrinsic
-def _part(_typing: Any, vector: Any, at: Any, shape: Any) -> Any:  # noqa: ARG001
+def _part(_typing: Any, vector: Any, at: Any, shape: Any) -> Any:
     view = types.Array(vector.dtype, len(shape), 'C')
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
@@ -64,7 +64,7 @@ def _part(_typing: Any, vector: Any, at: Any, shape: Any) -> Any:  # noqa: ARG00
         )
         return result._getvalue()  # noqa: SLF001
 
-    return view(vector, types.intp, types.UniTuple(types.intp, len(shape))), generate
+    return view(vector, at, shape), generate
 
 
 @overload(borrowed, strict=False)

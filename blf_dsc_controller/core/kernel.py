@@ -57,12 +57,12 @@ def inner(function: F) -> F:
 
 def kernel(function: F) -> F:
     """Compile `function`, which Python calls: IEEE arithmetic (no fast-math), cached."""
-    before = config.CACHE_DIR  # type: ignore[attr-defined]
-    config.CACHE_DIR = str(cache_folder())  # type: ignore[attr-defined]
+    before = config.CACHE_DIR
+    config.CACHE_DIR = str(cache_folder())
     try:
         compiled = numba.njit(
             function, cache=True, error_model='numpy', nogil=True, no_cfunc_wrapper=True
         )
         return cast('F', compiled)
     finally:
-        config.CACHE_DIR = before  # type: ignore[attr-defined]
+        config.CACHE_DIR = before

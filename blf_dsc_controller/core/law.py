@@ -106,8 +106,8 @@ def error_torque(settings: Settings, signals: Signals, i: int) -> float:
     torque = settings.Kp[i] * signals.xi2[i]
     torque += robust * saturation(signals.xi2[i] / settings.boundary_layer)
     if settings.surface == LINEAR:
-        return -torque - settings.weight[i] * signals.xi1[i]
-    return -torque - barrier.gradient(
+        return float(-torque - settings.weight[i] * signals.xi1[i])
+    return float(-torque) - barrier.gradient(
         signals.xi1[i],
         settings.bound[i],
         settings.weight[i],

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-
 from blf_dsc_controller.bags.errors import UnknownTypeError
 from blf_dsc_controller.bags.topics import Quality
 from blf_dsc_controller.bags.writer import BagWriter

@@ -126,7 +126,7 @@ def run_over_ros(config: LoopConfig, out: Path, domain: int) -> bool:
         for name, module in _MODULES.items()
     ]
     recorder, controller, plant = nodes
-    from blf_dsc_controller.tools.watch import Watch  # noqa: PLC0415 - after the processes
+    from blf_dsc_controller.tools.watch import Watch
 
     completed = True
     try:

@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
+from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 from sim_plant import arm
@@ -33,7 +32,7 @@ class Progress:
             mininterval=0.2,
         )
 
-    def show(self, elapsed: float, ratio: float, estimate: Sequence[float]) -> None:
+    def show(self, elapsed: float, ratio: float, estimate: ArrayLike) -> None:
         """Show the simulated time [s], the largest |xi1| / k_c so far, and P^ (3,)."""
         error = np.linalg.norm(np.asarray(estimate) - self._truth) / np.linalg.norm(self._truth)
         self._bar.set_postfix_str(
