@@ -108,7 +108,7 @@ def test_update_is_projected_in_the_parameters_and_free_in_the_columns():
     p = settings.p
     state.estimate[:p] /= np.linalg.norm(state.estimate[:p]) * (1.0 - 1e-12)
     state.estimate[p:] = 50.0  # far outside, were they counted
-    signals.xi2[:] *= -np.sign(signals.xi2 @ signals.H @ state.estimate[:p])  # outward
+    signals.xi2[:] *= np.sign(tracking_part(settings, signals)[:p] @ state.estimate[:p])  # outward
     v, w, Gamma = tracking_part(settings, signals)[:p], state.estimate[:p].copy(), settings.Gamma
 
     estimate, _ = estimates_after(settings, state, signals)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import blf_dsc_controller
@@ -19,7 +20,7 @@ def test_every_file_with_a_kernel_is_in_the_digest_of_the_cache():
         path
         for package in packages
         for path in package.rglob('*.py')
-        if '\n@kernel\n' in path.read_text(encoding='utf-8')
+        if re.search(r'^@(kernel|inner)$', path.read_text(encoding='utf-8'), re.MULTILINE)
     }
     assert with_kernels
     assert with_kernels <= set(ground_floor_sources())

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from arbitrary_case import arbitrary_settings
 from closed_loop_case import (
+    REFERENCE,
     START,
     closed_loop,
     controller,
@@ -23,7 +24,7 @@ from closed_loop_case import (
 )
 from numba.core.runtime import _nrt_python, rtsys
 
-from blf_dsc_controller.core import law as kernels
+from blf_dsc_controller.core.controller import respond
 from blf_dsc_controller.core.sample import sample_of, sample_size
 from blf_dsc_controller.core.settings import Settings, pack, settings_of
 from blf_dsc_controller.core.state import (
@@ -34,7 +35,7 @@ from blf_dsc_controller.core.state import (
 )
 
 SHAPES = [(1, 1), (2, 3), (3, 4), (6, 30)]
-SIZES = ('n', 'p', 'm')
+SIZES = ('n', 'p', 'm', 'tones')
 
 
 def distinct_settings(n, p):
@@ -163,9 +164,9 @@ def test_a_restored_loop_continues_bit_for_bit():
 
 
 @numba.njit
-def many_updates(settings, state, signals, measurement, count):
+def many_updates(settings, reference, state, signals, measurement, sample, count):
     for k in range(count):
-        kernels.update(settings, state, signals, k * 1e-3, 1e-3, measurement)
+        respond(settings, reference, state, signals, k * 1e-3, 1e-3, measurement, sample)
 
 
 def test_updates_in_a_compiled_loop_allocate_nothing():
@@ -173,7 +174,8 @@ def test_updates_in_a_compiled_loop_allocate_nothing():
     settings = pack(quick(window=50, learning_start=0.01, sigma=-1.0))
     law = controller(settings_of(settings))
     measurement = np.array([*START, *np.zeros(4)])
-    arguments = (settings, law.state_vector, law.signals_vector, measurement)
+    vectors = (settings, REFERENCE, law.state_vector, law.signals_vector)
+    arguments = (*vectors, measurement, law.sample_vector)
     many_updates(*arguments, 1)
     allocations = []
     _nrt_python.memsys_enable_stats()
