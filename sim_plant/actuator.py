@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.kernel import inner
 
 
 class Actuator(NamedTuple):
@@ -23,14 +23,14 @@ class ActuatorState(NamedTuple):
     ring: NDArray[np.float64]  # (delay, n) N m
 
 
-@kernel
+@inner
 def actuator_view(flat: NDArray[np.float64]) -> Actuator:
     """Read an actuator from its (n + 1,) vector."""
     n = flat.size - 1
     return Actuator(flat[:n], int(flat[n]))
 
 
-@kernel
+@inner
 def limited(torque: float, limit: float) -> float:
     """Return the torque within +-limit; a limit of 0 is none."""
     if limit == 0.0:
@@ -38,7 +38,7 @@ def limited(torque: float, limit: float) -> float:
     return min(max(torque, -limit), limit)
 
 
-@kernel
+@inner
 def actuate(
     actuator: Actuator, sample: int, command: NDArray[np.float64], state: ActuatorState
 ) -> None:

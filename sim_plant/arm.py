@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.kernel import inner
 
 ARM_SIZE = 5
 
@@ -30,13 +30,13 @@ class Arm(NamedTuple):
     g: float  # m/s^2
 
 
-@kernel
+@inner
 def arm_view(flat: NDArray[np.float64]) -> Arm:
     """Read an arm from its (ARM_SIZE,) vector."""
     return Arm(flat[0], flat[1], flat[2], flat[3], flat[4])
 
 
-@kernel
+@inner
 def parameters(arm: Arm, out: NDArray[np.float64]) -> None:
     """Write the (3,) parameters P the controller estimates, kg m^2."""
     out[0] = (arm.m1 + arm.m2) * arm.l1**2
@@ -44,7 +44,7 @@ def parameters(arm: Arm, out: NDArray[np.float64]) -> None:
     out[2] = arm.m2 * arm.l1 * arm.l2
 
 
-@kernel
+@inner
 def inertia(arm: Arm, q2: float) -> tuple[float, float, float]:
     """Return M11, M12 = M21 and M22 of the mass matrix, kg m^2."""
     outer = arm.m2 * arm.l2**2
@@ -52,20 +52,20 @@ def inertia(arm: Arm, q2: float) -> tuple[float, float, float]:
     return (arm.m1 + arm.m2) * arm.l1**2 + outer + 2.0 * coupling, outer + coupling, outer
 
 
-@kernel
+@inner
 def christoffel(arm: Arm, q2: float) -> float:
     """Return dM12/dq2 = dM11/dq2 / 2, of which all of C is made, kg m^2."""
     return -arm.m2 * arm.l1 * arm.l2 * math.sin(q2)
 
 
-@kernel
+@inner
 def gravity_torque(arm: Arm, q1: float, q2: float) -> tuple[float, float]:
     """Return G = grad U, N m."""
     outer = arm.m2 * arm.g * arm.l2 * math.cos(q1 + q2)
     return (arm.m1 + arm.m2) * arm.g * arm.l1 * math.cos(q1) + outer, outer
 
 
-@kernel
+@inner
 def mass_matrix(arm: Arm, q: NDArray[np.float64], out: NDArray[np.float64]) -> None:
     """Write M(q), (2, 2), kg m^2."""
     m11, m12, m22 = inertia(arm, q[1])
@@ -75,7 +75,7 @@ def mass_matrix(arm: Arm, q: NDArray[np.float64], out: NDArray[np.float64]) -> N
     out[1, 1] = m22
 
 
-@kernel
+@inner
 def coriolis(
     arm: Arm, q: NDArray[np.float64], dq: NDArray[np.float64], out: NDArray[np.float64]
 ) -> None:
@@ -87,13 +87,13 @@ def coriolis(
     out[1, 1] = 0.0
 
 
-@kernel
+@inner
 def gravity(arm: Arm, q: NDArray[np.float64], out: NDArray[np.float64]) -> None:
     """Write G(q), (2,), N m."""
     out[0], out[1] = gravity_torque(arm, q[0], q[1])
 
 
-@kernel
+@inner
 def acceleration(
     arm: Arm,
     q: NDArray[np.float64],
@@ -112,14 +112,14 @@ def acceleration(
     ddq[1] = (m11 * f2 - m12 * f1) / determinant
 
 
-@kernel
+@inner
 def kinetic_energy(arm: Arm, q: NDArray[np.float64], dq: NDArray[np.float64]) -> float:
     """Return dq^T M dq / 2, J."""
     m11, m12, m22 = inertia(arm, q[1])
     return float(0.5 * (m11 * dq[0] ** 2 + 2.0 * m12 * dq[0] * dq[1] + m22 * dq[1] ** 2))
 
 
-@kernel
+@inner
 def potential_energy(arm: Arm, q: NDArray[np.float64]) -> float:
     """Return U, J, zero with the arm stretched out horizontally."""
     height1 = arm.l1 * math.sin(q[0])

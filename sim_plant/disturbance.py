@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.kernel import inner
 
 DISTURBANCE_TERMS = 7
 
@@ -44,7 +44,7 @@ def disturbance_vector(
     return np.stack(columns, axis=-1).ravel()
 
 
-@kernel
+@inner
 def joint_disturbance(flat: NDArray[np.float64], i: int) -> JointDisturbance:
     """Read joint i of a disturbance vector."""
     k = i * DISTURBANCE_TERMS
@@ -53,7 +53,7 @@ def joint_disturbance(flat: NDArray[np.float64], i: int) -> JointDisturbance:
     )
 
 
-@kernel
+@inner
 def joint_torque(joint: JointDisturbance, t: float, dq: float) -> float:
     """Return tau_dist of one joint, N m, t seconds after the start."""
     torque = joint.constant + joint.amplitude * math.sin(joint.frequency * t + joint.phase)
@@ -63,7 +63,7 @@ def joint_torque(joint: JointDisturbance, t: float, dq: float) -> float:
     return torque
 
 
-@kernel
+@inner
 def disturbance_torque(
     flat: NDArray[np.float64], t: float, dq: NDArray[np.float64], out: NDArray[np.float64]
 ) -> None:

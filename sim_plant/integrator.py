@@ -9,7 +9,7 @@ x + h sum_j a_ij k_j, the step ends at x + h sum_i b_i k_i.
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.kernel import inner
 from sim_plant.arm import Arm
 from sim_plant.motion import motion
 
@@ -36,13 +36,13 @@ _DOPRI5_A = np.array(
 _DOPRI5_B = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
 
 
-@kernel
+@inner
 def scratch_size(n: int) -> int:
     """Length of the work vector `integrate` needs for n joints: the stages and one point."""
     return (STAGES + 1) * 2 * n
 
 
-@kernel
+@inner
 def _explicit_step(
     a: NDArray[np.float64],
     b: NDArray[np.float64],
@@ -71,7 +71,7 @@ def _explicit_step(
         x[i] += h * slope
 
 
-@kernel
+@inner
 def integrate(
     method: int,
     arm: Arm,

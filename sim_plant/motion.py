@@ -4,12 +4,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.kernel import inner
 from sim_plant.arm import Arm, acceleration
 from sim_plant.disturbance import disturbance_torque
 
 
-@kernel
+@inner
 def motion(
     arm: Arm,
     disturbance: NDArray[np.float64],

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.core.borrowed import borrowed
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.kernel import inner, kernel
 from blf_dsc_controller.errors import ConfigurationError
 from sim_plant.actuator import Actuator, ActuatorState, actuate, actuator_view
 from sim_plant.arm import ARM_SIZE, Arm, arm_view, parameters
@@ -73,13 +73,13 @@ def settings_vector(settings: PlantSettings) -> NDArray[np.float64]:
     return np.concatenate([np.ravel(np.asarray(part, dtype=np.float64)) for part in parts])
 
 
-@kernel
+@inner
 def joint_count(settings: NDArray[np.float64]) -> int:
     """Return n of a settings vector."""
     return (settings.size - _SCALARS) // _PER_JOINT
 
 
-@kernel
+@inner
 def settings_view(flat: NDArray[np.float64]) -> PlantSettings:
     """Name the parts of a settings vector."""
     sensor = 2 + ARM_SIZE
@@ -95,7 +95,7 @@ def settings_view(flat: NDArray[np.float64]) -> PlantSettings:
     )
 
 
-@kernel
+@inner
 def state_view(flat: NDArray[np.float64], n: int, delay: int) -> PlantState:
     """Name the parts of a state vector of n joints and a delay in samples."""
     sensor = 1 + 2 * n

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.core.kernel import inner
 
 MEASURED = 0
 DIFFERENCED = 1
@@ -36,7 +36,7 @@ class SensorState(NamedTuple):
     velocity: NDArray[np.float64]  # (n,) rad/s
 
 
-@kernel
+@inner
 def sensor_view(flat: NDArray[np.float64]) -> Sensor:
     """Read a sensor from its (SENSOR_SIZE,) vector."""
     return Sensor(flat[0], flat[1], flat[2], int(flat[3]))
@@ -47,20 +47,20 @@ def generator(seed: int) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
 
 
-@kernel
+@inner
 def is_noisy(sensor: Sensor) -> bool:
     """Return whether a reading needs random numbers at all."""
     return sensor.position_noise > 0.0 or sensor.velocity_noise > 0.0
 
 
-@kernel
+@inner
 def draw(rng: np.random.Generator, noise: NDArray[np.float64]) -> None:
     """Fill with standard normal numbers: the same as `rng.standard_normal(out=noise)`."""
     for i in range(noise.size):
         noise[i] = rng.standard_normal()
 
 
-@kernel
+@inner
 def quantised(angle: float, resolution: float) -> float:
     """Return the nearest multiple of the resolution; a resolution of 0 is none."""
     if resolution == 0.0:
@@ -68,7 +68,7 @@ def quantised(angle: float, resolution: float) -> float:
     return float(np.rint(angle / resolution) * resolution)
 
 
-@kernel
+@inner
 def sense(
     sensor: Sensor,
     sample: int,
