@@ -110,7 +110,8 @@ class PlainLaw:
         beta2 = self.virtual_control(xi1, dqr)
         if self.alpha2 is None:
             self.alpha2 = beta2
-        dalpha2 = (beta2 - self.alpha2) / g.time_constant
+        following = beta2 + (self.alpha2 - beta2) * np.exp(-dt / g.time_constant)
+        dalpha2 = (following - self.alpha2) / dt
         xi2 = dq - self.alpha2
         self.take_in(t, dt, q, dq, effort if self.effort else self.tau)
         H = self.regressor(q, dq, self.alpha2, dalpha2)
@@ -123,6 +124,6 @@ class PlainLaw:
         )
         torque = np.clip(demand, -g.torque_limit, g.torque_limit)
         self.adapt(dt, H, xi2, saturated=np.any(torque != demand))
-        self.alpha2 = beta2 + (self.alpha2 - beta2) * np.exp(-dt / g.time_constant)
+        self.alpha2 = following
         self.samples += 1
         return torque

@@ -41,15 +41,21 @@ def known_disturbance(settings: Settings, signals: Signals, t: float) -> None:
 
 
 @inner
-def filtered_surface(settings: Settings, state: State, signals: Signals) -> None:
-    """beta2 of (18) and alpha2' of the filter (13); alpha2 itself is moved on by `advance`."""
+def filtered_surface(settings: Settings, state: State, signals: Signals, dt: float) -> None:
+    """beta2 of (18) and alpha2' of the filter (13); alpha2 itself is moved on by `advance`.
+
+    beta2 is held for the sample, in which alpha2' falls from (beta2 - alpha2) / lambda by the
+    factor exp(-dt / lambda).  The torque is held too, so it is given the mean of alpha2', which is
+    what alpha2 then moves by: with lambda = 2 dt the first value would be 27 % too large.
+    """
+    share = surface.filter_gain(settings.time_constant, dt)
     for i in range(settings.n):
         signals.beta2[i] = surface.virtual_control(
             signals.xi1[i], settings.bound[i], settings.K[i], settings.mu[i], signals.dqr[i]
         )
         if state.samples[0] == 0.0:
             state.alpha2[i] = signals.beta2[i]
-        signals.dalpha2[i] = (signals.beta2[i] - state.alpha2[i]) / settings.time_constant
+        signals.dalpha2[i] = share * (signals.beta2[i] - state.alpha2[i]) / dt
 
 
 @inner
@@ -63,7 +69,12 @@ def linear_surface(settings: Settings, state: State, signals: Signals, dq: np.nd
 
 @inner
 def track(
-    settings: Settings, state: State, signals: Signals, q: np.ndarray, dq: np.ndarray
+    settings: Settings,
+    state: State,
+    signals: Signals,
+    dt: float,
+    q: np.ndarray,
+    dq: np.ndarray,
 ) -> None:
     """Errors xi1 and xi2, and the surface between them."""
     for i in range(settings.n):
@@ -71,7 +82,7 @@ def track(
     if settings.surface == LINEAR:
         linear_surface(settings, state, signals, dq)
     else:
-        filtered_surface(settings, state, signals)
+        filtered_surface(settings, state, signals, dt)
     for i in range(settings.n):
         signals.xi2[i] = dq[i] - state.alpha2[i]
 
@@ -169,7 +180,7 @@ def answer(
     if settings.torque_source == EFFORT:
         applied = part(measurement, 2 * n, (n,))
     known_disturbance(settings, signals, t)
-    track(settings, state, signals, q, dq)
+    track(settings, state, signals, dt, q, dq)
     models.regressor(
         settings.model, settings.constants, q, dq, state.alpha2, signals.dalpha2, signals.H
     )
