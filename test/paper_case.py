@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the tests of the paper's variants share: presets as configurations, and their runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.configuration.nodes import LoopConfig
+from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.core.sample import sample_of
+from blf_dsc_controller.simulation import simulate
+
+P = np.array([1.0, 0.32, 0.4])
+NO_DISTURBANCE = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
+EXACT = {
+    'truth.parameters': [1.0, 0.32, 0.4],
+    'truth.constant': [0.1, 0.1],
+    'truth.amplitude': [0.1, 0.1],
+}
+
+
+def configured(
+    preset: str,
+    duration: float,
+    law: Mapping[str, object] | None = None,
+    arm: Mapping[str, object] | None = None,
+) -> LoopConfig:
+    """A preset, with changes to the controller (`law`) and to the plant (`arm`)."""
+    config = load_loop(locate(preset), {'sim_plant': {'duration': duration}})
+    return config._replace(
+        controller=change(config.controller, law or {}), plant=change(config.plant, arm or {})
+    )
+
+
+class Loop(NamedTuple):
+    """A whole loop; the first axis is the sample."""
+
+    t: np.ndarray  # s
+    xi1: np.ndarray  # (., 2) rad
+    xi2: np.ndarray  # (., 2) rad/s
+    torque: np.ndarray  # (., 2) N m
+    estimate: np.ndarray  # (., m)
+    lyapunov: np.ndarray  # (., 4)
+    latched: np.ndarray  # (.,)
+
+    @property
+    def parameter_error(self) -> np.ndarray:
+        """|P^ - P| / |P| of each sample."""
+        return np.linalg.norm(self.estimate[:, :3] - P, axis=1) / np.linalg.norm(P)
+
+    def error_at(self, t: float) -> float:
+        """Relative parameter error at a time [s]."""
+        return float(self.parameter_error[np.abs(self.t - t).argmin()])
+
+
+def run(config: LoopConfig) -> Loop:
+    """Run a configuration offline."""
+    record = simulate(config.controller, config.plant)
+    columns = sample_of(np.arange(record.samples.shape[1]), 2, record.estimates)
+    names = ('xi1', 'xi2', 'torque', 'estimate', 'lyapunov')
+    parts = (record.samples[:, getattr(columns, name)] for name in names)
+    return Loop(record.stamps * 1e-9, *parts, record.samples[:, columns.latched[0]])

@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The laws by name: each against its own equations, and against the others where they agree."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from closed_loop_case import plant
+from paper_case import EXACT, NO_DISTURBANCE, P, configured, run
+from plain_law import PlainLaw, dynamics
+
+from blf_dsc_controller.assembly import controller_of
+from blf_dsc_controller.configuration.controller import LAWS
+
+ROUNDING = 1e-10
+R = 9.8  # 1/s^2, g / l1
+UNEVEN = {
+    'feedback.gain': [40.0, 25.0],
+    'feedback.boundary_layer': 0.02,
+    'learning.adaptation_gain': [0.7, 1.3, 2.1],
+    'comparison.surface_gain': [60.0, 35.0],
+    'comparison.position_gain': [30.0, 11.0],
+    'comparison.robust_gain': [0.4, 0.2],
+    'comparison.leakage': 0.05,
+}
+
+
+class PlainComparison:
+    """(35) as printed, P^ by Euler; `slotine_li` is the same without w, mu_bar and W_c."""
+
+    def __init__(self, config, *, bare):
+        own = config.comparison
+        self.Kp = np.array(config.feedback.gain)
+        self.layer = config.feedback.boundary_layer
+        self.Gamma = np.array(config.learning.adaptation_gain)
+        self.lambda_s = np.array(own.surface_gain)
+        self.w = np.zeros(2) if bare else np.array(own.position_gain)
+        self.mu_bar = np.zeros(2) if bare else np.array(own.robust_gain)
+        self.Wc = 0.0 if bare else own.leakage
+        self.P = np.array(config.learning.initial_estimate)
+
+    def update(self, dt, qr, dqr, ddqr, q, dq):
+        z1 = q - qr
+        alpha2 = dqr - self.lambda_s * z1
+        dalpha2 = ddqr - self.lambda_s * (dq - dqr)
+        z2 = dq - alpha2
+        parts = [dynamics(e, R, q, dq) for e in np.eye(3)]
+        H = np.column_stack([M @ dalpha2 + C @ alpha2 + G for M, C, G in parts])
+        sat = np.clip(z2 / self.layer, -1.0, 1.0)
+        torque = H @ self.P - self.Kp * z2 - self.w * z1 - self.mu_bar * sat
+        self.P = self.P - dt * self.Gamma * (H.T @ z2 + self.Wc * self.P)
+        return torque
+
+
+@pytest.mark.parametrize('law', ['backstepping', 'slotine_li'])
+def test_comparison_laws_are_their_equations_over_a_closed_loop(law):
+    config = configured('recommended', 1.0, UNEVEN | {'law': law}).controller
+    controller, plain = controller_of(config), PlainComparison(config, bare=law == 'slotine_li')
+    arm = plant()
+    for k in range(1000):
+        t = k * 1e-3
+        measurement = arm.measure()
+        controller.update(t, 1e-3, measurement)
+        qr = np.array([1.9935, 1.3961]) + 0.3 * np.cos(t)
+        dqr, ddqr = np.full(2, -0.3 * np.sin(t)), np.full(2, -0.3 * np.cos(t))
+        torque = plain.update(1e-3, qr, dqr, ddqr, measurement[:2], measurement[2:4])
+        np.testing.assert_allclose(controller.signals.torque, torque, atol=ROUNDING)
+        np.testing.assert_allclose(controller.state.estimate[:3], plain.P, atol=ROUNDING)
+        arm.step(controller.signals.torque)
+    assert np.abs(controller.state.estimate[:3] - [0.5, 0.16, 0.2]).max() > 0.05  # it did adapt
+
+
+def test_comparison_laws_leave_the_barrier_and_the_composite_learning_alone():
+    """Gains of the proposed law do not reach them: the same run bit for bit."""
+    changed = {
+        'barrier.weight': [5.0, 7.0],
+        'surface.gain': [3.0, 3.0],
+        'surface.time_constant': 0.5,
+        'feedback.damping': [9.0, 9.0],
+        'disturbance.gain': [7.0, 7.0],
+        'learning.weight': 3.0,
+    }
+    for law in ('backstepping', 'slotine_li'):
+        runs = [run(configured('recommended', 8.0, {'law': law} | more)) for more in ({}, changed)]
+        np.testing.assert_array_equal(runs[0].torque, runs[1].torque)
+        assert runs[0].latched[-1] == 1.0  # there was something to learn from
+
+
+def test_without_prediction_error_the_loop_is_the_one_without_learning_bit_for_bit():
+    """kappa = 0 against a threshold that is never reached, over the latch at 6.8 s."""
+    off = run(configured('recommended', 10.0, {'learning.weight': 0.0}))
+    never = run(configured('recommended', 10.0, {'learning.excitation_threshold': 1e9}))
+    learning = run(configured('recommended', 10.0))
+
+    assert (off.latched[-1], never.latched[-1]) == (1.0, 0.0)
+    np.testing.assert_array_equal(off.torque, never.torque)
+    np.testing.assert_array_equal(off.estimate[:, :3], never.estimate[:, :3])
+    assert np.abs(learning.torque - off.torque).max() > 0.01
+
+
+FROZEN = {
+    'learning.initial_estimate': list(P),
+    'learning.adaptation_gain': [0.0, 0.0, 0.0],
+    'disturbance.gain': [0.0, 0.0],
+    'truth.feed_forward': True,
+}
+
+
+def test_proposed_law_with_all_known_and_frozen_is_the_model_based_one():
+    frozen = run(configured('recommended', 10.0, EXACT | FROZEN))
+    model_based = run(configured('recommended', 10.0, EXACT | {'law': 'model_based'}))
+    np.testing.assert_allclose(frozen.torque, model_based.torque, atol=1e-12)
+    np.testing.assert_allclose(frozen.xi1, model_based.xi1, atol=1e-15)
+
+
+def test_model_based_law_is_equation_16_over_a_closed_loop():
+    """Against the plain transcription with P^ = P, d^3 = tau_dist, and nothing adapted."""
+    config = configured('recommended', 1.0, EXACT | {'law': 'model_based'}).controller
+    controller = controller_of(config)
+    plain = PlainLaw(controller.settings)
+    arm = plant()
+    for k in range(1000):
+        t = k * 1e-3
+        measurement = arm.measure()
+        controller.update(t, 1e-3, measurement)
+        plain.theta[:3], plain.d3 = P, np.full(2, 0.1 + 0.1 * np.sin(t))
+        signals = controller.signals
+        torque = plain.update(t, 1e-3, signals.qr, signals.dqr, measurement)
+        np.testing.assert_allclose(signals.torque, torque, atol=ROUNDING)
+        plain.tau = signals.torque.copy()
+        arm.step(signals.torque)
+
+
+@pytest.mark.parametrize('law', LAWS)
+def test_every_law_keeps_its_torque_within_the_limit(law):
+    limits = {'torque.limit': [8.0, 3.0]}
+    torque = np.abs(run(configured('recommended', 1.0, EXACT | limits | {'law': law})).torque)
+    assert np.all(torque <= [8.0, 3.0])
+    assert torque[:, 0].max() == 8.0
+
+
+def floor(changes):
+    """Largest |xi1| [rad] from 1 s on of the model-based law that is told the disturbance."""
+    loop = run(configured('model_based', 8.0, changes))
+    return np.abs(loop.xi1[loop.t >= 1.0]).max(axis=0)
+
+
+def test_error_of_the_oracle_stays_below_twenty_microradians():
+    assert floor({}).max() < 2e-5
+
+
+@pytest.mark.parametrize('time_constant', [0.002, 0.004, 0.008, 0.016])
+@pytest.mark.parametrize(
+    ('gain', 'mu', 'weight'),
+    [(150.0, 20.0, 1000.0), (60.0, 20.0, 1000.0), (60.0, 60.0, 1.0), (0.0, 40.0, 500.0)],
+)
+def test_error_of_the_oracle_is_the_surface_filter_s_lag(time_constant, gain, mu, weight):
+    """alpha2 lags beta2 by lambda alpha2', which xi1 has to make up for.
+
+    It does so by (K/2 + mu) xi1 in beta2, and by w xi1 = -K_p xi2 in the torque.  The reference's
+    acceleration is 0.3 rad/s^2; a torque that is held adds half a sample to the lag.
+    """
+    changes = {
+        'surface.time_constant': time_constant,
+        'surface.gain': [gain, gain],
+        'surface.mu': [mu, mu],
+        'barrier.weight': [weight, weight],
+    }
+    rate = gain / 2.0 + mu + weight / np.array([60.0, 20.0])
+    expected = (time_constant + 0.5e-3) * 0.3 / rate
+    np.testing.assert_allclose(floor(changes), expected, rtol=0.05)
+
+
+def test_lyapunov_function_of_the_oracle_falls_to_the_floor_of_the_lag():
+    """(17): V falls in every sample until what is left is the barrier's energy of the lag."""
+    loop = run(configured('model_based', 8.0))
+    V = loop.lyapunov.sum(axis=1)
+    lag = 1000.0 * np.sum(loop.xi1[loop.t >= 1.0] ** 2, axis=1).max()  # J, w xi1^2: twice the least
+    above = np.flatnonzero(10.0 * lag < V)
+    assert above[-1] > 50  # there is a fall to look at
+    assert np.all(np.diff(V[: above[-1] + 2]) < 0.0)
+    assert V[0] > 1e4 * V[loop.t >= 1.0].max()
+
+
+def test_parameter_error_without_disturbance():
+    """With the disturbance off and exact measurements a window of learning finds P."""
+    loop = run(configured('recommended', 20.0, {}, NO_DISTURBANCE))
+    assert loop.parameter_error[-1] < 1e-3
+
+
+def test_parameter_error_with_the_disturbance_unknown():
+    loop = run(configured('recommended', 60.0))
+    assert loop.parameter_error[-1] < 5e-4
