@@ -28,6 +28,7 @@ def test_factor_is_numpy_s_and_solves(m, rank, shift):
     cholesky.factor(A, shift, L)
     cholesky.solve(L, y)
 
+    np.fill_diagonal(L, 1.0 / np.diag(L))  # kept inverted
     # Backward stable: the residual, and not the solution, is at the level of rounding.
     shifted = A + shift * np.eye(m)
     np.testing.assert_allclose(L @ L.T, shifted, atol=1e-14 * np.linalg.norm(shifted))
@@ -45,8 +46,9 @@ def test_factor_exists_where_rounding_takes_a_pivot_below_the_shift():
         L = np.zeros((3, 3))
         cholesky.factor(np.outer(row, row), 1e-5, L)
         assert np.all(np.isfinite(L))
-        assert np.all(np.diag(L) >= np.sqrt(1e-5))
-        clamped += np.count_nonzero(np.diag(L) == np.sqrt(1e-5))
+        most = 1.0 / np.sqrt(1e-5)
+        assert np.all(np.diag(L) <= most)
+        clamped += np.count_nonzero(np.diag(L) == most)
     assert clamped > 0
 
 
@@ -112,6 +114,7 @@ def test_latch_keeps_the_whole_window_when_time_and_excitation_suffice(excited):
     Phi = np.einsum('kia,kib->ab', rows[:, :, :-1], rows[:, :, :-1]) / settings.window
     b = np.einsum('kia,ki->a', rows[:, :, :-1], rows[:, :, -1]) / settings.window
     factor = np.linalg.cholesky(Phi + settings.rho * np.eye(settings.m))
+    np.fill_diagonal(factor, 1.0 / np.diag(factor))
     assert (state.latched[0], state.latch_time[0]) == (1.0, settings.learning_start)
     np.testing.assert_allclose(state.Phi, Phi, atol=1e-14)
     np.testing.assert_allclose(state.b, b, atol=1e-14)

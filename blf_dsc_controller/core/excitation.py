@@ -36,8 +36,9 @@ def weakest_direction(
         square = 0.0
         for i in range(m):
             square += direction[i] * direction[i]
+        shrink = 1.0 / sqrt(square)
         for i in range(m):
-            direction[i] /= sqrt(square)
+            direction[i] *= shrink
     quotient = 0.0
     for i in range(m):
         work[i] = 0.0

@@ -35,6 +35,8 @@ def saturation(x: float) -> float:
 @inner
 def known_disturbance(settings: Settings, signals: Signals, t: float) -> None:
     """Leave the disturbance that the law is told of in `signals.known` (n,) [N m]."""
+    if settings.truth_known == 0 and settings.feed_forward == 0:
+        return
     told = settings.true_disturbance
     for i in range(settings.n):
         signals.known[i] = told[0, i] + told[1, i] * sin(told[2, i] * t + told[3, i])

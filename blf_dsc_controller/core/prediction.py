@@ -40,17 +40,19 @@ def filter_row(
         torque: torque applied over the interval (n,) [N m].
     """
     gain = surface.filter_gain(1.0 / settings.pole, dt)
+    p = settings.p
+    m = settings.m
+    row = signals.row
     for i in range(settings.n):
-        for j in range(settings.m + 1):
-            if j == settings.m:
-                value = torque[i]
-            else:
-                value = 0.5 * (signals.rest[i, j] + state.rest[i, j])
-                if j < settings.p:
-                    value += (signals.momentum[i, j] - state.momentum[i, j]) / dt
-            state.filter1[i, j] += gain * (value - state.filter1[i, j])
+        for j in range(m):
+            row[i, j] = 0.5 * (signals.rest[i, j] + state.rest[i, j])
+        for j in range(p):
+            row[i, j] += (signals.momentum[i, j] - state.momentum[i, j]) * (1.0 / dt)
+        row[i, m] = torque[i]
+        for j in range(m + 1):
+            state.filter1[i, j] += gain * (row[i, j] - state.filter1[i, j])
             state.filter2[i, j] += gain * (state.filter1[i, j] - state.filter2[i, j])
-            signals.row[i, j] = state.filter2[i, j]
+            row[i, j] = state.filter2[i, j]
 
 
 @inner
