@@ -145,12 +145,14 @@ def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
     return laws[config.law]
 
 
+def reference_of(config: ControllerConfig) -> np.ndarray:
+    """Vector of the configured reference, as `core.reference` reads it."""
+    reference = config.reference
+    return sinusoids_vector(
+        reference.offset, reference.amplitude, reference.frequency, reference.phase
+    )
+
+
 def controller_of(config: ControllerConfig) -> Controller:
     """Controller of a configuration, compiled and at rest."""
-    reference = config.reference
-    return Controller(
-        pack(settings_of_config(config)),
-        sinusoids_vector(
-            reference.offset, reference.amplitude, reference.frequency, reference.phase
-        ),
-    )
+    return Controller(pack(settings_of_config(config)), reference_of(config))

@@ -22,8 +22,9 @@ from blf_dsc_controller.bags import topics
 from blf_dsc_controller.bags.decoders import Float64MultiArrayDecoder
 from blf_dsc_controller.bags.telemetry import DECIMATION, Message, PlantTelemetry
 from blf_dsc_controller.core.two_link import PARAMETER_NAMES
-from blf_dsc_controller.nodes import executor, parameters, realtime
+from blf_dsc_controller.nodes import compilation, executor, parameters, realtime
 from blf_dsc_controller.nodes.endpoints import publisher, subscribe
+from blf_dsc_controller.nodes.latency import Latency
 from sim_plant.assembly import plant_of, steps_of
 from sim_plant.configuration import PlantConfig
 
@@ -32,7 +33,7 @@ LOCKSTEP_START = 1_000_000_000
 
 _READINESS_PERIOD = 0.01  # s
 _SETTLING = 0.2  # s from having found every peer until they have found this node too
-_REPEAT_PERIOD = 1.0  # s, for a first state that nobody has answered
+_REPEAT_PERIOD = 3.0  # s, for a first state that nobody has answered
 _EARLY = 0.05  # of a sample: a timer that fires this much early is on time
 
 
@@ -44,7 +45,7 @@ class PlantNode(executor.RunnableNode):
         plant: the simulated arm.
         finished: True once `duration` has passed and the last state has been answered.
         rejected: commands passed over because of their length or a number that is not finite.
-        late_steps: steps taken, in real time, before the torque for their state had come.
+        latency: how long, in real time, the arm waits for its torques.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -58,8 +59,7 @@ class PlantNode(executor.RunnableNode):
         self.plant = plant_of(self.config)
         self._compile()
         self.rejected = 0
-        self.late_steps = 0
-        realtime.request(self.config.realtime, self.get_logger())
+        self.latency = Latency()
         joints = self.config.joints
         self._steps = steps_of(self.config)
         self._lockstep = self.config.mode == 'lockstep'
@@ -68,8 +68,6 @@ class PlantNode(executor.RunnableNode):
         self._torque = np.zeros(len(joints))
         self._start_stamp = LOCKSTEP_START
         self._published = 0.0
-        self._latency = 0.0
-        self._answered = True
         self._publisher_of = {topic: publisher(self, topic) for topic in self._output_topics()}
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._began = 0.0
@@ -77,9 +75,12 @@ class PlantNode(executor.RunnableNode):
         self._beat: Timer | None = None
         self._readiness = self.create_timer(_READINESS_PERIOD, self._try_start, clock=self._steady)
         subscribe(self, topics.COMMANDS, self._on_command)
+        realtime.request(self.config.realtime, self.get_logger())
         self.get_logger().info(f'{self.config.mode}, waiting for a controller')
 
     def _compile(self) -> None:
+        if not compilation.is_compiled(*compilation.PLANT):
+            self.get_logger().info(compilation.NOTICE)
         self.plant.measure()
         self.plant.truth()
         self.plant.step(np.zeros(len(self.config.joints)))
@@ -139,8 +140,7 @@ class PlantNode(executor.RunnableNode):
         if not self._began:
             return
         self._torque[:] = self._decoder.data
-        self._latency = perf_counter() - self._published
-        self._answered = True
+        self.latency.answered(perf_counter())
         if self.plant.sample == 0 and not self._readiness.is_canceled():
             self._readiness.cancel()
             self.get_logger().info('first torque received: brake off')
@@ -150,6 +150,7 @@ class PlantNode(executor.RunnableNode):
 
     def _release(self) -> None:
         self._began = perf_counter()
+        self.latency = Latency()  # what it has waited for the controller's start is not counted
         if not self._lockstep:
             self._beat = self.create_timer(
                 self.config.sample_time, self._on_beat, clock=self._steady
@@ -160,11 +161,10 @@ class PlantNode(executor.RunnableNode):
         elapsed = perf_counter() - self._began
         due = int(elapsed / self.config.sample_time + _EARLY)
         while self.plant.sample < due and not self.finished:
-            if not self._answered:
-                self.late_steps += 1
+            waited = self.latency.step(perf_counter())
             deadline = (self.plant.sample + 1) * self.config.sample_time
             self._advance()
-            self._tell_timing(max(0.0, perf_counter() - self._began - deadline))
+            self._tell_timing(waited, max(0.0, perf_counter() - self._began - deadline))
 
     def _advance(self) -> None:
         if self._steps and self.plant.sample >= self._steps:
@@ -176,19 +176,18 @@ class PlantNode(executor.RunnableNode):
     def _publish_state(self) -> None:
         stamp = self.stamp
         measurement = self.plant.measure()
-        self._answered = False
         self._published = perf_counter()
+        self.latency.asked(self._published)
         self._publish(self._telemetry.joint_states(stamp, measurement))
         if self.plant.sample % DECIMATION == 0:
             self._publish(self._telemetry.truth(stamp, self.plant.truth()))
         if self.config.publish_clock:
             self._publish(self._telemetry.clock(stamp))
 
-    def _tell_timing(self, lateness: float) -> None:
+    def _tell_timing(self, waited: float, lateness: float) -> None:
         if not self.finished:
-            self._publish(
-                self._telemetry.timing(self.stamp, self._latency, lateness, self.late_steps)
-            )
+            late_steps = self.latency.late_steps
+            self._publish(self._telemetry.timing(self.stamp, waited, lateness, late_steps))
 
     def _publish(self, message: Message) -> None:
         topic, raw = message

@@ -30,14 +30,17 @@ Config = TypeVar('Config')
 
 
 def locate(given: str | Path) -> Path:
-    """Return the file of this path, or of the preset of this name.
+    """Return the preset of this name, or the file of this path.
 
+    A preset's name means the preset whatever lies in the current folder; `./name` means a file.
     Raises ConfigurationError, which lists the presets, where there is neither.
     """
+    presets = sorted(preset.stem for preset in config_file('').glob('*.yaml'))
     path = Path(given)
+    if str(given) in presets:
+        return config_file(str(given))
     if path.is_file():
         return path
-    presets = sorted(preset.stem for preset in config_file('').glob('*.yaml'))
     if str(given).removesuffix('.yaml') in presets:
         return config_file(str(given))
     what = 'is a folder' if path.is_dir() else 'does not exist'

@@ -46,6 +46,32 @@ def respond(
     tell(settings, state, signals, part(measurement, 0, (settings.n,)), sample)
 
 
+def check_start(
+    joints: tuple[str, ...],
+    q: np.ndarray,
+    bound: np.ndarray,
+    reference_vector: np.ndarray,
+    t: float = 0.0,
+) -> None:
+    """Refuse a start outside the barrier, where the law is not defined.
+
+    Args:
+        joints: names of the joints, for the message.
+        q: positions (n,) [rad].
+        bound: k_c (n,) [rad].
+        reference_vector: of `reference.sinusoids_vector`.
+        t: time since the start [s].
+
+    Raises:
+        OutsideBarrierError: some |xi1_i(0)| >= k_c,i; names joint, error and bound.
+    """
+    qr, dqr, ddqr = np.zeros((3, len(joints)))
+    reference.sinusoids(reference_vector, t, qr, dqr, ddqr)
+    for joint, error, limit in zip(joints, q - qr, bound, strict=True):
+        if not abs(error) < limit:
+            raise OutsideBarrierError(joint, float(error), float(limit))
+
+
 class Controller:
     """A law with its settings, its reference and its state.
 
@@ -84,21 +110,8 @@ class Controller:
         self.state.active.fill(1.0)
 
     def check_start(self, joints: tuple[str, ...], q: np.ndarray, t: float = 0.0) -> None:
-        """Refuse a start outside the barrier, where the law is not defined.
-
-        Args:
-            joints: names of the joints, for the message.
-            q: measured positions (n,) [rad].
-            t: time since the start [s].
-
-        Raises:
-            OutsideBarrierError: some |xi1_i(0)| >= k_c,i; names joint, error and bound.
-        """
-        qr, dqr, ddqr = np.zeros((3, self.settings.n))
-        reference.sinusoids(self.reference_vector, t, qr, dqr, ddqr)
-        for joint, error, bound in zip(joints, q - qr, self.settings.bound, strict=True):
-            if not abs(error) < bound:
-                raise OutsideBarrierError(joint, float(error), float(bound))
+        """Refuse measured positions (n,) [rad] outside the barrier: see `check_start`."""
+        check_start(joints, q, self.settings.bound, self.reference_vector, t)
 
     def update(self, t: float, dt: float, measurement: np.ndarray) -> np.ndarray:
         """Torque (n,) [N m] for a measurement; a view that the next update overwrites.

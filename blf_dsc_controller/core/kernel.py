@@ -5,6 +5,8 @@ Numba keys a cached function by the contents of its own file, not by those of th
 calls in other files, so an edit there would leave stale machine code behind. Here the cache folder
 is named after a digest of every source file of both packages' ground floor: any change of any
 kernel compiles afresh, and a reinstall of the same version finds its old cache again.
+
+Where nothing can be written below the home folder, the cache is in the folder for temporary files.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar, cast
@@ -44,9 +47,38 @@ def cache_folder() -> Path:
     for source in ground_floor_sources():
         digest.update(source.read_bytes())
     chosen = os.environ.get('NUMBA_CACHE_DIR')
-    users = os.environ.get('XDG_CACHE_HOME') or '~/.cache'
-    base = Path(chosen) if chosen else Path(users).expanduser() / 'blf_dsc_controller'
-    return base / digest.hexdigest()[:16]
+    return (Path(chosen) if chosen else _base()) / digest.hexdigest()[:16]
+
+
+def _base() -> Path:
+    try:
+        users = Path(os.environ.get('XDG_CACHE_HOME') or '~/.cache').expanduser()
+        return _writable(users / 'blf_dsc_controller')
+    except (OSError, RuntimeError):  # read-only, full, or no home at all
+        pass
+    try:
+        return _writable(Path(tempfile.gettempdir(), f'blf_dsc_controller-{os.getuid()}'))
+    except OSError:  # another user's
+        return Path(tempfile.mkdtemp(prefix='blf_dsc_controller-'))
+
+
+def _writable(folder: Path) -> Path:
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if folder.stat().st_uid != os.getuid():
+        raise PermissionError
+    with tempfile.TemporaryFile(dir=folder):
+        return folder
+
+
+def is_compiled(*functions: Callable[..., object]) -> bool:
+    """Whether the machine code of all these kernels is in the cache already."""
+    return bool(config.DISABLE_JIT) or all(
+        any(cache_folder().glob(f'*/{_file_stem(function)}-*.nbi')) for function in functions
+    )
+
+
+def _file_stem(function: Callable[..., object]) -> str:
+    return f'{function.__module__.rpartition(".")[2]}.{function.__name__}'
 
 
 def inner(function: F) -> F:

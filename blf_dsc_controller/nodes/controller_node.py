@@ -18,7 +18,7 @@ from blf_dsc_controller.bags.errors import MessageError
 from blf_dsc_controller.bags.telemetry import DECIMATION, ControllerTelemetry, Message
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.core.settings import pack
-from blf_dsc_controller.nodes import executor, parameters, realtime
+from blf_dsc_controller.nodes import compilation, executor, parameters, realtime
 from blf_dsc_controller.nodes.endpoints import publisher, subscribe
 
 _NANO = 1e-9
@@ -53,9 +53,10 @@ class ControllerNode(executor.RunnableNode):
         """
         super().__init__(topics.CONTROLLER, **options)
         self.config = parameters.declare(self, ControllerConfig)
+        if not compilation.is_compiled(*compilation.CONTROLLER):
+            self.get_logger().info(compilation.NOTICE)
         self.controller = assembly.controller_of(self.config)
         self.stopped = ''
-        realtime.request(self.config.realtime, self.get_logger())
         joints = self.config.joints
         self._telemetry = ControllerTelemetry(joints, assembly.estimate_names(self.config))
         self._decoder = JointStateDecoder(joints)
@@ -74,6 +75,7 @@ class ControllerNode(executor.RunnableNode):
         self.create_timer(_DIAGNOSTICS_PERIOD, self._report, clock=steady)
         parameters.on_change(self, ControllerConfig, self._retune)
         subscribe(self, topics.JOINT_STATES, self._on_joint_state)
+        realtime.request(self.config.realtime, self.get_logger())
         self.get_logger().info(f'ready for joint states of {", ".join(joints)}')
 
     def close(self) -> None:

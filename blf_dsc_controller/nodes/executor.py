@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from types import FrameType
 
 import rclpy
-from rclpy._rclpy_pybind11 import RCLError
+from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
 from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
@@ -62,7 +62,10 @@ def run(make_node: Callable[[], RunnableNode]) -> int:
         while not (signals.came or node.finished):
             executor.spin_once(timeout_sec=_POLL)
         executor.remove_node(node)
-    except (BlfDscError, RCLError) as error:
+    except UnknownROSArgsError as error:
+        print(f'arguments after --ros-args that ROS does not know: {error}', file=sys.stderr)  # noqa: T201
+        return 1
+    except (BlfDscError, RCLError, OSError) as error:
         print(error, file=sys.stderr)  # noqa: T201
         return 1
     finally:

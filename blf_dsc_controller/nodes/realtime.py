@@ -5,10 +5,14 @@ from __future__ import annotations
 
 import ctypes
 import os
+from contextlib import suppress
+from pathlib import Path
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 from blf_dsc_controller.configuration.sampling import Realtime
+
+_THREADS = Path('/proc/self/task')
 
 _MCL_CURRENT = 1
 _MCL_FUTURE = 2
@@ -18,7 +22,7 @@ def request(realtime: Realtime, logger: RcutilsLogger) -> None:
     """Ask for SCHED_FIFO and locked memory as configured; a refusal is logged, not fatal."""
     if realtime.priority > 0:
         try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(realtime.priority))
+            _schedule(realtime.priority)
         except OSError as error:
             logger.warning(
                 f'SCHED_FIFO priority {realtime.priority} refused ({error.strerror}): running with '
@@ -36,3 +40,13 @@ def request(realtime: Realtime, logger: RcutilsLogger) -> None:
             )
         else:
             logger.info('memory locked')
+
+
+def _schedule(priority: int) -> None:
+    """Schedule every thread alike: state and torque pass through the middleware's threads, too.
+
+    One left behind, even at the next lower priority, makes the others wait for it [measured].
+    """
+    for thread in _THREADS.iterdir():
+        with suppress(ProcessLookupError):  # it has ended meanwhile
+            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))

@@ -7,6 +7,8 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
+from rclpy.clock import Clock, ClockType
+
 from blf_dsc_controller.bags.errors import UnknownTypeError
 from blf_dsc_controller.bags.topics import Quality
 from blf_dsc_controller.bags.writer import BagWriter
@@ -43,8 +45,9 @@ class BagRecorderNode(RunnableNode):
         self._losses: dict[str, Losses] = {}
         self._by_handle: dict[int, Losses] = {}
         self._passed_over: set[str] = set()
-        self.create_timer(_DISCOVERY_PERIOD, self._discover)
-        self.create_timer(_TAKE_PERIOD, self._record)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # not the plant's, which may wait for it
+        self.create_timer(_DISCOVERY_PERIOD, self._discover, clock=steady)
+        self.create_timer(_TAKE_PERIOD, self._record, clock=steady)
         # The folder comes last: whatever ends the node from here on also completes the bag.
         self._writer = BagWriter(
             self._config.output,

@@ -110,9 +110,10 @@ def _timing(run: Run) -> Summary | None:
     """Real time: how fast the samples came, and how late the torques."""
     if run.timing is None or LATENCY not in run.timing.names:
         return None
-    elapsed = float(run.received[-1] - run.received[0]) * 1e-9
+    moving = run.received[1:]  # the first state waits, braked, for the controller
+    elapsed = float(moving[-1] - moving[0]) * 1e-9 if moving.size else 0.0
     return {
-        'rate_hz': (run.received.size - 1) / elapsed if elapsed > 0 else None,
+        'rate_hz': (moving.size - 1) / elapsed if elapsed > 0 else None,
         'latency_us': _percentiles(_MICROSECONDS * run.timing.column(LATENCY)),
         'late_steps': _late_steps(run.timing),
     }

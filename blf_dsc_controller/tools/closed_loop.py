@@ -4,42 +4,38 @@
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from blf_dsc_controller.assembly import reference_of
 from blf_dsc_controller.bags.offline import write_bag
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.dump import dump
-from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, LoopConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
 from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.core.controller import check_start
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.nodes import compilation
 from blf_dsc_controller.reports.figures import draw
 from blf_dsc_controller.reports.summary import summarize, write_summary
 from blf_dsc_controller.reports.table import format_table
-from blf_dsc_controller.simulation import Record, simulate
+from blf_dsc_controller.simulation import Record, loop, simulate
+from blf_dsc_controller.tools.domain import own_domain
 from blf_dsc_controller.tools.entry import require_ros
-from blf_dsc_controller.tools.processes import NodeProcess
+from blf_dsc_controller.tools.outcome import DEFAULT, OutputError, make_folder
+from blf_dsc_controller.tools.processes import NodeFailedError
 from blf_dsc_controller.tools.progress import Progress
+from blf_dsc_controller.tools.session import run_session
 
-_MODULES = {
-    RECORDER: 'blf_dsc_controller.nodes.recorder_node',
-    CONTROLLER: 'blf_dsc_controller.nodes.controller_node',
-    PLANT: 'sim_plant.node',
-}
 _INTERRUPTED = 130
-_DOMAINS = 100  # below the ports that the system hands out
-
-
-class OutputExistsError(BlfDscError):
-    """The folder for the results is there already."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        super().__init__(f'{path} exists already and is not overwritten: choose another --out')
+_DURATION = 60.0  # s, where neither the file nor an option says how long
 
 
 def parser() -> argparse.ArgumentParser:
@@ -52,7 +48,9 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument(
         '--config', default='recommended', help='parameter file, or a preset (recommended)'
     )
-    options.add_argument('--duration', type=float, help='simulated time [s] (60)')
+    options.add_argument(
+        '--duration', type=float, help='simulated time [s] (as configured, or else 60)'
+    )
     options.add_argument(
         '--mode', choices=('realtime', 'lockstep'), help='of the plant (as configured)'
     )
@@ -60,37 +58,50 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument(
         '--offline', action='store_true', help='the same without ROS: no processes, no topics'
     )
-    options.add_argument('--domain', type=int, help='ROS domain (one of its own)')
+    options.add_argument('--domain', type=int, help='ROS domain (one that is free)')
     options.add_argument(
-        '--out', type=Path, default=Path('closed_loop'), help='new folder for the results'
+        '--out', type=Path, help=f'new folder for the results ({DEFAULT}, {DEFAULT}-2, ...)'
     )
     return options
 
 
 def configure(options: argparse.Namespace) -> LoopConfig:
-    """Configuration of the three nodes, from the file and the options that override it."""
-    plant = {
-        name: value
-        for name, value in (
-            ('duration', options.duration),
-            ('mode', options.mode),
-            ('seed', options.seed),
-        )
-        if value is not None
-    }
+    """Configuration of the three nodes, from the file and the options that override it.
+
+    Raises:
+        ConfigurationError: the file and the options do not describe a loop.
+        OutsideBarrierError: the arm starts outside the bound.
+    """
+    chosen = {'duration': options.duration, 'mode': options.mode, 'seed': options.seed}
+    plant = {name: value for name, value in chosen.items() if value is not None}
     path = locate(options.config)
-    if 'duration' not in plant and load_loop(path).plant.duration == 0.0:
-        plant['duration'] = 60.0
     overrides: dict[str, dict[str, Any]] = {
         PLANT: {**plant, 'wait_for_subscribers': 1},
         CONTROLLER: {'wait_for_subscribers': 1},
-        RECORDER: {'output': str(options.out / 'bag')},
     }
-    return load_loop(path, overrides)
+    config = load_loop(path, overrides)
+    if config.plant.duration == 0.0:
+        overrides[PLANT]['duration'] = _DURATION
+        config = load_loop(path, overrides)
+    _check_start(config)
+    return config
+
+
+def _check_start(config: LoopConfig) -> None:
+    """Find a start outside the bound now, by the true position; the controller measures it."""
+    controller, plant = config.controller, config.plant
+    position = dict(zip(plant.joints, plant.initial.position, strict=True))
+    check_start(
+        controller.joints,
+        np.array([position[joint] for joint in controller.joints]),
+        np.array(controller.barrier.bound),
+        reference_of(controller),
+    )
 
 
 def run_offline(config: LoopConfig, bag: Path) -> None:
     """Run the compiled loop and write its bag."""
+    _announce(loop)
     progress = Progress(config.plant)
     bound = config.controller.barrier.bound
 
@@ -105,46 +116,16 @@ def run_offline(config: LoopConfig, bag: Path) -> None:
     write_bag(bag, record, config.controller, config.recorder.compression)
 
 
-def run_over_ros(config: LoopConfig, out: Path, domain: int) -> bool:
-    """Run the three nodes until the plant has ended; False if the user ended it before.
+def run_over_ros(config: LoopConfig, out: Path, domain: int | None) -> bool:
+    """Run the three nodes, in a free domain if none is given; False if a signal ended it."""
+    _announce(*compilation.CONTROLLER, *compilation.PLANT)
+    with own_domain() if domain is None else nullcontext(domain) as chosen:
+        return run_session(config.plant, out, chosen)
 
-    Raises:
-        NoRosError: rclpy is not installed.
-        NodeFailedError: a node ended with an error.
-    """
-    require_ros()
-    logs = out / 'logs'
-    logs.mkdir()
-    environment = {
-        'ROS_DOMAIN_ID': str(domain),
-        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        'ROS_LOG_DIR': str(logs / 'ros'),
-    }
-    os.environ.update(environment)
-    nodes = [
-        NodeProcess(name, module, out / 'config.yaml', logs / f'{name}.log', environment)
-        for name, module in _MODULES.items()
-    ]
-    recorder, controller, plant = nodes
-    from blf_dsc_controller.tools.watch import Watch
 
-    completed = True
-    try:
-        with Watch(config.plant) as watch:
-            while plant.is_running:
-                for node in nodes:
-                    node.check()
-                watch.wait(0.1)
-        plant.check()
-    except KeyboardInterrupt:
-        completed = False
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    finally:
-        # The recorder last: it is to have what the others say until their end.
-        for node in (plant, controller, recorder):
-            node.stop()
-    recorder.check()
-    return completed
+def _announce(*kernels: Any) -> None:
+    if not compilation.is_compiled(*kernels):
+        print(compilation.NOTICE, file=sys.stderr, flush=True)
 
 
 def report(out: Path) -> None:
@@ -152,8 +133,42 @@ def report(out: Path) -> None:
     run = read_run(out / 'bag')
     summary = summarize(run)
     write_summary(summary, out / 'summary.json')
-    draw(run, out)
+    pictures = draw(run, out)
     print(format_table(summary))
+    print(f'wrote       {out}: bag, summary.json, {", ".join(path.name for path in pictures)}')
+
+
+def _run(options: argparse.Namespace) -> int:
+    config = configure(options)
+    if not options.offline:
+        require_ros()
+    out = make_folder(options.out)
+    try:
+        recorder = {'output': str(out / 'bag')}
+        config = config._replace(recorder=change(config.recorder, recorder))
+        dump(out / 'config.yaml', config.by_node)
+        completed = True
+        if options.offline:
+            run_offline(config, out / 'bag')
+        else:
+            completed = run_over_ros(config, out, options.domain)
+        _report_of(out, completed=completed)
+    except NodeFailedError:
+        if (out / 'bag' / 'metadata.yaml').exists():
+            print(f'what was recorded until then is in {out / "bag"}', file=sys.stderr)
+        raise
+    except OSError as error:
+        raise OutputError(out, error) from error
+    return 0 if completed else _INTERRUPTED
+
+
+def _report_of(out: Path, *, completed: bool) -> None:
+    try:
+        report(out)
+    except BlfDscError as error:
+        if completed:
+            raise
+        print(f'closed_loop: interrupted, and nothing to draw: {error}', file=sys.stderr)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -161,24 +176,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        config = configure(options)
-        if options.out.exists():
-            raise OutputExistsError(options.out)
-        options.out.mkdir(parents=True)
-        dump(options.out / 'config.yaml', config.by_node)
-        completed = True
-        if options.offline:
-            run_offline(config, options.out / 'bag')
-        else:
-            domain = os.getpid() % _DOMAINS + 1 if options.domain is None else options.domain
-            completed = run_over_ros(config, options.out, domain)
-        report(options.out)
+        return _run(options)
     except BlfDscError as error:
         print(f'closed_loop: {error}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
+        print('closed_loop: interrupted', file=sys.stderr)
         return _INTERRUPTED
-    return 0 if completed else _INTERRUPTED
 
 
 if __name__ == '__main__':

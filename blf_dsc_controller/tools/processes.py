@@ -24,9 +24,10 @@ class NodeFailedError(BlfDscError):
         self.name = name
         self.code = code
         self.log = log
+        end = f'was ended by {_signal(-code)}' if code < 0 else f'ended with exit code {code}'
         lines = log.read_text(encoding='utf-8', errors='replace').splitlines()[-_TAIL:]
-        tail = '\n'.join(f'  {line}' for line in lines)
-        super().__init__(f'{name} ended with exit code {code}:\n{tail}\n(all of it: {log})')
+        tail = ''.join(f'\n  {line}' for line in lines)
+        super().__init__(f'{name} {end}:{tail}\n(all that it said: {log})')
 
 
 class NodeProcess:
@@ -77,6 +78,13 @@ class NodeProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+
+
+def _signal(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f'signal {number}'
 
 
 def _die_with_parent() -> None:

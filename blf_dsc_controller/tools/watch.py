@@ -43,6 +43,7 @@ class Watch:
         self._executor.spin_once(timeout_sec=seconds)
         if self._latest is not None:
             self._show(self._latest)
+            self._latest = None
 
     def __enter__(self) -> Watch:
         return self

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One run over ROS: arm, controller and recorder as processes, from their start to their end."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER
+from blf_dsc_controller.tools.entry import require_ros
+from blf_dsc_controller.tools.interruption import Interruption
+from blf_dsc_controller.tools.processes import NodeProcess
+from sim_plant.configuration import PlantConfig
+
+# In the order in which they start. They end the other way round: the recorder last, since it is to
+# have what the others say until their end.
+_MODULES = {
+    RECORDER: 'blf_dsc_controller.nodes.recorder_node',
+    CONTROLLER: 'blf_dsc_controller.nodes.controller_node',
+    PLANT: 'sim_plant.node',
+}
+
+
+def run_session(plant: PlantConfig, out: Path, domain: int) -> bool:
+    """Run the three nodes on `out/config.yaml` until the plant has ended.
+
+    Returns:
+        False if SIGINT or SIGTERM ended it before.
+
+    Raises:
+        NoRosError: rclpy is not installed.
+        NodeFailedError: a node ended with an error.
+    """
+    require_ros()
+    logs = out / 'logs'
+    logs.mkdir()
+    environment = {
+        'ROS_DOMAIN_ID': str(domain),
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        'ROS_LOG_DIR': str(logs / 'ros'),
+    }
+    os.environ.update(environment)
+    nodes: list[NodeProcess] = []
+    with Interruption() as interruption:
+        try:
+            for name, module in _MODULES.items():
+                log = logs / f'{name}.log'
+                nodes.append(NodeProcess(name, module, out / 'config.yaml', log, environment))
+            _watch(plant, nodes, interruption)
+        finally:
+            for node in reversed(nodes):
+                node.stop()
+        for node in nodes:
+            node.check()
+        return not interruption.came
+
+
+def _watch(plant: PlantConfig, nodes: list[NodeProcess], interruption: Interruption) -> None:
+    from blf_dsc_controller.tools.watch import Watch
+
+    with Watch(plant) as watch:
+        while nodes[-1].is_running and not interruption.came:
+            for node in nodes:
+                node.check()
+            watch.wait(0.1)
