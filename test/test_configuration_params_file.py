@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -178,9 +180,19 @@ def test_a_missing_file_names_the_presets(tmp_path):
         with pytest.raises(ConfigurationError) as caught:
             locate(given)
         assert str(given) in str(caught.value)
-        assert 'a preset: noisy, recommended' in str(caught.value)
+        assert re.search('a preset: .*noisy.* recommended', str(caught.value))
     with pytest.raises(ConfigurationError, match=r'absent\.yaml'):
         read(tmp_path / 'absent.yaml')
+
+
+def test_the_name_of_a_preset_means_the_preset_whatever_lies_in_the_folder(tmp_path, monkeypatch):
+    preset = locate('recommended')
+    monkeypatch.chdir(tmp_path)
+    for name in ('recommended', 'recommended.yaml'):
+        (tmp_path / name).write_text('', encoding='utf-8')
+    assert locate('recommended') == preset
+    for path in ('./recommended', 'recommended.yaml', tmp_path / 'recommended'):
+        assert locate(path).samefile(tmp_path / path)
 
 
 def test_a_loop_collects_the_problems_of_all_nodes(file):

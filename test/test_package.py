@@ -175,7 +175,7 @@ def imports(path):
 def test_all_that_is_imported_is_declared(metadata):
     used = {name for path in sources() for name in imports(path)}
     used |= set(imports(ROOT / 'launch/closed_loop.launch.py'))
-    foreign = used - set(sys.stdlib_module_names) - set(PACKAGES)
+    foreign = used - set(sys.stdlib_module_names) - set(PACKAGES) - {'llvmlite'}  # a part of numba
     distributions = {'pyyaml' if name == 'yaml' else name for name in foreign}
     assert distributions <= requirements(metadata) | depends('exec_depend')
 

@@ -146,9 +146,9 @@ def test_ros_has_the_values_under_the_types_of_the_schema(start):
     node = start('blf_dsc_controller')
     declare(node, ControllerConfig)
     values = {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in ((one, node.get_parameter(one).value) for one in node._parameters)
-        if name in flatten(ControllerConfig())
+        name: tuple(value or ()) if isinstance(expected, tuple) else value
+        for name, expected in flatten(ControllerConfig()).items()
+        for value in [node.get_parameter_or(name).value]  # none for an empty list
     }
     assert values == flatten(ControllerConfig())
     assert node.get_parameter('joints').type_ is Parameter.Type.STRING_ARRAY
