@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from blf_dsc_controller.configuration.parameter import parameter
 from blf_dsc_controller.configuration.sampling import (
     Realtime,
+    autostart,
     joint_problems,
     nanoseconds,
     sample_time_problems,
@@ -169,6 +170,17 @@ class Actuator:
         at_most=1000,
         read_only=_BUILT,
     )
+    command_timeout: float = parameter(
+        0.05,
+        'age from which on, in real time, a torque is not applied any more',
+        unit='s',
+        above=0.0,
+    )
+    without_command: str = parameter(
+        'zero',
+        'what the motors do then: no torque, or hold the joints with the brakes',
+        choices=('zero', 'brake'),
+    )
 
 
 @dataclass(frozen=True)
@@ -214,6 +226,7 @@ class PlantConfig:
         at_least=0,
         read_only=_BUILT,
     )
+    autostart: bool = autostart()
     integrator: str = parameter(
         'dopri5',
         'fixed-step method from one sample to the next: Dormand-Prince 5 or Runge-Kutta 4',

@@ -89,6 +89,12 @@ class Plant:
         """Apply the commanded torque, (n,) float64, N m, and go on to the next sample."""
         step(self.settings, self.state, torque)
 
+    def hold(self) -> None:
+        """Stay where it is, at rest and without torque, for one sample: the brakes are on."""
+        self._now.x[self.joints :] = 0.0
+        self._now.actuator.applied[:] = 0.0
+        self._now.sample[0] += 1.0
+
     def truth(self) -> NDArray[np.float64]:
         """Return [P, tau_dist, q, dq], (3 + 3n,), of this sample: a view, overwritten likewise."""
         truth(self.settings, self.state, self._truth)

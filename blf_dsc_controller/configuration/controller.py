@@ -15,8 +15,10 @@ from blf_dsc_controller.configuration.gains import (
 )
 from blf_dsc_controller.configuration.learning import Learning
 from blf_dsc_controller.configuration.parameter import parameter
+from blf_dsc_controller.configuration.safety import Safety
 from blf_dsc_controller.configuration.sampling import (
     Realtime,
+    autostart,
     joint_problems,
     nanoseconds,
     sample_time_problems,
@@ -117,6 +119,7 @@ class ControllerConfig:
         at_least=0,
         read_only=_TOPICS,
     )
+    autostart: bool = autostart()
     arm: Arm = Arm()
     reference: Reference = Reference()
     barrier: Barrier = field(default_factory=Barrier)
@@ -127,6 +130,7 @@ class ControllerConfig:
     learning: Learning = field(default_factory=Learning)
     comparison: Comparison = field(default_factory=Comparison)
     truth: Truth = field(default_factory=Truth)
+    safety: Safety = field(default_factory=Safety)
     telemetry: Telemetry = Telemetry()
     realtime: Realtime = field(default_factory=Realtime)
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from blf_dsc_controller.configuration.parameter import parameter
 
@@ -28,6 +29,15 @@ class Realtime:
         False,  # noqa: FBT003
         'keep all memory of the process from being swapped out',
         read_only=_AT_START,
+    )
+
+
+def autostart() -> Any:
+    """Field of a managed node that says whether it waits for a manager."""
+    return parameter(
+        True,  # noqa: FBT003
+        'configure and activate the node at once; false: wait for a manager to do it',
+        read_only='it only matters at the start',
     )
 
 

@@ -31,7 +31,14 @@ _GROUND_FLOOR = (
     'blf_dsc_controller/simulation.py',
     'sim_plant/*.py',
 )
-_ABOVE = {'assembly.py', 'configuration.py', 'node.py'}
+_ABOVE = {
+    'assembly.py',
+    'configuration.py',
+    'handshake.py',
+    'node.py',
+    'reception.py',
+    'status.py',
+}
 
 
 def ground_floor_sources() -> list[Path]:

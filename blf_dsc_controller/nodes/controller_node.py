@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import sys
-from time import perf_counter
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
+from rclpy.publisher import Publisher
+from std_srvs.srv import Trigger
 
 from blf_dsc_controller import assembly
 from blf_dsc_controller.bags import topics
@@ -17,12 +17,15 @@ from blf_dsc_controller.bags.decoders import JointStateDecoder
 from blf_dsc_controller.bags.errors import MessageError
 from blf_dsc_controller.bags.telemetry import DECIMATION, ControllerTelemetry, Message
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.core.settings import pack
+from blf_dsc_controller.core.controller import Controller
 from blf_dsc_controller.nodes import compilation, executor, parameters, realtime
+from blf_dsc_controller.nodes.controller_status import ControllerStatus
 from blf_dsc_controller.nodes.endpoints import publisher, subscribe
+from blf_dsc_controller.nodes.managed import ManagedNode
+from blf_dsc_controller.safety.guard import Guard
+from blf_dsc_controller.safety.reasons import Phase
 
-_NANO = 1e-9
-_READINESS_PERIOD = 0.01  # s
+_TICK = 0.01  # s, of what is watched on the steady clock
 _DIAGNOSTICS_PERIOD = 1.0  # s
 
 OUTPUTS = (
@@ -35,114 +38,157 @@ OUTPUTS = (
 )
 
 
-class ControllerNode(executor.RunnableNode):
+class ControllerNode(ManagedNode):
     """Answers each joint state with a torque on `~/commands`, and tells how it goes.
 
     Attributes:
         config: the configuration in force.
-        controller: the law with its state.
-        stopped: why only zero torque is commanded any more; empty while the law is running.
-        finished: never; the node runs until it is stopped.
+        guard: the law behind its supervisor; None until configured.
     """
 
     def __init__(self, **options: Any) -> None:
-        """Read the parameters, compile the law, and wait for joint states.
+        """Read the parameters and, with `autostart`, compile the law and wait for joint states.
 
         Raises:
             ConfigurationError: the parameters do not describe a law that can run.
         """
         super().__init__(topics.CONTROLLER, **options)
         self.config = parameters.declare(self, ControllerConfig)
-        if not compilation.is_compiled(*compilation.CONTROLLER):
-            self.get_logger().info(compilation.NOTICE)
-        self.controller = assembly.controller_of(self.config)
-        self.stopped = ''
+        self.guard: Guard | None = None
         joints = self.config.joints
         self._telemetry = ControllerTelemetry(joints, assembly.estimate_names(self.config))
-        self._decoder = JointStateDecoder(joints)
-        self._measurement = np.zeros(3 * len(joints))
-        self._start_stamp = -1
-        self._last_stamp = -1
-        self._repeated = 0
-        self._outside = 0
-        self._ratio = np.zeros(len(joints))
-        outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
-        self._publisher_of = {topic: publisher(self, topic) for topic in outputs}
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._decoder = JointStateDecoder(joints, self._required_fields())
         self._pending: bytes | None = None
-        self._readiness = self.create_timer(_READINESS_PERIOD, self._answer_pending, clock=steady)
+        self._observed = self._started = False
+        self._publisher_of: dict[topics.Topic, Publisher] = {}
+        self._status = ControllerStatus(self, joints)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_TICK, self._tick, clock=steady)
         self.create_timer(_DIAGNOSTICS_PERIOD, self._report, clock=steady)
-        parameters.on_change(self, ControllerConfig, self._retune)
-        subscribe(self, topics.JOINT_STATES, self._on_joint_state)
-        realtime.request(self.config.realtime, self.get_logger())
-        self.get_logger().info(f'ready for joint states of {", ".join(joints)}')
+        parameters.on_change(self, ControllerConfig, self._retune, self._objections)
+        self.create_service(Trigger, '~/reset', self._on_reset)
+        if self.config.autostart:
+            self.autostart()
+
+    @property
+    def controller(self) -> Controller:
+        """The law with its state; only while configured."""
+        if self.guard is None:
+            raise AttributeError(f'{self.get_name()} is not configured: there is no controller')
+        return self.guard.controller
+
+    @property
+    def stopped(self) -> str:
+        """Why the controller is in its safe stop; empty while it is not."""
+        return self.guard.supervisor.text if self.guard else ''
+
+    def _required_fields(self) -> tuple[str, ...]:
+        measured = self.config.safety.velocity == 'measured'
+        fields = ('position', 'velocity') if measured else ('position',)
+        return (*fields, 'effort') if self.config.learning.torque_source == 'effort' else fields
+
+    # The life of the node.
+
+    def configure(self) -> None:
+        """Compile the law; from the first time on, the topics of the loop are there."""
+        if not compilation.is_compiled(*compilation.CONTROLLER):
+            self.get_logger().info(compilation.NOTICE)
+        self.guard = Guard(self.config)
+        if not self._publisher_of:
+            outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
+            self._publisher_of = {topic: publisher(self, topic) for topic in outputs}
+            subscribe(self, topics.JOINT_STATES, self._on_joint_state)
+            realtime.request(self.config.realtime, self.get_logger())
+        self._report()
+
+    def activate(self) -> None:
+        """Take command with the next joint state."""
+        if self.guard is not None:
+            self.guard.activate()
+        self.get_logger().info(f'ready for joint states of {", ".join(self.config.joints)}')
+        self._report()
+
+    def deactivate(self) -> None:
+        """Go to the safe torque on its ramp; joint states are answered with it from then on."""
+        if self.guard is not None:
+            self.guard.deactivate()
+        self._report()
+
+    def release(self) -> None:
+        """Leave the arm without torque and let go of the law."""
+        self._leave()
+        self.guard = None
+        self._report()
 
     def close(self) -> None:
-        """See that every subscriber has the last messages."""
+        """Leave the arm without torque, and see that every subscriber has the last messages."""
+        self._leave()
         executor.drain(self._publisher_of.values())
 
+    def _leave(self) -> None:
+        """Command zero torque, as drivers hold the last command; unless the arm has gone."""
+        states = self.resolve_topic_name(topics.JOINT_STATES.relative)
+        if self.guard is not None and self.guard.commanding and self.count_publishers(states):
+            self._command(np.zeros(len(self.config.joints)))
+
+    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = self.guard is not None and self.state_label == 'active'
+        if self.guard is not None and response.success:
+            self.guard.reset()
+            self.failure = None
+            response.message = 'everything learned is forgotten: starting with the next state'
+            self._report()
+        else:
+            response.message = f'{self.get_name()} is {self.state_label}: activate it first'
+        return response
+
+    # The loop.
+
     def _on_joint_state(self, raw: bytes) -> None:
-        if self._start_stamp < 0 and not self._is_observed():
-            self._pending = raw
+        guard = self.guard
+        if guard is None:
             return
+        if not self._observed:
+            self._observed = self._is_observed()
+            if not self._observed:
+                self._pending = raw
+                return
+        try:
+            torque, stamp = self._answer(guard, raw)
+        except Exception as error:  # noqa: BLE001 - whatever it is, the arm must not hang on
+            self.get_logger().fatal(f'{type(error).__name__}: {error}')
+            torque, stamp = guard.fail(error), 0
+        if torque is not None:
+            self._command(torque)
+        if guard.answered:
+            self._tell(guard, stamp)
+        if self._status.is_news(guard):
+            self._take_note(guard)
+
+    def _answer(self, guard: Guard, raw: bytes) -> tuple[np.ndarray | None, int]:
         try:
             stamp = self._decoder.decode(raw)
         except MessageError as error:
-            self._stop(str(error))
-            self._publish(self._telemetry.command(np.zeros(len(self.config.joints))))
-            return
-        self._answer(stamp)
+            foreign = guard.foreign
+            torque = guard.unusable(error)
+            if guard.foreign != foreign:
+                self.get_logger().warning(f'passed over: {error}', throttle_duration_sec=10.0)
+            return torque, 0
+        return guard.answer(stamp, self._decoder.values), stamp
 
-    def _answer(self, stamp: int) -> None:
-        n = len(self.config.joints)
-        self._measurement[:n] = self._decoder.position
-        self._measurement[n : 2 * n] = self._decoder.velocity
-        self._measurement[2 * n :] = self._decoder.effort
-        if not np.isfinite(self._measurement[: 2 * n]).all():
-            self._stop(f'the joint state is not finite: {self._measurement[: 2 * n]}')
-        if self.stopped:
-            self._publish(self._telemetry.command(np.zeros(n)))
+    def _tell(self, guard: Guard, stamp: int) -> None:
+        if not self.config.telemetry.enabled:
             return
-        if self._start_stamp < 0:
-            self.controller.check_start(self.config.joints, self._measurement[:n])
-            self._start_stamp = stamp
-            self._last_stamp = stamp - self.config.sample_time_ns
+        told = guard.controller.sample
+        if guard.controller.samples == 1:
             self._publish_bound(stamp)
-        if stamp <= self._last_stamp:
-            self._repeated += 1
-            return
-        self._control(stamp)
-
-    def _control(self, stamp: int) -> None:
-        begin = perf_counter()
-        torque = self.controller.update(
-            (stamp - self._start_stamp) * _NANO,
-            (stamp - self._last_stamp) * _NANO,
-            self._measurement,
-        )
-        compute_time = perf_counter() - begin
-        self._last_stamp = stamp
-        if not np.isfinite(torque).all():
-            self._stop(f'the law gave a torque that is not finite: {torque}')
-            torque = np.zeros(len(self.config.joints))
-        self._publish(self._telemetry.command(torque))
-        self._watch_bound()
-        if self.config.telemetry.enabled:
-            self._tell(stamp, compute_time)
-
-    def _tell(self, stamp: int, compute_time: float) -> None:
-        told = self.controller.sample
-        for message in self._telemetry.sample(stamp, told, compute_time):
+        for message in self._telemetry.sample(stamp, told, guard.compute_time):
             self._publish(message)
-        if (self.controller.samples - 1) % DECIMATION == 0:
-            self._publish(self._telemetry.monitor(stamp, told, self._ratio))
+        if (guard.controller.samples - 1) % DECIMATION == 0:
+            self._publish(self._telemetry.monitor(stamp, told, guard.ratio))
 
-    def _watch_bound(self) -> None:
-        ratio = np.abs(self.controller.sample.xi1) / self.controller.settings.bound
-        np.maximum(self._ratio, ratio, out=self._ratio)
-        if ratio.max() >= 1.0:
-            self._outside += 1
+    def _command(self, torque: np.ndarray) -> None:
+        self._publish(self._telemetry.command(torque))
 
     def _publish(self, message: Message) -> None:
         topic, raw = message
@@ -161,54 +207,42 @@ class ControllerNode(executor.RunnableNode):
                 return False
         return True
 
-    def _answer_pending(self) -> None:
-        if self._start_stamp >= 0:
-            self._readiness.cancel()
-        elif self._pending is not None and self._is_observed():
+    def _tick(self) -> None:
+        guard = self.guard
+        if guard is None:
+            return
+        if self._pending is not None and self._is_observed():
             raw, self._pending = self._pending, None
             self._on_joint_state(raw)
+        torque = guard.watch(_TICK)
+        if torque is not None:
+            self._command(torque)
+        if self._status.is_news(guard):
+            self._take_note(guard)
+
+    # Changes, and what is told of them.
+
+    def _objections(self, config: ControllerConfig) -> list[str]:
+        return self.guard.objections(config) if self.guard else []
 
     def _retune(self, config: ControllerConfig) -> None:
         self.config = config
-        self.controller.settings_vector[:] = pack(assembly.settings_of_config(config))
-        if self._last_stamp >= 0:
-            self._publish_bound(self._last_stamp)
+        if self.guard is not None:
+            self.guard.retune(config)
+            if self.guard.last_stamp >= 0:
+                self._publish_bound(self.guard.last_stamp)
 
-    def _stop(self, reason: str) -> None:
-        if not self.stopped:
-            self.stopped = reason
-            self.get_logger().fatal(f'zero torque from now on: {reason}')
+    def _take_note(self, guard: Guard) -> None:
+        supervisor = guard.supervisor
+        if supervisor.phase is Phase.SAFE_STOP:
+            self.get_logger().fatal(f'{self.config.safety.torque} torque: {supervisor.text}')
+        self._started = self._started or supervisor.running
+        if guard.refusal is not None and self.config.autostart and not self._started:
+            self.failure, self.finished = guard.refusal, True
+        self._report()
 
     def _report(self) -> None:
-        level, message = self._verdict()
-        values = {
-            'samples': f'{self.controller.samples}',
-            'repeated or late states passed over': f'{self._repeated}',
-            'samples outside the bound': f'{self._outside}',
-            'lambda_min': f'{self.controller.state.lambda_min[0]:.3g}',
-            'learning': 'latched' if self.controller.state.latched[0] else 'not yet excited',
-        }
-        array = DiagnosticArray()
-        array.header.stamp = self.get_clock().now().to_msg()
-        array.status = [
-            DiagnosticStatus(
-                level=level,
-                name=f'{self.get_name()}: control loop',
-                message=message,
-                hardware_id=' '.join(self.config.joints),
-                values=[KeyValue(key=key, value=value) for key, value in values.items()],
-            )
-        ]
-        self._diagnostics.publish(array)
-
-    def _verdict(self) -> tuple[bytes, str]:
-        if self.stopped:
-            return DiagnosticStatus.ERROR, f'stopped: {self.stopped}'
-        if self._outside:
-            return DiagnosticStatus.ERROR, 'the tracking error has left its bound'
-        if self._start_stamp < 0:
-            return DiagnosticStatus.WARN, 'waiting for the first joint state'
-        return DiagnosticStatus.OK, 'tracking'
+        self._status.report(self.state_label, self.guard)
 
 
 def main() -> int:

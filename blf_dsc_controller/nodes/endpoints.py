@@ -10,6 +10,7 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from blf_dsc_controller.bags.topics import Quality, Topic
 
@@ -36,11 +37,26 @@ def profile(quality: Quality) -> QoSProfile:
 
 def publisher(node: Node, topic: Topic) -> Publisher:
     """Publisher of a topic that belongs to `node`; it takes serialised messages."""
-    return node.create_publisher(message_class(topic.type), topic.name, profile(topic.offered))
+    return node.create_publisher(
+        message_class(topic.type),
+        topic.name,
+        profile(topic.offered),
+        qos_overriding_options=_overridable(),
+    )
 
 
 def subscribe(node: Node, topic: Topic, callback: Callable[[bytes], None]) -> None:
     """Subscribe `node` to a topic of another node; the callback gets serialised messages."""
     node.create_subscription(
-        message_class(topic.type), topic.relative, callback, profile(topic.requested), raw=True
+        message_class(topic.type),
+        topic.relative,
+        callback,
+        profile(topic.requested),
+        qos_overriding_options=_overridable(),
+        raw=True,
     )
+
+
+def _overridable() -> QoSOverridingOptions:
+    """Declare `qos_overrides.TOPIC.publisher.depth` and so on: history, depth, reliability."""
+    return QoSOverridingOptions.with_default_policies()

@@ -7,6 +7,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterable
 from types import FrameType
+from typing import TypeAlias
 
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
@@ -16,22 +17,28 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.nodes.managed import ManagedNode
 
 _POLL = 0.1  # s; EventsExecutor has no usable spin()
 _GRACE = Duration(seconds=2)
 
 
 class RunnableNode(Node):
-    """A node that `run` can run.
+    """A plain node that `run` can run.
 
     Attributes:
         finished: True once the node has nothing more to do.
+        failure: why the node cannot go on; the process ends with it.
     """
 
     finished = False
+    failure: BlfDscError | None = None
 
     def close(self) -> None:
         """Let go of everything that must not be lost, while ROS is still up."""
+
+
+Runnable: TypeAlias = RunnableNode | ManagedNode
 
 
 class _Signals:
@@ -46,14 +53,14 @@ class _Signals:
         self.came = True
 
 
-def run(make_node: Callable[[], RunnableNode]) -> int:
+def run(make_node: Callable[[], Runnable]) -> int:
     """Run a node until it has finished, a signal comes, or it fails.
 
     Returns:
         Exit code: 0 at the end or on SIGINT and SIGTERM, 1 after an error, which is on stderr.
     """
     signals = _Signals()
-    node: RunnableNode | None = None
+    node: Runnable | None = None
     try:
         rclpy.init(args=sys.argv, signal_handler_options=rclpy.SignalHandlerOptions.NO)
         executor = EventsExecutor()
@@ -62,6 +69,8 @@ def run(make_node: Callable[[], RunnableNode]) -> int:
         while not (signals.came or node.finished):
             executor.spin_once(timeout_sec=_POLL)
         executor.remove_node(node)
+        if node.failure is not None:
+            raise node.failure
     except UnknownROSArgsError as error:
         print(f'arguments after --ros-args that ROS does not know: {error}', file=sys.stderr)  # noqa: T201
         return 1

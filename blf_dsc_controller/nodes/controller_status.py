@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the controller says of its state: `~/state`, latched, and its part of `/diagnostics`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.node import Node
+
+from blf_dsc_controller.bags import topics
+from blf_dsc_controller.nodes.board import ERROR, OK, STALE, WARN, Board
+from blf_dsc_controller.safety.guard import Guard
+from blf_dsc_controller.safety.reasons import Phase, Reason
+
+_LEVELS = {
+    Phase.INACTIVE: STALE,
+    Phase.STARTING: WARN,
+    Phase.APPROACHING: OK,
+    Phase.TRACKING: OK,
+    Phase.SAFE_STOP: ERROR,
+}
+_WORDS = {
+    Phase.INACTIVE: 'not in command',
+    Phase.STARTING: 'waiting for a joint state to start from',
+    Phase.APPROACHING: 'approaching the reference',
+    Phase.TRACKING: 'tracking',
+}
+
+
+class ControllerStatus:
+    """Publishes the state of the controller.
+
+    Args:
+        node: that tells.
+        joints: names of the joints.
+    """
+
+    def __init__(self, node: Node, joints: Sequence[str]) -> None:
+        self._board = Board(node, joints, topics.STATE)
+        self._told: tuple[Phase, Reason, int] | None = None
+        self._announced = ''
+
+    def is_news(self, guard: Guard) -> bool:
+        """Whether the state has changed since it was told."""
+        return _essence(guard) != self._told
+
+    def report(self, life: str, guard: Guard | None) -> None:
+        """Publish diagnostics and, where it has changed, the state.
+
+        Args:
+            life: lifecycle state of the node.
+            guard: None while the node is not configured.
+        """
+        state = self._state(life, guard)
+        parts = [state] if guard is None else [state, self._loop(guard), self._learning(guard)]
+        self._board.report(parts)
+        essence = f'{state.message} {life}'
+        if essence != self._announced:
+            self._board.announce(state)
+            self._announced = essence
+        self._told = _essence(guard) if guard else None
+
+    def _state(self, life: str, guard: Guard | None) -> DiagnosticStatus:
+        phase = guard.supervisor.phase if guard else Phase.INACTIVE
+        reason = guard.supervisor.reason if guard else Reason.NONE
+        if guard is not None and phase is Phase.SAFE_STOP:
+            message = f'stopped: {guard.supervisor.text}'
+        else:
+            message = _WORDS[phase] if guard else 'not configured'
+        values: dict[str, Any] = {'phase': phase.value, 'reason': reason.value, 'lifecycle': life}
+        if guard is not None:
+            values['stops'] = guard.supervisor.stops
+            values['safe torque'] = guard.config.safety.torque
+        return self._board.status('state', _LEVELS[phase], message, values)
+
+    def _loop(self, guard: Guard) -> DiagnosticStatus:
+        supervisor = guard.supervisor
+        values = {
+            'samples': guard.controller.samples,
+            'repeated or late states passed over': supervisor.repeated,
+            'samples outside the bound': guard.outside,
+            'largest error against the bound': f'{guard.ratio.max():.3g}',
+            'states missed': supervisor.overruns.count,
+            'samples with a torque at its limit': supervisor.saturation.count,
+            'messages for other joints': guard.foreign,
+            'watch on the steady clock': 'on' if guard.watching else 'off',
+        }
+        if guard.outside:
+            return self._board.status('loop', WARN, 'the error has left its bound', values)
+        if supervisor.saturation.lasted > 0.0:
+            message = 'torque at its limit: adaptation by the tracking error is frozen'
+            return self._board.status('loop', WARN, message, values)
+        return self._board.status('loop', OK, _WORDS.get(supervisor.phase, 'stopped'), values)
+
+    def _learning(self, guard: Guard) -> DiagnosticStatus:
+        state = guard.controller.state
+        learning = 'latched' if state.latched[0] else 'not yet excited'
+        values = {'lambda_min': f'{state.lambda_min[0]:.3g}', 'learning': learning}
+        return self._board.status('learning', OK, learning, values)
+
+
+def _essence(guard: Guard) -> tuple[Phase, Reason, int]:
+    return guard.supervisor.phase, guard.supervisor.reason, guard.supervisor.stops

@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The law behind its supervisor: an answer that is safe to apply, whatever comes.
+
+joint state -> [trusted?] -> law -> [trusted?] -> torque
+                   |                    |
+                   +--- safe torque <---+    until reset or activated again
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller import assembly
+from blf_dsc_controller.bags.errors import (
+    DuplicatedJointError,
+    MessageError,
+    MissingJointError,
+    ShortArrayError,
+)
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.errors import BlfDscError, OutsideBarrierError
+from blf_dsc_controller.safety import tuning
+from blf_dsc_controller.safety.fallback import Ramp, safe_torque
+from blf_dsc_controller.safety.monitors import Silence
+from blf_dsc_controller.safety.reasons import Phase, Reason
+from blf_dsc_controller.safety.supervisor import Supervisor, Trust
+from blf_dsc_controller.safety.velocity import Velocity
+
+Vector = NDArray[np.float64]
+_NANO = 1e-9
+_SAME_CLOCK = 60 * 1_000_000_000  # ns that a live stamp may be off this computer's time
+
+_REASONS: dict[type[MessageError], Reason] = {
+    MissingJointError: Reason.JOINT_MISSING,
+    DuplicatedJointError: Reason.JOINT_DUPLICATED,
+    ShortArrayError: Reason.FIELD_MISSING,
+}
+
+
+class Guard:
+    """A controller that stops by itself.
+
+    Args:
+        config: of the controller.
+        steady: steady clock [ns].
+        wall: time of day [ns].
+
+    Attributes:
+        config: the configuration in force.
+        controller: the law.
+        supervisor: what is going on, and why it stopped.
+        answered: whether the last answer was the law's, so that its telemetry is worth telling.
+        refusal: the error of a start that was refused; None if none was.
+        foreign: messages passed over because they name none of the joints.
+        ratio: largest |xi1| / k_c of each joint since the start (n,).
+        outside: samples past the bound since then.
+        start_stamp: of t = 0 [ns]; -1 before the first start.
+        last_stamp: of the last state that the law answered [ns].
+        compute_time: that the law took for it [s].
+        watching: whether silence on the steady clock leads to a stop.
+    """
+
+    def __init__(
+        self,
+        config: ControllerConfig,
+        steady: Callable[[], int] = time.monotonic_ns,
+        wall: Callable[[], int] = time.time_ns,
+    ) -> None:
+        n = len(config.joints)
+        self.config = config
+        self.controller = assembly.controller_of(config)
+        self.supervisor = Supervisor(config.joints, config.sample_time)
+        self.answered = False
+        self.refusal: BlfDscError | None = None
+        self.foreign = 0
+        self.watching = False
+        self.compute_time = 0.0
+        self.ratio = np.zeros(n)
+        self.outside = 0
+        self.start_stamp = -1
+        self.last_stamp = -1
+        self._steady = steady
+        self._wall = wall
+        self._silence = Silence()
+        self._velocity = Velocity(config.safety.velocity, n)
+        self._ramp = Ramp(n)
+        self._torque = np.zeros(n)
+        self._q = np.zeros(n)
+        self._dq = np.zeros(n)
+        self._commanded = False
+        self._kept = np.zeros(self.controller.settings.m + n)
+        self._clean = True
+        self._resumable = False
+        self._stops_seen = 0
+        self._measurement = np.zeros(3 * n)
+        self._keep()
+
+    @property
+    def commanding(self) -> bool:
+        """Whether a torque has been commanded since the node was configured."""
+        return self._commanded
+
+    # From here on: what the operator does.
+
+    def activate(self) -> None:
+        """Take command with the next state; what was learned is kept if so configured."""
+        if not self.config.safety.keep_estimates:
+            self.controller.reset()
+        elif self._clean:
+            self.controller.state.samples[0] = 0.0
+        else:
+            self._keep_estimates_alone()
+        self._start_over()
+
+    def deactivate(self) -> None:
+        """Leave command: the torque goes to the safe one on its ramp."""
+        was_running = self.supervisor.running
+        self._clean = self._clean and self.supervisor.phase is not Phase.SAFE_STOP
+        self.supervisor.enter(Phase.INACTIVE)
+        self._silence.forget()
+        self._resumable = False
+        if was_running:
+            self._ramp.begin(self._torque, self.config.safety.deactivation_ramp)
+
+    def reset(self) -> None:
+        """Forget everything that was learned, and every fault, and start with the next state."""
+        self._resumable = self._resumable or self.supervisor.running
+        self.controller.reset()
+        self._keep()
+        self._start_over()
+
+    def retune(self, config: ControllerConfig) -> None:
+        """Take a new configuration, between two samples."""
+        if self.supervisor.running:
+            t = (self.last_stamp - self.start_stamp) * _NANO
+            tuning.transfer(self.controller, config, t, self._measurement)
+        else:
+            tuning.take(self.controller, config)
+        self.config = config
+
+    def objections(self, config: ControllerConfig) -> list[str]:
+        """Why a configuration cannot be taken now, in words; empty if it can."""
+        return tuning.objections(self.controller, config) if self.supervisor.running else []
+
+    def _start_over(self) -> None:
+        self.supervisor.enter(Phase.STARTING)
+        self.refusal = None
+        self.answered = False
+        self.outside = 0
+        self.ratio[:] = 0.0
+        self._clean = True
+        self._stops_seen = self.supervisor.stops
+        self._silence.forget()
+        self._velocity.forget()
+
+    def _keep_estimates_alone(self) -> None:
+        """After a fault the window may hold what was wrong; the estimates are from before it."""
+        self.controller.reset()
+        m = self.controller.settings.m
+        self.controller.state.estimate[:] = self._kept[:m]
+        self.controller.state.disturbance[:] = self._kept[m:]
+
+    def _keep(self) -> None:
+        state = self.controller.state
+        m = self.controller.settings.m
+        self._kept[:m] = state.estimate
+        self._kept[m:] = state.disturbance
+
+    # From here on: what comes from the arm.
+
+    def answer(self, stamp: int, measurement: Vector) -> Vector | None:
+        """Torque (n,) [N m] for a state; None if it is to be passed over.
+
+        Args:
+            stamp: of the state [ns].
+            measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
+        """
+        self.answered = False
+        self._silence.state(self._steady())
+        n = self.ratio.size
+        q, dq = measurement[:n], measurement[n : 2 * n]
+        self._velocity.replace(stamp, q, dq)
+        trust = self.supervisor.inspect(self.config.safety, stamp, q, dq)
+        if trust is Trust.SKIP:
+            return None
+        self._remember(q, dq)
+        if trust is Trust.STOP:
+            return self._safe(self.config.sample_time)
+        if self.supervisor.phase is Phase.STARTING and not self._begin(stamp, q):
+            return self._safe(self.config.sample_time) if self._commanded else None
+        return self._control(stamp, measurement)
+
+    def unusable(self, error: MessageError) -> Vector | None:
+        """Torque (n,) [N m] for a message that cannot be read; None if it is not for this arm."""
+        self.answered = False
+        if isinstance(error, MissingJointError) and self._is_foreign(error):
+            self.foreign += 1
+            return None
+        self._silence.state(self._steady())
+        self.supervisor.stop(_REASONS.get(type(error), Reason.BAD_MESSAGE), str(error))
+        return self._safe(self.config.sample_time)
+
+    def watch(self, period: float) -> Vector | None:
+        """Look at the steady clock, `period` [s] after the last look; a torque if it is silent."""
+        if not self.watching:
+            return None
+        limit = self.config.sample_time + self.config.safety.state_timeout
+        silent = self._silence.look(self._steady(), period, limit)
+        if silent == 0.0 or not self._commanded:
+            return None
+        self._dq[:] = 0.0
+        self.supervisor.stop(Reason.STATE_TIMEOUT, f'no joint state has come for {silent:.3g} s')
+        return self._safe(period)
+
+    def fail(self, error: Exception) -> Vector | None:
+        """Torque (n,) [N m] after an error that nobody foresaw."""
+        self.answered = False
+        self.supervisor.stop(Reason.FAILED, f'{type(error).__name__}: {error}')
+        return self._safe(self.config.sample_time)
+
+    def _is_foreign(self, error: MissingJointError) -> bool:
+        """Several drivers may share joint_states, each with joints of its own."""
+        return bool(error.names) and not set(self.config.joints) & set(error.names)
+
+    def _begin(self, stamp: int, q: Vector) -> bool:
+        """Start at t = 0 or, where a running reference is still in reach, go on along it."""
+        joints = self.config.joints
+        elapsed = (stamp - self.start_stamp) * _NANO
+        try:
+            self.controller.check_start(joints, q)
+        except OutsideBarrierError as error:
+            if not (self._resumable and stamp > self.last_stamp and self._in_reach(q, elapsed)):
+                self.refusal = error
+                self.supervisor.stop(Reason.START_REFUSED, str(error))
+                return False
+        else:
+            self.start_stamp = stamp
+        self.last_stamp = stamp - self.config.sample_time_ns
+        watchdog = self.config.safety.watchdog
+        is_live = abs(self._wall() - stamp) < _SAME_CLOCK
+        self.watching = watchdog == 'on' or (watchdog == 'auto' and is_live)
+        self.supervisor.enter(Phase.TRACKING)
+        return True
+
+    def _in_reach(self, q: Vector, elapsed: float) -> bool:
+        try:
+            self.controller.check_start(self.config.joints, q, elapsed)
+        except OutsideBarrierError:
+            return False
+        return True
+
+    def _control(self, stamp: int, measurement: Vector) -> Vector | None:
+        controller = self.controller
+        dt = (stamp - self.last_stamp) * _NANO
+        begin = perf_counter()
+        torque = controller.update((stamp - self.start_stamp) * _NANO, dt, measurement)
+        self.compute_time = perf_counter() - begin
+        self.last_stamp = stamp
+        trusted = self.supervisor.judge(
+            self.config.safety, controller.settings, controller.signals, controller.sample, dt
+        )
+        self._watch_bound()
+        if not trusted:
+            return self._safe(self.config.sample_time)
+        self._keep()
+        self._measurement[:] = measurement
+        self._torque[:] = torque
+        self._commanded = self.answered = True
+        return self._torque
+
+    def _watch_bound(self) -> None:
+        ratio = np.abs(self.controller.sample.xi1) / self.controller.settings.bound
+        np.fmax(self.ratio, ratio, out=self.ratio)
+        if not ratio.max() < 1.0:
+            self.outside += 1
+
+    def _remember(self, q: Vector, dq: Vector) -> None:
+        if np.isfinite(q).all():
+            self._q[:] = q
+        self._dq[:] = np.where(np.isfinite(dq), dq, 0.0)
+
+    def _safe(self, dt: float) -> Vector | None:
+        """Safe torque, `dt` [s] further on the ramp; None as long as nothing is to be commanded."""
+        phase = self.supervisor.phase
+        if self._stops_seen != self.supervisor.stops:
+            self._stops_seen = self.supervisor.stops
+            self._clean = self._resumable = False
+            self._ramp.begin(self._torque, self.config.safety.stop_ramp)
+        if phase is Phase.INACTIVE and not self._commanded:
+            return None
+        settings = self.controller.settings
+        m = settings.m
+        goal = safe_torque(self.config.safety, settings, self._q, self._dq, self._kept[:m])
+        limit = settings.torque_limit
+        self._torque[:] = np.clip(self._ramp.towards(goal, dt), -limit, limit)
+        self._commanded = True
+        return self._torque
