@@ -36,6 +36,8 @@ COLUMN_GAIN = 1.0
 
 def model_of(config: ControllerConfig) -> models.Model:
     """Model named by `model`, with the geometry that the controller is told."""
+    if config.model == 'planar_chain':
+        return models.planar_arm(len(config.joints), config.arm.l1, config.arm.gravity)
     return models.two_link_arm(config.arm.l1, config.arm.gravity)
 
 

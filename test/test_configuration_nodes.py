@@ -14,7 +14,7 @@ from blf_dsc_controller.configuration.nodes import NODES, LoopConfig, known_name
 from blf_dsc_controller.configuration.params_file import load_loop, locate, read
 from blf_dsc_controller.configuration.recorder import RecorderConfig
 from blf_dsc_controller.configuration.schema import build, change, parameters
-from blf_dsc_controller.core import settings, two_link
+from blf_dsc_controller.core import planar_chain, settings, two_link
 from blf_dsc_controller.errors import ConfigurationError
 from sim_plant.configuration import PlantConfig
 
@@ -56,7 +56,10 @@ def test_the_noisy_preset_changes_sensors_and_delay_alone():
 
 def test_models_and_choices_are_those_of_the_law():
     assert MODELS['two_link'].joints == two_link.JOINTS
-    assert MODELS['two_link'].parameters == len(two_link.PARAMETER_NAMES)
+    assert MODELS['two_link'].parameters(2) == len(two_link.PARAMETER_NAMES)
+    for n in (1, 2, 7):
+        names = planar_chain.parameter_names(n)
+        assert MODELS['planar_chain'].parameters(n) == len(names)
     choices = {one.name: one.rule.choices for one in parameters(ControllerConfig)}
     for law in choices['law']:
         given = {'law': law, 'truth.parameters': [1.0, 0.32, 0.4]}  # model_based asks for them

@@ -63,9 +63,7 @@ class NumpyLaw:
         self.samples += 1
         return self.tau
 
-    def _regressor(
-        self, q: np.ndarray, dq: np.ndarray, v: np.ndarray, a: np.ndarray
-    ) -> np.ndarray:
+    def _regressor(self, q: np.ndarray, dq: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         r = self.s.constants[0]
         c2, s2, c12 = np.cos(q[1]), np.sin(q[1]), np.cos(q[0] + q[1])
         coriolis = s2 * (dq[1] * v[0] + (dq[0] + dq[1]) * v[1])

@@ -34,15 +34,18 @@ _TOPICS = 'topics are created once, when the node starts'
 
 @dataclass(frozen=True)
 class Model:
-    """Size of a model: how many joints and how many unknown parameters it has."""
+    """Size of a model: how many joints it has, None for any number."""
 
-    joints: int
-    parameters: int
+    joints: int | None
+
+    def parameters(self, joints: int) -> int:
+        """Number of unknown parameters: a planar arm has one for each pair of links."""
+        return joints * (joints + 1) // 2
 
 
 LAWS = ('blf_dsc', 'model_based', 'backstepping', 'slotine_li')
 
-MODELS = {'two_link': Model(joints=2, parameters=3)}
+MODELS = {'two_link': Model(joints=2), 'planar_chain': Model(joints=None)}
 
 
 @dataclass(frozen=True)
@@ -143,15 +146,16 @@ class ControllerConfig:
         """Return what is wrong beside the ranges of single parameters, in words."""
         model = MODELS[self.model]
         problems = joint_problems(self.joints) + sample_time_problems(self.sample_time)
-        if len(self.joints) != model.joints:
+        count = model.parameters(model.joints or len(self.joints))
+        if model.joints is not None and len(self.joints) != model.joints:
             problems.append(
                 f'joints: got {len(self.joints)} {"name" if len(self.joints) == 1 else "names"}, '
                 f'but model {self.model} has {model.joints} joints'
             )
         problems += self._slope_problems()
         problems += self.learning.window_problems(self.sample_time)
-        problems += self.truth.problems(self.law, self.model, model.parameters)
-        return problems + self.learning.estimate_problems(self.model, model.parameters)
+        problems += self.truth.problems(self.law, self.model, count)
+        return problems + self.learning.estimate_problems(self.model, count)
 
     def _slope_problems(self) -> list[str]:
         barrier = self.barrier

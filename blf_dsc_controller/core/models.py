@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from blf_dsc_controller.core import two_link
+from blf_dsc_controller.core import planar_chain, two_link
 from blf_dsc_controller.core.kernel import inner
 
 TWO_LINK = 0
+PLANAR_CHAIN = 1
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,11 @@ def two_link_arm(l1: float, gravity: float) -> Model:
     return Model(TWO_LINK, two_link.JOINTS, two_link.PARAMETER_NAMES, (gravity / l1,))
 
 
+def planar_arm(n: int, l1: float, gravity: float) -> Model:
+    """Planar arm of n links with known l1 [m] and gravity [m/s^2]; all else unknown."""
+    return Model(PLANAR_CHAIN, n, planar_chain.parameter_names(n), (gravity / l1,))
+
+
 @inner
 def regressor(
     code: int,
@@ -58,6 +64,8 @@ def regressor(
     """Fill H (n x p): H P = M(q) a + C(q, dq) v + G(q)   [N m], Property III."""
     if code == TWO_LINK:
         two_link.regressor(constants, q, dq, v, a, H)
+    else:
+        planar_chain.regressor(constants, q, dq, v, a, H)
 
 
 @inner
@@ -72,3 +80,5 @@ def momentum_regressor(
     """Fill Yp, Yr (n x p): Yp P = M dq  and  Yr P = G - C^T dq."""
     if code == TWO_LINK:
         two_link.momentum_regressor(constants, q, dq, Yp, Yr)
+    else:
+        planar_chain.momentum_regressor(constants, q, dq, Yp, Yr)
