@@ -93,6 +93,7 @@ class Guard:
         self._q = np.zeros(n)
         self._dq = np.zeros(n)
         self._commanded = False
+        self._learns_from_effort = config.learning.torque_source == 'effort'
         self._kept = np.zeros(self.controller.settings.m + n)
         self._clean = True
         self._resumable = False
@@ -185,7 +186,8 @@ class Guard:
         n = self.ratio.size
         q, dq = measurement[:n], measurement[n : 2 * n]
         self._velocity.replace(stamp, q, dq)
-        trust = self.supervisor.inspect(self.config.safety, stamp, q, dq)
+        effort = measurement[2 * n :] if self._learns_from_effort else None
+        trust = self.supervisor.inspect(self.config.safety, stamp, q, dq, effort)
         if trust is Trust.SKIP:
             return None
         self._remember(q, dq)

@@ -83,7 +83,9 @@ class Supervisor:
         self.stops += 1
         return True
 
-    def inspect(self, safety: Safety, stamp: int, q: Vector, dq: Vector) -> Trust:
+    def inspect(
+        self, safety: Safety, stamp: int, q: Vector, dq: Vector, effort: Vector | None = None
+    ) -> Trust:
         """Judge a state before the law sees it; what is wrong with it leads to the safe stop.
 
         Args:
@@ -91,12 +93,15 @@ class Supervisor:
             stamp: of the state [ns].
             q: positions (n,) [rad].
             dq: velocities (n,) [rad/s].
+            effort: applied torques (n,) [N m] where they are learned from.
         """
         if self.phase in (Phase.SAFE_STOP, Phase.INACTIVE):
             return Trust.STOP
         trust = self._inspect_stamp(safety, stamp)
         if trust is Trust.USE:
             trust = self._inspect_values(safety, q, dq)
+        if trust is Trust.USE and effort is not None and not np.isfinite(effort).all():
+            trust = self._halt(Reason.NOT_FINITE, f'the efforts learned from are {effort}')
         if trust is Trust.USE:
             self._last_stamp = stamp
         return trust
@@ -168,11 +173,13 @@ class Supervisor:
             told: what it tells of it.
             dt: time since the last sample [s].
         """
-        if not np.isfinite(told.torque).all():
-            self._halt(Reason.TORQUE, f'the law gave a torque that is not finite: {told.torque}')
-        elif not (np.isfinite(told.estimate).all() and np.isfinite(told.disturbance).all()):
+        if not (np.isfinite(told.estimate).all() and np.isfinite(told.disturbance).all()):
             text = f'an estimate is not finite: {told.estimate}, disturbance {told.disturbance}'
             self._halt(Reason.ESTIMATE, text)
+        # The limit makes a finite torque of a demand that is none.
+        elif not (np.isfinite(signals.demand).all() and np.isfinite(told.torque).all()):
+            text = f'the law asked for a torque that is not finite: {signals.demand}'
+            self._halt(Reason.TORQUE, text)
         else:
             self._judge_error(safety, settings, told)
             self._judge_torque(safety, settings, signals, dt)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A closed loop to break: arm, messages, guarded controller, and clocks that the test turns.
+
+Everything passes through the same decoders, supervisor and reception as in the nodes, without ROS.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.bags.decoders import Float64MultiArrayDecoder, JointStateDecoder
+from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.bags.errors import MessageError
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.safety.guard import Guard
+from sim_plant.assembly import plant_of
+from sim_plant.configuration import PlantConfig
+from sim_plant.reception import Reception
+
+JOINTS = ('joint1', 'joint2')
+MILLISECOND = 1_000_000  # ns
+LOCKSTEP = 1_000_000_000  # ns
+TODAY = 1_700_000_000_000_000_000  # ns
+PLAIN = JointStateEncoder(JOINTS)
+
+
+class State(NamedTuple):
+    """One measured state, before it becomes a message."""
+
+    stamp: int
+    q: np.ndarray
+    dq: np.ndarray
+    effort: np.ndarray
+
+    def raw(self, encoder=PLAIN, **changes):
+        """Message of the state, with changes."""
+        told = self._replace(**changes)
+        return encoder.encode(told.stamp, told.q, told.dq, told.effort)
+
+
+class Rig:
+    """A loop of a millisecond a step, stamped in lock-step's time or, `live`, in today's."""
+
+    def __init__(self, given=None, *, live=False, plant=None):
+        self.config = build(ControllerConfig, given or {})
+        self.live = live
+        self.steady = 5_000_000_000
+        self.wall = TODAY
+        self.base = TODAY if live else LOCKSTEP
+        self.guard = self.controller()
+        self.plant = plant_of(build(PlantConfig, plant or {}))
+        self.reception = Reception(JOINTS)
+        self.commands = []  # all torques commanded
+        self.push = np.zeros(2)
+        self.sense = lambda state: [state.raw()]  # messages that a state becomes
+        self.actuate = lambda raw: [raw]  # commands that a torque becomes
+
+    def controller(self):
+        """Start a controller process: activated, with nothing learned."""
+        config = self.config
+        measured = config.safety.velocity == 'measured'
+        fields = ('position', 'velocity') if measured else ('position',)
+        fields += ('effort',) * (config.learning.torque_source == 'effort')
+        self._decoder = JointStateDecoder(JOINTS, fields)
+        guard = Guard(config, lambda: self.steady, lambda: self.wall)
+        guard.activate()
+        return guard
+
+    @property
+    def supervisor(self):
+        return self.guard.supervisor
+
+    def state(self):
+        """Return the true state of now."""
+        q, dq, effort = self.plant.measure().copy().reshape(3, 2)
+        return State(self.base + self.plant.elapsed_ns, q, dq, effort)
+
+    def deliver(self, raw):
+        """Hand one message to the controller; return the torque it commands, or None."""
+        try:
+            stamp = self._decoder.decode(raw)
+        except MessageError as error:
+            torque = self.guard.unusable(error)
+        else:
+            torque = self.guard.answer(stamp, self._decoder.values)
+        self._command(torque)
+        return torque
+
+    def _command(self, torque):
+        if torque is None:
+            return
+        self.commands.append(torque.copy())
+        for raw in self.actuate(Float64MultiArrayEncoder(2).encode(torque)):
+            decoder = Float64MultiArrayDecoder(2)
+            size = decoder.decode(raw)
+            self.reception.take(size, decoder.data, self.plant.sample)
+
+    def step(self, count=1):
+        """Go on by milliseconds: measure, deliver, look at the clock now and then, move."""
+        for _ in range(count):
+            for raw in self.sense(self.state()):
+                self.deliver(raw)
+            self.wait()
+            self.plant.step(self.reception.torque + self.push)
+
+    def wait(self, milliseconds=1):
+        """Let the clocks go on, and the watch look at them each 5 ms."""
+        for _ in range(milliseconds):
+            self.steady += MILLISECOND
+            self.wall += MILLISECOND
+            if self.steady % (5 * MILLISECOND) == 0:
+                self._command(self.guard.watch(0.005))
+
+    def mend(self):
+        """Take the fault away, and reset arm and controller as the nodes' services do."""
+        self.sense = lambda state: [state.raw()]
+        self.actuate = lambda raw: [raw]
+        self.push = np.zeros(2)
+        self.guard.retune(self.config)
+        self.base = self.state().stamp + LOCKSTEP
+        self.wall = max(self.wall, self.base) if self.live else self.wall
+        self.plant.reset()
+        self.reception.restart()
+        self.guard.reset()

@@ -1,0 +1,475 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every fault that is injected, and the table of what came of it.
+
+`python test/fault_table.py doc/faults.md` runs them all and writes the table anew.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from fault_rig import JOINTS, MILLISECOND, Rig
+
+from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.safety.reasons import Phase, Reason
+
+LEAD = 40  # samples that run well before the fault
+WATCHED = 120  # samples after it
+
+R = Reason
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault: how it is made, what must come of it, and how soon."""
+
+    name: str
+    inject: Callable[[Rig], None]
+    reason: Reason  # NONE: the loop goes on within its bound
+    within: int = 1  # samples
+    given: dict[str, Any] = field(default_factory=dict)
+    live: bool = False
+
+
+class Outcome(NamedTuple):
+    """What came of a fault."""
+
+    noticed: int  # samples until the stop; -1 without one
+    reason: Reason
+    text: str
+    before: np.ndarray  # commanded from the fault to the stop
+    after: np.ndarray  # commanded from the stop on; without one, from the fault on
+    last: np.ndarray  # commanded before it
+    error: float  # largest |xi1| / k_c since, where tracking went on
+    recovered: bool
+    rejected: int  # commands that the plant passed over
+
+
+def run(fault: Fault) -> Outcome:
+    """Run a loop into a fault, watch it, and mend it."""
+    rig = Rig(fault.given, live=fault.live)
+    rig.step(LEAD)
+    assert rig.supervisor.phase is Phase.TRACKING, rig.supervisor.text
+    start, noticed = len(rig.commands), -1
+    stop = start
+    last = rig.commands[-1]
+    fault.inject(rig)
+    for sample in range(WATCHED):
+        commanded = len(rig.commands)
+        rig.step()
+        if noticed < 0 and rig.supervisor.phase is Phase.SAFE_STOP:
+            noticed, stop = sample + 1, commanded
+    reason, text = rig.supervisor.reason, rig.supervisor.text
+    error = float(rig.guard.ratio.max())
+    before, after = np.array(rig.commands[start:stop]), np.array(rig.commands[stop:])
+    rejected = rig.reception.rejected
+    rig.mend()
+    rig.step(LEAD)
+    recovered = rig.supervisor.phase is Phase.TRACKING and bool(rig.guard.ratio.max() < 1.0)
+    return Outcome(noticed, reason, text, before, after, last, error, recovered, rejected)
+
+
+def every(change) -> Callable[[Rig], None]:
+    """From now on each state becomes what `change` makes of it."""
+
+    def inject(rig):
+        rig.sense = change
+
+    return inject
+
+
+def once(change) -> Callable[[Rig], None]:
+    """The next state becomes what `change` makes of it."""
+
+    def inject(rig):
+        def sense(state):
+            rig.sense = lambda state: [state.raw()]
+            return change(state)
+
+        rig.sense = sense
+
+    return inject
+
+
+def spoil(name: str, joint: int, value: float) -> Callable[[Rig], None]:
+    """One value of one message is replaced."""
+
+    def change(state):
+        values = getattr(state, name).copy()
+        values[joint] = value
+        return [state.raw(**{name: values})]
+
+    return once(change)
+
+
+def shifted(nanoseconds: int) -> Callable[[Rig], None]:
+    """One message has its stamp moved."""
+    return once(lambda state: [state.raw(stamp=state.stamp + nanoseconds)])
+
+
+def named(*names: str, fields=('position', 'velocity', 'effort')) -> JointStateEncoder:
+    """Encoder of other joints."""
+    return JointStateEncoder(names, fields)
+
+
+def turned(state):
+    """The joints the other way round."""
+    q, dq, effort = (values[::-1] for values in (state.q, state.dq, state.effort))
+    return [state.raw(named(*JOINTS[::-1]), q=q, dq=dq, effort=effort)]
+
+
+def accompanied(state):
+    """The joints among others, of which one holds no number."""
+    wide = [np.array([np.nan, v[1], 7.0, v[0]]) for v in (state.q, state.dq, state.effort)]
+    names = ('gripper', 'joint2', 'rail', 'joint1')
+    return [state.raw(named(*names), q=wide[0], dq=wide[1], effort=wide[2])]
+
+
+def duplicated(state):
+    triple = [np.array([*v, v[0]]) for v in (state.q, state.dq, state.effort)]
+    names = ('joint1', 'joint2', 'joint1')
+    return [state.raw(named(*names), q=triple[0], dq=triple[1], effort=triple[2])]
+
+
+def renamed(*names: str):
+    return lambda state: [state.raw(named(*names))]
+
+
+def unmeasured(*fields: str):
+    """Arrays left empty."""
+    kept = tuple(f for f in ('position', 'velocity', 'effort') if f not in fields)
+    short = {'position': 'q', 'velocity': 'dq', 'effort': 'effort'}
+    empty = {short[name]: np.zeros(0) for name in fields}
+    return lambda state: [state.raw(named(*JOINTS, fields=kept), **empty)]
+
+
+def silence(milliseconds: int, *, queued: bool = False) -> Callable[[Rig], None]:
+    """No state comes for a while; the arm moves on under the last torque."""
+
+    def inject(rig):
+        held = []
+
+        def sense(state):
+            held.append(state.raw())
+            if len(held) < milliseconds:
+                return []
+            rig.sense = lambda state: [state.raw()]
+            return held if queued else held[-1:]
+
+        rig.sense = sense
+
+    return inject
+
+
+def stalled(rig: Rig) -> None:
+    """The process sleeps for 200 ms: the watch wakes first, then the queued states arrive."""
+    rig.steady += 200 * MILLISECOND
+    rig.guard.watch(0.005)
+
+
+def sparse(period: int) -> Callable[[Rig], None]:
+    """Only one state in so many comes."""
+
+    def inject(rig):
+        def sense(state):
+            return [state.raw()] if rig.plant.sample % period == 0 else []
+
+        rig.sense = sense
+
+    return inject
+
+
+def same_stamp(rig: Rig) -> None:
+    stamp = rig.state().stamp
+    rig.sense = lambda state: [state.raw(stamp=stamp)]
+
+
+def delayed(rig: Rig) -> None:
+    """Twenty states late, in one burst, after one that was newer."""
+    old = [
+        rig.state()._replace(stamp=rig.state().stamp - k * MILLISECOND) for k in range(20, 0, -1)
+    ]
+    rig.sense = lambda _: [one.raw() for one in old]
+
+
+def frozen(rig: Rig) -> None:
+    """The encoders stand still while the stamps go on."""
+    stuck = rig.state()
+    rig.sense = lambda state: [stuck.raw(stamp=state.stamp)]
+
+
+def jammed(rig: Rig) -> None:
+    """The arm itself stands still."""
+    held = rig.plant.state.copy()
+
+    def sense(state):
+        rig.plant.state[1:5] = [*held[1:3].tolist(), 0.0, 0.0]
+        return [state.raw(q=held[1:3], dq=np.zeros(2))]
+
+    rig.sense = sense
+
+
+def pushed(rig: Rig) -> None:
+    rig.push = np.array([40.0, 0.0])
+
+
+def reversed_motor(rig: Rig) -> None:
+    rig.actuate = lambda raw: [Float64MultiArrayEncoder(2).encode(-np.frombuffer(raw[-16:], '<f8'))]
+
+
+def wired(values: np.ndarray) -> Callable[[Rig], None]:
+    """Whatever is commanded, the plant receives this."""
+    raw = Float64MultiArrayEncoder(values.size).encode(values)
+
+    def inject(rig):
+        rig.actuate = lambda _: [raw]
+
+    return inject
+
+
+def wired_once(values: np.ndarray) -> Callable[[Rig], None]:
+    """One command is replaced."""
+    replaced = Float64MultiArrayEncoder(values.size).encode(values)
+
+    def inject(rig):
+        def actuate(_):
+            rig.actuate = lambda raw: [raw]
+            return [replaced]
+
+        rig.actuate = actuate
+
+    return inject
+
+
+def poisoned(what: str, value: float) -> Callable[[Rig], None]:
+    """A number in the memory of the law is spoilt."""
+
+    def inject(rig):
+        getattr(rig.guard.controller.state, what)[0] = value
+
+    return inject
+
+
+def retuned(**changes) -> Callable[[Rig], None]:
+    """Parameters set as they are, past every check."""
+    from blf_dsc_controller.configuration.schema import change
+
+    given = {name.replace('__', '.'): value for name, value in changes.items()}
+    return lambda rig: rig.guard.retune(change(rig.guard.config, given))
+
+
+def storm(rig: Rig) -> None:
+    """Every sample a change of all gains by up to a fifth, as `ros2 param set` makes it."""
+    from blf_dsc_controller.configuration.schema import change
+
+    rng = np.random.default_rng(0)
+    names = ('surface.gain', 'surface.mu', 'feedback.gain', 'barrier.weight', 'disturbance.gain')
+    start = rig.guard.config
+
+    def sense(state):
+        scale = rng.uniform(0.8, 1.2, (len(names), 2))
+        values = [start.surface.gain, start.surface.mu, start.feedback.gain]
+        values += [start.barrier.weight, start.disturbance.gain]
+        given = {n: tuple(v * s) for n, v, s in zip(names, values, scale, strict=True)}
+        candidate = change(rig.guard.config, given)
+        if not rig.guard.objections(candidate):
+            rig.guard.retune(candidate)
+        return [state.raw()]
+
+    rig.sense = sense
+
+
+def refused(**changes) -> Callable[[Rig], None]:
+    """A change that is asked for and must be objected to."""
+    from blf_dsc_controller.configuration.schema import change
+
+    given = {name.replace('__', '.'): value for name, value in changes.items()}
+
+    def inject(rig):
+        objections = rig.guard.objections(change(rig.guard.config, given))
+        assert objections
+        assert all(one.startswith(tuple(given)) for one in objections)
+
+    return inject
+
+
+def clock_back(rig: Rig) -> None:
+    """The time of day is set back by an hour; the stamps of a driver that has its own go on."""
+    rig.wall -= 3600 * 10**9
+
+
+def restarted_plant(rig: Rig) -> None:
+    """The plant's process is killed and started again: its stamps begin anew."""
+    rig.plant.reset()
+
+
+def restarted_controller(rig: Rig) -> None:
+    """A new controller process meets an arm in the middle of its motion, far from the start."""
+    rig.sense = lambda _: []
+    rig.step(1)
+    rig.plant.state[1] += 0.1
+    rig.guard = rig.controller()
+    rig.sense = lambda state: [state.raw()]
+
+
+NAN, INF = np.nan, np.inf
+FAULTS = (
+    Fault('position of joint1 is NaN', spoil('q', 0, NAN), R.NOT_FINITE),
+    Fault('position of joint2 is infinite', spoil('q', 1, INF), R.NOT_FINITE),
+    Fault('velocity of joint1 is NaN', spoil('dq', 0, NAN), R.NOT_FINITE),
+    Fault('velocity of joint2 is minus infinity', spoil('dq', 1, -INF), R.NOT_FINITE),
+    Fault('effort is NaN, and nobody asks for it', spoil('effort', 0, NAN), R.NONE),
+    Fault(
+        'effort is NaN, and is learned from',
+        spoil('effort', 0, NAN),
+        R.NOT_FINITE,
+        given={'learning.torque_source': 'effort'},
+    ),
+    Fault('position of joint1 jumps by 3 mrad', spoil('q', 0, 2.296), R.OUTSIDE_BOUND),
+    Fault('position of joint2 is 1e300 rad', spoil('q', 1, 1e300), R.OUTSIDE_BOUND),
+    Fault('velocity of joint1 is 60 rad/s', spoil('dq', 0, 60.0), R.VELOCITY),
+    Fault('velocity of joint2 is -1e300 rad/s', spoil('dq', 1, -1e300), R.VELOCITY),
+    Fault('joints in another order', every(turned), R.NONE),
+    Fault('joints among others, one of them NaN', every(accompanied), R.NONE),
+    Fault('a joint twice', once(duplicated), R.JOINT_DUPLICATED),
+    Fault('a joint missing', once(renamed('joint1', 'joint3')), R.JOINT_MISSING),
+    Fault(
+        'no joint at all', once(lambda s: [s.raw(named(), q=[], dq=[], effort=[])]), R.JOINT_MISSING
+    ),
+    Fault(
+        "another robot's states in between",
+        every(lambda s: [s.raw(named('a', 'b')), s.raw()]),
+        R.NONE,
+    ),
+    Fault(
+        "only another robot's states",
+        every(renamed('a', 'b')),
+        R.STATE_TIMEOUT,
+        60,
+        live=True,
+    ),
+    Fault('no positions', once(unmeasured('position')), R.FIELD_MISSING),
+    Fault('no velocities', once(unmeasured('velocity')), R.FIELD_MISSING),
+    Fault(
+        'no velocities, to be estimated',
+        every(unmeasured('velocity', 'effort')),
+        R.NONE,
+        given={'safety.velocity': 'estimated'},
+    ),
+    Fault('no efforts', every(unmeasured('effort')), R.NONE),
+    Fault('message cut off', once(lambda s: [s.raw()[:-9]]), R.BAD_MESSAGE),
+    Fault('message of no bytes', once(lambda _: [b'']), R.BAD_MESSAGE),
+    Fault(
+        'message in another encoding', once(lambda _: [b'\x00\x03' + s.raw()[2:]]), R.BAD_MESSAGE
+    ),
+    Fault('message of noise', once(lambda _: [b'\x00\x01\x00\x00' + b'\xff' * 60]), R.BAD_MESSAGE),
+    Fault('a state twice', once(lambda s: [s.raw(), s.raw()]), R.NONE),
+    Fault('each state four times', every(lambda s: [s.raw()] * 4), R.NONE),
+    Fault(
+        'the same stamp for ever',
+        same_stamp,
+        R.STAMP_REPEATED,
+        5,
+    ),
+    Fault('stamp 2 ms back', shifted(-2 * MILLISECOND), R.STAMP_BACKWARD),
+    Fault('stamp half a second back', shifted(-500 * MILLISECOND), R.STAMP_BACKWARD),
+    Fault('stamp 10 s ahead', shifted(10**10), R.STAMP_JUMP),
+    Fault('stamp of zero', once(lambda s: [s.raw(stamp=0)]), R.STAMP_MISSING),
+    Fault('stamp before 1970', once(lambda s: [s.raw(stamp=-1)]), R.STAMP_MISSING),
+    Fault('twenty old states in a burst', delayed, R.STAMP_BACKWARD),
+    Fault('10 ms of silence, then all its states at once', silence(10, queued=True), R.NONE),
+    Fault('50 ms of silence', silence(50), R.STATE_TIMEOUT, 50, live=True),
+    Fault('50 ms of silence, not watched by the clock', silence(50), R.STAMP_JUMP, 50),
+    Fault('the arm falls silent for good', every(lambda _: []), R.STATE_TIMEOUT, 60, live=True),
+    Fault('the controller sleeps for 200 ms', stalled, R.NONE, live=True),
+    Fault(
+        'only every second state arrives',
+        sparse(2),
+        R.OVERRUN,
+        60,
+        given={'safety.overrun_window': 0.1},
+    ),
+    Fault('time of day set back by an hour', clock_back, R.NONE, live=True),
+    Fault(
+        'encoders stand still',
+        frozen,
+        R.OUTSIDE_BOUND,
+        120,
+        given={'reference.amplitude': [1.0, 1.0], 'reference.offset': [1.2935, 0.6961]},
+    ),
+    Fault('arm jammed', jammed, R.OUTSIDE_BOUND, 120),
+    Fault('arm pushed with 40 N m', pushed, R.OUTSIDE_BOUND, 40),
+    Fault('motors reversed', reversed_motor, R.OUTSIDE_BOUND, 40),
+    Fault(
+        'torque limit below what gravity needs',
+        retuned(torque__limit=(5.0, 5.0)),
+        R.OUTSIDE_BOUND,
+        60,
+    ),
+    Fault(
+        'torque at its limit for longer than allowed',
+        retuned(torque__limit=(5.0, 5.0)),
+        R.SATURATED,
+        12,
+        given={'safety.saturation_time': 0.01},
+    ),
+    Fault('an estimate is NaN', poisoned('estimate', NAN), R.ESTIMATE),
+    Fault('an estimate is infinite', poisoned('estimate', INF), R.ESTIMATE),
+    Fault('the disturbance estimate is NaN', poisoned('disturbance', NAN), R.ESTIMATE),
+    Fault('the surface filter is NaN', poisoned('alpha2', NAN), R.TORQUE),
+    Fault(
+        'estimates driven to the projection ball',
+        poisoned('estimate', 1.0),
+        R.NONE,
+        given={'learning.radius': 0.6, 'learning.initial_estimate': [0.55, 0.16, 0.16]},
+    ),
+    Fault('all gains changed in every sample', storm, R.NONE),
+    Fault('bound asked for below the error', refused(barrier__bound=[1e-9, 1e-9]), R.NONE),
+    Fault('torque limit asked for below the torque', refused(torque__limit=[1.0, 1.0]), R.NONE),
+    Fault('one command of a wrong length', wired_once(np.zeros(3)), R.NONE),
+    Fault('one command without values', wired_once(np.zeros(0)), R.NONE),
+    Fault('one command that is NaN', wired_once(np.array([NAN, 1.0])), R.NONE),
+    Fault('one command that is infinite', wired_once(np.array([1.0, INF])), R.NONE),
+    Fault('all commands come as NaN', wired(np.array([NAN, NAN])), R.OUTSIDE_BOUND, 80),
+    Fault('plant killed and started again', restarted_plant, R.STAMP_BACKWARD),
+    Fault('controller killed, started far away', restarted_controller, R.START_REFUSED),
+)
+
+
+def rows() -> Iterator[str]:
+    """Rows of the table, as measured."""
+    for fault in FAULTS:
+        outcome = run(fault)
+        stopped = outcome.noticed >= 0
+        noticed = f'{outcome.noticed}' if stopped else 'passed over'
+        largest = f'{np.abs(outcome.after).max():.3g}'
+        recovered = 'yes' if outcome.recovered else 'NO'
+        yield f'| {fault.name} | {noticed} | {outcome.reason.value} | {largest} | {recovered} |\n'
+
+
+PREFACE = """\
+# Faults
+
+What the controller does when something breaks: each row is run by `test/test_faults.py`, in a loop
+of 1 kHz with the recommended settings, and this page is made by `python test/fault_table.py
+doc/faults.md`. *Noticed* counts the samples from the fault to the safe stop; a fault that is passed
+over does no harm, and tracking goes on within the bound. *Torque* is the largest commanded from
+then on. A stop lasts until `~/reset`, after which the loop runs again.
+
+| fault | noticed after | reason | torque [N m] | runs after reset |
+| --- | --- | --- | --- | --- |
+"""
+
+
+def page() -> str:
+    """The whole page."""
+    return PREFACE + ''.join(rows())
+
+
+if __name__ == '__main__':
+    Path(sys.argv[1]).write_text(page(), encoding='utf-8')
