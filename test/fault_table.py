@@ -365,7 +365,7 @@ FAULTS = (
     Fault('message cut off', once(lambda s: [s.raw()[:-9]]), R.BAD_MESSAGE),
     Fault('message of no bytes', once(lambda _: [b'']), R.BAD_MESSAGE),
     Fault(
-        'message in another encoding', once(lambda _: [b'\x00\x03' + s.raw()[2:]]), R.BAD_MESSAGE
+        'message in another encoding', once(lambda s: [b'\x00\x03' + s.raw()[2:]]), R.BAD_MESSAGE
     ),
     Fault('message of noise', once(lambda _: [b'\x00\x01\x00\x00' + b'\xff' * 60]), R.BAD_MESSAGE),
     Fault('a state twice', once(lambda s: [s.raw(), s.raw()]), R.NONE),

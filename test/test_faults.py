@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is injected, when it is noticed, what is commanded from then on, and which reason is told."""
+"""What is injected, when it is noticed, what is commanded from then on, and what is told."""
 
 from __future__ import annotations
 
