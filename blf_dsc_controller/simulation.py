@@ -35,6 +35,7 @@ class Record:
         truths: [P, tau_dist, q, dq] (k, p + 3 n).
         joints: number of joints n.
         estimates: number of estimates m.
+        controller: the law as the run has left it.
     """
 
     stamps: np.ndarray
@@ -43,6 +44,7 @@ class Record:
     truths: np.ndarray
     joints: int
     estimates: int
+    controller: Controller
 
     def sample(self, row: int) -> Sample:
         """Names for one row of `samples`."""
@@ -137,4 +139,5 @@ def _empty_record(controller: Controller, plant: Plant, rows: int) -> Record:
         truths=np.zeros((rows, plant.truth().size)),
         joints=n,
         estimates=controller.settings.m,
+        controller=controller,
     )

@@ -17,6 +17,7 @@ from blf_dsc_controller.bags.topics import (
     COMMANDS,
     JOINT_STATES,
     LEARNING,
+    MONITOR,
     REFERENCE,
     TIMING,
     TRACKING_ERROR,
@@ -33,6 +34,7 @@ _OF_INTEREST = (
     BOUND,
     TRUTH,
     TIMING,
+    MONITOR,
 )
 
 

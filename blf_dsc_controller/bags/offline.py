@@ -10,6 +10,7 @@ import numpy as np
 
 from blf_dsc_controller.assembly import estimate_names, model_of
 from blf_dsc_controller.bags import topics
+from blf_dsc_controller.bags.monitor import Monitor
 from blf_dsc_controller.bags.telemetry import (
     DECIMATION,
     ControllerTelemetry,
@@ -47,6 +48,7 @@ def write_bag(path: Path, record: Record, config: ControllerConfig, compression:
 def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, Message]]:
     plant = PlantTelemetry(config.joints, model_of(config).parameter_names)
     controller = ControllerTelemetry(config.joints, estimate_names(config))
+    monitor = Monitor(config.joints, estimate_names(config), record.controller.settings)
     bound = np.array(config.barrier.bound)
     ratio = np.zeros_like(bound)
     yield START, controller.bound(START, bound, np.array(config.torque.limit))
@@ -60,4 +62,4 @@ def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, M
             yield stamp, message
         if row % DECIMATION == 0:
             yield stamp, plant.truth(stamp, record.truths[row])
-            yield stamp, controller.monitor(stamp, told, ratio)
+            yield stamp, monitor.message(stamp, told, ratio, bound)

@@ -19,6 +19,7 @@ from blf_dsc_controller.bags.topics import (
     COMMANDS,
     JOINT_STATES,
     LEARNING,
+    MONITOR,
     REFERENCE,
     TIMING,
     TRACKING_ERROR,
@@ -67,6 +68,7 @@ def read_run(path: str | Path, namespace: str = '') -> Run:
         learning=_vector(content, LEARNING),
         truth=_vector(content, TRUTH),
         timing=_vector(content, TIMING),
+        monitor=_vector(content, MONITOR),
         message_counts=content.message_counts,
     )
 

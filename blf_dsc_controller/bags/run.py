@@ -59,6 +59,7 @@ class Run:
     learning: Series | None
     truth: Series | None
     timing: Series | None
+    monitor: Series | None
     message_counts: Mapping[str, int]
 
     @property

@@ -51,14 +51,12 @@ class ControllerTelemetry:
     """
 
     def __init__(self, joints: Sequence[str], estimates: Sequence[str]) -> None:
-        ratios = tuple(f'max_error_ratio {joint}' for joint in joints)
         learning = (*estimates, *disturbance_names(joints), LAMBDA_MIN, LATCHED, COMPUTE_TIME)
         self._command = Float64MultiArrayEncoder(len(joints))
         self._reference = JointStateEncoder(joints, ('position', 'velocity'))
         self._error = JointStateEncoder(joints)
         self._bound = JointStateEncoder(joints, ('position', 'effort'))
         self._learning = JointStateEncoder(learning, ('position',))
-        self._monitor = JointStateEncoder((*ratios, *estimates, LAMBDA_MIN, LATCHED), ('position',))
         self._values = np.zeros(len(learning))
 
     def command(self, torque: np.ndarray) -> Message:
@@ -92,11 +90,6 @@ class ControllerTelemetry:
         values[m + n + 1] = told.latched[0]
         values[m + n + 2] = compute_time
         yield topics.LEARNING, self._learning.encode(stamp, values)
-
-    def monitor(self, stamp: int, told: Sample, ratio: np.ndarray) -> Message:
-        """Slow summary: largest |xi1| / k_c so far (n,), estimates, excitation."""
-        values = (*ratio, *told.estimate, told.lambda_min[0], told.latched[0])
-        return topics.MONITOR, self._monitor.encode(stamp, values)
 
 
 class PlantTelemetry:

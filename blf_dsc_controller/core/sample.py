@@ -24,7 +24,7 @@ class Sample(NamedTuple):
     xi2: np.ndarray  # (n,) rad/s
     torque: np.ndarray  # (n,) commanded, after the limit, N m
     disturbance: np.ndarray  # (n,) d^3, N m
-    estimate: np.ndarray  # (m,) theta^
+    estimate: np.ndarray  # (m,) theta^; NaN for a disturbance column that has been refused
     lyapunov: np.ndarray  # (4,) terms of (29): error, kinetic, parameters, disturbance; or NaN
     lambda_min: np.ndarray  # (1,) of the present window's Phi
     latched: np.ndarray  # (1,) 0 or 1
@@ -65,7 +65,7 @@ def tell(settings: Settings, state: State, signals: Signals, q: np.ndarray, samp
         sample.torque[i] = signals.torque[i]
         sample.disturbance[i] = state.disturbance[i]
     for j in range(settings.m):
-        sample.estimate[j] = state.estimate[j]
+        sample.estimate[j] = state.estimate[j] if state.active[j] != 0.0 else nan
     sample.lambda_min[0] = state.lambda_min[0]
     sample.latched[0] = state.latched[0]
     sample.lyapunov[0] = lyapunov.error_term(settings, signals)

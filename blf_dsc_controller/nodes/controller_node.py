@@ -15,6 +15,7 @@ from blf_dsc_controller import assembly
 from blf_dsc_controller.bags import topics
 from blf_dsc_controller.bags.decoders import JointStateDecoder
 from blf_dsc_controller.bags.errors import MessageError
+from blf_dsc_controller.bags.monitor import Monitor
 from blf_dsc_controller.bags.telemetry import DECIMATION, ControllerTelemetry, Message
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.core.controller import Controller
@@ -22,6 +23,7 @@ from blf_dsc_controller.nodes import compilation, executor, parameters, realtime
 from blf_dsc_controller.nodes.controller_status import ControllerStatus
 from blf_dsc_controller.nodes.endpoints import publisher, subscribe
 from blf_dsc_controller.nodes.managed import ManagedNode
+from blf_dsc_controller.refusals import refusals
 from blf_dsc_controller.safety.guard import Guard
 from blf_dsc_controller.safety.reasons import Phase
 
@@ -56,7 +58,10 @@ class ControllerNode(ManagedNode):
         self.config = parameters.declare(self, ControllerConfig)
         self.guard: Guard | None = None
         joints = self.config.joints
-        self._telemetry = ControllerTelemetry(joints, assembly.estimate_names(self.config))
+        self._estimates = assembly.estimate_names(self.config)
+        self._telemetry = ControllerTelemetry(joints, self._estimates)
+        self._monitor: Monitor | None = None
+        self._judged = False
         self._decoder = JointStateDecoder(joints, self._required_fields())
         self._pending: bytes | None = None
         self._observed = self._started = False
@@ -177,15 +182,26 @@ class ControllerNode(ManagedNode):
         return guard.answer(stamp, self._decoder.values), stamp
 
     def _tell(self, guard: Guard, stamp: int) -> None:
+        if guard.controller.state.judged[0] != self._judged:
+            self._tell_refusals(guard)
         if not self.config.telemetry.enabled:
             return
         told = guard.controller.sample
-        if guard.controller.samples == 1:
+        settings = guard.controller.settings
+        if guard.controller.samples == 1 or self._monitor is None:
             self._publish_bound(stamp)
+            self._monitor = Monitor(self.config.joints, self._estimates, settings)
         for message in self._telemetry.sample(stamp, told, guard.compute_time):
             self._publish(message)
         if (guard.controller.samples - 1) % DECIMATION == 0:
-            self._publish(self._telemetry.monitor(stamp, told, guard.ratio))
+            self._publish(self._monitor.message(stamp, told, guard.ratio, settings.bound))
+
+    def _tell_refusals(self, guard: Guard) -> None:
+        """Say which disturbance columns are not estimated, once they have been judged."""
+        self._judged = bool(guard.controller.state.judged[0])
+        self._status.refusals = refusals(guard.controller, self._estimates)
+        for refusal in self._status.refusals:
+            self.get_logger().warning(f'{refusal}')
 
     def _command(self, torque: np.ndarray) -> None:
         self._publish(self._telemetry.command(torque))

@@ -11,6 +11,7 @@ from rclpy.node import Node
 
 from blf_dsc_controller.bags import topics
 from blf_dsc_controller.nodes.board import ERROR, OK, STALE, WARN, Board
+from blf_dsc_controller.refusals import Refusal
 from blf_dsc_controller.safety.guard import Guard
 from blf_dsc_controller.safety.reasons import Phase, Reason
 
@@ -35,9 +36,13 @@ class ControllerStatus:
     Args:
         node: that tells.
         joints: names of the joints.
+
+    Attributes:
+        refusals: disturbance columns that are not estimated, and why.
     """
 
     def __init__(self, node: Node, joints: Sequence[str]) -> None:
+        self.refusals: tuple[Refusal, ...] = ()
         self._board = Board(node, joints, topics.STATE)
         self._told: tuple[Phase, Reason, int] | None = None
         self._announced = ''
@@ -98,6 +103,10 @@ class ControllerStatus:
         state = guard.controller.state
         learning = 'latched' if state.latched[0] else 'not yet excited'
         values = {'lambda_min': f'{state.lambda_min[0]:.3g}', 'learning': learning}
+        values |= {f'refused {refusal.column}': f'{refusal}' for refusal in self.refusals}
+        if self.refusals:
+            columns = ', '.join(refusal.column for refusal in self.refusals)
+            return self._board.status('learning', WARN, f'not estimated: {columns}', values)
         return self._board.status('learning', OK, learning, values)
 
 

@@ -6,13 +6,22 @@ from __future__ import annotations
 from pathlib import Path
 
 from blf_dsc_controller.bags.run import Run
+from blf_dsc_controller.reports.monitors_figure import draw_monitors
 from blf_dsc_controller.reports.parameters_figure import draw_parameters
 from blf_dsc_controller.reports.tracking_figure import draw_tracking
 
 
 def draw(run: Run, folder: Path) -> list[Path]:
-    """Draw tracking.png, and parameters.png if something was learned, and return their paths."""
-    tracking = folder / 'tracking.png'
-    parameters = folder / 'parameters.png'
-    draw_tracking(run, tracking)
-    return [tracking, parameters] if draw_parameters(run, parameters) else [tracking]
+    """Draw tracking.png and what else the run tells of, and return the paths.
+
+    parameters.png if something was learned, monitors.png if the monitors were recorded.
+    """
+    written = [folder / 'tracking.png']
+    draw_tracking(run, written[0])
+    for name, picture in (
+        ('parameters.png', draw_parameters),
+        ('monitors.png', draw_monitors),
+    ):
+        if picture(run, folder / name):
+            written.append(folder / name)
+    return written

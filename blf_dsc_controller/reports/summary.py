@@ -11,7 +11,7 @@ import numpy as np
 
 from blf_dsc_controller.bags.names import COMPUTE_TIME, LATE_STEPS, LATENCY
 from blf_dsc_controller.bags.run import Floats, Run, Series
-from blf_dsc_controller.reports.estimation import Estimation, latch_time
+from blf_dsc_controller.reports.estimation import Estimation, latch_time, refused_columns
 
 Summary = dict[str, Any]
 
@@ -78,9 +78,11 @@ def _learning(run: Run) -> Summary | None:
         'relative_error_at_s': None,
         'final_relative_error': None,
         'time_to_1_percent_s': None,
-        'final_estimate': dict(
-            zip(estimation.names, estimation.estimate[-1].tolist(), strict=True)
-        ),
+        'final_estimate': {
+            name: None if np.isnan(value) else float(value)
+            for name, value in zip(estimation.names, estimation.estimate[-1], strict=True)
+        },
+        'refused_columns': list(refused_columns(run)),
         'true': None,
     }
     error = estimation.relative_error

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.assembly import reference_of
+from blf_dsc_controller.assembly import estimate_names, reference_of
 from blf_dsc_controller.bags.offline import write_bag
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.dump import dump
@@ -23,6 +23,7 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.core.controller import check_start
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.nodes import compilation
+from blf_dsc_controller.refusals import refusals
 from blf_dsc_controller.reports.figures import draw
 from blf_dsc_controller.reports.summary import summarize, write_summary
 from blf_dsc_controller.reports.table import format_table
@@ -113,6 +114,8 @@ def run_offline(config: LoopConfig, bag: Path) -> None:
 
     record = simulate(config.controller, config.plant, show)
     progress.close()
+    for refusal in refusals(record.controller, estimate_names(config.controller)):
+        print(f'warning: {refusal}')
     write_bag(bag, record, config.controller, config.recorder.compression)
 
 

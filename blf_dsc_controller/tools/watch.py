@@ -10,12 +10,11 @@ from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import JointState
 
 from blf_dsc_controller.bags import topics
+from blf_dsc_controller.bags.names import RATIO
 from blf_dsc_controller.core.two_link import PARAMETER_NAMES
 from blf_dsc_controller.nodes.endpoints import profile
 from blf_dsc_controller.tools.progress import Progress
 from sim_plant.configuration import PlantConfig
-
-_RATIO = 'max_error_ratio '
 
 
 class Watch:
@@ -67,6 +66,6 @@ class Watch:
         if self._start < 0.0:
             self._start = stamp
         values = dict(zip(message.name, message.position, strict=True))
-        ratio = max(value for name, value in values.items() if name.startswith(_RATIO))
+        ratio = max(value for name, value in values.items() if name.startswith(RATIO))
         estimate = [values[name] for name in PARAMETER_NAMES]
         self._progress.show(stamp - self._start, ratio, estimate)

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The slow topic: distance to the bound, (29) term by term, and the bound (32) on it."""
+
+from __future__ import annotations
+
+import matplotlib.image
+import numpy as np
+import pytest
+from paper_case import EXACT, configured
+
+from blf_dsc_controller.assembly import controller_of, estimate_names, settings_of_config
+from blf_dsc_controller.bags import topics
+from blf_dsc_controller.bags.decoders import JointStateDecoder
+from blf_dsc_controller.bags.monitor import ExponentialBound, Monitor, decay_rate, largest_inertia
+from blf_dsc_controller.bags.offline import write_bag
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.reports.monitors_figure import draw_monitors
+from blf_dsc_controller.reports.summary import summarize
+from blf_dsc_controller.simulation import simulate
+
+LARGEST = np.linalg.eigvalsh([[2.12, 0.72], [0.72, 0.32]])[-1]  # kg m^2, of M stretched
+LEAKY = EXACT | {'disturbance.leakage': 0.02, 'disturbance.gain': [50.0, 80.0]}
+
+
+def settings(law):
+    return settings_of_config(configured('recommended', 1.0, law).controller)
+
+
+def test_largest_inertia_is_that_of_the_stretched_arm():
+    assert largest_inertia(settings(EXACT)) == pytest.approx(LARGEST)
+
+
+@pytest.mark.parametrize(
+    ('law', 'rate'),
+    [
+        ({'disturbance.leakage': 0.0}, 0.0),
+        ({'disturbance.gain': [0.0, 1.0]}, 0.0),
+        ({'learning.weight': 0.0}, 0.0),
+        ({'law': 'backstepping'}, 0.0),
+        ({'truth.parameters': []}, 0.0),
+        ({}, 0.02 * 50.0),
+        ({'surface.gain': [0.3, 9.0]}, 0.3),
+        ({'learning.weight': 0.1}, 2.0 * 0.1 * 0.5 * 0.003 / (0.003 + 1e-5)),
+        ({'learning.update': 'gradient', 'learning.weight': 9.0}, 2.0 * 9.0 * 0.5 * 0.003),
+        ({'feedback.gain': [9.0, 0.4]}, 2.0 * 0.4 / LARGEST),
+    ],
+)
+def test_rate_is_the_least_of_the_four_of_equation_32(law, rate):
+    assert decay_rate(settings(LEAKY | law)) == pytest.approx(rate)
+
+
+def test_bound_begins_at_the_latch_and_ends_at_theta_over_kappa_e():
+    """Theta = eta |d3|^2 / 2, of which the largest on each joint is 0.1 + 0.1 N m."""
+    bound = ExponentialBound(settings(LEAKY))
+    floor = 0.5 * 0.02 * 2.0 * 0.2**2 / bound.rate
+    assert bound.floor == pytest.approx(floor)
+    assert np.isnan(bound.at(1.0, 3.0, latched=False))
+    assert bound.at(2.0, 0.7, latched=True) == pytest.approx(0.7)
+    later = floor + (0.7 - floor) * np.exp(-bound.rate * 1.5)
+    assert bound.at(3.5, 0.1, latched=True) == pytest.approx(later)
+    assert bound.at(1e3, 0.0, latched=True) == pytest.approx(floor)
+
+
+def decoded(monitor, names, *arguments):
+    topic, raw = monitor.message(*arguments)
+    decoder = JointStateDecoder(names, required=('position',))
+    decoder.decode(raw)
+    assert topic is topics.MONITOR
+    return dict(zip(names, decoder.position, strict=True))
+
+
+@pytest.mark.parametrize('known', [True, False])
+def test_message_tells_distance_and_the_terms_where_the_truth_is_known(known):
+    config = configured('recommended', 1.0, LEAKY if known else {}).controller
+    law = controller_of(config)
+    law.update(0.0, 1e-3, np.array([2.293, 1.696, 0.0, 0.0, 0.0, 0.0]))
+    monitor = Monitor(config.joints, estimate_names(config), law.settings)
+    names = [
+        f'{what} {joint}'
+        for what in ('max_error_ratio', 'distance_to_bound')
+        for joint in config.joints
+    ]
+    names += [*estimate_names(config), 'lambda_min', 'latched']
+    terms = ['V barrier', 'V velocity', 'V parameters', 'V disturbance', 'V bound']
+    arguments = (10**9, law.sample, np.array([0.3, 0.2]), np.array([0.002, 0.004]))
+    if not known:
+        assert b'V barrier' not in monitor.message(*arguments)[1]
+    told = decoded(monitor, [*names, *terms] if known else names, *arguments)
+
+    assert told['max_error_ratio joint1'] == 0.3
+    assert told['distance_to_bound joint1'] == pytest.approx(0.002 - abs(law.sample.xi1[0]))
+    assert told['distance_to_bound joint2'] == pytest.approx(0.004 - abs(law.sample.xi1[1]))
+    if known:
+        assert [told[name] for name in terms[:4]] == law.sample.lyapunov.tolist()
+
+
+@pytest.fixture(scope='module')
+def refusing_run(tmp_path_factory):
+    """Run from a bag, 8 s, with a cosine column that the reference cannot tell, truth known."""
+    learning = {'learning.frequencies': [1.0], 'learning.bias': False}
+    config = configured('recommended', 8.0, LEAKY | learning)
+    path = tmp_path_factory.mktemp('refusing') / 'bag'
+    write_bag(path, simulate(config.controller, config.plant), config.controller, 'none')
+    return read_run(path)
+
+
+def test_refused_columns_reach_the_summary_by_name(refusing_run):
+    learning = summarize(refusing_run)['learning']
+    (refused,) = learning['refused_columns']
+    assert refused.startswith('cos 1 rad/s ')
+    assert learning['final_relative_error'] < 0.5
+
+
+def test_a_run_that_refuses_nothing_says_so(tmp_path):
+    config = configured('recommended', 8.0)
+    write_bag(tmp_path / 'bag', simulate(*config[1::-1]), config.controller, 'none')
+    run = read_run(tmp_path / 'bag')
+    assert summarize(run)['learning']['refused_columns'] == []
+    assert 'V barrier' not in run.monitor.names
+
+
+def test_monitors_are_drawn_from_the_bag(refusing_run, tmp_path):
+    path = tmp_path / 'monitors.png'
+    assert draw_monitors(refusing_run, path)
+    image = matplotlib.image.imread(path)
+    assert image.shape[1] > 1200
+    dark = (image[..., :3].max(axis=2) < 0.3).sum()
+    assert dark > 1000  # the Lyapunov function is drawn in ink
