@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every preset is a loop that runs, by its name, offline and over ROS."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.configuration.share import config_file
+from blf_dsc_controller.tools import closed_loop
+
+PRESETS = sorted(path.stem for path in config_file('').glob('*.yaml'))
+LAW = {'comparison': 'backstepping', 'comparison_detuned': 'backstepping'} | {
+    name: name for name in ('model_based', 'slotine_li')
+}
+
+
+def offline(preset, out, duration):
+    arguments = ['--config', preset, '--offline', '--duration', str(duration), '--out', str(out)]
+    return closed_loop.main(arguments)
+
+
+@pytest.mark.parametrize('preset', PRESETS)
+def test_preset_runs_by_name_and_is_kept_as_it_ran(preset, tmp_path, capsys):
+    assert offline(preset, tmp_path / 'out', 0.5) == 0
+    told = capsys.readouterr().out
+    summary = json.loads((tmp_path / 'out' / 'summary.json').read_text(encoding='utf-8'))
+    assert summary['samples'] == round(0.5 / load_loop(locate(preset)).plant.sample_time) + 1
+    kept = load_loop(tmp_path / 'out' / 'config.yaml').controller
+    assert kept.law == LAW.get(preset, 'blf_dsc')
+    if preset != 'comparison_detuned':
+        assert summary['tracking']['held']
+        assert 'held by every joint' in told
+
+
+def test_detuned_comparison_leaves_the_bound(tmp_path):
+    assert offline('comparison_detuned', tmp_path / 'out', 0.5) == 0
+    summary = json.loads((tmp_path / 'out' / 'summary.json').read_text(encoding='utf-8'))
+    assert not summary['tracking']['held']
+
+
+def test_offline_run_warns_of_a_refused_column_and_what_it_is_like(tmp_path, capsys):
+    path = tmp_path / 'cosine.yaml'
+    path.write_text(
+        'blf_dsc_controller:\n  ros__parameters:\n'
+        '    learning: {frequencies: [1.0], bias: false}\n',
+        encoding='utf-8',
+    )
+    assert offline(str(path), tmp_path / 'out', 7.5) == 0
+    told = capsys.readouterr().out
+    assert 'warning: cos 1 rad/s joint1 is not estimated' in told
+    assert 'cannot be told from m2*l2^2 + cos 1 rad/s joint2' in told
+    assert 'refused     cos 1 rad/s joint1' in told
+
+
+@pytest.mark.skipif(importlib.util.find_spec('rclpy') is None, reason='needs ROS 2')
+def test_a_variant_over_ros_is_its_offline_run_bit_for_bit(tmp_path):
+    """Lambda prediction, gradient, all columns off, the truth told: not the defaults' path."""
+    assert offline('paper', tmp_path / 'offline', 1.0) == 0
+    over_ros = ['--config', 'paper', '--mode', 'lockstep', '--duration', '1.0']
+    assert closed_loop.main([*over_ros, '--out', str(tmp_path / 'ros')]) == 0
+
+    runs = [read_run(tmp_path / name / 'bag') for name in ('offline', 'ros')]
+    np.testing.assert_array_equal(runs[0].error, runs[1].error)
+    np.testing.assert_array_equal(runs[0].torque, runs[1].torque)
+    assert runs[0].monitor.names == runs[1].monitor.names
+    np.testing.assert_array_equal(runs[0].monitor.values, runs[1].monitor.values)
