@@ -62,6 +62,8 @@ setup(
             'ros-jazzy-rosgraph-msgs',
             'ros-jazzy-ament-index-python',
         ],
+        # To tune the compared laws again (blf_dsc_controller.study.tune); running needs none of it.
+        'study': ['scipy>=1.15'],
         # setuptools: test_package.py builds a wheel without going to the network.
         'test': ['pytest>=7', 'hypothesis', 'scipy', 'coverage', 'setuptools>=70.1'],
         # Fixed, because with nearly every rule on, each release of the linter finds something new.

@@ -53,7 +53,7 @@ def refusals(controller: Controller, names: Sequence[str]) -> tuple[Refusal, ...
     upper = np.triu(state.running[:, :-1])
     Phi = upper + np.triu(upper, 1).T
     kept = np.flatnonzero(state.active > 0.0)
-    return tuple(_refusal(Phi, column, kept, names) for column in refused)
+    return tuple(_refusal(Phi, int(column), kept, names) for column in refused)
 
 
 def _refusal(Phi: np.ndarray, column: int, kept: np.ndarray, names: Sequence[str]) -> Refusal:

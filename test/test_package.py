@@ -177,7 +177,8 @@ def test_all_that_is_imported_is_declared(metadata):
     used |= set(imports(ROOT / 'launch/closed_loop.launch.py'))
     foreign = used - set(sys.stdlib_module_names) - set(PACKAGES) - {'llvmlite'}  # a part of numba
     distributions = {'pyyaml' if name == 'yaml' else name for name in foreign}
-    assert distributions <= requirements(metadata) | depends('exec_depend')
+    optional = requirements(metadata, 'study')
+    assert distributions <= requirements(metadata) | optional | depends('exec_depend')
 
 
 def test_rosdep_installs_what_pip_would(metadata):

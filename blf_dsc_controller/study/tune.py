@@ -194,8 +194,8 @@ def preset(name: str, exponents: Floats, value: float, evaluations: int) -> str:
     return (
         f'# {task.title}.\n'
         f'# Made by `python -m blf_dsc_controller.study.tune {name} FILE`:\n'
-        f'# {evaluations} evaluations, objective {value:.3f} (decades of error; less is better).\n\n'
-        f'blf_dsc_controller:\n  ros__parameters:\n{lines}'
+        f'# {evaluations} evaluations, objective {value:.3f} (decades of error; less is better).\n'
+        f'\nblf_dsc_controller:\n  ros__parameters:\n{lines}'
     )
 
 
