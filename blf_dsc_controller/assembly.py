@@ -19,7 +19,6 @@ import numpy as np
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.core import barrier, models
 from blf_dsc_controller.core.controller import Controller
-from blf_dsc_controller.core.reference import sinusoids_vector
 from blf_dsc_controller.core.settings import (
     LATCHES,
     PREDICTIONS,
@@ -29,6 +28,7 @@ from blf_dsc_controller.core.settings import (
     Settings,
     pack,
 )
+from blf_dsc_controller.motion.start import reference_of
 
 COLUMN_GAIN = 1.0
 """Entry of Gamma for the disturbance columns: they do not act on the torque."""
@@ -94,7 +94,9 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         coulomb_velocity=learning.coulomb_velocity,
         radius=learning.radius,
         Wc=0.0,
+        funnel_rate=config.barrier.funnel_rate,
         bound=np.array(config.barrier.bound),
+        initial_bound=np.array(config.barrier.widest),
         weight=np.array(config.barrier.weight),
         slope_limit=np.array(config.barrier.slope_limit),
         knee=np.array([barrier.knee(*joint) for joint in per_joint]),
@@ -105,6 +107,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         mu_bar=np.zeros(model.n),
         gamma=np.array(config.disturbance.gain),
         torque_limit=np.array(config.torque.limit),
+        rate_limit=np.array(config.torque.rate_limit),
         true_disturbance=np.array((truth.constant, truth.amplitude, truth.frequency, truth.phase)),
         Gamma=np.array(learning.adaptation_gain + (COLUMN_GAIN,) * columns),
         initial_estimate=np.array(learning.initial_estimate + (0.0,) * columns),
@@ -145,14 +148,6 @@ def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
         'slotine_li': linear | {'weight': nothing},
     }
     return laws[config.law]
-
-
-def reference_of(config: ControllerConfig) -> np.ndarray:
-    """Vector of the configured reference, as `core.reference` reads it."""
-    reference = config.reference
-    return sinusoids_vector(
-        reference.offset, reference.amplitude, reference.frequency, reference.phase
-    )
 
 
 def controller_of(config: ControllerConfig) -> Controller:

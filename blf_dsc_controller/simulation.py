@@ -16,6 +16,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.core.controller import Controller, respond
 from blf_dsc_controller.core.kernel import kernel
 from blf_dsc_controller.core.sample import Sample, sample_of, sample_size
+from blf_dsc_controller.motion.start import begin
 from sim_plant import plant as plants
 from sim_plant.assembly import plant_of, steps_of
 from sim_plant.configuration import PlantConfig
@@ -101,12 +102,14 @@ def simulate(
         progress: called now and then with the record and the number of rows that are filled.
 
     Raises:
-        OutsideBarrierError: the arm starts outside the bound.
+        OutsideBarrierError: the arm starts outside the bound, and there is to be no approach.
+        MotionError: there is no approach within the limits.
     """
     controller = controller_of(controller_config)
     plant = plant_of(plant_config)
     n = controller.settings.n
-    controller.check_start(controller_config.joints, plant.measure()[:n])
+    measurement = plant.measure()
+    begin(controller, controller_config, measurement[:n], measurement[n : 2 * n])
     record = _empty_record(controller, plant, steps_of(plant_config) + 1)
     rows = record.stamps.size
     for first in range(0, rows, _CHUNK):

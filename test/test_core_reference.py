@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The reference is the sum of its tones, and its derivatives are derivatives."""
+"""The reference is that of the term in force, or a mixture, and its derivatives are derivatives."""
 
 from __future__ import annotations
 
@@ -7,22 +7,33 @@ import numpy as np
 import pytest
 
 from blf_dsc_controller.core import reference
+from blf_dsc_controller.core.reference import pack, sinusoids_term, spline_term, unpack
 
 OFFSET = (0.5, -1.0, 2.0)
 FREQUENCY, PHASE = (1.0, 2.7), (0.3, -1.1)
 AMPLITUDE = ((0.3, 0.1), (0.0, -0.2), (0.25, 0.05))  # a row for each joint
-VECTOR = reference.sinusoids_vector(OFFSET, np.ravel(AMPLITUDE), FREQUENCY, PHASE)
+SINUSOIDS = sinusoids_term(OFFSET, np.ravel(AMPLITUDE), FREQUENCY, PHASE)
+KNOTS = np.array([0.4, 1.0, 1.1, 3.0])
+COEFFICIENTS = np.random.default_rng(0).normal(size=(4, 3, 6))
+SPLINE = spline_term(KNOTS, COEFFICIENTS)
+LATER = SPLINE._replace(begin=0.5, fade=1.6)
+KINDS = {
+    'sinusoids': [SINUSOIDS],
+    'spline': [SPLINE],
+    'one into the other': [SINUSOIDS, LATER],
+    'three at once': [SINUSOIDS, LATER, SINUSOIDS._replace(begin=1.0, fade=2.0)],
+}
 
 
-def sampled(t):
+def at(terms, t):
     out = np.full((3, 3), np.nan)
-    reference.sinusoids(VECTOR, t, *out)
+    reference.evaluate(pack(3, terms), t, *out)
     return out
 
 
 @pytest.mark.parametrize('t', [0.0, 1.234, 60.0])
-def test_reference_is_the_sum_of_its_tones(t):
-    qr, _, _ = sampled(t)
+def test_sinusoids_are_the_sum_of_their_tones(t):
+    qr, _, _ = at([SINUSOIDS], t)
     expected = [
         offset
         + sum(a * np.cos(w * t + phase) for a, w, phase in zip(row, FREQUENCY, PHASE, strict=True))
@@ -31,22 +42,75 @@ def test_reference_is_the_sum_of_its_tones(t):
     np.testing.assert_allclose(qr, expected, atol=1e-15)
 
 
-@pytest.mark.parametrize('t', [0.0, 1.234, 60.0])
-def test_derivatives_are_those_of_the_reference(t):
-    # Five points of step 1e-3: truncation and rounding stay below 1e-12.
-    h = 1e-3
-    points = np.array([sampled(t + side * h) for side in (-2, -1, 1, 2)])
-    rate = (points[0] - 8.0 * points[1] + 8.0 * points[2] - points[3]) / (12.0 * h)
-    _, dqr, ddqr = sampled(t)
+@pytest.mark.parametrize(('piece', 't'), [(0, 0.4), (0, 0.9), (1, 1.0), (2, 1.5), (3, 3.0), (3, 5)])
+def test_spline_is_the_polynomial_of_the_piece_of_its_time(piece, t):
+    qr, _, _ = at([SPLINE], t)
+    expected = [np.polynomial.polynomial.polyval(t - KNOTS[piece], c) for c in COEFFICIENTS[piece]]
+    np.testing.assert_allclose(qr, expected, rtol=1e-13)
 
-    np.testing.assert_allclose(dqr, rate[0], atol=1e-11)
-    np.testing.assert_allclose(ddqr, rate[1], atol=1e-11)
+
+def test_spline_stands_where_it_begins_until_it_does():
+    np.testing.assert_array_equal(at([SPLINE], 0.39), [COEFFICIENTS[0, :, 0], [0] * 3, [0] * 3])
+
+
+@pytest.mark.parametrize('terms', KINDS.values(), ids=KINDS)
+@pytest.mark.parametrize('t', [0.1, 0.7, 1.05, 1.234, 3.5])
+def test_derivatives_are_those_of_the_reference(terms, t):
+    # Five points of step 1e-3: the fifth derivative, below 1e3 here, leaves 1e-10.
+    h = 1e-3
+    points = np.array([at(terms, t + side * h) for side in (-2, -1, 1, 2)])
+    rate = (points[0] - 8.0 * points[1] + 8.0 * points[2] - points[3]) / (12.0 * h)
+    _, dqr, ddqr = at(terms, t)
+
+    np.testing.assert_allclose(dqr, rate[0], atol=1e-9)
+    np.testing.assert_allclose(ddqr, rate[1], atol=1e-9)
+
+
+@pytest.mark.parametrize(('t', 'share'), [(0.5, 0.0), (1.3, 0.5), (2.1, 1.0)])
+def test_a_term_is_mixed_into_the_one_before_by_the_minimum_jerk_step(t, share):
+    old, new = at([SINUSOIDS], t)[0], at([SPLINE], t)[0]
+    expected = (1.0 - share) * old + share * new
+    np.testing.assert_allclose(at([SINUSOIDS, LATER], t)[0], expected, rtol=1e-13)
+
+
+def test_before_and_after_the_mixture_each_term_is_alone_to_the_last_bit():
+    for t in (0.0, 0.49, 0.5):
+        np.testing.assert_array_equal(at([SINUSOIDS, LATER], t), at([SINUSOIDS], t))
+    for t in (2.1, 2.2, 50.0):
+        np.testing.assert_array_equal(at([SINUSOIDS, LATER], t), at([SPLINE], t))
+
+
+@pytest.mark.parametrize('t', [0.5, 2.1])
+def test_mixing_begins_and_ends_without_a_jump(t):
+    # Over 2e-9 s the jerk, below 1e4 here, moves the acceleration by 2e-5.
+    before, after = (at([SINUSOIDS, LATER], t + side) for side in (-1e-9, 1e-9))
+    np.testing.assert_allclose(before, after, atol=1e-4)
+
+
+def test_a_term_without_a_fade_takes_over_at_once():
+    terms = [SINUSOIDS, SPLINE._replace(begin=1.5)]
+    np.testing.assert_array_equal(at(terms, 1.4999), at([SINUSOIDS], 1.4999))
+    np.testing.assert_array_equal(at(terms, 1.5), at([SPLINE], 1.5))
+
+
+def test_terms_come_out_of_their_vector_as_they_went_in():
+    terms = [SINUSOIDS, LATER, SPLINE]
+    for one, other in zip(terms, unpack(pack(3, terms)), strict=True):
+        assert (one.code, one.begin, one.fade) == (other.code, other.begin, other.fade)
+        np.testing.assert_array_equal(one.content, other.content)
+
+
+def test_many_times_at_once_give_what_each_gives():
+    times = np.linspace(0.0, 4.0, 9)
+    together = reference.sampled(pack(3, [SINUSOIDS, LATER]), times)
+    apart = np.array([at([SINUSOIDS, LATER], t) for t in times])
+    np.testing.assert_allclose(together, apart, rtol=1e-14, atol=1e-14)  # two libraries' cosines
 
 
 def test_papers_reference_is_at_rest_at_the_start():
     vector = reference.sinusoids_vector((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))
     qr, dqr, ddqr = np.full((3, 2), np.nan)
-    reference.sinusoids(vector, 0.0, qr, dqr, ddqr)
+    reference.evaluate(vector, 0.0, qr, dqr, ddqr)
     np.testing.assert_allclose(qr, [2.2935, 1.6961], rtol=1e-15)
     np.testing.assert_array_equal(dqr, 0.0)
     np.testing.assert_allclose(ddqr, -0.3, rtol=1e-15)

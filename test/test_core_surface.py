@@ -86,7 +86,7 @@ def test_law_follows_the_filter_from_the_first_virtual_control():
     alpha2 = None
     for k in range(200):
         t = k * 1e-3
-        reference.sinusoids(REFERENCE, t, qr, dqr, ddqr)
+        reference.evaluate(REFERENCE, t, qr, dqr, ddqr)
         xi1 = random.uniform(-0.0015, 0.0015, 2)
         dq = dqr + random.normal(size=2)
         law.update(t, 1e-3, np.concatenate([qr + xi1, dq, np.zeros(2)]))

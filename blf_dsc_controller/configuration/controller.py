@@ -15,6 +15,7 @@ from blf_dsc_controller.configuration.gains import (
 )
 from blf_dsc_controller.configuration.learning import Learning
 from blf_dsc_controller.configuration.parameter import parameter
+from blf_dsc_controller.configuration.reference import Approach, Limits, Reference
 from blf_dsc_controller.configuration.safety import Safety
 from blf_dsc_controller.configuration.sampling import (
     Realtime,
@@ -24,10 +25,7 @@ from blf_dsc_controller.configuration.sampling import (
     sample_time_problems,
 )
 
-_PER_JOINT = ('joints',)
-_TONES = ('reference.frequency',)
 _LAID_OUT = 'the state of the law is laid out for it at the start'
-_JUMP = 'the reference would jump, out of the bound'
 _MEASURED = 'what is already in the excitation window was measured with it'
 _TOPICS = 'topics are created once, when the node starts'
 
@@ -57,31 +55,6 @@ class Arm:
     )
     gravity: float = parameter(
         9.8, 'gravity; 0 for a horizontal arm', unit='m/s^2', symbol='g', read_only=_MEASURED
-    )
-
-
-@dataclass(frozen=True)
-class Reference:
-    """The trajectory to follow: qr_i = offset_i + sum_k amplitude_ik cos(frequency_k t + phase_k).
-
-    `amplitude` holds a row for each joint, one row after the other.
-    """
-
-    offset: tuple[float, ...] = parameter(
-        (1.9935, 1.3961), 'middle of the motion', unit='rad', length=_PER_JOINT, read_only=_JUMP
-    )
-    amplitude: tuple[float, ...] = parameter(
-        (0.3, 0.3),
-        'amplitude of each tone: a row for each joint, one after the other',
-        unit='rad',
-        length=('joints', 'reference.frequency'),
-        read_only=_JUMP,
-    )
-    frequency: tuple[float, ...] = parameter(
-        (1.0,), 'angular frequency of each tone', unit='rad/s', at_least=0.0, read_only=_JUMP
-    )
-    phase: tuple[float, ...] = parameter(
-        (0.0,), 'phase of each tone', unit='rad', length=_TONES, read_only=_JUMP
     )
 
 
@@ -124,7 +97,9 @@ class ControllerConfig:
     )
     autostart: bool = autostart()
     arm: Arm = Arm()
-    reference: Reference = Reference()
+    reference: Reference = field(default_factory=Reference)
+    approach: Approach = field(default_factory=Approach)
+    limits: Limits = field(default_factory=Limits)
     barrier: Barrier = field(default_factory=Barrier)
     surface: Surface = field(default_factory=Surface)
     feedback: Feedback = field(default_factory=Feedback)
@@ -152,18 +127,8 @@ class ControllerConfig:
                 f'joints: got {len(self.joints)} {"name" if len(self.joints) == 1 else "names"}, '
                 f'but model {self.model} has {model.joints} joints'
             )
-        problems += self._slope_problems()
+        problems += self.reference.problems() + self.limits.problems(self.joints)
+        problems += self.barrier.problems(self.joints)
         problems += self.learning.window_problems(self.sample_time)
         problems += self.truth.problems(self.law, self.model, count)
         return problems + self.learning.estimate_problems(self.model, count)
-
-    def _slope_problems(self) -> list[str]:
-        barrier = self.barrier
-        return [
-            f'barrier.slope_limit: got {limit:g} N m/rad for {joint}, but it must be above '
-            f'barrier.weight, {weight:g} N m/rad'
-            for joint, weight, limit in zip(
-                self.joints, barrier.weight, barrier.slope_limit, strict=True
-            )
-            if limit <= weight
-        ]

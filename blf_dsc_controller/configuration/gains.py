@@ -22,6 +22,17 @@ class Barrier:
         above=0.0,
         length=_PER_JOINT,
     )
+    initial_bound: tuple[float, ...] = parameter(
+        (0.0, 0.0),
+        'bound at the start, that narrows to `bound`; 0: the bound stands still',
+        unit='rad',
+        symbol='k_0',
+        at_least=0.0,
+        length=_PER_JOINT,
+    )
+    funnel_rate: float = parameter(
+        0.0, 'rate at which the bound narrows', unit='1/s', symbol='a', at_least=0.0
+    )
     weight: tuple[float, ...] = parameter(
         (1000.0, 1000.0),
         'stiffness of the barrier at no error; the paper has 1',
@@ -38,6 +49,34 @@ class Barrier:
         above=0.0,
         length=_PER_JOINT,
     )
+
+    @property
+    def widest(self) -> tuple[float, ...]:
+        """Bound of each joint at the start [rad]."""
+        return tuple(
+            initial or bound for initial, bound in zip(self.initial_bound, self.bound, strict=True)
+        )
+
+    def problems(self, joints: tuple[str, ...]) -> list[str]:
+        """Where weight and slope limit, or the bounds of the funnel, contradict each other."""
+        slopes = [
+            f'barrier.slope_limit: got {limit:g} N m/rad for {joint}, but it must be above '
+            f'barrier.weight, {weight:g} N m/rad'
+            for joint, weight, limit in zip(joints, self.weight, self.slope_limit, strict=True)
+            if limit <= weight
+        ]
+        bounds = [
+            f'barrier.initial_bound: got {initial:g} rad for {joint}, but it must be 0 (none) or '
+            f'at least barrier.bound, {bound:g} rad'
+            for joint, initial, bound in zip(joints, self.initial_bound, self.bound, strict=True)
+            if 0.0 < initial < bound
+        ]
+        if self.funnel_rate == 0.0 and self.widest != self.bound:
+            bounds.append(
+                'barrier.funnel_rate: got 0 1/s, but barrier.initial_bound is to narrow to '
+                'barrier.bound: give the rate at which it does'
+            )
+        return slopes + bounds
 
 
 @dataclass(frozen=True)
@@ -124,5 +163,12 @@ class Torque:
         'largest torque commanded; learning sees the limited torque',
         unit='N m',
         above=0.0,
+        length=_PER_JOINT,
+    )
+    rate_limit: tuple[float, ...] = parameter(
+        (0.0, 0.0),
+        'largest change of the torque commanded; 0: none',
+        unit='N m/s',
+        at_least=0.0,
         length=_PER_JOINT,
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from blf_dsc_controller.core import law, reference
+from blf_dsc_controller.core import funnel, law, reference
 from blf_dsc_controller.core.borrowed import part
 from blf_dsc_controller.core.kernel import kernel
 from blf_dsc_controller.core.sample import sample_of, sample_size, tell
@@ -29,7 +29,7 @@ def respond(
 
     Args:
         settings_vector: packed `Settings`.
-        reference_vector: of `reference.sinusoids_vector`.
+        reference_vector: of `reference.pack`.
         state_vector: packed `State`, moved on by one sample.
         signals_vector: packed `Signals`, overwritten.
         t: time since the start [s].
@@ -40,7 +40,7 @@ def respond(
     settings = settings_of(settings_vector)
     state = state_of(state_vector, settings)
     signals = signals_of(signals_vector, settings)
-    reference.sinusoids(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
+    reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
     law.answer(settings, state, signals, t, dt, measurement)
     sample = sample_of(sample_vector, settings.n, settings.m)
     tell(settings, state, signals, part(measurement, 0, (settings.n,)), sample)
@@ -58,15 +58,15 @@ def check_start(
     Args:
         joints: names of the joints, for the message.
         q: positions (n,) [rad].
-        bound: k_c (n,) [rad].
-        reference_vector: of `reference.sinusoids_vector`.
+        bound: k(t) (n,) [rad].
+        reference_vector: of `reference.pack`.
         t: time since the start [s].
 
     Raises:
-        OutsideBarrierError: some |xi1_i(0)| >= k_c,i; names joint, error and bound.
+        OutsideBarrierError: some |xi1_i| >= k_i(t); names joint, error and bound.
     """
     qr, dqr, ddqr = np.zeros((3, len(joints)))
-    reference.sinusoids(reference_vector, t, qr, dqr, ddqr)
+    reference.evaluate(reference_vector, t, qr, dqr, ddqr)
     for joint, error, limit in zip(joints, q - qr, bound, strict=True):
         if not abs(error) < limit:
             raise OutsideBarrierError(joint, float(error), float(limit))
@@ -94,8 +94,19 @@ class Controller:
         self.sample_vector = np.zeros(sample_size(self.settings.n, self.settings.m))
         self.sample = sample_of(self.sample_vector, self.settings.n, self.settings.m)
         self.reset()
+        self.reference_at(0.0)
         self.update(0.0, 1e-3, np.zeros(3 * self.settings.n))
         self.reset()
+
+    def bound_at(self, t: float) -> np.ndarray:
+        """Bound k(t) (n,) [rad] at a time [s] since the start."""
+        funnel.narrow(self.settings, self.signals, t)
+        return self.signals.bound.copy()
+
+    def reference_at(self, t: float) -> np.ndarray:
+        """Reference at a time [s] since the start: qr, dqr, ddqr (3, n)."""
+        (now,) = reference.sampled(self.reference_vector, np.array([t]))
+        return np.asarray(now)
 
     @property
     def samples(self) -> int:
@@ -111,7 +122,7 @@ class Controller:
 
     def check_start(self, joints: tuple[str, ...], q: np.ndarray, t: float = 0.0) -> None:
         """Refuse measured positions (n,) [rad] outside the barrier: see `check_start`."""
-        check_start(joints, q, self.settings.bound, self.reference_vector, t)
+        check_start(joints, q, self.bound_at(t), self.reference_vector, t)
 
     def update(self, t: float, dt: float, measurement: np.ndarray) -> np.ndarray:
         """Torque (n,) [N m] for a measurement; a view that the next update overwrites.

@@ -15,6 +15,8 @@ from blf_dsc_controller.core import (
     barrier,
     columns,
     excitation,
+    funnel,
+    limits,
     models,
     prediction,
     surface,
@@ -53,7 +55,11 @@ def filtered_surface(settings: Settings, state: State, signals: Signals, dt: flo
     share = surface.filter_gain(settings.time_constant, dt)
     for i in range(settings.n):
         signals.beta2[i] = surface.virtual_control(
-            signals.xi1[i], settings.bound[i], settings.K[i], settings.mu[i], signals.dqr[i]
+            signals.xi1[i],
+            signals.bound[i],
+            settings.K[i],
+            settings.mu[i],
+            signals.dqr[i] + signals.narrowing[i] * signals.xi1[i],
         )
         if state.samples[0] == 0.0:
             state.alpha2[i] = signals.beta2[i]
@@ -122,28 +128,23 @@ def error_torque(settings: Settings, signals: Signals, i: int) -> float:
         return float(-torque - settings.weight[i] * signals.xi1[i])
     return float(-torque) - barrier.gradient(
         signals.xi1[i],
-        settings.bound[i],
+        signals.bound[i],
         settings.weight[i],
         settings.slope_limit[i],
-        settings.knee[i],
+        signals.knee[i],
     )
 
 
 @inner
-def command(settings: Settings, state: State, signals: Signals) -> bool:
-    """Torque (28) or (35), cut at its limit; True if any joint was cut."""
-    saturated = False
+def command(settings: Settings, state: State, signals: Signals) -> None:
+    """Torque (28) or (35), before its limits, in `signals.demand`."""
     for i in range(settings.n):
         torque = error_torque(settings, signals, i) + state.disturbance[i]
         if settings.feed_forward == 1:
             torque += signals.known[i]
         for j in range(settings.p):
             torque += signals.H[i, j] * state.estimate[j]
-        limit = settings.torque_limit[i]
         signals.demand[i] = torque
-        signals.torque[i] = min(limit, max(-limit, torque))
-        saturated = saturated or signals.torque[i] != torque
-    return saturated
 
 
 @inner
@@ -182,11 +183,13 @@ def answer(
     if settings.torque_source == EFFORT:
         applied = part(measurement, 2 * n, (n,))
     known_disturbance(settings, signals, t)
+    funnel.narrow(settings, signals, t)
     track(settings, state, signals, dt, q, dq)
     models.regressor(
         settings.model, settings.constants, q, dq, state.alpha2, signals.dalpha2, signals.H
     )
     learn(settings, state, signals, t, dt, q, dq, applied)
-    saturated = command(settings, state, signals)
+    command(settings, state, signals)
+    saturated = limits.cut_torque(settings, state, signals, dt)
     adaptation.adapt(settings, state, signals, dt, saturated)
     advance(settings, state, signals, dt)

@@ -19,10 +19,10 @@ def error_term(settings: Settings, signals: Signals) -> float:
         else:
             total += barrier.potential(
                 signals.xi1[i],
-                settings.bound[i],
+                signals.bound[i],
                 settings.weight[i],
                 settings.slope_limit[i],
-                settings.knee[i],
+                signals.knee[i],
             )
     return total
 

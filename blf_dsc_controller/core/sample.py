@@ -24,6 +24,8 @@ class Sample(NamedTuple):
     xi2: np.ndarray  # (n,) rad/s
     torque: np.ndarray  # (n,) commanded, after the limit, N m
     disturbance: np.ndarray  # (n,) d^3, N m
+    bound: np.ndarray  # (n,) k(t), rad
+    cuts: np.ndarray  # (n,) 0, or LEVEL_CUT + RATE_CUT as the torque was cut in this sample
     estimate: np.ndarray  # (m,) theta^; NaN for a disturbance column that has been refused
     lyapunov: np.ndarray  # (4,) terms of (29): error, kinetic, parameters, disturbance; or NaN
     lambda_min: np.ndarray  # (1,) of the present window's Phi
@@ -33,13 +35,13 @@ class Sample(NamedTuple):
 @inner
 def sample_size(n: int, m: int) -> int:
     """Length of a sample vector."""
-    return 6 * n + m + 6
+    return 8 * n + m + 6
 
 
 @inner
 def sample_of(vector: np.ndarray, n: int, m: int) -> Sample:
     """Name the parts of a sample vector."""
-    at = 6 * n + m
+    at = 8 * n + m
     return Sample(
         qr=part(vector, 0, (n,)),
         dqr=part(vector, n, (n,)),
@@ -47,7 +49,9 @@ def sample_of(vector: np.ndarray, n: int, m: int) -> Sample:
         xi2=part(vector, 3 * n, (n,)),
         torque=part(vector, 4 * n, (n,)),
         disturbance=part(vector, 5 * n, (n,)),
-        estimate=part(vector, 6 * n, (m,)),
+        bound=part(vector, 6 * n, (n,)),
+        cuts=part(vector, 7 * n, (n,)),
+        estimate=part(vector, 8 * n, (m,)),
         lyapunov=part(vector, at, (4,)),
         lambda_min=part(vector, at + 4, (1,)),
         latched=part(vector, at + 5, (1,)),
@@ -64,6 +68,8 @@ def tell(settings: Settings, state: State, signals: Signals, q: np.ndarray, samp
         sample.xi2[i] = signals.xi2[i]
         sample.torque[i] = signals.torque[i]
         sample.disturbance[i] = state.disturbance[i]
+        sample.bound[i] = signals.bound[i]
+        sample.cuts[i] = signals.cuts[i]
     for j in range(settings.m):
         sample.estimate[j] = state.estimate[j] if state.active[j] != 0.0 else nan
     sample.lambda_min[0] = state.lambda_min[0]

@@ -60,10 +60,12 @@ class Settings(NamedTuple):
     coulomb_velocity: float  # rad/s
     radius: float  # omega_a of (4)
     Wc: float  # leakage of P^ in (35)
+    funnel_rate: float  # a, at which the bound narrows, 1/s
     bound: np.ndarray  # (n,) k_c, rad
+    initial_bound: np.ndarray  # (n,) k_0, rad; k_c: the bound stands still
     weight: np.ndarray  # (n,) w, N m/rad; of z1 in (35)
     slope_limit: np.ndarray  # (n,) S_lim, N m/rad
-    knee: np.ndarray  # (n,) where the barrier's slope reaches S_lim, rad
+    knee: np.ndarray  # (n,) where the slope reaches S_lim if the bound is k_c, rad
     K: np.ndarray  # (n,) 1/s; lambda_s of (35)
     mu: np.ndarray  # (n,) 1/s
     Kp: np.ndarray  # (n,) N m s/rad
@@ -71,6 +73,7 @@ class Settings(NamedTuple):
     mu_bar: np.ndarray  # (n,) N m
     gamma: np.ndarray  # (n,) gain of (30)
     torque_limit: np.ndarray  # (n,) N m
+    rate_limit: np.ndarray  # (n,) N m/s; 0: none
     true_disturbance: np.ndarray  # (4, n) constant, amplitude [N m], frequency, phase of a sine
     Gamma: np.ndarray  # (m,) diagonal of the adaptation gain
     initial_estimate: np.ndarray  # (m,) P^(0), zeros for the columns
@@ -91,7 +94,7 @@ def settings_of(vector: np.ndarray) -> Settings:
     p = int(vector[1])
     m = int(vector[2])
     tones = int(vector[14])
-    at = 29 + 15 * n
+    at = 30 + 17 * n
     tail = at + 2 * m + p + tones
     return Settings(
         n=n,
@@ -123,18 +126,21 @@ def settings_of(vector: np.ndarray) -> Settings:
         coulomb_velocity=vector[26],
         radius=vector[27],
         Wc=vector[28],
-        bound=part(vector, 29, (n,)),
-        weight=part(vector, 29 + n, (n,)),
-        slope_limit=part(vector, 29 + 2 * n, (n,)),
-        knee=part(vector, 29 + 3 * n, (n,)),
-        K=part(vector, 29 + 4 * n, (n,)),
-        mu=part(vector, 29 + 5 * n, (n,)),
-        Kp=part(vector, 29 + 6 * n, (n,)),
-        d2=part(vector, 29 + 7 * n, (n,)),
-        mu_bar=part(vector, 29 + 8 * n, (n,)),
-        gamma=part(vector, 29 + 9 * n, (n,)),
-        torque_limit=part(vector, 29 + 10 * n, (n,)),
-        true_disturbance=part(vector, 29 + 11 * n, (4, n)),
+        funnel_rate=vector[29],
+        bound=part(vector, 30, (n,)),
+        initial_bound=part(vector, 30 + n, (n,)),
+        weight=part(vector, 30 + 2 * n, (n,)),
+        slope_limit=part(vector, 30 + 3 * n, (n,)),
+        knee=part(vector, 30 + 4 * n, (n,)),
+        K=part(vector, 30 + 5 * n, (n,)),
+        mu=part(vector, 30 + 6 * n, (n,)),
+        Kp=part(vector, 30 + 7 * n, (n,)),
+        d2=part(vector, 30 + 8 * n, (n,)),
+        mu_bar=part(vector, 30 + 9 * n, (n,)),
+        gamma=part(vector, 30 + 10 * n, (n,)),
+        torque_limit=part(vector, 30 + 11 * n, (n,)),
+        rate_limit=part(vector, 30 + 12 * n, (n,)),
+        true_disturbance=part(vector, 30 + 13 * n, (4, n)),
         Gamma=part(vector, at, (m,)),
         initial_estimate=part(vector, at + m, (m,)),
         true_parameters=part(vector, at + 2 * m, (p,)),

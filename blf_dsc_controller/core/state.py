@@ -32,6 +32,8 @@ class State(NamedTuple):
     disturbance: np.ndarray  # (n,) d^3, N m
     observed: np.ndarray  # (n,) xi2 through the filter (8), rad/s
     observed_rate: np.ndarray  # (n,) its derivative, rad/s^2
+    level_cuts: np.ndarray  # (n,) samples in which the torque was cut at its limit
+    rate_cuts: np.ndarray  # (n,) samples in which it was cut at the limit of its rate
     estimate: np.ndarray  # (m,) theta^ = [P^; columns]
     momentum: np.ndarray  # (n, p) Yp of the last sample
     rest: np.ndarray  # (n, m) [Yr | columns] of the last sample
@@ -61,6 +63,10 @@ class Signals(NamedTuple):
     acceleration: np.ndarray  # (n,) estimated ddq, rad/s^2
     demand: np.ndarray  # (n,) torque (28) before the limit, N m
     torque: np.ndarray  # (n,) torque commanded, N m
+    cuts: np.ndarray  # (n,) how the torque was cut: 0, LEVEL_CUT, RATE_CUT, or their sum
+    bound: np.ndarray  # (n,) k(t), rad
+    knee: np.ndarray  # (n,) knee of the barrier of that bound, rad
+    narrowing: np.ndarray  # (n,) k'/k, 1/s
     H: np.ndarray  # (n, p)
     momentum: np.ndarray  # (n, p) Yp
     rest: np.ndarray  # (n, m) [Yr | columns]
@@ -77,13 +83,13 @@ def state_size(settings: Settings) -> int:
     n, p, m = settings.n, settings.p, settings.m
     row = n * (m + 1)
     ring = settings.window * row
-    return 8 + 5 * n + m + n * p + n * m + 2 * row + 4 * m * (m + 1) + m + ring
+    return 8 + 7 * n + m + n * p + n * m + 2 * row + 4 * m * (m + 1) + m + ring
 
 
 def signals_size(settings: Settings) -> int:
     """Length of a signals vector."""
     n, p, m = settings.n, settings.p, settings.m
-    return 11 * n + 2 * n * p + n * m + n * (m + 1) + 2 * m * m + 3 * m
+    return 15 * n + 2 * n * p + n * m + n * (m + 1) + 2 * m * m + 3 * m
 
 
 @inner
@@ -93,7 +99,7 @@ def state_of(vector: np.ndarray, settings: Settings) -> State:
     p = settings.p
     m = settings.m
     row = n * (m + 1)
-    estimate = 8 + 5 * n
+    estimate = 8 + 7 * n
     momentum = estimate + m
     rest = momentum + n * p
     filters = rest + n * m
@@ -114,6 +120,8 @@ def state_of(vector: np.ndarray, settings: Settings) -> State:
         disturbance=part(vector, 8 + 2 * n, (n,)),
         observed=part(vector, 8 + 3 * n, (n,)),
         observed_rate=part(vector, 8 + 4 * n, (n,)),
+        level_cuts=part(vector, 8 + 5 * n, (n,)),
+        rate_cuts=part(vector, 8 + 6 * n, (n,)),
         estimate=part(vector, estimate, (m,)),
         momentum=part(vector, momentum, (n, p)),
         rest=part(vector, rest, (n, m)),
@@ -136,7 +144,7 @@ def signals_of(vector: np.ndarray, settings: Settings) -> Signals:
     n = settings.n
     p = settings.p
     m = settings.m
-    regressor = 11 * n
+    regressor = 15 * n
     rest = regressor + 2 * n * p
     row = rest + n * m
     squares = row + n * (m + 1)
@@ -153,6 +161,10 @@ def signals_of(vector: np.ndarray, settings: Settings) -> Signals:
         acceleration=part(vector, 8 * n, (n,)),
         demand=part(vector, 9 * n, (n,)),
         torque=part(vector, 10 * n, (n,)),
+        cuts=part(vector, 11 * n, (n,)),
+        bound=part(vector, 12 * n, (n,)),
+        knee=part(vector, 13 * n, (n,)),
+        narrowing=part(vector, 14 * n, (n,)),
         H=part(vector, regressor, (n, p)),
         momentum=part(vector, regressor + n * p, (n, p)),
         rest=part(vector, rest, (n, m)),

@@ -24,6 +24,8 @@ from blf_dsc_controller.bags.errors import (
 )
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError, OutsideBarrierError
+from blf_dsc_controller.motion.errors import MotionError
+from blf_dsc_controller.motion.start import begin
 from blf_dsc_controller.safety import tuning
 from blf_dsc_controller.safety.fallback import Ramp, safe_torque
 from blf_dsc_controller.safety.monitors import Silence
@@ -60,6 +62,7 @@ class Guard:
         ratio: largest |xi1| / k_c of each joint since the start (n,).
         outside: samples past the bound since then.
         start_stamp: of t = 0 [ns]; -1 before the first start.
+        settled: time from which on the reference is the configured one [s].
         last_stamp: of the last state that the law answered [ns].
         compute_time: that the law took for it [s].
         watching: whether silence on the steady clock leads to a stop.
@@ -83,6 +86,7 @@ class Guard:
         self.ratio = np.zeros(n)
         self.outside = 0
         self.start_stamp = -1
+        self.settled = 0.0
         self.last_stamp = -1
         self._steady = steady
         self._wall = wall
@@ -193,7 +197,7 @@ class Guard:
         self._remember(q, dq)
         if trust is Trust.STOP:
             return self._safe(self.config.sample_time)
-        if self.supervisor.phase is Phase.STARTING and not self._begin(stamp, q):
+        if self.supervisor.phase is Phase.STARTING and not self._begin(stamp, q, dq):
             return self._safe(self.config.sample_time) if self._commanded else None
         return self._control(stamp, measurement)
 
@@ -229,24 +233,22 @@ class Guard:
         """Several drivers may share joint_states, each with joints of its own."""
         return bool(error.names) and not set(self.config.joints) & set(error.names)
 
-    def _begin(self, stamp: int, q: Vector) -> bool:
-        """Start at t = 0 or, where a running reference is still in reach, go on along it."""
-        joints = self.config.joints
+    def _begin(self, stamp: int, q: Vector, dq: Vector) -> bool:
+        """Go on along the running reference if it is in reach, or else start at t = 0."""
         elapsed = (stamp - self.start_stamp) * _NANO
-        try:
-            self.controller.check_start(joints, q)
-        except OutsideBarrierError as error:
-            if not (self._resumable and stamp > self.last_stamp and self._in_reach(q, elapsed)):
+        if not (self._resumable and stamp > self.last_stamp and self._in_reach(q, elapsed)):
+            try:
+                self.settled = begin(self.controller, self.config, q, dq)
+            except (OutsideBarrierError, MotionError) as error:
                 self.refusal = error
                 self.supervisor.stop(Reason.START_REFUSED, str(error))
                 return False
-        else:
             self.start_stamp = stamp
         self.last_stamp = stamp - self.config.sample_time_ns
         watchdog = self.config.safety.watchdog
         is_live = abs(self._wall() - stamp) < _SAME_CLOCK
         self.watching = watchdog == 'on' or (watchdog == 'auto' and is_live)
-        self.supervisor.enter(Phase.TRACKING)
+        self.supervisor.enter(Phase.APPROACHING)
         return True
 
     def _in_reach(self, q: Vector, elapsed: float) -> bool:
@@ -259,9 +261,12 @@ class Guard:
     def _control(self, stamp: int, measurement: Vector) -> Vector | None:
         controller = self.controller
         dt = (stamp - self.last_stamp) * _NANO
-        begin = perf_counter()
-        torque = controller.update((stamp - self.start_stamp) * _NANO, dt, measurement)
-        self.compute_time = perf_counter() - begin
+        t = (stamp - self.start_stamp) * _NANO
+        if self.supervisor.phase is Phase.APPROACHING and t >= self.settled:
+            self.supervisor.enter(Phase.TRACKING)
+        before = perf_counter()
+        torque = controller.update(t, dt, measurement)
+        self.compute_time = perf_counter() - before
         self.last_stamp = stamp
         trusted = self.supervisor.judge(
             self.config.safety, controller.settings, controller.signals, controller.sample, dt
@@ -276,7 +281,7 @@ class Guard:
         return self._torque
 
     def _watch_bound(self) -> None:
-        ratio = np.abs(self.controller.sample.xi1) / self.controller.settings.bound
+        ratio = np.abs(self.controller.sample.xi1) / self.controller.sample.bound
         np.fmax(self.ratio, ratio, out=self.ratio)
         if not ratio.max() < 1.0:
             self.outside += 1

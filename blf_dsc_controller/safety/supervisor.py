@@ -188,13 +188,13 @@ class Supervisor:
     def _judge_error(self, safety: Safety, settings: Settings, told: Sample) -> None:
         if settings.surface == LINEAR or safety.error_ratio == 0.0:
             return
-        ratio = np.abs(told.xi1) / settings.bound
+        ratio = np.abs(told.xi1) / told.bound
         worst = int(np.argmax(ratio))
         if ratio[worst] < safety.error_ratio:
             return
         text = (
             f'joint {self._joints[worst]!r} is {told.xi1[worst]:+.6g} rad from its reference: '
-            f'past {safety.error_ratio:g} times its bound of {settings.bound[worst]:.6g} rad'
+            f'past {safety.error_ratio:g} times its bound of {told.bound[worst]:.6g} rad'
         )
         self._halt(Reason.OUTSIDE_BOUND, text)
 

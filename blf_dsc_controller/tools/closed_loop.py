@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.assembly import estimate_names, reference_of
+from blf_dsc_controller.assembly import estimate_names
 from blf_dsc_controller.bags.offline import write_bag
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.dump import dump
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
 from blf_dsc_controller.configuration.params_file import load_loop, locate
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.core.controller import check_start
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.motion.start import plan
 from blf_dsc_controller.nodes import compilation
 from blf_dsc_controller.refusals import refusals
 from blf_dsc_controller.reports.figures import draw
@@ -71,7 +71,8 @@ def configure(options: argparse.Namespace) -> LoopConfig:
 
     Raises:
         ConfigurationError: the file and the options do not describe a loop.
-        OutsideBarrierError: the arm starts outside the bound.
+        OutsideBarrierError: the arm starts outside the bound, and there is to be no approach.
+        MotionError: there is no approach within the limits.
     """
     chosen = {'duration': options.duration, 'mode': options.mode, 'seed': options.seed}
     plant = {name: value for name, value in chosen.items() if value is not None}
@@ -89,14 +90,14 @@ def configure(options: argparse.Namespace) -> LoopConfig:
 
 
 def _check_start(config: LoopConfig) -> None:
-    """Find a start outside the bound now, by the true position; the controller measures it."""
+    """Find a start that will be refused now, by the true state; the controller measures it."""
     controller, plant = config.controller, config.plant
-    position = dict(zip(plant.joints, plant.initial.position, strict=True))
-    check_start(
-        controller.joints,
-        np.array([position[joint] for joint in controller.joints]),
-        np.array(controller.barrier.bound),
-        reference_of(controller),
+    order = [plant.joints.index(joint) for joint in controller.joints]
+    plan(
+        controller,
+        np.array(controller.barrier.widest),
+        np.array(plant.initial.position)[order],
+        np.array(plant.initial.velocity)[order],
     )
 
 

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Starts from anywhere: approach, hand-over and tracking, all within the bound; or a refusal."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.assembly import controller_of
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.reference import Approach, Reference
+from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.core.reference import sampled
+from blf_dsc_controller.errors import ConfigurationError, OutsideBarrierError
+from blf_dsc_controller.motion.start import begin, reference_of
+from blf_dsc_controller.simulation import simulate
+from sim_plant.configuration import Initial, PlantConfig
+
+CONFIG = ControllerConfig()
+PAPER = np.array([2.2935, 1.6961])  # qr(0)
+STILL = np.zeros(2)
+BOUND = 2e-3  # rad
+STARTS = PAPER + np.random.default_rng(7).uniform(-2.0, 2.0, (10, 2))
+
+
+def run(config, start, duration):
+    plant = replace(
+        PlantConfig(), initial=Initial(tuple(start), (0.0, 0.0)), duration=float(duration)
+    )
+    return simulate(config, plant)
+
+
+@pytest.mark.parametrize('start', STARTS, ids=range(len(STARTS)))
+def test_from_anywhere_the_arm_comes_to_the_reference_within_the_bound(start):
+    law = controller_of(CONFIG)
+    settled = begin(law, CONFIG, start, STILL)
+    record = run(CONFIG, start, 12.0)
+    t = record.stamps * 1e-9
+    qr, xi1 = record.samples[:, :2], record.samples[:, 4:6]
+
+    assert 0.5 < settled < 5.0  # a step of 2 rad at 1.5 rad/s takes 2.5 s
+    assert np.abs(xi1).max() < BOUND
+    np.testing.assert_allclose(qr[0], start, atol=1e-12)
+    paper = sampled(reference_of(CONFIG), t)[:, 0]
+    np.testing.assert_allclose(qr[t >= settled], paper[t >= settled], atol=1e-14)
+    assert np.abs(qr[t < settled] - paper[t < settled]).max() > BOUND
+
+
+def test_a_start_inside_the_bound_needs_no_approach():
+    law = controller_of(CONFIG)
+    assert begin(law, CONFIG, PAPER + 0.9 * BOUND, STILL, 0.0) == 0.0
+    np.testing.assert_array_equal(law.reference_vector, reference_of(CONFIG))
+
+
+def test_without_approaches_a_start_outside_is_refused():
+    config = replace(CONFIG, approach=Approach(enabled=False))
+    with pytest.raises(OutsideBarrierError):
+        begin(controller_of(config), config, PAPER + 1.1 * BOUND, STILL)
+
+
+def test_an_approach_may_begin_later():
+    law = controller_of(CONFIG)
+    settled = begin(law, CONFIG, PAPER, STILL, 3.0)  # the paper's reference is 0.6 rad away then
+    assert settled > 3.0
+    np.testing.assert_allclose(law.reference_at(3.0), [PAPER, STILL, STILL], atol=1e-12)
+
+
+def test_hold_stays_where_the_arm_is():
+    config = replace(CONFIG, reference=Reference(type='hold'))
+    start = PAPER - 0.7
+    record = run(config, start, 1.0)
+    np.testing.assert_array_equal(record.samples[:, :2], np.broadcast_to(start, (1001, 2)))
+    assert np.abs(record.samples[:, 4:6]).max() < BOUND
+
+
+def test_waypoints_are_passed_at_their_times_and_the_last_is_kept():
+    points = np.array([[2.0, 1.0], [2.4, 1.5], [1.8, 1.2]])
+    reference = Reference(type='waypoints', times=(0.0, 1.5, 3.5), points=tuple(points.T.ravel()))
+    config = replace(CONFIG, reference=reference)
+    record = run(config, points[0], 5.0)
+    qr, dqr = record.samples[:, :2], record.samples[:, 2:4]
+    np.testing.assert_allclose(qr[[0, 1500, 3500, 5000]], points[[0, 1, 2, 2]], atol=1e-12)
+    np.testing.assert_array_equal(dqr[[0, 3500, 5000]], 0.0)
+    assert np.abs(record.samples[:, 4:6]).max() < BOUND
+
+
+@pytest.mark.parametrize(
+    ('given', 'problem'),
+    [
+        ({'reference.type': 'spiral'}, "reference.type: got 'spiral', but it must be one of"),
+        ({'reference.type': 'waypoints'}, 'reference.times: got none'),
+        (
+            {'reference.times': [0.0, 1.0, 1.0], 'reference.points': [0.0] * 6},
+            'reference.times: got 1 s after 1 s, but they must increase',
+        ),
+        (
+            {'reference.times': [0.0, 1.0], 'reference.points': [0.0] * 3},
+            'reference.points: got 3 entries, but 4 are needed',
+        ),
+        ({'limits.velocity': [0.0, 1.0]}, 'limits.velocity: got 0.0 at entry 1'),
+        (
+            {'limits.position_lower': [1.0, 7.0]},
+            'limits.position_upper: got 6.28319 rad for joint2, but it must be above',
+        ),
+    ],
+)
+def test_what_makes_no_reference_is_refused_with_the_reason(given, problem):
+    with pytest.raises(ConfigurationError) as refusal:
+        build(ControllerConfig, given)
+    assert problem in str(refusal.value)
