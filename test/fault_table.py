@@ -437,7 +437,13 @@ FAULTS = (
     Fault('one command that is infinite', wired_once(np.array([1.0, INF])), R.NONE),
     Fault('all commands come as NaN', wired(np.array([NAN, NAN])), R.OUTSIDE_BOUND, 80),
     Fault('plant killed and started again', restarted_plant, R.STAMP_BACKWARD),
-    Fault('controller killed, started far away', restarted_controller, R.START_REFUSED),
+    Fault(
+        'controller killed, started far away',
+        restarted_controller,
+        R.START_REFUSED,
+        given={'approach.enabled': False},
+    ),
+    Fault('controller killed, led back by an approach', restarted_controller, R.NONE),
 )
 
 
