@@ -237,6 +237,8 @@ class PlantNode(ManagedNode):
 
     def _on_beat(self) -> None:
         """Take every step that is due: time does not wait for a late process."""
+        if not self._running:  # the timer was destroyed with this beat on its way
+            return
         elapsed = perf_counter() - self._began
         due = self._first + int(elapsed / self.config.sample_time + _EARLY)
         while self.plant.sample < due and not self.finished:

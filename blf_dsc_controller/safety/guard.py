@@ -128,7 +128,7 @@ class Guard:
         self._clean = self._clean and self.supervisor.phase is not Phase.SAFE_STOP
         self.supervisor.enter(Phase.INACTIVE)
         self._silence.forget()
-        self._resumable = False
+        self._resumable = was_running
         if was_running:
             self._ramp.begin(self._torque, self.config.safety.deactivation_ramp)
 
