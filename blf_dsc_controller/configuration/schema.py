@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import math
 import typing
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -34,7 +35,7 @@ _KINDS = {
 
 def parameters(cls: type[Any]) -> list[Parameter]:
     """Every parameter of the configuration `cls`, in the order written, under dotted names."""
-    return list(_walk(cls, ''))
+    return list(_listed(cls))  # type: ignore[arg-type] # mypy takes no type to be hashable
 
 
 def flatten(config: object) -> dict[str, Value]:
@@ -78,6 +79,11 @@ def unknown(name: str, known: Iterable[str]) -> str:
         close = [other for other in known if other.rsplit('.', 1)[-1] == name.rsplit('.', 1)[-1]]
     hint = f': did you mean {close[0]}?' if close else ''
     return f'{name}: there is no parameter of this name{hint}'
+
+
+@functools.cache
+def _listed(cls: type[Any]) -> tuple[Parameter, ...]:
+    return tuple(_walk(cls, ''))
 
 
 def _walk(cls: type[Any], prefix: str) -> Iterator[Parameter]:

@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The guarded controller: safe torques and ramps, what is kept, and gains changed while it runs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fault_rig import MILLISECOND, Rig
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.safety import Safety
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.core.two_link import gravity
+from blf_dsc_controller.safety.fallback import Ramp, safe_torque
+from blf_dsc_controller.safety.monitors import Overruns, Silence
+from blf_dsc_controller.safety.reasons import Phase, Reason
+
+Q, DQ = np.array([0.3, -0.4]), np.array([0.5, -2.0])
+P = np.array([1.0, 0.32, 0.4])
+
+
+def settings(**given):
+    from blf_dsc_controller import assembly
+
+    return assembly.settings_of_config(change(ControllerConfig(), given))
+
+
+def weight(q):
+    """Gravity torque of the true parameters, from the potential."""
+    G = np.zeros(2)
+    gravity(np.array([9.8]), P, q, G)
+    return G
+
+
+def safe(torque, q=Q, dq=DQ, estimate=P, **given):
+    return safe_torque(
+        Safety(torque=torque, damping=(2.0, 1.0)), settings(**given), q, dq, estimate
+    )
+
+
+def test_each_safe_torque_is_what_its_name_says():
+    np.testing.assert_array_equal(safe('zero'), [0.0, 0.0])
+    np.testing.assert_allclose(safe('damping'), [-1.0, 2.0])
+    np.testing.assert_allclose(safe('hold_gravity'), weight(Q) + np.array([-1.0, 2.0]))
+
+
+def test_a_safe_torque_keeps_the_limit_and_is_none_where_it_cannot_be_told():
+    limited = safe('hold_gravity', **{'torque.limit': (3.0, 3.0)})
+    np.testing.assert_array_equal(limited, [3.0, 3.0])
+    np.testing.assert_array_equal(safe('hold_gravity', estimate=P * np.nan), [0.0, 0.0])
+
+
+def test_a_ramp_is_straight_and_ends_at_a_goal_that_moves():
+    ramp = Ramp(1)
+    ramp.begin(np.array([4.0]), 0.004)
+    goals = (0.0, 0.0, 8.0, 8.0, 7.0)
+    got = [ramp.towards(np.array([goal]), 0.001)[0] for goal in goals]
+    np.testing.assert_allclose(got, [3.0, 2.0, 7.0, 8.0, 7.0])
+    ramp.begin(np.array([4.0]), 0.0)
+    assert ramp.towards(np.array([1.0]), 0.001) == 1.0
+
+
+def test_missed_states_are_averaged():
+    """Every second state missed is a fraction of a half, after a few windows."""
+    overruns = Overruns()
+    for _ in range(1000):
+        overruns.take(2, 100.0)
+    assert overruns.count == 1000
+    assert overruns.fraction == pytest.approx(0.5, abs=0.01)
+    for _ in range(1000):
+        overruns.take(1, 100.0)
+    assert overruns.fraction < 1e-4
+
+
+def test_silence_is_told_by_a_watch_that_was_awake():
+    silence = Silence()
+    assert silence.look(0, 0.01, 0.04) == 0.0  # nothing has come yet: nobody is missed
+    silence.state(10 * MILLISECOND)
+    for now in range(10, 51, 10):
+        assert silence.look(now * MILLISECOND, 0.01, 0.04) == 0.0
+    assert silence.look(60 * MILLISECOND, 0.01, 0.04) == pytest.approx(0.05)
+    assert silence.look(200 * MILLISECOND, 0.01, 0.04) == 0.0  # it has slept itself
+    assert silence.look(210 * MILLISECOND, 0.01, 0.04) == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(('watchdog', 'live'), [('auto', True), ('on', False)])
+def test_silence_stops_where_the_stamps_are_of_today_or_it_is_asked_for(watchdog, live):
+    rig = Rig({'safety.watchdog': watchdog}, live=live)
+    rig.step(20)
+    rig.wait(60)
+    assert rig.supervisor.reason is Reason.STATE_TIMEOUT
+    assert rig.commands[-1].tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(('watchdog', 'live'), [('auto', False), ('off', True)])
+def test_a_slow_lockstep_is_no_silence(watchdog, live):
+    rig = Rig({'safety.watchdog': watchdog}, live=live)
+    rig.step(20)
+    rig.wait(5000)
+    rig.step(20)
+    assert rig.supervisor.phase is Phase.TRACKING
+
+
+def test_after_a_fault_the_torque_ramps_if_so_configured():
+    rig = Rig({'safety.stop_ramp': 0.01})
+    rig.step(20)
+    last = rig.commands[-1]
+    rig.deliver(b'')
+    rig.step(12)
+    ramp = np.array(rig.commands[-13:])
+    np.testing.assert_allclose(ramp[:10], np.outer(np.linspace(0.9, 0.0, 10), last), atol=1e-12)
+    assert not ramp[10:].any()
+
+
+def test_a_stopped_arm_is_held_by_the_gravity_that_was_learned():
+    """With parameters that are right, gravity is held and damping takes the rest of the motion."""
+    learned = {'learning.initial_estimate': P.tolist(), 'safety.torque': 'hold_gravity'}
+    rig = Rig(learned, plant={'disturbance.constant': [0.0, 0.0]})
+    rig.step(20)
+    rig.deliver(b'')
+    start = rig.state().q
+    rig.step(500)
+    assert rig.supervisor.phase is Phase.SAFE_STOP
+    np.testing.assert_allclose(rig.commands[-1], weight(rig.state().q), atol=0.1)
+    # With zero torque it falls by 1.5 rad in that time; the sinusoid of 0.1 N m is not held.
+    assert np.abs(rig.state().q - start).max() < 0.05
+
+
+def test_activated_again_at_once_the_torque_goes_on_where_it_was():
+    rig = Rig({'safety.deactivation_ramp': 10.0})
+    rig.step(200)
+    before = rig.commands[-1]
+    rig.guard.deactivate()
+    rig.step(1)
+    rig.guard.activate()
+    rig.step(100)
+    assert rig.supervisor.phase is Phase.TRACKING
+    # The surface filter starts anew: that costs K_p = 60 N m s/rad times the few mrad/s that it
+    # lagged behind, of a torque of 9 N m.
+    assert np.abs(rig.commands[201] - before).max() < 0.3
+    assert rig.guard.ratio.max() < 0.5
+
+
+@pytest.mark.parametrize('keep', [True, False])
+def test_estimates_are_kept_or_forgotten_as_configured(keep):
+    rig = Rig({'safety.keep_estimates': keep})
+    rig.step(200)
+    learned = rig.guard.controller.state.estimate.copy()
+    window = rig.guard.controller.state.rows[0]
+    rig.guard.deactivate()
+    rig.guard.activate()
+    state = rig.guard.controller.state
+    start = rig.guard.controller.settings.initial_estimate
+    np.testing.assert_array_equal(state.estimate, learned if keep else start)
+    assert state.rows[0] == (window if keep else 0.0)
+    assert not np.array_equal(learned, start)
+
+
+def test_after_a_fault_estimates_are_kept_from_before_it_and_the_window_is_not():
+    rig = Rig({'safety.error_ratio': 0.2})  # passed on the way, while nothing is saturated
+    while rig.supervisor.reason is Reason.NONE:
+        learned = rig.guard.controller.state.estimate.copy()
+        rig.step()
+    assert rig.supervisor.reason is Reason.OUTSIDE_BOUND
+    assert not np.array_equal(rig.guard.controller.state.estimate, learned)
+    rig.guard.deactivate()
+    rig.guard.activate()
+    np.testing.assert_array_equal(rig.guard.controller.state.estimate, learned)
+    assert rig.guard.controller.state.rows[0] == 0.0
+
+
+def test_a_reset_forgets():
+    rig = Rig()
+    rig.step(200)
+    rig.guard.reset()
+    state = rig.guard.controller.state
+    np.testing.assert_array_equal(state.estimate, rig.guard.controller.settings.initial_estimate)
+    assert not state.disturbance.any()
+
+
+def test_an_error_nobody_foresaw_stops_too():
+    rig = Rig()
+    rig.step(20)
+    torque = rig.guard.fail(ZeroDivisionError('x'))
+    assert rig.supervisor.reason is Reason.FAILED
+    assert rig.supervisor.text == 'ZeroDivisionError: x'
+    assert torque.tolist() == [0.0, 0.0]
+
+
+NEW_GAINS = [
+    {'feedback.gain': (120.0, 40.0)},
+    {'surface.gain': (300.0, 75.0)},
+    {'surface.mu': (40.0, 10.0)},
+    {'barrier.weight': (5000.0, 200.0)},
+    {'barrier.bound': (0.004, 0.0015)},
+]
+
+
+def jump(given, *, bumpless):
+    """Largest step of a torque at a change of gains, at the largest error of the start."""
+    rig = Rig()
+    rig.step(60)
+    candidate = change(rig.guard.config, given)
+    if bumpless:
+        assert rig.guard.objections(candidate) == []
+        rig.guard.retune(candidate)
+    else:
+        from blf_dsc_controller.safety import tuning
+
+        tuning.take(rig.guard.controller, candidate)
+    rig.step(1)
+    return np.abs(rig.commands[-1] - rig.commands[-2]).max()
+
+
+@pytest.mark.parametrize('given', NEW_GAINS, ids=lambda given: next(iter(given)))
+def test_new_gains_are_taken_without_a_bump(given):
+    """The torque moves by no more than it does from sample to sample without a change."""
+    usual = jump({}, bumpless=True)
+    assert jump(given, bumpless=False) > 4.0 * usual
+    assert jump(given, bumpless=True) < 2.0 * usual
+
+
+@pytest.mark.parametrize(
+    ('given', 'said'),
+    [
+        ({'barrier.bound': (1e-6, 0.002)}, 'barrier.bound: joint1 is'),
+        ({'torque.limit': (20.0, 1.0)}, 'torque.limit: joint2 is held with'),
+        ({'learning.radius': 0.58}, 'learning.radius: the estimate is at'),
+    ],
+)
+def test_what_a_running_law_cannot_take_is_refused_with_the_reason(given, said):
+    rig = Rig()
+    rig.step(200)
+    (objection,) = rig.guard.objections(change(rig.guard.config, given))
+    assert objection.startswith(said)
+    rig.guard.deactivate()
+    assert rig.guard.objections(change(rig.guard.config, given)) == []
+
+
+def test_an_update_that_would_diverge_is_refused():
+    """Gradient: kappa Gamma lambda_max T >= 2; here kappa is 100 and lambda_max some 100."""
+    rig = Rig(
+        {
+            'learning.window': 0.2,
+            'learning.excitation_threshold': 1e-12,
+            'learning.settling_time': 0.0,
+        }
+    )
+    rig.step(400)
+    assert rig.guard.controller.state.latched[0] == 1.0
+    (objection,) = rig.guard.objections(change(rig.guard.config, {'learning.update': 'gradient'}))
+    assert objection.startswith('learning.weight: with the update gradient')
+    gentle = {'learning.update': 'gradient', 'learning.weight': 2.0}
+    assert rig.guard.objections(change(rig.guard.config, gentle)) == []

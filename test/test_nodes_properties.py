@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whatever comes, in whatever order: no callback raises, and no torque is bad.
+
+`make test-nightly` runs ten thousand examples of each, `make test` some hundreds in all.
+"""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+
+import rclpy
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+
+from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.nodes.controller_node import ControllerNode
+from sim_plant.node import PlantNode
+
+EXAMPLES = int(os.environ.get('BLF_DSC_EXAMPLES', '150'))
+SETTINGS = settings(
+    max_examples=EXAMPLES,
+    deadline=None,
+    derandomize='BLF_DSC_EXAMPLES' not in os.environ,
+    suppress_health_check=list(HealthCheck),
+)
+LIMIT = 20.0
+START = (2.293, 1.696)
+
+numbers = st.one_of(
+    st.floats(allow_nan=True, allow_infinity=True, width=64),
+    st.floats(-4.0, 4.0),
+    st.sampled_from([0.0, np.nan, np.inf, 1e308, 5e-324]),
+)
+names = st.lists(st.sampled_from(['joint1', 'joint2', 'joint3', '', 'ü']), max_size=4)
+
+
+@st.composite
+def joint_states(draw):
+    """Serialised joint states: good ones, wrong ones, and mere bytes."""
+    kind = draw(st.sampled_from(['good', 'good', 'good', 'near', 'wrong', 'names', 'bytes', 'cut']))
+    step = draw(st.sampled_from([1, 1, 1, 1, 0, 2, 60, -1, -1000, 10**7]))
+    q = [start + draw(st.floats(-1e-3, 1e-3)) for start in START]
+    dq = [draw(st.floats(-0.1, 0.1)) for _ in START]
+    if kind == 'bytes':
+        return step, lambda _: draw(st.binary(max_size=200))
+    if kind == 'wrong':
+        q, dq = ([draw(numbers) for _ in START] for _ in range(2))
+    if kind == 'near':
+        q = [start + draw(st.floats(-0.1, 0.1)) for start in START]
+    joints = draw(names) if kind == 'names' else ['joint1', 'joint2']
+    fields = draw(st.sets(st.sampled_from(['position', 'velocity', 'effort'])))
+    if kind != 'names':
+        fields |= {'position', 'velocity'}
+    encoder = JointStateEncoder(joints, fields)
+    values = {'position': q, 'velocity': dq, 'effort': dq}
+    told = {name: (values[name] * 2)[: len(joints)] for name in fields}
+    cut = draw(st.integers(0, 100)) if kind == 'cut' else 0
+
+    def raw(stamp):
+        message = encoder.encode(stamp % 2**61, **told)
+        return message[: len(message) - cut]
+
+    return step, raw
+
+
+TUNABLE = [
+    'barrier.bound',
+    'barrier.weight',
+    'surface.gain',
+    'surface.mu',
+    'feedback.gain',
+    'feedback.damping',
+    'disturbance.gain',
+    'torque.limit',
+    'safety.damping',
+]
+SCALARS = [
+    'actuator.command_timeout',
+    'learning.weight',
+    'learning.radius',
+    'safety.velocity_limit',
+    'safety.stop_ramp',
+]
+
+parameters = st.one_of(
+    st.tuples(st.sampled_from(TUNABLE), st.lists(st.floats(0.0, 19.0), max_size=3)),
+    st.tuples(st.sampled_from(TUNABLE[:-2]), st.lists(numbers, max_size=3)),
+    st.tuples(st.sampled_from(SCALARS), numbers),
+    st.tuples(st.just('safety.torque'), st.sampled_from(['zero', 'hold_gravity', 'damping', 'x'])),
+    st.tuples(st.just('joints'), st.just(['a', 'b'])),
+)
+transitions = st.sampled_from(
+    [
+        Transition.TRANSITION_CONFIGURE,
+        Transition.TRANSITION_CLEANUP,
+        Transition.TRANSITION_ACTIVATE,
+        Transition.TRANSITION_DEACTIVATE,
+        Transition.TRANSITION_CREATE,
+        77,
+    ]
+)
+
+
+def events(messages):
+    """Sequences of what can happen to a node; messages are most of it."""
+    one = st.one_of(
+        st.tuples(st.just('message'), messages),
+        st.tuples(st.just('message'), messages),
+        st.tuples(st.just('parameter'), parameters),
+        st.tuples(st.just('transition'), transitions),
+        st.tuples(st.just('reset'), st.none()),
+        st.tuples(st.just('tick'), st.none()),
+    )
+    return st.lists(one, max_size=30)
+
+
+@pytest.fixture(scope='module')
+def context():
+    context = rclpy.Context()
+    rclpy.init(context=context, signal_handler_options=rclpy.SignalHandlerOptions.NO)
+    yield context
+    rclpy.try_shutdown(context=context)
+
+
+@pytest.fixture(scope='module')
+def bystander(context):
+    """Keeps the middleware up between examples, which then cost a tenth."""
+    node = rclpy.create_node('bystander', context=context)
+    yield node
+    node.destroy_node()
+
+
+def happen(node, what, told):
+    """Let one thing happen to a node, through the callbacks that ROS would call."""
+    if what == 'transition':
+        request = ChangeState.Request(transition=Transition(id=told))
+        node._service_change_state.callback(request, ChangeState.Response())
+    elif what == 'reset':
+        node._on_reset(Trigger.Request(), Trigger.Response())
+    elif what == 'tick':
+        node._tick()
+        node._report()
+    elif what == 'parameter':
+        name, value = told
+        if not node.has_parameter(name):  # of the other node
+            return
+        typed = Parameter(name, value=value) if value != [] else Parameter(name)
+        node.set_parameters_atomically([typed])
+
+
+@pytest.mark.usefixtures('bystander')
+@given(events(joint_states()))
+@SETTINGS
+def test_the_controller_bears_everything(context, sequence):
+    node = ControllerNode(context=context, cli_args=[], enable_rosout=False)
+    commands = []
+    node._command = lambda torque: commands.append(torque.copy())
+    node._is_observed = lambda: True
+    stamp = 10**9
+    try:
+        for what, told in sequence:
+            if what == 'message':
+                step, raw = told
+                stamp = max(1, stamp + step * 1_000_000)
+                node._on_joint_state(raw(stamp))
+            happen(node, what, told)
+            limit = np.array(node.config.torque.limit)
+            for torque in commands:
+                assert np.isfinite(torque).all()
+                assert (np.abs(torque) <= limit).all()
+            commands.clear()
+    finally:
+        node.destroy_node()
+
+
+@st.composite
+def commands(draw):
+    """Serialised torques of any number of values, and mere bytes."""
+    if draw(st.booleans()):
+        values = draw(st.lists(numbers, max_size=4))
+        return Float64MultiArrayEncoder(len(values)).encode(values)
+    return draw(st.binary(max_size=60))
+
+
+@pytest.mark.usefixtures('bystander')
+@given(events(commands()))
+@SETTINGS
+def test_the_plant_bears_everything(context, sequence):
+    overrides = [
+        Parameter('mode', value='lockstep'),
+        Parameter('actuator.torque_limit', value=[20.0, 20.0]),
+    ]
+    node = PlantNode(
+        context=context, cli_args=[], enable_rosout=False, parameter_overrides=overrides
+    )
+    node._is_observed = lambda: True
+    node._handshake._since = 1e-9
+    try:
+        for what, told in sequence:
+            if what == 'message':
+                node._on_command(told)
+            happen(node, what, told)
+            assert np.isfinite(node.reception.torque).all()
+            if node.state_label == 'active':
+                measured = node.plant.measure()
+                assert np.isfinite(measured).all()
+                assert (np.abs(measured[4:]) <= 20.0).all()
+    finally:
+        node.destroy_node()
