@@ -46,6 +46,9 @@ setup(
         'numba',
         'mcap>=1.6',
         'rosbags>=0.11',
+        # What the chunks of MCAP files are packed with; mcap brings both.
+        'lz4',
+        'zstandard',
         'matplotlib',
         'pyyaml',
         'tqdm',
@@ -75,6 +78,8 @@ setup(
             'blf_dsc_controller = blf_dsc_controller.tools.entry:blf_dsc_controller',
             'bag_recorder = blf_dsc_controller.tools.entry:bag_recorder',
             'closed_loop = blf_dsc_controller.tools.closed_loop:main',
+            'bag_replay = blf_dsc_controller.tools.bag_replay:main',
+            'bag_recover = blf_dsc_controller.tools.bag_recover:main',
             'bag_plot = blf_dsc_controller.tools.bag_plot:main',
         ],
     },

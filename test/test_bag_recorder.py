@@ -22,12 +22,12 @@ from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.bags.encoders import JointStateEncoder
 from blf_dsc_controller.bags.errors import BagExistsError
+from blf_dsc_controller.bags.losses import Losses
 from blf_dsc_controller.bags.topics import FOREVER, JOINT_STATES, Quality
 from blf_dsc_controller.bags.types import type_hash
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.nodes import recorder_node
 from blf_dsc_controller.nodes.intake import quality_of
-from blf_dsc_controller.nodes.losses import Losses
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 
 PATIENCE = 20.0  # s, until a test gives up on what should take a moment

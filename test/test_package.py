@@ -19,7 +19,15 @@ import blf_dsc_controller
 ROOT = Path(__file__).resolve().parents[1]
 NAME = 'blf_dsc_controller'
 PACKAGES = (NAME, 'sim_plant')
-EXECUTABLES = {'sim_plant', 'blf_dsc_controller', 'bag_recorder', 'closed_loop', 'bag_plot'}
+EXECUTABLES = {
+    'sim_plant',
+    'blf_dsc_controller',
+    'bag_recorder',
+    'closed_loop',
+    'bag_plot',
+    'bag_replay',
+    'bag_recover',
+}
 
 # rosdep's names for what pip installs. rosdep has no key for mcap alone.
 ROSDEP_KEYS = {
@@ -29,6 +37,8 @@ ROSDEP_KEYS = {
     'pyyaml': 'python3-yaml',
     'tqdm': 'python3-tqdm',
     'mcap': 'mcap-ros2-support',
+    'lz4': 'mcap-ros2-support',  # by way of mcap
+    'zstandard': 'mcap-ros2-support',
     'rosbags': 'python3-rosbags-pip',
 }
 

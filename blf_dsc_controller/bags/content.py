@@ -4,20 +4,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rosbags.rosbag2 import Reader
+import numpy as np
 
-from blf_dsc_controller.bags.errors import MissingTopicError, UnreadableBagError
+from blf_dsc_controller.bags.errors import EmptyTopicError, MissingTopicError
 from blf_dsc_controller.bags.lookup import find
+from blf_dsc_controller.bags.name_map import NO_NAMES, NameMap
+from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.topics import (
     BOUND,
     COMMANDS,
+    JOINT_STATE,
     JOINT_STATES,
     LEARNING,
     MONITOR,
+    PARAMETER_EVENTS,
     REFERENCE,
     TIMING,
     TRACKING_ERROR,
@@ -32,9 +35,10 @@ _OF_INTEREST = (
     TRACKING_ERROR,
     LEARNING,
     BOUND,
+    MONITOR,
+    PARAMETER_EVENTS,
     TRUTH,
     TIMING,
-    MONITOR,
 )
 
 
@@ -43,8 +47,17 @@ class Recorded:
     """All messages of one topic, undecoded."""
 
     name: str
+    type: str = ''
     received: list[int] = field(default_factory=list)  # ns
     raw: list[bytes] = field(default_factory=list)
+
+    def sort(self) -> None:
+        """Put the messages into the order in which they were received."""
+        times = np.array(self.received, dtype=np.int64)
+        if (times[1:] < times[:-1]).any():
+            order = np.argsort(times, kind='stable').tolist()
+            self.received = [self.received[k] for k in order]
+            self.raw = [self.raw[k] for k in order]
 
 
 @dataclass(frozen=True)
@@ -55,45 +68,47 @@ class Content:
     message_counts: Mapping[str, int]
 
 
-def read_content(path: Path, namespace: str = '') -> Content:
+def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Content:
     """Read the messages of every topic that this package knows.
 
     Args:
-        path: folder of the bag, or one of its storage files.
+        path: folder of the bag, one of its storage files, or a ROS 1 `.bag`.
         namespace: of the robot to look at, if the bag holds several.
+        names: of topics that are called otherwise in the bag.
 
     Raises:
         UnreadableBagError: there is no bag, or it is damaged.
-        MissingTopicError: it holds no joint states.
+        MissingTopicError: it holds no joint states, or not a topic of `names`.
+        EmptyTopicError: it holds no message of the joint states.
         AmbiguousTopicError: it holds the topics of several robots.
     """
-    try:
-        reader = Reader(path)
-        reader.open()
-    except Exception as error:  # a damaged file makes the library raise nearly anything
-        raise UnreadableBagError(path, _reason(path, error)) from error
-    with closing(reader):
-        held = [(one.topic, one.msgtype) for one in reader.connections]
-        counts = {one.topic: one.msgcount for one in reader.connections}
-        names = {topic: find(topic, held, namespace) for topic in _OF_INTEREST}
-        if not counts.get(names[JOINT_STATES] or ''):
-            raise MissingTopicError(JOINT_STATES.name, JOINT_STATES.type, held)
-        topics = {topic: Recorded(name) for topic, name in names.items() if name is not None}
+    with open_bag(path) as bag:
+        found = {topic: _find(topic, bag.held, namespace, names) for topic in _OF_INTEREST}
+        states = found[JOINT_STATES]
+        if states is None:
+            raise MissingTopicError(JOINT_STATES.name, JOINT_STATES.type, bag.held)
+        if not bag.counts[states]:
+            raise EmptyTopicError(path, states)
+        topics = {topic: Recorded(name) for topic, name in found.items() if name is not None}
+        types = dict(bag.held)
+        for topic, recorded in topics.items():
+            recorded.type = types[recorded.name] if topic is COMMANDS else topic.type
         by_name = {one.name: one for one in topics.values()}
-        chosen = [one for one in reader.connections if one.topic in by_name]
-        try:
-            for connection, received, raw in reader.messages(chosen):
-                recorded = by_name[connection.topic]
-                recorded.received.append(received)
-                recorded.raw.append(raw)
-        except Exception as error:
-            raise UnreadableBagError(path, _reason(path, error)) from error
+        for name, received, raw in bag.messages(by_name):
+            recorded = by_name[name]
+            recorded.received.append(received)
+            recorded.raw.append(raw)
+        counts = bag.counts
+    for recorded in topics.values():
+        recorded.sort()
     return Content({topic: one for topic, one in topics.items() if one.raw}, counts)
 
 
-def _reason(path: Path, error: Exception) -> str:
-    if not path.exists():
-        return 'there is no such folder'
-    if path.is_dir() and not (path / 'metadata.yaml').exists():
-        return 'the folder has no metadata.yaml; was the recording ended before it was complete?'
-    return f'{error or type(error).__name__}'
+def _find(topic: Topic, held: list[tuple[str, str]], namespace: str, names: NameMap) -> str | None:
+    name = names.topics.get(topic.leaf)
+    if name is None:
+        return find(topic, held, namespace)
+    types = (topic.type, JOINT_STATE) if topic is COMMANDS else (topic.type,)
+    if not any((name, type_) in held for type_ in types):
+        raise MissingTopicError(name, ' or '.join(types), held)
+    return name

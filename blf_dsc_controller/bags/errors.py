@@ -109,9 +109,29 @@ class MissingTopicError(BlfDscError):
         self.type_name = type_name
         self.held = tuple(held)
         listing = ''.join(f'\n  {name} ({type_})' for name, type_ in self.held) or ' no topic'
+        named = 'called' if wanted.startswith('/') else 'whose name ends in'
         super().__init__(
-            f'the bag has no topic whose name ends in {wanted!r} of type {type_name}; '
-            f'it holds:{listing}'
+            f'the bag has no topic {named} {wanted!r} of type {type_name}; it holds:{listing}'
+        )
+
+
+class EmptyTopicError(BlfDscError):
+    """A bag without a message of an essential topic."""
+
+    def __init__(self, path: Path, topic: str) -> None:
+        self.path = path
+        self.topic = topic
+        super().__init__(f'{path} is empty: it holds no message of {topic}')
+
+
+class NameMapError(BlfDscError):
+    """An entry that does not say what is called what."""
+
+    def __init__(self, entry: str, reason: str) -> None:
+        self.entry = entry
+        super().__init__(
+            f'--map {entry}: {reason}; expected OURS=THEIRS with a topic, as in '
+            'joint_states=/arm/states, or a joint, as in joint1=shoulder'
         )
 
 
@@ -134,3 +154,28 @@ class UnreadableMessageError(BlfDscError):
         self.topic = topic
         self.index = index
         super().__init__(f'message {index + 1} of {topic} cannot be read: {error}')
+
+
+class NoConfigurationError(BlfDscError):
+    """A bag that does not tell how the controller was configured."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        super().__init__(
+            f'{path} does not hold the configuration of a controller: it was recorded by something '
+            'else, or without the controller; name one, as in --config recommended'
+        )
+
+
+class OtherVersionError(BlfDscError):
+    """A bag of another version of this package, whose configuration this one cannot run."""
+
+    def __init__(self, path: Path, recorded: str, present: str, reason: Exception) -> None:
+        self.path = path
+        self.recorded = recorded
+        self.present = present
+        super().__init__(
+            f'{path} was recorded by version {recorded or "unknown"}, and this is version '
+            f'{present}, which cannot run its configuration: {reason}\n'
+            'Replay it with the version that recorded it, or name another configuration (--config)'
+        )

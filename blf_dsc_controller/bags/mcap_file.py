@@ -16,6 +16,9 @@ from blf_dsc_controller.bags.metadata import (
 )
 
 COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
+CHANNEL_RECORD = 'blf_dsc_controller channel '
+"""Start of the name of a metadata record that repeats a topic outside of the chunks."""
+
 CHUNK_SIZE = 1 << 20
 
 
@@ -41,19 +44,37 @@ class McapFile:
 
     def describe(self, bag: BagInformation) -> None:
         """Store what is known of the bag; rosbag2 reads the last such record of a file."""
-        self._writer.add_metadata('rosbag2', {'serialized_metadata': bag.record_text()})
+        self.note('rosbag2', {'serialized_metadata': bag.record_text()})
 
-    def add_channel(self, topic: TopicInformation, definition: str) -> int:
-        """Announce a topic and return its number within the file."""
+    def note(self, name: str, facts: dict[str, str]) -> None:
+        """Store a metadata record."""
+        self._writer.add_metadata(name, facts)
+
+    def attach(self, name: str, media_type: str, text: str, log_time: int) -> None:
+        """Store a text of this time [ns] as an attachment."""
+        self._writer.add_attachment(log_time, log_time, name, media_type, text.encode())
+
+    def add_channel(
+        self, topic: TopicInformation, definition: str, encoding: str = 'ros2msg'
+    ) -> int:
+        """Announce a topic and return its number within the file.
+
+        It stands in the chunk of its first message and in the index at the end; a third time, in a
+        record of its own, for a file that has lost both.
+        """
         if topic.type not in self._schemas:
             self._schemas[topic.type] = self._writer.register_schema(
-                topic.type, 'ros2msg', definition.encode()
+                topic.type, encoding, definition.encode()
             )
         metadata = {
             'offered_qos_profiles': quality_text(topic.offered),
             'topic_type_hash': topic.type_hash,
         }
-        return self._writer.register_channel(topic.name, 'cdr', self._schemas[topic.type], metadata)
+        schema = self._schemas[topic.type]
+        number = self._writer.register_channel(topic.name, 'cdr', schema, metadata)
+        repeated = {'topic': topic.name, 'topic_type': topic.type, **metadata}
+        self.note(f'{CHANNEL_RECORD}{number}', repeated)
+        return number
 
     def write(
         self, channel: int, raw: bytes, log_time: int, publish_time: int, sequence: int

@@ -64,6 +64,7 @@ class BagInformation:
 
     topics: list[TopicInformation] = field(default_factory=list)
     files: list[FileInformation] = field(default_factory=list)
+    custom_data: dict[str, str] = field(default_factory=dict)
 
     def as_tree(self) -> dict[str, Any]:
         """Plain data as rosbag2 lays it out.
@@ -84,7 +85,7 @@ class BagInformation:
             'compression_mode': '',
             'relative_file_paths': [file.path for file in self.files],
             'files': [file.as_tree() for file in self.files],
-            'custom_data': None,
+            'custom_data': self.custom_data or None,
             'ros_distro': ROS_DISTRO,
         }
 
@@ -100,6 +101,23 @@ class BagInformation:
 def quality_text(offered: tuple[Quality, ...]) -> str:
     """Text for the entry `offered_qos_profiles` of a channel."""
     return _dump([_quality_tree(quality) for quality in offered])
+
+
+def qualities(text: str) -> tuple[Quality, ...]:
+    """Qualities of service that `quality_text` wrote; none, if the text is something else."""
+    try:
+        return tuple(_quality(tree) for tree in yaml.safe_load(text) or ())
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError):
+        return ()
+
+
+def _quality(tree: dict[str, Any]) -> Quality:
+    durations = {
+        name: tree[name]['sec'] * NANOSECONDS + tree[name]['nsec']
+        for name in ('deadline', 'lifespan', 'liveliness_lease_duration')
+    }
+    words = {name: tree[name] for name in ('reliability', 'durability', 'history', 'liveliness')}
+    return Quality(depth=tree['depth'], **words, **durations)
 
 
 def _quality_tree(quality: Quality) -> dict[str, Any]:

@@ -19,13 +19,21 @@ from blf_dsc_controller.bags.telemetry import (
 )
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.dump import text
 from blf_dsc_controller.simulation import Record
+from sim_plant.configuration import PlantConfig
 
 START = 1_000_000_000
 """Stamp of the first sample [ns], as in lock-step."""
 
 
-def write_bag(path: Path, record: Record, config: ControllerConfig, compression: str) -> None:
+def write_bag(
+    path: Path,
+    record: Record,
+    config: ControllerConfig,
+    compression: str,
+    plant: PlantConfig | None = None,
+) -> None:
     """Write a run as a bag.
 
     Args:
@@ -33,11 +41,17 @@ def write_bag(path: Path, record: Record, config: ControllerConfig, compression:
         record: the run.
         config: of the controller that ran.
         compression: `none` or `zstd`.
+        plant: configuration of the arm, to be stored beside that of the controller.
 
     Raises:
         BagExistsError: `path` is there already.
     """
     with BagWriter(path, compression=compression, flush_interval=None) as bag:
+        nodes: dict[str, object] = {topics.CONTROLLER: config}
+        if plant is not None:
+            nodes[topics.PLANT] = plant
+        bag.configure(text(nodes))
+        bag.note({'clock': 'offline'})
         handles: dict[topics.Topic, int] = {}
         for stamp, (topic, raw) in _messages(record, config):
             if topic not in handles:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from blf_dsc_controller.bags.batch import decode_arrays, decode_joint_states
 from blf_dsc_controller.bags.cdr import JointStateLayout
 from blf_dsc_controller.bags.content import Content, Recorded, read_content
-from blf_dsc_controller.bags.decoders import Float64MultiArrayDecoder, JointStateDecoder
 from blf_dsc_controller.bags.errors import MessageError, UnreadableMessageError
 from blf_dsc_controller.bags.run import Floats, Run, Series, Stamps
 from blf_dsc_controller.bags.topics import (
@@ -107,18 +107,10 @@ def _names(recorded: Recorded) -> tuple[str, ...]:
 
 
 def _decode(recorded: Recorded, names: Sequence[str]) -> _Decoded:
-    decoder = JointStateDecoder(names, required=('position',))
-    stamp = np.empty(len(recorded.raw), dtype=np.int64)
-    values = np.empty((len(recorded.raw), 3 * len(names)))
-    for k, raw in enumerate(recorded.raw):
-        try:
-            stamp[k] = decoder.decode(raw)
-        except MessageError as error:
-            raise UnreadableMessageError(recorded.name, k, error) from error
-        values[k] = decoder.values
+    stamp, values = decode_joint_states(recorded, names, ('position',))
     stamp, order = np.unique(stamp, return_index=True)
     received = np.array(recorded.received, dtype=np.int64)[order]
-    return _Decoded(tuple(names), stamp, received, values[order].reshape(-1, 3, len(names)))
+    return _Decoded(tuple(names), stamp, received, values[order])
 
 
 def _optional(content: Content, topic: Topic, joints: Sequence[str]) -> _Decoded | None:
@@ -135,23 +127,9 @@ def _vector(content: Content, topic: Topic) -> Series | None:
 def _torque(content: Content, states: _Decoded, errors: _Decoded | None) -> Floats:
     commands = content.topics.get(COMMANDS)
     if commands is not None and len(commands.raw) == states.stamp.size:
-        torque = _commands(commands, len(states.names))
+        torque = decode_arrays(commands, len(states.names))
         if torque is not None:
             return torque
     if errors is not None:
         return errors.effort.exact(states.stamp)
     return np.vstack([states.effort.values[1:], np.full(len(states.names), np.nan)])
-
-
-def _commands(recorded: Recorded, size: int) -> Floats | None:
-    """Commands (m, size), None if one of them is of another size."""
-    decoder = Float64MultiArrayDecoder(size)
-    values = np.empty((len(recorded.raw), size))
-    for k, raw in enumerate(recorded.raw):
-        try:
-            if decoder.decode(raw) != size:
-                return None
-        except MessageError as error:
-            raise UnreadableMessageError(recorded.name, k, error) from error
-        values[k] = decoder.data
-    return values

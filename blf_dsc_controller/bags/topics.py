@@ -84,6 +84,10 @@ CLOCK = Topic(PLANT, '/clock', 'rosgraph_msgs/msg/Clock', STREAM, LATEST)
 DIAGNOSTICS = Topic(
     CONTROLLER, '/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', DIAGNOSTIC, DIAGNOSTIC
 )
+PARAMETER_EVENTS = Topic(
+    CONTROLLER, '/parameter_events', 'rcl_interfaces/msg/ParameterEvent', STREAM, STREAM
+)
+"""ROS's own, of every node."""
 
 TOPICS = (
     JOINT_STATES,

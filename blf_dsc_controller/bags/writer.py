@@ -9,6 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import final
 
+from blf_dsc_controller.bags.context import ATTACHMENT, MEDIA_TYPE, RECORD, facts_of
 from blf_dsc_controller.bags.errors import BagExistsError
 from blf_dsc_controller.bags.mcap_file import McapFile
 from blf_dsc_controller.bags.metadata import BagInformation, TopicInformation
@@ -61,6 +62,7 @@ class BagWriter:
         *,
         text: str = '',
         hash_: str = '',
+        encoding: str = 'ros2msg',
     ) -> int:
         """Announce a topic and return the handle to write to it.
 
@@ -70,12 +72,13 @@ class BagWriter:
             offered: quality of service of each publisher.
             text: definition of the type and all nested ones, if not a common type of Jazzy.
             hash_: of the type, likewise.
+            encoding: of the definition.
 
         Raises:
             UnknownTypeError: no `text` is given and the type is none of the common ones.
         """
         topic = TopicInformation(name, type_name, tuple(offered), hash_ or type_hash(type_name))
-        handle = self._file.add_channel(topic, text or definition(type_name))
+        handle = self._file.add_channel(topic, text or definition(type_name), encoding)
         self._bag.topics.append(topic)
         return handle
 
@@ -101,6 +104,23 @@ class BagWriter:
         )
         self._bag.topics[handle - 1].message_count += 1
         self.flush_if_due()
+
+    def configure(self, configuration: str, known_at: int | None = None) -> None:
+        """Store the configuration of the run.
+
+        Args:
+            configuration: text of a parameter file of all nodes known so far.
+            known_at: when it was learned [ns], now if not given.
+        """
+        known_at = time.time_ns() if known_at is None else known_at
+        self._bag.custom_data.update(facts_of(configuration))
+        self._file.note(RECORD, self._bag.custom_data)
+        self._file.attach(ATTACHMENT, MEDIA_TYPE, configuration, known_at)
+
+    def note(self, facts: dict[str, str]) -> None:
+        """Store facts of the run under names of their own."""
+        self._bag.custom_data.update(facts)
+        self._file.note(RECORD, self._bag.custom_data)
 
     def flush_if_due(self) -> None:
         """Flush if the flush interval has passed, for use in a pause of the messages."""

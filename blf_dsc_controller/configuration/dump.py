@@ -20,7 +20,17 @@ def dump(path: Path, configs: Mapping[str, object]) -> None:
 
     `configs` are configurations by the names of their nodes, which may carry a namespace.
     """
-    path.write_text(''.join(_lines(configs)), encoding='utf-8')
+    path.write_text(text(configs), encoding='utf-8')
+
+
+def text(configs: Mapping[str, object]) -> str:
+    """Return what `dump` writes."""
+    return text_of_values({node: flatten(config) for node, config in configs.items()})
+
+
+def text_of_values(nodes: Mapping[str, Mapping[str, Value]]) -> str:
+    """Return the parameter file of values by dotted name, for each node by its name."""
+    return ''.join(_lines(nodes))
 
 
 def written(value: Value) -> str:
@@ -40,8 +50,8 @@ def _number(value: float) -> str:
     return mantissa + ('' if '.' in mantissa or not exponent else '.0') + exponent + power
 
 
-def _lines(configs: Mapping[str, object]) -> Iterator[str]:
-    for node, config in configs.items():
+def _lines(nodes: Mapping[str, Mapping[str, Value]]) -> Iterator[str]:
+    for node, values in nodes.items():
         yield f'/{node.removeprefix("/")}:\n  ros__parameters:\n'
-        for name, value in flatten(config).items():
+        for name, value in values.items():
             yield f'    {name}: {written(value)}\n'

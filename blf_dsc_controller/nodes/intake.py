@@ -48,10 +48,13 @@ class Intake:
         context: of the node that records.
         name: of the hidden node that subscribes.
         depth: messages that may wait for each topic.
+
+    Attributes:
+        node: the hidden node.
     """
 
     def __init__(self, context: Context, name: str, depth: int) -> None:
-        self._node = Node(
+        self.node = Node(
             name,
             context=context,
             use_global_arguments=False,
@@ -72,7 +75,7 @@ class Intake:
         """
         class_ = message_class(type_name)
         profile = requested(offered, self._depth)
-        subscription = self._node.create_subscription(class_, topic, _unused, profile, raw=True)
+        subscription = self.node.create_subscription(class_, topic, _unused, profile, raw=True)
         self._sources.append(_Source(subscription, class_, handle))
 
     def take(self) -> list[Arrival]:
@@ -91,7 +94,7 @@ class Intake:
     def close(self) -> None:
         """End all subscriptions."""
         self._sources.clear()
-        self._node.destroy_node()
+        self.node.destroy_node()
 
 
 def requested(offered: Sequence[Quality], depth: int) -> QoSProfile:

@@ -10,18 +10,22 @@ from typing import Any
 from rclpy.clock import Clock, ClockType
 
 from blf_dsc_controller.bags.errors import UnknownTypeError
+from blf_dsc_controller.bags.losses import Losses
 from blf_dsc_controller.bags.topics import Quality
 from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.configuration.dump import text_of_values
 from blf_dsc_controller.configuration.recorder import RecorderConfig
 from blf_dsc_controller.nodes.definitions import learn
 from blf_dsc_controller.nodes.endpoints import message_class
 from blf_dsc_controller.nodes.executor import RunnableNode, run
+from blf_dsc_controller.nodes.inquiry import Inquiry, Values
 from blf_dsc_controller.nodes.intake import Intake, quality_of
-from blf_dsc_controller.nodes.losses import Losses
 from blf_dsc_controller.nodes.parameters import declare
 
 _DISCOVERY_PERIOD = 0.1  # s
 _TAKE_PERIOD = 0.01  # s
+_UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'  # rmw's words
+_OF_EVERY_NODE = ('/parameter_events', '/rosout')
 _FLUSH_INTERVAL = 0.05  # s; with the period above, data is in the process for less than 0.1 s
 
 
@@ -45,6 +49,9 @@ class BagRecorderNode(RunnableNode):
         self._losses: dict[str, Losses] = {}
         self._by_handle: dict[int, Losses] = {}
         self._passed_over: set[str] = set()
+        self._anonymous: set[str] = set()
+        self._inquiry = Inquiry(self._on_parameters)
+        self._parameters: dict[str, Values] = {}
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # not the plant's, which may wait for it
         self.create_timer(_DISCOVERY_PERIOD, self._discover, clock=steady)
         self.create_timer(_TAKE_PERIOD, self._record, clock=steady)
@@ -60,6 +67,7 @@ class BagRecorderNode(RunnableNode):
         """Write what still waits, complete the bag and tell what is in it."""
         self._record()
         self._intake.close()
+        self._writer.note(self._statistics())
         self._writer.close()
         for line in self._summary():
             self.get_logger().info(line)
@@ -68,8 +76,26 @@ class BagRecorderNode(RunnableNode):
         for topic, types in self.get_topic_names_and_types():
             if topic in self._losses:
                 self._losses[topic].publishers_seen(self.count_publishers(topic))
+                if topic in self._anonymous:
+                    self._ask_publishers(topic)
             elif topic not in self._passed_over and self._wanted(topic):
                 self._consider(topic, types)
+
+    def _ask_publishers(self, topic: str) -> None:
+        """Ask them for their parameters; a node's name may become known after its publishers."""
+        names = [
+            f'{one.node_namespace.rstrip("/")}/{one.node_name}'
+            for one in self.get_publishers_info_by_topic(topic)
+        ]
+        known = [name for name in names if not name.endswith(_UNKNOWN_NODE)]
+        for name in known:
+            self._inquiry.of(self._intake.node, name)
+        if known == names:
+            self._anonymous.discard(topic)
+
+    def _on_parameters(self, node: str, values: Values) -> None:
+        self._parameters[node] = values
+        self._writer.configure(text_of_values(self._parameters))
 
     def _wanted(self, topic: str) -> bool:
         if self._chosen:
@@ -96,6 +122,9 @@ class BagRecorderNode(RunnableNode):
         handle = self._writer.add_topic(topic, type_name, offered)
         self._losses[topic] = self._by_handle[handle] = Losses(len(offered))
         self._intake.subscribe(topic, type_name, offered, handle)
+        if topic not in _OF_EVERY_NODE:
+            self._anonymous.add(topic)
+            self._ask_publishers(topic)
         self.get_logger().info(f'recording {topic} ({type_name})')
 
     def _pass_over(self, topic: str, reason: str) -> None:
@@ -108,11 +137,20 @@ class BagRecorderNode(RunnableNode):
             self._writer.write(
                 arrival.handle, arrival.raw, arrival.received, arrival.published, arrival.sequence
             )
+        self._inquiry.go_on()
         self._writer.flush_if_due()
+
+    def _statistics(self) -> dict[str, str]:
+        return {
+            f'messages {topic}': f'{count} written{self._losses[topic].text()}'
+            for topic, count in self._writer.message_counts.items()
+        }
 
     def _summary(self) -> Iterator[str]:
         for topic in self._chosen.difference(self._losses, self._passed_over):
             yield f'{topic}: never appeared'
+        for node in self._inquiry.unanswered:
+            yield f'{node}: did not tell its parameters'
         for topic, count in self._writer.message_counts.items():
             yield f'{topic}: {count} messages{self._losses[topic].text()}'
 

@@ -117,7 +117,7 @@ def run_offline(config: LoopConfig, bag: Path) -> None:
     progress.close()
     for refusal in refusals(record.controller, estimate_names(config.controller)):
         print(f'warning: {refusal}')
-    write_bag(bag, record, config.controller, config.recorder.compression)
+    write_bag(bag, record, config.controller, config.recorder.compression, config.plant)
 
 
 def run_over_ros(config: LoopConfig, out: Path, domain: int | None) -> bool:

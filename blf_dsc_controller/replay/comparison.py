@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recorded against replayed, bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.bags.batch import decode_arrays, decode_joint_states
+from blf_dsc_controller.bags.cdr import JointStateLayout
+from blf_dsc_controller.bags.content import Content, Recorded
+from blf_dsc_controller.bags.encoders import JOINT_STATE_FIELDS
+from blf_dsc_controller.bags.run import Floats, Stamps
+from blf_dsc_controller.bags.topics import COMMANDS, LEARNING, MONITOR, Topic
+from blf_dsc_controller.replay.expected import Columns
+from blf_dsc_controller.replay.states import States
+
+_NAMED = (LEARNING, MONITOR)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The first number of a topic that is not the same."""
+
+    topic: str
+    field: str
+    stamp: int  # ns
+    time: float  # s since the first state
+    recorded: float
+    replayed: float
+
+    def __str__(self) -> str:
+        return (
+            f'{self.time:.6f} s (stamp {self.stamp} ns), {self.topic}, {self.field}: '
+            f'recorded {self.recorded!r}, replayed {self.replayed!r}'
+        )
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One topic.
+
+    Attributes:
+        topic: its name in the bag.
+        values: numbers compared.
+        difference: the first, None if all are equal.
+        left_out: what was not compared, and why not; empty if nothing.
+    """
+
+    topic: str
+    values: int
+    difference: Difference | None
+    left_out: str = ''
+
+
+def compare(
+    content: Content,
+    states: States,
+    expectation: dict[Topic, Columns],
+    gappy: Collection[str] = (),
+) -> Iterator[Comparison]:
+    """Compare each topic of the controller that the bag holds.
+
+    Args:
+        content: of the bag.
+        states: that were replayed.
+        expectation: what the topics must hold.
+        gappy: topics of which the recorder missed messages.
+
+    Raises:
+        UnreadableMessageError: a message cannot be decoded.
+    """
+    for topic, columns in expectation.items():
+        recorded = content.topics.get(topic)
+        if recorded is None:
+            continue
+        if topic is COMMANDS:
+            is_gappy = recorded.name in gappy
+            yield _compare_commands(recorded, states, columns, is_gappy=is_gappy)
+        else:
+            yield _compare_stamped(recorded, states, columns, named=topic in _NAMED)
+
+
+def first(comparisons: Sequence[Comparison]) -> Difference | None:
+    """Earliest difference of all topics."""
+    found = [one.difference for one in comparisons if one.difference is not None]
+    return min(found, key=lambda difference: difference.stamp, default=None)
+
+
+def _compare_commands(
+    recorded: Recorded, states: States, columns: Columns, *, is_gappy: bool
+) -> Comparison:
+    """Commands have no stamp: the k-th answers the k-th state; what follows is a safe torque."""
+    count = len(recorded.raw)
+    if count < states.stamp.size or is_gappy:
+        reason = f'{count} commands for {states.stamp.size} answered states, and they have no stamp'
+        return Comparison(recorded.name, 0, None, reason)
+    values = decode_arrays(recorded, len(columns))
+    if values is None:
+        return Comparison(recorded.name, 0, None, f'they are not {len(columns)} values each')
+    rows = np.arange(states.stamp.size)
+    return _compare(recorded.name, states, rows, columns, values[: rows.size])
+
+
+def _compare_stamped(
+    recorded: Recorded, states: States, columns: Columns, *, named: bool
+) -> Comparison:
+    names = JointStateLayout.parse(recorded.raw[0]).names
+    stamp, values = decode_joint_states(recorded, names, ())
+    rows, known = _rows(stamp, states)
+    fields = dict(zip(names, values[:, 0].T, strict=True)) if named else _fields(names, values)
+    shared = {field: column for field, column in columns.items() if field in fields}
+    absent = [field for field in (*columns, *fields) if (field in columns) != (field in fields)]
+    left_out = ', '.join(absent)
+    told = [fields[field][known] for field in shared]
+    table = np.stack(told, axis=1) if told else np.empty((rows.size, 0))
+    return _compare(recorded.name, states, rows, shared, table, left_out)
+
+
+def _rows(stamp: Stamps, states: States) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Sample that each message is of, and which messages are of one."""
+    rows = np.minimum(np.searchsorted(states.stamp, stamp), states.stamp.size - 1)
+    known = states.stamp[rows] == stamp
+    return rows[known], known
+
+
+def _fields(names: Sequence[str], values: Floats) -> dict[str, Floats]:
+    """Columns of the fields that are not empty."""
+    return {
+        f'{field} of {joint}': values[:, f, j]
+        for f, field in enumerate(JOINT_STATE_FIELDS)
+        for j, joint in enumerate(names)
+        if not np.isnan(values[:, f, j]).all()
+    }
+
+
+def _compare(
+    topic: str,
+    states: States,
+    rows: NDArray[np.intp],
+    columns: Columns,
+    recorded: Floats,
+    left_out: str = '',
+) -> Comparison:
+    replayed = (
+        np.stack([column[rows] for column in columns.values()], axis=1)
+        if columns
+        else (np.empty(recorded.shape))
+    )
+    unlike = np.ascontiguousarray(recorded).view(np.int64) != replayed.view(np.int64)
+    unlike &= ~(np.isnan(recorded) & np.isnan(replayed))
+    difference = None
+    if unlike.any():
+        k, j = np.argwhere(unlike)[0]
+        difference = Difference(
+            topic,
+            list(columns)[j],
+            int(states.stamp[rows[k]]),
+            float(states.time[rows[k]]),
+            float(recorded[k, j]),
+            float(replayed[k, j]),
+        )
+    return Comparison(topic, recorded.size, difference, left_out)

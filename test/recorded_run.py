@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags of short offline runs of the real law, and what tests do to their messages."""
+
+from __future__ import annotations
+
+from blf_dsc_controller.bags.offline import write_bag
+from blf_dsc_controller.bags.sources import open_bag
+from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
+from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.configuration.share import config_file
+from blf_dsc_controller.simulation import simulate
+
+# Learns within the second: a window of half a second, which this excites less.
+QUICK = {
+    'learning.window': 0.5,
+    'learning.settling_time': 0.1,
+    'learning.excitation_threshold': 1e-7,
+}
+
+
+def loop_config(duration=1.0, **controller):
+    """Recommended configuration that learns quickly."""
+    overrides = {PLANT: {'duration': duration}, CONTROLLER: {**QUICK, **controller}}
+    return load_loop(locate(config_file('recommended')), overrides)
+
+
+def record(path, duration=1.0, compression='none', **controller):
+    """Run offline and write the bag; return its folder."""
+    config = loop_config(duration, **controller)
+    run = simulate(config.controller, config.plant)
+    write_bag(path, run, config.controller, compression, config.plant)
+    return path
+
+
+def messages(path):
+    """Every message as [topic, type, time, bytes]."""
+    with open_bag(path) as bag:
+        types = dict(bag.held)
+        return [[topic, types[topic], at, raw] for topic, at, raw in bag.messages(types)]
+
+
+def write(path, entries, configuration=''):
+    """Write messages into a new bag."""
+    handles = {}
+    with BagWriter(path, flush_interval=None) as bag:
+        if configuration:
+            bag.configure(configuration, 0)
+        for topic, type_name, at, raw in entries:
+            if topic not in handles:
+                handles[topic] = bag.add_topic(topic, type_name, [])
+            bag.write(handles[topic], raw, at)
+    return path

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`bag_replay` as a user runs it, without ROS."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+import recorded_run
+
+from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.bags.topics import COMMANDS
+from blf_dsc_controller.tools.bag_replay import DIFFERENT, main
+
+WITHOUT_ROS = """
+import sys
+sys.modules['rclpy'] = None  # any import of it fails
+from blf_dsc_controller.tools.bag_replay import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    return recorded_run.record(tmp_path_factory.mktemp('recorded') / 'bag', 0.3)
+
+
+def test_equal_bags_end_with_zero_and_a_verdict(bag):
+    command = [sys.executable, '-c', WITHOUT_ROS, str(bag)]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert '/blf_dsc_controller/commands: 602 values bit-equal' in run.stdout
+    assert 'x real time' in run.stdout
+
+
+def test_a_difference_is_the_exit_code_and_the_last_line(bag, tmp_path, capsys):
+    entries = recorded_run.messages(bag)
+    second = [entry for entry in entries if entry[0] == COMMANDS.resolved][1]
+    second[3] = second[3][:-1] + bytes([second[3][-1] ^ 0x80])  # the sign
+    path = recorded_run.write(tmp_path / 'bag', entries, read_context(bag).configuration)
+    assert main([str(path)]) == DIFFERENT
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith('DIFFERENT, first at 0.001000 s (stamp 1001000000 ns), /blf_dsc_c')
+    assert 'effort of joint2: recorded ' in last
+
+
+def test_another_configuration_is_said_to_be_open_loop(bag, capsys):
+    assert main([str(bag), '--config', 'recommended']) == 0
+    said = capsys.readouterr().out
+    assert 'OPEN LOOP' in said
+    assert 'joint2: torque differs from the recorded by rms' in said
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'said'),
+    [
+        (['nowhere'], 'nowhere cannot be read as a bag: there is no such folder'),
+        (['nowhere', '--config', 'recomended'], 'recomended does not exist'),
+        (['nowhere', '--config', 'recommended', '--map', 'joint1'], 'one side is missing'),
+    ],
+)
+def test_what_is_wrong_is_one_message(arguments, said, capsys):
+    assert main(arguments) == 1
+    error = capsys.readouterr().err
+    assert error.startswith('bag_replay: ')
+    assert said in error

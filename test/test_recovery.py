@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A damaged bag gives up every whole chunk, says what was lost, and is left as it is."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+
+from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.bags.errors import BagExistsError, UnreadableBagError
+from blf_dsc_controller.bags.mcap_records import CHUNK, HEAD, MAGIC, chunk_of, head
+from blf_dsc_controller.bags.topics import COMMANDS, JOINT_STATES
+from blf_dsc_controller.bags.types import typestore
+from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.recovery.recover import recover
+from blf_dsc_controller.recovery.salvage import Salvage
+from blf_dsc_controller.tools.bag_recover import main
+
+START = 1_734_000_000_000_000_000
+MILLISECOND = 1_000_000
+CHUNKS = 6
+PER_CHUNK = 5  # messages of each topic
+CONFIGURATION = '/blf_dsc_controller:\n  ros__parameters:\n    law: "blf_dsc"\n'
+
+
+def write(path, compression='none'):
+    """Write a bag of two topics: a chunk each five milliseconds, the last one flushed, too."""
+    states, torques = JointStateEncoder(['joint1']), Float64MultiArrayEncoder(1)
+    with BagWriter(path, flush_interval=None, compression=compression) as bag:
+        bag.configure(CONFIGURATION, 17)
+        first = bag.add_topic(JOINT_STATES.resolved, JOINT_STATES.type, [JOINT_STATES.offered])
+        second = bag.add_topic(COMMANDS.resolved, COMMANDS.type, [COMMANDS.offered])
+        for k in range(CHUNKS * PER_CHUNK):
+            stamp = START + k * MILLISECOND
+            bag.write(first, states.encode(stamp, [k], [0], [0]), stamp, stamp - 7, k + 1)
+            bag.write(second, torques.encode([k]), stamp + 1, stamp, k + 1)
+            if k % PER_CHUNK == PER_CHUNK - 1:
+                bag.flush()
+    return path / f'{path.name}_0.mcap'
+
+
+def chunks(data):
+    """Place, end and content of each chunk."""
+    found, at = [], len(MAGIC)
+    while at < len(data) - len(MAGIC):
+        opcode, end = head(data, at)
+        if opcode == CHUNK:
+            found.append((at, end, chunk_of(data[at + HEAD.size : end])))
+        at = end
+    return found
+
+
+def read(path):
+    """Every message of a clean bag, by a library that is not ours, in the order of time."""
+    with Reader(path) as reader:
+        return [(c.topic, at, bytes(raw)) for c, at, raw in reader.messages()]
+
+
+def indexed(path):
+    """Number of messages that the index of a clean bag leads to."""
+    (file,) = path.glob('*.mcap')
+    with file.open('rb') as stream:
+        return sum(1 for _ in make_reader(stream).iter_messages())
+
+
+@pytest.fixture(scope='module', params=['none', 'zstd'])
+def whole(request, tmp_path_factory):
+    return write(tmp_path_factory.mktemp('whole') / 'bag', request.param)
+
+
+@pytest.fixture(scope='module')
+def plain(tmp_path_factory):
+    return write(tmp_path_factory.mktemp('plain') / 'bag')
+
+
+def damaged(folder, data):
+    """A bag of one file with this content, as a killed recorder leaves it."""
+    folder.mkdir()
+    (folder / 'bag_0.mcap').write_bytes(data)
+    return folder
+
+
+def test_every_truncation_gives_every_whole_chunk(plain, tmp_path):
+    data = plain.read_bytes()
+    ends = [end for _, end, _ in chunks(data)]
+    all_of_it = read(plain.parent)
+    # Every byte through the reading, which is quick; writing thousands of bags would take minutes.
+    for size in range(len(data) + 1):
+        expected = 2 * PER_CHUNK * sum(end <= size for end in ends)
+        salvage = Salvage(plain)
+        assert sum(1 for _ in salvage.messages(data[:size])) == expected
+        if size not in (*ends, *range(0, len(data), 499)):
+            continue
+        recovery = recover(damaged(tmp_path / str(size), data[:size]), tmp_path / f'{size}_clean')
+        assert sum(recovery.messages.values()) == expected
+        assert read(recovery.path) == all_of_it[:expected]
+        assert indexed(recovery.path) == expected
+        assert recovery.is_whole == salvage.is_complete
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_no_damage_whatever_is_too_much(whole, tmp_path_factory, data):
+    # Flip some bytes anywhere: what is recovered was written, and no other chunk is lost.
+    original = whole.read_bytes()
+    places = data.draw(st.lists(st.integers(0, len(original) - 1), min_size=1, max_size=4))
+    content = bytearray(original)
+    for place in places:
+        content[place] ^= data.draw(st.integers(1, 255))
+    folder = tmp_path_factory.mktemp('flipped')
+    recovery = recover(damaged(folder / 'bag', content), folder / 'clean')
+    written = set(read(whole.parent))
+    assert set(read(recovery.path)) <= written
+    # A chunk is lost with itself alone; its neighbours' records in between may hide one more.
+    hit = sum(any(at <= place < end for place in places) for at, end, _ in chunks(original))
+    outside = sum(not any(a <= place < e for a, e, _ in chunks(original)) for place in places)
+    assert sum(recovery.messages.values()) >= 2 * PER_CHUNK * (CHUNKS - hit - outside)
+
+
+def test_a_corrupted_chunk_is_skipped_and_told_with_its_times_and_messages(whole, tmp_path):
+    content = bytearray(whole.read_bytes())
+    at, end, chunk = chunks(content)[2]
+    content[(at + end) // 2] ^= 0x40
+    recovery = recover(damaged(tmp_path / 'bag', content), tmp_path / 'clean')
+    (loss,) = recovery.losses
+    assert (loss.start, loss.end) == (chunk.start, chunk.end)
+    assert (chunk.start, chunk.end) == (START + 10 * MILLISECOND, START + 14 * MILLISECOND + 1)
+    assert loss.messages == {JOINT_STATES.resolved: PER_CHUNK, COMMANDS.resolved: PER_CHUNK}
+    assert recovery.missed == {JOINT_STATES.resolved: PER_CHUNK, COMMANDS.resolved: PER_CHUNK}
+    remaining = [one for one in read(whole.parent) if not chunk.start <= one[1] <= chunk.end]
+    assert read(recovery.path) == remaining
+    assert 'from 1734000000.010000000 s (2024-12-12 10:40:00 UTC)' in str(loss)
+    assert 'messages lost: 5 of /joint_states' in str(loss)
+
+
+def test_the_first_chunk_takes_the_topics_with_it_but_they_are_told_elsewhere(plain, tmp_path):
+    # Of a recording that was killed, too: there is no index at the end to tell.
+    content = bytearray(plain.read_bytes())
+    (first, *_, last) = chunks(content)
+    content[(first[0] + first[1]) // 2] ^= 1
+    recovery = recover(damaged(tmp_path / 'bag', content[: last[1]]), tmp_path / 'clean')
+    assert recovery.unknown == 0
+    assert read(recovery.path) == read(plain.parent)[2 * PER_CHUNK :]
+
+
+def test_what_was_known_of_the_run_is_kept(plain, tmp_path):
+    content = plain.read_bytes()[: chunks(plain.read_bytes())[3][1]]
+    recovery = recover(damaged(tmp_path / 'bag', content), tmp_path / 'clean')
+    context = read_context(recovery.path)
+    assert context.configurations == ((17, CONFIGURATION),)
+    assert context.facts['law'] == 'blf_dsc'
+    assert context.facts['recovered_from'] == str(tmp_path / 'bag')
+    with Reader(recovery.path) as reader, Reader(plain.parent) as before:
+        for clean, original in zip(reader.connections, before.connections, strict=True):
+            assert clean.topic == original.topic
+            assert clean.digest == original.digest
+            assert clean.ext.offered_qos_profiles == original.ext.offered_qos_profiles
+
+
+def test_the_damaged_bag_is_not_touched(plain, tmp_path):
+    folder = damaged(tmp_path / 'bag', plain.read_bytes()[:-2000])
+    digest = hashlib.sha256((folder / 'bag_0.mcap').read_bytes()).hexdigest()
+    recover(folder, tmp_path / 'clean')
+    assert [one.name for one in folder.iterdir()] == ['bag_0.mcap']
+    assert hashlib.sha256((folder / 'bag_0.mcap').read_bytes()).hexdigest() == digest
+    with pytest.raises(BagExistsError):
+        recover(folder, tmp_path / 'clean')
+
+
+def test_a_whole_bag_has_lost_nothing(whole, tmp_path, capsys):
+    recovery = recover(whole.parent, tmp_path / 'clean')
+    assert recovery.is_whole
+    assert read(recovery.path) == read(whole.parent)
+    assert main([str(whole.parent), '--out', str(tmp_path / 'again')]) == 0
+    assert 'nothing was lost' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('name', ['bag_0.mcap', 'bag_1.mcap'])
+def test_files_of_a_split_bag_are_recovered_together(plain, tmp_path, name):
+    folder = damaged(tmp_path / 'bag', plain.read_bytes())
+    (folder / 'bag_1.mcap').write_bytes(plain.read_bytes())
+    (folder / 'bag_10.mcap').write_bytes(plain.read_bytes())
+    (folder / name).write_bytes(b'')
+    recovery = recover(folder, tmp_path / 'clean')
+    assert sum(recovery.messages.values()) == 2 * len(read(plain.parent))
+    assert recovery.unfinished == [(name, None)]
+
+
+def test_a_bag_of_another_writer_is_recovered(tmp_path):
+    with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection('/x', COMMANDS.type, typestore=typestore())
+        for k in range(100):
+            writer.write(connection, START + k, Float64MultiArrayEncoder(1).encode([k]))
+    expected = read(tmp_path / 'bag')
+    (file,) = (tmp_path / 'bag').glob('*.mcap')
+    recovery = recover(damaged(tmp_path / 'cut', file.read_bytes()[:-1]), tmp_path / 'clean')
+    assert read(recovery.path) == expected
+
+
+def test_what_is_no_bag_is_one_message(tmp_path, capsys):
+    with pytest.raises(UnreadableBagError, match='there is no MCAP file'):
+        recover(tmp_path, tmp_path / 'clean')
+    assert main([str(tmp_path / 'nowhere')]) == 1
+    assert capsys.readouterr().err.startswith('bag_recover: ')
+    assert not Path(tmp_path / 'clean').exists()
+
+
+def test_the_command_tells_what_was_lost_in_words(plain, tmp_path, capsys):
+    folder = damaged(tmp_path / 'bag', plain.read_bytes()[: chunks(plain.read_bytes())[-1][0]])
+    assert main([str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert 'bag_0.mcap: the recording was not ended; it ends at 1734000000.024000001 s' in said
+    assert f'wrote {tmp_path / "bag_recovered"}' in said
