@@ -79,7 +79,7 @@ def test_every_number_is_the_same(bag):
         'tracking_error': 6 * SAMPLES,
         'reference': 4 * SAMPLES,
         'learning': 9 * SAMPLES,  # three parameters, two biases, two disturbances, two more
-        'monitor': 9 * 101,  # two ratios, five estimates, two more
+        'monitor': 11 * 101,  # two ratios, two distances, five estimates, two more
     }
     assert [one.left_out for one in outcome.comparisons if one.left_out] == ['compute_time']
 
