@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import sys
 
 from blf_dsc_controller.errors import BlfDscError
@@ -13,18 +12,21 @@ from blf_dsc_controller.errors import BlfDscError
 class NoRosError(BlfDscError):
     """ROS 2 cannot be imported."""
 
-    def __init__(self) -> None:
+    def __init__(self, reason: ImportError) -> None:
+        self.reason = reason
         super().__init__(
-            'ROS 2 cannot be imported (there is no module rclpy): source a ROS 2 Jazzy '
+            f'ROS 2 cannot be imported ({reason}): source a ROS 2 Jazzy '
             '(source /opt/ros/jazzy/setup.bash), or install it as wheels '
             "(pip install 'blf_dsc_controller[ros]')"
         )
 
 
 def require_ros() -> None:
-    """Raise NoRosError if rclpy is not installed."""
-    if importlib.util.find_spec('rclpy') is None:
-        raise NoRosError
+    """Raise NoRosError if rclpy cannot be imported."""
+    try:
+        importlib.import_module('rclpy')
+    except ImportError as error:
+        raise NoRosError(error) from error
 
 
 def _run_node(module: str) -> int:

@@ -16,6 +16,8 @@ from blf_dsc_controller.nodes.endpoints import profile
 from blf_dsc_controller.tools.progress import Progress
 from sim_plant.configuration import PlantConfig
 
+_LAST = 0.05  # s without a message after which the last one has come
+
 
 class Watch:
     """Shows the progress of the loop that runs in this process's ROS domain.
@@ -34,15 +36,17 @@ class Watch:
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._node.create_subscription(
-            JointState, topics.MONITOR.relative, self._take, profile(topics.MONITOR.requested)
+            JointState, topics.MONITOR.relative, self._take, profile(topics.MONITOR.offered)
         )
 
-    def wait(self, seconds: float) -> None:
-        """Show what has come, and wait for a message."""
+    def wait(self, seconds: float) -> bool:
+        """Wait for a message and show it; False if none came."""
         self._executor.spin_once(timeout_sec=seconds)
-        if self._latest is not None:
-            self._show(self._latest)
-            self._latest = None
+        if self._latest is None:
+            return False
+        self._show(self._latest)
+        self._latest = None
+        return True
 
     def __enter__(self) -> Watch:
         return self
@@ -53,6 +57,8 @@ class Watch:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        while kind is None and self.wait(_LAST):
+            pass
         self._progress.close()
         self._executor.remove_node(self._node)
         self._node.destroy_node()

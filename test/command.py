@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`closed_loop` as a process of its own, as a user starts it, and the processes it starts."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+PATIENCE = 120.0  # s, until a test gives up on what should take seconds
+COMMAND = (sys.executable, '-m', 'blf_dsc_controller.tools.closed_loop')
+
+
+def closed_loop(*arguments, **options):
+    """Run the command to its end."""
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+        **options,
+    )
+
+
+def wait_for(condition):
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, 'still waiting'
+        time.sleep(0.02)
+
+
+class Running:
+    """A run without end, until the test ends it."""
+
+    def __init__(self, out):
+        self.out = out
+        self.process = subprocess.Popen(
+            [*COMMAND, '--mode', 'lockstep', '--duration', '100000', '--out', str(out)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        bag = out / 'bag' / 'bag_0.mcap'
+        # 200 kB: joint states are being recorded, which are under 1 kB each.
+        wait_for(lambda: bag.exists() and bag.stat().st_size > 200_000)
+        self.children = [
+            int(child)
+            for child in Path(f'/proc/{self.process.pid}/task/{self.process.pid}/children')
+            .read_text()
+            .split()
+        ]
+        assert len(self.children) == 3
+
+    def child(self, module):
+        """Process id of the child that runs a module."""
+        (found,) = (
+            child for child in self.children if module in Path(f'/proc/{child}/cmdline').read_text()
+        )
+        return found
+
+    def end(self):
+        """Wait for the end; return exit code, output and errors."""
+        out, err = self.process.communicate(timeout=PATIENCE)
+        return self.process.returncode, out, err
+
+    def wait_for_children(self):
+        """Wait until none of the nodes is left."""
+        wait_for(lambda: not any(_is_alive(child) for child in self.children))
+
+    def close(self):
+        """Leave nothing behind."""
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.communicate()
+        for child in self.children:
+            if _is_alive(child):
+                os.kill(child, 9)
+
+
+def _is_alive(pid):
+    try:
+        state = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return state != 'Z'

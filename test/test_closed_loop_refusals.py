@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bad input to `closed_loop` and to the nodes: one clear paragraph, and nothing lost or left."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+from command import COMMAND, PATIENCE, closed_loop
+
+WITHOUT_ROS = """
+import sys
+from importlib.machinery import PathFinder
+
+class Hidden:
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        return None if name.split('.')[0] == 'rclpy' else PathFinder.find_spec(name, path, target)
+
+sys.meta_path[:] = [Hidden if finder is PathFinder else finder for finder in sys.meta_path]
+from blf_dsc_controller.tools import closed_loop, entry
+start = getattr(entry, sys.argv[1], None) or (lambda: closed_loop.main(sys.argv[2:]))
+sys.exit(start())
+"""
+
+
+def written(folder, plant='', controller=''):
+    """Write a parameter file with these lines for the nodes."""
+    path = folder / 'given.yaml'
+    path.write_text(
+        f'sim_plant:\n  ros__parameters: {{seed: 0, {plant}}}\n'
+        f'blf_dsc_controller:\n  ros__parameters: {{law: blf_dsc, {controller}}}\n'
+    )
+    return path
+
+
+@pytest.mark.parametrize(
+    ('plant', 'controller', 'told'),
+    [
+        ('', 'barier.bound: [0.1, 0.1]', 'barier.bound: there is no parameter of this name'),
+        ('', 'barrier.bound: [0.1]', 'barrier.bound: got 1 entry, but 2 are needed'),
+        ('', 'feedback.gain: [-6.0, 2.0]', 'feedback.gain: got -6.0 at entry 1'),
+        ('', 'barrier.bound: [0.0, 0.1]', 'barrier.bound: got 0.0 at entry 1'),
+        ('', 'joints: [joint1, wrist]', 'joints: sim_plant has joint1, joint2'),
+        ('initial.position: [2.293, 0.1696]', '', "joint 'joint2' starts -1.5265 rad"),
+    ],
+)
+def test_a_configuration_that_cannot_run_is_refused_before_anything_starts(
+    tmp_path, plant, controller, told
+):
+    out = tmp_path / 'out'
+    run = closed_loop('--config', written(tmp_path, plant, controller), '--out', out)
+    assert run.returncode == 1
+    assert run.stderr.startswith('closed_loop: ')
+    assert told in run.stderr
+    assert 'Traceback' not in run.stderr
+    assert run.stdout == ''
+    assert not out.exists()
+
+
+def test_results_are_never_written_over(tmp_path):
+    kept = tmp_path / 'out' / 'kept.txt'
+    kept.parent.mkdir()
+    kept.write_text('mine')
+    run = closed_loop('--offline', '--duration', 0.1, '--out', kept.parent)
+    assert run.returncode == 1
+    assert f'{kept.parent} exists already and is not overwritten' in run.stderr
+    assert [path.name for path in kept.parent.iterdir()] == ['kept.txt']
+
+
+def test_without_a_name_each_run_gets_a_folder_of_its_own(tmp_path):
+    for folder in ('closed_loop', 'closed_loop-2'):
+        run = closed_loop('--offline', '--duration', 0.1, cwd=tmp_path, env=_environment())
+        assert run.returncode == 0, run.stderr
+        assert f'wrote       {folder}:' in run.stdout
+        assert (tmp_path / folder / 'summary.json').is_file()
+
+
+def _environment():
+    """Return an environment in which this checkout is found from any folder."""
+    return {**os.environ, 'PYTHONPATH': os.pathsep.join(['', *map(str, sys.path)]).lstrip(':')}
+
+
+def test_a_file_that_is_not_there_is_named_with_the_presets(tmp_path):
+    run = closed_loop('--config', tmp_path / 'absent.yaml')
+    assert run.returncode == 1
+    assert f'{tmp_path / "absent.yaml"} does not exist' in run.stderr
+    assert 'recommended' in run.stderr
+
+
+@pytest.mark.parametrize(
+    'command', ['closed_loop', 'sim_plant', 'blf_dsc_controller', 'bag_recorder']
+)
+def test_without_ros_it_is_said_where_to_get_it(tmp_path, command):
+    out = tmp_path / 'out'
+    run = subprocess.run(
+        [sys.executable, '-c', WITHOUT_ROS, command, '--out', out],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert run.returncode == 1, run.stderr
+    assert 'ROS 2 cannot be imported' in run.stderr
+    assert 'source /opt/ros/jazzy/setup.bash' in run.stderr
+    assert 'Traceback' not in run.stderr
+    assert not out.exists()
+
+
+def test_offline_needs_no_ros(tmp_path):
+    out = tmp_path / 'out'
+    run = subprocess.run(
+        [
+            sys.executable,
+            '-c',
+            WITHOUT_ROS,
+            'closed_loop',
+            '--offline',
+            '--duration',
+            '0.1',
+            '--out',
+            out,
+        ],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    assert (out / 'bag' / 'metadata.yaml').is_file()
+
+
+@pytest.mark.parametrize(
+    ('content', 'told'),
+    [
+        ('sim_plant:\n  ros__parameters:\n    seed: [1,\n', 'params'),
+        ('sim_plant:\n  ros__parameters:\n    sede: 1\n', 'sede: there is no parameter'),
+    ],
+    ids=['no YAML', 'unknown name'],
+)
+def test_a_node_says_what_is_wrong_with_its_file(tmp_path, content, told):
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    path = tmp_path / 'given.yaml'
+    path.write_text(content)
+    run = subprocess.run(
+        [sys.executable, '-m', 'sim_plant.node', '--ros-args', '--params-file', path],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert run.returncode == 1
+    assert told in run.stderr
+    assert 'Traceback' not in run.stderr
+
+
+def test_a_node_says_which_argument_ros_does_not_know():
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    run = subprocess.run(
+        [sys.executable, '-m', 'sim_plant.node', '--ros-args', '--param', 'seed:=1', '--sede'],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert run.returncode == 1
+    assert '--sede' in run.stderr
+    assert 'Traceback' not in run.stderr
+
+
+def test_the_options_are_listed():
+    run = closed_loop('--help')
+    assert run.returncode == 0
+    assert COMMAND[-1].rsplit('.', 1)[-1] in run.stdout
+    for option in ('--config', '--duration', '--mode', '--seed', '--offline', '--out'):
+        assert option in run.stdout

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The controller node before states sent by hand: joints by name, refusals, live gains."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+
+from node_loop import JOINTS, START, Arm, NodeLoop
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+
+from blf_dsc_controller import assembly
+from blf_dsc_controller.bags.encoders import JointStateEncoder
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.core.settings import pack
+from blf_dsc_controller.errors import ConfigurationError, OutsideBarrierError
+from blf_dsc_controller.nodes.controller_node import ControllerNode
+
+NOTHING = (0.0, 0.0)
+VELOCITY = (0.01, -0.02)  # rad/s
+
+
+@pytest.fixture
+def loop():
+    one = NodeLoop()
+    yield one
+    one.close()
+
+
+def law_answers(*measurements, config=None):
+    """Torques of the law without a node, for states (q, dq) one sample apart."""
+    controller = assembly.controller_of(config or ControllerConfig())
+    return [
+        controller.update(k * 1e-3, 1e-3, np.array([*q, *dq, 0.0, 0.0])).copy()
+        for k, (q, dq) in enumerate(measurements)
+    ]
+
+
+@pytest.mark.parametrize(
+    ('names', 'order'),
+    [
+        (JOINTS, (0, 1)),
+        (('joint2', 'joint1'), (1, 0)),
+        (('gripper', 'joint2', 'rail', 'joint1'), (None, 1, None, 0)),
+    ],
+    ids=['as configured', 'turned round', 'among others'],
+)
+def test_joints_are_found_by_name_not_by_place(loop, names, order):
+    loop.add(ControllerNode)
+    arm = Arm(loop, names)
+
+    def placed(values):
+        return [9.0 if i is None else values[i] for i in order]
+
+    torque = arm.ask(0, placed(START), placed(VELOCITY))
+    np.testing.assert_array_equal(torque, law_answers((START, VELOCITY))[0])
+
+
+def test_a_state_that_is_not_finite_stops_the_arm_for_good(loop):
+    node = loop.add(ControllerNode)
+    arm = Arm(loop)
+    assert arm.ask(0, START).any()
+    np.testing.assert_array_equal(arm.ask(1, (START[0], np.nan)), NOTHING)
+    assert 'not finite' in node.stopped
+    np.testing.assert_array_equal(arm.ask(2, START), NOTHING)
+
+
+def test_a_state_without_one_of_the_joints_stops_the_arm_and_names_it(loop):
+    node = loop.add(ControllerNode)
+    arm = Arm(loop)
+    assert arm.ask(0, START).any()
+    stranger = JointStateEncoder(('joint1', 'joint3'))
+    np.testing.assert_array_equal(arm.ask(1, START, encoder=stranger), NOTHING)
+    assert "'joint2' is not in the message" in node.stopped
+    assert 'joint1, joint3' in node.stopped
+
+
+def test_a_start_outside_the_bound_names_joint_error_and_bound(loop):
+    loop.add(ControllerNode)
+    arm = Arm(loop)
+    with pytest.raises(OutsideBarrierError) as caught:
+        arm.ask(0, (START[0], START[1] - 0.0021))
+    # 1.696 - 0.0021 against the reference's 1.6961 at its start
+    assert (caught.value.joint, caught.value.bound) == ('joint2', 0.002)
+    assert caught.value.error == pytest.approx(-0.0022)
+    assert "'joint2'" in str(caught.value)
+    assert '-0.0022 rad' in str(caught.value)
+    assert '0.002 rad' in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('given', 'told'),
+    [
+        ({'feedback.gian': [1.0, 1.0]}, 'feedback.gian: there is no parameter of this name'),
+        ({'feedback.gain': [-1.0, 2.0]}, 'feedback.gain: got -1.0 at entry 1'),
+        ({'barrier.bound': [0.002, 0.0]}, 'barrier.bound: got 0.0 at entry 2'),
+        ({'torque.limit': [20.0]}, 'torque.limit: got 1 entry, but 2 are needed'),
+        ({'sample_time': 1}, 'sample_time: got 1'),
+    ],
+)
+def test_a_parameter_that_will_not_do_is_named(loop, given, told):
+    with pytest.raises(ConfigurationError) as caught:
+        loop.add(ControllerNode, given)
+    assert told in str(caught.value)
+
+
+def set_parameters(loop, node, **values):
+    """Do what `ros2 param set` does; return whether it was taken, and why not."""
+    client = loop.tester.create_client(SetParameters, f'{node.get_name()}/set_parameters')
+    loop.spin_until(client.service_is_ready)
+    request = SetParameters.Request()
+    for name, value in values.items():
+        dotted = name.replace('__', '.')
+        request.parameters.append(Parameter(dotted, value=value).to_parameter_msg())
+    future = client.call_async(request)
+    loop.spin_until(future.done)
+    results = future.result().results
+    return all(result.successful for result in results), [result.reason for result in results]
+
+
+def test_a_gain_changed_while_running_acts_from_the_next_sample_on(loop):
+    node = loop.add(ControllerNode)
+    arm = Arm(loop)
+    gain = [30.0, 10.0]
+    arm.ask(0, START, VELOCITY)
+    assert set_parameters(loop, node, feedback__gain=gain) == (True, [''])
+    torque = arm.ask(1, START, VELOCITY)
+
+    law = assembly.controller_of(ControllerConfig())
+    measurement = np.array([*START, *VELOCITY, 0.0, 0.0])
+    law.update(0.0, 1e-3, measurement)
+    changed = change(ControllerConfig(), {'feedback.gain': gain})
+    law.settings_vector[:] = pack(assembly.settings_of_config(changed))
+    np.testing.assert_array_equal(torque, law.update(1e-3, 1e-3, measurement))
+    assert not np.array_equal(torque, law_answers(*[(START, VELOCITY)] * 2)[1])
+
+
+def test_a_gain_that_will_not_do_changes_nothing_and_says_why(loop):
+    node = loop.add(ControllerNode)
+    arm = Arm(loop)
+    arm.ask(0, START, VELOCITY)
+    taken, reasons = set_parameters(loop, node, feedback__gain=[30.0, -10.0])
+    assert not taken
+    assert '-10.0' in reasons[0]
+    torque = arm.ask(1, START, VELOCITY)
+    np.testing.assert_array_equal(torque, law_answers(*[(START, VELOCITY)] * 2)[1])

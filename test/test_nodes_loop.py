@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plant and controller as nodes in one process: the loop they close, and whose time counts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+
+from node_loop import NodeLoop, simulated_torques, states, torques
+from rclpy.time import Time
+
+from blf_dsc_controller.assembly import reference_of
+from blf_dsc_controller.bags import topics
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.core import reference
+from blf_dsc_controller.nodes.controller_node import ControllerNode
+from sim_plant.node import LOCKSTEP_START, PlantNode
+
+MILLISECOND = 1_000_000  # ns
+OBSERVED = {'wait_for_subscribers': 1}
+NOISY = {'sensor.position_noise': 1e-5, 'sensor.velocity': 'differenced', 'actuator.delay': 1}
+
+
+@pytest.fixture
+def loop():
+    one = NodeLoop()
+    yield one
+    one.close()
+
+
+def run_lockstep(loop, plant, controller=None):
+    """Run to the end; return torques and what else was heard."""
+    heard = {topic: loop.listen(topic) for topic in (topics.COMMANDS, topics.JOINT_STATES)}
+    arm = loop.add(PlantNode, {'mode': 'lockstep', **OBSERVED, **plant})
+    loop.add(ControllerNode, {'telemetry.enabled': False, **OBSERVED, **(controller or {})})
+    truth = loop.listen(topics.TRUTH)
+    samples = round(plant['duration'] * 1000) + 1
+    loop.spin_until(lambda: arm.finished and len(heard[topics.COMMANDS]) >= samples)
+    loop.spin_until(lambda: len(heard[topics.JOINT_STATES]) >= samples)
+    assert len(truth) == (samples - 1) // 10 + 1
+    return torques(heard[topics.COMMANDS]), states(heard[topics.JOINT_STATES])[0]
+
+
+@pytest.mark.parametrize(
+    'plant',
+    [{'duration': 10.0}, {'duration': 2.0, 'seed': 5, **NOISY}],
+    ids=['learning', 'noise, differenced velocity and delay'],
+)
+def test_lockstep_torques_are_those_of_the_offline_run_bit_for_bit(loop, plant):
+    over_ros, stamps = run_lockstep(loop, plant)
+    np.testing.assert_array_equal(over_ros, simulated_torques(plant))
+    np.testing.assert_array_equal(stamps, LOCKSTEP_START + MILLISECOND * np.arange(len(stamps)))
+
+
+def test_a_seed_is_heard_in_the_torques(loop):
+    over_ros, _ = run_lockstep(loop, {'duration': 0.5, 'seed': 5, **NOISY})
+    assert not np.array_equal(over_ros, simulated_torques({'duration': 0.5, 'seed': 6, **NOISY}))
+
+
+def test_the_clock_is_the_plants_and_nodes_on_simulated_time_follow_it(loop):
+    clock = loop.listen(topics.CLOCK)
+    plant = {'duration': 0.5, 'publish_clock': True}
+    over_ros, _ = run_lockstep(loop, plant, {'use_sim_time': True})
+    loop.spin_until(lambda: len(clock) == 501)
+    now = Time(nanoseconds=LOCKSTEP_START + 500 * MILLISECOND)
+    loop.spin_until(lambda: loop.nodes[1].get_clock().now().nanoseconds == now.nanoseconds)
+    np.testing.assert_array_equal(over_ros, simulated_torques({'duration': 0.5}))
+
+
+def test_real_time_is_counted_by_the_plant_in_whole_samples(loop):
+    heard = {
+        topic: loop.listen(topic)
+        for topic in (topics.JOINT_STATES, topics.REFERENCE, topics.TIMING, topics.TRUTH)
+    }
+    plant = loop.add(PlantNode, {'mode': 'realtime', 'duration': 0.3, **OBSERVED})
+    controller = loop.add(ControllerNode)
+    loop.spin_until(lambda: plant.finished)
+    loop.spin_until(lambda: len(heard[topics.REFERENCE]) == controller.controller.samples)
+    loop.spin_until(lambda: len(heard[topics.TIMING]) == 300)
+
+    stamps, _ = states(heard[topics.JOINT_STATES])
+    np.testing.assert_array_equal(stamps, stamps[0] + MILLISECOND * np.arange(301))
+
+    # However late a state was answered, the reference is that of the state's own time.
+    told, values = states(heard[topics.REFERENCE])
+    assert set(told) <= set(stamps)
+    vector = reference_of(ControllerConfig())
+    qr, dqr, ddqr = np.zeros((3, 2))
+    for stamp, value in zip(told, values, strict=True):
+        reference.evaluate(vector, (stamp - stamps[0]) * 1e-9, qr, dqr, ddqr)
+        np.testing.assert_array_equal(value[0], qr)
+
+    stamps_of_steps, timing = states(heard[topics.TIMING], ('latency', 'lateness', 'late_steps'))
+    np.testing.assert_array_equal(stamps_of_steps, stamps[1:])
+    latency, lateness, late_steps = timing[:, 0].T
+    assert latency[0] == 0.0  # the first state waits, braked, however long the controller takes
+    assert (latency[1:] > 0.0).all()
+    assert (lateness >= 0.0).all()
+    assert set(np.diff(late_steps, prepend=0.0)) <= {0.0, 1.0}
+    assert late_steps[-1] == plant.latency.late_steps

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Asking the operating system: what is asked for, and that a refusal is told and survived."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+
+from blf_dsc_controller.configuration.sampling import Realtime
+from blf_dsc_controller.nodes import realtime
+
+
+class Log:
+    """Takes what is logged."""
+
+    def __init__(self):
+        self.told = []
+        self.warned = []
+
+    def info(self, text):
+        self.told.append(text)
+
+    def warning(self, text):
+        self.warned.append(text)
+
+
+@pytest.fixture
+def system(monkeypatch):
+    """A system that takes notes, and refuses what `refused` names."""
+
+    class System:
+        def __init__(self):
+            self.refused = ()
+            self.scheduled = []
+            self.locked = []
+
+        def schedule(self, thread, policy, parameters):
+            if 'schedule' in self.refused:
+                raise PermissionError(errno.EPERM, 'Operation not permitted')
+            self.scheduled.append((thread, policy, parameters.sched_priority))
+
+        def mlockall(self, flags):
+            if 'lock' in self.refused:
+                ctypes.set_errno(errno.ENOMEM)
+                return -1
+            self.locked.append(flags)
+            return 0
+
+    one = System()
+    monkeypatch.setattr(os, 'sched_setscheduler', one.schedule)
+    monkeypatch.setattr(ctypes, 'CDLL', lambda *_, **__: one)
+    return one
+
+
+def asked(**values):
+    log = Log()
+    realtime.request(Realtime(**values), log)
+    return log
+
+
+def test_nothing_is_asked_for_by_default(system):
+    log = asked()
+    assert (system.scheduled, system.locked) == ([], [])
+    assert (log.told, log.warned) == ([], [])
+
+
+def test_every_thread_gets_the_priority(system):
+    log = asked(priority=50)
+    threads = {int(name) for name in os.listdir('/proc/self/task')}  # noqa: PTH208
+    assert {thread for thread, *_ in system.scheduled} == threads
+    assert {(policy, level) for _, policy, level in system.scheduled} == {(os.SCHED_FIFO, 50)}
+    assert log.told == ['running with SCHED_FIFO priority 50']
+
+
+def test_memory_is_locked_now_and_for_all_to_come(system):
+    log = asked(lock_memory=True)
+    assert system.locked == [1 | 2]  # MCL_CURRENT | MCL_FUTURE of Linux
+    assert log.told == ['memory locked']
+
+
+def test_a_refusal_is_told_with_its_remedy_and_survived(system):
+    system.refused = ('schedule', 'lock')
+    log = asked(priority=50, lock_memory=True)
+    assert log.told == []
+    schedule, lock = log.warned
+    assert 'priority 50 refused (Operation not permitted)' in schedule
+    assert 'rtprio' in schedule
+    assert 'locking memory refused (Cannot allocate memory)' in lock
+    assert 'memlock' in lock
