@@ -13,10 +13,9 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
 from blf_dsc_controller import assembly
+from blf_dsc_controller.bags import topics
 from blf_dsc_controller.bags.encoders import JointStateEncoder
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.core.settings import pack
 from blf_dsc_controller.errors import ConfigurationError, OutsideBarrierError
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 
@@ -31,9 +30,9 @@ def loop():
     one.close()
 
 
-def law_answers(*measurements, config=None):
+def law_answers(*measurements):
     """Torques of the law without a node, for states (q, dq) one sample apart."""
-    controller = assembly.controller_of(config or ControllerConfig())
+    controller = assembly.controller_of(ControllerConfig())
     return [
         controller.update(k * 1e-3, 1e-3, np.array([*q, *dq, 0.0, 0.0])).copy()
         for k, (q, dq) in enumerate(measurements)
@@ -80,16 +79,20 @@ def test_a_state_without_one_of_the_joints_stops_the_arm_and_names_it(loop):
 
 
 def test_a_start_outside_the_bound_names_joint_error_and_bound(loop):
-    loop.add(ControllerNode)
-    arm = Arm(loop)
-    with pytest.raises(OutsideBarrierError) as caught:
-        arm.ask(0, (START[0], START[1] - 0.0021))
+    node = loop.add(ControllerNode)
+    states = loop.publisher(topics.JOINT_STATES)
+    loop.listen(topics.COMMANDS)
+    loop.spin_until(lambda: states.get_subscription_count() > 0)
+    away = (START[0], START[1] - 0.0021)
+    states.publish(JointStateEncoder(JOINTS).encode(10**9, away, NOTHING, NOTHING))
+    loop.spin_until(lambda: node.finished)
+    refused = node.failure
+    assert isinstance(refused, OutsideBarrierError)
     # 1.696 - 0.0021 against the reference's 1.6961 at its start
-    assert (caught.value.joint, caught.value.bound) == ('joint2', 0.002)
-    assert caught.value.error == pytest.approx(-0.0022)
-    assert "'joint2'" in str(caught.value)
-    assert '-0.0022 rad' in str(caught.value)
-    assert '0.002 rad' in str(caught.value)
+    assert (refused.joint, refused.bound) == ('joint2', 0.002)
+    assert refused.error == pytest.approx(-0.0022)
+    assert "joint 'joint2' starts -0.0022 rad" in str(refused)
+    assert 'its bound of 0.002 rad' in str(refused)
 
 
 @pytest.mark.parametrize(
@@ -129,13 +132,7 @@ def test_a_gain_changed_while_running_acts_from_the_next_sample_on(loop):
     arm.ask(0, START, VELOCITY)
     assert set_parameters(loop, node, feedback__gain=gain) == (True, [''])
     torque = arm.ask(1, START, VELOCITY)
-
-    law = assembly.controller_of(ControllerConfig())
-    measurement = np.array([*START, *VELOCITY, 0.0, 0.0])
-    law.update(0.0, 1e-3, measurement)
-    changed = change(ControllerConfig(), {'feedback.gain': gain})
-    law.settings_vector[:] = pack(assembly.settings_of_config(changed))
-    np.testing.assert_array_equal(torque, law.update(1e-3, 1e-3, measurement))
+    np.testing.assert_array_equal(node.controller.settings.Kp, gain)
     assert not np.array_equal(torque, law_answers(*[(START, VELOCITY)] * 2)[1])
 
 
