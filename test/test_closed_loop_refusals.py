@@ -44,7 +44,11 @@ def written(folder, plant='', controller=''):
         ('', 'feedback.gain: [-6.0, 2.0]', 'feedback.gain: got -6.0 at entry 1'),
         ('', 'barrier.bound: [0.0, 0.1]', 'barrier.bound: got 0.0 at entry 1'),
         ('', 'joints: [joint1, wrist]', 'joints: sim_plant has joint1, joint2'),
-        ('initial.position: [2.293, 0.1696]', '', "joint 'joint2' starts -1.5265 rad"),
+        (
+            'initial.position: [2.293, 0.1696]',
+            'approach.enabled: false',
+            "joint 'joint2' starts -1.5265 rad",
+        ),
     ],
 )
 def test_a_configuration_that_cannot_run_is_refused_before_anything_starts(

@@ -79,7 +79,7 @@ def test_a_state_without_one_of_the_joints_stops_the_arm_and_names_it(loop):
 
 
 def test_a_start_outside_the_bound_names_joint_error_and_bound(loop):
-    node = loop.add(ControllerNode)
+    node = loop.add(ControllerNode, {'approach.enabled': False})
     states = loop.publisher(topics.JOINT_STATES)
     loop.listen(topics.COMMANDS)
     loop.spin_until(lambda: states.get_subscription_count() > 0)
