@@ -38,7 +38,7 @@ PIP_FAILED := { echo 'The installation failed: see above. It needs a package ind
   'set HTTPS_PROXY, for a mirror PIP_INDEX_URL, without a network PIP_FIND_LINKS and' \
   'PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
 
-.PHONY: help venv demo test lint clean
+.PHONY: help venv demo paper test lint clean
 
 help: ## List what can be made
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1	\2/p' Makefile
@@ -51,6 +51,11 @@ demo: $(READY) ## Run the closed loop over ROS 2 (CONFIG, DURATION in s) and dra
 	$(RUN) -m blf_dsc_controller.tools.closed_loop --mode lockstep --config "$(CONFIG)" \
 	    --duration "$(DURATION)" --out "$$out" && \
 	echo && echo "Pictures to look at:" && ls "$$out"/*.png && echo "The recording: $$out/bag"
+
+paper: $(READY) ## Run the paper's simulation with every law and judge its claims, into out/
+	@mkdir -p out; out=out/paper; n=1; \
+	while [ -e "$$out" ]; do n=$$((n + 1)); out=out/paper-$$n; done; \
+	$(RUN) -m blf_dsc_controller.tools.paper_study --out "$$out"
 
 test: $(READY) ## Run the tests (TESTS=test/test_x.py for some)
 	@$(if $(filter sourced,$(FLAVOUR)),PYTEST_DISABLE_PLUGIN_AUTOLOAD=1) $(RUN) -m pytest $(TESTS)

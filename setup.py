@@ -81,6 +81,7 @@ setup(
             'bag_replay = blf_dsc_controller.tools.bag_replay:main',
             'bag_recover = blf_dsc_controller.tools.bag_recover:main',
             'bag_plot = blf_dsc_controller.tools.bag_plot:main',
+            'paper_study = blf_dsc_controller.tools.paper_study:main',
         ],
     },
     # The digest of the compiled kernels' cache is taken over the source files on disk.

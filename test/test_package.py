@@ -27,6 +27,7 @@ EXECUTABLES = {
     'bag_plot',
     'bag_replay',
     'bag_recover',
+    'paper_study',
 }
 
 # rosdep's names for what pip installs. rosdep has no key for mcap alone.

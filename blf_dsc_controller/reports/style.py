@@ -45,7 +45,16 @@ _SETTINGS: Any = {
 class Picture:
     """A figure of panels, made with these settings and without pyplot's global state."""
 
-    def __init__(self, rows: int, columns: int, title: str, panel: tuple[float, float]) -> None:
+    def __init__(
+        self,
+        rows: int,
+        columns: int,
+        title: str,
+        panel: tuple[float, float],
+        *,
+        share_time: bool = True,
+    ) -> None:
+        self._share_time = share_time
         with rc_context(_SETTINGS):
             width, height = panel
             self._figure = Figure(
@@ -54,14 +63,14 @@ class Picture:
             )
             FigureCanvasAgg(self._figure)
             self._figure.suptitle(title, x=0.01, ha='left', fontsize=14, fontweight='bold')
-            self.axes = self._figure.subplots(rows, columns, sharex=True, squeeze=False)
+            self.axes = self._figure.subplots(rows, columns, sharex=share_time, squeeze=False)
             for axes in self.axes.flat:
                 _dress(axes)
 
     def save(self, path: Path) -> None:
         """Write the picture as PNG."""
         with rc_context(_SETTINGS):
-            for column in self.axes.T:
+            for column in self.axes.T if self._share_time else ():
                 lowest = [axes for axes in column if axes.get_visible()][-1]
                 lowest.set_xlabel('time [s]')
                 lowest.tick_params(labelbottom=True)

@@ -32,6 +32,7 @@ class Courses:
     estimate: Floats  # (N, p)
     truth: Floats  # (p,)
     lyapunov: Floats  # (N, 4)
+    lambda_min: Floats  # (N,)
     latched: Floats  # (N,)
 
     @classmethod
@@ -50,6 +51,7 @@ class Courses:
             estimate=part['estimate'][:, :p],
             truth=record.truths[0, :p],
             lyapunov=part['lyapunov'],
+            lambda_min=part['lambda_min'][:, 0],
             latched=part['latched'][:, 0],
         )
 

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The study of the paper: its numbers, its claims, and a report that stands by itself."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.simulation import simulate
+from blf_dsc_controller.study import claims, tune
+from blf_dsc_controller.study.cases import SIDE_BY_SIDE, VARIATIONS
+from blf_dsc_controller.study.claims import FAILS, HOLDS, ONLY_IF, verdict
+from blf_dsc_controller.study.metrics import Courses, measure
+from blf_dsc_controller.study.sweeps import SWEEPS, case_name
+from blf_dsc_controller.tools import paper_study
+
+BOUND = np.array([0.002, 0.004])
+
+
+def courses(**changes):
+    """Ten seconds at 100 Hz of a made-up run."""
+    time = np.arange(1001) * 0.01
+    falling = np.exp(-time)[:, np.newaxis]
+    made = Courses(
+        time=time,
+        position=np.zeros((1001, 2)),
+        reference=np.zeros((1001, 2)),
+        error=falling * [0.001, -0.002],
+        torque=np.column_stack([3.0 * time, -np.ones(1001)]),
+        estimate=(1.0 - falling) * [3.0, 4.0],
+        truth=np.array([3.0, 4.0]),
+        lyapunov=np.zeros((1001, 4)),
+        lambda_min=np.zeros(1001),
+        latched=(time >= 2.0).astype(float),
+    )
+    return replace(made, **changes)
+
+
+def test_numbers_of_a_run_are_those_of_its_courses():
+    found = measure(courses(), BOUND)
+    assert found.max_error == pytest.approx((0.001, 0.002))
+    assert found.rms_error[0] == pytest.approx(0.001 * np.sqrt(0.05), rel=1e-2)
+    assert found.peak_torque == (30.0, 1.0)
+    assert found.torque_rate == pytest.approx((3.0, 0.0))
+    assert found.parameter_error[5] == pytest.approx(np.exp(-5.0))
+    assert np.isnan(found.parameter_error[20])
+    assert found.time_to_1_percent == pytest.approx(np.log(100.0), abs=0.01)
+    assert found.largest_ratio == pytest.approx(0.5)
+    assert found.held
+    assert found.learning_start == 2.0
+
+
+def test_first_violation_is_told_and_a_late_error_resets_the_time_to_one_percent():
+    error = courses().error.copy()
+    error[300, 1] = -0.004
+    estimate = courses().estimate.copy()
+    estimate[900] = 0.0
+    found = measure(courses(error=error, estimate=estimate), BOUND)
+    assert (found.held, found.first_violation) == (False, 3.0)
+    assert found.time_to_1_percent == pytest.approx(9.01)
+
+
+def test_verdict_follows_from_the_runs():
+    assert [verdict(*runs) for runs in ((True, True), (True, False), (False, False))] == [
+        HOLDS,
+        ONLY_IF,
+        FAILS,
+    ]
+
+
+def test_tuning_searches_as_hard_for_every_law():
+    """Same optimiser, seed and budget; a shared gain has one range; as many for both of Fig. 2."""
+    ranges = {}
+    for task in tune.TASKS.values():
+        for gain in task.gains:
+            place = gain.name, gain.joint
+            assert ranges.setdefault(place, (gain.least, gain.most)) == (gain.least, gain.most)
+    assert len(tune.TASKS['proposed'].gains) == len(tune.TASKS['comparison'].gains)
+
+
+@pytest.mark.parametrize('name', ['proposed', 'comparison', 'slotine_li'])
+def test_committed_gains_beat_the_middle_of_their_ranges(name):
+    """By a decade or more, by the very objective of the search, which they are within."""
+    task = tune.TASKS[name]
+    preset = {'proposed': 'paper_tuned'}.get(name, name)
+    tuned = {case.name: case for case in SIDE_BY_SIDE}[preset].loop().controller
+    middle = np.array([np.log10(gain.least * gain.most) / 2.0 for gain in task.gains])
+    loops = tune.loops_of(task)
+    bare = replace(task, gains=())
+    best = tune.objective(np.array([]), bare, [loop._replace(controller=tuned) for loop in loops])
+    assert best < tune.objective(middle, task, loops) - 1.0
+
+
+@pytest.fixture(scope='module')
+def report(tmp_path_factory):
+    """The whole study, once: some 20 s of two cores."""
+    out = tmp_path_factory.mktemp('study') / 'report'
+    assert paper_study.main(['--out', str(out)]) == 0
+    return out
+
+
+def rows(path):
+    with path.open(encoding='utf-8', newline='') as file:
+        return list(csv.DictReader(file))
+
+
+def test_report_is_one_page_that_needs_nothing_beside_it(report):
+    page = (report / 'index.html').read_text(encoding='utf-8')
+    pictures = sorted(report.glob('*.png'))
+    assert len(pictures) == 8
+    assert page.count('src="data:image/png;base64,') == len(pictures)
+    assert not re.search(r'(?:src|href)="(?!data:)', page)
+    for claim in rows(report / 'claims.csv'):
+        assert claim['says'].split("'")[0] in page
+
+
+def test_tables_hold_every_run(report):
+    assert len(rows(report / 'side_by_side.csv')) == len(SIDE_BY_SIDE)
+    sweeps = rows(report / 'robustness.csv')
+    assert len(sweeps) == sum(len(sweep.values) * len(sweep.laws) for sweep in SWEEPS)
+    assert {row['bound'] for row in sweeps} == {'kept', 'left'}
+
+
+def test_claims_are_judged_by_the_runs(report):
+    """The verdicts that the mathematics leaves no doubt about."""
+    by_words = {row['says']: row['verdict'] for row in rows(report / 'claims.csv')}
+    assert len(by_words) >= 11
+    assert by_words['The reference does not fully excite the system.'] == FAILS
+    assert by_words['With everything known V falls for ever.'] == ONLY_IF
+    assert by_words['It is superior in tracking and in estimation.'] == ONLY_IF
+    assert by_words['The proposed controller always stays within the boundaries.'] == HOLDS
+    for row in rows(report / 'claims.csv'):
+        assert row['command'].startswith(('paper_study', 'closed_loop'))
+        assert bool(row['condition']) or row['verdict'] != ONLY_IF
+
+
+def test_kept_configurations_are_those_that_ran(report):
+    """One of a sweep, run again from its file, gives the number of the report."""
+    name = case_name('delay', 'comparison', 1.0)
+    loop = load_loop(report / 'configurations' / f'{name.replace(" ", "_")}.yaml')
+    again = measure(Courses.of(simulate(loop.controller, loop.plant)), np.full(2, 0.002))
+    metrics = json.loads((report / 'metrics.json').read_text(encoding='utf-8'))
+    assert metrics[name]['largest_ratio'] == again.largest_ratio
+    assert loop.plant.actuator.delay == 1
+    count = len(SIDE_BY_SIDE) + len(VARIATIONS) + sum(len(sweep.cases()) for sweep in SWEEPS)
+    assert len(list((report / 'configurations').iterdir())) == len(metrics) == count
+
+
+def test_barrier_of_the_paper_gives_next_to_nothing_where_it_is_needed(report):
+    """w = 1 N m/rad is a spring of 2 mN m at 2 mrad, and 8 N m push through it."""
+    metrics = json.loads((report / 'metrics.json').read_text(encoding='utf-8'))
+    assert metrics['paper_pushed']['largest_ratio'] > 1.0
+    assert metrics['recommended_pushed']['largest_ratio'] < 0.5
+
+
+def test_study_does_not_overwrite(report, capsys):
+    before = (report / 'index.html').stat().st_mtime_ns
+    assert paper_study.main(['--out', str(report)]) == 1
+    assert 'not overwritten' in capsys.readouterr().err
+    assert (report / 'index.html').stat().st_mtime_ns == before
+
+
+def test_exponential_fit_tells_a_line_from_a_bend():
+    straight = courses(time=np.arange(1001) * 0.02)
+    bent = 1.0 / (1.0 + straight.time) ** 3
+    fits = [
+        claims._exponential_fit(each)
+        for each in (
+            replace(straight, estimate=straight.truth * (1.0 - np.exp(-straight.time))[:, None]),
+            replace(straight, estimate=straight.truth * (1.0 - bent)[:, None]),
+        )
+    ]
+    assert fits[0] > 0.999
+    assert fits[1] < fits[0]
