@@ -105,7 +105,7 @@ class ControllerNode(ManagedNode):
             outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
             self._publisher_of = {topic: publisher(self, topic) for topic in outputs}
             subscribe(self, topics.JOINT_STATES, self._on_joint_state)
-            self.trajectories = TrajectoryInput(self, lambda: self.guard)
+            self._status.trajectories = TrajectoryInput(self, lambda: self.guard)
             realtime.request(self.config.realtime, self.get_logger())
         self._report()
 

@@ -46,7 +46,7 @@ class TrajectoryInput:
     Attributes:
         taken: trajectories that are or were followed.
         refused: trajectories that are not.
-        reason: why the last one was refused; empty if it was not.
+        reason: why the last of those was refused.
     """
 
     def __init__(self, node: Node, guard: Callable[[], Guard | None]) -> None:
@@ -57,6 +57,15 @@ class TrajectoryInput:
         self._guard = guard
         name, quality = JOINT_TRAJECTORY.name, profile(JOINT_TRAJECTORY.requested)
         node.create_subscription(JointTrajectory, name, self._take, quality)
+
+    @property
+    def told(self) -> dict[str, str]:
+        """Values for the diagnostics."""
+        return {
+            'trajectories followed': f'{self.taken}',
+            'trajectories refused': f'{self.refused}',
+            'last refusal': self.reason or 'none',
+        }
 
     def _take(self, message: JointTrajectory) -> None:
         try:
@@ -71,7 +80,6 @@ class TrajectoryInput:
             raise TrajectoryError(['the controller is not configured'])
         guard.follow(request_of(message, guard.start_stamp))
         self.taken += 1
-        self.reason = ''
         self._log.info(f'following a trajectory of {len(message.points)} points')
 
 
