@@ -67,8 +67,20 @@ setup(
         ],
         # To tune the compared laws again (blf_dsc_controller.study.tune); running needs none of it.
         'study': ['scipy>=1.15'],
+        # Only for `monte_carlo`: its results are Parquet files; a robot has no use for 50 MB more.
+        'monte-carlo': ['pyarrow'],
+        'dask': ['pyarrow', 'distributed'],
+        'mpi': ['pyarrow', 'mpi4py'],
         # setuptools: test_package.py builds a wheel without going to the network.
-        'test': ['pytest>=7', 'hypothesis', 'scipy', 'coverage', 'setuptools>=70.1'],
+        'test': [
+            'pytest>=7',
+            'hypothesis',
+            'scipy',
+            'coverage',
+            'setuptools>=70.1',
+            'pyarrow',
+            'distributed',
+        ],
         # Fixed, because with nearly every rule on, each release of the linter finds something new.
         'lint': ['ruff~=0.17.5', 'mypy~=2.4.1', 'types-PyYAML', 'types-tqdm', 'pre-commit'],
     },
@@ -82,6 +94,7 @@ setup(
             'bag_recover = blf_dsc_controller.tools.bag_recover:main',
             'bag_plot = blf_dsc_controller.tools.bag_plot:main',
             'paper_study = blf_dsc_controller.tools.paper_study:main',
+            'monte_carlo = blf_dsc_controller.tools.monte_carlo:main',
         ],
     },
     # The digest of the compiled kernels' cache is taken over the source files on disk.

@@ -28,6 +28,7 @@ EXECUTABLES = {
     'bag_replay',
     'bag_recover',
     'paper_study',
+    'monte_carlo',
 }
 
 # rosdep's names for what pip installs. rosdep has no key for mcap alone.
@@ -188,7 +189,8 @@ def test_all_that_is_imported_is_declared(metadata):
     used |= set(imports(ROOT / 'launch/closed_loop.launch.py'))
     foreign = used - set(sys.stdlib_module_names) - set(PACKAGES) - {'llvmlite'}  # a part of numba
     distributions = {'pyyaml' if name == 'yaml' else name for name in foreign}
-    optional = requirements(metadata, 'study')
+    extras = ('study', 'monte-carlo', 'dask', 'mpi')
+    optional = set().union(*(requirements(metadata, extra) for extra in extras))
     assert distributions <= requirements(metadata) | optional | depends('exec_depend')
 
 

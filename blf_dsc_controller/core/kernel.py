@@ -29,6 +29,7 @@ _PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 _GROUND_FLOOR = (
     'blf_dsc_controller/core/*.py',
     'blf_dsc_controller/simulation.py',
+    'blf_dsc_controller/trajectory.py',
     'sim_plant/*.py',
 )
 _ABOVE = {

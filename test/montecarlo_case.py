@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A small study for tests: runs of a third of a second in which everything happens."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from blf_dsc_controller.montecarlo.chunk import run_chunk
+from blf_dsc_controller.montecarlo.study_file import load_study
+
+RUNS = 24
+
+# A window of 0.1 s has next to no excitation, but it latches: learning within 0.3 s.
+LOOP = """\
+sim_plant:
+  ros__parameters:
+    duration: 0.3
+blf_dsc_controller:
+  ros__parameters:
+    approach: {enabled: false}
+    learning: {window: 0.1, settling_time: 0.05, excitation_threshold: 1.0e-12}
+"""
+
+STUDY = """\
+monte_carlo:
+  ros__parameters:
+    runs: 24
+    seed: 7
+    settled_after: 0.2
+    moments: [0.1, 0.25]
+    vary:
+      arm.m2: uniform(0.3, 0.7)
+      disturbance.constant: uniform(-0.2, 0.2)
+      sensor.position_noise: loguniform(1.0e-6, 2.0e-5)
+      sensor.velocity: choice(measured, differenced)
+      actuator.delay: integers(0, 3)
+      initial.error: uniform(-0.9, 0.9)
+      initial.velocity_error: normal(0.0, 0.02)
+"""
+
+
+def write(folder, text=LOOP + STUDY):
+    """File of a study."""
+    path = folder / 'study.yaml'
+    path.write_text(text)
+    return path
+
+
+def study(folder, text=LOOP + STUDY, **overrides):
+    """The study of a file of this text."""
+    return load_study(write(folder, text), overrides)
+
+
+def whole(a_study):
+    """Results of all runs, computed in one go, in this process."""
+    return run_chunk(a_study, 0, a_study.settings.runs)
+
+
+def same(one, other):
+    """Whether two results are the same, bit for bit."""
+    assert list(one) == list(other)
+    for name, values in one.items():
+        np.testing.assert_array_equal(values, other[name], err_msg=name)
+    return True

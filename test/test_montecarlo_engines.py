@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Results do not depend on what computes them, nor on what is lost on the way."""
+
+from __future__ import annotations
+
+import os
+import signal
+from concurrent.futures import BrokenExecutor, Executor
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from montecarlo_case import RUNS, same, study, whole
+
+from blf_dsc_controller.montecarlo import engines
+from blf_dsc_controller.montecarlo.chunk import warm_up
+from blf_dsc_controller.montecarlo.computation import PATIENCE, chunk_size, compute
+from blf_dsc_controller.montecarlo.errors import WorkersLostError
+from blf_dsc_controller.montecarlo.store import Span
+
+
+@pytest.fixture(scope='module')
+def a_study(tmp_path_factory):
+    one = study(tmp_path_factory.mktemp('study'))
+    warm_up(one)
+    return one
+
+
+@pytest.fixture(scope='module')
+def undisturbed(a_study):
+    return whole(a_study)
+
+
+def spans(size):
+    return [Span(first, min(size, RUNS - first)) for first in range(0, RUNS, size)]
+
+
+def joined(parts):
+    """Results of all chunks in the order of the runs."""
+    assert sorted(parts) == sorted(set(parts))
+    chunks = [parts[span] for span in sorted(parts)]
+    return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
+
+
+def computed(a_study, engine, size, tell=pytest.fail):
+    parts = {}
+    compute(a_study, spans(size), engine, parts.__setitem__, tell)
+    return joined(parts)
+
+
+def local_dask():
+    pytest.importorskip('distributed', reason='the extra dask is not installed')
+    return engines.dask(2)
+
+
+def ranks_of_mpi():
+    pytest.importorskip('mpi4py', reason='the extra mpi is not installed')
+    return engines.mpi(2)
+
+
+@pytest.mark.parametrize(
+    ('make', 'size'),
+    [
+        (lambda: engines.threads(3), 1),
+        (lambda: engines.threads(1), 5),
+        (lambda: engines.processes(1), RUNS),
+        (lambda: engines.processes(2), 4),
+        (local_dask, 5),
+        (ranks_of_mpi, 5),
+    ],
+    ids=['threads', 'thread', 'process', 'processes', 'dask', 'mpi'],
+)
+def test_every_engine_gives_the_same(a_study, undisturbed, make, size):
+    assert same(computed(a_study, make(), size), undisturbed)
+
+
+def killing(engine, kills):
+    """Let the engine lose a worker to SIGKILL when the first chunk of each pool is done."""
+    pools = []
+
+    @contextmanager
+    def start():
+        with engine.open() as executor:
+            pools.append(executor)
+            yield executor
+
+    def kill():
+        if len(pools) <= kills:
+            os.kill(next(iter(pools[-1]._processes)), signal.SIGKILL)
+
+    return replace(engine, open=start), kill
+
+
+def test_killed_worker_loses_nothing(a_study, undisturbed):
+    engine, kill = killing(engines.processes(2), kills=1)
+    parts, told = {}, []
+
+    def keep(span, columns):
+        assert span not in parts
+        parts[span] = columns
+        kill()
+
+    compute(a_study, spans(1), engine, keep, told.append)
+    assert same(joined(parts), undisturbed)
+    assert len(told) == 1
+    assert 'a worker was lost' in told[0]
+
+
+class Broken(Executor):
+    """Workers that cannot even be started."""
+
+    def submit(self, *_args, **_keywords):
+        raise BrokenExecutor('out of memory')
+
+
+def test_workers_that_are_always_lost_are_given_up(a_study):
+    told = []
+    engine = engines.Engine(lambda: nullcontext(Broken()), 2)
+    with pytest.raises(WorkersLostError, match=r'out of memory.* 24 chunks are left'):
+        compute(a_study, spans(1), engine, pytest.fail, told.append)
+    assert len(told) == PATIENCE
+
+
+def test_error_of_a_run_is_no_lost_worker(a_study):
+    with pytest.raises(ZeroDivisionError):
+        compute(a_study, spans(1), engines.threads(2), lambda *_: 1 / 0, pytest.fail)
+
+
+@pytest.mark.parametrize(('runs', 'workers'), [(1, 8), (10_000, 2), (10**8, 64)])
+def test_chunks_are_few_but_enough_for_all_workers(runs, workers):
+    size = chunk_size(runs, workers)
+    assert 1 <= size <= 250
+    assert runs / size >= min(runs, 20 * workers)

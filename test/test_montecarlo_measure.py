@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is measured of a run without recording it is what its whole record says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from montecarlo_case import LOOP, STUDY, study, whole
+
+from blf_dsc_controller.core.sample import sample_of
+from blf_dsc_controller.montecarlo.chunk import run_chunk
+from blf_dsc_controller.montecarlo.reproduction import plant_of_run
+from blf_dsc_controller.simulation import simulate
+
+LIMITS = 'blf_dsc_controller:\n  ros__parameters:\n'
+WEAK = LOOP.replace(LIMITS, LIMITS + '    torque: {limit: [8.0, 20.0]}\n')
+# Far above what a loop of 1 kHz can hold, and with nothing to cut it.
+UNSTABLE = LOOP.replace(
+    LIMITS,
+    LIMITS + '    torque: {limit: [1.0e+308, 1.0e+308]}\n    feedback: {gain: [1.0e+9, 1.0e+9]}\n',
+)
+
+
+def plainly(a_study, run):
+    """Figures of a run from its whole record, as their definitions say."""
+    plant = plant_of_run(a_study, run)
+    record = simulate(a_study.controller, plant)
+    names = sample_of(np.arange(record.samples.shape[1]), 2, record.estimates)
+    t = record.stamps * 1e-9
+    error = np.abs(record.samples[:, names.xi1])
+    torque = np.abs(record.samples[:, names.torque])
+    estimate = record.samples[:, names.estimate][:, :3]
+    P = record.truths[0, :3]
+    outside = np.flatnonzero((error >= 0.002).any(axis=1))
+    latched = np.flatnonzero(record.samples[:, names.latched[0]])
+    limit = a_study.controller.torque.limit
+    distance = np.linalg.norm(estimate - P, axis=1) / np.linalg.norm(P)
+    told = {
+        'first_violation_s': t[outside[0]] if outside.size else np.nan,
+        'latch_time_s': t[latched[0]] if latched.size else np.nan,
+        'saturated_share': (torque >= limit).any(axis=1).mean(),
+        'parameter_error.0.1_s': distance[100],
+        'parameter_error.0.25_s': distance[250],
+        'parameter_error.end': distance[300],
+    }
+    for i, joint in enumerate(('joint1', 'joint2')):
+        told[f'max_error_ratio.{joint}'] = error[:, i].max() / 0.002
+        told[f'rms_error_rad.{joint}'] = np.sqrt(np.mean(error[200:, i] ** 2))
+        told[f'peak_torque_nm.{joint}'] = np.abs(record.measurements[:, 4 + i]).max()
+    return told
+
+
+@pytest.mark.parametrize('loop', [LOOP, WEAK], ids=['strong', 'weak'])
+def test_figures_are_those_of_the_record(tmp_path, loop):
+    a_study = study(tmp_path, loop + STUDY, runs=6)
+    results = whole(a_study)
+    for run in range(6):
+        for name, value in plainly(a_study, run).items():
+            # Sums in another order.
+            assert results[name][run] == pytest.approx(value, rel=1e-12, nan_ok=True), name
+
+
+def test_study_of_these_tests_has_all_kinds_of_figures(tmp_path):
+    strong = whole(study(tmp_path, LOOP + STUDY))
+    weak = whole(study(tmp_path, WEAK + STUDY))
+    assert (strong['outcome'] == 'kept').sum() > 12
+    assert (weak['outcome'] == 'violated').sum() > 12
+    assert np.isfinite(strong['latch_time_s']).all()
+    assert (weak['saturated_share'] > 0.1).any()
+    assert (strong['first_violation_s'] >= 0).sum() == (strong['outcome'] != 'kept').sum()
+
+
+def test_loss_of_all_numbers_is_noticed_and_ends_the_run(tmp_path):
+    results = whole(study(tmp_path, UNSTABLE + STUDY, runs=3))
+    assert results['outcome'].tolist() == ['diverged'] * 3
+    assert (results['first_violation_s'] < 0.3).all()
+    assert np.isnan(results['parameter_error.end']).all()
+
+
+def test_start_that_the_controller_refuses_is_told_apart(tmp_path):
+    """With noise of ten times the bound nearly every start is measured outside."""
+    text = STUDY.replace('loguniform(1.0e-6, 2.0e-5)', 'choice(0.02)')
+    results = whole(study(tmp_path, LOOP + text))
+    refused = results['outcome'] == 'refused'
+    assert refused.sum() > 12
+    assert (results['first_violation_s'][refused] == 0.0).all()
+    worst = np.maximum(results['max_error_ratio.joint1'], results['max_error_ratio.joint2'])
+    assert (worst[refused] >= 1.0).all()
+    assert np.isnan(results['latch_time_s'][refused]).all()
+
+
+def test_motor_weaker_than_the_law_thinks_counts_as_saturated(tmp_path):
+    motors = '  ros__parameters:\n    actuator: {torque_limit: [8.0, 0.0]}\n    duration'
+    loop = LOOP.replace('  ros__parameters:\n    duration', motors, 1)
+    results = whole(study(tmp_path, loop + STUDY))
+    assert (results['saturated_share'] > 0.1).any()
+    assert results['peak_torque_nm.joint1'].max() == 8.0
+
+
+def test_memory_of_one_run_is_not_seen_by_the_next(tmp_path):
+    a_study = study(tmp_path, runs=4)
+    together = whole(a_study)
+    alone = run_chunk(a_study, 3, 1)
+    for name, values in together.items():
+        np.testing.assert_array_equal(values[3:], alone[name], err_msg=name)

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report says how many runs kept the bound, and its worst runs can be looked at."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+
+import matplotlib.image
+import numpy as np
+import pyarrow.parquet
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from montecarlo_case import RUNS, study, whole
+from scipy.stats import binomtest
+
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.montecarlo.errors import NotReproducedError
+from blf_dsc_controller.montecarlo.judgement import influence, judge, wilson, worst_first
+from blf_dsc_controller.montecarlo.report import write_report
+from blf_dsc_controller.montecarlo.reproduction import plant_of_run, reproduce
+from blf_dsc_controller.montecarlo.store import Span, Store
+from blf_dsc_controller.simulation import simulate
+from blf_dsc_controller.tools import monte_carlo
+
+
+@pytest.fixture(scope='module')
+def store(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('study')
+    made = Store.create_or_open(folder / 'out', study(folder))
+    made.keep(Span(0, RUNS), whole(made.study))
+    return made
+
+
+@given(trials=st.integers(1, 10_000), data=st.data())
+def test_interval_is_wilsons(trials, data):
+    hits = data.draw(st.integers(0, trials))
+    expected = binomtest(hits, trials).proportion_ci(0.95, method='wilson')
+    assert wilson(hits, trials) == pytest.approx((expected.low, expected.high), abs=1e-12)
+
+
+def test_worst_runs_come_first_and_lost_numbers_before_all(store):
+    results = store.results()
+    ratio = np.linspace(0.1, 0.5, RUNS)
+    results['max_error_ratio.joint1'] = ratio
+    results['max_error_ratio.joint2'] = ratio[::-1].copy()
+    outcome = results['outcome'].astype(object)
+    outcome[:] = 'kept'
+    outcome[5] = 'diverged'
+    results['outcome'] = outcome
+    # The worse of both joints: ends before the middle, equal ones in their order.
+    assert worst_first(store.study, results)[:5].tolist() == [5, 0, 23, 1, 22]
+    summary = judge(store.study, results)
+    assert [one['run'] for one in summary['worst'][:3]] == [5, 0, 23]
+    assert summary['outcomes'] == {'kept': 23, 'violated': 0, 'diverged': 1, 'refused': 0}
+    assert summary['kept']['share'] == 23 / 24
+
+
+def test_influence_also_sees_that_both_ends_are_bad(store):
+    """A start near either side of the bound: no correlation at all, yet it explains everything."""
+    rng = np.random.default_rng(3)
+    runs = 2000
+    results = {one.column: rng.random(runs) for one in store.study.spreads}
+    start = rng.uniform(-1.0, 1.0, runs)
+    results['plant.initial.error.joint1'] = start
+    results['outcome'] = np.full(runs, 'kept')
+    results['max_error_ratio.joint1'] = np.abs(start)
+    results['max_error_ratio.joint2'] = np.zeros(runs)
+    explained = influence(store.study, results)
+    assert next(iter(explained)) == 'initial.error.joint1'
+    # Ten groups of equal size, five pairs: all but 1/25 of the variance, whatever the scale.
+    assert explained.pop('initial.error.joint1') == pytest.approx(0.96, abs=0.01)
+    assert max(explained.values()) < 0.02
+
+
+def test_report_is_written(store):
+    summary, written = write_report(store)
+    assert [path.name for path in written] == [
+        'report.md',
+        'distributions.png',
+        'influence.png',
+        'summary.json',
+    ]
+    assert json.loads((store.folder / 'summary.json').read_text()) == summary
+    results = store.results()
+    kept = int((results['outcome'] == 'kept').sum())
+    text = (store.folder / 'report.md').read_text()
+    assert f'({kept} of 24; 95 % confidence:' in text
+    for picture in ('distributions.png', 'influence.png'):
+        assert f']({picture})' in text
+        assert matplotlib.image.imread(store.folder / picture).shape[1] > 1200
+
+
+def test_worst_ten_are_reproduced_by_the_commands_of_the_report(store, tmp_path, monkeypatch):
+    write_report(store)
+    commands = re.findall(
+        r'`(monte_carlo --reproduce .*?)`', (store.folder / 'report.md').read_text()
+    )
+    assert len(commands) == 10
+    monkeypatch.chdir(tmp_path)
+    arguments = shlex.split(commands[0])[1:]
+    assert monte_carlo.main(arguments) == 0
+    run, out = int(arguments[2]), tmp_path / arguments[4]
+    written = {path.name for path in out.iterdir()}
+    assert {'bag', 'config.yaml', 'summary.json', 'tracking.png', 'parameters.png'} <= written
+    row = store.results()
+    bag = read_run(out / 'bag')
+    peak = np.abs(bag.error).max(axis=0) / 0.002
+    told = [row[f'max_error_ratio.joint{i}'][run] for i in (1, 2)]
+    # The bag's errors are divided here in another order than in the kernel.
+    np.testing.assert_allclose(peak, told, rtol=1e-15)
+    # The run is an ordinary configuration too.
+    loop = load_loop(out / 'config.yaml')
+    assert loop.plant == plant_of_run(store.study, run)
+    again = simulate(loop.controller, loop.plant)
+    np.testing.assert_array_equal(again.measurements[:, :2], bag.position)
+    # It does not overwrite.
+    assert monte_carlo.main(arguments) == 1
+
+
+def test_run_that_is_not_what_it_was_is_told(store, tmp_path):
+    folder = tmp_path / 'tampered'
+    other = Store.create_or_open(folder, store.study)
+    results = store.results()
+    results['max_error_ratio.joint2'] = np.nextafter(results['max_error_ratio.joint2'], 2.0)
+    other.keep(Span(0, RUNS), results)
+    (tmp_path / 'run').mkdir()
+    with pytest.raises(NotReproducedError, match=r'run 4 is not .*\n.*max_error_ratio.joint2'):
+        reproduce(other, 4, tmp_path / 'run')
+
+
+def test_run_that_is_not_there_is_told(store, tmp_path, capsys):
+    command = ['--reproduce', str(store.folder), '24', '--out', str(tmp_path / 'run')]
+    assert monte_carlo.main(command) == 1
+    assert 'has no run 24' in capsys.readouterr().err
+
+
+def test_columns_carry_what_was_drawn(store):
+    table = pyarrow.parquet.read_table(store.folder / 'runs')
+    plant = plant_of_run(store.study, 9)
+    row = table.slice(9, 1).to_pylist()[0]
+    assert row['seed'] == plant.seed
+    assert row['plant.arm.m2'] == plant.arm.m2
+    assert row['plant.sensor.velocity'] == plant.sensor.velocity
+    assert row['plant.actuator.delay'] == plant.actuator.delay

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A study goes on where it was killed, and never mixes with another one."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from pathlib import Path
+
+import pyarrow.parquet
+import pytest
+from montecarlo_case import LOOP, RUNS, STUDY, same, study, whole, write
+
+from blf_dsc_controller.montecarlo import store as stores
+from blf_dsc_controller.montecarlo.chunk import run_chunk
+from blf_dsc_controller.montecarlo.errors import (
+    NotAStudyError,
+    OtherStudyError,
+    StudyInUseError,
+    UnreadablePartError,
+)
+from blf_dsc_controller.montecarlo.store import Span, Store
+from blf_dsc_controller.tools import monte_carlo
+
+MODULE = 'blf_dsc_controller.tools.monte_carlo'
+PATIENCE = 60.0  # s; the machine may be busy
+
+
+@pytest.fixture
+def store(tmp_path):
+    return Store.create_or_open(tmp_path / 'out', study(tmp_path))
+
+
+def filled(store, *ranges):
+    for first, runs in ranges:
+        store.keep(Span(first, runs), run_chunk(store.study, first, runs))
+    return store
+
+
+def stamps(folder):
+    return {path.name: path.stat().st_mtime_ns for path in (folder / 'runs').iterdir()}
+
+
+def until(condition):
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def marked(mark):
+    """Processes with this mark in their environment."""
+    found = []
+    for path in Path('/proc').glob('[0-9]*/environ'):
+        try:
+            if mark.encode() in path.read_bytes():
+                found.append(int(path.parent.name))
+        except OSError:
+            continue
+    return found
+
+
+def test_study_killed_in_the_middle_goes_on(tmp_path):
+    loop = LOOP.replace('duration: 0.3', 'duration: 3.0')
+    path, out = write(tmp_path, loop + STUDY), tmp_path / 'out'
+    command = [sys.executable, '-m', MODULE, '--config', path, '--out', out]
+    command += ['--workers', '2', '--chunk', '1']
+    mark = str(uuid.uuid4())
+    with subprocess.Popen(
+        command, env={**os.environ, 'MARK': mark}, stderr=subprocess.DEVNULL
+    ) as process:
+        until(lambda: (out / 'runs').is_dir() and len(list((out / 'runs').glob('r*'))) >= 3)
+        process.send_signal(signal.SIGKILL)
+    until(lambda: not marked(mark))  # nor do its workers go on
+    before = stamps(out)
+    assert 3 <= len(before) < RUNS
+    (out / 'runs' / '.runs-000000023-000000023.parquet.1').write_bytes(b'half a fi')
+
+    again = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert f'{sum(name[0] == "r" for name in before)} of 24 runs are done already' in again.stderr
+    after = stamps(out)
+    assert not [name for name in after if name.startswith('.')]
+    kept = {name: stamp for name, stamp in before.items() if name.startswith('r')}
+    assert kept.items() <= after.items()
+    assert len(after) == RUNS
+    opened = Store(out)
+    assert same(opened.results(), whole(opened.study))
+
+
+def test_complete_study_is_not_computed_again(tmp_path, capsys):
+    path, out = write(tmp_path), tmp_path / 'out'
+    command = ['--config', str(path), '--out', str(out), '--engine', 'threads']
+    assert monte_carlo.main(command) == 0
+    before = stamps(out)
+    assert monte_carlo.main(command) == 0
+    assert stamps(out) == before
+    assert 'of the runs kept the bound' in capsys.readouterr().out
+
+
+def test_missing_runs_are_found_between_those_done(store):
+    filled(store, (3, 4), (10, 1))
+    assert store.done() == [Span(3, 4), Span(10, 1)]
+    missing = store.missing(5)
+    assert missing[:3] == [Span(0, 3), Span(7, 3), Span(11, 5)]
+    runs = [i for first, count in missing for i in range(first, first + count)]
+    assert sorted([*runs, 3, 4, 5, 6, 10]) == list(range(RUNS))
+
+
+def test_pyarrow_alone_reads_the_results(store):
+    filled(store, (12, 12), (0, 12))
+    table = pyarrow.parquet.read_table(store.folder / 'runs')
+    assert table['run'].to_pylist() == list(range(RUNS))
+    expected = whole(store.study)
+    assert table.column_names == list(expected)
+    assert table['outcome'].to_pylist() == expected['outcome'].tolist()
+    assert table['plant.arm.m2'].to_pylist() == expected['plant.arm.m2'].tolist()
+    assert same(store.results(), expected)
+
+
+@pytest.mark.parametrize(
+    ('before', 'after', 'difference'),
+    [
+        ('runs: 24', 'runs: 25', r'monte_carlo.runs: there 24, here 25'),
+        ('m2: uniform(0.3', 'm2: uniform(0.2', r'arm.m2: there uniform\(0.3, 0.7\), here uniform'),
+        ('arm.m2', 'arm.m1', r'arm.m2: there uniform\(0.3, 0.7\), here nothing'),
+        ('duration: 0.3', 'duration: 0.4', r'sim_plant.duration: there 0.3, here 0.4'),
+        ('window: 0.1', 'window: 0.12', r'learning.window: there 0.1, here 0.12'),
+    ],
+)
+def test_other_study_is_refused_and_the_difference_named(
+    tmp_path, store, before, after, difference
+):
+    other = study(tmp_path, (LOOP + STUDY).replace(before, after, 1))
+    with pytest.raises(OtherStudyError, match=difference):
+        Store.create_or_open(store.folder, other)
+    assert Store(store.folder).study == store.study
+
+
+def test_other_version_is_refused(store, monkeypatch):
+    now = stores.versions()
+    monkeypatch.setattr(stores, 'versions', lambda: now | {'kernels': 'of tomorrow'})
+    with pytest.raises(OtherStudyError, match=r'kernels: there .*, here of tomorrow'):
+        Store.create_or_open(store.folder, store.study)
+
+
+def test_folder_of_something_else_is_left_alone(tmp_path, capsys):
+    out = tmp_path / 'thesis'
+    out.mkdir()
+    (out / 'chapter1.txt').write_text('In the beginning')
+    with pytest.raises(NotAStudyError, match='holds no study'):
+        Store.create_or_open(out, study(tmp_path))
+    assert monte_carlo.main(['--config', str(write(tmp_path)), '--out', str(out)]) == 1
+    assert 'choose another folder' in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ['chapter1.txt']
+
+
+def test_two_cannot_write_into_one_folder(store):
+    with store.locked(), pytest.raises(StudyInUseError), Store(store.folder).locked():
+        pass
+    with Store(store.folder).locked():
+        pass
+
+
+def test_damaged_file_is_named(store):
+    filled(store, (0, 2))
+    (part,) = (store.folder / 'runs').iterdir()
+    part.write_bytes(part.read_bytes()[:-20])
+    with pytest.raises(UnreadablePartError, match=f'{part.name} cannot be read .*remove it'):
+        store.results()

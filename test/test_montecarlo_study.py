@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A study's file says what varies, or what is wrong with it; each run is drawn for itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from montecarlo_case import LOOP, STUDY, study, write
+from scipy import stats
+
+from blf_dsc_controller.assembly import controller_of
+from blf_dsc_controller.configuration.parameter import Kind
+from blf_dsc_controller.configuration.params_file import locate
+from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.montecarlo.distribution import TAIL, parse
+from blf_dsc_controller.montecarlo.study import draw, origin_of, plant_of_draw
+from blf_dsc_controller.montecarlo.study_file import load_study, write_study
+
+SHARES = st.floats(0.0, 1.0, exclude_max=True)
+
+
+def drawn_values(a_study, run):
+    return dict(zip((s.column for s in a_study.spreads), draw(a_study, run).values, strict=True))
+
+
+@pytest.mark.parametrize(
+    ('text', 'reference'),
+    [
+        ('uniform(-2, 3)', stats.uniform(-2, 5)),
+        ('loguniform(0.01, 10)', stats.loguniform(0.01, 10)),
+        ('normal(2, 0.5)', stats.truncnorm(-TAIL, TAIL, 2, 0.5)),
+    ],
+)
+@given(u=SHARES)
+def test_distributions_are_those_of_their_names(text, reference, u):
+    distribution = parse(text, Kind.DOUBLE)
+    assert distribution.at(u) == pytest.approx(reference.ppf(u), rel=1e-9, abs=1e-9)
+    low, high = distribution.extremes
+    assert low <= distribution.at(u) <= high
+
+
+@pytest.mark.parametrize('text', ['integers(-1, 3)', 'choice(-1, 0, 1, 2, 3)'])
+def test_every_integer_comes_as_often(text):
+    distribution = parse(text, Kind.INTEGER)
+    values = [distribution.at(u) for u in np.arange(1000) / 1000]
+    assert [values.count(i) for i in range(-1, 4)] == [200] * 5
+
+
+def test_one_value_is_allowed():
+    assert parse('uniform(0.5, 0.5)', Kind.DOUBLE).at(0.9) == 0.5
+    assert parse('choice(brake)', Kind.STRING).at(0.9) == 'brake'
+
+
+def test_preset_is_a_study_of_ten_thousand_runs():
+    preset = load_study(locate('monte_carlo'))
+    assert preset.settings.runs == 10_000
+    assert preset.plant.duration == 10.0
+
+
+@pytest.mark.parametrize(
+    ('before', 'after', 'expected'),
+    [
+        ('arm.m2', 'arm.m3', r'line 15: vary.arm.m3: there is no parameter .* mean arm.m[12]\?'),
+        ('arm.m2', 'initial.position', r'vary.initial.position: there is no parameter'),
+        (
+            'uniform(0.3',
+            'unifrm(0.3',
+            r"line 15: vary.arm.m2: got 'unifrm\(0.3, 0.7\)', but",
+        ),
+        (
+            'uniform(0.3, 0.7)',
+            '0.5',
+            r'vary.arm.m2: got 0.5, but one of these is expected',
+        ),
+        ('uniform(0.3, 0.7)', 'uniform(0.3)', r'with 1 values, but uniform\(low, high\) is'),
+        ('uniform(0.3, 0.7)', 'uniform(a, 0.7)', r'but a number is expected between commas'),
+        ('uniform(0.3, 0.7)', 'uniform(nan, 0.7)', r'but a number is expected between commas'),
+        ('uniform(0.3, 0.7)', 'uniform(0.7, 0.3)', r'must not be above the second'),
+        ('uniform(0.3, 0.7)', 'normal(0.3, -0.1)', r'a deviation cannot be below 0'),
+        ('loguniform(1.0e-6', 'loguniform(0.0', r'loguniform distribution begins above 0'),
+        # Four deviations below the mean there would be no mass.
+        ('uniform(0.3, 0.7)', 'normal(0.4, 0.1)', r'can give what is not allowed: got .*above 0'),
+        ('uniform(-0.9, 0.9)', 'uniform(-1.0, 0.9)', r'initial.error: .* above -1 and below 1'),
+        ('integers(0, 3)', 'uniform(0.0, 3.0)', r'delay: got .*: integers\(low, high\), choice'),
+        ('integers(0, 3)', 'integers(0.5, 3)', r'delay: .* an integer is expected between'),
+        ('choice(measured,', 'choice(guessed,', r"velocity: .* got 'guessed', but it must be one"),
+        ('uniform(-0.2, 0.2)', '["uniform(0, 1)"]', r'got 1 distributions, but there are 2 joints'),
+        ('runs: 24', 'runs: 0', r'line 10: runs: got 0, but it must be at least 1'),
+        ('runs: 24', 'rums: 24', r'line 10: rums: .* did you mean runs\?'),
+        ('[0.1, 0.25]', '[0.1, 0.4]', r'moments: got 0.4 s at entry 2, but a run ends at 0.3 s'),
+        ('[0.1, 0.25]', '[0.1, 0.1]', r'moments: 0.1 s is there more than once'),
+        ('after: 0.2', 'after: 0.3', r'settled_after: got 0.3 s, but a run ends at 0.3 s'),
+        ('duration: 0.3', 'duration: 0.0', r'sim_plant.duration: got 0 s, but every run must end'),
+        ('duration: 0.3', 'duraton: 0.3', r'line 3: duraton: .* did you mean duration\?'),
+        ('monte_carlo:', 'monte:', r'there is no section monte_carlo'),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path, before, after, expected):
+    text = LOOP + STUDY
+    assert before in text
+    with pytest.raises(ConfigurationError, match=expected) as error:
+        study(tmp_path, text.replace(before, after, 1))
+    assert str(tmp_path / 'study.yaml') in str(error.value)
+
+
+def test_everything_wrong_is_said_at_once(tmp_path):
+    text = (LOOP + STUDY).replace('seed: 7', 'seed: -7').replace('arm.m2', 'arm.m3')
+    with pytest.raises(ConfigurationError) as error:
+        study(tmp_path, text.replace('window: 0.1', 'window: -0.1'))
+    assert len(error.value.problems) == 3
+
+
+def test_written_study_is_the_same_study(tmp_path):
+    text = STUDY.replace('constant: uniform(-0.2, 0.2)', 'constant: ["choice(1, 2)", "choice(3)"]')
+    original = study(tmp_path, LOOP + text)
+    write_study(original, tmp_path / 'again.yaml')
+    assert load_study(tmp_path / 'again.yaml') == original
+
+
+def test_run_depends_on_seed_and_index_alone(tmp_path):
+    one = study(tmp_path)
+    assert draw(one, 5) == draw(study(tmp_path, runs=100), 5)
+    assert draw(one, 5) != draw(one, 6)
+    assert draw(one, 5).seed != draw(one, 6).seed
+    assert draw(one, 5) != draw(study(tmp_path, seed=8), 5)
+
+
+def test_what_else_varies_does_not_change_a_draw(tmp_path):
+    one = study(tmp_path)
+    other = study(tmp_path, LOOP + STUDY.replace('arm.m2: uniform(0.3, 0.7)', 'arm.l2: choice(1)'))
+    before, after = drawn_values(one, 3), drawn_values(other, 3)
+    assert set(after) - set(before) == {'plant.arm.l2'}
+    shared = set(after) & set(before)
+    assert len(shared) > 5
+    assert {name: before[name] for name in shared} == {name: after[name] for name in shared}
+
+
+def test_draws_become_the_plant_of_the_run(tmp_path):
+    a_study = study(tmp_path)
+    origin = origin_of(controller_of(a_study.controller))
+    drawn = draw(a_study, 2)
+    values = drawn_values(a_study, 2)
+    plant = plant_of_draw(a_study, drawn, origin)
+    assert plant.seed == drawn.seed
+    assert plant.arm.m2 == values['plant.arm.m2']
+    assert plant.arm.m1 == a_study.plant.arm.m1
+    assert plant.disturbance.constant[1] == values['plant.disturbance.constant.joint2']
+    assert plant.disturbance.constant[0] != plant.disturbance.constant[1]
+    assert plant.actuator.delay == values['plant.actuator.delay']
+    # The reference begins at offset + 0.3 cos 0, at rest; the bound is 2 mrad.
+    share = np.array([values[f'plant.initial.error.joint{i}'] for i in (1, 2)])
+    start = np.array([1.9935, 1.3961]) + 0.3 + 0.002 * share
+    np.testing.assert_allclose(plant.initial.position, start, rtol=1e-12)
+    velocity = [values[f'plant.initial.velocity_error.joint{i}'] for i in (1, 2)]
+    np.testing.assert_allclose(plant.initial.velocity, velocity, atol=1e-15)
+
+
+def test_start_as_configured_where_it_does_not_vary(tmp_path):
+    text = '\n'.join(line for line in STUDY.splitlines() if 'initial' not in line) + '\n'
+    a_study = study(tmp_path, LOOP + text)
+    origin = origin_of(controller_of(a_study.controller))
+    assert plant_of_draw(a_study, draw(a_study, 0), origin).initial == a_study.plant.initial
+
+
+def test_overrides_count_more_than_the_file(tmp_path):
+    assert load_study(write(tmp_path), {'runs': 3}).settings.runs == 3
