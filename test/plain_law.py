@@ -37,19 +37,27 @@ class PlainLaw:
         self.samples = 0
         self.pole1 = self.pole2 = np.zeros((2, settings.m + 1))
 
-    def barrier_torque(self, xi1):
+    def bound(self, t):
+        """k(t), and its derivative."""
+        g = self.gains
+        wider = (g.initial_bound - g.bound) * np.exp(-g.funnel_rate * t)
+        return g.bound + wider, -g.funnel_rate * wider
+
+    def barrier_torque(self, xi1, t):
         """tau_c of (16) with its weight, a straight line from the knee on."""
         g = self.gains
-        edge = np.minimum(np.abs(xi1), g.knee)
-        inside = g.weight * edge / np.cos(np.pi * edge**2 / (2.0 * g.bound**2)) ** 2
+        k, _ = self.bound(t)
+        edge = np.minimum(np.abs(xi1), g.knee / g.bound * k)
+        inside = g.weight * edge / np.cos(np.pi * edge**2 / (2.0 * k**2)) ** 2
         return -np.sign(xi1) * (inside + g.slope_limit * (np.abs(xi1) - edge))
 
-    def virtual_control(self, xi1, dqr):
+    def virtual_control(self, xi1, dqr, t):
         """beta2 of (18) with (15) as printed: it needs an error that is not zero."""
         g = self.gains
-        s = np.pi * xi1**2 / (2.0 * g.bound**2)
-        tau_aux = -g.K * g.bound**2 / (xi1 * np.pi) * np.sin(s) * np.cos(s)
-        return np.where(np.abs(xi1) < g.bound, tau_aux, 0.0) - g.mu * xi1 + dqr
+        k, dk = self.bound(t)
+        s = np.pi * xi1**2 / (2.0 * k**2)
+        tau_aux = -g.K * k**2 / (xi1 * np.pi) * np.sin(s) * np.cos(s)
+        return np.where(np.abs(xi1) < k, tau_aux, 0.0) - g.mu * xi1 + dqr + xi1 * dk / k
 
     def regressor(self, q, dq, v, a):
         """H, column by column: M a + C v + G of each unit parameter."""
@@ -107,7 +115,7 @@ class PlainLaw:
         g = self.gains
         q, dq, effort = measurement.reshape(3, 2).copy()
         xi1 = q - qr
-        beta2 = self.virtual_control(xi1, dqr)
+        beta2 = self.virtual_control(xi1, dqr, t)
         if self.alpha2 is None:
             self.alpha2 = beta2
         following = beta2 + (self.alpha2 - beta2) * np.exp(-dt / g.time_constant)
@@ -116,13 +124,16 @@ class PlainLaw:
         self.take_in(t, dt, q, dq, effort if self.effort else self.tau)
         H = self.regressor(q, dq, self.alpha2, dalpha2)
         demand = (
-            self.barrier_torque(xi1)
+            self.barrier_torque(xi1, t)
             - g.d2 * np.abs(xi1) * np.clip(xi2 / g.boundary_layer, -1.0, 1.0)
             - g.Kp * xi2
             + H @ self.theta[:3]
             + self.d3
         )
         torque = np.clip(demand, -g.torque_limit, g.torque_limit)
+        if self.samples:
+            step = np.where(g.rate_limit > 0.0, g.rate_limit * dt, np.inf)
+            torque = np.clip(torque, self.tau - step, self.tau + step)
         self.adapt(dt, H, xi2, saturated=np.any(torque != demand))
         self.alpha2 = following
         self.samples += 1

@@ -23,6 +23,15 @@ CASES = {
     'damping and leakage': ({'d2': np.array([300.0, 200.0]), 'eta': 0.5}, {}),
     'effort': ({'torque_source': EFFORT}, {'delay': 2, 'noise': 1e-6}),
     'torque limit': ({'torque_limit': np.array([10.0, 4.0])}, {}),
+    'torque rate limit': ({'rate_limit': np.array([500.0, 0.0])}, {}),
+    'both limits': (
+        {'torque_limit': np.array([10.5, 4.0]), 'rate_limit': np.array([500.0, 90.0])},
+        {},
+    ),
+    'bound that narrows': (
+        {'initial_bound': np.full(2, 0.01), 'funnel_rate': 3.0},
+        {'start': (2.2975, 1.690)},
+    ),
     'at the ball': ({'radius': 0.9, 'Gamma': np.array([0.2, 1.0, 3.0, 0.5, 0.5])}, {}),
     'window not full': ({'window': 2000, 'learning_start': 0.5}, {}),
     'half the rate': ({}, {'sample_time': 2e-3}),

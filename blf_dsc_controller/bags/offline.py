@@ -63,13 +63,16 @@ def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, M
     plant = PlantTelemetry(config.joints, model_of(config).parameter_names)
     controller = ControllerTelemetry(config.joints, estimate_names(config))
     monitor = Monitor(config.joints, estimate_names(config), record.controller.settings)
-    bound = np.array(config.barrier.bound)
-    ratio = np.zeros_like(bound)
-    yield START, controller.bound(START, bound, np.array(config.torque.limit))
+    limit = np.array(config.torque.limit)
+    ratio = np.zeros(record.joints)
+    bound = np.zeros(record.joints)
     for row, elapsed in enumerate(record.stamps.tolist()):
         stamp = START + elapsed
         told = record.sample(row)
-        np.maximum(ratio, np.abs(told.xi1) / bound, out=ratio)
+        np.maximum(ratio, np.abs(told.xi1) / told.bound, out=ratio)
+        if not np.array_equal(told.bound, bound):
+            bound = told.bound
+            yield stamp, controller.bound(stamp, bound, limit)
         yield stamp, plant.joint_states(stamp, record.measurements[row])
         yield stamp, controller.command(told.torque)
         for message in controller.sample(stamp, told, float('nan')):

@@ -75,7 +75,7 @@ COMMANDS = Topic(CONTROLLER, '~/commands', FLOAT64_MULTI_ARRAY, STREAM, LATEST)
 REFERENCE = Topic(CONTROLLER, '~/reference', JOINT_STATE, STREAM, STREAM)
 TRACKING_ERROR = Topic(CONTROLLER, '~/tracking_error', JOINT_STATE, STREAM, STREAM)
 LEARNING = Topic(CONTROLLER, '~/learning', JOINT_STATE, STREAM, STREAM)
-BOUND = Topic(CONTROLLER, '~/bound', JOINT_STATE, LATCHED, LATCHED)
+BOUND = Topic(CONTROLLER, '~/bound', JOINT_STATE, HISTORY, LATCHED)
 STATE = Topic(CONTROLLER, '~/state', 'diagnostic_msgs/msg/DiagnosticStatus', LATCHED, LATCHED)
 MONITOR = Topic(CONTROLLER, '~/monitor', JOINT_STATE, HISTORY, STREAM)
 TRUTH = Topic(PLANT, '~/truth', JOINT_STATE, HISTORY, STREAM)
@@ -88,6 +88,14 @@ PARAMETER_EVENTS = Topic(
     CONTROLLER, '/parameter_events', 'rcl_interfaces/msg/ParameterEvent', STREAM, STREAM
 )
 """ROS's own, of every node."""
+JOINT_TRAJECTORY = Topic(
+    CONTROLLER,
+    '~/joint_trajectory',
+    'trajectory_msgs/msg/JointTrajectory',
+    DIAGNOSTIC,
+    DIAGNOSTIC,
+)
+"""Of other nodes, to the controller; the package's own topics follow."""
 
 TOPICS = (
     JOINT_STATES,

@@ -28,7 +28,7 @@ _BRAKE = 3.0
 
 
 class Motion(NamedTuple):
-    """A packed reference, and the time [s] from which on it is what was asked for."""
+    """A packed reference, and the time [s] from which on it is no mixture."""
 
     vector: np.ndarray
     settled: float

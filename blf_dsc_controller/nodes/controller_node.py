@@ -23,6 +23,7 @@ from blf_dsc_controller.nodes import compilation, executor, parameters, realtime
 from blf_dsc_controller.nodes.controller_status import ControllerStatus
 from blf_dsc_controller.nodes.endpoints import publisher, subscribe
 from blf_dsc_controller.nodes.managed import ManagedNode
+from blf_dsc_controller.nodes.trajectory import TrajectoryInput
 from blf_dsc_controller.refusals import refusals
 from blf_dsc_controller.safety.guard import Guard
 from blf_dsc_controller.safety.reasons import Phase
@@ -62,6 +63,7 @@ class ControllerNode(ManagedNode):
         self._telemetry = ControllerTelemetry(joints, self._estimates)
         self._monitor: Monitor | None = None
         self._judged = False
+        self._told_bound = np.zeros(len(joints))
         self._decoder = JointStateDecoder(joints, self._required_fields())
         self._pending: bytes | None = None
         self._observed = self._started = False
@@ -103,6 +105,7 @@ class ControllerNode(ManagedNode):
             outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
             self._publisher_of = {topic: publisher(self, topic) for topic in outputs}
             subscribe(self, topics.JOINT_STATES, self._on_joint_state)
+            self._status.trajectories = TrajectoryInput(self, lambda: self.guard)
             realtime.request(self.config.realtime, self.get_logger())
         self._report()
 
@@ -189,12 +192,14 @@ class ControllerNode(ManagedNode):
         told = guard.controller.sample
         settings = guard.controller.settings
         if guard.controller.samples == 1 or self._monitor is None:
-            self._publish_bound(stamp)
             self._monitor = Monitor(self.config.joints, self._estimates, settings)
+            self._publish_bound(stamp, told.bound)
+        elif settings.funnel_rate > 0.0 and not np.array_equal(told.bound, self._told_bound):
+            self._publish_bound(stamp, told.bound)
         for message in self._telemetry.sample(stamp, told, guard.compute_time):
             self._publish(message)
         if (guard.controller.samples - 1) % DECIMATION == 0:
-            self._publish(self._monitor.message(stamp, told, guard.ratio, settings.bound))
+            self._publish(self._monitor.message(stamp, told, guard.ratio, told.bound))
 
     def _tell_refusals(self, guard: Guard) -> None:
         """Say which disturbance columns are not estimated, once they have been judged."""
@@ -210,10 +215,10 @@ class ControllerNode(ManagedNode):
         topic, raw = message
         self._publisher_of[topic].publish(raw)
 
-    def _publish_bound(self, stamp: int) -> None:
-        if self.config.telemetry.enabled:
-            settings = self.controller.settings
-            self._publish(self._telemetry.bound(stamp, settings.bound, settings.torque_limit))
+    def _publish_bound(self, stamp: int, bound: np.ndarray) -> None:
+        self._told_bound[:] = bound
+        limit = self.controller.settings.torque_limit
+        self._publish(self._telemetry.bound(stamp, bound, limit))
 
     def _is_observed(self) -> bool:
         observers = self.config.wait_for_subscribers
@@ -245,8 +250,10 @@ class ControllerNode(ManagedNode):
         self.config = config
         if self.guard is not None:
             self.guard.retune(config)
-            if self.guard.last_stamp >= 0:
-                self._publish_bound(self.guard.last_stamp)
+            stamp = self.guard.last_stamp
+            if stamp >= 0 and config.telemetry.enabled:
+                t = (stamp - self.guard.start_stamp) * 1e-9
+                self._publish_bound(stamp, self.guard.controller.bound_at(t))
 
     def _take_note(self, guard: Guard) -> None:
         supervisor = guard.supervisor

@@ -11,6 +11,7 @@ from rclpy.node import Node
 
 from blf_dsc_controller.bags import topics
 from blf_dsc_controller.nodes.board import ERROR, OK, STALE, WARN, Board
+from blf_dsc_controller.nodes.trajectory import TrajectoryInput
 from blf_dsc_controller.refusals import Refusal
 from blf_dsc_controller.safety.guard import Guard
 from blf_dsc_controller.safety.reasons import Phase, Reason
@@ -39,10 +40,13 @@ class ControllerStatus:
 
     Attributes:
         refusals: disturbance columns that are not estimated, and why.
+        trajectories: what came of the trajectories that were sent.
     """
 
     def __init__(self, node: Node, joints: Sequence[str]) -> None:
         self.refusals: tuple[Refusal, ...] = ()
+        self.trajectories: TrajectoryInput | None = None
+        self._joints = tuple(joints)
         self._board = Board(node, joints, topics.STATE)
         self._told: tuple[Phase, Reason, int] | None = None
         self._announced = ''
@@ -91,13 +95,28 @@ class ControllerStatus:
             'samples with a torque at its limit': supervisor.saturation.count,
             'messages for other joints': guard.foreign,
             'watch on the steady clock': 'on' if guard.watching else 'off',
+            **self._cuts(guard),
+            **(self.trajectories.told if self.trajectories else {}),
         }
         if guard.outside:
             return self._board.status('loop', WARN, 'the error has left its bound', values)
         if supervisor.saturation.lasted > 0.0:
             message = 'torque at its limit: adaptation by the tracking error is frozen'
             return self._board.status('loop', WARN, message, values)
+        if guard.answered and guard.controller.sample.cuts.any():
+            message = 'torque changes at its limit: adaptation by the tracking error is frozen'
+            return self._board.status('loop', WARN, message, values)
         return self._board.status('loop', OK, _WORDS.get(supervisor.phase, 'stopped'), values)
+
+    def _cuts(self, guard: Guard) -> dict[str, int]:
+        """Samples in which the law's torque was cut, joint by joint."""
+        state = guard.controller.state
+        causes = {'torque limit': state.level_cuts, 'torque rate limit': state.rate_cuts}
+        return {
+            f'samples cut by the {cause}, {joint}': int(count)
+            for cause, counts in causes.items()
+            for joint, count in zip(self._joints, counts, strict=True)
+        }
 
     def _learning(self, guard: Guard) -> DiagnosticStatus:
         state = guard.controller.state

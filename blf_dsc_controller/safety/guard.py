@@ -24,8 +24,9 @@ from blf_dsc_controller.bags.errors import (
 )
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError, OutsideBarrierError
-from blf_dsc_controller.motion.errors import MotionError
-from blf_dsc_controller.motion.start import begin
+from blf_dsc_controller.motion.errors import MotionError, TrajectoryError
+from blf_dsc_controller.motion.start import begin, rules_of
+from blf_dsc_controller.motion.trajectory import Request, follow
 from blf_dsc_controller.safety import tuning
 from blf_dsc_controller.safety.fallback import Ramp, safe_torque
 from blf_dsc_controller.safety.monitors import Silence
@@ -138,6 +139,24 @@ class Guard:
         self.controller.reset()
         self._keep()
         self._start_over()
+
+    def follow(self, request: Request) -> None:
+        """Follow another trajectory from the next sample on.
+
+        Raises:
+            TrajectoryError: it cannot be followed; the present reference goes on.
+        """
+        if not self.supervisor.running:
+            raise TrajectoryError([f'the controller is not in command: {self._situation()}'])
+        now = (self.last_stamp - self.start_stamp) * _NANO
+        motion = follow(request, self.controller.reference_vector, now, rules_of(self.config))
+        self.controller.reference_vector = motion.vector
+        self.settled = motion.settled
+        self.supervisor.enter(Phase.APPROACHING if motion.settled > now else Phase.TRACKING)
+
+    def _situation(self) -> str:
+        phase = self.supervisor.phase
+        return self.supervisor.text if phase is Phase.SAFE_STOP else phase.value
 
     def retune(self, config: ControllerConfig) -> None:
         """Take a new configuration, between two samples."""

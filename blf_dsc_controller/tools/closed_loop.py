@@ -105,11 +105,10 @@ def run_offline(config: LoopConfig, bag: Path) -> None:
     """Run the compiled loop and write its bag."""
     _announce(loop)
     progress = Progress(config.plant)
-    bound = config.controller.barrier.bound
 
     def show(record: Record, rows: int) -> None:
         n = record.joints
-        errors = abs(record.samples[:rows, 2 * n : 3 * n]) / bound
+        errors = abs(record.samples[:rows, 2 * n : 3 * n] / record.samples[:rows, 6 * n : 7 * n])
         estimate = record.sample(rows - 1).estimate[:3]
         progress.show(record.stamps[rows - 1] * 1e-9, errors.max(), estimate)
 

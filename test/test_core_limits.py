@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The limits on the torque and on its rate: what is cut, what is counted, what learns of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from arbitrary_case import arbitrary
+from closed_loop_case import closed_loop, controller, plant, quick, recommended, record
+
+from blf_dsc_controller.core.limits import LEVEL_CUT, RATE_CUT, cut_torque
+
+DT = 2e-3  # s: with 500 N m/s, 1 N m from sample to sample
+
+
+def cut(demand, last, *, level=10.0, rate=500.0, samples=7.0):
+    case = arbitrary(0, n=1, torque_limit=np.array([level]), rate_limit=np.array([rate]))
+    case.state.samples[0] = samples
+    case.state.torque[0] = last
+    case.state.level_cuts[0] = case.state.rate_cuts[0] = 0.0
+    case.signals.demand[0] = demand
+    is_cut = cut_torque(case.settings, case.state, case.signals, DT)
+    return case.signals.torque[0], case.signals.cuts[0], is_cut, case.state
+
+
+@pytest.mark.parametrize(
+    ('demand', 'last', 'torque', 'cuts'),
+    [
+        (3.5, 3.0, 3.5, 0.0),
+        (4.0, 3.0, 4.0, 0.0),
+        (5.0, 3.0, 4.0, RATE_CUT),
+        (-5.0, 3.0, 2.0, RATE_CUT),
+        (12.0, 9.5, 10.0, LEVEL_CUT),
+        (12.0, 5.0, 6.0, LEVEL_CUT + RATE_CUT),
+        (-12.0, -9.0, -10.0, LEVEL_CUT),
+        (13.0, 14.0, 10.0, LEVEL_CUT + RATE_CUT),  # the level has been lowered below the last one
+    ],
+)
+def test_torque_is_cut_at_its_level_and_at_its_rate(demand, last, torque, cuts):
+    answer, told, is_cut, state = cut(demand, last)
+    assert (answer, told) == (torque, cuts)
+    assert bool(is_cut) is (cuts > 0.0)
+    assert state.level_cuts[0] == (cuts in {LEVEL_CUT, LEVEL_CUT + RATE_CUT})
+    assert state.rate_cuts[0] == (cuts in {RATE_CUT, LEVEL_CUT + RATE_CUT})
+
+
+def test_without_a_rate_limit_any_change_is_allowed():
+    assert cut(9.0, -9.0, rate=0.0)[:2] == (9.0, 0.0)
+
+
+def test_the_first_torque_has_none_before_it():
+    assert cut(9.0, 0.0, samples=0.0)[:2] == (9.0, 0.0)
+
+
+def test_a_demand_that_is_no_number_stays_none():
+    """It must not turn into a torque that looks like one."""
+    assert np.isnan(cut(np.nan, 3.0)[0])
+    assert np.isnan(cut(np.nan, 3.0, rate=0.0)[0])
+
+
+def test_over_a_loop_no_step_is_larger_than_the_rate_and_every_cut_is_counted_by_joint():
+    rates = np.array([450.0, 80.0])
+    law = controller(recommended(rate_limit=rates))  # which hardly disturbs the loop
+    torques, cuts = [], []
+    for _ in closed_loop(law, plant(), 2.0):
+        torques.append(law.sample.torque.copy())
+        cuts.append(law.sample.cuts.copy())
+    steps = np.abs(np.diff(torques, axis=0))
+
+    assert np.all(steps <= rates * 1e-3 * (1.0 + 1e-12))
+    np.testing.assert_allclose(steps.max(axis=0), rates * 1e-3)
+    np.testing.assert_array_equal(law.state.rate_cuts, np.sum(np.array(cuts) == RATE_CUT, axis=0))
+    assert law.state.rate_cuts.min() > 0.0
+    np.testing.assert_array_equal(law.state.level_cuts, 0.0)
+
+
+def test_while_one_joint_is_cut_the_tracking_error_teaches_nothing():
+    law = controller(quick(rate_limit=np.array([0.1, 0.0])))
+    loop = closed_loop(law, plant(), 0.3)
+    next(loop)
+    estimate, disturbance = law.state.estimate.copy(), law.state.disturbance.copy()
+    for _ in loop:
+        assert law.sample.cuts[0] >= RATE_CUT
+    np.testing.assert_array_equal(law.state.estimate, estimate)
+    np.testing.assert_array_equal(law.state.disturbance, disturbance)
+
+
+@pytest.mark.parametrize(
+    'changes',
+    [{'rate_limit': np.array([400.0, 150.0])}, {'torque_limit': np.array([10.5, 4.0])}],
+    ids=['rate', 'level'],
+)
+def test_learning_sees_the_torque_that_was_applied(changes):
+    """The torque is cut in many samples; had they been learned from as asked for, P^ were wrong."""
+    law = controller(recommended(**changes))
+    run = record(law, plant(), 12.0)
+    assert np.maximum(law.state.level_cuts, law.state.rate_cuts).max() > 30.0
+    assert run.parameter_error[-1] < 0.01

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Approaches, sent trajectories and narrowing bounds over ROS, in lock-step in one process."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+
+from builtin_interfaces.msg import Duration, Time
+from ros_rig import RosRig, torques
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from blf_dsc_controller.bags import topics
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.safety.reasons import Phase
+from blf_dsc_controller.simulation import simulate
+from sim_plant.configuration import PlantConfig
+
+JOINTS = ('joint1', 'joint2')
+AWAY = [0.9, 2.9]  # rad, 1.4 and 1.2 from the paper's reference
+SECOND = 1_000_000_000
+BRISK = {'limits__acceleration': [4.0, 4.0]}  # rad/s^2, for a lead of a second
+
+
+@pytest.fixture
+def ros():
+    rig = RosRig()
+    yield rig
+    rig.close()
+
+
+def inputs(law):
+    return law._status.trajectories
+
+
+def phase(law):
+    return law.guard.supervisor.phase
+
+
+def test_an_approach_over_ros_is_the_offline_one_bit_for_bit(ros):
+    commands = ros.listen(topics.COMMANDS)
+    arm, law = ros.loop({'initial__position': AWAY, 'duration': 4.0})
+    ros.run(arm, 10)
+    assert phase(law) is Phase.APPROACHING
+    ros.until(lambda: phase(law) is Phase.TRACKING)
+    assert arm.plant.sample == pytest.approx(1e3 * law.guard.settled, abs=2)
+    ros.until(lambda: len(commands) >= 4001)
+
+    assert law.guard.ratio.max() < 1.0
+    plant = build(PlantConfig, {'initial.position': AWAY, 'duration': 4.0})
+    offline = simulate(ControllerConfig(), plant)
+    np.testing.assert_array_equal(torques(commands)[:4001], offline.samples[:, 8:10])
+
+
+def test_an_approach_that_cannot_be_made_is_refused_and_told(ros):
+    _, law = ros.loop(
+        {'initial__position': AWAY},
+        {'limits__velocity': [0.2, 1.5]},  # the paper's reference moves at 0.3 rad/s
+    )
+    ros.until(lambda: phase(law) is Phase.SAFE_STOP)
+    assert "the velocity of joint 'joint1' would be" in law.stopped
+    assert law.guard.supervisor.reason.value == 'start refused'
+
+
+def two_tones(t, shift):
+    """Position, velocity and acceleration (3, 2) at t [s] of two tones on each joint."""
+    rates, phases = np.array([1.0, 2.3]), np.array([0.2, -0.9])
+    sizes = np.array([[0.2, 0.08], [0.25, -0.05]])
+    angle = rates * t + phases
+    middle = np.array([1.9, 1.4]) + shift
+    return np.stack(
+        (
+            middle + sizes @ np.cos(angle),
+            -sizes @ (rates * np.sin(angle)),
+            -sizes @ (rates**2 * np.cos(angle)),
+        )
+    )
+
+
+def message(joints, shift, *, duration, names=None, period=0.05, lead=1.0, fields=3, stamp=0):
+    """Trajectory that leads to two tones within `lead` [s], and rests a second after them."""
+    sent = JointTrajectory(joint_names=names or joints)
+    sent.header.stamp = Time(sec=stamp // SECOND, nanosec=stamp % SECOND)
+    times = lead + np.arange(round(duration / period)) * period
+    points = [two_tones(t, shift) for t in times]
+    rest = np.vstack((points[-1][:1], np.zeros((2, 2))))
+    for t, point in zip((*times, times[-1] + 1.0), (*points, rest), strict=True):
+        values = [row[[JOINTS.index(joint) for joint in joints]] for row in point[:fields]]
+        nanoseconds = round(t * 1e9)
+        sent.points.append(
+            JointTrajectoryPoint(
+                **dict(zip(('positions', 'velocities', 'accelerations'), values, strict=False)),
+                time_from_start=Duration(sec=nanoseconds // SECOND, nanosec=nanoseconds % SECOND),
+            )
+        )
+    return sent
+
+
+@pytest.fixture
+def sender(ros):
+    name = '/' + topics.JOINT_TRAJECTORY.relative
+    publisher = ros.tester.create_publisher(JointTrajectory, name, 10)
+
+    def send(law, sent):
+        ros.until(lambda: publisher.get_subscription_count() > 0)
+        before = inputs(law).taken + inputs(law).refused
+        publisher.publish(sent)
+        ros.until(lambda: inputs(law).taken + inputs(law).refused > before)
+        return inputs(law).reason
+
+    return send
+
+
+def test_a_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ros, sender):
+    references = ros.listen(topics.REFERENCE)
+    errors = ros.listen(topics.TRACKING_ERROR)
+    arm, law = ros.loop(None, BRISK)
+    ros.run(arm, 200)
+    shifts = ([0.0, 0.0], [0.1, -0.2], [-0.15, 0.1])
+    orders = (JOINTS, JOINTS[::-1], JOINTS)
+    for shift, joints, fields in zip(shifts, orders, (3, 2, 3), strict=True):
+        sent = message(joints, np.array(shift), duration=3.0, fields=fields)
+        assert sender(law, sent) == ''
+        ros.run(arm, 1800)
+    begin = law.guard.start_stamp
+    last = [1e-9 * (law.guard.last_stamp - begin)]
+    ros.run(arm, 3500)
+
+    assert inputs(law).taken == 3
+    assert inputs(law).refused == 0
+    # On the last of the three, then held at its end.
+    now = law.controller.reference_at(last[0] + 3.4)
+    np.testing.assert_allclose(now, [two_tones(3.95, np.array(shifts[2]))[0], [0, 0], [0, 0]])
+    assert law.guard.ratio.max() < 1.0
+    assert np.max([np.abs(one.position) for one in errors]) < 2e-3
+    positions = np.array([one.position for one in references])
+    velocities = np.array([one.velocity for one in references])
+    # At most 4 rad/s^2 for a millisecond, and nothing jumps where one replaces another.
+    assert np.abs(np.diff(velocities, axis=0)).max() < 4.1e-3
+    np.testing.assert_allclose(
+        np.diff(positions, axis=0), 0.5e-3 * (velocities[1:] + velocities[:-1]), atol=1e-8
+    )
+    assert phase(law) is Phase.TRACKING
+
+
+def test_a_trajectory_that_is_refused_changes_nothing(ros, sender):
+    arm, law = ros.loop()
+    ros.run(arm, 20)
+    before = law.controller.reference_vector.copy()
+    sender(law, message(JOINTS, np.zeros(2), duration=0.1, names=('joint1', 'elbow')))
+    assert inputs(law).refused == 1
+    for part in ("no joint 'elbow'", "nothing of joint 'joint2'"):
+        assert part in inputs(law).reason
+    np.testing.assert_array_equal(law.controller.reference_vector, before)
+    ros.run(arm, 20)
+    assert phase(law) is Phase.TRACKING
+
+
+def test_a_stamp_says_when_it_begins(ros, sender):
+    arm, law = ros.loop(None, BRISK)
+    ros.run(arm, 20)
+    begin = law.guard.start_stamp + 3 * SECOND
+    assert sender(law, message(JOINTS, np.zeros(2), duration=0.1, stamp=begin)) == ''
+    np.testing.assert_allclose(law.controller.reference_at(4.0), two_tones(1.0, 0.0), atol=1e-9)
+    np.testing.assert_allclose(law.controller.reference_at(2.0)[0], [1.8686, 1.2713], atol=1e-4)
+    assert phase(law) is Phase.TRACKING
+
+
+def test_before_the_start_a_trajectory_is_refused_with_the_reason(ros, sender):
+    law = ros.loop()[1]
+    sender(law, message(JOINTS, np.zeros(2), duration=0.1))
+    assert 'not in command: starting' in inputs(law).reason
+
+
+def test_the_moving_bound_is_told_each_sample_and_a_still_one_once(ros):
+    bounds = ros.listen(replace(topics.BOUND, requested=topics.STREAM))
+    arm, _ = ros.loop(None, {'barrier__initial_bound': [0.02, 0.01], 'barrier__funnel_rate': 5.0})
+    ros.run(arm, 300)
+    ros.until(lambda: len(bounds) >= 300)
+    t = np.arange(300) * 1e-3
+    told = np.array([one.position for one in bounds[:300]])
+    np.testing.assert_allclose(told[:, 0], 0.002 + 0.018 * np.exp(-5.0 * t), rtol=1e-12)
+    np.testing.assert_allclose(told[:, 1], 0.002 + 0.008 * np.exp(-5.0 * t), rtol=1e-12)
