@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterable
 from types import FrameType
 from typing import TypeAlias
@@ -13,6 +14,7 @@ import rclpy
 from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
 from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
+from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
@@ -20,7 +22,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.nodes.managed import ManagedNode
 
 _POLL = 0.1  # s; EventsExecutor has no usable spin()
-_GRACE = Duration(seconds=2)
+_GRACE = 10.0  # s for all topics; a recorder on a busy machine has been seen 2 s behind
 
 
 class RunnableNode(Node):
@@ -87,5 +89,10 @@ def run(make_node: Callable[[], Runnable]) -> int:
 
 def drain(publishers: Iterable[Publisher]) -> None:
     """Wait until every subscriber has what was published, so that no recorder misses the end."""
+    deadline = time.monotonic() + _GRACE
     for publisher in publishers:
-        publisher.wait_for_all_acked(_GRACE)
+        left = max(0.0, deadline - time.monotonic())
+        if not publisher.wait_for_all_acked(Duration(seconds=left)):
+            get_logger('end').warning(
+                f'{publisher.topic_name}: the last messages have not reached every subscriber'
+            )

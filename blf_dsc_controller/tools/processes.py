@@ -12,7 +12,7 @@ from pathlib import Path
 
 from blf_dsc_controller.errors import BlfDscError
 
-_PATIENCE = 15.0  # s that a node may take to end before it is killed
+_PATIENCE = 20.0  # s that a node may take to end before it is killed
 _TAIL = 12  # lines of a failed node's log that are shown
 _PR_SET_PDEATHSIG = 1
 
