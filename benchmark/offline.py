@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The closed loop offline, beside the same in C, numpy and other people's simulators."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from c_reference import compiled
+from peers import loops
+from peers.octave import octave_loop
+from timing import Ratio, interleaved, ratio
+
+from blf_dsc_controller.simulation import simulate
+
+GROUP = 'closed loop offline'
+PACKAGE = 'blf_dsc_controller'
+C = 'C -O3'
+_LONG = 60.0  # s
+_SHORT = 8.0  # s, past the moment where learning begins
+_AGREEMENT = 10.0  # s
+_ROUNDS = 5
+
+_PEERS = {
+    'numpy': ('numpy', loops.numpy_loop, 'law, arm and DP5 in numpy'),
+    'scipy solve_ivp': (
+        'scipy',
+        loops.scipy_loop,
+        'adaptive steps of a continuous problem between samples, law in numpy',
+    ),
+    'MuJoCo': ('mujoco', loops.mujoco_loop, 'its RK4, law in numpy'),
+    'Drake': ('pydrake', loops.drake_loop, 'MultibodyPlant, fixed RK3, law in numpy'),
+    'pinocchio': ('pinocchio', loops.pinocchio_loop, 'aba, DP5 and law in numpy'),
+}
+
+
+def measure() -> Iterator[Ratio]:
+    """Time per closed-loop millisecond relative to the package; C and Octave where installed."""
+    yield from _beside_c()
+    yield from _beside_peers()
+
+
+def disagreement() -> float:
+    """Largest difference to the C reference over 10 s in errors [rad], torques and estimates."""
+    plant = replace(loops.PLANT, duration=_AGREEMENT)
+    rows = compiled()(loops.CONTROLLER, plant)
+    record = simulate(loops.CONTROLLER, plant)
+    told = [record.sample(k) for k in range(len(rows))]
+    mine = np.array([np.concatenate((s.xi1, s.torque, s.estimate)) for s in told])
+    return float(np.abs(mine - rows).max())
+
+
+def _package(duration: float) -> Callable[[], int]:
+    plant = replace(loops.PLANT, duration=duration)
+    return lambda: simulate(loops.CONTROLLER, plant).stamps.size
+
+
+def _beside_c() -> Iterator[Ratio]:
+    run = compiled()
+    plant = replace(loops.PLANT, duration=_LONG)
+    contestants = {
+        PACKAGE: _package(_LONG),
+        C: lambda: len(run(loops.CONTROLLER, plant)),
+    }
+    times = interleaved(contestants, 4 * _ROUNDS)
+    yield ratio(
+        GROUP, PACKAGE, C, times[PACKAGE], times[C], f'largest difference {disagreement():.0e}'
+    )
+
+
+def _beside_peers() -> Iterator[Ratio]:
+    contestants = {PACKAGE: _package(_SHORT)}
+    notes = {}
+    for name, (module, loop, note) in _PEERS.items():
+        if importlib.util.find_spec(module) is not None:
+            contestants[name] = lambda loop=loop: len(loop(_SHORT))
+            notes[name] = note
+    if shutil.which('octave'):
+        contestants['Octave'] = lambda: octave_loop(_SHORT)
+        notes['Octave'] = "the whole loop in Octave, MATLAB's stand-in; its start-up taken off"
+    times = interleaved(contestants, _ROUNDS)
+    for name, note in notes.items():
+        yield ratio(GROUP, name, PACKAGE, times[name], times[PACKAGE], note)
