@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -36,6 +36,9 @@ _ROUNDS = 5
 _STEPS = 5000
 _WARM_UP = 500
 _START = 1_000_000_000
+_SETTLING = 1.0  # s until both sides have found each other
+_PATIENCE = 10.0  # s for one torque
+_START_UP = 120.0  # s, kernels may have to be compiled
 _NULL = 'null node'
 _NULL_TYPED = 'null node, typed messages'
 _QUIET = 'controller, telemetry off'
@@ -66,6 +69,7 @@ class Arm:
         self.executor = EventsExecutor()
         self.executor.add_node(self.node)
         states, commands = topics.JOINT_STATES, topics.COMMANDS
+        self.commands = commands.relative
         self.publisher = self.node.create_publisher(
             message_class(states.type), states.name, profile(states.offered)
         )
@@ -84,8 +88,9 @@ class Arm:
 
     def play(self, pid: int, period: float) -> Run:
         """Play all states, each `period` [s] after the last; 0: each when the last is answered."""
-        self._await(lambda: self.publisher.get_subscription_count() > 0)
-        time.sleep(0.3)
+        self._await(lambda: self.publisher.get_subscription_count() == 1)
+        self._await(lambda: self.node.count_publishers(self.commands) == 1)
+        time.sleep(_SETTLING)
         latency = np.zeros(len(self.messages))
         begin = time.perf_counter()
         busy = cpu_time(pid)
@@ -101,15 +106,24 @@ class Arm:
             sent = time.perf_counter()
             self.publisher.publish(message)
             while not self.answered:
-                self.executor.spin_once(timeout_sec=1.0)
+                self.executor.spin_once(timeout_sec=_PATIENCE)
+                if time.perf_counter() - sent > _PATIENCE:
+                    raise TimeoutError(f'no torque for state {k} of {pid}')
             latency[k] = time.perf_counter() - sent
         elapsed = time.perf_counter() - begin
         return Run(latency[_WARM_UP:], elapsed, cpu_time(pid) - busy)
 
-    def _await(self, condition: object) -> None:
-        assert callable(condition)
+    def left_alone(self) -> None:
+        """Wait until the last contestant has gone."""
+        self._await(lambda: self.publisher.get_subscription_count() == 0)
+        self._await(lambda: self.node.count_publishers(self.commands) == 0)
+
+    def _await(self, condition: Callable[[], bool]) -> None:
+        begin = time.perf_counter()
         while not condition():
             self.executor.spin_once(timeout_sec=0.05)
+            if time.perf_counter() - begin > _START_UP:
+                raise TimeoutError('a contestant did not start or did not end')
 
 
 def cpu_time(pid: int) -> float:
@@ -132,6 +146,8 @@ def measure() -> Iterator[Ratio]:
                 for runs, period in ((real, 1e-3), (lockstep, 0.0)):
                     with _started(name, Path(folder), f'{k}-{name}-{period}') as pid:
                         runs[name].append(arm.play(pid, period))
+                    arm.left_alone()
+                    print(name, period, np.median(runs[name][-1].latency)*1e6, np.percentile(runs[name][-1].latency,99.9)*1e6, runs[name][-1].cpu, flush=True)
     yield from _real_time(real)
     yield from _rates(lockstep)
 
