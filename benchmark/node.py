@@ -147,7 +147,6 @@ def measure() -> Iterator[Ratio]:
                     with _started(name, Path(folder), f'{k}-{name}-{period}') as pid:
                         runs[name].append(arm.play(pid, period))
                     arm.left_alone()
-                    print(name, period, np.median(runs[name][-1].latency)*1e6, np.percentile(runs[name][-1].latency,99.9)*1e6, runs[name][-1].cpu, flush=True)
     yield from _real_time(real)
     yield from _rates(lockstep)
 
@@ -182,7 +181,8 @@ def _started(name: str, folder: Path, tag: str) -> Iterator[int]:
     processes = []
     if name == _RECORDED:
         bag = folder / tag.replace(' ', '_')
-        processes.append(_spawn('-m', 'blf_dsc_controller.nodes.recorder_node', '-p', f'output:={bag}'))
+        module = 'blf_dsc_controller.nodes.recorder_node'
+        processes.append(_spawn('-m', module, '-p', f'output:={bag}'))
     if name in (_NULL, _NULL_TYPED):
         kind = 'raw' if name == _NULL else 'typed'
         processes.append(_spawn(str(_HERE / 'null_node.py'), kind))

@@ -49,9 +49,7 @@ def ratio(
     )
 
 
-def interleaved(
-    contestants: Mapping[str, Callable[[], int]], rounds: int
-) -> dict[str, np.ndarray]:
+def interleaved(contestants: Mapping[str, Callable[[], int]], rounds: int) -> dict[str, np.ndarray]:
     """Seconds per unit of work (rounds,) of each contestant, all of them in each round.
 
     A contestant does its work and returns how many units that was.  One round is not counted.

@@ -23,6 +23,7 @@ from blf_dsc_controller.bags.errors import (
     ShortArrayError,
 )
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.core import soundness
 from blf_dsc_controller.errors import BlfDscError, OutsideBarrierError
 from blf_dsc_controller.motion.errors import MotionError, TrajectoryError
 from blf_dsc_controller.motion.start import begin, rules_of
@@ -213,7 +214,7 @@ class Guard:
         trust = self.supervisor.inspect(self.config.safety, stamp, q, dq, effort)
         if trust is Trust.SKIP:
             return None
-        self._remember(q, dq)
+        self._remember(q, dq, trust)
         if trust is Trust.STOP:
             return self._safe(self.config.sample_time)
         if self.supervisor.phase is Phase.STARTING and not self._begin(stamp, q, dq):
@@ -287,25 +288,39 @@ class Guard:
         torque = controller.update(t, dt, measurement)
         self.compute_time = perf_counter() - before
         self.last_stamp = stamp
-        trusted = self.supervisor.judge(
-            self.config.safety, controller.settings, controller.signals, controller.sample, dt
-        )
-        self._watch_bound()
-        if not trusted:
+        if not self._is_trusted(dt):
             return self._safe(self.config.sample_time)
-        self._keep()
         self._measurement[:] = measurement
         self._torque[:] = torque
         self._commanded = self.answered = True
         return self._torque
 
-    def _watch_bound(self) -> None:
-        ratio = np.abs(self.controller.sample.xi1) / self.controller.sample.bound
-        np.fmax(self.ratio, ratio, out=self.ratio)
-        if not ratio.max() < 1.0:
+    def _is_trusted(self, dt: float) -> bool:
+        """Whether the torque may be used: by a quick look, or in doubt by a judgement."""
+        controller, safety = self.controller, self.config.safety
+        verdict = soundness.look(
+            controller.settings_vector,
+            controller.signals_vector,
+            controller.sample_vector,
+            safety.error_ratio,
+            self.ratio,
+            self._kept,
+        )
+        if verdict & soundness.OUTSIDE:
             self.outside += 1
+        if not verdict & soundness.SUSPECT:
+            return self.supervisor.accept(dt)
+        trusted = self.supervisor.judge(
+            safety, controller.settings, controller.signals, controller.sample, dt
+        )
+        if trusted:
+            self._keep()
+        return trusted
 
-    def _remember(self, q: Vector, dq: Vector) -> None:
+    def _remember(self, q: Vector, dq: Vector, trust: Trust) -> None:
+        if trust is Trust.USE:
+            self._q[:], self._dq[:] = q, dq
+            return
         if np.isfinite(q).all():
             self._q[:] = q
         self._dq[:] = np.where(np.isfinite(dq), dq, 0.0)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.safety import Safety
 from blf_dsc_controller.core.sample import Sample
 from blf_dsc_controller.core.settings import LINEAR, Settings
+from blf_dsc_controller.core.soundness import state_is_sound
 from blf_dsc_controller.core.state import Signals
 from blf_dsc_controller.safety.monitors import Overruns, Saturation
 from blf_dsc_controller.safety.reasons import Phase, Reason
@@ -149,17 +150,22 @@ class Supervisor:
         return self._halt(Reason.OVERRUN, text)
 
     def _inspect_values(self, safety: Safety, q: Vector, dq: Vector) -> Trust:
+        if state_is_sound(q, dq, safety.velocity_limit):
+            return Trust.USE
         if not (np.isfinite(q).all() and np.isfinite(dq).all()):
             text = f'the joint state is not finite: positions {q}, velocities {dq}'
             return self._halt(Reason.NOT_FINITE, text)
         worst = int(np.argmax(np.abs(dq)))
-        if abs(dq[worst]) > safety.velocity_limit:
-            text = (
-                f'joint {self._joints[worst]!r} is said to move at {dq[worst]:+.6g} rad/s: more '
-                f'than safety.velocity_limit, {safety.velocity_limit:g} rad/s'
-            )
-            return self._halt(Reason.VELOCITY, text)
-        return Trust.USE
+        text = (
+            f'joint {self._joints[worst]!r} is said to move at {dq[worst]:+.6g} rad/s: more '
+            f'than safety.velocity_limit, {safety.velocity_limit:g} rad/s'
+        )
+        return self._halt(Reason.VELOCITY, text)
+
+    def accept(self, dt: float) -> bool:
+        """Take note of an answer that there is nothing to say against, `dt` [s] after the last."""
+        self.saturation.take(dt, saturated=False)
+        return self.running
 
     def judge(
         self, safety: Safety, settings: Settings, signals: Signals, told: Sample, dt: float
