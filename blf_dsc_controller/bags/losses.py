@@ -15,10 +15,12 @@ class Losses:
 
     Attributes:
         missed: messages that did not come; None if that cannot be told.
+        before: messages that its publisher had sent before the first that came.
     """
 
     def __init__(self, publishers: int) -> None:
         self.missed: int | None = 0
+        self.before = 0
         self._last = 0
         self.publishers_seen(publishers)
 
@@ -29,10 +31,15 @@ class Losses:
 
     def count(self, sequence: int) -> None:
         """Take note of a message; a number that is not higher than the last is a new publisher."""
+        if not self._last:
+            self.before = max(sequence - 1, 0)
         if self.missed is not None and self._last and sequence > self._last:
             self.missed += sequence - self._last - 1
         self._last = sequence
 
     def text(self) -> str:
         """Words to follow the number of messages that came."""
-        return '' if self.missed is None else f', {self.missed} missed'
+        if self.missed is None:
+            return ''
+        earlier = f', {self.before} sent before the recorder heard them' if self.before else ''
+        return f', {self.missed} missed{earlier}'

@@ -70,7 +70,8 @@ HISTORY = Quality(depth=5000, durability='transient_local')
 LATCHED = Quality(depth=1, durability='transient_local')
 DIAGNOSTIC = Quality(depth=10)
 
-JOINT_STATES = Topic(PLANT, 'joint_states', JOINT_STATE, STREAM, LATEST)
+# Kept for who comes late: a recorder may match the plant a moment after the plant has matched it.
+JOINT_STATES = Topic(PLANT, 'joint_states', JOINT_STATE, HISTORY, LATEST)
 COMMANDS = Topic(CONTROLLER, '~/commands', FLOAT64_MULTI_ARRAY, STREAM, LATEST)
 REFERENCE = Topic(CONTROLLER, '~/reference', JOINT_STATE, STREAM, STREAM)
 TRACKING_ERROR = Topic(CONTROLLER, '~/tracking_error', JOINT_STATE, STREAM, STREAM)

@@ -21,6 +21,17 @@ class NothingToCompareError(BlfDscError):
         )
 
 
+class LateRecordingError(BlfDscError):
+    """A bag that begins after the controller did, so that the state of the law is not known."""
+
+    def __init__(self, path: Path, stamp: int) -> None:
+        self.path = path
+        super().__init__(
+            f'{path} does not hold the first state that the controller answered, that of stamp '
+            f'{stamp} ns, so what it knew at any later one cannot be told: start the recorder first'
+        )
+
+
 class NoTorqueError(BlfDscError):
     """A bag that does not tell which torques acted on the arm."""
 

@@ -17,7 +17,7 @@ from blf_dsc_controller.bags.topics import BOUND, FOREVER
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.replay.changes import changes_of, restarts
 from blf_dsc_controller.replay.comparison import Comparison, Difference, compare, first
-from blf_dsc_controller.replay.errors import NothingToCompareError
+from blf_dsc_controller.replay.errors import LateRecordingError, NothingToCompareError
 from blf_dsc_controller.replay.expected import expected
 from blf_dsc_controller.replay.law import run_law
 from blf_dsc_controller.replay.states import States, answered_states
@@ -61,6 +61,8 @@ def replay(path: Path, namespace: str = '') -> Outcome:
     content = read_content(path, namespace)
     recorded = context.controller()
     states = answered_states(content, recorded.config.joints, ('position',))
+    if states.lost is not None and not states.stamp.size:
+        raise LateRecordingError(path, states.lost)
     again = restarts(content, recorded.config, int(states.stamp[0]))
     end = int(again[0]) if again.size else FOREVER
     states = states.until(end)

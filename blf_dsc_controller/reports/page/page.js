@@ -1,0 +1,157 @@
+// SPDX-License-Identifier: Apache-2.0
+// Draws the panels and the arm from the data of the page; nothing is loaded from elsewhere.
+'use strict';
+
+const data = JSON.parse(document.getElementById('data').textContent);
+const timePlots = [];
+const duration = Math.max(...data.arms.map((arm) => arm.time[arm.time.length - 1]));
+let following = false;
+
+function layoutOf(panel) {
+  const grid = {gridcolor: '#e5e7eb', zerolinecolor: '#d1d5db'};
+  return {
+    title: {text: panel.title, x: 0.01, xanchor: 'left', font: {size: 14}},
+    margin: {l: 62, r: 34, t: 50, b: 40},
+    paper_bgcolor: 'white', plot_bgcolor: 'white', bargap: 0, barmode: 'overlay',
+    legend: {orientation: 'h', x: 1, xanchor: 'right', y: 1.01, yanchor: 'bottom',
+      font: {size: 11}},
+    modebar: {orientation: 'v'},
+    font: {family: 'system-ui, DejaVu Sans, sans-serif', size: 12, color: '#22272e'},
+    hovermode: panel.time ? 'x' : 'closest',
+    dragmode: 'zoom',
+    xaxis: {...grid, title: {text: panel.time ? 'time [s]' : `[${panel.unit}]`, standoff: 6},
+      ...(panel.time ? {range: [0, duration]} : {})},
+    yaxis: {...grid, title: {text: panel.time ? panel.unit : 'count', standoff: 4},
+      type: panel.log ? 'log' : 'linear', exponentformat: 'power'},
+    shapes: panel.marks.map(([time, colour]) => ({type: 'line', x0: time, x1: time, y0: 0, y1: 1,
+      yref: 'paper', line: {color: colour, width: 1.2, dash: 'dot'}})),
+    annotations: panel.marks.map(([time, colour]) => ({x: time, y: 1, yref: 'paper', yanchor: 'top',
+      xanchor: 'left', text: 'latch', showarrow: false, font: {size: 11, color: colour}})),
+  };
+}
+
+// Zooming one panel over time zooms all of them.
+function follow(source, change) {
+  if (following) return;
+  let update = null;
+  if (change['xaxis.autorange']) update = {'xaxis.autorange': true};
+  if (change['xaxis.range[0]'] !== undefined) {
+    update = {'xaxis.range': [change['xaxis.range[0]'], change['xaxis.range[1]']]};
+  }
+  if (!update) return;
+  following = true;
+  const others = timePlots.filter((plot) => plot !== source);
+  Promise.all(others.map((plot) => Plotly.relayout(plot, {...update})))
+    .finally(() => { following = false; });
+}
+
+function draw(panel, place) {
+  const traces = panel.traces.map((trace) => ({mode: 'lines', connectgaps: false, ...trace}));
+  const options = {responsive: true, displaylogo: false, scrollZoom: false};
+  return Plotly.newPlot(place, traces, layoutOf(panel), options).then(() => {
+    if (!panel.time) return;
+    timePlots.push(place);
+    place.on('plotly_relayout', (change) => follow(place, change));
+  });
+}
+
+async function drawAll() {
+  const plots = document.getElementById('plots');
+  const places = [];
+  let group = '';
+  let grid = null;
+  for (const panel of data.panels) {
+    if (panel.group !== group) {
+      group = panel.group;
+      const heading = document.createElement('h2');
+      heading.textContent = group;
+      heading.id = group;
+      grid = document.createElement('div');
+      grid.className = 'grid';
+      plots.append(heading, grid);
+    }
+    const place = document.createElement('div');
+    place.className = 'plot';
+    grid.append(place);
+    places.push([panel, place]);
+  }
+  for (const [panel, place] of places) {
+    await draw(panel, place);
+    // Between two plots the browser gets to show what there is.
+    await new Promise((resolve) => { setTimeout(resolve, 0); });
+  }
+  window.reportReady = performance.now();
+}
+
+const canvas = document.getElementById('arm');
+const slider = document.getElementById('arm-time');
+const clock = document.getElementById('arm-clock');
+const play = document.getElementById('arm-play');
+let playing = null;
+
+function points(arm, angles) {
+  const found = [[0, 0]];
+  let angle = 0;
+  angles.forEach((turn, i) => {
+    angle += turn;
+    const [x, y] = found[i];
+    found.push([x + arm.lengths[i] * Math.cos(angle), y + arm.lengths[i] * Math.sin(angle)]);
+  });
+  return found;
+}
+
+function drawArm(time) {
+  const scale = window.devicePixelRatio || 1;
+  const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+  canvas.width = width * scale;
+  canvas.height = height * scale;
+  const pen = canvas.getContext('2d');
+  pen.setTransform(scale, 0, 0, scale, 0, 0);
+  pen.clearRect(0, 0, width, height);
+  const reach = Math.max(...data.arms.map((arm) => arm.lengths.reduce((sum, l) => sum + l, 0)));
+  const unit = 0.46 * Math.min(width, height) / reach;
+  const place = ([x, y]) => [width / 2 + unit * x, height / 2 - unit * y];
+  const line = (corners, colour, thickness) => {
+    pen.strokeStyle = colour;
+    pen.lineWidth = thickness;
+    pen.lineCap = pen.lineJoin = 'round';
+    pen.beginPath();
+    corners.map(place).forEach(([x, y]) => pen.lineTo(x, y));
+    pen.stroke();
+  };
+  line([[-reach, 0], [reach, 0]], '#e5e7eb', 1);
+  for (const arm of data.arms) {
+    const last = arm.time.length - 1;
+    const k = Math.min(last, Math.round(time / arm.time[last] * last) || 0);
+    const corners = points(arm, arm.angles[k]);
+    line(corners, arm.colour, 6);
+    corners.map(place).forEach(([x, y]) => {
+      pen.fillStyle = arm.colour;
+      pen.beginPath();
+      pen.arc(x, y, 6, 0, 7);
+      pen.fill();
+    });
+    if (arm.reference.length) line(points(arm, arm.reference[k]), '#22272e', 1.5);
+  }
+  clock.textContent = `${time.toFixed(2)} s`;
+  canvas.dataset.time = time;
+}
+
+function showArm() { drawArm(slider.value / 1000 * duration); }
+
+play.addEventListener('click', () => {
+  playing = playing === null ? performance.now() - slider.value / 1000 * duration * 1e3 : null;
+  play.textContent = playing === null ? 'play' : 'pause';
+  const step = (now) => {
+    if (playing === null) return;
+    const time = ((now - playing) / 1e3) % duration;
+    slider.value = time / duration * 1000;
+    drawArm(Math.max(0, time));
+    requestAnimationFrame(step);
+  };
+  if (playing !== null) requestAnimationFrame(step);
+});
+slider.addEventListener('input', () => { playing = null; play.textContent = 'play'; showArm(); });
+window.addEventListener('resize', showArm);
+showArm();
+drawAll();

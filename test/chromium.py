@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A headless Chromium, told what to do over the pipe of its DevTools: no driver is needed."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import select
+import shutil
+import subprocess
+import time
+
+FLAGS = (
+    '--headless',
+    '--no-sandbox',
+    '--disable-gpu',
+    '--disable-quic',
+    '--no-first-run',
+    '--disable-background-networking',
+    '--disable-component-update',
+    '--disable-sync',
+    '--remote-debugging-pipe',
+    '--window-size=1400,1000',
+)
+NAMES = ('chromium', 'chromium-browser', 'google-chrome')
+PATIENCE = 120.0  # s, until a test gives up on what should take seconds
+
+
+def find():
+    """Path of a Chromium, None if there is none."""
+    return next((path for name in NAMES if (path := shutil.which(name))), None)
+
+
+class Browser:
+    """One page in a browser of its own; `complaints` gathers errors of console and scripts."""
+
+    def __init__(self, profile):
+        theirs_in, self._to = os.pipe()
+        self._from, theirs_out = os.pipe()
+        launch = f'exec {find()} "$@" 3<&{theirs_in} 4>&{theirs_out}'
+        self._process = subprocess.Popen(
+            ['/bin/bash', '-c', launch, 'chromium', *FLAGS, f'--user-data-dir={profile}'],
+            pass_fds=(theirs_in, theirs_out),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        os.close(theirs_in)
+        os.close(theirs_out)
+        self._number = 0
+        self._pending = b''
+        self._session = None
+        self.complaints = []
+        target = self.call('Target.createTarget', url='about:blank')['targetId']
+        attached = self.call('Target.attachToTarget', targetId=target, flatten=True)
+        self._session = attached['sessionId']
+        for domain in ('Page', 'Runtime', 'Log'):
+            self.call(f'{domain}.enable')
+
+    def call(self, method, **parameters):
+        """Let the browser do something and return what it answers."""
+        self._number += 1
+        request = {'id': self._number, 'method': method, 'params': parameters}
+        if self._session:
+            request['sessionId'] = self._session
+        os.write(self._to, json.dumps(request).encode() + b'\0')
+        while True:
+            answer = self._take()
+            if answer.get('id') == self._number:
+                assert 'error' not in answer, answer
+                return answer['result']
+
+    def value(self, expression):
+        """Value of an expression in the page."""
+        told = self.call('Runtime.evaluate', expression=expression, returnByValue=True)
+        assert 'exceptionDetails' not in told, told
+        return told['result'].get('value')
+
+    def wait(self, expression):
+        """Wait until an expression in the page is true, and return it."""
+        deadline = time.monotonic() + PATIENCE
+        while not (value := self.value(expression)):
+            assert time.monotonic() < deadline, f'still waiting for {expression}'
+            time.sleep(0.05)
+        return value
+
+    def mouse(self, kind, x, y):
+        """Move, press or release the left button at a place of the window."""
+        self.call(
+            'Input.dispatchMouseEvent',
+            type=kind,
+            x=x,
+            y=y,
+            button='left',
+            buttons=0 if kind == 'mouseReleased' else 1,
+            clickCount=1,
+        )
+
+    def drag(self, start, end):
+        """Drag from one place of the window to another."""
+        (x0, y0), (x1, y1) = start, end
+        self.mouse('mousePressed', x0, y0)
+        for k in range(1, 6):
+            self.mouse('mouseMoved', x0 + (x1 - x0) * k / 5, y0 + (y1 - y0) * k / 5)
+        self.mouse('mouseReleased', x1, y1)
+
+    def screenshot(self, path, *, whole=False):
+        """Write what the window shows, or the whole page, as PNG."""
+        told = self.call('Page.captureScreenshot', captureBeyondViewport=whole, format='png')
+        path.write_bytes(base64.b64decode(told['data']))
+
+    def close(self):
+        """End the browser."""
+        self._process.kill()
+        self._process.wait()
+        os.close(self._to)
+        os.close(self._from)
+
+    def _take(self):
+        deadline = time.monotonic() + PATIENCE
+        while b'\0' not in self._pending:
+            ready, _, _ = select.select([self._from], [], [], 1.0)
+            assert time.monotonic() < deadline, 'the browser says nothing'
+            if ready:
+                came = os.read(self._from, 1 << 20)
+                assert came, 'the browser has ended'
+                self._pending += came
+        raw, self._pending = self._pending.split(b'\0', 1)
+        message = json.loads(raw)
+        self._note(message)
+        return message
+
+    def _note(self, message):
+        told = message.get('params', {})
+        if message.get('method') == 'Runtime.exceptionThrown':
+            self.complaints.append(told['exceptionDetails'])
+        elif message.get('method') == 'Runtime.consoleAPICalled':
+            if told['type'] in ('error', 'warning', 'assert'):
+                self.complaints.append(told['args'])
+        elif message.get('method') == 'Log.entryAdded' and told['entry']['level'] == 'error':
+            self.complaints.append(told['entry'])

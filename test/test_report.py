@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the page of a bag is made of: every panel, event and parameter, without a browser."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import recorded_run
+import synthetic_bag
+from synthetic_bag import JOINTS, Synthetic
+
+from blf_dsc_controller.bags.topics import JOINT_STATES
+from blf_dsc_controller.reports.html import write_page
+from blf_dsc_controller.reports.motion import animation, lengths
+from blf_dsc_controller.reports.panels import panels
+from blf_dsc_controller.reports.subject import read_subjects
+from blf_dsc_controller.tools.bag_report import main
+
+pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp('bags')
+    recorded_run.record(path / 'one')
+    recorded_run.record(path / 'other', **{'feedback.gain': [30.0, 10.0]})
+    made = Synthetic(4000)
+    made.error[1234, 0] = -0.005  # one sample far outside
+    made.torque[2000:2010, 1] = 20.0  # ten at the limit
+    synthetic_bag.write(path / 'synthetic', made.messages(with_timing=True))
+    return path
+
+
+def by_title(subjects):
+    return {panel['title']: panel for panel in panels(subjects)}
+
+
+def test_every_quantity_has_its_panel(folder):
+    titles = set(by_title(read_subjects([folder / 'synthetic'])))
+    expected = {f'{what} of {joint}' for what in ('error', 'position', 'torque') for joint in JOINTS}
+    expected |= {'(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2', 'relative parameter error'}
+    expected |= {'least eigenvalue', *(f'disturbance {joint}' for joint in JOINTS)}
+    expected |= {'period of the joint states, as received', 'state to torque'}
+    assert titles == {*expected, 'time that the law takes'}
+
+
+def test_a_peak_of_one_sample_is_not_thinned_away(folder):
+    panel = by_title(read_subjects([folder / 'synthetic']))['error of shoulder']
+    error, bound, _ = panel['traces']
+    k = int(np.argmin(error['y']))
+    assert (error['x'][k], error['y'][k]) == (1.234, -5.0)
+    assert len(error['x']) <= 3000
+    assert set(bound['y']) == {2.0}
+
+
+def test_events_tell_violations_saturation_and_the_latch(folder):
+    (subject,) = read_subjects([folder / 'synthetic'])
+    told = {(event.kind, round(event.time, 3)): event.text for event in subject.events}
+    assert told == {
+        ('violation', 1.234): 'shoulder outside of its bound for 1 samples',
+        ('learning', 1.5): 'the first window was excited enough: learning began',
+        ('saturation', 2.0): 'elbow at its torque limit for 10 samples',
+    }
+
+
+def test_several_bags_lie_over_each_other_and_their_differences_are_told(folder, tmp_path):
+    subjects = read_subjects([folder / 'one', folder / 'other'])
+    panel = by_title(subjects)['error of joint1']
+    names = [trace['name'] for trace in panel['traces']]
+    assert names == [f'{bag}: {what}' for bag in ('one', 'other') for what in ('error', *['bound'] * 2)]
+    assert panel['traces'][0]['line']['color'] != panel['traces'][3]['line']['color']
+    write_page(subjects, tmp_path / 'page.html')
+    text = (tmp_path / 'page.html').read_text()
+    assert '<p>1 parameters differ.</p>' in text
+    row = 'blf_dsc_controller: feedback.gain</td><td>[60.0, 20.0]</td><td>[30.0, 10.0]</td>'
+    assert row in text
+
+
+def test_bags_of_one_name_are_told_apart(folder):
+    with_bag = [folder / 'one', folder / '..' / folder.name / 'other', folder / 'one']
+    assert [one.name for one in read_subjects(with_bag)] == ['one (1)', 'other', 'one (2)']
+
+
+def test_the_arm_has_its_lengths_and_moves_as_measured(folder):
+    (subject,) = read_subjects([folder / 'one'])
+    assert lengths(subject) == [1.0, 0.8]  # of the plant's configuration
+    (arm,) = animation([subject])
+    assert len(arm['time']) == 50  # a second, at fifty pictures
+    assert arm['angles'][-1] == pytest.approx(subject.run.position[-1], abs=1e-4)
+    assert arm['reference'][0] == pytest.approx(subject.run.reference[0], abs=1e-4)
+
+
+def test_a_page_is_one_file_whose_data_no_name_can_break(folder, tmp_path):
+    (subject,) = read_subjects([folder / 'one'])
+    nasty = '</script><b>&{{data}}'
+    write_page([replace(subject, name=nasty)], tmp_path / 'page.html')
+    text = (tmp_path / 'page.html').read_text()
+    assert not re.search(r'(?:src|href)="(?!#|data:)', text)
+    embedded = re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1]
+    assert json.loads(embedded)['arms'][0]['name'] == nasty
+    assert '<b>' not in text.replace(embedded, '').split('<script>')[0]
+
+
+def test_joint_states_alone_make_a_page(folder, tmp_path):
+    states = [one for one in Synthetic(500).messages() if one[0] is JOINT_STATES]
+    synthetic_bag.write(tmp_path / 'bag', states)
+    assert main([str(tmp_path / 'bag'), '--out', str(tmp_path / 'page.html')]) == 0
+    assert 'not recorded in the bag' in (tmp_path / 'page.html').read_text()
+
+
+def test_what_is_wrong_is_one_message(tmp_path, capsys):
+    assert main([str(tmp_path / 'nowhere'), '--out', str(tmp_path / 'page.html')]) == 1
+    assert capsys.readouterr().err.startswith('bag_report: ')
+    assert not (tmp_path / 'page.html').exists()

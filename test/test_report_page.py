@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of a bag in a browser: it draws, it zooms, it complains of nothing. `make test-browser`.
+
+What is plotted is checked without a browser in test_report.py.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import chromium
+import pytest
+import recorded_run
+
+pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
+
+from blf_dsc_controller.reports.html import write_page
+from blf_dsc_controller.reports.subject import read_subjects
+
+pytestmark = [
+    pytest.mark.skipif(chromium.find() is None, reason='there is no Chromium here'),
+    pytest.mark.skipif(not os.environ.get('BROWSER_TESTS'), reason='runs in make test-browser'),
+]
+
+PLOTS = "document.querySelectorAll('.js-plotly-plot')"
+SHOTS = Path(os.environ.get('BROWSER_SHOTS') or '.')
+
+
+@pytest.fixture(scope='module')
+def pages(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('pages')
+    one = recorded_run.record(folder / 'one', 4.0)
+    other = recorded_run.record(folder / 'other', 4.0, **{'feedback.gain': [30.0, 10.0]})
+    write_page(read_subjects([one]), folder / 'one.html')
+    write_page(read_subjects([one, other]), folder / 'both.html')
+    return folder
+
+
+@pytest.fixture
+def browser(tmp_path):
+    one = chromium.Browser(tmp_path / 'profile')
+    yield one
+    one.close()
+
+
+def show(browser, path):
+    browser.call('Page.navigate', url=path.as_uri())
+    browser.wait('window.reportReady')
+
+
+def ranges(browser):
+    return browser.value(
+        f'Array.from({PLOTS}).filter(p => p.layout.xaxis.title.text == "time [s]")'
+        '.map(p => p.layout.xaxis.range)'
+    )
+
+
+@pytest.mark.parametrize('name', ['one', 'both'])
+def test_every_panel_is_drawn_and_nothing_complains(browser, pages, name):
+    show(browser, pages / f'{name}.html')
+    drawn = browser.value(f"Array.from({PLOTS}).filter(p => p.querySelector('.trace')).length")
+    assert drawn == browser.value('data.panels.length')
+    assert drawn >= 12  # two joints, each with error, position, torque; parameters; excitation
+    lines = browser.value("document.querySelectorAll('.scatterlayer path.js-line').length")
+    assert lines > drawn
+    browser.screenshot(SHOTS / f'report_{name}.png')
+    browser.screenshot(SHOTS / f'report_{name}_whole.png', whole=True)
+    assert browser.complaints == []
+
+
+def test_nothing_is_loaded_from_elsewhere(browser, pages):
+    show(browser, pages / 'one.html')
+    assert browser.value('performance.getEntriesByType("resource").length') == 0
+
+
+def test_dragging_zooms_all_panels_over_time_and_a_double_click_undoes_it(browser, pages):
+    show(browser, pages / 'one.html')
+    before = ranges(browser)
+    assert all(one == pytest.approx([0.0, 4.0]) for one in before)
+    place = browser.value(
+        f"(() => {{ const r = {PLOTS}[0].querySelector('.nsewdrag').getBoundingClientRect();"
+        'return [r.left, r.top, r.width, r.height]; })()'
+    )
+    left, top, width, height = place
+    middle = top + height / 2
+    browser.drag((left + width * 0.25, middle), (left + width * 0.5, middle))
+    browser.wait(f'{PLOTS}[0].layout.xaxis.range[1] < 2.5')
+    browser.wait(f'Array.from({PLOTS})[3].layout.xaxis.range[1] < 2.5')
+    for low, high in ranges(browser):
+        assert low == pytest.approx(1.0, abs=0.05)
+        assert high == pytest.approx(2.0, abs=0.05)
+    browser.screenshot(SHOTS / 'report_zoomed.png')
+    assert browser.complaints == []
+
+
+def test_the_arm_moves(browser, pages):
+    show(browser, pages / 'one.html')
+    browser.value("document.getElementById('arm-play').click()")
+    browser.wait("document.getElementById('arm').dataset.time > 0.2")
+    picture = "document.getElementById('arm').toDataURL()"
+    first = browser.value(picture)
+    browser.wait(f'{picture} != {first!r}')
+    browser.value("document.getElementById('arm').scrollIntoView()")
+    browser.screenshot(SHOTS / 'report_arm.png')
+    assert browser.complaints == []
