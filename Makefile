@@ -38,10 +38,10 @@ PIP_FAILED := { echo 'The installation failed: see above. It needs a package ind
   'set HTTPS_PROXY, for a mirror PIP_INDEX_URL, without a network PIP_FIND_LINKS and' \
   'PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
 
-.PHONY: help venv demo paper test lint clean
+.PHONY: help venv demo paper test test-browser lint clean
 
 help: ## List what can be made
-	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1	\2/p' Makefile
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' Makefile
 
 venv: $(READY) ## Install everything into .venv (the others do it when needed)
 
@@ -59,6 +59,9 @@ paper: $(READY) ## Run the paper's simulation with every law and judge its claim
 
 test: $(READY) ## Run the tests (TESTS=test/test_x.py for some)
 	@$(if $(filter sourced,$(FLAVOUR)),PYTEST_DISABLE_PLUGIN_AUTOLOAD=1) $(RUN) -m pytest $(TESTS)
+
+test-browser: $(READY) ## Open the page of bag_report in a headless Chromium, if there is one
+	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_report_page.py
 
 lint: $(LINT_READY) ## Check style and types
 	@good=1; for check in 'ruff check' 'ruff format --check' mypy; do \

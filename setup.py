@@ -34,7 +34,7 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*', 'sim_plant', 'sim_plant.*']),
-    package_data={NAME: ['py.typed'], 'sim_plant': ['py.typed']},
+    package_data={NAME: ['py.typed', 'reports/page/page.*'], 'sim_plant': ['py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (SHARE, ['package.xml']),
@@ -71,6 +71,8 @@ setup(
         'monte-carlo': ['pyarrow'],
         'dask': ['pyarrow', 'distributed'],
         'mpi': ['pyarrow', 'mpi4py'],
+        # Only for `bag_report`: what draws its pages, 40 MB.
+        'report': ['plotly>=6'],
         # setuptools: test_package.py builds a wheel without going to the network.
         'test': [
             'pytest>=7',
@@ -80,6 +82,7 @@ setup(
             'setuptools>=70.1',
             'pyarrow',
             'distributed',
+            'plotly>=6',
         ],
         # Fixed, because with nearly every rule on, each release of the linter finds something new.
         'lint': ['ruff~=0.17.5', 'mypy~=2.4.1', 'types-PyYAML', 'types-tqdm', 'pre-commit'],
@@ -92,6 +95,7 @@ setup(
             'closed_loop = blf_dsc_controller.tools.closed_loop:main',
             'bag_replay = blf_dsc_controller.tools.bag_replay:main',
             'bag_recover = blf_dsc_controller.tools.bag_recover:main',
+            'bag_report = blf_dsc_controller.tools.bag_report:main',
             'bag_plot = blf_dsc_controller.tools.bag_plot:main',
             'paper_study = blf_dsc_controller.tools.paper_study:main',
             'monte_carlo = blf_dsc_controller.tools.monte_carlo:main',

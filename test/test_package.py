@@ -27,6 +27,7 @@ EXECUTABLES = {
     'bag_plot',
     'bag_replay',
     'bag_recover',
+    'bag_report',
     'paper_study',
     'monte_carlo',
 }
@@ -189,7 +190,7 @@ def test_all_that_is_imported_is_declared(metadata):
     used |= set(imports(ROOT / 'launch/closed_loop.launch.py'))
     foreign = used - set(sys.stdlib_module_names) - set(PACKAGES) - {'llvmlite'}  # a part of numba
     distributions = {'pyyaml' if name == 'yaml' else name for name in foreign}
-    extras = ('study', 'monte-carlo', 'dask', 'mpi')
+    extras = ('study', 'monte-carlo', 'dask', 'mpi', 'report')
     optional = set().union(*(requirements(metadata, extra) for extra in extras))
     assert distributions <= requirements(metadata) | optional | depends('exec_depend')
 

@@ -7,6 +7,7 @@ What is plotted is checked without a browser in test_report.py.
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 
 import chromium
@@ -24,11 +25,12 @@ pytestmark = [
 ]
 
 PLOTS = "document.querySelectorAll('.js-plotly-plot')"
-SHOTS = Path(os.environ.get('BROWSER_SHOTS') or '.')
+SHOTS = Path(os.environ.get('BROWSER_SHOTS') or tempfile.gettempdir())
 
 
 @pytest.fixture(scope='module')
 def pages(tmp_path_factory):
+    SHOTS.mkdir(exist_ok=True)
     folder = tmp_path_factory.mktemp('pages')
     one = recorded_run.record(folder / 'one', 4.0)
     other = recorded_run.record(folder / 'other', 4.0, **{'feedback.gain': [30.0, 10.0]})

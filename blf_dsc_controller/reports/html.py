@@ -68,8 +68,8 @@ def _subtitle(subjects: Sequence[Subject]) -> str:
     versions = sorted({one.context.version or 'another recorder' for one in subjects})
     seconds = max(one.run.duration for one in subjects)
     return (
-        f'{seconds:.3f} s, recorded by {", ".join(versions)}. Drag to zoom, double-click to see all; '
-        'long series are thinned to their lowest and highest values.'
+        f'{seconds:.3f} s, recorded by {", ".join(versions)}. Drag to zoom, double-click for all '
+        'of it; long series are thinned to their lowest and highest values.'
     )
 
 

@@ -165,7 +165,13 @@ def _histogram(values: Floats) -> Trace:
 
 
 def _over_time(
-    subjects: Sequence[Subject], group: str, title: str, unit: str, lines: Lines, *, log: bool = False
+    subjects: Sequence[Subject],
+    group: str,
+    title: str,
+    unit: str,
+    lines: Lines,
+    *,
+    log: bool = False,
 ) -> Panel:
     traces = []
     for k, one in enumerate(subjects):
@@ -173,9 +179,7 @@ def _over_time(
             line = {'width': 1.3, 'color': colour(k), **trace.get('line', {})}
             if len(subjects) > 1 and line['color'] == INK:
                 line['color'] = colour(k)
-            traces.append(
-                {**trace, **_identity(one, k, subjects, trace['name']), 'line': line}
-            )
+            traces.append({**trace, **_identity(one, k, subjects, trace['name']), 'line': line})
     marks = [(latch_time(one.run), colour(k)) for k, one in enumerate(subjects)]
     learns = group in ('Parameters', 'Excitation', 'Disturbance')
     return {
@@ -205,9 +209,7 @@ def _limits(name: str, time: Floats, values: Floats) -> Iterator[Trace]:
         yield {**line, 'showlegend': sign > 0}
 
 
-def _line(
-    name: str, time: Floats, values: Floats, dash: str = 'solid', colour: str = ''
-) -> Trace:
+def _line(name: str, time: Floats, values: Floats, dash: str = 'solid', colour: str = '') -> Trace:
     x, y = _corners(time, values)
     line = {'dash': dash, **({'color': colour} if colour else {})}
     return {'name': name, 'x': _numbers(x), 'y': _numbers(y), 'type': 'scatter', 'line': line}
