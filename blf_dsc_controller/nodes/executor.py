@@ -81,10 +81,17 @@ def run(make_node: Callable[[], Runnable]) -> int:
         return 1
     finally:
         if node is not None:
-            node.close()
-            node.destroy_node()
+            _close(node)
         rclpy.try_shutdown()
     return 0
+
+
+def _close(node: Runnable) -> None:
+    try:
+        node.close()
+    except OSError as error:  # such as a full disk, which `run` has told of if it ended the node
+        print(f'{node.get_name()} could not end in order: {error}', file=sys.stderr)  # noqa: T201
+    node.destroy_node()
 
 
 def drain(publishers: Iterable[Publisher]) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import signal
 import sys
 from collections.abc import Sequence
@@ -36,6 +37,7 @@ from blf_dsc_controller.tools.progress import Progress
 from blf_dsc_controller.tools.session import run_session
 
 _INTERRUPTED = 130
+_ROOM = 1_000_000  # bytes that a log needs at least
 _DURATION = 60.0  # s, where neither the file nor an option says how long
 
 
@@ -157,6 +159,8 @@ def _run(options: argparse.Namespace) -> int:
             completed = run_over_ros(config, out, options.domain)
         _report_of(out, completed=completed)
     except NodeFailedError:
+        if shutil.disk_usage(out).free < _ROOM:
+            print(f'there is no room left on the disk of {out}', file=sys.stderr)
         if (out / 'bag' / 'metadata.yaml').exists():
             print(f'what was recorded until then is in {out / "bag"}', file=sys.stderr)
         raise
