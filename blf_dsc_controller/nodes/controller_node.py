@@ -19,6 +19,7 @@ from blf_dsc_controller.bags.monitor import Monitor
 from blf_dsc_controller.bags.telemetry import DECIMATION, ControllerTelemetry, Message
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.core.controller import Controller
+from blf_dsc_controller.feasibility import concerns
 from blf_dsc_controller.nodes import compilation, executor, parameters, realtime
 from blf_dsc_controller.nodes.controller_status import ControllerStatus
 from blf_dsc_controller.nodes.endpoints import publisher, subscribe
@@ -101,6 +102,8 @@ class ControllerNode(ManagedNode):
         if not compilation.is_compiled(*compilation.CONTROLLER):
             self.get_logger().info(compilation.NOTICE)
         self.guard = Guard(self.config)
+        for concern in concerns(self.config):
+            self.get_logger().warning(concern)
         if not self._publisher_of:
             outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
             self._publisher_of = {topic: publisher(self, topic) for topic in outputs}

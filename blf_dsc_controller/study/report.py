@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from blf_dsc_controller.configuration.dump import dump
+from blf_dsc_controller.feasibility import concerns
 from blf_dsc_controller.study import page, tune
 from blf_dsc_controller.study.cases import SIDE_BY_SIDE, VARIATIONS
 from blf_dsc_controller.study.claims import Claim, claims
@@ -128,6 +129,7 @@ def content(
                 f'time.'
             ),
         ),
+        page.section('Warnings before the start', page.paragraphs(*warnings())),
         page.section('What was equalised', page.paragraphs(*equalised())),
         page.section('Figures', *figures),
         page.section('Where each law breaks', *robust),
@@ -140,6 +142,16 @@ def content(
             ),
         ),
     ]
+
+
+def warnings() -> list[str]:
+    """What the feasibility checks say of the side-by-side cases."""
+    found = [
+        f'{case.label}: {concern}'
+        for case in SIDE_BY_SIDE
+        for concern in concerns(case.loop().controller)
+    ]
+    return found or ['None of these configurations is warned of.']
 
 
 def equalised() -> list[str]:

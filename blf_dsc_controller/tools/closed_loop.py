@@ -22,6 +22,7 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
 from blf_dsc_controller.configuration.params_file import load_loop, locate
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.feasibility import concerns
 from blf_dsc_controller.motion.start import plan
 from blf_dsc_controller.nodes import compilation
 from blf_dsc_controller.refusals import refusals
@@ -145,6 +146,9 @@ def report(out: Path) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     config = configure(options)
+    order = [config.plant.joints.index(joint) for joint in config.controller.joints]
+    for concern in concerns(config.controller, np.array(config.plant.initial.position)[order]):
+        print(f'warning: {concern}', file=sys.stderr)
     if not options.offline:
         require_ros()
     out = make_folder(options.out)

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Warnings before the start: none where all is well, and what they warn of does happen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from paper_case import EXACT, NO_DISTURBANCE, P, configured, run
+
+from blf_dsc_controller.assembly import settings_of_config
+from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.feasibility import concerns, rehearse
+from blf_dsc_controller.tools import closed_loop
+
+BOUND = 0.002  # rad
+
+
+def told(changes, preset='recommended', q=None):
+    return concerns(configured(preset, 1.0, changes).controller, q)
+
+
+@pytest.mark.parametrize('preset', ['recommended', 'paper', 'noisy', 'two_tone', 'model_based'])
+def test_presets_are_not_warned_of(preset):
+    config = load_loop(locate(preset))
+    assert concerns(config.controller, np.array(config.plant.initial.position)) == []
+
+
+@pytest.mark.parametrize(
+    ('parameter', 'changes'),
+    [
+        ('torque.limit', {'torque.limit': [5.0, 20.0]}),
+        ('feedback.gain', {'feedback.gain': [60.0, 120.0]}),
+        ('disturbance.gain', {'disturbance.gain': [100.0, 15000.0]}),
+        ('surface.time_constant', {'surface.time_constant': 0.0005}),
+        ('surface.gain', {'surface.time_constant': 0.05}),
+        ('barrier.slope_limit', {'barrier.slope_limit': [2e4, 5e4]}),
+        ('learning.weight', {'learning.weight': 2500.0}),
+        ('learning.weight', {'learning.update': 'gradient'}),
+        ('disturbance.leakage', {'disturbance.leakage': 11.0}),
+        ('learning.excitation_threshold', {'learning.excitation_threshold': 0.5}),
+        ('learning.window', {'learning.window': 5.0}),
+        ('learning.settling_time', {'learning.settling_time': 0.1}),
+        (
+            'learning.settling_time',
+            {'learning.prediction': 'lambda', 'learning.derivative_filter': 10.0},
+        ),
+    ],
+)
+def test_what_cannot_work_is_named(parameter, changes):
+    (concern,) = told(changes)
+    assert concern.startswith(parameter)
+
+
+def test_a_start_close_to_the_bound_is_named_with_its_joint():
+    qr = np.array([2.2935, 1.6961])
+    (concern,) = told({}, q=qr - np.array([0.0, 0.9 * BOUND]))
+    assert concern.startswith('barrier.bound: joint2 starts -0.0018 rad')
+    assert told({}, q=qr - np.array([0.0, 0.5 * BOUND])) == []
+
+
+def test_laws_are_not_warned_of_gains_they_do_not_have():
+    changes = {'surface.time_constant': 0.05, 'learning.window': 5.0, 'law': 'backstepping'}
+    assert told(changes) == []
+
+
+def test_rehearsal_needs_the_torque_that_the_run_needs():
+    """With the true parameters and no disturbance, within the filter's lag of the run's largest."""
+    silent = {'truth.constant': [0.0, 0.0], 'truth.amplitude': [0.0, 0.0]}
+    loop = configured('model_based', 7.0, silent, NO_DISTURBANCE)
+    config, torque = loop.controller, np.abs(run(loop).torque[1000:])
+    rehearsal = rehearse(config, settings_of_config(config))
+    np.testing.assert_allclose(rehearsal.torque, torque.max(axis=0), rtol=2e-3)
+    assert np.linalg.eigvalsh(rehearsal.excitation)[0] == pytest.approx(0.269, abs=5e-4)
+
+
+def test_too_high_a_feedback_chatters_from_twice_the_inertia_s_rate_on():
+    """K_p T over the true inertia: below two the sampled loop is calm, above it saturates."""
+    calm = {}
+    for gain in (100.0, 160.0, 180.0, 250.0):
+        changes = {'sample_time': 0.002, 'feedback.gain': [60.0, gain]}
+        config = configured('recommended', 4.0, EXACT | changes, {'sample_time': 0.002})
+        settings = settings_of_config(config.controller)
+        true = rehearse(config.controller, settings._replace(initial_estimate=np.array([*P, 0, 0])))
+        torque = run(config).torque
+        calm[true.rate * 0.002] = np.abs(np.diff(torque[-1000:], axis=0)).max() < 0.1
+    assert all(is_calm == (product < 2.0) for product, is_calm in calm.items()), calm
+    assert set(calm.values()) == {True, False}
+
+
+def test_too_heavy_a_gradient_diverges_as_it_is_warned():
+    changes = {'learning.update': 'gradient', 'learning.weight': 30.0}
+    assert told(changes)[0].startswith('learning.weight')
+    loop = run(configured('recommended', 9.0, changes))
+    assert loop.parameter_error[-1] > 0.5
+    assert np.linalg.norm(P) > 0.0
+
+
+def test_a_window_of_no_whole_period_keeps_the_disturbance():
+    changes = {'learning.window': 5.0}
+    assert told(changes)[0].startswith('learning.window')
+    errors = [run(configured('recommended', 12.0, each)).error_at(12.0) for each in (changes, {})]
+    assert errors[0] > 100.0 * errors[1]
+
+
+def test_too_small_a_torque_limit_breaks_the_bound():
+    changes = {'torque.limit': [5.5, 20.0]}
+    assert told(changes)[0].startswith('torque.limit: joint1')
+    changes['approach.enabled'] = False
+    assert np.abs(run(configured('recommended', 1.0, changes)).xi1).max() > BOUND
+
+
+def test_closed_loop_warns_before_it_runs(tmp_path, capsys):
+    path = tmp_path / 'short.yaml'
+    path.write_text(
+        'blf_dsc_controller:\n  ros__parameters:\n    learning: {window: 5.0}\n', encoding='utf-8'
+    )
+    arguments = ['--config', str(path), '--offline', '--duration', '0.1']
+    assert closed_loop.main([*arguments, '--out', str(tmp_path / 'out')]) == 0
+    assert 'warning: learning.window: 5 s are 0.796 periods' in capsys.readouterr().err
