@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the pages about the paper refer to is there: tests, presets, parameters, errata, figures."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from paper_case import configured, run
+
+from blf_dsc_controller.configuration.nodes import known_names
+from blf_dsc_controller.configuration.params_file import locate
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = {name: (ROOT / 'doc' / f'{name}.md').read_text() for name in ('theory', 'errata', 'tuning')}
+TESTS = ''.join(path.read_text() for path in (ROOT / 'test').glob('test_*.py'))
+
+
+@pytest.mark.parametrize('page', PAGES)
+def test_every_test_and_preset_a_page_names_exists(page):
+    text = PAGES[page]
+    for name in re.findall(r'`(test_\w+)`', text):
+        assert f'def {name}' in TESTS, name
+    for path in re.findall(r'`?(test/test_\w+\.py)', text):
+        assert (ROOT / path).is_file(), path
+    for preset in re.findall(r'--config (\w+)', text):
+        assert locate(preset).is_file()
+
+
+def test_every_erratum_has_its_row_and_every_test_of_one_its_row():
+    rows = [int(number) for number in re.findall(r'^\| (\d+)', PAGES['errata'], re.MULTILINE)]
+    assert rows == list(range(1, 27))
+    tested = {int(number) for number in re.findall(r'def test_erratum_(\d+)_', TESTS)}
+    assert tested <= set(rows)
+    for line in PAGES['errata'].splitlines():
+        if re.match(r'\| \d', line):
+            assert '`test_' in line, line
+
+
+def test_every_parameter_the_tuning_page_names_exists():
+    names = re.findall(r'`((?:\w+\.)+\w+)`', PAGES['tuning'])
+    groups = {name.split('.')[0] for name in known_names()}
+    wanted = [name for name in names if name.split('.')[0] in groups]
+    assert len(wanted) > 15
+    assert set(wanted) <= known_names()
+
+
+def test_figures_of_the_pages_are_those_of_the_runs():
+    assert 'a fifth is left' in ' '.join(PAGES['theory'].split())
+    errors = [
+        run(configured('recommended', 60.0, {'learning.weight': weight})).parameter_error[-1]
+        for weight in (100.0, 500.0)
+    ]
+    assert errors[0] / errors[1] == pytest.approx(5.0, abs=0.5)
+
+    assert '7 % at 5 s instead of 0.01 % at 2π' in PAGES['tuning']
+    window = run(configured('recommended', 30.0, {'learning.window': 5.0}))
+    assert window.error_at(30.0) == pytest.approx(0.07, abs=0.015)
