@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from paper_case import configured, run
 
@@ -44,6 +45,23 @@ def test_every_parameter_the_tuning_page_names_exists():
     wanted = [name for name in names if name.split('.')[0] in groups]
     assert len(wanted) > 15
     assert set(wanted) <= known_names()
+
+
+def test_table_of_the_readme_is_that_of_the_presets():
+    """As `paper_study` writes them: joint1 / joint2."""
+    rows = re.findall(
+        r'^\| `(\w+)`[^|]*\| ([\d.]+) / ([\d.]+) \| ([\d.]+) / ([\d.]+) \| ([\d.]+)?',
+        (ROOT / 'README.md').read_text(),
+        re.MULTILINE,
+    )
+    assert len(rows) == 7
+    for preset, *figures, learned in rows:
+        loop = run(configured(preset, 60.0))
+        largest = 1e3 * np.abs(loop.xi1).max(axis=0)
+        typical = 1e3 * np.sqrt(np.mean(loop.xi1**2, axis=0))
+        np.testing.assert_allclose([*largest, *typical], np.array(figures, float), rtol=0.01)
+        if learned:
+            assert 100 * loop.parameter_error[-1] == pytest.approx(float(learned), rel=0.1)
 
 
 def test_figures_of_the_pages_are_those_of_the_runs():
