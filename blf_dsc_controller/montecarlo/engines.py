@@ -106,8 +106,12 @@ def dask(workers: int, address: str = '') -> Engine:
 
 
 def mpi(workers: int) -> Engine:
-    """Use the ranks of an MPI job: `mpiexec -n 9 python -m mpi4py.futures -m ...`."""
+    """Use the ranks of an MPI job, `mpiexec -n 9 python -m mpi4py.futures -m ...`: all but one.
+
+    Started as a single rank, it asks MPI for as many more as there are to be workers.
+    """
     try:
+        from mpi4py import MPI
         from mpi4py.futures import MPIPoolExecutor
     except ImportError:
         raise MissingExtraError('mpi4py', 'mpi', 'the engine mpi') from None
@@ -117,6 +121,7 @@ def mpi(workers: int) -> Engine:
         with MPIPoolExecutor(workers) as executor:
             yield executor
 
+    workers = MPI.COMM_WORLD.Get_size() - 1 or workers
     return Engine(start, workers)
 
 
