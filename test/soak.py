@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A loop of both nodes for a long time, with something breaking every few seconds.
+
+`python test/soak.py --minutes 30` (or `make soak`) runs half an hour of the plant's time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import sys
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from fault_rig import JOINTS, LOCKSTEP
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.parameter import Parameter
+from ros_rig import RosRig, activate, deactivate
+
+from blf_dsc_controller.bags import topics
+from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.endpoints import message_class, profile
+from blf_dsc_controller.safety.reasons import Phase
+from sim_plant.node import PlantNode
+
+START = (2.293, 1.696)
+PAGE = os.sysconf('SC_PAGE_SIZE')
+
+
+def memory():
+    """Resident memory of this process [MB]."""
+    gc.collect()
+    return int(Path('/proc/self/statm').read_text().split()[1]) * PAGE / 1e6
+
+
+def handles():
+    """Open files and sockets of this process."""
+    return len(list(Path('/proc/self/fd').iterdir()))
+
+
+@dataclass
+class Report:
+    """What came of it."""
+
+    samples: int = 0
+    faults: Counter = field(default_factory=Counter)
+    reasons: Counter = field(default_factory=Counter)
+    memory: list = field(default_factory=list)  # MB, after each fault
+    handles: list = field(default_factory=list)
+    worst: float = 0.0  # largest |xi1| / k_c outside of faults
+
+
+class Soak:
+    """The loop, and what is done to it."""
+
+    def __init__(self, seed):
+        self.ros = RosRig()
+        self.rng = np.random.default_rng(seed)
+        self.report = Report()
+        self.states = self._publisher(topics.JOINT_STATES)
+        self.commands = self._publisher(topics.COMMANDS)
+        self.arm, self.law = self.ros.loop()
+        self.base = 0
+
+    def _publisher(self, topic):
+        node = self.ros.tester
+        kind = message_class(topic.type)
+        return node.create_publisher(kind, topic.relative, profile(topic.offered))
+
+    def run(self, samples):
+        """Run for a total of so many samples, faults not counted."""
+        while self.report.samples < samples:
+            count = int(self.rng.integers(1000, 4000))
+            self.ros.run(self.arm, count)
+            assert self.law.guard.supervisor.running, self.law.stopped
+            self.report.samples += count
+            self.report.worst = max(self.report.worst, float(self.law.guard.ratio.max()))
+            fault = self.rng.choice(FAULTS)
+            self.report.faults[fault.__name__] += 1
+            fault(self)
+            self.ros.spin(0.02)
+            self.recover()
+            self.report.memory.append(memory())
+            self.report.handles.append(handles())
+        return self.report
+
+    def recover(self):
+        """Reset what has stopped; the loop runs from its start."""
+        supervisor = self.law.guard.supervisor
+        self.report.reasons[supervisor.reason.value] += 1
+        if supervisor.phase is Phase.SAFE_STOP or self.arm.plant.sample == 0:
+            assert self.ros.reset(self.arm).success
+        self.ros.until(lambda: self.law.guard.supervisor.phase is Phase.TRACKING)
+
+    def close(self):
+        self.ros.close()
+
+
+def rogue_state(soak):
+    """A joint state from elsewhere."""
+    rng = soak.rng
+    q = np.array(START) + rng.normal(0.0, 1.0, 2)
+    if rng.random() < 0.3:
+        q[0] = rng.choice([np.nan, np.inf, 1e300])
+    names = JOINTS if rng.random() < 0.7 else ('joint1', 'joint9')
+    stamp = int(rng.choice([0, LOCKSTEP, soak.arm.stamp + 10**6, soak.arm.stamp + 10**10]))
+    raw = JointStateEncoder(names).encode(stamp, q, q, q)
+    soak.states.publish(raw[: rng.integers(30, len(raw) + 1)] if rng.random() < 0.3 else raw)
+
+
+def rogue_command(soak):
+    """A torque from elsewhere, that will not do."""
+    values = soak.rng.choice([1.0, np.nan, np.inf], int(soak.rng.choice([0, 1, 3, 5])))
+    soak.commands.publish(Float64MultiArrayEncoder(values.size).encode(values))
+    soak.commands.publish(Float64MultiArrayEncoder(2).encode([np.nan, 1.0]))
+
+
+def push(soak):
+    """A blow to the arm."""
+    soak.arm.plant.state[3:5] += soak.rng.normal(0.0, 1.0, 2)
+
+
+def new_gains(soak):
+    """Twenty requests for other gains."""
+    name = f'{soak.law.get_fully_qualified_name()}/set_parameters_atomically'
+    for _ in range(20):
+        gain = (np.array([60.0, 20.0]) * soak.rng.uniform(0.5, 1.5, 2)).tolist()
+        request = SetParametersAtomically.Request(
+            parameters=[Parameter('feedback.gain', value=gain).to_parameter_msg()]
+        )
+        soak.ros.ask(SetParametersAtomically, name, request)
+
+
+def kill_controller(soak):
+    soak.ros.kill(soak.law)
+    soak.law = soak.ros.add(ControllerNode)
+    soak.ros.reset(soak.arm)
+
+
+def kill_plant(soak):
+    soak.ros.kill(soak.arm)
+    soak.arm = soak.ros.add(PlantNode, mode='lockstep')
+    soak.ros.spin(0.3)
+    soak.ros.reset(soak.arm)
+
+
+def pause_both(soak):
+    for node in (soak.law, soak.arm):
+        assert deactivate(soak.ros, node)
+    for node in (soak.arm, soak.law):
+        assert activate(soak.ros, node)
+
+
+def reset_one(soak):
+    soak.ros.reset(soak.arm if soak.rng.random() < 0.5 else soak.law)
+
+
+FAULTS = (
+    rogue_state,
+    rogue_state,
+    rogue_command,
+    push,
+    new_gains,
+    kill_controller,
+    kill_plant,
+    pause_both,
+    reset_one,
+)
+
+
+def soak(samples, seed=0):
+    """Run and return the report."""
+    one = Soak(seed)
+    try:
+        return one.run(samples)
+    finally:
+        one.close()
+
+
+def main():
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument('--minutes', type=float, default=30.0, help='of the plant (30)')
+    options.add_argument('--seed', type=int, default=0)
+    given = options.parse_args()
+    report = soak(round(given.minutes * 60_000), given.seed)
+    quarter = max(1, len(report.memory) // 4)
+    growth = report.memory[-1] - report.memory[quarter]
+    extra = report.handles[-1] - report.handles[quarter]
+    print(f'{report.samples} samples, {sum(report.faults.values())} faults', file=sys.stderr)
+    for what in (report.faults, report.reasons):
+        print(dict(what), file=sys.stderr)
+    print(f'largest error against the bound outside of them: {report.worst:.2f}', file=sys.stderr)
+    print(f'since the first quarter: {growth:+.1f} MB, {extra:+d} handles', file=sys.stderr)
+    assert report.worst < 1.0
+    assert growth < 0.02 * len(report.memory) + 5.0
+    assert extra <= 0
+
+
+if __name__ == '__main__':
+    main()
