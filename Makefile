@@ -8,6 +8,7 @@
 PYTHON ?= python3
 CONFIG ?= recommended
 DURATION ?= 60
+MINUTES ?= 30
 
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory
@@ -38,7 +39,7 @@ PIP_FAILED := { echo 'The installation failed: see above. It needs a package ind
   'set HTTPS_PROXY, for a mirror PIP_INDEX_URL, without a network PIP_FIND_LINKS and' \
   'PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
 
-.PHONY: help venv demo paper test test-browser lint clean
+.PHONY: help venv demo paper test test-browser test-nightly soak lint clean
 
 help: ## List what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' Makefile
@@ -62,6 +63,12 @@ test: $(READY) ## Run the tests (TESTS=test/test_x.py for some)
 
 test-browser: $(READY) ## Open the page of bag_report in a headless Chromium, if there is one
 	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_report_page.py
+
+test-nightly: $(READY) ## Run ten thousand examples of each property of the nodes
+	@BLF_DSC_EXAMPLES=10000 $(RUN) -m pytest -q test/test_nodes_properties.py
+
+soak: $(READY) ## Run half an hour of the plant's time with a fault every few seconds (MINUTES)
+	@$(RUN) test/soak.py --minutes "$(MINUTES)"
 
 lint: $(LINT_READY) ## Check style and types
 	@good=1; for check in 'ruff check' 'ruff format --check' mypy; do \

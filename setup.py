@@ -79,6 +79,7 @@ setup(
             'hypothesis',
             'scipy',
             'coverage',
+            'mujoco',
             'setuptools>=70.1',
             'pyarrow',
             'distributed',

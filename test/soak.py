@@ -14,6 +14,11 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
+# Before anything of ROS is imported.
+os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(Path(__file__).with_name('one_process.xml'))
+os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 101))
+os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+
 import numpy as np
 from fault_rig import JOINTS, LOCKSTEP
 from rcl_interfaces.srv import SetParametersAtomically

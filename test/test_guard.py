@@ -178,6 +178,29 @@ def test_a_reset_forgets():
     assert not state.disturbance.any()
 
 
+def test_after_a_reset_on_the_way_learning_waits_for_a_full_window():
+    rig = Rig({'learning.window': 0.5, 'learning.excitation_threshold': 1e-9})
+    rig.step(1200)
+    state = rig.guard.controller.state
+    assert state.latched[0] == 1.0
+    rig.guard.reset()
+    rig.step(999)  # the window and the settling time of the filters
+    assert rig.guard.supervisor.running
+    assert state.latched[0] == 0.0
+    rig.step(20)
+    assert state.latched[0] == 1.0
+
+
+def test_a_column_that_learning_refuses_is_no_fault():
+    """Its estimate is told as NaN, which says that there is none."""
+    rig = Rig()
+    rig.step(20)
+    rig.guard.controller.state.active[-1] = 0.0
+    rig.step(20)
+    assert np.isnan(rig.guard.controller.sample.estimate[-1])
+    assert rig.supervisor.phase is Phase.TRACKING
+
+
 def test_an_error_nobody_foresaw_stops_too():
     rig = Rig()
     rig.step(20)

@@ -118,6 +118,7 @@ class Guard:
         """Take command with the next state; what was learned is kept if so configured."""
         if not self.config.safety.keep_estimates:
             self.controller.reset()
+            self._resumable = False  # t counts the window's filling, too
         elif self._clean:
             self.controller.state.samples[0] = 0.0
         else:
@@ -136,7 +137,7 @@ class Guard:
 
     def reset(self) -> None:
         """Forget everything that was learned, and every fault, and start with the next state."""
-        self._resumable = self._resumable or self.supervisor.running
+        self._resumable = False
         self.controller.reset()
         self._keep()
         self._start_over()
@@ -310,9 +311,7 @@ class Guard:
             self.outside += 1
         if not verdict & soundness.SUSPECT:
             return self.supervisor.accept(dt)
-        trusted = self.supervisor.judge(
-            safety, controller.settings, controller.signals, controller.sample, dt
-        )
+        trusted = self.supervisor.judge(safety, controller, dt)
         if trusted:
             self._keep()
         return trusted

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.safety import Safety
+from blf_dsc_controller.core.controller import Controller
 from blf_dsc_controller.core.sample import Sample
 from blf_dsc_controller.core.settings import LINEAR, Settings
 from blf_dsc_controller.core.soundness import state_is_sound
@@ -167,28 +168,25 @@ class Supervisor:
         self.saturation.take(dt, saturated=False)
         return self.running
 
-    def judge(
-        self, safety: Safety, settings: Settings, signals: Signals, told: Sample, dt: float
-    ) -> bool:
+    def judge(self, safety: Safety, controller: Controller, dt: float) -> bool:
         """Judge what the law made of a state; False stops, and its torque must not be used.
 
         Args:
             safety: the limits.
-            settings: of the law.
-            signals: what the law computed.
-            told: what it tells of it.
+            controller: the law, just updated.
             dt: time since the last sample [s].
         """
-        if not (np.isfinite(told.estimate).all() and np.isfinite(told.disturbance).all()):
-            text = f'an estimate is not finite: {told.estimate}, disturbance {told.disturbance}'
+        state, signals, told = controller.state, controller.signals, controller.sample
+        if not (np.isfinite(state.estimate).all() and np.isfinite(state.disturbance).all()):
+            text = f'an estimate is not finite: {state.estimate}, disturbance {state.disturbance}'
             self._halt(Reason.ESTIMATE, text)
         # The limit makes a finite torque of a demand that is none.
         elif not (np.isfinite(signals.demand).all() and np.isfinite(told.torque).all()):
             text = f'the law asked for a torque that is not finite: {signals.demand}'
             self._halt(Reason.TORQUE, text)
         else:
-            self._judge_error(safety, settings, told)
-            self._judge_torque(safety, settings, signals, dt)
+            self._judge_error(safety, controller.settings, told)
+            self._judge_torque(safety, controller.settings, signals, dt)
         return self.running
 
     def _judge_error(self, safety: Safety, settings: Settings, told: Sample) -> None:
