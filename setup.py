@@ -98,6 +98,7 @@ setup(
             'bag_recover = blf_dsc_controller.tools.bag_recover:main',
             'bag_report = blf_dsc_controller.tools.bag_report:main',
             'bag_plot = blf_dsc_controller.tools.bag_plot:main',
+            'excite = blf_dsc_controller.tools.excite:main',
             'paper_study = blf_dsc_controller.tools.paper_study:main',
             'monte_carlo = blf_dsc_controller.tools.monte_carlo:main',
         ],

@@ -24,6 +24,7 @@ EXECUTABLES = {
     'blf_dsc_controller',
     'bag_recorder',
     'closed_loop',
+    'excite',
     'bag_plot',
     'bag_replay',
     'bag_recover',

@@ -73,3 +73,15 @@ class TrajectoryError(MotionError):
     def __init__(self, reasons: list[str]) -> None:
         self.reasons = reasons
         super().__init__('trajectory refused: ' + '; '.join(reasons))
+
+
+class ExcitationError(MotionError):
+    """No reference was found that keeps the limits."""
+
+    def __init__(self, starts: int) -> None:
+        self.starts = starts
+        super().__init__(
+            f'no reference was found, in {starts} searches, that keeps positions, velocities, '
+            'accelerations and torques within their limits: allow a larger share of the torque, '
+            'widen limits, or search from more starts'
+        )
