@@ -28,6 +28,7 @@ _MILLI = 1e3
 _TRACKING = (6.4, 2.5)  # inches
 _ESTIMATES = (8.6, 2.4)
 _COLOURS = (BLUE, ORANGE)
+_WIDTHS = (5.0, 2.4)  # where the curves lie upon each other
 _LETTERS = ('(a)', '(b)', '(c)', '(d)', '(e)', '(f)')
 
 
@@ -46,10 +47,10 @@ def draw_figure_2(
 def _positions(
     axes: Axes, courses: Mapping[str, Courses], i: int, until: float, _bound: float
 ) -> None:
-    for (name, one), colour in zip(courses.items(), _COLOURS, strict=False):
+    for (name, one), colour, width in zip(courses.items(), _COLOURS, _WIDTHS, strict=False):
         shown = one.time <= until
         values = envelope(one.time[shown], one.position[shown, i])
-        axes.plot(*values, color=colour, lw=2.6, alpha=0.6, label=name if i == 0 else None)
+        axes.plot(*values, color=colour, lw=width, label=name if i == 0 else None)
     one = next(iter(courses.values()))
     shown = one.time <= until
     reference = envelope(one.time[shown], one.reference[shown, i])

@@ -44,8 +44,7 @@ _TRACKING_UNTIL = 10.0  # s
 
 
 def study(folder: Path) -> list[Claim]:
-    """Run the study into a new folder and return its claims."""
-    folder.mkdir(parents=True)
+    """Run the study into an empty folder and return its claims."""
     keep_configurations(folder / 'configurations')
     outcomes = run_all(
         SIDE_BY_SIDE + VARIATIONS, [case for sweep in SWEEPS for case in sweep.cases()]

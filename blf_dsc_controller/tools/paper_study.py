@@ -10,7 +10,7 @@ from pathlib import Path
 
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.study.report import study
-from blf_dsc_controller.tools.outcome import OutputExistsError
+from blf_dsc_controller.tools.outcome import make_folder
 
 _INTERRUPTED = 130
 
@@ -32,9 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
     out = parser().parse_args(arguments).out
     try:
-        if out.exists():
-            raise OutputExistsError(out)
-        found = study(out)
+        found = study(make_folder(out))
     except BlfDscError as error:
         print(f'paper_study: {error}', file=sys.stderr)
         return 1
