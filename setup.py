@@ -92,6 +92,7 @@ setup(
         'console_scripts': [
             'sim_plant = blf_dsc_controller.tools.entry:sim_plant',
             'blf_dsc_controller = blf_dsc_controller.tools.entry:blf_dsc_controller',
+            'arm_markers = blf_dsc_controller.tools.entry:arm_markers',
             'bag_recorder = blf_dsc_controller.tools.entry:bag_recorder',
             'closed_loop = blf_dsc_controller.tools.closed_loop:main',
             'bag_replay = blf_dsc_controller.tools.bag_replay:main',

@@ -9,7 +9,11 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from blf_dsc_controller.configuration.params_file import locate
+from blf_dsc_controller.configuration.nodes import PLANT
+from blf_dsc_controller.configuration.params_file import load, locate
+from blf_dsc_controller.configuration.share import config_file
+from blf_dsc_controller.description.urdf import urdf
+from sim_plant.configuration import PlantConfig
 
 PACKAGE = 'blf_dsc_controller'
 
@@ -40,6 +44,18 @@ def generate_launch_description() -> LaunchDescription:
                 default_value='',
                 description='folder to record into, which must not exist; empty: no recording',
             ),
+            DeclareLaunchArgument(
+                'markers',
+                default_value='false',
+                choices=['false', 'true'],
+                description='publish reference, bound and torques for RViz and Foxglove',
+            ),
+            DeclareLaunchArgument(
+                'rviz',
+                default_value='false',
+                choices=['false', 'true'],
+                description='open RViz on the arm, with its markers',
+            ),
             OpaqueFunction(function=nodes),
         ]
     )
@@ -47,9 +63,9 @@ def generate_launch_description() -> LaunchDescription:
 
 def nodes(context: LaunchContext) -> list[Node]:
     """Make the nodes, once the arguments are known."""
-    config, mode, namespace, bag = (
+    config, mode, namespace, bag, markers, rviz = (
         LaunchConfiguration(name).perform(context)
-        for name in ('config', 'mode', 'namespace', 'bag')
+        for name in ('config', 'mode', 'namespace', 'bag', 'markers', 'rviz')
     )
     common = {'package': PACKAGE, 'namespace': namespace, 'output': 'screen'}
     parameters = [str(locate(config))]
@@ -63,4 +79,28 @@ def nodes(context: LaunchContext) -> list[Node]:
     if bag:
         of_recorder = [parameters[0], {'output': bag}]
         loop.append(Node(executable='bag_recorder', parameters=of_recorder, **common))
+    if 'true' in (markers, rviz):
+        loop.append(Node(executable='arm_markers', parameters=parameters[:1], **common))
+    if rviz == 'true':
+        loop += view(namespace, str(locate(config)))
     return loop
+
+
+def view(namespace: str, config: str) -> list[Node]:
+    """RViz, and what turns the arm's states into frames for it; both are packages of their own."""
+    plant = load(config, PLANT, PlantConfig)
+    text = urdf(PLANT, plant.joints, plant.arm, plant.actuator.torque_limit)
+    return [
+        Node(
+            package='robot_state_publisher',
+            executable='robot_state_publisher',
+            namespace=namespace,
+            parameters=[{'robot_description': text}],
+        ),
+        Node(
+            package='rviz2',
+            executable='rviz2',
+            namespace=namespace,
+            arguments=['-d', str(config_file('arm.rviz'))],
+        ),
+    ]

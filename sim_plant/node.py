@@ -21,6 +21,7 @@ import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.publisher import Publisher
 from rclpy.timer import Timer
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from blf_dsc_controller.bags import topics
@@ -28,6 +29,7 @@ from blf_dsc_controller.bags.decoders import Float64MultiArrayDecoder
 from blf_dsc_controller.bags.errors import MessageError
 from blf_dsc_controller.bags.telemetry import DECIMATION, Message, PlantTelemetry
 from blf_dsc_controller.core.two_link import PARAMETER_NAMES
+from blf_dsc_controller.description.urdf import urdf
 from blf_dsc_controller.nodes import compilation, executor, parameters, realtime
 from blf_dsc_controller.nodes.endpoints import publisher, subscribe
 from blf_dsc_controller.nodes.latency import Latency
@@ -114,8 +116,14 @@ class PlantNode(ManagedNode):
         self._rest()
         if not self._publisher_of:
             self._publisher_of = {topic: publisher(self, topic) for topic in self._output_topics()}
+            self._publish_description()
             subscribe(self, topics.COMMANDS, self._on_command)
             realtime.request(self.config.realtime, self.get_logger())
+
+    def _publish_description(self) -> None:
+        limits = self.config.actuator.torque_limit
+        text = urdf(topics.PLANT, self.config.joints, self.config.arm, limits)
+        publisher(self, topics.ROBOT_DESCRIPTION).publish(String(data=text))
 
     def activate(self) -> None:
         """Send the present state once a controller listens, and go on from its answer."""

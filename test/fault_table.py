@@ -388,10 +388,10 @@ FAULTS = (
     Fault('the arm falls silent for good', every(lambda _: []), R.STATE_TIMEOUT, 60, live=True),
     Fault('the controller sleeps for 200 ms', stalled, R.NONE, live=True),
     Fault(
-        'only every second state arrives',
-        sparse(2),
+        'only every third state arrives',
+        sparse(3),
         R.OVERRUN,
-        60,
+        100,
         given={'safety.overrun_window': 0.1},
     ),
     Fault('time of day set back by an hour', clock_back, R.NONE, live=True),

@@ -23,6 +23,7 @@ EXECUTABLES = {
     'sim_plant',
     'blf_dsc_controller',
     'bag_recorder',
+    'arm_markers',
     'closed_loop',
     'excite',
     'bag_plot',
@@ -212,8 +213,9 @@ def test_launch_file_starts_executables_there_are(entry_points):
         for keyword in node.keywords
         if keyword.arg == 'executable'
     }
-    assert started == {'sim_plant', 'blf_dsc_controller', 'bag_recorder'}
-    assert started <= {entry.name for entry in entry_points}
+    of_others = {'rviz2', 'robot_state_publisher'}
+    assert started - of_others == {'sim_plant', 'blf_dsc_controller', 'bag_recorder', 'arm_markers'}
+    assert started - of_others <= {entry.name for entry in entry_points}
 
 
 def test_launch_file_sets_parameters_there_are():
@@ -227,6 +229,6 @@ def test_launch_file_sets_parameters_there_are():
         for key in node.keys
         if isinstance(key, ast.Constant)
     }
-    arguments_of_node = {'package', 'namespace'}
+    arguments_of_node = {'package', 'namespace', 'robot_description'}
     assert {'mode', 'output', 'wait_for_subscribers'} <= keys
     assert keys - arguments_of_node <= known_names()

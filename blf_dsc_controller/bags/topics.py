@@ -89,6 +89,8 @@ PARAMETER_EVENTS = Topic(
     CONTROLLER, '/parameter_events', 'rcl_interfaces/msg/ParameterEvent', STREAM, STREAM
 )
 """ROS's own, of every node."""
+ROBOT_DESCRIPTION = Topic(PLANT, 'robot_description', 'std_msgs/msg/String', LATCHED, LATCHED)
+"""The URDF; not among the topics of a run, which a bag without ROS holds as well."""
 JOINT_TRAJECTORY = Topic(
     CONTROLLER,
     '~/joint_trajectory',

@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.markers import MarkersConfig
 from blf_dsc_controller.configuration.recorder import RecorderConfig
 from blf_dsc_controller.configuration.schema import parameters
 from sim_plant.configuration import PlantConfig
@@ -16,11 +17,13 @@ if TYPE_CHECKING:
 PLANT = 'sim_plant'
 CONTROLLER = 'blf_dsc_controller'
 RECORDER = 'bag_recorder'
+MARKERS = 'arm_markers'
 
-NODES: Mapping[str, type[PlantConfig | ControllerConfig | RecorderConfig]] = {
+NODES: Mapping[str, type[PlantConfig | ControllerConfig | RecorderConfig | MarkersConfig]] = {
     PLANT: PlantConfig,
     CONTROLLER: ControllerConfig,
     RECORDER: RecorderConfig,
+    MARKERS: MarkersConfig,
 }
 
 

@@ -57,7 +57,7 @@ class Safety:
         0.5, 'time for which a torque may be at its limit without a break', unit='s', above=0.0
     )
     overrun_fraction: float = parameter(
-        0.2,
+        0.4,
         'part of the states that may be missed, on average over overrun_window',
         above=0.0,
         at_most=1.0,

@@ -52,3 +52,8 @@ def blf_dsc_controller() -> int:
 def bag_recorder() -> int:
     """Run the recorder."""
     return _run_node('blf_dsc_controller.nodes.recorder_node')
+
+
+def arm_markers() -> int:
+    """Run the node that draws the arm."""
+    return _run_node('blf_dsc_controller.nodes.markers_node')

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `arm_markers`: the reference as a ghost, the bound at its tip, torques as arrows.
+
+It looks at the newest messages a few times a second instead of being called for each of them.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import Point
+from rclpy.clock import Clock, ClockType
+from std_msgs.msg import ColorRGBA
+from visualization_msgs.msg import Marker, MarkerArray
+
+from blf_dsc_controller.bags import topics
+from blf_dsc_controller.bags.decoders import JointStateDecoder
+from blf_dsc_controller.bags.errors import MessageError
+from blf_dsc_controller.configuration.markers import MarkersConfig
+from blf_dsc_controller.description.pose import points, tip_radius
+from blf_dsc_controller.nodes.endpoints import profile
+from blf_dsc_controller.nodes.executor import RunnableNode, run
+from blf_dsc_controller.nodes.intake import Intake
+from blf_dsc_controller.nodes.parameters import declare
+
+NAME = 'arm_markers'
+_DEPTH = 1  # only the newest counts
+_GHOST = ColorRGBA(r=0.2, g=0.8, b=0.3, a=0.5)
+_BOUND = ColorRGBA(r=0.9, g=0.7, b=0.1, a=0.5)
+_TORQUE = ColorRGBA(r=0.9, g=0.2, b=0.2, a=0.9)
+_WIDTH = 0.01  # m
+
+
+class MarkersNode(RunnableNode):
+    """Publishes `~/markers`.
+
+    Args:
+        options: of rclpy's Node (context, namespace, parameter_overrides, ...).
+
+    Raises:
+        ConfigurationError: a parameter is wrong.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(NAME, **options)
+        self._config = declare(self, MarkersConfig)
+        joints = self._config.joints
+        watched = (topics.JOINT_STATES, topics.REFERENCE, topics.BOUND)
+        self._decoders = [JointStateDecoder(joints, required=('position',)) for _ in watched]
+        self._intake = Intake(self.context, f'_{self.get_name()}_intake', _DEPTH)
+        for handle, topic in enumerate(watched):
+            name = self.resolve_topic_name(topic.relative)
+            self._intake.subscribe(name, topic.type, [topic.offered], handle)
+        self._markers = self.create_publisher(MarkerArray, '~/markers', profile(topics.LATEST))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(self._config.period, self._draw, clock=steady)
+
+    def close(self) -> None:
+        """End the subscriptions."""
+        self._intake.close()
+
+    def _draw(self) -> None:
+        for arrival in self._intake.take():
+            try:
+                self._decoders[arrival.handle].decode(arrival.raw)
+            except MessageError as error:
+                self.get_logger().warning(f'not drawn: {error}', throttle_duration_sec=10.0)
+        state, reference, bound = self._decoders
+        markers = [
+            *self._torques(state.position, state.effort),
+            *self._ghost(reference.position, bound.position),
+        ]
+        if markers:
+            self._markers.publish(MarkerArray(markers=markers))
+
+    def _torques(self, q: np.ndarray, torque: np.ndarray) -> list[Marker]:
+        """Arrows along the axes, -y for a positive torque."""
+        if not (np.isfinite(q).all() and np.isfinite(torque).all()):
+            return []
+        arrows = []
+        joints = points(self._config.arm.l1, self._config.arm.l2, q.tolist())[:2]
+        for number, (at, value) in enumerate(zip(joints, torque.tolist(), strict=True)):
+            arrow = self._marker('torque', number, Marker.ARROW, _TORQUE)
+            arrow.scale.x, arrow.scale.y, arrow.scale.z = _WIDTH, 3 * _WIDTH, 3 * _WIDTH
+            tip = (at[0], -value * self._config.torque_scale, at[2])
+            arrow.points = [_point(at), _point(tip)]
+            arrows.append(arrow)
+        return arrows
+
+    def _ghost(self, q: np.ndarray, bound: np.ndarray) -> list[Marker]:
+        """The arm where it should be, and a ball that its tip stays in."""
+        if not np.isfinite(q).all():
+            return []
+        l1, l2 = self._config.arm.l1, self._config.arm.l2
+        corners = points(l1, l2, q.tolist())
+        ghost = self._marker('reference', 0, Marker.LINE_STRIP, _GHOST)
+        ghost.scale.x = _WIDTH
+        ghost.points = [_point(corner) for corner in corners]
+        if not np.isfinite(bound).all():
+            return [ghost]
+        ball = self._marker('bound', 0, Marker.SPHERE, _BOUND)
+        ball.pose.position = _point(corners[-1])
+        diameter = 2.0 * tip_radius(l1, l2, float(q[1]), bound.tolist())
+        ball.scale.x = ball.scale.y = ball.scale.z = diameter
+        return [ghost, ball]
+
+    def _marker(self, kind: str, number: int, shape: int, colour: ColorRGBA) -> Marker:
+        marker = Marker(ns=kind, id=number, type=shape, action=Marker.ADD, color=colour)
+        marker.header.frame_id = self._config.frame
+        marker.pose.orientation.w = 1.0
+        return marker
+
+
+def _point(at: tuple[float, float, float]) -> Point:
+    return Point(x=at[0], y=at[1], z=at[2])
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return run(MarkersNode)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

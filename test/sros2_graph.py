@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The SROS 2 policy of the nodes: what each of them really has, no more and no less.
+
+`python test/sros2_graph.py config/sros2_policy.xml` starts the nodes and writes it anew.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+from ros_rig import RosRig
+
+from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.markers_node import MarkersNode
+from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
+from sim_plant.node import PlantNode
+
+KINDS = (
+    ('topics', 'publish', 'topic', 'get_publisher_names_and_types_by_node'),
+    ('topics', 'subscribe', 'topic', 'get_subscriber_names_and_types_by_node'),
+    ('services', 'reply', 'service', 'get_service_names_and_types_by_node'),
+    ('services', 'request', 'service', 'get_client_names_and_types_by_node'),
+)
+HEAD = """\
+<?xml version="1.0" encoding="UTF-8"?>
+<!-- SPDX-License-Identifier: Apache-2.0 -->
+<!-- What each node may do, for SROS 2: made by `python test/sros2_graph.py config/sros2_policy.xml`
+     from the running nodes in the root namespace. See the README for how to use it. -->
+"""
+
+
+def granted(ros, names):
+    """Names of the topics or services that nodes have, by kind of access."""
+    ask = ros.tester
+    found = {}
+    for _, access, _, method in KINDS:
+        told = set()
+        for name in names:
+            told |= {one for one, _ in getattr(ask, method)(name, '/')}
+        found[access] = sorted(told)
+    return found
+
+
+def is_recording_all(ros):
+    """Whether the recorder has found every topic."""
+    there = {name for name, _ in ros.tester.get_topic_names_and_types()}
+    found = ros.tester.get_subscriber_names_and_types_by_node('_bag_recorder_intake', '/')
+    published = {name for name in there if ros.tester.count_publishers(name)}
+    return '/arm_markers/markers' in there and published <= {name for name, _ in found}
+
+
+def live():
+    """What the running nodes have, by enclave and kind of access."""
+    ros = RosRig()
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            bag = str(Path(folder, 'bag'))
+            ros.add(PlantNode, publish_clock=True)
+            ros.add(ControllerNode)
+            ros.add(MarkersNode)
+            recorder = ros.add(BagRecorderNode, output=bag)
+            ros.until(lambda: is_recording_all(ros))
+            nodes = {
+                'sim_plant': ['sim_plant'],
+                'blf_dsc_controller': ['blf_dsc_controller'],
+                'arm_markers': ['arm_markers', '_arm_markers_intake'],
+                'bag_recorder': ['bag_recorder', '_bag_recorder_intake'],
+            }
+            found = {name: granted(ros, parts) for name, parts in nodes.items()}
+            ros.executor.remove_node(recorder)
+            ros.spin(0.1)
+            recorder.close()
+            return found
+    finally:
+        ros.close()
+
+
+def policy(found):
+    """Write the policy as XML."""
+    root = ET.Element('policy', version='0.2.0')
+    enclaves = ET.SubElement(root, 'enclaves')
+    for node, access in found.items():
+        enclave = ET.SubElement(enclaves, 'enclave', path=f'/{node}')
+        profiles = ET.SubElement(enclave, 'profiles')
+        profile = ET.SubElement(profiles, 'profile', ns='/', node=node)
+        for group, kind, element, _ in KINDS:
+            if access[kind]:
+                part = ET.SubElement(profile, group, {kind: 'ALLOW'})
+                for name in access[kind]:
+                    ET.SubElement(part, element).text = name
+    ET.indent(root)
+    return HEAD + ET.tostring(root, encoding='unicode') + '\n'
+
+
+def read(path):
+    """What a policy grants, in the form of `live`."""
+    found = {}
+    for enclave in ET.parse(path).getroot().iter('enclave'):  # noqa: S314 - our own file
+        (profile,) = enclave.iter('profile')
+        access = {kind: [] for _, kind, _, _ in KINDS}
+        for part in profile:
+            ((kind, verdict),) = part.attrib.items()
+            assert verdict == 'ALLOW'
+            access[kind] = [one.text for one in part]
+        assert enclave.get('path') == '/' + profile.get('node')
+        found[profile.get('node')] = access
+    return found
+
+
+if __name__ == '__main__':
+    Path(sys.argv[1]).write_text(policy(live()), encoding='utf-8')

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The URDF says what the simulated arm is, to a reader that knows nothing of us."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.description.urdf import urdf
+from sim_plant import arm as arms
+from sim_plant.configuration import PlantConfig
+
+CONFIG = build(PlantConfig, {'arm.l1': 1.1, 'arm.l2': 0.7, 'arm.m1': 0.6, 'arm.m2': 0.45})
+
+
+def test_mujoco_reads_the_very_arm_from_it():
+    """Mass matrix and gravity torque of the URDF, compiled by MuJoCo, against the plant's own."""
+    mujoco = pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
+    text = urdf('arm', CONFIG.joints, CONFIG.arm, (0.0, 0.0))
+    model = mujoco.MjModel.from_xml_string(text)
+    model.opt.gravity[:] = (0.0, 0.0, -CONFIG.arm.gravity)
+    data = mujoco.MjData(model)
+    a = CONFIG.arm
+    arm = arms.Arm(a.l1, a.l2, a.m1, a.m2, a.gravity)
+    mass, weight, theirs = np.zeros((2, 2)), np.zeros(2), np.zeros((2, 2))
+    for q in np.random.default_rng(0).uniform(-3.0, 3.0, (20, 2)):
+        for joint, angle in zip(CONFIG.joints, q, strict=True):
+            data.joint(joint).qpos[0] = angle
+        mujoco.mj_forward(model, data)
+        for i in range(2):
+            mujoco.mj_mulM(model, data, theirs[i], np.eye(2)[i])
+        arms.mass_matrix(arm, q, mass)
+        arms.gravity(arm, q, weight)
+        np.testing.assert_allclose(theirs, mass, atol=1e-7)  # a point has 1e-9 kg m^2 in it
+        np.testing.assert_allclose(data.qfrc_bias, weight, atol=1e-7)
+
+
+def test_a_limit_of_the_motors_is_told_where_there_is_one():
+    assert 'effort="12"' in urdf('arm', ('a', 'b'), CONFIG.arm, (12.0, 0.0))
+    assert urdf('arm', ('a', 'b'), CONFIG.arm, (12.0, 0.0)).count('<limit') == 1
+    assert '<joint name="b"' in urdf('arm', ('a', 'b'), CONFIG.arm, (0.0, 0.0))
