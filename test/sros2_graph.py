@@ -70,9 +70,16 @@ def live():
                 'bag_recorder': ['bag_recorder', '_bag_recorder_intake'],
             }
             found = {name: granted(ros, parts) for name, parts in nodes.items()}
+            ros.until(lambda: not recorder._inquiry.unanswered)
             ros.executor.remove_node(recorder)
             ros.spin(0.1)
             recorder.close()
+            # It asks each node, once and for a moment, for its parameters.
+            found['bag_recorder']['request'] = sorted(
+                f'/{name}/{service}'
+                for name in nodes
+                for service in ('get_parameters', 'list_parameters')
+            )
             return found
     finally:
         ros.close()
