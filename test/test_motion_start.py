@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from blf_dsc_controller.assembly import controller_of
+from blf_dsc_controller.bags.offline import write_bag
+from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.reference import Approach, Reference
 from blf_dsc_controller.configuration.schema import build
@@ -110,3 +112,20 @@ def test_what_makes_no_reference_is_refused_with_the_reason(given, problem):
     with pytest.raises(ConfigurationError) as refusal:
         build(ControllerConfig, given)
     assert problem in str(refusal.value)
+
+
+def test_the_bag_of_an_offline_run_tells_the_moving_bound(tmp_path):
+    config = build(
+        ControllerConfig,
+        {'barrier.initial_bound': [0.02, 0.01], 'barrier.funnel_rate': 4.0},
+    )
+    record = run(config, PAPER + 0.009, 0.5)
+    write_bag(tmp_path / 'bag', record, config, 'none')
+    told = read_run(tmp_path / 'bag')
+
+    t = record.stamps[:, np.newaxis] * 1e-9
+    expected = BOUND + np.array([0.018, 0.008]) * np.exp(-4.0 * t)
+    np.testing.assert_allclose(told.bound, expected, rtol=1e-12)
+    ratios = np.abs(told.error / told.bound).max(axis=0)
+    assert ratios[1] == pytest.approx(0.9)  # at the start
+    assert told.monitor.column('max_error_ratio joint2')[-1] == pytest.approx(0.9)
