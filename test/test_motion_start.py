@@ -7,13 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fault_rig import Rig
 
 from blf_dsc_controller.assembly import controller_of
 from blf_dsc_controller.bags.offline import write_bag
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.reference import Approach, Reference
-from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.core.reference import sampled
 from blf_dsc_controller.errors import ConfigurationError, OutsideBarrierError
 from blf_dsc_controller.motion.start import begin, reference_of
@@ -129,3 +130,13 @@ def test_the_bag_of_an_offline_run_tells_the_moving_bound(tmp_path):
     ratios = np.abs(told.error / told.bound).max(axis=0)
     assert ratios[1] == pytest.approx(0.9)  # at the start
     assert told.monitor.column('max_error_ratio joint2')[-1] == pytest.approx(0.9)
+
+
+def test_a_new_bound_is_judged_by_how_wide_it_is_now():
+    funnel = {'barrier.initial_bound': [0.02, 0.02], 'barrier.funnel_rate': 1.0}
+    guard = (rig := Rig(funnel)).guard
+    rig.step(60)
+    narrow = {'barrier.bound': [0.1 * np.abs(guard.controller.sample.xi1).max()] * 2}
+    assert guard.objections(change(guard.config, narrow)) == []
+    still = {'barrier.initial_bound': [0.0, 0.0], 'barrier.funnel_rate': 0.0}
+    assert guard.objections(change(guard.config, narrow | still))

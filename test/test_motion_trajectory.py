@@ -69,6 +69,13 @@ def test_it_has_no_jump_in_velocity_anywhere_and_is_held_at_the_end(fields):
     np.testing.assert_array_equal(one(motion.vector, 1e4), [GOALS[-1], (0, 0), (0, 0)])
 
 
+def test_the_way_to_the_first_point_of_cubics_arrives_with_their_acceleration():
+    motion = follow(request((GOALS, SPEEDS)), PAPER, NOW, RULES)
+    before, after = (one(motion.vector, NOW + 1.0 + side)[2] for side in (-1e-9, 1e-9))
+    np.testing.assert_allclose(before, after, atol=1e-6)
+    assert np.abs(after).min() > 0.1
+
+
 def test_cubics_are_hermite_s():
     """Halfway between two points, h apart: their mean, and h/8 times the fall of the velocity."""
     motion = follow(request((GOALS, SPEEDS)), PAPER, NOW, RULES)
@@ -124,6 +131,7 @@ def test_a_later_one_replaces_those_that_run_or_wait():
     np.testing.assert_allclose(one(last, NOW + 1.5), one(first, NOW + 1.5), atol=1e-12)
     np.testing.assert_allclose(one(last, NOW + 5.0)[0], GOALS[0] + 0.1, atol=1e-12)
     np.testing.assert_allclose(one(last, 22.0)[0], GOALS[0] + 0.1, atol=1e-12)
+    assert len(unpack(last)) == 2
 
 
 def test_what_is_over_is_forgotten():

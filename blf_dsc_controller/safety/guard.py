@@ -171,7 +171,10 @@ class Guard:
 
     def objections(self, config: ControllerConfig) -> list[str]:
         """Why a configuration cannot be taken now, in words; empty if it can."""
-        return tuning.objections(self.controller, config) if self.supervisor.running else []
+        if not self.supervisor.running:
+            return []
+        t = (self.last_stamp - self.start_stamp) * _NANO
+        return tuning.objections(self.controller, config, t)
 
     def _start_over(self) -> None:
         self.supervisor.enter(Phase.STARTING)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller import assembly
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.core import funnel
 from blf_dsc_controller.core.controller import Controller
 from blf_dsc_controller.core.settings import LINEAR, pack
 
@@ -61,18 +62,19 @@ def _trial(
     return controller.signals.beta2.copy(), controller.signals.demand.copy()
 
 
-def objections(controller: Controller, config: ControllerConfig) -> list[str]:
-    """Why a running law cannot take a valid configuration now, a sentence each."""
+def objections(controller: Controller, config: ControllerConfig, t: float) -> list[str]:
+    """Why a running law cannot take a valid configuration at the time t [s], a sentence each."""
     return [
-        *_bound_objections(controller, config),
+        *_bound_objections(controller, config, t),
         *_torque_objections(controller, config),
         *_learning_objections(controller, config),
     ]
 
 
-def _bound_objections(controller: Controller, config: ControllerConfig) -> Iterator[str]:
+def _bound_objections(controller: Controller, config: ControllerConfig, t: float) -> Iterator[str]:
     errors = np.abs(controller.sample.xi1)
-    for joint, error, bound in zip(config.joints, errors, config.barrier.bound, strict=True):
+    funnel.narrow(assembly.settings_of_config(config), controller.signals, t)
+    for joint, error, bound in zip(config.joints, errors, controller.signals.bound, strict=True):
         if not error < bound:
             yield (
                 f'barrier.bound: {joint} is {error:.6g} rad from its reference now, outside of a '
