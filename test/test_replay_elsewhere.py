@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags that other software wrote: other topics, other joint names and orders, joints too many."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import recorded_run
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from blf_dsc_controller.bags.batch import decode_joint_states
+from blf_dsc_controller.bags.content import read_content
+from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.bags.errors import (
+    EmptyTopicError,
+    MissingTopicError,
+    NameMapError,
+    UnreadableBagError,
+    UnreadableMessageError,
+)
+from blf_dsc_controller.bags.name_map import NameMap
+from blf_dsc_controller.bags.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE, JOINT_STATES
+from blf_dsc_controller.bags.types import typestore
+from blf_dsc_controller.replay.errors import NoCommandOrderError, NoTorqueError
+from blf_dsc_controller.replay.open_loop import answer
+from blf_dsc_controller.tools.bag_replay import main
+
+SHUFFLED = ('gripper', 'elbow_pitch', 'base', 'shoulder_pitch')
+MAP = [
+    'joint_states=/arm/states',
+    'commands=/arm/torque',
+    'joint1=shoulder_pitch',
+    'joint2=elbow_pitch',
+]
+CONFIG = recorded_run.loop_config().controller
+
+
+@pytest.fixture(scope='module')
+def run(tmp_path_factory):
+    """Stamps, [q, dq, effort] and torques of a run of ours."""
+    path = recorded_run.record(tmp_path_factory.mktemp('ours') / 'bag', 0.5)
+    content = read_content(path)
+    stamp, values = decode_joint_states(content.topics[JOINT_STATES], CONFIG.joints)
+    return stamp, values, answer(path, CONFIG)
+
+
+def spread(values):
+    """Two values among those of four joints, as SHUFFLED orders them."""
+    return [77.0, values[1], -5.0, values[0]]
+
+
+def foreign(run, torque='array'):
+    """Topic, type, time and bytes of each message as another robot's software writes it."""
+    stamps, values, ours = run
+    states = JointStateEncoder(SHUFFLED, frame_id='base_link')
+    arrays = {4: Float64MultiArrayEncoder(4), 2: Float64MultiArrayEncoder(2)}
+    for k, stamp in enumerate(stamps.tolist()):
+        q, dq, effort = (spread(field) for field in values[k])
+        told = effort if torque == 'effort' else [0.0] * 4
+        yield '/arm/states', JOINT_STATE, stamp, states.encode(stamp, q, dq, told)
+        command = ours.applied[k]
+        if torque == 'array':
+            yield '/arm/torque', FLOAT64_MULTI_ARRAY, stamp + 9, arrays[4].encode(spread(command))
+        if torque == 'pair':
+            yield '/arm/torque', FLOAT64_MULTI_ARRAY, stamp + 9, arrays[2].encode(command)
+        if torque == 'state':
+            raw = states.encode(stamp, [0] * 4, [0] * 4, spread(command))
+            yield '/arm/torque', JOINT_STATE, stamp + 9, raw
+
+
+def write(path, messages, storage=StoragePlugin.MCAP, version=9):
+    with Writer(path, version=version, storage_plugin=storage) as writer:
+        connections = {}
+        for topic, type_name, at, raw in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, type_name, typestore=typestore())
+            writer.write(connections[topic], at, raw)
+    return path
+
+
+def write_ros1(path, messages):
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Writer1(path) as writer:
+        connections = {}
+        for k, (topic, type_name, at, raw) in enumerate(messages):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, type_name, typestore=store)
+            message = typestore().deserialize_cdr(raw, type_name)
+            if type_name == JOINT_STATE:
+                types = store.types
+                stamp = message.header.stamp
+                header = types['std_msgs/msg/Header'](
+                    seq=k,
+                    stamp=types['builtin_interfaces/msg/Time'](stamp.sec, stamp.nanosec),
+                    frame_id=message.header.frame_id,
+                )
+                arrays = (message.name, message.position, message.velocity, message.effort)
+                message = types[JOINT_STATE](header, *arrays)
+            writer.write(connections[topic], at, store.serialize_ros1(message, type_name))
+    return path
+
+
+@pytest.mark.parametrize('torque', ['array', 'pair', 'state'])
+@pytest.mark.parametrize('storage', [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_shuffled_joints_and_two_more_replay_to_the_same_torques(run, tmp_path, storage, torque):
+    path = write(tmp_path / 'bag', foreign(run, torque), storage)
+    found = answer(path, CONFIG, names=NameMap.parse(MAP))
+    np.testing.assert_array_equal(found.replayed.told.torque, run[2].replayed.told.torque)
+    np.testing.assert_array_equal(found.applied, run[2].applied)
+
+
+@pytest.mark.parametrize('version', [5, 8])  # of Humble, whose bags hold no definitions, and Iron
+def test_bags_of_earlier_releases_are_read(run, tmp_path, version):
+    path = write(tmp_path / 'bag', foreign(run), StoragePlugin.SQLITE3, max(version, 8))
+    if version == 5:
+        text = (path / 'metadata.yaml').read_text()
+        (path / 'metadata.yaml').write_text(text.replace('version: 8', 'version: 5'))
+    found = answer(path, CONFIG, names=NameMap.parse(MAP))
+    assert np.abs(found.difference).max() == 0.0
+
+
+def test_a_bag_of_ros_1_is_read(run, tmp_path):
+    path = write_ros1(tmp_path / 'run.bag', foreign(run))
+    found = answer(path, CONFIG, names=NameMap.parse(MAP))
+    np.testing.assert_array_equal(found.replayed.told.torque, run[2].replayed.told.torque)
+
+
+def test_without_commands_the_effort_is_the_torque(run, tmp_path):
+    path = write(tmp_path / 'bag', foreign(run, 'effort'))
+    names = NameMap.parse([entry for entry in MAP if 'commands' not in entry])
+    found = answer(path, CONFIG, names=names)
+    assert found.source == 'effort of /arm/states'
+    # The effort of a state is the torque that led to it: the last one is not known.
+    np.testing.assert_array_equal(found.applied[:-1], run[2].applied[:-1])
+    assert np.isnan(found.applied[-1]).all()
+
+
+def test_commands_at_another_rate_are_those_that_had_come(run, tmp_path):
+    messages = list(foreign(run, 'pair'))
+    kept = [one for k, one in enumerate(messages) if one[0] != '/arm/torque' or k % 4 == 1]
+    found = answer(write(tmp_path / 'bag', kept), CONFIG, names=NameMap.parse(MAP))
+    np.testing.assert_array_equal(found.applied[1], run[2].applied[0])  # of two states, one command
+    np.testing.assert_array_equal(found.applied[2], run[2].applied[2])
+
+
+def test_the_command_reads_them_too(run, tmp_path, capsys):
+    path = write(tmp_path / 'bag', foreign(run), StoragePlugin.SQLITE3)
+    words = [word for entry in MAP for word in ('--map', entry)]
+    assert main([str(path), '--config', 'recommended', *words]) == 0
+    assert 'recorded torque: /arm/torque' in capsys.readouterr().out
+
+
+def names_of(**changes):
+    entries = dict(entry.split('=') for entry in MAP) | changes
+    return NameMap.parse(f'{ours}={theirs}' for ours, theirs in entries.items())
+
+
+@pytest.mark.parametrize(
+    ('changes', 'error', 'said'),
+    [
+        ({'joint_states': '/arm/state'}, MissingTopicError, r"'/arm/state' of type sensor_msgs"),
+        (
+            {'joint_states': '/arm/torque', 'commands': '/arm/states'},
+            MissingTopicError,
+            r'/arm/torque \(std_msgs',
+        ),
+        ({'joint1': 'shoulder'}, UnreadableMessageError, "'shoulder' is not in .* gripper, elbow"),
+        ({'joint3': 'base'}, NameMapError, 'joint3 is neither a topic nor one of the joints'),
+    ],
+)
+def test_a_wrong_name_is_told_with_what_there_is(run, tmp_path, changes, error, said):
+    path = write(tmp_path / 'bag', foreign(run))
+    with pytest.raises(error, match=said):
+        answer(path, CONFIG, names=names_of(**changes))
+
+
+def test_without_any_torque_it_is_said_where_it_was_looked_for(run, tmp_path):
+    states = [one for one in foreign(run) if one[0] == '/arm/states']
+    empty = JointStateEncoder(SHUFFLED, ('position', 'velocity'))
+    bare = [
+        (topic, type_, at, empty.encode(at, spread(run[1][k, 0]), spread(run[1][k, 1])))
+        for k, (topic, type_, at, _) in enumerate(states)
+    ]
+    names = NameMap.parse([entry for entry in MAP if 'commands' not in entry])
+    with pytest.raises(NoTorqueError, match='--map commands='):
+        answer(write(tmp_path / 'bag', bare), CONFIG, names=names)
+
+
+def test_commands_that_are_of_no_known_order_are_refused(run, tmp_path):
+    three = Float64MultiArrayEncoder(3)
+    messages = [
+        one if one[0] == '/arm/states' else (*one[:3], three.encode([1, 2, 3]))
+        for one in foreign(run)
+    ]
+    with pytest.raises(NoCommandOrderError, match='3 values, but there are 2 joints, and 4 in'):
+        answer(write(tmp_path / 'bag', messages), CONFIG, names=NameMap.parse(MAP))
+
+
+def test_an_empty_bag_is_called_empty(tmp_path):
+    with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        writer.add_connection('/joint_states', JOINT_STATE, typestore=typestore())
+    with pytest.raises(EmptyTopicError, match='is empty: it holds no message of /joint_states'):
+        answer(tmp_path / 'bag', CONFIG)
+
+
+def test_a_bag_of_a_later_format_is_refused_in_words(run, tmp_path):
+    path = write(tmp_path / 'bag', foreign(run))
+    text = (path / 'metadata.yaml').read_text()
+    (path / 'metadata.yaml').write_text(text.replace('version: 9', 'version: 99'))
+    with pytest.raises(UnreadableBagError, match='99'):
+        answer(path, CONFIG, names=NameMap.parse(MAP))
+
+
+@pytest.mark.parametrize('entry', ['joint1', '=x', 'joint1='])
+def test_an_entry_with_one_side_is_refused(entry):
+    with pytest.raises(NameMapError, match='one side is missing'):
+        NameMap.parse([entry])
+
+
+def test_a_name_given_twice_is_refused():
+    with pytest.raises(NameMapError, match='given before'):
+        NameMap.parse(['joint1=a', 'joint2=a'])
