@@ -39,7 +39,7 @@ PIP_FAILED := { echo 'The installation failed: see above. It needs a package ind
   'set HTTPS_PROXY, for a mirror PIP_INDEX_URL, without a network PIP_FIND_LINKS and' \
   'PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
 
-.PHONY: help venv demo paper test test-browser test-nightly soak lint clean
+.PHONY: help venv demo paper test test-long test-browser test-nightly soak lint clean
 
 help: ## List what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' Makefile
@@ -60,6 +60,9 @@ paper: $(READY) ## Run the paper's simulation with every law and judge its claim
 
 test: $(READY) ## Run the tests (TESTS=test/test_x.py for some)
 	@$(if $(filter sourced,$(FLAVOUR)),PYTEST_DISABLE_PLUGIN_AUTOLOAD=1) $(RUN) -m pytest $(TESTS)
+
+test-long: $(READY) ## Kill the recorder at ten moments, and not only at three
+	@BAG_KILLS=10 $(RUN) -m pytest test/test_bag_recorder_trouble.py
 
 test-browser: $(READY) ## Open the page of bag_report in a headless Chromium, if there is one
 	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_report_page.py

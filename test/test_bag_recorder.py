@@ -62,7 +62,7 @@ class Loop:
         """Let both nodes work until the recorder has that many messages of these topics."""
         self.spin_until(
             lambda: all(
-                self.recorder._writer.message_counts.get(f'/{topic}', 0) >= count
+                self.recorder._sink.message_counts.get(f'/{topic}', 0) >= count
                 for topic, count in counts.items()
             )
         )
@@ -177,7 +177,7 @@ def test_quality_and_type_are_those_of_the_graph(loop):
     run = loop()
     quality = QoSProfile(depth=7, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     run.source.create_publisher(Float64MultiArray, 'commands', quality)
-    run.spin_until(lambda: '/commands' in run.recorder._writer.message_counts)
+    run.spin_until(lambda: '/commands' in run.recorder._sink.message_counts)
     (seen,) = run.recorder.get_publishers_info_by_topic('/commands')
     run.close()
     with Reader(run.bag) as reader:

@@ -82,6 +82,28 @@ class BagExistsError(BlfDscError):
         )
 
 
+class WriteError(BlfDscError):
+    """A bag that cannot be written any further, for another reason than a full disk."""
+
+    def __init__(self, error: OSError) -> None:
+        super().__init__(
+            f'the bag cannot be written any further: {error}; what was written before is saved by '
+            'bag_recover'
+        )
+
+
+class DiskFullError(BlfDscError):
+    """The disk of a bag is full; what was written until then is a complete bag."""
+
+    def __init__(self, path: Path, messages: int) -> None:
+        self.path = path
+        self.messages = messages
+        super().__init__(
+            f'the disk is full: recording into {path} has ended with {messages} messages, which '
+            'are complete and readable; make room, or split and move bags while they are recorded'
+        )
+
+
 class UnknownTypeError(BlfDscError):
     """A message type whose definition is not known here."""
 

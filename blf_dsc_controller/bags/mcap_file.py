@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import IO, cast
 
 from mcap.writer import CompressionType, Writer
 
@@ -14,12 +15,16 @@ from blf_dsc_controller.bags.metadata import (
     TopicInformation,
     quality_text,
 )
+from blf_dsc_controller.bags.reserved_file import ReservedFile
 
 COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
 CHANNEL_RECORD = 'blf_dsc_controller channel '
 """Start of the name of a metadata record that repeats a topic outside of the chunks."""
 
 CHUNK_SIZE = 1 << 20
+
+_CHUNK_ENTRY = 100  # bytes that a chunk takes in the index at the end ...
+_CHANNEL_ENTRY = 16  # ... and for each channel
 
 
 class McapFile:
@@ -35,12 +40,16 @@ class McapFile:
 
     def __init__(self, path: Path, compression: str) -> None:
         self.information = FileInformation(path.name)
-        self._stream = path.open('xb')
+        self._stream = ReservedFile(path)
+        self._index_size = 0
         self._writer = Writer(
-            self._stream, chunk_size=CHUNK_SIZE, compression=COMPRESSIONS[compression]
+            cast('IO[bytes]', self._stream),
+            chunk_size=CHUNK_SIZE,
+            compression=COMPRESSIONS[compression],
         )
         self._writer.start(profile='ros2', library=f'blf_dsc_controller {__version__}')
         self._schemas: dict[str, int] = {}
+        self._channels = 0
 
     def describe(self, bag: BagInformation) -> None:
         """Store what is known of the bag; rosbag2 reads the last such record of a file."""
@@ -71,6 +80,7 @@ class McapFile:
             'topic_type_hash': topic.type_hash,
         }
         schema = self._schemas[topic.type]
+        self._channels += 1
         number = self._writer.register_channel(topic.name, 'cdr', schema, metadata)
         repeated = {'topic': topic.name, 'topic_type': topic.type, **metadata}
         self.note(f'{CHANNEL_RECORD}{number}', repeated)
@@ -86,9 +96,22 @@ class McapFile:
         information.starting_time = min(information.starting_time, log_time)
         information.ending_time = max(information.ending_time, log_time)
 
+    @property
+    def size(self) -> int:
+        """Bytes of the file so far."""
+        return self._stream.tell()
+
+    @property
+    def is_full(self) -> bool:
+        """Whether its disk is full: it can still be closed in order, but should take no more."""
+        return self._stream.is_full
+
     def flush(self) -> None:
         """End the current chunk and hand all of it to the operating system."""
         self._writer.flush()  # type: ignore[no-untyped-call]
+        self._stream.flush()
+        self._index_size += _CHUNK_ENTRY + _CHANNEL_ENTRY * self._channels
+        self._stream.hold(self._index_size)
 
     def close(self) -> None:
         """Write the index and close the file."""

@@ -5,16 +5,26 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from types import TracebackType
 from typing import final
 
 from blf_dsc_controller.bags.context import ATTACHMENT, MEDIA_TYPE, RECORD, facts_of
-from blf_dsc_controller.bags.errors import BagExistsError
+from blf_dsc_controller.bags.errors import BagExistsError, DiskFullError
 from blf_dsc_controller.bags.mcap_file import McapFile
 from blf_dsc_controller.bags.metadata import BagInformation, TopicInformation
 from blf_dsc_controller.bags.topics import Quality
 from blf_dsc_controller.bags.types import definition, type_hash
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When a new file of the bag is begun: at a size [bytes], or after a time [s]; inf: never."""
+
+    size: float = inf
+    duration: float = inf
 
 
 @final
@@ -30,6 +40,7 @@ class BagWriter:
         flush_interval: longest time that data stays in the process [s]; None leaves it to the size
             of a chunk, which is best where nothing is lost by starting over.
         clock: monotonic time [s].
+        limits: of one file.
 
     Raises:
         BagExistsError: `path` is there already.
@@ -42,17 +53,20 @@ class BagWriter:
         compression: str = 'none',
         flush_interval: float | None = 0.1,
         clock: Callable[[], float] = time.monotonic,
+        limits: Limits = Limits(),
     ) -> None:
         self.path = Path(path)
+        self._compression = compression
+        self._limits = limits
         self._bag = BagInformation()
+        self._definitions: list[tuple[str, str]] = []
+        self._configuration: tuple[str, int] | None = None
         self._make_folder()
-        self._file = McapFile(self.path / f'{self.path.name}_0.mcap', compression)
-        self._bag.files.append(self._file.information)
-        self._file.describe(self._bag)
-        self._flush_interval = float('inf') if flush_interval is None else flush_interval
+        self._file = self._new_file()
+        self._flush_interval = inf if flush_interval is None else flush_interval
         self._clock = clock
-        self._flushed = clock()
-        self._closed = False
+        self._flushed = self._began = clock()
+        self.closed = False
 
     def add_topic(
         self,
@@ -78,9 +92,9 @@ class BagWriter:
             UnknownTypeError: no `text` is given and the type is none of the common ones.
         """
         topic = TopicInformation(name, type_name, tuple(offered), hash_ or type_hash(type_name))
-        handle = self._file.add_channel(topic, text or definition(type_name), encoding)
+        self._definitions.append((text or definition(type_name), encoding))
         self._bag.topics.append(topic)
-        return handle
+        return self._file.add_channel(topic, *self._definitions[-1])
 
     def write(
         self,
@@ -98,6 +112,9 @@ class BagWriter:
             log_time: when it was received [ns].
             publish_time: when it was published [ns], `log_time` if not known.
             sequence: number that the publisher gave it, 0 if not known.
+
+        Raises:
+            DiskFullError: there is no room left; the bag is complete and closed.
         """
         self._file.write(
             handle, raw, log_time, log_time if publish_time is None else publish_time, sequence
@@ -112,10 +129,9 @@ class BagWriter:
             configuration: text of a parameter file of all nodes known so far.
             known_at: when it was learned [ns], now if not given.
         """
-        known_at = time.time_ns() if known_at is None else known_at
+        self._configuration = configuration, time.time_ns() if known_at is None else known_at
         self._bag.custom_data.update(facts_of(configuration))
-        self._file.note(RECORD, self._bag.custom_data)
-        self._file.attach(ATTACHMENT, MEDIA_TYPE, configuration, known_at)
+        self._describe(self._file)
 
     def note(self, facts: dict[str, str]) -> None:
         """Store facts of the run under names of their own."""
@@ -123,23 +139,37 @@ class BagWriter:
         self._file.note(RECORD, self._bag.custom_data)
 
     def flush_if_due(self) -> None:
-        """Flush if the flush interval has passed, for use in a pause of the messages."""
-        if self._clock() - self._flushed >= self._flush_interval:
+        """Flush if the flush interval has passed, for use in a pause of the messages.
+
+        Raises:
+            DiskFullError: as in `write`.
+        """
+        if self._file.is_full or self._clock() - self._flushed >= self._flush_interval:
             self.flush()
 
     def flush(self) -> None:
-        """Hand everything written so far to the operating system."""
+        """Hand everything written so far to the operating system.
+
+        Raises:
+            DiskFullError: as in `write`.
+        """
         self._file.flush()
         self._flushed = self._clock()
+        if self._file.is_full:
+            self.close()
+            raise DiskFullError(self.path, sum(self.message_counts.values()))
+        if (
+            self._file.size >= self._limits.size
+            or self._flushed - self._began >= self._limits.duration
+        ):
+            self._split()
 
     def close(self) -> None:
         """Complete the bag; a second call does nothing."""
-        if self._closed:
+        if self.closed:
             return
-        self._closed = True
-        self._file.flush()
-        self._file.describe(self._bag)
-        self._file.close()
+        self.closed = True
+        self._end(self._file)
         (self.path / 'metadata.yaml').write_text(self._bag.file_text(), encoding='utf-8')
 
     @property
@@ -157,6 +187,34 @@ class BagWriter:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+    def _new_file(self) -> McapFile:
+        """Begin the next file, with all that the one before it announced."""
+        name = f'{self.path.name}_{len(self._bag.files)}.mcap'
+        file = McapFile(self.path / name, self._compression)
+        self._bag.files.append(file.information)
+        file.describe(self._bag)
+        for topic, (text, encoding) in zip(self._bag.topics, self._definitions, strict=True):
+            file.add_channel(topic, text, encoding)
+        self._describe(file)
+        return file
+
+    def _describe(self, file: McapFile) -> None:
+        if self._bag.custom_data:
+            file.note(RECORD, self._bag.custom_data)
+        if self._configuration is not None:
+            text, known_at = self._configuration
+            file.attach(ATTACHMENT, MEDIA_TYPE, text, known_at)
+
+    def _split(self) -> None:
+        self._end(self._file)
+        self._file = self._new_file()
+        self._began = self._flushed
+
+    def _end(self, file: McapFile) -> None:
+        file.flush()
+        file.describe(self._bag)
+        file.close()
 
     def _make_folder(self) -> None:
         try:

@@ -39,6 +39,28 @@ class RecorderConfig:
         read_only=_AT_START,
     )
 
+    split_size: float = parameter(
+        0.0,
+        'size at which a new file of the bag is begun; 0: never',
+        unit='MB',
+        at_least=0.0,
+        read_only=_AT_START,
+    )
+    split_duration: float = parameter(
+        0.0,
+        'time after which a new file of the bag is begun; 0: never',
+        unit='s',
+        at_least=0.0,
+        read_only=_AT_START,
+    )
+    ring: float = parameter(
+        0.0,
+        'keep only this last time, in memory, and write it on the service trigger; 0: write all',
+        unit='s',
+        at_least=0.0,
+        read_only=_AT_START,
+    )
+
     def problems(self) -> list[str]:
         """Return what is wrong beside the ranges of single parameters, in words."""
         return [] if self.output.strip() else ['output: got no folder name to write the bag into']

@@ -9,10 +9,9 @@ from typing import Any
 
 from rclpy.clock import Clock, ClockType
 
-from blf_dsc_controller.bags.errors import UnknownTypeError
+from blf_dsc_controller.bags.errors import DiskFullError, UnknownTypeError, WriteError
 from blf_dsc_controller.bags.losses import Losses
 from blf_dsc_controller.bags.topics import Quality
-from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.dump import text_of_values
 from blf_dsc_controller.configuration.recorder import RecorderConfig
 from blf_dsc_controller.nodes.definitions import learn
@@ -21,12 +20,12 @@ from blf_dsc_controller.nodes.executor import RunnableNode, run
 from blf_dsc_controller.nodes.inquiry import Inquiry, Values
 from blf_dsc_controller.nodes.intake import Intake, quality_of
 from blf_dsc_controller.nodes.parameters import declare
+from blf_dsc_controller.nodes.sinks import BlackBox, Recording
 
 _DISCOVERY_PERIOD = 0.1  # s
 _TAKE_PERIOD = 0.01  # s
 _UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'  # rmw's words
 _OF_EVERY_NODE = ('/parameter_events', '/rosout')
-_FLUSH_INTERVAL = 0.05  # s; with the period above, data is in the process for less than 0.1 s
 
 
 class BagRecorderNode(RunnableNode):
@@ -56,19 +55,15 @@ class BagRecorderNode(RunnableNode):
         self.create_timer(_DISCOVERY_PERIOD, self._discover, clock=steady)
         self.create_timer(_TAKE_PERIOD, self._record, clock=steady)
         # The folder comes last: whatever ends the node from here on also completes the bag.
-        self._writer = BagWriter(
-            self._config.output,
-            compression=self._config.compression,
-            flush_interval=_FLUSH_INTERVAL,
-        )
-        self.get_logger().info(f'recording into {self._writer.path}')
+        self._sink = BlackBox(self, self._config) if self._config.ring else Recording(self._config)
+        self.get_logger().info(self._sink.beginning)
 
     def close(self) -> None:
         """Write what still waits, complete the bag and tell what is in it."""
-        self._record()
+        if self.failure is None:
+            self._record()
         self._intake.close()
-        self._writer.note(self._statistics())
-        self._writer.close()
+        self._sink.close(self._statistics())
         for line in self._summary():
             self.get_logger().info(line)
 
@@ -95,7 +90,7 @@ class BagRecorderNode(RunnableNode):
 
     def _on_parameters(self, node: str, values: Values) -> None:
         self._parameters[node] = values
-        self._writer.configure(text_of_values(self._parameters))
+        self._sink.configure(text_of_values(self._parameters))
 
     def _wanted(self, topic: str) -> bool:
         if self._chosen:
@@ -119,7 +114,7 @@ class BagRecorderNode(RunnableNode):
         self._start(topic, types[0], offered)
 
     def _start(self, topic: str, type_name: str, offered: list[Quality]) -> None:
-        handle = self._writer.add_topic(topic, type_name, offered)
+        handle = self._sink.add_topic(topic, type_name, offered)
         self._losses[topic] = self._by_handle[handle] = Losses(len(offered))
         self._intake.subscribe(topic, type_name, offered, handle)
         if topic not in _OF_EVERY_NODE:
@@ -132,18 +127,22 @@ class BagRecorderNode(RunnableNode):
         self.get_logger().warning(f'{topic} is not recorded: {reason}')
 
     def _record(self) -> None:
-        for arrival in self._intake.take():
-            self._by_handle[arrival.handle].count(arrival.sequence)
-            self._writer.write(
-                arrival.handle, arrival.raw, arrival.received, arrival.published, arrival.sequence
-            )
-        self._inquiry.go_on()
-        self._writer.flush_if_due()
+        if self.failure is not None:
+            return
+        try:
+            for arrival in self._intake.take():
+                self._by_handle[arrival.handle].count(arrival.sequence)
+                self._sink.write(arrival)
+            self._inquiry.go_on()
+            self._sink.flush_if_due()
+        except (DiskFullError, OSError) as error:
+            self.failure = error if isinstance(error, DiskFullError) else WriteError(error)
+            self.finished = True
 
     def _statistics(self) -> dict[str, str]:
         return {
             f'messages {topic}': f'{count} written{self._losses[topic].text()}'
-            for topic, count in self._writer.message_counts.items()
+            for topic, count in self._sink.message_counts.items()
         }
 
     def _summary(self) -> Iterator[str]:
@@ -151,7 +150,7 @@ class BagRecorderNode(RunnableNode):
             yield f'{topic}: never appeared'
         for node in self._inquiry.unanswered:
             yield f'{node}: did not tell its parameters'
-        for topic, count in self._writer.message_counts.items():
+        for topic, count in self._sink.message_counts.items():
             yield f'{topic}: {count} messages{self._losses[topic].text()}'
 
 

@@ -60,6 +60,7 @@ def _watch(plant: PlantConfig, nodes: list[NodeProcess], interruption: Interrupt
 
     with Watch(plant) as watch:
         while nodes[-1].is_running and not interruption.came:
-            for node in nodes:
+            # A loop that has begun goes on without its recorder, whose end is told afterwards.
+            for node in nodes[1:] if watch.has_begun else nodes:
                 node.check()
             watch.wait(0.1)

@@ -48,6 +48,11 @@ class Watch:
         self._latest = None
         return True
 
+    @property
+    def has_begun(self) -> bool:
+        """Whether the loop has been seen to run."""
+        return self._start >= 0.0
+
     def __enter__(self) -> Watch:
         return self
 
