@@ -146,7 +146,7 @@ def test_its_ring_is_written_when_it_is_asked_to(rig, tmp_path):
     assert answer.result().success, answer.result().message
     assert answer.result().message.endswith(f'messages into {tmp_path / "bag"}')
     stamps = [at for topic, at, _ in read(tmp_path / 'bag') if topic == '/a']
-    assert stamps[-1] - stamps[0] <= 0.5e9
+    assert stamps[-1] - stamps[1] <= 0.5e9  # the first is older: the topic is a latched one
     again = client.call_async(Trigger.Request())
     rig.wait_for(again.done)
     assert (tmp_path / 'bag-2' / 'metadata.yaml').exists()
