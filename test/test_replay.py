@@ -25,6 +25,7 @@ from blf_dsc_controller.bags.telemetry import ControllerTelemetry
 from blf_dsc_controller.bags.topics import (
     COMMANDS,
     JOINT_STATES,
+    JOINT_TRAJECTORY,
     LEARNING,
     PARAMETER_EVENTS,
     REFERENCE,
@@ -88,6 +89,19 @@ def test_every_number_is_the_same(bag):
 def test_every_law_and_a_compressed_bag_replay(tmp_path, law):
     path = recorded_run.record(tmp_path / law, 0.3, 'zstd', law=law)
     assert replay(path).difference is None
+
+
+def test_trajectories_that_were_sent_are_told_of(entries, rewritten):
+    sent = [JOINT_TRAJECTORY.resolved, JOINT_TRAJECTORY.type, START, b'']
+    outcome = replay(rewritten([*entries, sent]))
+    assert 'trajectories were sent' in outcome.remarks[0]
+
+
+def test_a_bound_that_narrows_replays_too(tmp_path):
+    funnel = {'barrier.initial_bound': [0.02, 0.01], 'barrier.funnel_rate': 5.0}
+    outcome = replay(recorded_run.record(tmp_path / 'bag', 0.3, **funnel))
+    assert outcome.difference is None
+    assert (outcome.changes, outcome.remarks) == (0, ())
 
 
 def test_the_learning_has_begun_in_that_bag(bag):

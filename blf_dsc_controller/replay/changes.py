@@ -48,8 +48,7 @@ def changes_of(
     """
     bounds = content.topics.get(BOUND)
     begin = bounds.received[0] if bounds is not None else 0
-    stamps = [] if bounds is None else decode_joint_states(bounds, (), ())[0].tolist()[1:]
-    stamps = [one for one in stamps if one < end]
+    stamps = [] if bounds is None else [one for one in _told_again(bounds, config) if one < end]
     ended = None if bounds is None else _received_from(bounds, end)
     later: list[ControllerConfig] = []
     for received, values in _events(content, node):
@@ -82,6 +81,21 @@ def restarts(content: Content, config: ControllerConfig, start: int) -> Stamps:
     first = values[np.searchsorted(stamp, start)]
     back = stamp[(values == first).all(axis=1) & (stamp > start)]
     return np.intersect1d(back, decode_joint_states(bounds, (), ())[0])
+
+
+def _told_again(bounds: Recorded, config: ControllerConfig) -> list[int]:
+    """Stamps [ns] of the bounds that were told for a change of parameters.
+
+    A bound that narrows is told with every sample, too: what tells a change then has the stamp, or
+    the value, of the message before it.
+    """
+    stamp, values = decode_joint_states(bounds, config.joints, ('position',))
+    told_again = np.ones(stamp.size - 1, dtype=np.bool_)
+    if config.barrier.widest != config.barrier.bound:
+        same = (values[1:, 0] == values[:-1, 0]).all(axis=1)
+        told_again = same | (stamp[1:] == stamp[:-1])
+    changed: list[int] = stamp[1:][told_again].tolist()
+    return changed
 
 
 def _received_from(bounds: Recorded, end: int) -> int | None:

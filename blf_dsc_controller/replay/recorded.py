@@ -6,15 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.batch import decode_joint_states
-from blf_dsc_controller.bags.content import Content, read_content
+from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.run import Floats, Series
-from blf_dsc_controller.bags.topics import BOUND, FOREVER
-from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.bags.topics import FOREVER, JOINT_TRAJECTORY
 from blf_dsc_controller.replay.changes import changes_of, restarts
 from blf_dsc_controller.replay.comparison import Comparison, Difference, compare, first
 from blf_dsc_controller.replay.errors import LateRecordingError, NothingToCompareError
@@ -70,12 +65,17 @@ def replay(path: Path, namespace: str = '') -> Outcome:
         content, recorded.config, recorded.known_at, recorded.node, end
     )
     replayed = run_law(config, states, changes)
-    bound = _bound(content, config, states)
     gappy = [topic for topic in content.message_counts if context.missed(topic)]
-    comparisons = tuple(compare(content, states, expected(replayed, states, bound), gappy))
+    messages = expected(replayed, states, replayed.told.bound)
+    comparisons = tuple(compare(content, states, messages, gappy))
     if not any(one.values for one in comparisons):
         raise NothingToCompareError(path, content.message_counts)
     remarks = [problem] if problem else []
+    if any(topic.rsplit('/', 1)[-1] == JOINT_TRAJECTORY.leaf for topic in content.message_counts):
+        remarks.append(
+            'trajectories were sent to the controller: the replay follows the configured reference '
+            'throughout'
+        )
     if context.version != __version__:
         remarks.append(
             f'recorded by version {context.version or "unknown"} and replayed by {__version__}: '
@@ -96,15 +96,3 @@ def replay(path: Path, namespace: str = '') -> Outcome:
             'controller started again?'
         )
     return Outcome(states, len(changes), comparisons, tuple(remarks))
-
-
-def _bound(content: Content, config: ControllerConfig, states: States) -> Floats:
-    """Bound k_c of each sample (N, n): the one in force when the sample was answered."""
-    configured = np.tile(np.array(config.barrier.bound), (states.stamp.size, 1))
-    if BOUND not in content.topics:
-        return configured
-    stamp, values = decode_joint_states(content.topics[BOUND], config.joints, ('position',))
-    if stamp.size < 2:
-        return configured
-    # A change is stamped with the last state that was answered before it.
-    return Series(config.joints, stamp, values[:, 0]).held(states.stamp - 1)
