@@ -23,13 +23,16 @@ AHEAD = 3
 PATIENCE = 3
 """Times in a row that all workers may be lost with nothing done in between."""
 
-_LARGEST_CHUNK = 250
 _CHUNKS_EACH = 20
+_MOST_PARTS = 1000
+_LARGEST = (100, 1000)  # runs in a chunk: in a study of up to 100 000, and in any
 
 
 def chunk_size(runs: int, workers: int) -> int:
     """Runs in a chunk: few files, yet enough chunks for the workers to end together."""
-    return max(1, min(_LARGEST_CHUNK, runs // (_CHUNKS_EACH * workers)))
+    usual, ever = _LARGEST
+    largest = min(ever, max(usual, runs // _MOST_PARTS))
+    return max(1, min(largest, runs // (_CHUNKS_EACH * workers)))
 
 
 def compute(
