@@ -17,7 +17,9 @@ from blf_dsc_controller.study import claims, tune
 from blf_dsc_controller.study.cases import SIDE_BY_SIDE, VARIATIONS
 from blf_dsc_controller.study.claims import FAILS, HOLDS, ONLY_IF, verdict
 from blf_dsc_controller.study.metrics import Courses, measure
+from blf_dsc_controller.study.runs import Outcome
 from blf_dsc_controller.study.sweeps import SWEEPS, case_name
+from blf_dsc_controller.study.tables import kept_bounds
 from blf_dsc_controller.tools import paper_study
 
 BOUND = np.array([0.002, 0.004])
@@ -127,6 +129,21 @@ def test_tables_hold_every_run(report):
     sweeps = rows(report / 'robustness.csv')
     assert len(sweeps) == sum(len(sweep.values) * len(sweep.laws) for sweep in SWEEPS)
     assert {row['bound'] for row in sweeps} == {'kept', 'left'}
+
+
+def test_bounds_that_were_kept_are_told_by_condition_and_law():
+    held, left = (Outcome(measure(courses(), np.full(2, k))) for k in (0.004, 0.001))
+    outcomes = {
+        case.name: left if case.name.endswith((' 10', ' 0')) else held
+        for sweep in SWEEPS
+        for case in sweep.cases()
+    }
+    header, table = kept_bounds(outcomes)
+    rows = {row[0]: row[1:] for row in table}
+    assert len(header) == 5
+    assert rows['delay of the torque [samples]'] == ['1, 2, 3, 4, 5, 6, 8'] * 4
+    assert rows['encoder [bits a turn]'] == ['all'] * 4
+    assert rows['excitation window [s]'][2:] == ['-', '-']
 
 
 def test_claims_are_judged_by_the_runs(report):

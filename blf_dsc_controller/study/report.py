@@ -19,7 +19,7 @@ from blf_dsc_controller.study.paper_figures import draw_figure_2, draw_figure_3
 from blf_dsc_controller.study.robustness_figure import draw_robustness
 from blf_dsc_controller.study.runs import Outcome, run_all
 from blf_dsc_controller.study.sweeps import SWEEPS
-from blf_dsc_controller.study.tables import HEADER, side_by_side, write_tables
+from blf_dsc_controller.study.tables import HEADER, kept_bounds, side_by_side, write_tables
 
 TITLE = 'The paper, side by side'
 
@@ -131,7 +131,7 @@ def content(
         page.section('Warnings before the start', page.paragraphs(*warnings())),
         page.section('What was equalised', page.paragraphs(*equalised())),
         page.section('Figures', *figures),
-        page.section('Where each law breaks', *robust),
+        page.section('Where each law breaks', page.table(*kept_bounds(outcomes)), *robust),
         page.section(
             'Files',
             page.paragraphs(

@@ -13,7 +13,7 @@ from blf_dsc_controller.study.cases import SIDE_BY_SIDE
 from blf_dsc_controller.study.claims import Claim
 from blf_dsc_controller.study.metrics import MOMENTS, Metrics
 from blf_dsc_controller.study.runs import Outcome
-from blf_dsc_controller.study.sweeps import SWEEPS, case_name
+from blf_dsc_controller.study.sweeps import LAWS, SWEEPS, Sweep, case_name
 
 HEADER = (
     'law',
@@ -54,6 +54,26 @@ def _cells(metrics: Metrics) -> list[str]:
 
 def _pair(values: Iterable[float], factor: float, decimals: int) -> str:
     return ' / '.join(f'{factor * value:.{decimals}f}' for value in values)
+
+
+def kept_bounds(outcomes: Mapping[str, Outcome]) -> tuple[list[str], list[list[str]]]:
+    """Header and rows: at which values of each condition each law has kept its bound."""
+    rows = [
+        [sweep.label, *(_kept(outcomes, sweep, law) if law in sweep.laws else '-' for law in LAWS)]
+        for sweep in SWEEPS
+    ]
+    return ['bound kept at', *LAWS.values()], rows
+
+
+def _kept(outcomes: Mapping[str, Outcome], sweep: Sweep, law: str) -> str:
+    held = []
+    for value in sweep.values:
+        metrics = outcomes[case_name(sweep.name, law, value)].metrics
+        if metrics is not None and metrics.held:
+            held.append(value)
+    if len(held) == len(sweep.values):
+        return 'all'
+    return ', '.join(f'{value:g}' for value in held) or 'none'
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
