@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Subscribe to some topics in serialised form and throw every message away.
+
+Usage: python raw_subscriber.py NUMBER_OF_TOPICS
+"""
+
+from __future__ import annotations
+
+import sys
+
+import rclpy
+from rclpy.experimental import EventsExecutor
+from sensor_msgs.msg import JointState
+
+from blf_dsc_controller.bags.topics import RECORDED
+from blf_dsc_controller.nodes.endpoints import profile
+
+
+def main() -> None:
+    """Take messages until the process is ended."""
+    rclpy.init()
+    node = rclpy.create_node('raw_subscriber')
+    for i in range(int(sys.argv[1])):
+        node.create_subscription(JointState, f'topic{i}', _drop, profile(RECORDED), raw=True)
+    executor = EventsExecutor()
+    executor.add_node(node)
+    while True:
+        executor.spin_once(timeout_sec=0.1)
+
+
+def _drop(_message: bytes) -> None:
+    pass
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All benchmarks: measured in turns in one run, written as a table and a picture.
+
+Usage: python benchmark/run.py [GROUP ...]   with groups offline, growth, node, recording, startup
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import importlib
+import importlib.metadata
+import platform
+from itertools import groupby
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from timing import Ratio
+
+from blf_dsc_controller import __version__
+
+_GROUPS = ('offline', 'growth', 'node', 'recording', 'startup')
+_HERE = Path(__file__).parent
+_PACKAGES = ('numpy', 'numba', 'scipy', 'mujoco', 'drake', 'pin', 'ros-jazzy-rclpy')
+
+
+def machine() -> str:
+    """What this is measured on, without its name."""
+    model = 'unknown processor'
+    for line in Path('/proc/cpuinfo').read_text().splitlines():
+        if line.startswith('model name'):
+            model = line.split(':', 1)[1].strip()
+    cores = sum(
+        line.startswith('processor') for line in Path('/proc/cpuinfo').read_text().split('\n')
+    )
+    versions = [f'Python {platform.python_version()}', f'blf_dsc_controller {__version__}']
+    for package in _PACKAGES:
+        try:
+            versions.append(f'{package} {importlib.metadata.version(package)}')
+        except importlib.metadata.PackageNotFoundError:
+            versions.append(f'{package} absent')
+    return f'{model}, {cores} cores, {platform.system()}; ' + ', '.join(versions)
+
+
+def table(rows: list[Ratio]) -> str:
+    """Markdown, a table for each group."""
+    parts = []
+    for group, members in groupby(rows, key=lambda row: row.group):
+        parts.append(
+            f'\n## {group}\n\n| what | ratio | range | to | |\n| --- | --- | --- | --- | --- |'
+        )
+        parts += [
+            f'| {row.what} | **{row.median:.3g}** | {row.low:.3g} to {row.high:.3g} '
+            f'| {row.baseline} | {row.note} |'
+            for row in members
+        ]
+    return '\n'.join(parts) + '\n'
+
+
+def draw(rows: list[Ratio], path: Path) -> None:
+    """Bars of all ratios on a logarithmic axis, with their ranges."""
+    figure = Figure(figsize=(11.0, 1.5 + 0.27 * len(rows)), layout='constrained')
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    places = range(len(rows))
+    axes.barh(places, [row.median for row in rows], color='#0072b2', height=0.6)
+    spread = [[row.median - row.low for row in rows], [row.high - row.median for row in rows]]
+    axes.errorbar(
+        [row.median for row in rows], places, xerr=spread, fmt='none', ecolor='#404040', capsize=2
+    )
+    axes.axvline(1.0, color='#404040', linewidth=1.0)
+    axes.set_xscale('log')
+    axes.set_yticks(places, [f'{row.what}  (to {row.baseline})' for row in rows], fontsize=8)
+    axes.invert_yaxis()
+    axes.set_xlabel('ratio, median and range of the rounds')
+    axes.grid(visible=True, axis='x', which='both', alpha=0.2)
+    axes.spines[['top', 'right']].set_visible(False)
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Run the groups and write RESULTS.md and results.png."""
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument('groups', nargs='*', metavar='GROUP', help=', '.join(_GROUPS))
+    options.add_argument('--out', type=Path, default=_HERE, help='folder for the results')
+    chosen = options.parse_args()
+    rows: list[Ratio] = []
+    for name in chosen.groups or _GROUPS:
+        print(f'measuring: {name}', flush=True)
+        for row in importlib.import_module(name).measure():
+            print(f'  {row.what}: {row.median:.3g} times {row.baseline}  {row.note}', flush=True)
+            rows.append(row)
+    today = datetime.datetime.now(datetime.timezone.utc).date()
+    text = (
+        '# Results of the benchmarks\n\n'
+        f'Written by `make bench` on {today}. Every figure is a ratio of two things measured in '
+        'turns in\nthe same run: median and range of its rounds. Absolute times are notes about '
+        f'one machine.\n\n{machine()}\n\n![all ratios](results.png)\n' + table(rows)
+    )
+    (chosen.out / 'RESULTS.md').write_text(text, encoding='utf-8')
+    draw(rows, chosen.out / 'results.png')
+    print(f'written: {chosen.out / "RESULTS.md"}')
+
+
+if __name__ == '__main__':
+    main()
