@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from node import cpu_time
@@ -62,13 +63,11 @@ def _command(name: str, bag: Path) -> list[str]:
     return [sys.executable, '-m', module, '--ros-args', *arguments]
 
 
-def _play(node: object, process: subprocess.Popen[bytes]) -> float:
-    from rclpy.node import Node
+def _play(node: Any, process: subprocess.Popen[bytes]) -> float:
     from sensor_msgs.msg import JointState
 
     from blf_dsc_controller.nodes.endpoints import profile
 
-    assert isinstance(node, Node)
     publishers = [
         node.create_publisher(JointState, f'topic{i}', profile(STREAM)) for i in range(_TOPICS)
     ]

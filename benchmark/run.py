@@ -7,7 +7,7 @@ Usage: python benchmark/run.py [GROUP ...]   with groups offline, growth, node, 
 from __future__ import annotations
 
 import argparse
-import datetime
+import datetime as dt
 import importlib
 import importlib.metadata
 import platform
@@ -91,7 +91,7 @@ def main() -> None:
         for row in importlib.import_module(name).measure():
             print(f'  {row.what}: {row.median:.3g} times {row.baseline}  {row.note}', flush=True)
             rows.append(row)
-    today = datetime.datetime.now(datetime.timezone.utc).date()
+    today = dt.datetime.now(dt.timezone.utc).date()
     text = (
         '# Results of the benchmarks\n\n'
         f'Written by `make bench` on {today}. Every figure is a ratio of two things measured in '
