@@ -80,7 +80,7 @@ def _beside_peers() -> Iterator[Ratio]:
             notes[name] = note
     if shutil.which('octave'):
         contestants['Octave'] = lambda: octave_loop(_SHORT)
-        notes['Octave'] = "the whole loop in Octave, the stand-in for MATLAB; with its start-up"
+        notes['Octave'] = 'the whole loop in Octave, the stand-in for MATLAB; with its start-up'
     times = interleaved(contestants, _ROUNDS)
     for name, note in notes.items():
         yield ratio(GROUP, name, PACKAGE, times[name], times[PACKAGE], note)

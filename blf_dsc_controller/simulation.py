@@ -13,9 +13,11 @@ import numpy as np
 
 from blf_dsc_controller.assembly import controller_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.core.controller import Controller, respond
+from blf_dsc_controller.core.controller import Controller, answer
 from blf_dsc_controller.core.kernel import kernel
-from blf_dsc_controller.core.sample import Sample, sample_of, sample_size
+from blf_dsc_controller.core.sample import Sample, sample_of
+from blf_dsc_controller.core.settings import settings_of
+from blf_dsc_controller.core.state import signals_of, state_of
 from blf_dsc_controller.motion.start import begin
 from sim_plant import plant as plants
 from sim_plant.assembly import plant_of, steps_of
@@ -68,25 +70,21 @@ def loop(
     is_last: bool,
 ) -> None:
     """Run as many samples as there are rows; the torque of the last row of all is not applied."""
-    joints = measurements.shape[1] // 3
-    period = plant_settings[0]
+    law = settings_of(settings)
+    law_state = state_of(state, law)
+    law_signals = signals_of(signals, law)
+    arm, now = plants.plant_of(plant_settings, plant_state)
+    period = arm.period_ns * 1e-9
     rows = stamps.size
     for k in range(rows):
-        plants.measure(plant_settings, plant_state, rng, measurements[k])
-        plants.truth(plant_settings, plant_state, truths[k])
-        respond(
-            settings,
-            reference,
-            state,
-            signals,
-            stamps[k] * 1e-9,
-            period * 1e-9,
-            measurements[k],
-            samples[k],
-        )
+        sample = sample_of(samples[k], law.n, law.m)
+        plants.draw_next(arm, now, rng)
+        plants.read(arm, now, measurements[k])
+        plants.reveal(arm, now, truths[k])
+        t = stamps[k] * 1e-9
+        answer(law, reference, law_state, law_signals, t, period, measurements[k], sample)
         if not (is_last and k == rows - 1):
-            torque = sample_of(samples[k], joints, samples.shape[1] - sample_size(joints, 0)).torque
-            plants.step(plant_settings, plant_state, torque)
+            plants.move(arm, now, sample.torque)
 
 
 def simulate(

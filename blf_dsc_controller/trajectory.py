@@ -12,9 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.core.borrowed import borrowed, part
-from blf_dsc_controller.core.controller import respond
+from blf_dsc_controller.core.controller import answer
 from blf_dsc_controller.core.kernel import inner, kernel
 from blf_dsc_controller.core.sample import Sample, sample_of, sample_size
+from blf_dsc_controller.core.settings import settings_of
+from blf_dsc_controller.core.state import signals_of, state_of
 from sim_plant import plant as plants
 
 
@@ -201,17 +203,22 @@ def run(
     wanted = wanted_of(borrowed(wanted_vector))
     figures = figures_of(borrowed(figures_vector), n)
     told = sample_of(borrowed(sample), n, sample.size - sample_size(n, 0))
-    period = int(plant_settings[0])
+    law = settings_of(settings)
+    law_state = state_of(state, law)
+    law_signals = signals_of(signals, law)
+    arm, now = plants.plant_of(plant_settings, plant_state)
+    period = int(arm.period_ns)
     begin(figures)
     for k in range(samples):
-        plants.measure(plant_settings, plant_state, rng, measurement)
+        plants.draw_next(arm, now, rng)
+        plants.read(arm, now, measurement)
         t = (k * period) * 1e-9
-        respond(settings, reference, state, signals, t, period * 1e-9, measurement, sample)
+        answer(law, reference, law_state, law_signals, t, period * 1e-9, measurement, told)
         weigh(wanted, figures, t, measurement, told)
         if figures.finite[0] == 0.0:
             return
         if k < samples - 1:
-            plants.step(plant_settings, plant_state, told.torque)
+            plants.move(arm, now, told.torque)
 
 
 @kernel

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from blf_dsc_controller.core.borrowed import borrowed
+from blf_dsc_controller.core.borrowed import borrowed, part
 from blf_dsc_controller.core.kernel import inner, kernel
 from blf_dsc_controller.errors import ConfigurationError
 from sim_plant.actuator import Actuator, ActuatorState, actuate, actuator_view
@@ -130,57 +130,31 @@ def initial_state(
     return flat
 
 
-@kernel
-def draw_noise(
-    settings: NDArray[np.float64], state: NDArray[np.float64], rng: np.random.Generator
-) -> None:
+@inner
+def draw_next(plant: PlantSettings, now: PlantState, rng: np.random.Generator) -> None:
     """Draw the noise of the next reading, where the sensor has any and the sample is unread."""
-    plant = settings_view(borrowed(settings))
-    now = state_view(borrowed(state), joint_count(settings), plant.actuator.delay)
     if is_noisy(plant.sensor) and now.sensor.sample[0] != now.sample[0]:
         draw(rng, now.sensor.noise)
 
 
-@kernel
-def observe(
-    settings: NDArray[np.float64], state: NDArray[np.float64], measurement: NDArray[np.float64]
-) -> None:
-    """Write [q, dq, effort], (3n,), of this sample, with the noise already drawn.
-
-    `effort` is the torque applied over the last interval, N m. A sample is read once: asking for
-    it again gives the same numbers.
-    """
-    n = joint_count(settings)
-    plant = settings_view(borrowed(settings))
-    now = state_view(borrowed(state), n, plant.actuator.delay)
+@inner
+def read(plant: PlantSettings, now: PlantState, measurement: NDArray[np.float64]) -> None:
+    """Write [q, dq, effort], (3n,), of this sample; see `observe`."""
+    n = now.actuator.applied.size
     if now.sensor.sample[0] != now.sample[0]:
         period = plant.period_ns * 1e-9
-        sense(plant.sensor, int(now.sample[0]), period, now.x[:n], now.x[n:], now.sensor)
+        q = part(now.x, 0, (n,))
+        dq = part(now.x, n, (n,))
+        sense(plant.sensor, int(now.sample[0]), period, q, dq, now.sensor)
     for i in range(n):
         measurement[i] = now.sensor.position[i]
         measurement[n + i] = now.sensor.velocity[i]
         measurement[2 * n + i] = now.actuator.applied[i]
 
 
-@kernel
-def measure(
-    settings: NDArray[np.float64],
-    state: NDArray[np.float64],
-    rng: np.random.Generator,
-    measurement: NDArray[np.float64],
-) -> None:
-    """Draw the noise of this sample and `observe` it."""
-    draw_noise(settings, state, rng)
-    observe(settings, state, measurement)
-
-
-@kernel
-def step(
-    settings: NDArray[np.float64], state: NDArray[np.float64], command: NDArray[np.float64]
-) -> None:
-    """Take the commanded torque, (n,) N m, of this sample and go on to the next one."""
-    plant = settings_view(borrowed(settings))
-    now = state_view(borrowed(state), command.size, plant.actuator.delay)
+@inner
+def move(plant: PlantSettings, now: PlantState, command: NDArray[np.float64]) -> None:
+    """Take the commanded torque of this sample and go on to the next one; see `step`."""
     actuate(plant.actuator, int(now.sample[0]), command, now.actuator)
     integrate(
         plant.integrator,
@@ -195,15 +169,75 @@ def step(
     now.sample[0] += 1.0
 
 
+@inner
+def reveal(plant: PlantSettings, now: PlantState, out: NDArray[np.float64]) -> None:
+    """Write what no sensor tells; see `truth`."""
+    n = now.actuator.applied.size
+    t = now.sample[0] * plant.period_ns * 1e-9
+    parameters(plant.arm, out)
+    dq = part(now.x, n, (n,))
+    disturbance_torque(plant.disturbance, t, dq, part(out, PARAMETERS, (n,)))
+    for i in range(2 * n):
+        out[PARAMETERS + n + i] = now.x[i]
+
+
+@inner
+def plant_of(
+    settings: NDArray[np.float64], state: NDArray[np.float64]
+) -> tuple[PlantSettings, PlantState]:
+    """Name the parts of both vectors, without counting references to them."""
+    plant = settings_view(borrowed(settings))
+    return plant, state_view(borrowed(state), joint_count(settings), plant.actuator.delay)
+
+
+@kernel
+def draw_noise(
+    settings: NDArray[np.float64], state: NDArray[np.float64], rng: np.random.Generator
+) -> None:
+    """Draw the noise of the next reading, where the sensor has any and the sample is unread."""
+    plant, now = plant_of(settings, state)
+    draw_next(plant, now, rng)
+
+
+@kernel
+def observe(
+    settings: NDArray[np.float64], state: NDArray[np.float64], measurement: NDArray[np.float64]
+) -> None:
+    """Write [q, dq, effort], (3n,), of this sample, with the noise already drawn.
+
+    `effort` is the torque applied over the last interval, N m. A sample is read once: asking for
+    it again gives the same numbers.
+    """
+    plant, now = plant_of(settings, state)
+    read(plant, now, measurement)
+
+
+@kernel
+def measure(
+    settings: NDArray[np.float64],
+    state: NDArray[np.float64],
+    rng: np.random.Generator,
+    measurement: NDArray[np.float64],
+) -> None:
+    """Draw the noise of this sample and `observe` it."""
+    plant, now = plant_of(settings, state)
+    draw_next(plant, now, rng)
+    read(plant, now, measurement)
+
+
+@kernel
+def step(
+    settings: NDArray[np.float64], state: NDArray[np.float64], command: NDArray[np.float64]
+) -> None:
+    """Take the commanded torque, (n,) N m, of this sample and go on to the next one."""
+    plant, now = plant_of(settings, state)
+    move(plant, now, command)
+
+
 @kernel
 def truth(
     settings: NDArray[np.float64], state: NDArray[np.float64], out: NDArray[np.float64]
 ) -> None:
     """Write what no sensor tells, (3 + 3n,): [P, tau_dist, q, dq] of this sample."""
-    n = joint_count(settings)
-    plant = settings_view(borrowed(settings))
-    now = state_view(borrowed(state), n, plant.actuator.delay)
-    t = now.sample[0] * plant.period_ns * 1e-9
-    parameters(plant.arm, out[:PARAMETERS])
-    disturbance_torque(plant.disturbance, t, now.x[n:], out[PARAMETERS : PARAMETERS + n])
-    out[PARAMETERS + n :] = now.x
+    plant, now = plant_of(settings, state)
+    reveal(plant, now, out)

@@ -7,11 +7,46 @@ import numpy as np
 
 from blf_dsc_controller.core import funnel, law, reference
 from blf_dsc_controller.core.borrowed import part
-from blf_dsc_controller.core.kernel import kernel
-from blf_dsc_controller.core.sample import sample_of, sample_size, tell
-from blf_dsc_controller.core.settings import settings_of
-from blf_dsc_controller.core.state import signals_of, signals_size, state_of, state_size
+from blf_dsc_controller.core.kernel import inner, kernel
+from blf_dsc_controller.core.sample import Sample, sample_of, sample_size, tell
+from blf_dsc_controller.core.settings import Settings, settings_of
+from blf_dsc_controller.core.state import (
+    Signals,
+    State,
+    signals_of,
+    signals_size,
+    state_of,
+    state_size,
+)
 from blf_dsc_controller.errors import OutsideBarrierError
+
+
+@inner
+def answer(
+    settings: Settings,
+    reference_vector: np.ndarray,
+    state: State,
+    signals: Signals,
+    t: float,
+    dt: float,
+    measurement: np.ndarray,
+    sample: Sample,
+) -> None:
+    """Reference at t, then the law: everything between a measurement and its torque.
+
+    Args:
+        settings: of the law.
+        reference_vector: of `reference.pack`.
+        state: moved on by one sample.
+        signals: overwritten.
+        t: time since the start [s].
+        dt: time since the last sample [s].
+        measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
+        sample: filled.
+    """
+    reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
+    law.answer(settings, state, signals, t, dt, measurement)
+    tell(settings, state, signals, part(measurement, 0, (settings.n,)), sample)
 
 
 @kernel
@@ -25,25 +60,18 @@ def respond(
     measurement: np.ndarray,
     sample_vector: np.ndarray,
 ) -> None:
-    """Reference at t, then the law: everything between a measurement and its torque.
-
-    Args:
-        settings_vector: packed `Settings`.
-        reference_vector: of `reference.pack`.
-        state_vector: packed `State`, moved on by one sample.
-        signals_vector: packed `Signals`, overwritten.
-        t: time since the start [s].
-        dt: time since the last sample [s].
-        measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
-        sample_vector: packed `Sample`, filled.
-    """
+    """`answer`, with settings, state, signals and sample as packed vectors."""
     settings = settings_of(settings_vector)
-    state = state_of(state_vector, settings)
-    signals = signals_of(signals_vector, settings)
-    reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
-    law.answer(settings, state, signals, t, dt, measurement)
-    sample = sample_of(sample_vector, settings.n, settings.m)
-    tell(settings, state, signals, part(measurement, 0, (settings.n,)), sample)
+    answer(
+        settings,
+        reference_vector,
+        state_of(state_vector, settings),
+        signals_of(signals_vector, settings),
+        t,
+        dt,
+        measurement,
+        sample_of(sample_vector, settings.n, settings.m),
+    )
 
 
 def check_start(

@@ -91,7 +91,7 @@ def _file_stem(function: Callable[..., object]) -> str:
 
 def inner(function: F) -> F:
     """Let kernels call `function`, which is compiled into them; in Python it stays what it is."""
-    register_jitable(error_model='numpy', forceinline=True)(function)
+    register_jitable(error_model='numpy', forceinline=True, no_cfunc_wrapper=True)(function)
     return function
 
 
