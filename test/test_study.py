@@ -15,7 +15,7 @@ from blf_dsc_controller.configuration.params_file import load_loop, locate
 from blf_dsc_controller.simulation import simulate
 from blf_dsc_controller.study import claims, tune
 from blf_dsc_controller.study.cases import SIDE_BY_SIDE, VARIATIONS
-from blf_dsc_controller.study.claims import FAILS, HOLDS, ONLY_IF, verdict
+from blf_dsc_controller.study.evidence import FAILS, HOLDS, ONLY_IF, verdict
 from blf_dsc_controller.study.metrics import Courses, measure
 from blf_dsc_controller.study.runs import Outcome
 from blf_dsc_controller.study.sweeps import SWEEPS, case_name

@@ -68,7 +68,8 @@ def _distance(run: Run, distance: Floats, axes: Axes) -> None:
 
 def _excitation(run: Run, monitor: Series, axes: Axes) -> None:
     time, values = run.time_of(monitor.stamp), monitor.column(LAMBDA_MIN)
-    axes.semilogy(*envelope(time, np.maximum(values, _LEAST)), color=GREEN)
+    known = np.where(values > 0.0, values, np.nan)  # 0 until the first look
+    axes.semilogy(*envelope(time, known), color=GREEN)
     axes.set_ylabel(r'$\lambda_{\min}(\Phi)$')
     latched = latch_time(run)
     head(axes, 'excitation' + ('' if latched is None else f'; learning from {latched:.4g} s on'))

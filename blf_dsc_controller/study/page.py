@@ -8,7 +8,7 @@ import html
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from blf_dsc_controller.study.claims import FAILS, HOLDS, ONLY_IF, Claim
+from blf_dsc_controller.study.evidence import FAILS, HOLDS, ONLY_IF, Claim
 
 _STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;color:#22272e;max-width:76rem;margin:2rem auto;

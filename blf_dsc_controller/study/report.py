@@ -13,7 +13,8 @@ from blf_dsc_controller.configuration.dump import dump
 from blf_dsc_controller.feasibility import concerns
 from blf_dsc_controller.study import page, tune
 from blf_dsc_controller.study.cases import SIDE_BY_SIDE, VARIATIONS
-from blf_dsc_controller.study.claims import Claim, claims
+from blf_dsc_controller.study.claims import claims
+from blf_dsc_controller.study.evidence import Claim
 from blf_dsc_controller.study.metrics import Courses
 from blf_dsc_controller.study.paper_figures import draw_figure_2, draw_figure_3
 from blf_dsc_controller.study.robustness_figure import draw_robustness

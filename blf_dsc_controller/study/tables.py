@@ -10,7 +10,7 @@ from dataclasses import astuple, fields
 from pathlib import Path
 
 from blf_dsc_controller.study.cases import SIDE_BY_SIDE
-from blf_dsc_controller.study.claims import Claim
+from blf_dsc_controller.study.evidence import Claim
 from blf_dsc_controller.study.metrics import MOMENTS, Metrics
 from blf_dsc_controller.study.runs import Outcome
 from blf_dsc_controller.study.sweeps import LAWS, SWEEPS, Sweep, case_name
