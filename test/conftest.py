@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS environment of the test process and of the processes that tests start.
+"""ROS environment of the test process and of the processes that tests start; no deadlines.
 
 It is set here, before any test module imports rclpy: a domain that no other run on this machine is
 likely to share, on this machine only, with the logs in a folder that goes away at the end.
@@ -10,6 +10,12 @@ import os
 import shutil
 import tempfile
 import zlib
+
+import hypothesis
+
+# How long an example takes says something of the machine, not of the package.
+hypothesis.settings.register_profile('patient', deadline=None)
+hypothesis.settings.load_profile('patient')
 
 # Domains 1 to 101 keep clear of the default 0 and of Linux's ephemeral ports.
 _RUN = f'{os.getpid()} {os.environ.get("PYTEST_XDIST_WORKER", "")}'
