@@ -32,6 +32,17 @@ class LateRecordingError(BlfDscError):
         )
 
 
+class ShortBagError(BlfDscError):
+    """A bag that ends before a window of the learning is full."""
+
+    def __init__(self, path: Path, duration: float, window: float) -> None:
+        self.path = path
+        super().__init__(
+            f'{path} holds {duration:.3g} s, which is not enough for a window of {window:.3g} s '
+            'and the time that the filters settle: record longer, or set learning.window shorter'
+        )
+
+
 class NoTorqueError(BlfDscError):
     """A bag that does not tell which torques acted on the arm."""
 

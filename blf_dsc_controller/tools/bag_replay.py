@@ -11,13 +11,16 @@ from time import perf_counter
 
 import numpy as np
 
+from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.name_map import NameMap
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.params_file import load, locate
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.replay.identify import Identification, identify
 from blf_dsc_controller.replay.open_loop import Answer, answer
 from blf_dsc_controller.replay.recorded import Outcome, replay
+from blf_dsc_controller.tools.entry import require_ros
 
 DIFFERENT = 3
 """Exit code where the replay found other numbers than the bag holds."""
@@ -47,7 +50,63 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument(
         '--namespace', default='', help='of the robot to look at, if the bag holds several'
     )
+    options.add_argument(
+        '--learn',
+        action='store_true',
+        help='identify the arm: only the learning, on the recorded states and torques',
+    )
+    playing = options.add_argument_group('playing over ROS')
+    playing.add_argument('--play', action='store_true', help='publish the recorded topics')
+    playing.add_argument('--rate', type=float, default=1.0, help='speed; 0: as fast as goes (1)')
+    playing.add_argument('--clock', action='store_true', help="publish the bag's time on /clock")
+    playing.add_argument('--loop', action='store_true', help='begin again at the end')
+    playing.add_argument('--start-paused', action='store_true', help='wait for ~/resume')
+    playing.add_argument(
+        '--delay', type=float, default=1.0, help='time for subscribers to be found [s] (1)'
+    )
+    playing.add_argument(
+        '--remap', action='append', default=[], metavar='FROM:=TO', help='as ROS remaps'
+    )
     return options
+
+
+def _learner(options: argparse.Namespace) -> tuple[Path, ControllerConfig, str, NameMap]:
+    """Arguments of `identify`: the recorded configuration, unless another is named."""
+    if options.config is None:
+        config = read_context(options.bag).controller().config
+    else:
+        config = load(locate(options.config), CONTROLLER, ControllerConfig)
+    return options.bag, config, options.namespace, NameMap.parse(options.map)
+
+
+def _learned(found: Identification) -> Iterator[str]:
+    yield f'torque: {found.source}; window from {found.begin:.3f} s to {found.end:.3f} s'
+    width = max(len(name) for name in found.names)
+    for name, value, deviation in zip(found.names, found.estimate, found.deviation, strict=True):
+        if np.isnan(value):
+            yield f'{name:{width}}  not to be told from the others: its column was refused'
+        else:
+            yield f'{name:{width}}  {value:10.6g} +- {2 * deviation:.2g} (95 %)'
+    verdict = 'enough' if found.is_excited else 'NOT ENOUGH: do not trust these figures'
+    yield (
+        f'excitation {found.excitation:.3g}, asked for {found.threshold:.3g}: {verdict}; '
+        f'left over {found.residual:.3g} N m rms'
+    )
+
+
+def _play(options: argparse.Namespace) -> None:
+    require_ros()
+    from blf_dsc_controller.nodes.player_node import play
+
+    play(
+        options.bag,
+        options.rate,
+        loop=options.loop,
+        clock=options.clock,
+        paused=options.start_paused,
+        delay=options.delay,
+        remaps=options.remap,
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -55,6 +114,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     begin = perf_counter()
     try:
+        if options.play:
+            _play(options)
+            return 0
+        if options.learn:
+            print('\n'.join(_learned(identify(*_learner(options)))))
+            return 0
         if options.config is None:
             outcome = replay(options.bag, options.namespace)
             lines = list(_told(outcome))

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `rosbag2_player`: publishes a bag again, and is led by the services of rosbag2's player.
+
+They are called as rosbag2 calls them. Their types come without wheels, so std_srvs/Trigger stands
+in for all; `is_paused` answers in `success`, and `play_next` says there whether it played one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from blf_dsc_controller.bags.encoders import encode_clock
+from blf_dsc_controller.bags.sources import open_bag
+from blf_dsc_controller.bags.topics import CLOCK, HISTORY, STREAM
+from blf_dsc_controller.nodes.endpoints import message_class, profile
+from blf_dsc_controller.nodes.executor import drain
+from blf_dsc_controller.replay.timeline import Timeline
+
+_MOST_AT_ONCE = 100
+_LONGEST_WAIT = 0.01  # s
+_CLOCK_PERIOD = 10_000_000  # ns
+_LATCHED = ('bound',)
+
+
+class PlayerNode(Node):
+    """Publishes the messages of a bag as time goes by.
+
+    Args:
+        path: of the bag.
+        rate: bag time per time; 0: as fast as possible.
+        loop: whether to begin again at the end.
+        clock: whether to publish the bag's time on /clock.
+        options: of rclpy's Node.
+
+    Raises:
+        UnreadableBagError: there is no bag, or it is damaged.
+    """
+
+    def __init__(self, path: Path, rate: float, *, loop: bool, clock: bool, **options: Any) -> None:
+        super().__init__('rosbag2_player', **options)
+        with open_bag(path) as bag:
+            types = {name: type_ for name, type_ in bag.held if not (clock and name == '/clock')}
+            outputs = {name: self._output(name, type_) for name, type_ in types.items()}
+            known = {name for name, output in outputs.items() if output is not None}
+            messages = sorted(bag.messages(known), key=lambda message: message[1])
+        self._messages = [(outputs[name], raw) for name, _, raw in messages]
+        self._outputs = [output for output in outputs.values() if output is not None]
+        self.timeline = Timeline([at for _, at, _ in messages], rate, loop=loop)
+        self._clock_output = (
+            self.create_publisher(message_class(CLOCK.type), '/clock', 10) if clock else None
+        )
+        self._clock_told = 0
+        for name, action in self._actions().items():
+            self.create_service(Trigger, f'~/{name}', _answer(action))
+
+    def play(self) -> None:
+        """Publish what is due."""
+        now = time.monotonic_ns()
+        for number in self.timeline.due(now, _MOST_AT_ONCE):
+            self._publish(number)
+        if self._clock_output is not None and now - self._clock_told >= _CLOCK_PERIOD:
+            self._clock_told = now
+            self._clock_output.publish(encode_clock(self.timeline.position(now)))
+
+    def drain(self) -> None:
+        """Wait until every subscriber has what was published."""
+        drain(self._outputs)
+
+    def _output(self, name: str, type_name: str) -> Any:
+        try:
+            class_ = message_class(type_name)
+        except (ImportError, AttributeError):
+            self.get_logger().warning(f'{name} is not played: {type_name} is not installed here')
+            return None
+        quality = HISTORY if name.rsplit('/', 1)[-1] in _LATCHED else STREAM
+        return self.create_publisher(class_, name, profile(quality))
+
+    def _publish(self, number: int) -> None:
+        output, raw = self._messages[number]
+        output.publish(raw)
+
+    def _actions(self) -> dict[str, Callable[[], tuple[bool, str]]]:
+        return {
+            'pause': self._pause,
+            'resume': self._resume,
+            'toggle_paused': lambda: self._resume() if self.timeline.paused else self._pause(),
+            'is_paused': lambda: (self.timeline.paused, ''),
+            'play_next': self._play_next,
+        }
+
+    def _pause(self) -> tuple[bool, str]:
+        self.timeline.pause(time.monotonic_ns())
+        return True, 'paused'
+
+    def _resume(self) -> tuple[bool, str]:
+        self.timeline.resume(time.monotonic_ns())
+        return True, 'playing'
+
+    def _play_next(self) -> tuple[bool, str]:
+        number = self.timeline.step()
+        if number is None:
+            return False, 'pause first' if not self.timeline.paused else 'this is the end'
+        self._publish(number)
+        return True, f'message {number + 1} of {len(self._messages)}'
+
+
+def _answer(action: Callable[[], tuple[bool, str]]) -> Callable[[Any, Any], Any]:
+    def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = action()
+        return response
+
+    return answer
+
+
+def play(
+    path: Path,
+    rate: float,
+    *,
+    loop: bool,
+    clock: bool,
+    paused: bool,
+    delay: float,
+    remaps: Sequence[str],
+) -> None:
+    """Play a bag until its end, or until Ctrl-C.
+
+    Args:
+        path: of the bag.
+        rate: bag time per time; 0: as fast as possible.
+        loop: whether to begin again at the end.
+        clock: whether to publish the bag's time on /clock.
+        paused: whether to wait for the service `resume`.
+        delay: time for subscribers to be found before the first message [s].
+        remaps: such as `joint_states:=other`.
+
+    Raises:
+        UnreadableBagError: there is no bag, or it is damaged.
+    """
+    words = [word for remap in remaps for word in ('--remap', remap)]
+    rclpy.init(args=['bag_replay', '--ros-args', *words] if words else None)
+    try:
+        node = PlayerNode(path, rate, loop=loop, clock=clock)
+        executor = EventsExecutor()
+        executor.add_node(node)
+        begin = time.monotonic()
+        while time.monotonic() - begin < delay:
+            executor.spin_once(timeout_sec=_LONGEST_WAIT)
+        if paused:
+            node.timeline.pause(time.monotonic_ns())
+        while rclpy.ok() and not node.timeline.is_over:
+            node.play()
+            wait = node.timeline.wait(time.monotonic_ns())
+            executor.spin_once(timeout_sec=min(wait, _LONGEST_WAIT))
+        node.drain()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        rclpy.try_shutdown()
