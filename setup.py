@@ -73,6 +73,7 @@ setup(
         'mpi': ['pyarrow', 'mpi4py'],
         # Only for `bag_report`: what draws its pages, 40 MB.
         'report': ['plotly>=6'],
+        'parquet': ['pyarrow'],  # only for `bag_export` into Parquet
         # setuptools: test_package.py builds a wheel without going to the network.
         'test': [
             'pytest>=7',
@@ -98,6 +99,7 @@ setup(
             'bag_replay = blf_dsc_controller.tools.bag_replay:main',
             'bag_recover = blf_dsc_controller.tools.bag_recover:main',
             'bag_report = blf_dsc_controller.tools.bag_report:main',
+            'bag_export = blf_dsc_controller.tools.bag_export:main',
             'bag_plot = blf_dsc_controller.tools.bag_plot:main',
             'excite = blf_dsc_controller.tools.excite:main',
             'paper_study = blf_dsc_controller.tools.paper_study:main',

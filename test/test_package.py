@@ -29,6 +29,7 @@ EXECUTABLES = {
     'bag_plot',
     'bag_replay',
     'bag_recover',
+    'bag_export',
     'bag_report',
     'paper_study',
     'monte_carlo',

@@ -178,6 +178,26 @@ class UnreadableMessageError(BlfDscError):
         super().__init__(f'message {index + 1} of {topic} cannot be read: {error}')
 
 
+class UnknownFormatError(BlfDscError):
+    """A file whose ending does not say how it is to be written."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        super().__init__(
+            f'{path} ends in neither .csv nor .parquet: name the file such that it tells its format'
+        )
+
+
+class NoParquetError(BlfDscError):
+    """The library that writes Parquet is not installed."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            'Parquet files are written by pyarrow, which is not installed: '
+            "pip install 'blf_dsc_controller[parquet]', or choose a .csv file"
+        )
+
+
 class NoConfigurationError(BlfDscError):
     """A bag that does not tell how the controller was configured."""
 
