@@ -8,6 +8,7 @@
 PYTHON ?= python3
 CONFIG ?= recommended
 DURATION ?= 60
+WORKERS ?= 2
 MINUTES ?= 30
 
 .DEFAULT_GOAL := help
@@ -32,6 +33,7 @@ endif
 VENV := .venv
 READY := $(VENV)/.ready-$(FLAVOUR)-$(VERSION)
 LINT_READY := $(READY)-lint
+BENCH_READY := $(READY)-bench
 PIP := $(VENV)/bin/python -m pip --disable-pip-version-check -qq
 # This checkout comes first, also before a workspace that has the package installed.
 RUN := PYTHONPATH="$(CURDIR)$${PYTHONPATH:+:$$PYTHONPATH}" $(VENV)/bin/python
@@ -39,7 +41,7 @@ PIP_FAILED := { echo 'The installation failed: see above. It needs a package ind
   'set HTTPS_PROXY, for a mirror PIP_INDEX_URL, without a network PIP_FIND_LINKS and' \
   'PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
 
-.PHONY: help venv demo paper test test-long test-browser test-nightly soak lint clean
+.PHONY: help venv demo paper test test-long test-browser test-nightly soak lint clean bench
 
 help: ## List what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' Makefile
@@ -58,8 +60,10 @@ paper: $(READY) ## Run the paper's simulation with every law and judge its claim
 	while [ -e "$$out" ]; do n=$$((n + 1)); out=out/paper-$$n; done; \
 	$(RUN) -m blf_dsc_controller.tools.paper_study --out "$$out"
 
-test: $(READY) ## Run the tests (TESTS=test/test_x.py for some)
-	@$(if $(filter sourced,$(FLAVOUR)),PYTEST_DISABLE_PLUGIN_AUTOLOAD=1) $(RUN) -m pytest $(TESTS)
+# A file's tests stay together on one of the workers, for what they set up is shared.
+test: $(READY) ## Run the tests (TESTS=test/test_x.py for some, WORKERS=0 in one process)
+	@PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(RUN) -m pytest -p xdist -p _hypothesis_pytestplugin \
+	    -n $(WORKERS) --dist loadfile $(TESTS)
 
 test-long: $(READY) ## Kill the recorder at ten moments, and not only at three
 	@BAG_KILLS=10 $(RUN) -m pytest test/test_bag_recorder_trouble.py
@@ -69,6 +73,9 @@ test-browser: $(READY) ## Open the page of bag_report in a headless Chromium, if
 
 test-nightly: $(READY) ## Run ten thousand examples of each property of the nodes
 	@BLF_DSC_EXAMPLES=10000 $(RUN) -m pytest -q test/test_nodes_properties.py
+
+bench: $(BENCH_READY) ## Measure everything side by side, into benchmark/RESULTS.md (GROUPS=offline)
+	@$(RUN) benchmark/run.py $(GROUPS)
 
 soak: $(READY) ## Run half an hour of the plant's time with a fault every few seconds (MINUTES)
 	@$(RUN) test/soak.py --minutes "$(MINUTES)"
@@ -92,6 +99,10 @@ $(READY): setup.py
 	@: > $(VENV)/constraints.txt; $(constrain_$(FLAVOUR))
 	@$(PIP) install 'pip>=22' && $(PIP) install -c $(VENV)/constraints.txt \
 	    -e '.[$(extras_$(FLAVOUR))]' || $(PIP_FAILED)
+	@touch $@
+
+$(BENCH_READY): $(READY)
+	@$(PIP) install -c $(VENV)/constraints.txt -e '.[bench]' || $(PIP_FAILED)
 	@touch $@
 
 $(LINT_READY): $(READY)

@@ -77,6 +77,7 @@ setup(
         # setuptools: test_package.py builds a wheel without going to the network.
         'test': [
             'pytest>=7',
+            'pytest-xdist',
             'hypothesis',
             'scipy',
             'coverage',
@@ -86,6 +87,8 @@ setup(
             'distributed',
             'plotly>=6',
         ],
+        # The peers that `make bench` compares with; Octave and a C compiler are the system's.
+        'bench': ['mujoco', 'drake', 'pin', 'scipy'],
         # Fixed, because with nearly every rule on, each release of the linter finds something new.
         'lint': ['ruff~=0.17.5', 'mypy~=2.4.1', 'types-PyYAML', 'types-tqdm', 'pre-commit'],
     },
