@@ -207,7 +207,7 @@ def _of_section_4(evidence: Evidence) -> Iterator[Claim]:
             f'; {law} from zero: {"kept" if kept else "violated"}' for law, kept in others.items()
         ),
         verdict(not zero.held, *(not kept for kept in others.values())),
-        'the gains are low',
+        'the feedback is too weak to carry the arm by itself',
         STUDY,
     )
 

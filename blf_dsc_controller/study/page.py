@@ -14,7 +14,7 @@ _STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;color:#22272e;max-width:76rem;margin:2rem auto;
 padding:0 1rem}
 h1{font-size:1.7rem}h2{font-size:1.25rem;margin-top:2.2rem}img{max-width:100%;height:auto}
-table{border-collapse:collapse;font-size:.85rem;width:100%}
+table{border-collapse:collapse;font-size:.8rem;width:100%}
 .wide{overflow-x:auto}th,td{border-bottom:1px solid #e5e7eb;padding:.4rem .55rem;text-align:left;
 vertical-align:top}th{background:#f6f8fa}td.number{white-space:nowrap;
 font-variant-numeric:tabular-nums}
