@@ -21,8 +21,10 @@ _MOST_BINS = 60
 _MILLI = 1e3
 _PANELS_OF_INFLUENCE = 6
 _MOST_DOTS = 20_000
+_FEW_DOTS = 1000
 _LEAST_ERROR = 1e-6
-_FARTHEST = 10.0  # |xi1| / k_c that is drawn
+_FARTHEST = 2.0  # |xi1| / k_c that is drawn; what is beyond is put there
+_FEW_DECADES = 50.0
 
 
 def draw_study(study: Study, results: Columns, folder: Path) -> list[Path]:
@@ -74,10 +76,12 @@ def _tail(axes: Axes, study: Study, results: Columns) -> None:
 
 
 def _plain(axes: Axes) -> None:
-    """Label a logarithmic axis with plain numbers at 1, 2 and 5 of each decade."""
+    """Label a logarithmic axis with plain numbers: decades, and 2 and 5 if they are few."""
+    low, high = axes.get_xlim()
+    between = '25' if high < _FEW_DECADES * low else ''
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
     axes.xaxis.set_minor_formatter(
-        FuncFormatter(lambda value, _: f'{value:g}' if f'{value:e}'[0] in '25' else '')
+        FuncFormatter(lambda value, _: f'{value:g}' if f'{value:e}'[0] in between else '')
     )
 
 
@@ -134,13 +138,15 @@ def _draw_influence(study: Study, results: Columns, path: Path) -> None:
     kept = np.flatnonzero(results['outcome'] == KEPT)
     kept = kept[:: -(-kept.size // _MOST_DOTS) or 1]
     lost = np.flatnonzero(results['outcome'] != KEPT)
-    size = 5.0 if kept.size < 1000 else 2.5
+    size, opacity = (5.0, 0.5) if kept.size < _FEW_DOTS else (2.5, 0.25)
+    beyond = worst > _FARTHEST
     distributions = {one.column: one.distribution for one in study.spreads}
     for axes, (name, share) in zip(picture.axes.flat, strongest, strict=False):
         values = results[f'plant.{name}']
         ratios = np.minimum(worst, _FARTHEST)
-        axes.plot(values[kept], ratios[kept], '.', ms=size, color=BLUE, alpha=0.5, mew=0)
+        axes.plot(values[kept], ratios[kept], '.', ms=size, color=BLUE, alpha=opacity, mew=0)
         axes.plot(values[lost], ratios[lost], '.', ms=6, color=ALARM, mew=0)
+        axes.plot(values[beyond], ratios[beyond], '^', ms=7, color=ALARM, mew=0)
         if distributions[f'plant.{name}'].name == 'loguniform':
             axes.set_xscale('log')
         axes.axhline(1.0, color=INK, lw=1.0, ls='--')
