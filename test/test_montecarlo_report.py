@@ -30,7 +30,7 @@ from blf_dsc_controller.tools import monte_carlo
 @pytest.fixture(scope='module')
 def store(tmp_path_factory):
     folder = tmp_path_factory.mktemp('study')
-    made = Store.create_or_open(folder / 'out', study(folder))
+    made = Store.create_or_open(folder / 'my study', study(folder))
     made.keep(Span(0, RUNS), whole(made.study))
     return made
 

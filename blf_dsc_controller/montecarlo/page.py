@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -20,7 +21,8 @@ _MEANING = {
 
 def command(folder: Path, run: int) -> str:
     """What computes a run again and records it."""
-    return f'monte_carlo --reproduce {folder} {run} --out {folder.name}-run-{run}'
+    out = shlex.quote(f'{folder.name}-run-{run}')
+    return f'monte_carlo --reproduce {shlex.quote(str(folder))} {run} --out {out}'
 
 
 def headline(summary: Summary) -> str:
