@@ -50,6 +50,9 @@ def decode_arrays(recorded: Recorded, size: int) -> Floats | None:
     Raises:
         UnreadableMessageError: a message cannot be decoded; it tells which and why.
     """
+    alike = _alike_arrays(recorded, size)
+    if alike is not None:
+        return alike
     decoder = Float64MultiArrayDecoder(size)
     values = np.empty((len(recorded.raw), size))
     for k, raw in enumerate(recorded.raw):
@@ -79,7 +82,7 @@ def _alike(
 ) -> tuple[Stamps, Floats] | None:
     """Decode messages that are alike but for their numbers; None if they are not."""
     first, count = recorded.raw[0], len(recorded.raw)
-    if count < _FEWEST or any(len(raw) != len(first) for raw in recorded.raw):
+    if count < _FEWEST or len(set(map(len, recorded.raw))) > 1:
         return None
     try:
         layout = JointStateLayout.parse(first)
@@ -100,6 +103,23 @@ def _alike(
     columns = [layout.names.index(name) for name in names]
     values = np.stack([_doubles(table, one, order, columns) for one in arrays], axis=1)
     return seconds * NANOSECONDS + nanoseconds, values
+
+
+def _alike_arrays(recorded: Recorded, size: int) -> Floats | None:
+    """Decode arrays that are alike but for their numbers; None if they are not."""
+    first, count = recorded.raw[0], len(recorded.raw)
+    if count < _FEWEST or len(set(map(len, recorded.raw))) > 1:
+        return None
+    try:
+        layout = ArrayLayout.parse(first)
+    except MessageError:
+        return None
+    if layout.data.size != size or size == 0:
+        return None
+    table = np.frombuffer(b''.join(recorded.raw), np.uint8).reshape(count, -1)
+    if (table[:, : layout.data.offset] != table[0, : layout.data.offset]).any():
+        return None
+    return _doubles(table, layout.data, layout.byte_order, list(range(size)))
 
 
 def _column(table: NDArray[np.uint8], at: int, kind: str) -> NDArray[np.int64]:

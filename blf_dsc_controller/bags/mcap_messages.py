@@ -60,15 +60,20 @@ class McapMessages:
     def _records(self, records: bytes) -> Iterator[tuple[str, int, bytes]]:
         at, size = 0, len(records)
         wanted = self._wanted
+        unpack, before_content = MESSAGE_HEAD.unpack_from, MESSAGE_HEAD.size
+        last = size - before_content
         while at < size:
-            opcode, end = head(records, at)
-            if opcode == MESSAGE:
-                if end - at < MESSAGE_HEAD.size:
-                    raise MalformedRecordError('a message is too short')
-                _, _, number, _, log_time, _ = MESSAGE_HEAD.unpack_from(records, at)
+            if at <= last and records[at] == MESSAGE:
+                _, length, number, _, log_time, _ = unpack(records, at)
+                end = at + HEAD.size + length
+                if end > size or end < at + before_content:
+                    raise MalformedRecordError('a message does not fit its length')
                 if number in wanted:
-                    yield wanted[number], log_time, records[at + MESSAGE_HEAD.size : end]
-            elif opcode == CHANNEL:
+                    yield wanted[number], log_time, records[at + before_content : end]
+                at = end
+                continue
+            opcode, end = head(records, at)
+            if opcode == CHANNEL:
                 channel = channel_of(records[at + HEAD.size : end])
                 if channel.topic in self._topics:
                     wanted[channel.id] = channel.topic
