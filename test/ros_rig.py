@@ -86,11 +86,11 @@ class RosRig:
         self.until(lambda: arm.plant.sample >= goal)
 
     def listen(self, topic, *, raw=False):
-        """Return a list that fills with the messages of a topic."""
+        """Return a list that fills with all messages of a topic."""
         heard = []
         name = topic.relative if isinstance(topic, topics.Topic) else topic
         self.tester.create_subscription(
-            message_class(topic.type), name, heard.append, profile(topic.requested), raw=raw
+            message_class(topic.type), name, heard.append, profile(topic.offered), raw=raw
         )
         return heard
 

@@ -219,8 +219,8 @@ NEW_GAINS = [
 ]
 
 
-def jump(given, *, bumpless):
-    """Largest step of a torque at a change of gains, at the largest error of the start."""
+def jump(given, *, bumpless, samples=1):
+    """Largest way of a torque after a change of gains, at the largest error of the start."""
     rig = Rig()
     rig.step(60)
     candidate = change(rig.guard.config, given)
@@ -231,8 +231,8 @@ def jump(given, *, bumpless):
         from blf_dsc_controller.safety import tuning
 
         tuning.take(rig.guard.controller, candidate)
-    rig.step(1)
-    return np.abs(rig.commands[-1] - rig.commands[-2]).max()
+    rig.step(samples)
+    return np.abs(np.array(rig.commands[-samples:]) - rig.commands[-samples - 1]).max()
 
 
 @pytest.mark.parametrize('given', NEW_GAINS, ids=lambda given: next(iter(given)))
@@ -241,6 +241,14 @@ def test_new_gains_are_taken_without_a_bump(given):
     usual = jump({}, bumpless=True)
     assert jump(given, bumpless=False) > 4.0 * usual
     assert jump(given, bumpless=True) < 2.0 * usual
+
+
+@pytest.mark.parametrize('given', NEW_GAINS[1:3], ids=lambda given: next(iter(given)))
+def test_nor_does_the_bump_come_later(given):
+    """Ten time constants of the surface filter on, what it took up must not come back."""
+    usual = jump({}, bumpless=True, samples=20)
+    assert jump(given, bumpless=False, samples=20) > 4.0 * usual
+    assert jump(given, bumpless=True, samples=20) < 1.2 * usual
 
 
 @pytest.mark.parametrize(
