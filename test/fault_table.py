@@ -298,6 +298,29 @@ def refused(**changes) -> Callable[[Rig], None]:
     return inject
 
 
+def replaced(*, possible: bool) -> Callable[[Rig], None]:
+    """Another trajectory each 30 ms, before the last one is through; or one that is too fast."""
+    from blf_dsc_controller.motion.errors import TrajectoryError
+    from blf_dsc_controller.motion.trajectory import Point, Request
+
+    def inject(rig):
+        def sense(state):
+            if rig.plant.sample % 30 == 0:
+                goal = tuple(state.q + (0.2 if rig.plant.sample % 60 else -0.2))
+                point = Point(time=1.5 if possible else 0.001, positions=goal)
+                try:
+                    rig.guard.follow(Request(JOINTS, (point,)))
+                except TrajectoryError:
+                    assert not possible
+                else:
+                    assert possible
+            return [state.raw()]
+
+        rig.sense = sense
+
+    return inject
+
+
 def clock_back(rig: Rig) -> None:
     """The time of day is set back by an hour; the stamps of a driver that has its own go on."""
     rig.wall -= 3600 * 10**9
@@ -429,6 +452,8 @@ FAULTS = (
         given={'learning.radius': 0.6, 'learning.initial_estimate': [0.55, 0.16, 0.16]},
     ),
     Fault('all gains changed in every sample', storm, R.NONE),
+    Fault('reference replaced on the way, again and again', replaced(possible=True), R.NONE),
+    Fault('reference asked for that is too fast', replaced(possible=False), R.NONE),
     Fault('bound asked for below the error', refused(barrier__bound=[1e-9, 1e-9]), R.NONE),
     Fault('torque limit asked for below the torque', refused(torque__limit=[1.0, 1.0]), R.NONE),
     Fault('one command of a wrong length', wired_once(np.zeros(3)), R.NONE),
