@@ -12,7 +12,7 @@ from blf_dsc_controller.core.borrowed import part
 from blf_dsc_controller.core.kernel import kernel
 from blf_dsc_controller.core.sample import sample_of
 from blf_dsc_controller.core.settings import LINEAR, settings_of
-from blf_dsc_controller.core.state import signals_of
+from blf_dsc_controller.core.state import signals_of, state_of
 
 SUSPECT = 1
 OUTSIDE = 2
@@ -30,6 +30,7 @@ def state_is_sound(q: np.ndarray, dq: np.ndarray, velocity_limit: float) -> bool
 @kernel
 def look(
     settings_vector: np.ndarray,
+    state_vector: np.ndarray,
     signals_vector: np.ndarray,
     sample_vector: np.ndarray,
     error_ratio: float,
@@ -40,6 +41,7 @@ def look(
 
     Args:
         settings_vector: packed `Settings`.
+        state_vector: packed `State` after the sample; a refused column is a number there.
         signals_vector: packed `Signals` of the sample.
         sample_vector: packed `Sample`.
         error_ratio: |xi1| / k_c from which on an error is suspect; 0 switches this off.
@@ -54,6 +56,7 @@ def look(
     settings = settings_of(settings_vector)
     n = settings.n
     m = settings.m
+    state = state_of(state_vector, settings)
     signals = signals_of(signals_vector, settings)
     told = sample_of(sample_vector, n, m)
     verdict = 0
@@ -65,16 +68,16 @@ def look(
         if error_ratio > 0.0 and settings.surface != LINEAR and not now < error_ratio:
             verdict |= SUSPECT
         within = abs(signals.demand[i]) <= settings.torque_limit[i]
-        if not (within and isfinite(told.torque[i]) and isfinite(told.disturbance[i])):
+        if not (within and isfinite(told.torque[i]) and isfinite(state.disturbance[i])):
             verdict |= SUSPECT
     for j in range(m):
-        if not isfinite(told.estimate[j]):
+        if not isfinite(state.estimate[j]):
             verdict |= SUSPECT
     if verdict & SUSPECT == 0:
         estimates = part(kept, 0, (m,))
         disturbances = part(kept, m, (n,))
         for j in range(m):
-            estimates[j] = told.estimate[j]
+            estimates[j] = state.estimate[j]
         for i in range(n):
-            disturbances[i] = told.disturbance[i]
+            disturbances[i] = state.disturbance[i]
     return verdict

@@ -304,6 +304,7 @@ class Guard:
         controller, safety = self.controller, self.config.safety
         verdict = soundness.look(
             controller.settings_vector,
+            controller.state_vector,
             controller.signals_vector,
             controller.sample_vector,
             safety.error_ratio,
