@@ -59,6 +59,19 @@ def test_a_full_disk_leaves_a_whole_bag_and_one_clear_error(tmp_path, compressio
         ]
 
 
+def test_room_for_the_index_grows_with_it(tmp_path):
+    # A chunk for each message: the index of 16 MB of them is larger than the first reserve, 2 MB.
+    with small_disk(tmp_path / 'disk', 16) as disk:
+        bag = BagWriter(disk / 'bag', flush_interval=0.0)
+        handle = bag.add_topic('/a', JOINT_STATES.type, [STREAM])
+        with pytest.raises(DiskFullError):
+            write_without_end(bag, handle, 1)
+        with (disk / 'bag' / 'bag_0.mcap').open('rb') as stream:
+            summary = make_reader(stream).get_summary()
+        assert summary.statistics.message_count == bag.message_counts['/a']
+        assert len(summary.chunk_indexes) == bag.message_counts['/a'] > 20_000
+
+
 def test_no_room_at_all_is_told_at_the_start(tmp_path):
     with small_disk(tmp_path / 'disk', 1) as disk, pytest.raises(OSError, match='No space left'):
         BagWriter(disk / 'bag')

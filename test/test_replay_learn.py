@@ -41,14 +41,19 @@ def test_the_parameters_are_found(bag):
     assert found.end - found.begin == pytest.approx(2 * np.pi, abs=0.002)
 
 
-@pytest.mark.parametrize('seed', [1, 2, 3])
-def test_noise_leaves_the_truth_within_the_confidence_told(tmp_path, seed):
-    noise = {'sensor.position_noise': 1e-5, 'sensor.velocity_noise': 1e-3, 'seed': seed}
+def test_noise_leaves_the_truth_within_the_confidence_told(tmp_path):
+    noise = {'sensor.position_noise': 1e-5, 'sensor.velocity_noise': 1e-3}
     noise['disturbance.amplitude'] = [0.0, 0.0]  # which would be left over, and widen all
-    found = identify(record(tmp_path / 'bag', **noise), ControllerConfig())
-    # Four deviations: of nine draws none should be further off.
-    assert (np.abs(found.estimate[:3] - TRUE) < 4.0 * found.deviation[:3] + 2e-3 * TRUE).all()
-    assert (found.deviation[:3] < 0.1 * TRUE).all()
+    runs = [record(tmp_path / f'{seed}', **noise, seed=seed) for seed in range(4)]
+    found = [identify(run, ControllerConfig()) for run in runs]
+    estimates = np.array([one.estimate[:3] for one in found])
+    deviation = np.array([one.deviation[:3] for one in found])
+    # Four deviations: of twelve draws none should be further off; 2e-3 is what sampling leaves.
+    assert (np.abs(estimates - TRUE) < 4.0 * deviation + 2e-3 * TRUE).all()
+    # What is told covers the spread of the draws, which four of them show to a factor of three. It
+    # may be wider: of the residuals only their own correlation is known, not that with X.
+    spread = np.sqrt(np.mean(estimates.var(axis=0, ddof=1) / deviation.mean(axis=0) ** 2))
+    assert 0.05 < spread < 3
 
 
 def test_joint_states_with_their_effort_are_enough(bag, tmp_path):

@@ -4,7 +4,7 @@
 The rows X theta = u are those of the controller (see core.prediction), over the window that excites
 them most:  theta = (Phi + rho I)^-1 b  with (21) and (22). The deviations are those of least
 squares,  s^2 (N Phi)^-1,  with the variance s^2 of what the rows leave over, times the number of
-samples that hang together in it, since filtered residuals repeat themselves.
+samples that hang together in it, since filtered residuals repeat themselves: on the careful side.
 """
 
 from __future__ import annotations
