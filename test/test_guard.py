@@ -48,6 +48,7 @@ def test_a_safe_torque_keeps_the_limit_and_is_none_where_it_cannot_be_told():
     limited = safe('hold_gravity', **{'torque.limit': (3.0, 3.0)})
     np.testing.assert_array_equal(limited, [3.0, 3.0])
     np.testing.assert_array_equal(safe('hold_gravity', estimate=P * np.nan), [0.0, 0.0])
+    np.testing.assert_array_equal(safe('damping', dq=np.array([1.7e308, 0.0])), [0.0, 0.0])
 
 
 def test_a_ramp_is_straight_and_ends_at_a_goal_that_moves():
@@ -110,6 +111,15 @@ def test_after_a_fault_the_torque_ramps_if_so_configured():
     ramp = np.array(rig.commands[-13:])
     np.testing.assert_allclose(ramp[:10], np.outer(np.linspace(0.9, 0.0, 10), last), atol=1e-12)
     assert not ramp[10:].any()
+
+
+def test_a_velocity_that_cannot_be_is_not_damped():
+    rig = Rig({'safety.torque': 'damping'})
+    rig.step(20)
+    state = rig.state()
+    torque = rig.deliver(state.raw(dq=np.array([60.0, 0.1])))
+    assert rig.supervisor.reason is Reason.VELOCITY
+    np.testing.assert_allclose(torque, [0.0, -0.1])  # D of joint2 is 1 N m s/rad
 
 
 def test_a_stopped_arm_is_held_by_the_gravity_that_was_learned():

@@ -34,10 +34,11 @@ def safe_torque(
         estimate: theta^ (m,).
     """
     torque = np.zeros(settings.n)
-    if safety.torque != 'zero':
-        torque -= np.array(safety.damping) * dq
-    if safety.torque == 'hold_gravity':
-        torque += gravity(settings, q, estimate)
+    with np.errstate(over='ignore', invalid='ignore'):  # what comes of it is looked at below
+        if safety.torque != 'zero':
+            torque -= np.array(safety.damping) * dq
+        if safety.torque == 'hold_gravity':
+            torque += gravity(settings, q, estimate)
     if not np.isfinite(torque).all():
         return np.zeros(settings.n)
     return np.clip(torque, -settings.torque_limit, settings.torque_limit)

@@ -326,7 +326,8 @@ class Guard:
             return
         if np.isfinite(q).all():
             self._q[:] = q
-        self._dq[:] = np.where(np.isfinite(dq), dq, 0.0)
+        plausible = np.abs(dq) <= self.config.safety.velocity_limit
+        self._dq[:] = np.where(plausible, dq, 0.0)
 
     def _safe(self, dt: float) -> Vector | None:
         """Safe torque, `dt` [s] further on the ramp; None as long as nothing is to be commanded."""
