@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import rclpy
+from own_domain import own_domain
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
@@ -31,7 +32,7 @@ class NodeLoop:
 
     def __init__(self):
         self.context = Context()
-        rclpy.init(context=self.context)
+        rclpy.init(context=self.context, domain_id=own_domain())
         self.executor = EventsExecutor(context=self.context)
         self.nodes = []
         self.tester = Node('tester', context=self.context, start_parameter_services=False)

@@ -10,6 +10,7 @@ import numpy as np
 import rclpy
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from own_domain import own_domain
 from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
@@ -27,7 +28,11 @@ class RosRig:
 
     def __init__(self):
         self.context = rclpy.Context()
-        rclpy.init(context=self.context, signal_handler_options=rclpy.SignalHandlerOptions.NO)
+        rclpy.init(
+            context=self.context,
+            domain_id=own_domain(),
+            signal_handler_options=rclpy.SignalHandlerOptions.NO,
+        )
         self.executor = EventsExecutor(context=self.context)
         self.nodes = []
         self.tester = self._keep(rclpy.create_node('tester', context=self.context))

@@ -17,7 +17,7 @@ import rclpy
 from mcap.stream_reader import StreamReader
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
 
@@ -35,6 +35,10 @@ def wait_for(condition):
         time.sleep(0.01)
 
 
+# A reader and its writer find each other one after the other: what is kept cannot fall between.
+KEPT = QoSProfile(depth=2000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
 class Recording:
     """A recorder process and publishers that it listens to."""
 
@@ -50,9 +54,7 @@ class Recording:
         self.context = Context()
         rclpy.init(context=self.context)
         self.node = Node('source', context=self.context)
-        self.publishers = [
-            self.node.create_publisher(JointState, topic, QoSProfile(depth=100)) for topic in TOPICS
-        ]
+        self.publishers = [self.node.create_publisher(JointState, topic, KEPT) for topic in TOPICS]
 
     def wait_until_it_listens(self):
         """Wait until every topic has the recorder as its subscriber."""
