@@ -77,7 +77,7 @@ def test_every_engine_gives_the_same(a_study, undisturbed, make, size):
 
 def killing(engine, kills):
     """Let the engine lose a worker to SIGKILL when the first chunk of each pool is done."""
-    pools = []
+    pools, hit = [], []
 
     @contextmanager
     def start():
@@ -86,7 +86,8 @@ def killing(engine, kills):
             yield executor
 
     def kill():
-        if len(pools) <= kills:
+        if len(pools) <= kills and pools[-1] not in hit:
+            hit.append(pools[-1])
             os.kill(next(iter(pools[-1]._processes)), signal.SIGKILL)
 
     return replace(engine, open=start), kill

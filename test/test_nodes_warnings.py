@@ -10,6 +10,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from diagnostic_msgs.msg import DiagnosticArray
 from node_loop import NodeLoop
 from rcl_interfaces.msg import Log
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from sim_plant.node import PlantNode
@@ -25,15 +26,22 @@ def loop():
     one.close()
 
 
-def listen(loop, kind, topic):
+# /rosout keeps what was logged before anyone had found the node.
+KEPT = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def listen(loop, kind, topic, quality=100):
     heard = []
-    loop.tester.create_subscription(kind, topic, heard.append, 100)
+    loop.tester.create_subscription(kind, topic, heard.append, quality)
     return heard
 
 
 def test_refused_columns_are_logged_and_diagnosed_with_what_they_are_like(loop):
     """On the paper's reference cos t on both joints is the column of m2 l2^2."""
-    log, diagnostics = listen(loop, Log, '/rosout'), listen(loop, DiagnosticArray, '/diagnostics')
+    log, diagnostics = (
+        listen(loop, Log, '/rosout', KEPT),
+        listen(loop, DiagnosticArray, '/diagnostics'),
+    )
     loop.add(ControllerNode, COSINE)
     arm = loop.add(PlantNode, {'mode': 'lockstep', 'duration': 7.0})
 
@@ -56,6 +64,6 @@ def test_refused_columns_are_logged_and_diagnosed_with_what_they_are_like(loop):
 
 
 def test_concerns_are_logged_before_the_first_state(loop):
-    log = listen(loop, Log, '/rosout')
+    log = listen(loop, Log, '/rosout', KEPT)
     loop.add(ControllerNode, {'learning.window': 5.0})
     loop.spin_until(lambda: any('learning.window: 5 s' in one.msg for one in log))
