@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from types import TracebackType
 
 import rclpy
@@ -17,6 +18,7 @@ from blf_dsc_controller.tools.progress import Progress
 from sim_plant.configuration import PlantConfig
 
 _LAST = 0.05  # s without a message after which the last one has come
+_LINGER = 0.5  # s for all of them: a loop that is being interrupted still runs
 
 
 class Watch:
@@ -62,7 +64,8 @@ class Watch:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        while kind is None and self.wait(_LAST):
+        end = time.monotonic() + _LINGER
+        while kind is None and time.monotonic() < end and self.wait(_LAST):
             pass
         self._progress.close()
         self._executor.remove_node(self._node)
