@@ -9,20 +9,17 @@ import atexit
 import os
 import shutil
 import tempfile
-import zlib
 
 import hypothesis
+from own_domain import MINE
 
 # How long an example takes says something of the machine, not of the package.
 hypothesis.settings.register_profile('patient', deadline=None)
 hypothesis.settings.load_profile('patient')
 
-# Domains 1 to 101 keep clear of the default 0 and of Linux's ephemeral ports.
-_WORKER = os.environ.get('PYTEST_XDIST_WORKER', 'gw0')
-_RUN = f'{os.getpid()} {_WORKER}'
 _LOG_FOLDER = tempfile.mkdtemp(prefix='blf_dsc_controller_test_log_')
 
-os.environ['ROS_DOMAIN_ID'] = str(1 + 2 * (zlib.crc32(_RUN.encode()) % 50) + int(_WORKER[2:]) % 2)
+os.environ['ROS_DOMAIN_ID'] = str(MINE[0])
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_LOG_DIR'] = _LOG_FOLDER
 

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
@@ -30,6 +32,11 @@ def loop():
 KEPT = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
+def named(namespace, make_node):
+    """Node whose logger no other test of this process has: rcl keeps a publisher for each name."""
+    return partial(make_node, namespace=namespace)
+
+
 def listen(loop, kind, topic, quality=100):
     heard = []
     loop.tester.create_subscription(kind, topic, heard.append, quality)
@@ -42,8 +49,8 @@ def test_refused_columns_are_logged_and_diagnosed_with_what_they_are_like(loop):
         listen(loop, Log, '/rosout', KEPT),
         listen(loop, DiagnosticArray, '/diagnostics'),
     )
-    loop.add(ControllerNode, COSINE)
-    arm = loop.add(PlantNode, {'mode': 'lockstep', 'duration': 7.0})
+    loop.add(named('refused', ControllerNode), COSINE)
+    arm = loop.add(named('refused', PlantNode), {'mode': 'lockstep', 'duration': 7.0})
 
     def refused():
         return [
@@ -65,5 +72,5 @@ def test_refused_columns_are_logged_and_diagnosed_with_what_they_are_like(loop):
 
 def test_concerns_are_logged_before_the_first_state(loop):
     log = listen(loop, Log, '/rosout', KEPT)
-    loop.add(ControllerNode, {'learning.window': 5.0})
+    loop.add(named('concerned', ControllerNode), {'learning.window': 5.0})
     loop.spin_until(lambda: any('learning.window: 5 s' in one.msg for one in log))
