@@ -7,19 +7,16 @@ Every contestant is a process of its own, started anew in each round.
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from contestant import Contestant, ContestantError, own_graph, wait_for
 from timing import Ratio, ratio
 
 from blf_dsc_controller.bags import topics
@@ -31,14 +28,12 @@ from blf_dsc_controller.core.two_link import PARAMETER_NAMES
 from blf_dsc_controller.simulation import simulate
 from sim_plant.configuration import PlantConfig
 
-_DOMAIN = '93'
 _ROUNDS = 5
 _STEPS = 5000
 _WARM_UP = 500
 _START = 1_000_000_000
 _SETTLING = 1.0  # s until both sides have found each other
 _PATIENCE = 10.0  # s for one torque
-_START_UP = 120.0  # s, kernels may have to be compiled
 _NULL = 'null node'
 _NULL_TYPED = 'null node, typed messages'
 _QUIET = 'controller, telemetry off'
@@ -86,18 +81,23 @@ class Arm:
     def _take(self, _torque: bytes) -> None:
         self.answered = True
 
-    def play(self, pid: int, period: float) -> Run:
-        """Play all states, each `period` [s] after the last; 0: each when the last is answered."""
-        self._await(lambda: self.publisher.get_subscription_count() == 1)
-        self._await(lambda: self.node.count_publishers(self.commands) == 1)
+    def play(self, contestants: Sequence[Contestant], period: float) -> Run:
+        """Play all states, each `period` [s] after the last; 0: each when the last is answered.
+
+        The last of the contestants is the node; the others are beside it.
+        """
+        takers = len(contestants)  # a recorder takes the states, too
+        self._wait_for(lambda: self.publisher.get_subscription_count() == takers, contestants)
+        self._wait_for(lambda: self.node.count_publishers(self.commands) == 1, contestants)
         time.sleep(_SETTLING)
+        node = contestants[-1]
         latency = np.zeros(len(self.messages))
         begin = time.perf_counter()
-        busy = cpu_time(pid)
+        busy = node.cpu_time()
         for k, message in enumerate(self.messages):
             if k == _WARM_UP:
                 begin = time.perf_counter()
-                busy = cpu_time(pid)
+                busy = node.cpu_time()
             if period:
                 due = begin + (k - _WARM_UP if k >= _WARM_UP else k) * period
                 while (left := due - time.perf_counter()) > 0.0:
@@ -108,44 +108,38 @@ class Arm:
             while not self.answered:
                 self.executor.spin_once(timeout_sec=_PATIENCE)
                 if time.perf_counter() - sent > _PATIENCE:
-                    raise TimeoutError(f'no torque for state {k} of {pid}')
+                    node.check()
+                    raise ContestantError(f'{node.name}: no torque for state {k}')
             latency[k] = time.perf_counter() - sent
         elapsed = time.perf_counter() - begin
-        return Run(latency[_WARM_UP:], elapsed, cpu_time(pid) - busy)
+        for contestant in contestants:
+            contestant.check()
+        return Run(latency[_WARM_UP:], elapsed, node.cpu_time() - busy)
 
     def left_alone(self) -> None:
         """Wait until the last contestant has gone."""
-        self._await(lambda: self.publisher.get_subscription_count() == 0)
-        self._await(lambda: self.node.count_publishers(self.commands) == 0)
+        self._wait_for(lambda: self.publisher.get_subscription_count() == 0)
+        self._wait_for(lambda: self.node.count_publishers(self.commands) == 0)
 
-    def _await(self, condition: Callable[[], bool]) -> None:
-        begin = time.perf_counter()
-        while not condition():
-            self.executor.spin_once(timeout_sec=0.05)
-            if time.perf_counter() - begin > _START_UP:
-                raise TimeoutError('a contestant did not start or did not end')
-
-
-def cpu_time(pid: int) -> float:
-    """User and system time of a process so far [s]."""
-    fields = Path(f'/proc/{pid}/stat').read_text().rsplit(') ', 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+    def _wait_for(
+        self, condition: Callable[[], bool], contestants: Sequence[Contestant] = ()
+    ) -> None:
+        what = f'{contestants[-1].name} to appear' if contestants else 'a contestant to disappear'
+        wait_for(condition, what, contestants, lambda: self.executor.spin_once(timeout_sec=0.05))
 
 
 def measure() -> Iterator[Ratio]:
     """Latency, CPU and lock-step rate of the controller node relative to the null node."""
-    os.environ['ROS_DOMAIN_ID'] = _DOMAIN
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    arm = Arm()
     contestants = (_NULL, _NULL_TYPED, _QUIET, _TELLING, _RECORDED)
     real: dict[str, list[Run]] = {name: [] for name in contestants}
     lockstep: dict[str, list[Run]] = {name: [] for name in contestants}
-    with tempfile.TemporaryDirectory() as folder:
+    with own_graph(), tempfile.TemporaryDirectory() as folder:
+        arm = Arm()
         for k in range(_ROUNDS):
             for name in contestants:
                 for runs, period in ((real, 1e-3), (lockstep, 0.0)):
-                    with _started(name, Path(folder), f'{k}-{name}-{period}') as pid:
-                        runs[name].append(arm.play(pid, period))
+                    with _started(name, Path(folder), f'{k}-{name}-{period}') as these:
+                        runs[name].append(arm.play(these, period))
                     arm.left_alone()
     yield from _real_time(real)
     yield from _rates(lockstep)
@@ -176,42 +170,32 @@ def _rates(runs: dict[str, list[Run]]) -> Iterator[Ratio]:
 
 
 @contextmanager
-def _started(name: str, folder: Path, tag: str) -> Iterator[int]:
-    """Process id of a contestant, with a recorder beside it if it is to have one."""
-    processes = []
+def _started(name: str, folder: Path, tag: str) -> Iterator[list[Contestant]]:
+    """Processes of a contestant: its node, after the recorder if it is to have one."""
+    tag = tag.replace(' ', '_')
+    commands = [_command(name, folder / f'{tag}.yaml')]
     if name == _RECORDED:
-        bag = folder / tag.replace(' ', '_')
         module = 'blf_dsc_controller.nodes.recorder_node'
-        processes.append(_spawn('-m', module, '-p', f'output:={bag}'))
-    if name in (_NULL, _NULL_TYPED):
-        kind = 'raw' if name == _NULL else 'typed'
-        processes.append(_spawn(str(_HERE / 'null_node.py'), kind))
-    else:
-        config = ControllerConfig()
-        telemetry = replace(config.telemetry, enabled=name != _QUIET)
-        observers = int(name == _RECORDED)
-        config = replace(config, telemetry=telemetry, wait_for_subscribers=observers)
-        params = folder / f'{tag}.yaml'.replace(' ', '_')
-        dump(params, {CONTROLLER: config})
-        module = 'blf_dsc_controller.nodes.controller_node'
-        processes.append(_spawn('-m', module, '--params-file', str(params)))
+        bag = folder / tag
+        commands.insert(0, ['-m', module, '--ros-args', '-p', f'output:={bag}'])
+    contestants: list[Contestant] = []
     try:
-        yield processes[-1].pid
+        contestants.extend(Contestant(name, command) for command in commands)
+        yield contestants
     finally:
-        for process in reversed(processes):
-            process.send_signal(signal.SIGINT)
-            process.wait()
+        for contestant in reversed(contestants):
+            contestant.end()
 
 
-def _spawn(*command: str) -> subprocess.Popen[bytes]:
-    split = next((k for k, word in enumerate(command) if word.startswith(('-p', '--p'))), None)
-    program, ros = command[:split], command[split:] if split else ()
-    arguments = ['--ros-args', *ros] if ros else []
-    return subprocess.Popen(
-        [sys.executable, *program, *arguments],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
+def _command(name: str, params: Path) -> list[str]:
+    if name in (_NULL, _NULL_TYPED):
+        return [str(_HERE / 'null_node.py'), 'raw' if name == _NULL else 'typed']
+    config = ControllerConfig()
+    telemetry = replace(config.telemetry, enabled=name != _QUIET)
+    observers = int(name == _RECORDED)
+    dump(params, {CONTROLLER: replace(config, telemetry=telemetry, wait_for_subscribers=observers)})
+    module = 'blf_dsc_controller.nodes.controller_node'
+    return ['-m', module, '--ros-args', '--params-file', str(params)]
 
 
 def _recorded_states() -> list[bytes]:

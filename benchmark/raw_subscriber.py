@@ -12,16 +12,18 @@ import rclpy
 from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import JointState
 
-from blf_dsc_controller.bags.topics import RECORDED
-from blf_dsc_controller.nodes.endpoints import profile
+from blf_dsc_controller.bags.topics import STREAM
+from blf_dsc_controller.configuration.recorder import RecorderConfig
+from blf_dsc_controller.nodes.intake import requested
 
 
 def main() -> None:
-    """Take messages until the process is ended."""
+    """Take messages, of the quality that the recorder asks for, until the process is ended."""
     rclpy.init()
     node = rclpy.create_node('raw_subscriber')
+    profile = requested([STREAM], RecorderConfig().queue_depth)
     for i in range(int(sys.argv[1])):
-        node.create_subscription(JointState, f'topic{i}', _drop, profile(RECORDED), raw=True)
+        node.create_subscription(JointState, f'topic{i}', _drop, profile, raw=True)
     executor = EventsExecutor()
     executor.add_node(node)
     while True:

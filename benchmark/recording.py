@@ -3,10 +3,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -14,56 +10,59 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from node import cpu_time
+from contestant import Contestant, own_graph, wait_for
 from timing import Ratio, ratio
 
 from blf_dsc_controller.bags.encoders import JointStateEncoder
 from blf_dsc_controller.bags.topics import STREAM
 
-_DOMAIN = '94'
 _ROUNDS = 5
 _TOPICS = 5
 _MESSAGES = 5000  # of each topic, at 1 kHz
+_SETTLING = 1.0  # s until both sides have found each other
 _SUBSCRIBER = 'raw subscriber, nothing written'
 _RECORDERS = {'recorder': 'none', 'recorder, zstd': 'zstd'}
 
 
 def measure() -> Iterator[Ratio]:
     """CPU time per message relative to the raw subscriber."""
-    os.environ['ROS_DOMAIN_ID'] = _DOMAIN
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    import rclpy
-
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node('source', context=context)
-    cpu: dict[str, list[float]] = {name: [] for name in (_SUBSCRIBER, *_RECORDERS)}
-    with tempfile.TemporaryDirectory() as folder:
-        for k in range(_ROUNDS):
-            for name, spent in cpu.items():
-                command = _command(name, Path(folder, f'{k}-{name}'.replace(', ', '-')))
-                process = subprocess.Popen(
-                    command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-                )
-                spent.append(_play(node, process))
-    node.destroy_node()
-    rclpy.try_shutdown(context=context)
-    times = {name: np.array(values) for name, values in cpu.items()}
+    with own_graph():
+        times = _cpu_times()
     for name in _RECORDERS:
         note = f'{1e6 * np.median(times[name]) / (_TOPICS * _MESSAGES):.1f} us a message here'
         yield ratio('recording', f'{name}: CPU', _SUBSCRIBER, times[name], times[_SUBSCRIBER], note)
 
 
+def _cpu_times() -> dict[str, np.ndarray]:
+    """CPU time (rounds,) [s] of each contestant."""
+    import rclpy
+
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node: Any = rclpy.create_node('source', context=context)
+    cpu: dict[str, list[float]] = {name: [] for name in (_SUBSCRIBER, *_RECORDERS)}
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            for k in range(_ROUNDS):
+                for name, spent in cpu.items():
+                    command = _command(name, Path(folder, f'{k}-{name}'.replace(', ', '-')))
+                    spent.append(_play(node, Contestant(name, command)))
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
+    return {name: np.array(values) for name, values in cpu.items()}
+
+
 def _command(name: str, bag: Path) -> list[str]:
     if name == _SUBSCRIBER:
-        return [sys.executable, str(Path(__file__).with_name('raw_subscriber.py')), str(_TOPICS)]
+        return [str(Path(__file__).with_name('raw_subscriber.py')), str(_TOPICS)]
     parameters = (f'output:={bag}', f'compression:={_RECORDERS[name]}')
     arguments = [word for parameter in parameters for word in ('-p', parameter)]
-    module = 'blf_dsc_controller.nodes.recorder_node'
-    return [sys.executable, '-m', module, '--ros-args', *arguments]
+    return ['-m', 'blf_dsc_controller.nodes.recorder_node', '--ros-args', *arguments]
 
 
-def _play(node: Any, process: subprocess.Popen[bytes]) -> float:
+def _play(node: Any, contestant: Contestant) -> float:
+    """CPU time [s] that a contestant spends on all messages."""
     from sensor_msgs.msg import JointState
 
     from blf_dsc_controller.nodes.endpoints import profile
@@ -72,20 +71,24 @@ def _play(node: Any, process: subprocess.Popen[bytes]) -> float:
         node.create_publisher(JointState, f'topic{i}', profile(STREAM)) for i in range(_TOPICS)
     ]
     encoder = JointStateEncoder(('joint1', 'joint2'))
-    while not all(publisher.get_subscription_count() == 1 for publisher in publishers):
-        time.sleep(0.05)
-    time.sleep(1.0)
-    before = cpu_time(process.pid)
-    begin = time.perf_counter()
-    for k in range(_MESSAGES):
-        message = encoder.encode(k * 1_000_000, (1.0, 2.0), (3.0, 4.0), (5.0, 6.0))
+    try:
+        wait_for(
+            lambda: all(one.get_subscription_count() == 1 for one in publishers),
+            f'the subscriptions of {contestant.name}',
+            [contestant],
+        )
+        time.sleep(_SETTLING)
+        before = contestant.cpu_time()
+        begin = time.perf_counter()
+        for k in range(_MESSAGES):
+            message = encoder.encode(k * 1_000_000, (1.0, 2.0), (3.0, 4.0), (5.0, 6.0))
+            for publisher in publishers:
+                publisher.publish(message)
+            time.sleep(max(0.0, begin + 1e-3 * (k + 1) - time.perf_counter()))
+        time.sleep(0.5)
+        contestant.check()
+        return contestant.cpu_time() - before
+    finally:
+        contestant.end()
         for publisher in publishers:
-            publisher.publish(message)
-        time.sleep(max(0.0, begin + 1e-3 * (k + 1) - time.perf_counter()))
-    time.sleep(0.5)
-    spent = cpu_time(process.pid) - before
-    process.send_signal(signal.SIGINT)
-    process.wait()
-    for publisher in publishers:
-        node.destroy_publisher(publisher)
-    return spent
+            node.destroy_publisher(publisher)

@@ -3,21 +3,19 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
+import itertools
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from contestant import Contestant, own_graph, wait_for
 from timing import Ratio, ratio
 
 from blf_dsc_controller.bags import topics
 
-_DOMAIN = '95'
 _ROUNDS = 3
 _NULL = 'null node'
 _WARM = 'controller, warm cache'
@@ -27,10 +25,8 @@ _POLL = 0.002  # s
 
 def measure() -> Iterator[Ratio]:
     """Time to the first torque relative to the null node's."""
-    os.environ['ROS_DOMAIN_ID'] = _DOMAIN
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     seconds: dict[str, list[float]] = {name: [] for name in (_NULL, _WARM, _COLD)}
-    with tempfile.TemporaryDirectory() as caches:
+    with own_graph(), tempfile.TemporaryDirectory() as caches:
         _first_torque(_WARM, f'{caches}/warm')
         for k in range(_ROUNDS):
             for name, values in seconds.items():
@@ -51,7 +47,7 @@ def _first_torque(name: str, cache: str) -> float:
 
     context = rclpy.Context()
     rclpy.init(context=context)
-    node = rclpy.create_node('sim_plant', context=context)
+    node: Any = rclpy.create_node('sim_plant', context=context)
     executor = EventsExecutor(context=context)
     executor.add_node(node)
     came: list[float] = []
@@ -73,20 +69,18 @@ def _first_torque(name: str, cache: str) -> float:
     else:
         command = ['-m', 'blf_dsc_controller.nodes.controller_node']
     begin = time.perf_counter()
-    process = subprocess.Popen(
-        [sys.executable, *command],
-        env={**os.environ, 'NUMBA_CACHE_DIR': cache},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    stamp = 1_000_000_000
-    while not came:
-        stamp += 1_000_000
-        publisher.publish(encoder.joint_states(stamp, state)[1])
+    contestant = Contestant(name, command, {'NUMBA_CACHE_DIR': cache})
+    stamps = itertools.count(1_000_000_000, 1_000_000)
+
+    def ask() -> None:
+        publisher.publish(encoder.joint_states(next(stamps), state)[1])
         executor.spin_once(timeout_sec=_POLL)
-    process.send_signal(signal.SIGINT)
-    process.wait()
-    executor.remove_node(node)
-    node.destroy_node()
-    rclpy.try_shutdown(context=context)
+
+    try:
+        wait_for(lambda: bool(came), 'the first torque', [contestant], ask)
+    finally:
+        contestant.end()
+        executor.remove_node(node)
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
     return came[0] - begin
