@@ -8,6 +8,7 @@ import subprocess
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -75,7 +76,7 @@ def compiled() -> Callable[[ControllerConfig, PlantConfig], np.ndarray]:
 def _settings(controller: ControllerConfig, plant: PlantConfig) -> _Settings:
     law = settings_of_config(controller)
     disturbance = plant.disturbance
-    values = {
+    values: dict[str, Any] = {
         'l1': plant.arm.l1,
         'l2': plant.arm.l2,
         'm1': plant.arm.m1,
@@ -112,7 +113,7 @@ def _settings(controller: ControllerConfig, plant: PlantConfig) -> _Settings:
         'interval': law.interval,
     }
     settings = _Settings()
-    for name, kind in _Settings._fields_:
+    for name, *_ in _Settings._fields_:
         value = values[name]
-        setattr(settings, name, value if np.ndim(value) == 0 else kind(*value))
+        setattr(settings, name, value if np.ndim(value) == 0 else tuple(value))
     return settings

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ BASE = 'two links, 3 + 2 unknowns'
 
 def chain(n: int, **changes: Any) -> ControllerConfig:
     """Recommended settings spread over a planar arm of n links."""
-    default = flatten(ControllerConfig())
+    default: Mapping[str, Any] = flatten(ControllerConfig())
     values: dict[str, Any] = {'model': 'planar_chain', 'joints': [f'joint{i}' for i in range(n)]}
     for one in parameters(ControllerConfig):
         if one.rule.length == ('joints',):

@@ -7,6 +7,7 @@ import importlib.util
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from c_reference import compiled
@@ -58,6 +59,10 @@ def _package(duration: float) -> Callable[[], int]:
     return lambda: simulate(loops.CONTROLLER, plant).stamps.size
 
 
+def _peer(loop: Callable[[float], np.ndarray]) -> int:
+    return len(loop(_SHORT))
+
+
 def _beside_c() -> Iterator[Ratio]:
     run = compiled()
     plant = replace(loops.PLANT, duration=_LONG)
@@ -76,7 +81,7 @@ def _beside_peers() -> Iterator[Ratio]:
     notes = {}
     for name, (module, loop, note) in _PEERS.items():
         if importlib.util.find_spec(module) is not None:
-            contestants[name] = lambda loop=loop: len(loop(_SHORT))
+            contestants[name] = partial(_peer, loop)
             notes[name] = note
     if shutil.which('octave'):
         contestants['Octave'] = lambda: octave_loop(_SHORT)

@@ -29,7 +29,7 @@ def disturbance(t: float) -> np.ndarray:
     """tau_dist (2,) [N m]."""
     d = PLANT.disturbance
     wave = np.sin(np.multiply(d.frequency, t) + d.phase)
-    return np.asarray(d.constant) + np.asarray(d.amplitude) * wave
+    return np.add(d.constant, np.multiply(d.amplitude, wave))
 
 
 def run(duration: float, state: State, step: Step) -> np.ndarray:

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The benchmarks run, in a tiny form, and notice a contestant that does not."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARK = Path(__file__).parents[1] / 'benchmark'
+MODULES = [
+    '.'.join(path.relative_to(BENCHMARK).with_suffix('').parts)
+    for path in sorted(BENCHMARK.rglob('*.py'))
+]
+
+
+@pytest.fixture(autouse=True)
+def _found(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARK))
+    for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE'):
+        monkeypatch.setenv(name, '')  # which the benchmarks set, and which is restored after each
+
+
+def tiny(monkeypatch, name, **sizes):
+    """A benchmark that runs once, with other sizes where they are given."""
+    module = importlib.import_module(name)
+    for constant, value in {'_ROUNDS': 1, **sizes}.items():
+        monkeypatch.setattr(module, constant, value)
+    return module
+
+
+def contestants(rows):
+    """What was measured, each of it a ratio that is a number."""
+    assert all(0.0 < row.low <= row.median <= row.high < math.inf for row in rows)
+    return [row.what for row in rows]
+
+
+@pytest.mark.parametrize('name', MODULES)
+def test_every_module_finds_what_it_imports(name):
+    importlib.import_module(name)
+
+
+def test_growth_is_written_as_table_and_picture(monkeypatch, tmp_path):
+    tiny(monkeypatch, 'growth', _UPDATES=2)
+    monkeypatch.setattr(sys, 'argv', ['run.py', 'growth', '--out', str(tmp_path)])
+    importlib.import_module('run').main()
+    text = (tmp_path / 'RESULTS.md').read_text()
+    assert '## growth with joints' in text
+    assert '| window of 100000 samples | **' in text
+    assert (tmp_path / 'results.png').stat().st_size > 0
+
+
+@pytest.mark.skipif(shutil.which('cc') is None, reason='there is no C compiler')
+def test_loop_beside_c_and_numpy(monkeypatch):
+    offline = tiny(monkeypatch, 'offline', _LONG=0.1, _SHORT=0.02)
+    monkeypatch.setattr(offline, '_PEERS', {'numpy': offline._PEERS['numpy']})
+    monkeypatch.setattr(shutil, 'which', lambda _: None)  # no Octave
+    assert contestants(list(offline.measure())) == ['blf_dsc_controller', 'numpy']
+
+
+@pytest.mark.skipif(shutil.which('cc') is None, reason='there is no C compiler')
+def test_c_reference_gives_the_same_trajectory():
+    # Issued for 10 s, in which learning begins; angles, torques and estimates are of order 1 to 10.
+    assert importlib.import_module('offline').disagreement() < 1e-9
+
+
+def test_recorder_beside_raw_subscriber(monkeypatch):
+    sizes = {'_TOPICS': 2, '_MESSAGES': 20, '_SETTLING': 0.0, '_RECORDERS': {'recorder': 'none'}}
+    recording = tiny(monkeypatch, 'recording', **sizes)
+    assert contestants(list(recording.measure())) == ['recorder: CPU']
+
+
+def test_contestant_that_dies_ends_the_measurement(monkeypatch):
+    recording = tiny(monkeypatch, 'recording')
+    monkeypatch.setattr(recording, '_command', lambda *_: ['-c', 'raise SystemExit("no disk")'])
+    error = importlib.import_module('contestant').ContestantError
+    with pytest.raises(error, match=r'raw subscriber.* ended with exit code 1:\nno disk'):
+        list(recording.measure())
+
+
+def test_contestant_that_does_not_answer_is_not_waited_for_for_ever():
+    contestant = importlib.import_module('contestant')
+    with pytest.raises(contestant.ContestantError, match=r'waited 0\.1 s for a torque in vain'):
+        contestant.wait_for(lambda: False, 'a torque', patience=0.1)
