@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """All benchmarks: measured in turns in one run, written as a table and a picture.
 
-Usage: python benchmark/run.py [GROUP ...]   with groups offline, growth, node, recording, startup
+Usage: python benchmark/run.py [GROUP ...]   (--help lists the groups)
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from timing import Ratio
 
 from blf_dsc_controller import __version__
 
-_GROUPS = ('offline', 'growth', 'node', 'recording', 'startup')
+_GROUPS = ('offline', 'growth', 'node', 'recording', 'replay', 'startup')
 _HERE = Path(__file__).parent
 _PACKAGES = ('numpy', 'numba', 'scipy', 'mujoco', 'drake', 'pin', 'ros-jazzy-rclpy')
 

@@ -74,6 +74,21 @@ def test_recorder_beside_raw_subscriber(monkeypatch):
     assert contestants(list(recording.measure())) == ['recorder: CPU']
 
 
+def test_replay_beside_the_reader_of_mcap(monkeypatch):
+    replay = tiny(monkeypatch, 'replay', _DURATION=0.1)
+    units = []
+
+    def counting(each, rounds):
+        units.extend(work() for work in each.values())
+        return measured(each, rounds)
+
+    measured = replay.interleaved
+    monkeypatch.setattr(replay, 'interleaved', counting)
+    assert len(contestants(list(replay.measure()))) == 2
+    # 101 samples of five messages, two more in each tenth from the first on, and the bound.
+    assert units == 3 * [101 * 5 + 11 * 2 + 1]
+
+
 def test_contestant_that_dies_ends_the_measurement(monkeypatch):
     recording = tiny(monkeypatch, 'recording')
     monkeypatch.setattr(recording, '_command', lambda *_: ['-c', 'raise SystemExit("no disk")'])
