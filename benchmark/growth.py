@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the update grows: with joints and parameters, the window, and the disturbance columns."""
+"""How the update grows: with joints and unknowns p, the window, and the disturbance columns.
+
+Every window is full, and the learning has latched it, before anything is measured.
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -13,14 +17,24 @@ from blf_dsc_controller.assembly import controller_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, flatten, parameters
 from blf_dsc_controller.core.controller import Controller
+from blf_dsc_controller.core.reference import sampled
 
 _ROUNDS = 9
 _UPDATES = 2000
-BASE = 'two links, 3 + 2 unknowns'
+_T = 1e-3  # s
+_NOISE = (1e-4, 0.05)  # rad, rad/s: beside the reference, so that every column is excited
+_ANY_EXCITATION = 1e-12
+"""A threshold that every window passes: short ones and those of many columns, too."""
+
+
+def two_link(**changes: Any) -> ControllerConfig:
+    """Recommended settings that learn from any window."""
+    values = {'learning.excitation_threshold': _ANY_EXCITATION}
+    return build(ControllerConfig, values | {k.replace('__', '.'): v for k, v in changes.items()})
 
 
 def chain(n: int, **changes: Any) -> ControllerConfig:
-    """Recommended settings spread over a planar arm of n links."""
+    """The same, spread over a planar arm of n links, with a window of 1 s."""
     default: Mapping[str, Any] = flatten(ControllerConfig())
     values: dict[str, Any] = {'model': 'planar_chain', 'joints': [f'joint{i}' for i in range(n)]}
     for one in parameters(ControllerConfig):
@@ -35,48 +49,61 @@ def chain(n: int, **changes: Any) -> ControllerConfig:
         'learning.window': 1.0,
         'torque.limit': [1e3] * n,
     }
-    return build(ControllerConfig, values | {k.replace('__', '.'): v for k, v in changes.items()})
+    return two_link(**{name.replace('.', '__'): value for name, value in values.items()}, **changes)
+
+
+def label(config: ControllerConfig) -> str:
+    """Size of the problem; p counts everything that is estimated, as in m = p + columns."""
+    law = controller_of(config).settings
+    columns = f'{law.p} of the arm + {law.m - law.p} of disturbances'
+    return f'n = {law.n} joints, p = {law.m} unknowns ({columns})'
+
+
+BASE = 'two-link arm, p = 5'
 
 
 def updates(config: ControllerConfig) -> Callable[[], int]:
-    """Work of some thousand updates with a moving state, learning latched after the window."""
+    """Work of some thousand updates along the reference, begun when the window is full.
+
+    Raises RuntimeError if nothing is learned from it then.
+    """
     controller: Controller = controller_of(config)
-    n = controller.settings.n
-    random = np.random.default_rng(0)
-    states = 0.01 * random.standard_normal((64, 3 * n))
-    states[:, :n] += np.array(config.reference.offset) + np.array(config.reference.amplitude)
-    clock = {'k': 0}
+    law = controller.settings
+    full = round(law.learning_start / _T) + law.window + law.interval
+    ahead = full + (_ROUNDS + 1) * _UPDATES
+    told = sampled(controller.reference_vector, _T * np.arange(ahead + 1))
+    noise = np.random.default_rng(0).standard_normal((2, ahead + 1, law.n))
+    states = np.zeros((ahead + 1, 3 * law.n))
+    states[:, : law.n] = told[:, 0] + _NOISE[0] * noise[0]
+    states[:, law.n : 2 * law.n] = told[:, 1] + _NOISE[1] * noise[1]
+    clock = itertools.count()
 
-    def work() -> int:
-        for _ in range(_UPDATES):
-            k = clock['k'] = clock['k'] + 1
-            controller.update(k * 1e-3, 1e-3, states[k % 64])
-        return _UPDATES
+    def go_on(count: int) -> int:
+        for k in itertools.islice(clock, count):
+            controller.update(k * _T, _T, states[k])
+        return count
 
-    return work
+    go_on(full)
+    if not controller.sample.latched[0] or not np.isfinite(controller.state_vector).all():
+        raise RuntimeError(f'{label(config)}: nothing is learned from the window')
+    return lambda: go_on(_UPDATES)
 
 
 def measure() -> Iterator[Ratio]:
     """Time per update relative to the two-link arm's."""
-    base = ControllerConfig()
-    wide = {'learning__viscous': True, 'learning__coulomb': True}
-    cases = {
-        'joints': {f'{n} links, {n * (n + 1) // 2} + {n} unknowns': chain(n) for n in range(2, 8)},
-        'columns': {
-            '7 links, 28 + 14 unknowns': chain(7, learning__viscous=True),
-            '7 links, 28 + 42 unknowns': chain(7, **wide, learning__frequencies=[1.0, 2.0][:1]),
-            '7 links, 28 + 49 unknowns': chain(7, **wide, learning__frequencies=[1.0, 2.0]),
-        },
+    wide: dict[str, Any] = {'learning__viscous': True, 'learning__coulomb': True}
+    tones = {'learning__viscous': True, 'learning__frequencies': [1.0, 2.0]}
+    columns = (chain(7), chain(7, **wide), chain(7, **tones))
+    cases: dict[str, dict[str, ControllerConfig]] = {
+        'joints and unknowns': {label(one): one for one in map(chain, range(2, 8))},
+        'disturbance columns': {label(one): one for one in columns},
         'window': {
-            f'window of {samples} samples': build(
-                ControllerConfig,
-                {'learning.window': samples * 1e-3},
-            )
+            f'window of {samples} samples': two_link(learning__window=samples * _T)
             for samples in (100, 1000, 10_000, 100_000)
         },
     }
     for group, configs in cases.items():
-        contestants = {BASE: updates(base)}
+        contestants = {BASE: updates(two_link())}
         contestants |= {name: updates(config) for name, config in configs.items()}
         times = interleaved(contestants, _ROUNDS)
         for name, config in configs.items():

@@ -45,13 +45,17 @@ def test_every_module_finds_what_it_imports(name):
 
 
 def test_growth_is_written_as_table_and_picture(monkeypatch, tmp_path):
-    tiny(monkeypatch, 'growth', _UPDATES=2)
+    growth = tiny(monkeypatch, 'growth', _UPDATES=2)
     monkeypatch.setattr(sys, 'argv', ['run.py', 'growth', '--out', str(tmp_path)])
     importlib.import_module('run').main()
     text = (tmp_path / 'RESULTS.md').read_text()
     assert '## growth with joints' in text
+    assert '| n = 7 joints, p = 70 unknowns (28 of the arm + 42 of disturbances) | **' in text
     assert '| window of 100000 samples | **' in text
     assert (tmp_path / 'results.png').stat().st_size > 0
+    monkeypatch.setattr(growth, '_ANY_EXCITATION', 1e6)
+    with pytest.raises(RuntimeError, match=r'p = 5 .* nothing is learned from the window'):
+        growth.updates(growth.two_link())
 
 
 @pytest.mark.skipif(shutil.which('cc') is None, reason='there is no C compiler')
