@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A publisher in the test's process, and recorders as processes of their own beside it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+
+import rclpy
+from own_domain import own_domain
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosbags.rosbag2 import Reader
+from sensor_msgs.msg import JointState
+
+from blf_dsc_controller.bags.encoders import JointStateEncoder
+
+PATIENCE = 30.0  # s, until a test gives up on what should take a moment
+RECORDER = (sys.executable, '-m', 'blf_dsc_controller.nodes.recorder_node', '--ros-args')
+ENCODER = JointStateEncoder(['joint1', 'joint2'])
+# Kept for the recorder, which may match a moment after the publisher has.
+KEPT = QoSProfile(depth=5000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class Rig:
+    """A node that publishes, and the recorders; `close` it."""
+
+    def __init__(self, topics=('a',), quality=KEPT):
+        self.context = Context()
+        self.domain = own_domain()
+        rclpy.init(context=self.context, domain_id=self.domain)
+        self.node = Node('source', context=self.context)
+        self.node.declare_parameter('gain', [1.0, 2.0])
+        self.topics = topics
+        self.publishers = [
+            self.node.create_publisher(JointState, topic, quality) for topic in topics
+        ]
+        self.processes = []
+        self._executor = SingleThreadedExecutor(context=self.context)
+
+    def start(self, output, **parameters):
+        """Start a recorder."""
+        given = {'output': output, 'topics': f'[{", ".join(self.topics)}]', **parameters}
+        words = [word for name, value in given.items() for word in ('-p', f'{name}:={value}')]
+        process = subprocess.Popen(
+            [*RECORDER, *words],
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, 'ROS_DOMAIN_ID': str(self.domain)},
+        )
+        self.processes.append(process)
+        return process
+
+    def record(self, output, **parameters):
+        """Start a recorder and wait until it listens."""
+        process = self.start(output, **parameters)
+        self.wait_for(lambda: all(one.get_subscription_count() for one in self.publishers))
+        return process
+
+    def wait_for(self, condition):
+        deadline = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < deadline, 'still waiting'
+            rclpy.spin_once(self.node, timeout_sec=0.01, executor=self._executor)
+
+    def publish(self, number):
+        """Publish a message of this number as its stamp [ns] on every topic."""
+        raw = ENCODER.encode(number, [1, 2], [3, 4], [5, 6])
+        for publisher in self.publishers:
+            publisher.publish(raw)
+
+    def publish_for(self, seconds):
+        """Publish about each millisecond."""
+        end, number = time.monotonic() + seconds, 0
+        while time.monotonic() < end:
+            self.publish(number)
+            number += 1
+            time.sleep(0.001)
+
+    def close(self):
+        for process in self.processes:
+            if process.poll() is None:
+                process.kill()
+                process.communicate()
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+def read(path):
+    """All messages of a bag, by a reader that does not know this package."""
+    with Reader(path) as reader:
+        return [(c.topic, at, bytes(raw)) for c, at, raw in reader.messages()]
