@@ -107,12 +107,12 @@ class Rig:
             self.plant.step(self.reception.torque + self.push)
 
     def wait(self, milliseconds=1):
-        """Let the clocks go on, and the watch look at them each 5 ms."""
+        """Let the clocks go on, and the watch look at them each 8 ms."""
         for _ in range(milliseconds):
             self.steady += MILLISECOND
             self.wall += MILLISECOND
-            if self.steady % (5 * MILLISECOND) == 0:
-                self._command(self.guard.watch(0.005))
+            if self.steady % (8 * MILLISECOND) == 0:
+                self._command(self.guard.watch(0.008))
 
     def mend(self):
         """Take the fault away, and reset arm and controller as the nodes' services do."""

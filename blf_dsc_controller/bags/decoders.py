@@ -81,7 +81,7 @@ class JointStateDecoder:
         ):
             self._learn(raw)
         self._buffer[12:] = raw
-        np.take(self._grid, self._index, out=self.values, mode='clip')
+        self._grid.take(self._index, out=self.values, mode='clip')
         seconds, nanoseconds = self._stamp.unpack_from(raw, STAMP_OFFSET)
         return int(seconds * NANOSECONDS + nanoseconds)
 

@@ -29,9 +29,9 @@ class Quality:
     liveliness_lease_duration: int = FOREVER
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Topic:
-    """One topic.
+    """One topic, which is itself only: the nodes look their publishers up by it in each sample.
 
     `name` is as its publisher `node` writes it: `~/x` is private to the node, `x` relative to the
     namespace, `/x` absolute. `offered` is the publisher's quality, `requested` the subscriber's.

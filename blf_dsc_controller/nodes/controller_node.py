@@ -29,7 +29,7 @@ from blf_dsc_controller.refusals import refusals
 from blf_dsc_controller.safety.guard import Guard
 from blf_dsc_controller.safety.reasons import Phase
 
-_TICK = 0.005  # s, of what is watched on the steady clock
+_TICK = 0.008  # s, of what is watched on the steady clock
 _DIAGNOSTICS_PERIOD = 1.0  # s
 
 OUTPUTS = (

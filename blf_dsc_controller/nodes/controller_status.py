@@ -48,12 +48,12 @@ class ControllerStatus:
         self.trajectories: TrajectoryInput | None = None
         self._joints = tuple(joints)
         self._board = Board(node, joints, topics.STATE)
-        self._told: tuple[Phase, Reason, int] | None = None
+        self._told = -1
         self._announced = ''
 
     def is_news(self, guard: Guard) -> bool:
         """Whether the state has changed since it was told."""
-        return _essence(guard) != self._told
+        return guard.supervisor.turns != self._told
 
     def report(self, life: str, guard: Guard | None) -> None:
         """Publish diagnostics and, where it has changed, the state.
@@ -69,7 +69,7 @@ class ControllerStatus:
         if essence != self._announced:
             self._board.announce(state)
             self._announced = essence
-        self._told = _essence(guard) if guard else None
+        self._told = guard.supervisor.turns if guard else -1
 
     def _state(self, life: str, guard: Guard | None) -> DiagnosticStatus:
         phase = guard.supervisor.phase if guard else Phase.INACTIVE
@@ -127,7 +127,3 @@ class ControllerStatus:
             columns = ', '.join(refusal.column for refusal in self.refusals)
             return self._board.status('learning', WARN, f'not estimated: {columns}', values)
         return self._board.status('learning', OK, learning, values)
-
-
-def _essence(guard: Guard) -> tuple[Phase, Reason, int]:
-    return guard.supervisor.phase, guard.supervisor.reason, guard.supervisor.stops

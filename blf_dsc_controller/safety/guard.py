@@ -96,8 +96,6 @@ class Guard:
         self._velocity = Velocity(config.safety.velocity, n)
         self._ramp = Ramp(n)
         self._torque = np.zeros(n)
-        self._q = np.zeros(n)
-        self._dq = np.zeros(n)
         self._commanded = False
         self._learns_from_effort = config.learning.torque_source == 'effort'
         self._kept = np.zeros(self.controller.settings.m + n)
@@ -105,6 +103,8 @@ class Guard:
         self._resumable = False
         self._stops_seen = 0
         self._measurement = np.zeros(3 * n)
+        self._q = self._measurement[:n]
+        self._dq = self._measurement[n : 2 * n]
         self._keep()
 
     @property
@@ -218,9 +218,10 @@ class Guard:
         trust = self.supervisor.inspect(self.config.safety, stamp, q, dq, effort)
         if trust is Trust.SKIP:
             return None
-        self._remember(q, dq, trust)
         if trust is Trust.STOP:
+            self._remember(q, dq)
             return self._safe(self.config.sample_time)
+        self._measurement[:] = measurement
         if self.supervisor.phase is Phase.STARTING and not self._begin(stamp, q, dq):
             return self._safe(self.config.sample_time) if self._commanded else None
         return self._control(stamp, measurement)
@@ -294,7 +295,6 @@ class Guard:
         self.last_stamp = stamp
         if not self._is_trusted(dt):
             return self._safe(self.config.sample_time)
-        self._measurement[:] = measurement
         self._torque[:] = torque
         self._commanded = self.answered = True
         return self._torque
@@ -314,16 +314,15 @@ class Guard:
         if verdict & soundness.OUTSIDE:
             self.outside += 1
         if not verdict & soundness.SUSPECT:
-            return self.supervisor.accept(dt)
+            self.supervisor.accept()
+            return True
         trusted = self.supervisor.judge(safety, controller, dt)
         if trusted:
             self._keep()
         return trusted
 
-    def _remember(self, q: Vector, dq: Vector, trust: Trust) -> None:
-        if trust is Trust.USE:
-            self._q[:], self._dq[:] = q, dq
-            return
+    def _remember(self, q: Vector, dq: Vector) -> None:
+        """Keep of a state that is not to be trusted what the safe torque can use."""
         if np.isfinite(q).all():
             self._q[:] = q
         plausible = np.abs(dq) <= self.config.safety.velocity_limit

@@ -48,6 +48,7 @@ class Supervisor:
         overruns: states missed.
         repeated: states passed over because their stamp was there before.
         stops: stops since the start.
+        turns: times that phase, reason or text have been set.
     """
 
     def __init__(self, joints: Sequence[str], sample_time: float) -> None:
@@ -58,10 +59,12 @@ class Supervisor:
         self.text = ''
         self.repeated = 0
         self.stops = 0
+        self.turns = 0
         self.saturation = Saturation()
         self.overruns = Overruns()
         self._last_stamp = -1
         self._repeats = 0
+        self._one_sample = (0.5e9 * sample_time, 1.5e9 * sample_time)  # ns
 
     @property
     def running(self) -> bool:
@@ -71,6 +74,7 @@ class Supervisor:
     def enter(self, phase: Phase) -> None:
         """Begin a phase that is no stop; earlier reasons are forgotten."""
         self.phase, self.reason, self.text = phase, Reason.NONE, ''
+        self.turns += 1
         if phase in (Phase.STARTING, Phase.INACTIVE):
             self._last_stamp = -1
             self._repeats = 0
@@ -82,6 +86,7 @@ class Supervisor:
         if self.phase in (Phase.SAFE_STOP, Phase.INACTIVE):
             return False
         self.phase, self.reason, self.text = Phase.SAFE_STOP, reason, text
+        self.turns += 1
         self.stops += 1
         return True
 
@@ -99,14 +104,25 @@ class Supervisor:
         """
         if self.phase in (Phase.SAFE_STOP, Phase.INACTIVE):
             return Trust.STOP
-        trust = self._inspect_stamp(safety, stamp)
-        if trust is Trust.USE:
-            trust = self._inspect_values(safety, q, dq)
+        trust = Trust.USE if self._is_next(stamp) else self._inspect_stamp(safety, stamp)
+        if trust is Trust.USE and not state_is_sound(q, dq, safety.velocity_limit):
+            trust = self._distrust(safety, q, dq)
         if trust is Trust.USE and effort is not None and not np.isfinite(effort).all():
             trust = self._halt(Reason.NOT_FINITE, f'the efforts learned from are {effort}')
         if trust is Trust.USE:
             self._last_stamp = stamp
         return trust
+
+    def _is_next(self, stamp: int) -> bool:
+        """Whether a stamp follows the last as it should, so that there is nothing to count."""
+        shortest, longest = self._one_sample
+        step = stamp - self._last_stamp
+        return (
+            shortest < step < longest
+            and self._last_stamp > 0
+            and self._repeats == 0
+            and self.overruns.fraction == 0.0
+        )
 
     def _inspect_stamp(self, safety: Safety, stamp: int) -> Trust:
         if stamp <= 0:
@@ -150,9 +166,7 @@ class Supervisor:
         )
         return self._halt(Reason.OVERRUN, text)
 
-    def _inspect_values(self, safety: Safety, q: Vector, dq: Vector) -> Trust:
-        if state_is_sound(q, dq, safety.velocity_limit):
-            return Trust.USE
+    def _distrust(self, safety: Safety, q: Vector, dq: Vector) -> Trust:
         if not (np.isfinite(q).all() and np.isfinite(dq).all()):
             text = f'the joint state is not finite: positions {q}, velocities {dq}'
             return self._halt(Reason.NOT_FINITE, text)
@@ -163,10 +177,9 @@ class Supervisor:
         )
         return self._halt(Reason.VELOCITY, text)
 
-    def accept(self, dt: float) -> bool:
-        """Take note of an answer that there is nothing to say against, `dt` [s] after the last."""
-        self.saturation.take(dt, saturated=False)
-        return self.running
+    def accept(self) -> None:
+        """Take note of an answer that there is nothing to say against."""
+        self.saturation.lasted = 0.0
 
     def judge(self, safety: Safety, controller: Controller, dt: float) -> bool:
         """Judge what the law made of a state; False stops, and its torque must not be used.
