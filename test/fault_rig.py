@@ -47,7 +47,7 @@ class Rig:
     def __init__(self, given=None, *, live=False, plant=None):
         self.config = build(ControllerConfig, given or {})
         self.live = live
-        self.steady = 5_000_000_000
+        self.steady = self.next_watch = 5_000_000_000
         self.wall = TODAY
         self.base = TODAY if live else LOCKSTEP
         self.guard = self.controller()
@@ -107,12 +107,13 @@ class Rig:
             self.plant.step(self.reception.torque + self.push)
 
     def wait(self, milliseconds=1):
-        """Let the clocks go on, and the watch look at them each 8 ms."""
+        """Let the clocks go on, and the watch look at them when it wants to."""
         for _ in range(milliseconds):
             self.steady += MILLISECOND
             self.wall += MILLISECOND
-            if self.steady % (8 * MILLISECOND) == 0:
-                self._command(self.guard.watch(0.008))
+            if self.steady >= self.next_watch:
+                self._command(self.guard.watch())
+                self.next_watch = self.steady + self.guard.next_watch * 1e9
 
     def mend(self):
         """Take the fault away, and reset arm and controller as the nodes' services do."""

@@ -75,13 +75,13 @@ def test_missed_states_are_averaged():
 
 def test_silence_is_told_by_a_watch_that_was_awake():
     silence = Silence()
-    assert silence.look(0, 0.01, 0.04) == 0.0  # nothing has come yet: nobody is missed
+    assert silence.look(0, 0.04) == 0.0  # nothing has come yet: nobody is missed
     silence.state(10 * MILLISECOND)
-    for now in range(10, 51, 10):
-        assert silence.look(now * MILLISECOND, 0.01, 0.04) == 0.0
-    assert silence.look(60 * MILLISECOND, 0.01, 0.04) == pytest.approx(0.05)
-    assert silence.look(200 * MILLISECOND, 0.01, 0.04) == 0.0  # it has slept itself
-    assert silence.look(210 * MILLISECOND, 0.01, 0.04) == pytest.approx(0.2)
+    assert silence.look(41 * MILLISECOND, 0.04) == 0.0
+    assert silence.next_look == pytest.approx(0.01)  # 1 ms after it could be silent
+    assert silence.look(51 * MILLISECOND, 0.04) == pytest.approx(0.041)
+    assert silence.look(200 * MILLISECOND, 0.04) == 0.0  # it has slept itself
+    assert silence.look(208 * MILLISECOND, 0.04) == pytest.approx(0.198)
 
 
 @pytest.mark.parametrize(('watchdog', 'live'), [('auto', True), ('on', False)])

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from node_loop import JOINTS, START, Arm, NodeLoop
+from node_loop import JOINTS, START, Arm, NodeLoop, torques
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
@@ -76,6 +76,18 @@ def test_a_state_without_one_of_the_joints_stops_the_arm_and_names_it(loop):
     np.testing.assert_array_equal(arm.ask(1, START, encoder=stranger), NOTHING)
     assert "'joint2' is not in the message" in node.stopped
     assert 'joint1, joint3' in node.stopped
+
+
+def test_an_arm_that_falls_silent_gets_the_safe_torque_again_and_again(loop):
+    node = loop.add(ControllerNode, {'safety.watchdog': 'on'})
+    arm = Arm(loop)
+    said = loop.listen(topics.COMMANDS)
+    assert arm.ask(0, START).any()
+    loop.spin_until(lambda: node.stopped)  # with a clock as its only reason
+    assert 'no joint state has come for' in node.stopped
+    before = len(said)
+    loop.spin_until(lambda: len(said) >= before + 20)
+    np.testing.assert_array_equal(torques(said)[-1], NOTHING)
 
 
 def test_a_start_outside_the_bound_names_joint_error_and_bound(loop):

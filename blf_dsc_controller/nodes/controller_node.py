@@ -29,7 +29,7 @@ from blf_dsc_controller.refusals import refusals
 from blf_dsc_controller.safety.guard import Guard
 from blf_dsc_controller.safety.reasons import Phase
 
-_TICK = 0.008  # s, of what is watched on the steady clock
+_FIRST_LOOK = 0.01  # s, and the time between two looks for who listens
 _DIAGNOSTICS_PERIOD = 1.0  # s
 
 OUTPUTS = (
@@ -71,7 +71,7 @@ class ControllerNode(ManagedNode):
         self._publisher_of: dict[topics.Topic, Publisher] = {}
         self._status = ControllerStatus(self, joints)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_TICK, self._tick, clock=steady)
+        self._look = self.create_timer(_FIRST_LOOK, self._on_look, clock=steady)
         self.create_timer(_DIAGNOSTICS_PERIOD, self._report, clock=steady)
         parameters.on_change(self, ControllerConfig, self._retune, self._objections)
         self.create_service(Trigger, '~/reset', self._on_reset)
@@ -231,14 +231,21 @@ class ControllerNode(ManagedNode):
                 return False
         return True
 
-    def _tick(self) -> None:
-        guard = self.guard
-        if guard is None:
-            return
+    def _on_look(self) -> None:
+        """Watch, and be woken again when there may be something to see: waking has its price."""
+        wait = _FIRST_LOOK
+        if self.guard is not None:
+            self._watch(self.guard)
+            if self._pending is None:
+                wait = self.guard.next_watch
+        self._look.timer_period_ns = int(1e9 * wait)
+        self._look.reset()
+
+    def _watch(self, guard: Guard) -> None:
         if self._pending is not None and self._is_observed():
             raw, self._pending = self._pending, None
             self._on_joint_state(raw)
-        torque = guard.watch(_TICK)
+        torque = guard.watch()
         if torque is not None:
             self._command(torque)
         if self._status.is_news(guard):

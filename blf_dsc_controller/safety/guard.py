@@ -30,7 +30,7 @@ from blf_dsc_controller.motion.start import begin, rules_of
 from blf_dsc_controller.motion.trajectory import Request, follow
 from blf_dsc_controller.safety import tuning
 from blf_dsc_controller.safety.fallback import Ramp, safe_torque
-from blf_dsc_controller.safety.monitors import Silence
+from blf_dsc_controller.safety.monitors import LOOK, Silence
 from blf_dsc_controller.safety.reasons import Phase, Reason
 from blf_dsc_controller.safety.supervisor import Supervisor, Trust
 from blf_dsc_controller.safety.velocity import Velocity
@@ -236,17 +236,20 @@ class Guard:
         self.supervisor.stop(_REASONS.get(type(error), Reason.BAD_MESSAGE), str(error))
         return self._safe(self.config.sample_time)
 
-    def watch(self, period: float) -> Vector | None:
-        """Look at the steady clock, `period` [s] after the last look; a torque if it is silent."""
-        if not self.watching:
-            return None
+    @property
+    def next_watch(self) -> float:
+        """Time [s] after which to `watch` again."""
+        return self._silence.next_look
+
+    def watch(self) -> Vector | None:
+        """Look at the steady clock, `next_watch` after the last look; a torque if it is silent."""
         limit = self.config.sample_time + self.config.safety.state_timeout
-        silent = self._silence.look(self._steady(), period, limit)
-        if silent == 0.0 or not self._commanded:
+        silent = self._silence.look(self._steady(), limit)
+        if silent == 0.0 or not (self.watching and self._commanded):
             return None
         self._dq[:] = 0.0
         self.supervisor.stop(Reason.STATE_TIMEOUT, f'no joint state has come for {silent:.3g} s')
-        return self._safe(period)
+        return self._safe(LOOK)
 
     def fail(self, error: Exception) -> Vector | None:
         """Torque (n,) [N m] after an error that nobody foresaw."""

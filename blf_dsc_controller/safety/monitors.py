@@ -3,6 +3,10 @@
 
 from __future__ import annotations
 
+LOOK = 0.008
+"""Time [s] from one look at the steady clock to the next while it is silent."""
+
+_MARGIN = 0.001  # s, after which what was due has come or is late
 _NANO = 1e-9
 
 
@@ -54,9 +58,13 @@ class Silence:
 
     A watch that was itself late proves nothing, because the states may wait in the queue behind
     it: then the verdict is left to the next look.
+
+    Attributes:
+        next_look: time [s] from the last look to the next: as soon as it could have become silent.
     """
 
     def __init__(self) -> None:
+        self.next_look = LOOK
         self._last_state = -1
         self._last_look = -1
 
@@ -68,16 +76,15 @@ class Silence:
         """Wait for a state without counting the time."""
         self._last_state = -1
 
-    def look(self, now: int, period: float, limit: float) -> float:
+    def look(self, now: int, limit: float) -> float:
         """Return for how long it has been silent past `limit` [s]; 0 if it has not.
 
         Args:
-            now: steady clock [ns].
-            period: time between two looks [s].
+            now: steady clock [ns], `next_look` after the last look.
             limit: longest time between two states [s].
         """
-        previous, self._last_look = self._last_look, now
-        if self._last_state < 0 or (now - previous) * _NANO > 2.0 * period:
-            return 0.0
-        silent = (now - self._last_state) * _NANO
-        return silent if silent > limit else 0.0
+        is_late = (now - self._last_look) * _NANO > self.next_look + LOOK
+        self._last_look = now
+        silent = (now - self._last_state) * _NANO if self._last_state >= 0 else 0.0
+        self.next_look = limit - silent + _MARGIN if silent <= limit else LOOK
+        return silent if silent > limit and not is_late else 0.0
