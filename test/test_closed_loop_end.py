@@ -11,9 +11,11 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from command import Running, wait_for
+from command import Running, closed_loop, wait_for
+from small_disk import small_disk
 
 from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.recovery.recover import recover
 
 
 @pytest.fixture
@@ -61,3 +63,30 @@ def test_no_node_outlives_the_command(running):
     bag = running.out / 'bag'
     wait_for((bag / 'metadata.yaml').exists)
     assert whole(bag) > 100
+
+
+def at_the_end(complaints):
+    """Last line of progress."""
+    return [line for line in complaints.splitlines() if line.startswith('closed loop ')][-1]
+
+
+@pytest.mark.parametrize(('mode', 'duration'), [('lockstep', 20), ('realtime', 5)])
+def test_a_full_disk_ends_the_recording_and_not_the_loop(tmp_path, mode, duration):
+    # Full after 2 s: each takes over 1 MB, and half of the 4 MB are kept for the end of the bag.
+    run = ('--mode', mode, '--duration', duration, '--out')
+    with small_disk(tmp_path / 'disk', 4) as disk:
+        recorded = closed_loop(*run, disk / 'out')
+        assert recorded.returncode == 1
+        said = recorded.stderr
+        assert 'bag_recorder has ended: the loop goes on and is no longer recorded' in said
+        assert 'bag_recorder ended with exit code 1 while the loop went on without it' in said
+        assert said.count('the disk is full') == 1
+        assert f'what was recorded until then is in {disk / "out" / "bag"}' in said
+        assert 'Traceback' not in said
+        assert at_the_end(said).startswith(f'closed loop {duration}.0/{duration} s, ')
+        bag = disk / 'out' / 'bag'
+        assert 500 < whole(bag) < 1000 * duration
+        assert recover(bag, tmp_path / 'clean').is_whole
+    if mode == 'lockstep':
+        alone = closed_loop('--offline', *run, tmp_path / 'alone')
+        assert at_the_end(alone.stderr) == at_the_end(said)

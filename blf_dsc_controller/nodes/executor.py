@@ -63,6 +63,7 @@ def run(make_node: Callable[[], Runnable]) -> int:
     """
     signals = _Signals()
     node: Runnable | None = None
+    complaint = ''
     try:
         rclpy.init(args=sys.argv, signal_handler_options=rclpy.SignalHandlerOptions.NO)
         executor = EventsExecutor()
@@ -74,15 +75,16 @@ def run(make_node: Callable[[], Runnable]) -> int:
         if node.failure is not None:
             raise node.failure
     except UnknownROSArgsError as error:
-        print(f'arguments after --ros-args that ROS does not know: {error}', file=sys.stderr)  # noqa: T201
-        return 1
+        complaint = f'arguments after --ros-args that ROS does not know: {error}'
     except (BlfDscError, RCLError, OSError) as error:
-        print(error, file=sys.stderr)  # noqa: T201
-        return 1
+        complaint = str(error)
     finally:
         if node is not None:
             _close(node)
         rclpy.try_shutdown()
+    if complaint:  # last, so that it stands at the end of whatever else was said
+        print(complaint, file=sys.stderr)  # noqa: T201
+        return 1
     return 0
 
 

@@ -18,16 +18,16 @@ _PR_SET_PDEATHSIG = 1
 
 
 class NodeFailedError(BlfDscError):
-    """A node ended with an error of its own."""
+    """A node ended with an error of its own; `remark` follows what is said of its end."""
 
-    def __init__(self, name: str, code: int, log: Path) -> None:
+    def __init__(self, name: str, code: int, log: Path, remark: str = '') -> None:
         self.name = name
         self.code = code
         self.log = log
         end = f'was ended by {_signal(-code)}' if code < 0 else f'ended with exit code {code}'
         lines = log.read_text(encoding='utf-8', errors='replace').splitlines()[-_TAIL:]
         tail = ''.join(f'\n  {line}' for line in lines)
-        super().__init__(f'{name} {end}:{tail}\n(all that it said: {log})')
+        super().__init__(f'{name} {end}{remark}:{tail}\n(all that it said: {log})')
 
 
 class NodeProcess:
@@ -63,11 +63,11 @@ class NodeProcess:
         """Whether the process is there."""
         return self._process.poll() is None
 
-    def check(self) -> None:
-        """Raise NodeFailedError if the node has ended with an error."""
+    def check(self, remark: str = '') -> None:
+        """Raise NodeFailedError, with this remark, if the node has ended with an error."""
         code = self._process.poll()
         if code:
-            raise NodeFailedError(self.name, code, self._log)
+            raise NodeFailedError(self.name, code, self._log, remark)
 
     def stop(self) -> None:
         """Ask the node to end and wait for it; past its time it is killed."""

@@ -52,6 +52,11 @@ class Progress:
         if time.monotonic() >= self._due:
             self._print_line()
 
+    def say(self, text: str) -> None:
+        """Print a line of its own, which the bar does not run into."""
+        self._bar.write(text, file=sys.stderr)
+        sys.stderr.flush()
+
     def close(self) -> None:
         """Leave the bar, or a last line, as it is."""
         self._bar.close()

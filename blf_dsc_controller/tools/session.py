@@ -41,26 +41,40 @@ def run_session(plant: PlantConfig, out: Path, domain: int) -> bool:
     }
     os.environ.update(environment)
     nodes: list[NodeProcess] = []
+    remark = ''
     with Interruption() as interruption:
         try:
             for name, module in _MODULES.items():
                 log = logs / f'{name}.log'
                 nodes.append(NodeProcess(name, module, out / 'config.yaml', log, environment))
-            _watch(plant, nodes, interruption)
+            remark = _watch(plant, nodes, interruption)
         finally:
             for node in reversed(nodes):
                 node.stop()
-        for node in nodes:
+        recorder, *loop = nodes
+        for node in loop:
             node.check()
+        recorder.check(remark)
         return not interruption.came
 
 
-def _watch(plant: PlantConfig, nodes: list[NodeProcess], interruption: Interruption) -> None:
+def _watch(plant: PlantConfig, nodes: list[NodeProcess], interruption: Interruption) -> str:
+    """Watch over the nodes until the plant ends; return what is to be said of the recorder's end.
+
+    A loop that has begun goes on without its recorder.
+    """
     from blf_dsc_controller.tools.watch import Watch
 
+    recorder, *loop = nodes
+    remark = ''
     with Watch(plant) as watch:
-        while nodes[-1].is_running and not interruption.came:
-            # A loop that has begun goes on without its recorder, whose end is told afterwards.
-            for node in nodes[1:] if watch.has_begun else nodes:
+        while loop[-1].is_running and not interruption.came:
+            for node in loop:
                 node.check()
+            if not watch.has_begun:
+                recorder.check()
+            elif not (recorder.is_running or remark):
+                remark = ' while the loop went on without it'
+                watch.say(f'{recorder.name} has ended: the loop goes on and is no longer recorded')
             watch.wait(0.1)
+    return remark

@@ -50,6 +50,10 @@ class Watch:
         self._latest = None
         return True
 
+    def say(self, text: str) -> None:
+        """Print a line beside the progress."""
+        self._progress.say(text)
+
     @property
     def has_begun(self) -> bool:
         """Whether the loop has been seen to run."""
