@@ -146,7 +146,7 @@ def test_erratum_19_printed_projection_lets_the_estimate_out_and_never_back():
         rate = outward.copy() if k < 10 else -corrected
         projection.project(corrected, rate, gain, radius)
         corrected += dt * rate
-        projection.rescale(corrected, 2, radius)
+        projection.retract(corrected, gain, radius)
         assert np.linalg.norm(corrected) <= radius * (1.0 + 1e-15)
     assert np.linalg.norm(printed) > 1.01 * radius
     assert np.linalg.norm(corrected) < 1e-6

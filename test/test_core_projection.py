@@ -37,12 +37,12 @@ def test_no_step_leaves_the_ball(seed, size, speed, radius):
     random = np.random.default_rng(seed)
     gain = 10.0 ** random.uniform(-3.0, 3.0, size)
     estimate = random.normal(size=size) * radius
-    projection.rescale(estimate, size, radius)
+    projection.retract(estimate, gain, radius)
     for _ in range(20):
         rate = random.normal(size=size) * speed
         projection.project(estimate, rate, gain, radius)
         estimate += 1e-2 * rate
-        projection.rescale(estimate, size, radius)
+        projection.retract(estimate, gain, radius)
         assert np.linalg.norm(estimate) <= radius * (1.0 + 1e-15)
 
 
@@ -50,7 +50,7 @@ def test_inside_the_ball_nothing_is_changed():
     estimate, rate = np.array([1.0, -2.0, 1.9]), np.array([1e3, -5.0, 7.0])
     np.testing.assert_array_equal(projected(estimate, rate), rate)
     before = estimate.copy()
-    projection.rescale(estimate, 3, RADIUS)
+    projection.retract(estimate, GAIN, RADIUS)
     np.testing.assert_array_equal(estimate, before)
 
 
@@ -74,15 +74,14 @@ def test_at_the_ball_nothing_outward_is_left(seed):
     assert w @ rate == pytest.approx(0.0, abs=1e-13)
 
 
-def test_a_rescaled_estimate_counts_as_on_the_sphere():
+def test_a_retracted_estimate_counts_as_on_the_sphere():
     """It is there up to a rounding, either way: or half the steps would go unprojected."""
     for seed in range(100):
         random = np.random.default_rng(seed)
         w, v = random.normal(size=(2, 3))
         w *= 2.0 * RADIUS / np.linalg.norm(w)
+        projection.retract(w, GAIN, RADIUS)
         v *= np.sign(w @ v)
-
-        projection.rescale(w, 3, RADIUS)
 
         assert w @ projected(w, v) == pytest.approx(0.0, abs=1e-12)
 
@@ -98,7 +97,36 @@ def test_projection_never_slows_the_fall_of_the_lyapunov_function(seed):
     assert slope[0] <= slope[1] + 1e-12
 
 
-def test_rescale_touches_the_parameters_alone():
-    estimate = np.array([3.0, 4.0, 100.0, -100.0])
-    projection.rescale(estimate, 2, 2.5)
-    np.testing.assert_allclose(estimate, [1.5, 2.0, 100.0, -100.0], rtol=1e-15)
+@pytest.mark.parametrize('seed', range(100))
+def test_a_retracted_estimate_is_the_nearest_of_the_ball_in_the_metric_of_gamma(seed):
+    """Then no true P inside the ball gets farther: 1/2 P~^T Gamma^-1 P~ does not grow."""
+    random = np.random.default_rng(seed)
+    gain = 10.0 ** random.uniform(-3.0, 3.0, 4)
+    outside = random.normal(size=4)
+    outside *= RADIUS * 10.0 ** random.uniform(0.0, 3.0) / np.linalg.norm(outside)
+    inside = outside.copy()
+
+    projection.retract(inside, gain, RADIUS)
+
+    # Nearest: what is left of the way out is Gamma w nu, in each direction with the same nu > 0.
+    nu = (outside - inside) / (gain * inside)
+    np.testing.assert_allclose(nu, np.full(4, nu.max()), rtol=1e-6)
+    assert nu.min() > 0.0
+    assert np.linalg.norm(inside) == pytest.approx(RADIUS, rel=1e-12)
+    for _ in range(10):
+        true = on_sphere(random, 4) * random.uniform()
+        before, after = (((true - w) ** 2 / gain).sum() for w in (outside, inside))
+        assert after <= before * (1.0 + 1e-9)
+
+
+def test_an_even_gamma_retracts_along_the_radius():
+    estimate = np.array([3.0, 4.0])
+    projection.retract(estimate, np.array([0.5, 0.5]), 2.5)
+    np.testing.assert_allclose(estimate, [1.5, 2.0], rtol=1e-15)
+
+
+@pytest.mark.parametrize('bad', [np.nan, np.inf])
+def test_what_is_no_number_is_left_for_the_supervisor_to_see(bad):
+    estimate = np.array([bad, 1.0, 1.0])
+    projection.retract(estimate, GAIN, RADIUS)
+    assert not np.isfinite(estimate[0])

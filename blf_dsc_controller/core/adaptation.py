@@ -48,15 +48,12 @@ def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturat
             tracking += settings.Wc * state.estimate[j]
         signals.rate[j] = settings.Gamma[j] * (settings.kappa * signals.rate[j] - tracking)
     p = settings.p
-    projection.project(
-        part(state.estimate, 0, (p,)),
-        part(signals.rate, 0, (p,)),
-        part(settings.Gamma, 0, (p,)),
-        settings.radius,
-    )
+    parameters = part(state.estimate, 0, (p,))
+    gain = part(settings.Gamma, 0, (p,))
+    projection.project(parameters, part(signals.rate, 0, (p,)), gain, settings.radius)
     for j in range(settings.m):
         state.estimate[j] += dt * signals.rate[j]
-    projection.rescale(state.estimate, p, settings.radius)
+    projection.retract(parameters, gain, settings.radius)
     if not saturated:
         for i in range(settings.n):
             state.disturbance[i] -= (

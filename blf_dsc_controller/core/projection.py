@@ -3,16 +3,19 @@
 
 (4) as printed acts where |P^| equals the radius, which a sampled update never does: it steps over
 and never returns.  Here the outward part is removed on and beyond the sphere, in the metric that
-the Lyapunov function (29) measures P~ with, and the step ends inside the ball.
+the Lyapunov function (29) measures P~ with, and a step that leaves the ball ends at its nearest
+point in that metric, which is never farther from a true P inside.
 """
 
-from math import sqrt
+from math import isfinite, sqrt
 
 import numpy as np
 
 from blf_dsc_controller.core.kernel import inner
 
-_ON_SPHERE = 1.0 - 1e-12  # of radius^2: `rescale` ends a rounding inside or outside
+_ON_SPHERE = 1.0 - 1e-12  # of radius^2: `retract` ends a rounding inside or outside
+_ROUNDED = 1.0 + 1e-14
+_MOST_STEPS = 100  # of Newton's method; about ten for a Gamma of six decades
 
 
 @inner
@@ -38,12 +41,38 @@ def project(estimate: np.ndarray, rate: np.ndarray, gain: np.ndarray, radius: fl
 
 
 @inner
-def rescale(estimate: np.ndarray, size: int, radius: float) -> None:
-    """Bring the first `size` entries of `estimate` back onto the ball, if a step has left it."""
+def retract(estimate: np.ndarray, gain: np.ndarray, radius: float) -> None:
+    """Replace a P^ (p,) outside the ball by the nearest in it, in the metric of Gamma.
+
+    That is P^_j / (1 + nu Gamma_j) with the nu > 0 that gives it the length omega_a, found by
+    Newton's method on 1 / length: exact after one step if Gamma is even, monotone if it is not.
+
+    Args:
+        estimate: P^ (p,), changed in place.
+        gain: diagonal of Gamma (p,).
+        radius: omega_a.
+    """
+    nu = 0.0
+    length = _shrunk(estimate, gain, nu)[0]
+    if not (length > radius and isfinite(length)):
+        return
+    for _ in range(_MOST_STEPS):
+        length, slope = _shrunk(estimate, gain, nu)
+        if not (length > _ROUNDED * radius and slope > 0.0):
+            break
+        nu += (length / radius - 1.0) * length * length / slope
+    rounding = min(1.0, radius / length)
+    for j in range(gain.size):
+        estimate[j] *= rounding / (1.0 + nu * gain[j])
+
+
+@inner
+def _shrunk(estimate: np.ndarray, gain: np.ndarray, nu: float) -> tuple[float, float]:
+    """Length of P^_j / (1 + nu Gamma_j), and minus half the slope of its square in nu."""
     square = 0.0
-    for j in range(size):
-        square += estimate[j] * estimate[j]
-    if square > radius * radius:
-        shrink = radius / sqrt(square)
-        for j in range(size):
-            estimate[j] *= shrink
+    slope = 0.0
+    for j in range(gain.size):
+        entry = estimate[j] / (1.0 + nu * gain[j])
+        square += entry * entry
+        slope += gain[j] * entry * entry / (1.0 + nu * gain[j])
+    return sqrt(square), slope
