@@ -40,12 +40,14 @@ def messages(path):
         return [[topic, types[topic], at, raw] for topic, at, raw in bag.messages(types)]
 
 
-def write(path, entries, configuration=''):
+def write(path, entries, configuration='', **facts):
     """Write messages into a new bag."""
     handles = {}
     with BagWriter(path, flush_interval=None) as bag:
         if configuration:
             bag.configure(configuration, 0)
+        if facts:
+            bag.note(facts)
         for topic, type_name, at, raw in entries:
             if topic not in handles:
                 handles[topic] = bag.add_topic(topic, type_name, [])

@@ -20,6 +20,7 @@ from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.encoders import JointStateEncoder
 from blf_dsc_controller.bags.errors import BagExistsError
 from blf_dsc_controller.bags.losses import Losses
@@ -29,6 +30,7 @@ from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.nodes import recorder_node
 from blf_dsc_controller.nodes.intake import quality_of
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
+from blf_dsc_controller.reports.subject import read_subjects
 
 PATIENCE = 20.0  # s, until a test gives up on what should take a moment
 
@@ -256,11 +258,31 @@ def test_messages_that_the_queue_could_not_hold_are_counted_as_missed(loop):
     assert losses.missed > 0
 
 
+def test_a_beginning_that_was_not_heard_is_told_in_the_bag_and_by_what_reads_it(loop, capfd):
+    run = loop()
+    publisher = run.source.create_publisher(JointState, 'joint_states', 100)
+    encoder = JointStateEncoder(['joint1'])
+    for k in range(7):  # nobody listens yet, and nothing is kept
+        publisher.publish(encoder.encode(k, [k], [0], [0]))
+    run.spin_until(lambda: publisher.get_subscription_count() > 0)
+    for k in range(7, 10):
+        publisher.publish(encoder.encode(k, [k], [0], [0]))
+    run.spin_until_recorded(joint_states=3)
+    run.close()
+    lost = '0 missed, 7 sent before the recorder heard them'
+    assert f'/joint_states: 3 messages, {lost}' in capfd.readouterr().err
+    assert read_context(run.bag).losses == {'/joint_states': lost}
+    (subject,) = read_subjects([run.bag])
+    assert [(event.kind, event.text) for event in subject.events] == [
+        ('lost', f'/joint_states: {lost}')
+    ]
+
+
 def test_losses_are_gaps_in_the_numbers():
     losses = Losses(publishers=1)
-    for sequence in (4, 5, 8, 9, 1, 2):  # the first is not a loss, the 1 a new publisher
+    for sequence in (4, 5, 8, 9, 2, 3):  # the 2 is of a new publisher
         losses.count(sequence)
-    assert losses.missed == 2
+    assert losses.text() == ', 2 missed, 4 sent before the recorder heard them'
     losses.publishers_seen(2)
     losses.count(100)
     assert losses.text() == ''

@@ -182,6 +182,19 @@ def test_a_whole_bag_has_lost_nothing(whole, tmp_path, capsys):
     assert 'nothing was lost' in capsys.readouterr().out
 
 
+def test_what_the_recorder_did_not_get_is_told_of_the_clean_bag_too(tmp_path, capsys):
+    with BagWriter(tmp_path / 'bag') as bag:
+        handle = bag.add_topic(JOINT_STATES.resolved, JOINT_STATES.type, [JOINT_STATES.offered])
+        for number in (6, 7, 9):
+            bag.write(handle, JointStateEncoder(['x']).encode(0, [0], [0], [0]), 0, 0, number)
+    assert main([str(tmp_path / 'bag'), '--out', str(tmp_path / 'clean')]) == 0
+    said = capsys.readouterr().out
+    assert '3 messages, 1 numbers missing in between, 5 numbers missing before the first' in said
+    assert read_context(tmp_path / 'clean').losses == {
+        '/joint_states': '1 missed, 5 sent before the recorder heard them'
+    }
+
+
 @pytest.mark.parametrize('name', ['bag_0.mcap', 'bag_1.mcap'])
 def test_files_of_a_split_bag_are_recovered_together(plain, tmp_path, name):
     folder = damaged(tmp_path / 'bag', plain.read_bytes())
@@ -217,4 +230,5 @@ def test_the_command_tells_what_was_lost_in_words(plain, tmp_path, capsys):
     assert main([str(folder)]) == 0
     said = capsys.readouterr().out
     assert 'bag_0.mcap: the recording was not ended; it ends at 1734000000.024000001 s' in said
+    assert 'missing' not in said
     assert f'wrote {tmp_path / "bag_recovered"}' in said

@@ -60,8 +60,8 @@ def rewritten(bag, entries, tmp_path):
     """Writes the bag again with other messages, under its own configuration."""
     configuration = read_context(bag).configuration
 
-    def write(changed=entries):
-        return recorded_run.write(tmp_path / 'changed', changed, configuration)
+    def write(changed=entries, **facts):
+        return recorded_run.write(tmp_path / 'changed', changed, configuration, **facts)
 
     return write
 
@@ -178,8 +178,12 @@ def test_a_lost_state_ends_the_replay_there_and_says_so(entries, rewritten):
 
 
 def test_a_recording_that_began_late_is_recognised(entries, rewritten):
-    outcome = replay(rewritten([e for e in entries if e[2] > START + 200 * MILLISECOND]))
+    late = [entry for entry in entries if entry[2] > START + 200 * MILLISECOND]
+    said = '800 written, 0 missed, 201 sent before the recorder heard them'
+    outcome = replay(rewritten(late, **{'messages /joint_states': said}))
     assert outcome.difference.time == 0.0
+    lost = '/joint_states: 0 missed, 201 sent before the recorder heard them'
+    assert f'the recorder did not get all of {lost}' in outcome.remarks
     assert any('begun after the controller' in remark for remark in outcome.remarks)
 
 

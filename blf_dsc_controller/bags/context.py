@@ -17,6 +17,8 @@ from mcap.reader import make_reader
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.errors import NoConfigurationError, OtherVersionError
+from blf_dsc_controller.bags.losses import NOTHING_MISSED
+from blf_dsc_controller.bags.topics import TOPICS
 from blf_dsc_controller.configuration.builtin import is_builtin
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
@@ -32,8 +34,11 @@ RECORD = 'blf_dsc_controller'
 ATTACHMENT = 'configuration.yaml'
 MEDIA_TYPE = 'application/yaml'
 VERSION = 'package_version'
+MESSAGES = 'messages '
+"""Start of the name of a fact that tells of a topic what was written and what was lost."""
 
 _FACTS = {'law': 'law', 'model': 'model', 'seed': 'seed', 'mode': 'clock'}
+_KEPT = frozenset(topic.leaf for topic in TOPICS if topic.offered.depth > 1)
 _OF_CONTROLLER = frozenset(('law', 'model', 'barrier.bound', 'learning.window'))
 
 
@@ -79,8 +84,21 @@ class Context:
 
     def missed(self, topic: str) -> int:
         """Messages of a topic that the recorder knows it missed."""
-        found = re.search(r'(\d+) missed', self.facts.get(f'messages {topic}', ''))
+        found = re.search(r'(\d+) missed', self.facts.get(f'{MESSAGES}{topic}', ''))
         return int(found[1]) if found else 0
+
+    @property
+    def losses(self) -> dict[str, str]:
+        """What the recorder did not get of each topic, in its words, where there is anything.
+
+        Of a topic that keeps its last message alone, earlier ones are not counted as lost.
+        """
+        told = {
+            name.removeprefix(MESSAGES): text.partition(', ')[2]
+            for name, text in self.facts.items()
+            if name.startswith(MESSAGES) and name.rsplit('/', 1)[-1] in _KEPT
+        }
+        return {topic: text for topic, text in told.items() if text not in ('', NOTHING_MISSED)}
 
     def controller(self) -> Recorded:
         """Tell which controller ran, and how it was configured.

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+NOTHING_MISSED = '0 missed'
+"""Words of a topic of which everything came."""
+
 
 class Losses:
-    """Messages of one topic that were published after the first one seen but never came.
+    """Messages of one topic that were published but never came.
 
     Several publishers each count for themselves, so nothing can be said of a topic that ever had
     more than one.
@@ -14,8 +17,8 @@ class Losses:
         publishers: number of publishers at present.
 
     Attributes:
-        missed: messages that did not come; None if that cannot be told.
-        before: messages that its publisher had sent before the first that came.
+        missed: messages between others that did not come; None if that cannot be told.
+        before: messages that a publisher had sent before the first of its own that came.
     """
 
     def __init__(self, publishers: int) -> None:
@@ -27,14 +30,15 @@ class Losses:
     def publishers_seen(self, publishers: int) -> None:
         """Take note of the present number of publishers."""
         if publishers > 1:
-            self.missed = None
+            self.missed, self.before = None, 0
 
     def count(self, sequence: int) -> None:
         """Take note of a message; a number that is not higher than the last is a new publisher."""
-        if not self._last:
-            self.before = max(sequence - 1, 0)
-        if self.missed is not None and self._last and sequence > self._last:
-            self.missed += sequence - self._last - 1
+        if self.missed is not None:
+            if self._last and sequence > self._last:
+                self.missed += sequence - self._last - 1
+            else:
+                self.before += max(sequence - 1, 0)
         self._last = sequence
 
     def text(self) -> str:

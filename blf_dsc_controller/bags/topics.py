@@ -63,7 +63,9 @@ JOINT_STATE = 'sensor_msgs/msg/JointState'
 FLOAT64_MULTI_ARRAY = 'std_msgs/msg/Float64MultiArray'
 
 # A late state or torque is worth nothing once the next one is there, so the two ends of the loop
-# keep one; publishers keep more, because a recorder beside the loop must not miss any.
+# keep one; publishers keep more, because a recorder beside the loop must not miss any. They do not
+# keep it for who comes late, least of all torques, of which an arm must never be given an old one;
+# a recorder that hears them late says so, and closed_loop waits until it listens.
 LATEST = Quality(depth=1)
 STREAM = Quality(depth=5000)
 HISTORY = Quality(depth=5000, durability='transient_local')

@@ -9,6 +9,7 @@ from typing import Any
 
 from rclpy.clock import Clock, ClockType
 
+from blf_dsc_controller.bags.context import MESSAGES
 from blf_dsc_controller.bags.errors import DiskFullError, UnknownTypeError, WriteError
 from blf_dsc_controller.bags.losses import Losses
 from blf_dsc_controller.bags.topics import Quality
@@ -141,7 +142,7 @@ class BagRecorderNode(RunnableNode):
 
     def _statistics(self) -> dict[str, str]:
         return {
-            f'messages {topic}': f'{count} written{self._losses[topic].text()}'
+            f'{MESSAGES}{topic}': f'{count} written{self._losses[topic].text()}'
             for topic, count in self._sink.message_counts.items()
         }
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
-from blf_dsc_controller.bags.context import ATTACHMENT, RECORD
+from blf_dsc_controller.bags.context import ATTACHMENT, MESSAGES, RECORD
 from blf_dsc_controller.bags.errors import UnknownTypeError, UnreadableBagError
 from blf_dsc_controller.bags.losses import Losses
 from blf_dsc_controller.bags.mcap_file import CHANNEL_RECORD
@@ -30,6 +30,7 @@ class Recovery:
         path: of the clean bag.
         messages: recovered, by topic.
         missed: numbers missing between recovered messages, by topic; None if not numbered.
+        before: numbers missing before the first one, by topic.
         losses: pieces of the files that could not be read.
         unfinished: files that were not ended properly, and the time of their last message [ns].
         unknown: messages of topics of which nothing is known any more.
@@ -38,6 +39,7 @@ class Recovery:
     path: Path
     messages: dict[str, int] = field(default_factory=dict)
     missed: dict[str, int | None] = field(default_factory=dict)
+    before: dict[str, int] = field(default_factory=dict)
     losses: list[Loss] = field(default_factory=list)
     unfinished: list[tuple[str, int | None]] = field(default_factory=list)
     unknown: int = 0
@@ -68,9 +70,10 @@ def recover(path: Path, out: Path) -> Recovery:
         transfer = _Transfer(bag, recovery)
         for file in files:
             transfer.file(file)
-        bag.note({'recovered_from': str(path)})
+        bag.note({'recovered_from': str(path), **transfer.statistics()})
     recovery.messages = bag.message_counts
     recovery.missed = {topic: one.missed for topic, one in transfer.losses.items()}
+    recovery.before = {topic: one.before for topic, one in transfer.losses.items()}
     return recovery
 
 
@@ -136,7 +139,14 @@ class _Transfer:
             if one.name == ATTACHMENT:
                 self._bag.configure(one.text, one.log_time)
         facts = salvage.metadata.get(RECORD, {})
-        self._bag.note({k: v for k, v in facts.items() if not k.startswith('messages ')})
+        self._bag.note({k: v for k, v in facts.items() if not k.startswith(MESSAGES)})
+
+    def statistics(self) -> dict[str, str]:
+        """What the clean bag holds of each topic and what it lacks, in the recorder's words."""
+        return {
+            f'{MESSAGES}{topic}': f'{count} written{self.losses[topic].text()}'
+            for topic, count in self._bag.message_counts.items()
+        }
 
 
 def _repeated(salvage: Salvage, number: int) -> Channel | None:

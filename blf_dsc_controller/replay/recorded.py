@@ -71,6 +71,9 @@ def replay(path: Path, namespace: str = '') -> Outcome:
     if not any(one.values for one in comparisons):
         raise NothingToCompareError(path, content.message_counts)
     remarks = [problem] if problem else []
+    remarks += [
+        f'the recorder did not get all of {on}: {what}' for on, what in context.losses.items()
+    ]
     if any(topic.rsplit('/', 1)[-1] == JOINT_TRAJECTORY.leaf for topic in content.message_counts):
         remarks.append(
             'trajectories were sent to the controller: the replay follows the configured reference '

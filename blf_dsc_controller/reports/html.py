@@ -93,7 +93,7 @@ def _events(subjects: Sequence[Subject]) -> str:
     )
     if not rows:
         return '<p>none</p>'
-    bad = ('violation', 'ERROR')
+    bad = ('violation', 'ERROR', 'lost')
     cells = (
         f'<tr><td class="number">{time:.3f} s</td><td>{_swatch(k)}{escape(subjects[k].name)}</td>'
         f'<td{" class=bad" if kind in bad else ""}>{escape(kind)}</td><td>{escape(text)}</td></tr>'

@@ -82,8 +82,10 @@ def _read(path: Path, name: str, namespace: str) -> Subject:
     run = read_run(path, namespace)
     events = [*_learning_events(run), *_bound_events(run), *_torque_events(run)]
     events += _diagnosed(path, run)
+    context = read_context(path)
+    events += (Event(0.0, 'lost', f'{topic}: {text}') for topic, text in context.losses.items())
     events.sort(key=lambda event: event.time)
-    return Subject(name, run, read_context(path), tuple(events))
+    return Subject(name, run, context, tuple(events))
 
 
 def _learning_events(run: Run) -> Iterator[Event]:

@@ -43,7 +43,9 @@ def _lines(recovery: Recovery) -> Iterator[str]:
     for topic, count in recovery.messages.items():
         missed = recovery.missed[topic]
         gaps = f', {missed} numbers missing in between' if missed else ''
-        yield f'{topic}: {count} messages{gaps}'
+        before = recovery.before[topic]
+        begun = f', {before} numbers missing before the first' if before else ''
+        yield f'{topic}: {count} messages{gaps}{begun}'
     for loss in recovery.losses:
         yield f'LOST {loss}'
     for name, last in recovery.unfinished:
@@ -55,7 +57,7 @@ def _lines(recovery: Recovery) -> Iterator[str]:
     if recovery.unknown:
         yield f'LOST {recovery.unknown} messages of topics of which nothing is known any more'
     if recovery.is_whole:
-        yield 'nothing was lost'
+        yield 'nothing was lost of what had been recorded'
     yield f'wrote {recovery.path}'
 
 

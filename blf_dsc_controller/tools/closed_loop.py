@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from blf_dsc_controller.assembly import estimate_names
+from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.offline import write_bag
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.dump import dump
@@ -141,6 +142,8 @@ def report(out: Path) -> None:
     write_summary(summary, out / 'summary.json')
     pictures = draw(run, out)
     print(format_table(summary))
+    for topic, text in read_context(out / 'bag').losses.items():
+        print(f'warning: the bag does not hold all of {topic}: {text}')
     print(f'wrote       {out}: bag, summary.json, {", ".join(path.name for path in pictures)}')
 
 
