@@ -31,7 +31,7 @@ from blf_dsc_controller.bags.telemetry import DECIMATION, Message, PlantTelemetr
 from blf_dsc_controller.core.two_link import PARAMETER_NAMES
 from blf_dsc_controller.description.urdf import urdf
 from blf_dsc_controller.nodes import compilation, executor, parameters, realtime
-from blf_dsc_controller.nodes.endpoints import publisher, subscribe
+from blf_dsc_controller.nodes.endpoints import are_observed, publisher, subscribe
 from blf_dsc_controller.nodes.latency import Latency
 from blf_dsc_controller.nodes.managed import ManagedNode
 from sim_plant.assembly import plant_of, steps_of
@@ -204,11 +204,7 @@ class PlantNode(ManagedNode):
 
     def _is_observed(self) -> bool:
         observers = self.config.wait_for_subscribers
-        for topic, output in self._publisher_of.items():
-            needed = observers + 1 if topic is topics.JOINT_STATES else observers
-            if output.get_subscription_count() < needed:
-                return False
-        return True
+        return are_observed(self._publisher_of, topics.JOINT_STATES, observers)
 
     def _on_command(self, raw: bytes) -> None:
         try:

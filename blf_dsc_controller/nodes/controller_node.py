@@ -22,7 +22,7 @@ from blf_dsc_controller.core.controller import Controller
 from blf_dsc_controller.feasibility import concerns
 from blf_dsc_controller.nodes import compilation, executor, parameters, realtime
 from blf_dsc_controller.nodes.controller_status import ControllerStatus
-from blf_dsc_controller.nodes.endpoints import publisher, subscribe
+from blf_dsc_controller.nodes.endpoints import are_observed, publisher, subscribe
 from blf_dsc_controller.nodes.managed import ManagedNode
 from blf_dsc_controller.nodes.trajectory import TrajectoryInput
 from blf_dsc_controller.refusals import refusals
@@ -225,11 +225,7 @@ class ControllerNode(ManagedNode):
 
     def _is_observed(self) -> bool:
         observers = self.config.wait_for_subscribers
-        for topic, output in self._publisher_of.items():
-            needed = observers + 1 if topic is topics.COMMANDS else observers
-            if output.get_subscription_count() < needed:
-                return False
-        return True
+        return are_observed(self._publisher_of, topics.COMMANDS, observers)
 
     def _on_look(self) -> None:
         """Watch, and be woken again when there may be something to see: waking has its price."""

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rclpy.node import Node
@@ -54,6 +54,20 @@ def subscribe(node: Node, topic: Topic, callback: Callable[[bytes], None]) -> No
         profile(topic.requested),
         qos_overriding_options=_overridable(),
         raw=True,
+    )
+
+
+def are_observed(publishers: Mapping[Topic, Publisher], loop: Topic, observers: int) -> bool:
+    """Whether each topic has its subscribers.
+
+    Args:
+        publishers: of the topics.
+        loop: the one that the other side of the loop listens to as well.
+        observers: subscribers that each must have beside it.
+    """
+    return all(
+        publisher.get_subscription_count() >= observers + (topic is loop)
+        for topic, publisher in publishers.items()
     )
 
 

@@ -18,9 +18,8 @@ from blf_dsc_controller.bags.names import LAMBDA_MIN, LYAPUNOV
 from blf_dsc_controller.bags.run import Floats, Run, Series
 from blf_dsc_controller.reports.envelope import envelope
 from blf_dsc_controller.reports.estimation import latch_time
-from blf_dsc_controller.reports.style import ALARM, COLOURS, GREEN, INK, MUTED, Picture, head
+from blf_dsc_controller.reports.style import ALARM, COLOURS, GREEN, INK, MUTED, head, save_panels
 
-_COLUMNS = 2
 _PANEL = (6.4, 3.2)  # inches
 _MILLI = 1e3
 _LEAST = 1e-12  # J and 1, the least that a logarithmic axis shows
@@ -31,16 +30,7 @@ def draw_monitors(run: Run, path: Path) -> bool:
     panels = list(_panels(run))
     if run.monitor is None or not panels:
         return False
-    rows = -(-len(panels) // _COLUMNS)
-    picture = Picture(rows, min(len(panels), _COLUMNS), 'Monitors', _PANEL)
-    latched = latch_time(run)
-    for axes, panel in zip(picture.axes.flat, panels, strict=False):
-        panel(axes)
-        if latched is not None:
-            axes.axvline(latched, color=INK, lw=1.1, ls=(0, (1, 2)), zorder=1)
-    for axes in picture.axes.flat[len(panels) :]:
-        axes.set_visible(False)
-    picture.save(path)
+    save_panels(path, 'Monitors', panels, _PANEL, latch_time(run))
     return True
 
 

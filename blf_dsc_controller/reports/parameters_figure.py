@@ -21,12 +21,11 @@ from blf_dsc_controller.reports.style import (
     GREEN,
     INK,
     MUTED,
-    Picture,
     formula,
     head,
+    save_panels,
 )
 
-_COLUMNS = 2
 _PANEL = (6.2, 3.2)  # inches
 _GOAL = 0.01  # relative error
 _LEAST = 1e-7  # relative error that is drawn
@@ -38,16 +37,7 @@ def draw_parameters(run: Run, path: Path) -> bool:
     if estimation is None or not estimation.names:
         return False
     panels = list(_panels(run, estimation))
-    rows = -(-len(panels) // _COLUMNS)
-    picture = Picture(rows, min(len(panels), _COLUMNS), _title(estimation), _PANEL)
-    latched = latch_time(run)
-    for axes, panel in zip(picture.axes.flat, panels, strict=False):
-        panel(axes)
-        if latched is not None:
-            axes.axvline(latched, color=INK, lw=1.1, ls=(0, (1, 2)), zorder=1)
-    for axes in picture.axes.flat[len(panels) :]:
-        axes.set_visible(False)
-    picture.save(path)
+    save_panels(path, _title(estimation), panels, _PANEL, latch_time(run))
     return True
 
 

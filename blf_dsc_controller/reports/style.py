@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ MUTED = '#6B7280'
 SHADE = '#DCE9F5'
 ALARM = '#B3001B'
 
+_COLUMNS = 2
 _DPI = 130
 _MOST_ABOVE = 4  # entries of a legend that fit beside a title
 _SETTINGS: Any = {
@@ -75,6 +77,33 @@ class Picture:
                 lowest.set_xlabel('time [s]')
                 lowest.tick_params(labelbottom=True)
             self._figure.savefig(path, dpi=_DPI, facecolor='white')
+
+
+def save_panels(
+    path: Path,
+    title: str,
+    panels: Sequence[Callable[[Axes], None]],
+    size: tuple[float, float],
+    latched: float | None,
+) -> None:
+    """Write a picture of panels in two columns, with a line where learning began.
+
+    Args:
+        path: of the PNG.
+        title: above all.
+        panels: what draws each.
+        size: of a panel [inches].
+        latched: when learning began [s]; None: never.
+    """
+    rows = -(-len(panels) // _COLUMNS)
+    picture = Picture(rows, min(len(panels), _COLUMNS), title, size)
+    for axes, panel in zip(picture.axes.flat, panels, strict=False):
+        panel(axes)
+        if latched is not None:
+            axes.axvline(latched, color=INK, lw=1.1, ls=(0, (1, 2)), zorder=1)
+    for axes in picture.axes.flat[len(panels) :]:
+        axes.set_visible(False)
+    picture.save(path)
 
 
 def head(axes: Axes, title: str) -> None:
