@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One closed loop that keeps only its figures: what a study of thousands of them needs.
 
-The samples are those of `simulation.loop`, bit for bit; each is weighed and forgotten.
+The samples are those of `simulation.loop`, bit for bit, but have no energies; each is weighed and
+forgotten.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.core.borrowed import borrowed, part
-from blf_dsc_controller.core.controller import answer
+from blf_dsc_controller.core.controller import decide
 from blf_dsc_controller.core.kernel import inner, kernel
 from blf_dsc_controller.core.sample import Sample, sample_of, sample_size
 from blf_dsc_controller.core.settings import settings_of
@@ -200,6 +201,8 @@ def run(
         figures_vector: packed `Figures`, filled.
     """
     n = measurement.size // 3
+    seen = borrowed(measurement)
+    wanted_motion = borrowed(reference)
     wanted = wanted_of(borrowed(wanted_vector))
     figures = figures_of(borrowed(figures_vector), n)
     told = sample_of(borrowed(sample), n, sample.size - sample_size(n, 0))
@@ -211,10 +214,10 @@ def run(
     begin(figures)
     for k in range(samples):
         plants.draw_next(arm, now, rng)
-        plants.read(arm, now, measurement)
+        plants.read(arm, now, seen)
         t = (k * period) * 1e-9
-        answer(law, reference, law_state, law_signals, t, period * 1e-9, measurement, told)
-        weigh(wanted, figures, t, measurement, told)
+        decide(law, wanted_motion, law_state, law_signals, t, period * 1e-9, seen, told)
+        weigh(wanted, figures, t, seen, told)
         if figures.finite[0] == 0.0:
             return
         if k < samples - 1:

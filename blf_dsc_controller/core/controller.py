@@ -8,7 +8,7 @@ import numpy as np
 from blf_dsc_controller.core import funnel, law, reference
 from blf_dsc_controller.core.borrowed import part
 from blf_dsc_controller.core.kernel import inner, kernel
-from blf_dsc_controller.core.sample import Sample, sample_of, sample_size, tell
+from blf_dsc_controller.core.sample import Sample, sample_of, sample_size, tell, tell_energies
 from blf_dsc_controller.core.settings import Settings, settings_of
 from blf_dsc_controller.core.state import (
     Signals,
@@ -19,6 +19,23 @@ from blf_dsc_controller.core.state import (
     state_size,
 )
 from blf_dsc_controller.errors import OutsideBarrierError
+
+
+@inner
+def decide(
+    settings: Settings,
+    reference_vector: np.ndarray,
+    state: State,
+    signals: Signals,
+    t: float,
+    dt: float,
+    measurement: np.ndarray,
+    sample: Sample,
+) -> None:
+    """`answer`, without the energies of the sample."""
+    reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
+    law.answer(settings, state, signals, t, dt, measurement)
+    tell(settings, state, signals, sample)
 
 
 @inner
@@ -44,9 +61,8 @@ def answer(
         measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
         sample: filled.
     """
-    reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
-    law.answer(settings, state, signals, t, dt, measurement)
-    tell(settings, state, signals, part(measurement, 0, (settings.n,)), sample)
+    decide(settings, reference_vector, state, signals, t, dt, measurement, sample)
+    tell_energies(settings, state, signals, part(measurement, 0, (settings.n,)), sample)
 
 
 @kernel

@@ -59,8 +59,8 @@ def sample_of(vector: np.ndarray, n: int, m: int) -> Sample:
 
 
 @inner
-def tell(settings: Settings, state: State, signals: Signals, q: np.ndarray, sample: Sample) -> None:
-    """Fill a sample from what the law has just computed at the positions q (n,) [rad]."""
+def tell(settings: Settings, state: State, signals: Signals, sample: Sample) -> None:
+    """Fill the sample with what the update that has just been made says, but for its energies."""
     for i in range(settings.n):
         sample.qr[i] = signals.qr[i]
         sample.dqr[i] = signals.dqr[i]
@@ -74,6 +74,13 @@ def tell(settings: Settings, state: State, signals: Signals, q: np.ndarray, samp
         sample.estimate[j] = state.estimate[j] if state.active[j] != 0.0 else nan
     sample.lambda_min[0] = state.lambda_min[0]
     sample.latched[0] = state.latched[0]
+
+
+@inner
+def tell_energies(
+    settings: Settings, state: State, signals: Signals, q: np.ndarray, sample: Sample
+) -> None:
+    """Fill in the terms of (29): a tangent for each joint, which only who watches pays for."""
     sample.lyapunov[0] = lyapunov.error_term(settings, signals)
     if settings.truth_known == 1:
         sample.lyapunov[1] = lyapunov.kinetic_term(settings, signals, q)
