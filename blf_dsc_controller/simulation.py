@@ -13,6 +13,7 @@ import numpy as np
 
 from blf_dsc_controller.assembly import controller_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.core.borrowed import borrowed
 from blf_dsc_controller.core.controller import Controller, answer
 from blf_dsc_controller.core.kernel import kernel
 from blf_dsc_controller.core.sample import Sample, sample_of
@@ -74,15 +75,17 @@ def loop(
     law_state = state_of(state, law)
     law_signals = signals_of(signals, law)
     arm, now = plants.plant_of(plant_settings, plant_state)
+    wanted, seen = borrowed(reference), borrowed(measurements)
+    told, true = borrowed(samples), borrowed(truths)
     period = arm.period_ns * 1e-9
     rows = stamps.size
     for k in range(rows):
-        sample = sample_of(samples[k], law.n, law.m)
+        sample = sample_of(told[k], law.n, law.m)
         plants.draw_next(arm, now, rng)
-        plants.read(arm, now, measurements[k])
-        plants.reveal(arm, now, truths[k])
+        plants.read(arm, now, seen[k])
+        plants.reveal(arm, now, true[k])
         t = stamps[k] * 1e-9
-        answer(law, reference, law_state, law_signals, t, period, measurements[k], sample)
+        answer(law, wanted, law_state, law_signals, t, period, seen[k], sample)
         if not (is_last and k == rows - 1):
             plants.move(arm, now, sample.torque)
 

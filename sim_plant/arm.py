@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.core.kernel import inner
 
 ARM_SIZE = 5
+JOINTS = 2
 
 
 class Arm(NamedTuple):

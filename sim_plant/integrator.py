@@ -9,14 +9,17 @@ x + h sum_j a_ij k_j, the step ends at x + h sum_i b_i k_i.
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.core.borrowed import part
 from blf_dsc_controller.core.kernel import inner
-from sim_plant.arm import Arm
+from sim_plant.arm import JOINTS, Arm
 from sim_plant.motion import motion
 
 RK4 = 0
 DOPRI5 = 1
 INTEGRATORS = {'rk4': RK4, 'dopri5': DOPRI5}
 STAGES = 6
+
+_SIZE = 2 * JOINTS
 
 _RK4_C = np.array([0, 1 / 2, 1 / 2, 1])
 _RK4_A = np.array([[0, 0, 0, 0], [1 / 2, 0, 0, 0], [0, 1 / 2, 0, 0], [0, 0, 1, 0]])
@@ -55,16 +58,16 @@ def _explicit_step(
     x: NDArray[np.float64],
     scratch: NDArray[np.float64],
 ) -> None:
-    point = scratch[: x.size]
-    k = scratch[x.size :].reshape((STAGES, x.size))
+    point = part(scratch, 0, (_SIZE,))
+    k = part(scratch, _SIZE, (STAGES, _SIZE))
     for stage in range(b.size):
-        for i in range(x.size):
+        for i in range(_SIZE):
             slope = 0.0
             for j in range(stage):
                 slope += a[stage, j] * k[j, i]
             point[i] = x[i] + h * slope
         motion(arm, disturbance, t + c[stage] * h, point, torque, k[stage])
-    for i in range(x.size):
+    for i in range(_SIZE):
         slope = 0.0
         for j in range(b.size):
             slope += b[j] * k[j, i]

@@ -4,8 +4,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.core.borrowed import part
 from blf_dsc_controller.core.kernel import inner
-from sim_plant.arm import Arm, acceleration
+from sim_plant.arm import JOINTS, Arm, acceleration
 from sim_plant.disturbance import disturbance_torque
 
 
@@ -19,11 +20,10 @@ def motion(
     dx: NDArray[np.float64],
 ) -> None:
     """Write dx/dt = [dq, M^-1 (torque - tau_dist(t, dq) - C dq - G)], (2n,)."""
-    n = torque.size
-    q, dq = x[:n], x[n:]
-    velocity, net_torque = dx[:n], dx[n:]
+    q, dq = part(x, 0, (JOINTS,)), part(x, JOINTS, (JOINTS,))
+    velocity, net_torque = part(dx, 0, (JOINTS,)), part(dx, JOINTS, (JOINTS,))
     disturbance_torque(disturbance, t, dq, net_torque)
-    for i in range(n):
+    for i in range(JOINTS):
         velocity[i] = dq[i]
         net_torque[i] = torque[i] - net_torque[i]
-    acceleration(arm, q, dq, net_torque, dx[n:])  # in place
+    acceleration(arm, q, dq, net_torque, net_torque)  # in place
