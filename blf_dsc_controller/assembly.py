@@ -55,6 +55,13 @@ def estimate_names(config: ControllerConfig) -> tuple[str, ...]:
     return model_of(config).parameter_names + column_names(config)
 
 
+def required_fields(config: ControllerConfig) -> tuple[str, ...]:
+    """Fields of a joint state that the controller cannot do without."""
+    velocity = ('velocity',) if config.safety.velocity == 'measured' else ()
+    effort = ('effort',) if config.learning.torque_source == 'effort' else ()
+    return ('position', *velocity, *effort)
+
+
 def settings_of_config(config: ControllerConfig) -> Settings:
     """Translate the configuration's words into the paper's symbols."""
     model = model_of(config)

@@ -4,15 +4,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from builtin_interfaces.msg import Duration, Time
 from ros_rig import RosRig, torques
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from sent_trajectory import JOINTS, SECOND, inputs, send, trajectory, two_tones
 
 from blf_dsc_controller.bags import topics
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -21,9 +21,7 @@ from blf_dsc_controller.safety.reasons import Phase
 from blf_dsc_controller.simulation import simulate
 from sim_plant.configuration import PlantConfig
 
-JOINTS = ('joint1', 'joint2')
 AWAY = [0.9, 2.9]  # rad, 1.4 and 1.2 from the paper's reference
-SECOND = 1_000_000_000
 BRISK = {'limits__acceleration': [4.0, 4.0]}  # rad/s^2, for a lead of a second
 
 
@@ -32,10 +30,6 @@ def ros():
     rig = RosRig()
     yield rig
     rig.close()
-
-
-def inputs(law):
-    return law._status.trajectories
 
 
 def phase(law):
@@ -67,53 +61,9 @@ def test_an_approach_that_cannot_be_made_is_refused_and_told(ros):
     assert law.guard.supervisor.reason.value == 'start refused'
 
 
-def two_tones(t, shift):
-    """Position, velocity and acceleration (3, 2) at t [s] of two tones on each joint."""
-    rates, phases = np.array([1.0, 2.3]), np.array([0.2, -0.9])
-    sizes = np.array([[0.2, 0.08], [0.25, -0.05]])
-    angle = rates * t + phases
-    middle = np.array([1.9, 1.4]) + shift
-    return np.stack(
-        (
-            middle + sizes @ np.cos(angle),
-            -sizes @ (rates * np.sin(angle)),
-            -sizes @ (rates**2 * np.cos(angle)),
-        )
-    )
-
-
-def message(joints, shift, *, duration, names=None, period=0.05, lead=1.0, fields=3, stamp=0):
-    """Trajectory that leads to two tones within `lead` [s], and rests a second after them."""
-    sent = JointTrajectory(joint_names=names or joints)
-    sent.header.stamp = Time(sec=stamp // SECOND, nanosec=stamp % SECOND)
-    times = lead + np.arange(round(duration / period)) * period
-    points = [two_tones(t, shift) for t in times]
-    rest = np.vstack((points[-1][:1], np.zeros((2, 2))))
-    for t, point in zip((*times, times[-1] + 1.0), (*points, rest), strict=True):
-        values = [row[[JOINTS.index(joint) for joint in joints]] for row in point[:fields]]
-        nanoseconds = round(t * 1e9)
-        sent.points.append(
-            JointTrajectoryPoint(
-                **dict(zip(('positions', 'velocities', 'accelerations'), values, strict=False)),
-                time_from_start=Duration(sec=nanoseconds // SECOND, nanosec=nanoseconds % SECOND),
-            )
-        )
-    return sent
-
-
 @pytest.fixture
 def sender(ros):
-    name = '/' + topics.JOINT_TRAJECTORY.relative
-    publisher = ros.tester.create_publisher(JointTrajectory, name, 10)
-
-    def send(law, sent):
-        ros.until(lambda: publisher.get_subscription_count() > 0)
-        before = inputs(law).taken + inputs(law).refused
-        publisher.publish(sent)
-        ros.until(lambda: inputs(law).taken + inputs(law).refused > before)
-        return inputs(law).reason
-
-    return send
+    return partial(send, ros)
 
 
 def test_a_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ros, sender):
@@ -124,7 +74,7 @@ def test_a_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ro
     shifts = ([0.0, 0.0], [0.1, -0.2], [-0.15, 0.1])
     orders = (JOINTS, JOINTS[::-1], JOINTS)
     for shift, joints, fields in zip(shifts, orders, (3, 2, 3), strict=True):
-        sent = message(joints, np.array(shift), duration=3.0, fields=fields)
+        sent = trajectory(joints, np.array(shift), duration=3.0, fields=fields)
         assert sender(law, sent) == ''
         ros.run(arm, 1800)
     begin = law.guard.start_stamp
@@ -152,7 +102,7 @@ def test_a_trajectory_that_is_refused_changes_nothing(ros, sender):
     arm, law = ros.loop()
     ros.run(arm, 20)
     before = law.controller.reference_vector.copy()
-    sender(law, message(JOINTS, np.zeros(2), duration=0.1, names=('joint1', 'elbow')))
+    sender(law, trajectory(JOINTS, np.zeros(2), duration=0.1, names=('joint1', 'elbow')))
     assert inputs(law).refused == 1
     for part in ("no joint 'elbow'", "nothing of joint 'joint2'"):
         assert part in inputs(law).reason
@@ -165,7 +115,7 @@ def test_a_stamp_says_when_it_begins(ros, sender):
     arm, law = ros.loop(None, BRISK)
     ros.run(arm, 20)
     begin = law.guard.start_stamp + 3 * SECOND
-    assert sender(law, message(JOINTS, np.zeros(2), duration=0.1, stamp=begin)) == ''
+    assert sender(law, trajectory(JOINTS, np.zeros(2), duration=0.1, stamp=begin)) == ''
     np.testing.assert_allclose(law.controller.reference_at(4.0), two_tones(1.0, 0.0), atol=1e-9)
     np.testing.assert_allclose(law.controller.reference_at(2.0)[0], [1.8686, 1.2713], atol=1e-4)
     assert phase(law) is Phase.TRACKING
@@ -173,7 +123,7 @@ def test_a_stamp_says_when_it_begins(ros, sender):
 
 def test_before_the_start_a_trajectory_is_refused_with_the_reason(ros, sender):
     law = ros.loop()[1]
-    sender(law, message(JOINTS, np.zeros(2), duration=0.1))
+    sender(law, trajectory(JOINTS, np.zeros(2), duration=0.1))
     assert 'not in command: starting' in inputs(law).reason
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names under which values travel in the named vectors (learning, truth, timing)."""
+"""Names under which values travel: in the vectors (learning, truth, timing), and in `~/state`."""
 
 from __future__ import annotations
 
@@ -16,3 +16,11 @@ COMPUTE_TIME = 'compute_time'
 LATENCY = 'latency'
 LATENESS = 'lateness'
 LATE_STEPS = 'late_steps'
+
+# Of the values of ~/state.
+PHASE = 'phase'
+REASON = 'reason'
+STOPS = 'stops'  # since the node was configured
+OPERATIONS = 'operations'  # likewise: activations, deactivations and resets
+OPERATION = 'last operation'
+LAST_STATE = 'last state'  # stamp of the last joint state that came by then, ns

@@ -100,7 +100,15 @@ JOINT_TRAJECTORY = Topic(
     DIAGNOSTIC,
     DIAGNOSTIC,
 )
-"""Of other nodes, to the controller; the package's own topics follow."""
+"""Of other nodes, to the controller."""
+ACCEPTED_TRAJECTORY = Topic(
+    CONTROLLER,
+    '~/accepted_trajectory',
+    'trajectory_msgs/msg/JointTrajectory',
+    Quality(depth=100, durability='transient_local'),
+    LATCHED,
+)
+"""What the controller took of those, and when: see motion.message."""
 
 TOPICS = (
     JOINT_STATES,
@@ -110,6 +118,7 @@ TOPICS = (
     LEARNING,
     BOUND,
     STATE,
+    ACCEPTED_TRAJECTORY,
     MONITOR,
     TRUTH,
     TIMING,

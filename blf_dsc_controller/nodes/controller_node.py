@@ -65,7 +65,7 @@ class ControllerNode(ManagedNode):
         self._monitor: Monitor | None = None
         self._judged = False
         self._told_bound = np.zeros(len(joints))
-        self._decoder = JointStateDecoder(joints, self._required_fields())
+        self._decoder = JointStateDecoder(joints, assembly.required_fields(self.config))
         self._pending: bytes | None = None
         self._observed = self._started = False
         self._publisher_of: dict[topics.Topic, Publisher] = {}
@@ -90,11 +90,6 @@ class ControllerNode(ManagedNode):
         """Why the controller is in its safe stop; empty while it is not."""
         return self.guard.supervisor.text if self.guard else ''
 
-    def _required_fields(self) -> tuple[str, ...]:
-        measured = self.config.safety.velocity == 'measured'
-        fields = ('position', 'velocity') if measured else ('position',)
-        return (*fields, 'effort') if self.config.learning.torque_source == 'effort' else fields
-
     # The life of the node.
 
     def configure(self) -> None:
@@ -108,7 +103,9 @@ class ControllerNode(ManagedNode):
             outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
             self._publisher_of = {topic: publisher(self, topic) for topic in outputs}
             subscribe(self, topics.JOINT_STATES, self._on_joint_state)
-            self._status.trajectories = TrajectoryInput(self, lambda: self.guard)
+            self._status.trajectories = TrajectoryInput(
+                self, lambda: self.guard, telemetry=self.config.telemetry.enabled
+            )
             realtime.request(self.config.realtime, self.get_logger())
         self._report()
 
@@ -259,7 +256,7 @@ class ControllerNode(ManagedNode):
             stamp = self.guard.last_stamp
             if stamp >= 0 and config.telemetry.enabled:
                 t = (stamp - self.guard.start_stamp) * 1e-9
-                self._publish_bound(stamp, self.guard.controller.bound_at(t))
+                self._publish_bound(self.guard.last_seen, self.guard.controller.bound_at(t))
 
     def _take_note(self, guard: Guard) -> None:
         supervisor = guard.supervisor

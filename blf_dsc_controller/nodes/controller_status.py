@@ -10,6 +10,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
 from blf_dsc_controller.bags import topics
+from blf_dsc_controller.bags.names import LAST_STATE, OPERATION, OPERATIONS, PHASE, REASON, STOPS
 from blf_dsc_controller.nodes.board import ERROR, OK, STALE, WARN, Board
 from blf_dsc_controller.nodes.trajectory import TrajectoryInput
 from blf_dsc_controller.refusals import Refusal
@@ -49,7 +50,7 @@ class ControllerStatus:
         self._joints = tuple(joints)
         self._board = Board(node, joints, topics.STATE)
         self._told = -1
-        self._announced = ''
+        self._announced: tuple[str, str, int, int] | None = None
 
     def is_news(self, guard: Guard) -> bool:
         """Whether the state has changed since it was told."""
@@ -65,7 +66,8 @@ class ControllerStatus:
         state = self._state(life, guard)
         parts = [state] if guard is None else [state, self._loop(guard), self._learning(guard)]
         self._board.report(parts)
-        essence = f'{state.message} {life}'
+        counts = (guard.supervisor.stops, guard.operations) if guard else (0, 0)
+        essence = (state.message, life, *counts)
         if essence != self._announced:
             self._board.announce(state)
             self._announced = essence
@@ -78,10 +80,13 @@ class ControllerStatus:
             message = f'stopped: {guard.supervisor.text}'
         else:
             message = _WORDS[phase] if guard else 'not configured'
-        values: dict[str, Any] = {'phase': phase.value, 'reason': reason.value, 'lifecycle': life}
+        values: dict[str, Any] = {PHASE: phase.value, REASON: reason.value, 'lifecycle': life}
         if guard is not None:
-            values['stops'] = guard.supervisor.stops
+            values[STOPS] = guard.supervisor.stops
             values['safe torque'] = guard.config.safety.torque
+            values[OPERATIONS] = guard.operations
+            values[OPERATION] = guard.operation.value
+            values[LAST_STATE] = guard.last_seen
         return self._board.status('state', _LEVELS[phase], message, values)
 
     def _loop(self, guard: Guard) -> DiagnosticStatus:

@@ -1,39 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`~/joint_trajectory`: another reference while the controller runs, or the reason why not."""
+"""`~/joint_trajectory`: another reference while the controller runs, or the reason why not.
+
+What is followed is told on `~/accepted_trajectory`, with the sample after which it was taken.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
+from builtin_interfaces.msg import Time
 from rclpy.node import Node
+from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
-from blf_dsc_controller.bags.topics import JOINT_TRAJECTORY
+from blf_dsc_controller.bags.encoders import NANOSECONDS
+from blf_dsc_controller.bags.topics import ACCEPTED_TRAJECTORY, JOINT_TRAJECTORY
 from blf_dsc_controller.motion.errors import TrajectoryError
-from blf_dsc_controller.motion.trajectory import Point, Request
-from blf_dsc_controller.nodes.endpoints import profile
+from blf_dsc_controller.motion.message import request_of, told_begin
+from blf_dsc_controller.nodes.endpoints import profile, publisher
 from blf_dsc_controller.safety.guard import Guard
-
-_NANO = 1e-9
-_SECOND = 1_000_000_000
-
-
-def request_of(message: JointTrajectory, start_stamp: int) -> Request:
-    """Trajectory of a message, in times since the controller's start_stamp [ns]."""
-    stamp = _nanoseconds(message.header.stamp)
-    points = tuple(
-        Point(
-            _nanoseconds(point.time_from_start) * _NANO,
-            tuple(point.positions),
-            tuple(point.velocities),
-            tuple(point.accelerations),
-            tuple(point.effort),
-        )
-        for point in message.points
-    )
-    begin = (stamp - start_stamp) * _NANO if stamp else None
-    return Request(tuple(message.joint_names), points, begin)
 
 
 class TrajectoryInput:
@@ -42,6 +27,7 @@ class TrajectoryInput:
     Args:
         node: that listens.
         guard: gives the guard; None while there is none.
+        telemetry: whether to tell what is followed.
 
     Attributes:
         taken: trajectories that are or were followed.
@@ -49,12 +35,13 @@ class TrajectoryInput:
         reason: why the last of those was refused.
     """
 
-    def __init__(self, node: Node, guard: Callable[[], Guard | None]) -> None:
+    def __init__(self, node: Node, guard: Callable[[], Guard | None], *, telemetry: bool) -> None:
         self.taken = 0
         self.refused = 0
         self.reason = ''
         self._log = node.get_logger()
         self._guard = guard
+        self._accepted = publisher(node, ACCEPTED_TRAJECTORY) if telemetry else None
         name, quality = JOINT_TRAJECTORY.name, profile(JOINT_TRAJECTORY.requested)
         node.create_subscription(JointTrajectory, name, self._take, quality)
 
@@ -79,9 +66,16 @@ class TrajectoryInput:
         if guard is None:
             raise TrajectoryError(['the controller is not configured'])
         guard.follow(request_of(message, guard.start_stamp))
+        self._tell(message, guard.last_seen)
         self.taken += 1
         self._log.info(f'following a trajectory of {len(message.points)} points')
 
-
-def _nanoseconds(time: Any) -> int:
-    return int(time.sec) * _SECOND + int(time.nanosec)
+    def _tell(self, message: JointTrajectory, stamp: int) -> None:
+        if self._accepted is None:
+            return
+        seconds, nanoseconds = divmod(stamp, NANOSECONDS)
+        header = Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=told_begin(message))
+        told = JointTrajectory(
+            header=header, joint_names=message.joint_names, points=message.points
+        )
+        self._accepted.publish(told)

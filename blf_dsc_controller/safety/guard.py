@@ -31,7 +31,7 @@ from blf_dsc_controller.motion.trajectory import Request, follow
 from blf_dsc_controller.safety import tuning
 from blf_dsc_controller.safety.fallback import Ramp, safe_torque
 from blf_dsc_controller.safety.monitors import LOOK, Silence
-from blf_dsc_controller.safety.reasons import Phase, Reason
+from blf_dsc_controller.safety.reasons import Operation, Phase, Reason
 from blf_dsc_controller.safety.supervisor import Supervisor, Trust
 from blf_dsc_controller.safety.velocity import Velocity
 
@@ -66,6 +66,9 @@ class Guard:
         start_stamp: of t = 0 [ns]; -1 before the first start.
         settled: time from which on the reference is the configured one [s].
         last_stamp: of the last state that the law answered [ns].
+        last_seen: stamp of the last state that came, whoever answered it [ns]; -1 before the first.
+        operations: how often it was activated, deactivated or reset.
+        operation: which of these was the last.
         compute_time: that the law took for it [s].
         watching: whether silence on the steady clock leads to a stop.
     """
@@ -90,6 +93,9 @@ class Guard:
         self.start_stamp = -1
         self.settled = 0.0
         self.last_stamp = -1
+        self.last_seen = -1
+        self.operations = 0
+        self.operation = Operation.NONE
         self._steady = steady
         self._wall = wall
         self._silence = Silence()
@@ -116,6 +122,7 @@ class Guard:
 
     def activate(self) -> None:
         """Take command with the next state; what was learned is kept if so configured."""
+        self._note(Operation.ACTIVATE)
         if not self.config.safety.keep_estimates:
             self.controller.reset()
             self._resumable = False  # t counts the window's filling, too
@@ -127,6 +134,7 @@ class Guard:
 
     def deactivate(self) -> None:
         """Leave command: the torque goes to the safe one on its ramp."""
+        self._note(Operation.DEACTIVATE)
         was_running = self.supervisor.running
         self._clean = self._clean and self.supervisor.phase is not Phase.SAFE_STOP
         self.supervisor.enter(Phase.INACTIVE)
@@ -137,6 +145,7 @@ class Guard:
 
     def reset(self) -> None:
         """Forget everything that was learned, and every fault, and start with the next state."""
+        self._note(Operation.RESET)
         self._resumable = False
         self.controller.reset()
         self._keep()
@@ -155,6 +164,10 @@ class Guard:
         self.controller.reference_vector = motion.vector
         self.settled = motion.settled
         self.supervisor.enter(Phase.APPROACHING if motion.settled > now else Phase.TRACKING)
+
+    def _note(self, operation: Operation) -> None:
+        self.operation = operation
+        self.operations += 1
 
     def _situation(self) -> str:
         phase = self.supervisor.phase
@@ -210,6 +223,7 @@ class Guard:
             measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
         """
         self.answered = False
+        self.last_seen = stamp
         self._silence.state(self._steady())
         n = self.ratio.size
         q, dq = measurement[:n], measurement[n : 2 * n]

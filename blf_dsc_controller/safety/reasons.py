@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The words for what the controller is doing, and for why it stopped."""
+"""The words for what the controller is doing, what was done to it, and why it stopped."""
 
 from __future__ import annotations
 
@@ -14,6 +14,15 @@ class Phase(Enum):
     APPROACHING = 'approaching'  # on the way to the reference
     TRACKING = 'tracking'
     SAFE_STOP = 'safe stop'  # the safe torque until reset or activated again
+
+
+class Operation(Enum):
+    """What an operator did last; the value is what `~/state` says."""
+
+    NONE = 'none'
+    ACTIVATE = 'activate'
+    DEACTIVATE = 'deactivate'
+    RESET = 'reset'
 
 
 class Reason(Enum):
