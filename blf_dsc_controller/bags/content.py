@@ -14,6 +14,7 @@ from blf_dsc_controller.bags.lookup import find
 from blf_dsc_controller.bags.name_map import NO_NAMES, NameMap
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.topics import (
+    ACCEPTED_TRAJECTORY,
     BOUND,
     COMMANDS,
     JOINT_STATE,
@@ -22,6 +23,7 @@ from blf_dsc_controller.bags.topics import (
     MONITOR,
     PARAMETER_EVENTS,
     REFERENCE,
+    STATE,
     TIMING,
     TRACKING_ERROR,
     TRUTH,
@@ -37,6 +39,8 @@ _OF_INTEREST = (
     BOUND,
     MONITOR,
     PARAMETER_EVENTS,
+    STATE,
+    ACCEPTED_TRAJECTORY,
     TRUTH,
     TIMING,
 )

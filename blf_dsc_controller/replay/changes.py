@@ -7,7 +7,7 @@ the controller publishes with each change: that of the last state answered with 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from blf_dsc_controller.bags.batch import decode_joint_states
 from blf_dsc_controller.bags.content import Content, Recorded
 from blf_dsc_controller.bags.run import Stamps
-from blf_dsc_controller.bags.topics import BOUND, PARAMETER_EVENTS, REFERENCE
+from blf_dsc_controller.bags.topics import BOUND, FOREVER, PARAMETER_EVENTS, REFERENCE
 from blf_dsc_controller.bags.types import typestore
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change, parameters
@@ -32,7 +32,14 @@ _FIELDS = {
 
 
 def changes_of(
-    content: Content, config: ControllerConfig, known_at: int, node: str, end: int
+    content: Content,
+    config: ControllerConfig,
+    known_at: int,
+    node: str,
+    end: int,
+    until: int = FOREVER,
+    told: Stamps | None = None,
+    starts: Sequence[int] = (),
 ) -> tuple[ControllerConfig, list[Change], str]:
     """Configuration at the start, what changed later, and in words what cannot be told.
 
@@ -42,30 +49,35 @@ def changes_of(
         known_at: when it was recorded [ns]; earlier changes are in it.
         node: full name of the controller.
         end: stamp [ns] up to which changes count.
+        until: when the recorder must have heard of them [ns].
+        told: stamps of the states that the law answered [ns], in order; None if it is not known.
+        starts: stamps [ns] behind which the controller began; its bound is then told anyway.
 
     Raises:
         ConfigurationError: a change that this version does not accept.
     """
     bounds = content.topics.get(BOUND)
     begin = bounds.received[0] if bounds is not None else 0
-    stamps = [] if bounds is None else [one for one in _told_again(bounds, config) if one < end]
-    ended = None if bounds is None else _received_from(bounds, end)
+    again = [] if bounds is None else _told_again(bounds, config, told, starts)
+    again = [one for one in again if one[0] < end and one[1] < until]
+    ended = until if bounds is None else min(until, _received_from(bounds, end))
     later: list[ControllerConfig] = []
     for received, values in _events(content, node):
-        if received <= known_at or (ended is not None and received >= ended):
+        if received <= known_at or received >= ended:
             continue
         config_after = change(later[-1] if later else config, values)
         if received < begin:
             config = config_after
         else:
             later.append(config_after)
-    if len(stamps) != len(later):
+    if len(again) != len(later):
         problem = (
-            f'{len(stamps)} changes of parameters took effect, but the bag tells what changed in '
+            f'{len(again)} changes of parameters took effect, but the bag tells what changed in '
             f'{len(later)}: the replay goes on with the first configuration'
         )
         return config, [], problem
-    return config, [Change(*one) for one in zip(stamps, later, strict=True)], ''
+    changes = [Change(*moment, one) for moment, one in zip(again, later, strict=True)]
+    return config, changes, ''
 
 
 def restarts(content: Content, config: ControllerConfig, start: int) -> Stamps:
@@ -83,26 +95,33 @@ def restarts(content: Content, config: ControllerConfig, start: int) -> Stamps:
     return np.intersect1d(back, decode_joint_states(bounds, (), ())[0])
 
 
-def _told_again(bounds: Recorded, config: ControllerConfig) -> list[int]:
-    """Stamps [ns] of the bounds that were told for a change of parameters.
+def _told_again(
+    bounds: Recorded, config: ControllerConfig, told: Stamps | None, starts: Sequence[int]
+) -> list[tuple[int, int]]:
+    """Stamp [ns] of the bounds that were told for a change of parameters, and when they came [ns].
 
-    A bound that narrows is told with every sample, too: what tells a change then has the stamp, or
-    the value, of the message before it.
+    Not of those that are told at a beginning, with the first state that was answered after each of
+    `starts`.  A bound that narrows is told with every sample, too: what tells a change then has the
+    stamp, or the value, of the message before it, or the stamp of a state that was not answered.
     """
     stamp, values = decode_joint_states(bounds, config.joints, ('position',))
-    told_again = np.ones(stamp.size - 1, dtype=np.bool_)
+    answered = stamp if told is None else told
+    is_first = np.concatenate([[True], stamp[1:] != stamp[:-1]])
+    first = np.searchsorted(answered, starts, side='right')
+    begun = answered[first[first < answered.size]]
+    told_again = ~(is_first & np.isin(stamp, begun))
+    told_again[0] = False
     if config.barrier.widest != config.barrier.bound:
         same = (values[1:, 0] == values[:-1, 0]).all(axis=1)
-        told_again = same | (stamp[1:] == stamp[:-1])
-    changed: list[int] = stamp[1:][told_again].tolist()
-    return changed
+        told_again[1:] &= same | (stamp[1:] == stamp[:-1]) | ~np.isin(stamp[1:], answered)
+    return [(int(stamp[k]), bounds.received[k]) for k in np.flatnonzero(told_again)]
 
 
-def _received_from(bounds: Recorded, end: int) -> int | None:
-    """When the first bound of a stamp from `end` on came [ns]; None if there is none."""
+def _received_from(bounds: Recorded, end: int) -> int:
+    """When the first bound of a stamp from `end` on came [ns]."""
     stamp, _ = decode_joint_states(bounds, (), ())
     late = [at for at, one in zip(bounds.received, stamp.tolist(), strict=True) if one >= end]
-    return late[0] if late else None
+    return late[0] if late else FOREVER
 
 
 def _events(content: Content, node: str) -> Iterator[tuple[int, dict[str, Any]]]:

@@ -56,11 +56,39 @@ class Comparison:
     left_out: str = ''
 
 
+@dataclass(frozen=True)
+class Commands:
+    """Torques in the order in which they were commanded.
+
+    Attributes:
+        stamp: of the state that each answers (M,) [ns].
+        torque: (M, n) [N m].
+        of_law: which of them are the law's (M,). Those answer the states that the controller tells
+            of; it tells of none while the law is not in command.
+        known: how many there are before something that does not show in the states.
+        doubt: what that is, in words; empty if there is no such thing.
+        in_step: whether the plant waited for each command, so that every state was answered.
+    """
+
+    stamp: Stamps
+    torque: Floats
+    of_law: NDArray[np.bool_]
+    known: int
+    doubt: str = ''
+    in_step: bool = True
+
+    @property
+    def sure(self) -> int:
+        """How many there are before the first that is not the law's."""
+        return int(np.argmin(np.append(self.of_law, values=False)))
+
+
 def compare(
     content: Content,
     states: States,
     expectation: dict[Topic, Columns],
     gappy: Collection[str] = (),
+    commands: Commands | None = None,
 ) -> Iterator[Comparison]:
     """Compare each topic of the controller that the bag holds.
 
@@ -69,6 +97,7 @@ def compare(
         states: that were replayed.
         expectation: what the topics must hold.
         gappy: topics of which the recorder missed messages.
+        commands: all torques; None if there are no others than the law's.
 
     Raises:
         UnreadableMessageError: a message cannot be decoded.
@@ -78,8 +107,13 @@ def compare(
         if recorded is None:
             continue
         if topic is COMMANDS:
+            torque = np.stack(list(columns.values()), axis=1)
+            law_alone = Commands(
+                states.stamp, torque, np.ones(len(torque), dtype=np.bool_), len(torque)
+            )
+            all_of_them = commands or law_alone
             is_gappy = recorded.name in gappy
-            yield _compare_commands(recorded, states, columns, is_gappy=is_gappy)
+            yield _compare_commands(recorded, all_of_them, columns, is_gappy=is_gappy)
         else:
             yield _compare_stamped(recorded, states, columns, named=topic in _NAMED)
 
@@ -91,18 +125,42 @@ def first(comparisons: Sequence[Comparison]) -> Difference | None:
 
 
 def _compare_commands(
-    recorded: Recorded, states: States, columns: Columns, *, is_gappy: bool
+    recorded: Recorded, commands: Commands, fields: Collection[str], *, is_gappy: bool
 ) -> Comparison:
-    """Commands have no stamp: the k-th answers the k-th state; what follows is a safe torque."""
-    count = len(recorded.raw)
-    if count < states.stamp.size or is_gappy:
-        reason = f'{count} commands for {states.stamp.size} answered states, and they have no stamp'
+    """Commands have no stamp: the k-th is the k-th."""
+    count, sure = len(recorded.raw), commands.sure
+    if count < sure or is_gappy:
+        reason = f'{count} commands for {sure} answered states, and they have no stamp'
         return Comparison(recorded.name, 0, None, reason)
-    values = decode_arrays(recorded, len(columns))
+    values = decode_arrays(recorded, len(fields))
     if values is None:
-        return Comparison(recorded.name, 0, None, f'they are not {len(columns)} values each')
-    rows = np.arange(states.stamp.size)
-    return _compare(recorded.name, states, rows, columns, values[: rows.size])
+        return Comparison(recorded.name, 0, None, f'they are not {len(fields)} values each')
+    compared = min(count, commands.known)
+    left_out = _left_out(values, commands)
+    if not commands.in_step and not _alike(values[:compared], commands.torque[:compared]).all():
+        compared = sure
+        left_out = (
+            f'{count - sure} torques from the first stop or deactivation on, which do not match: '
+            'in real time a state may have been missed'
+        )
+    columns = dict(zip(fields, commands.torque[:compared].T, strict=True))
+    moments = States(commands.stamp[:compared], commands.torque[:compared])
+    return _compare(
+        recorded.name, moments, np.arange(compared), columns, values[:compared], left_out
+    )
+
+
+def _left_out(values: Floats, commands: Commands) -> str:
+    """What of the commands cannot be compared, and why not, in words.
+
+    The last command of a node that ends in order is zero, and answers no state.
+    """
+    rest = values[commands.known :]
+    if commands.doubt:
+        return f'{len(rest)} torques, because {commands.doubt}' if len(rest) else ''
+    if len(rest) > 1 or rest.any():
+        return f'{len(rest)} torques more than are due to the states'
+    return ''
 
 
 def _compare_stamped(
@@ -122,6 +180,8 @@ def _compare_stamped(
 
 def _rows(stamp: Stamps, states: States) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Sample that each message is of, and which messages are of one."""
+    if not states.stamp.size:
+        return np.empty(0, dtype=np.intp), np.zeros(stamp.size, dtype=np.bool_)
     rows = np.minimum(np.searchsorted(states.stamp, stamp), states.stamp.size - 1)
     known = states.stamp[rows] == stamp
     return rows[known], known
@@ -150,8 +210,7 @@ def _compare(
         if columns
         else (np.empty(recorded.shape))
     )
-    unlike = np.ascontiguousarray(recorded).view(np.int64) != replayed.view(np.int64)
-    unlike &= ~(np.isnan(recorded) & np.isnan(replayed))
+    unlike = ~_alike(recorded, replayed)
     difference = None
     if unlike.any():
         k, j = np.argwhere(unlike)[0]
@@ -164,3 +223,9 @@ def _compare(
             float(replayed[k, j]),
         )
     return Comparison(topic, recorded.size, difference, left_out)
+
+
+def _alike(recorded: Floats, replayed: Floats) -> NDArray[np.bool_]:
+    """Where the bits are the same, or both no number."""
+    equal = np.ascontiguousarray(recorded).view(np.int64) == replayed.view(np.int64)
+    return np.asarray(equal | (np.isnan(recorded) & np.isnan(replayed)))

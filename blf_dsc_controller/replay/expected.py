@@ -30,13 +30,15 @@ Columns = Mapping[str, Floats]
 """Values (N,) by the field that holds them, as in `velocity of joint1` or `lambda_min`."""
 
 
-def expected(replayed: Replayed, states: States, bound: Floats) -> dict[Topic, Columns]:
+def expected(
+    replayed: Replayed, states: States, monitored: Mapping[int, bytes]
+) -> dict[Topic, Columns]:
     """Columns of every topic of the controller, over the samples.
 
     Args:
         replayed: what the law told.
         states: of N samples, that it answered.
-        bound: k_c of each sample (N, n) [rad].
+        monitored: messages of the monitor, by the number of their sample.
     """
     told, config = replayed.told, replayed.config
     joints = config.joints
@@ -52,24 +54,36 @@ def expected(replayed: Replayed, states: States, bound: Floats) -> dict[Topic, C
             LAMBDA_MIN: told.lambda_min[:, 0],
             LATCHED: told.latched[:, 0],
         },
-        MONITOR: _monitored(replayed, states, bound),
+        MONITOR: _table(monitored, states),
     }
 
 
-def _monitored(replayed: Replayed, states: States, bound: Floats) -> Columns:
-    """What the monitor says of every tenth sample; NaN in between."""
+def monitored(replayed: Replayed, states: States, bound: Floats) -> dict[int, bytes]:
+    """What the monitor says of every tenth sample.
+
+    Args:
+        replayed: what the law told.
+        states: of N samples, that it answered, without a break.
+        bound: k_c of each sample (N, n) [rad].
+    """
     config = replayed.config
     monitor = Monitor(config.joints, estimate_names(config), replayed.settings)
     ratio = np.fmax.accumulate(np.abs(replayed.told.xi1) / replayed.told.bound)
-    rows = range(0, states.stamp.size, DECIMATION)
-    messages = [
-        monitor.message(int(states.stamp[k]), replayed.sample(k), ratio[k], bound[k])[1]
-        for k in rows
-    ]
+    return {
+        k: monitor.message(int(states.stamp[k]), replayed.sample(k), ratio[k], bound[k])[1]
+        for k in range(0, states.stamp.size, DECIMATION)
+    }
+
+
+def _table(monitored: Mapping[int, bytes], states: States) -> Columns:
+    """Columns of the monitor; NaN between its messages."""
+    if not monitored:
+        return {}
+    messages = list(monitored.values())
     names = JointStateLayout.parse(messages[0]).names
     _, values = decode_joint_states(Recorded(MONITOR.resolved, raw=messages), names, ())
     table = np.full((states.stamp.size, len(names)), np.nan)
-    table[rows] = values[:, 0]
+    table[list(monitored)] = values[:, 0]
     return dict(zip(names, table.T, strict=True))
 
 

@@ -23,9 +23,16 @@ _NANO = 1e-9
 
 @dataclass(frozen=True)
 class Change:
-    """A configuration that came into force after the state of this stamp [ns]."""
+    """A configuration that came into force.
+
+    Attributes:
+        stamp: of the last state that had come by then [ns].
+        told: when the recorder heard of it [ns].
+        config: from then on.
+    """
 
     stamp: int
+    told: int
     config: ControllerConfig
 
 
@@ -82,7 +89,11 @@ def run_law(config: ControllerConfig, states: States, changes: Sequence[Change] 
         controller.update((stamp - stamps[0]) * _NANO, (stamp - last) * _NANO, now)
         rows[k] = controller.sample_vector
         last = stamp
-    # The names of a row are those of all rows: their places are found on a row of indices.
+    return replayed_of(config, rows, settings)
+
+
+def replayed_of(config: ControllerConfig, rows: Floats, settings: Settings) -> Replayed:
+    """Give the columns of `rows` their names: their places are found on a row of indices."""
     places = sample_of(np.arange(rows.shape[1], dtype=np.float64), settings.n, settings.m)
     told = Sample(*(rows[:, part.astype(np.intp)] for part in places))
     return Replayed(config, rows, told, settings)

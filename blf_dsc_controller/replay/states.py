@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from blf_dsc_controller.bags.batch import decode_joint_states
-from blf_dsc_controller.bags.content import Content
+from blf_dsc_controller.bags.content import Content, Recorded
+from blf_dsc_controller.bags.decoders import JointStateDecoder
+from blf_dsc_controller.bags.errors import MessageError, UnreadableMessageError
 from blf_dsc_controller.bags.run import Floats, Stamps
 from blf_dsc_controller.bags.topics import JOINT_STATES, LEARNING, REFERENCE, TRACKING_ERROR
 
@@ -46,7 +49,7 @@ class States:
     @property
     def duration(self) -> float:
         """Time from the first state to the last [s]."""
-        return float(self.time[-1])
+        return float(self.time[-1]) if self.stamp.size else 0.0
 
 
 def answered_states(
@@ -64,7 +67,7 @@ def answered_states(
     """
     stamp, values = decode_joint_states(content.topics[JOINT_STATES], joints, required)
     increasing = stamp > np.maximum.accumulate(np.concatenate([[-1], stamp[:-1]]))
-    told = _told(content)
+    told = told_stamps(content)
     kept = increasing if told is None else increasing & np.isin(stamp, told)
     lost = None
     if told is not None:
@@ -76,7 +79,7 @@ def answered_states(
     return States(stamp[kept], values[kept].reshape(-1, 3 * len(joints)), passed_over, lost)
 
 
-def _told(content: Content) -> Stamps | None:
+def told_stamps(content: Content) -> Stamps | None:
     """Stamps of the states that the controller tells of; one topic may have what another lost."""
     told = [
         decode_joint_states(content.topics[topic], (), ())[0]
@@ -84,3 +87,52 @@ def _told(content: Content) -> Stamps | None:
         if topic in content.topics
     ]
     return np.unique(np.concatenate(told)) if told else None
+
+
+@dataclass(frozen=True)
+class Arrivals:
+    """Every joint state of a bag as it came, also those that nobody can use.
+
+    Attributes:
+        stamp: of each [ns]; 0 where the message cannot be read.
+        measurement: (N, 3 n) as in `States`.
+        errors: why a message cannot be read, by its number.
+    """
+
+    stamp: list[int]
+    measurement: Floats
+    errors: Mapping[int, MessageError]
+
+
+def arrivals(
+    content: Content, joints: Sequence[str], required: Sequence[str], until: int
+) -> Arrivals:
+    """Take the joint states that the recorder received before `until` [ns].
+
+    Raises:
+        UnreadableMessageError: not one of them can be read.
+    """
+    recorded = content.topics[JOINT_STATES]
+    count = bisect_left(recorded.received, until)
+    taken = replace(recorded, received=recorded.received[:count], raw=recorded.raw[:count])
+    try:
+        stamp, values = decode_joint_states(taken, joints, required)
+    except UnreadableMessageError:
+        return _one_by_one(taken, joints, required)
+    return Arrivals(stamp.tolist(), values.reshape(count, -1), {})
+
+
+def _one_by_one(recorded: Recorded, joints: Sequence[str], required: Sequence[str]) -> Arrivals:
+    decoder = JointStateDecoder(joints, required)
+    stamp = [0] * len(recorded.raw)
+    measurement = np.zeros((len(recorded.raw), 3 * len(joints)))
+    errors: dict[int, MessageError] = {}
+    for k, raw in enumerate(recorded.raw):
+        try:
+            stamp[k] = decoder.decode(raw)
+            measurement[k] = decoder.values
+        except MessageError as error:
+            errors[k] = error
+    if len(errors) == len(recorded.raw):
+        raise UnreadableMessageError(recorded.name, 0, errors[0])
+    return Arrivals(stamp, measurement, errors)

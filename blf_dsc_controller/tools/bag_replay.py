@@ -148,6 +148,7 @@ def _told(outcome: Outcome) -> Iterator[str]:
         yield f'{one.topic}: {one.values} values {verdict}{left_out}'
     if outcome.changes:
         yield f'{outcome.changes} changes of parameters replayed where they took effect'
+    yield from outcome.done
     if outcome.states.passed_over:
         yield f'{outcome.states.passed_over} states passed over: the controller did not answer them'
     yield from (f'note: {remark}' for remark in outcome.remarks)
