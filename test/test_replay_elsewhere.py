@@ -14,7 +14,7 @@ from blf_dsc_controller.bags.batch import decode_joint_states
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.bags.errors import (
-    EmptyTopicError,
+    EmptyBagError,
     MissingTopicError,
     NameMapError,
     UnreadableBagError,
@@ -201,7 +201,7 @@ def test_commands_that_are_of_no_known_order_are_refused(run, tmp_path):
 def test_an_empty_bag_is_called_empty(tmp_path):
     with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         writer.add_connection('/joint_states', JOINT_STATE, typestore=typestore())
-    with pytest.raises(EmptyTopicError, match='is empty: it holds no message of /joint_states'):
+    with pytest.raises(EmptyBagError, match='is empty: it holds no message of /joint_states'):
         answer(tmp_path / 'bag', CONFIG)
 
 

@@ -111,3 +111,13 @@ def test_a_bag_is_played_over_ros_byte_by_byte_under_another_name(tmp_path):
         node.destroy_node()
         context.try_shutdown()
     assert JOINT_STATES.resolved == '/joint_states'
+
+
+def test_a_bag_with_nothing_to_play_is_called_empty(tmp_path):
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    path = recorded_run.write(tmp_path / 'bag', [])
+    command = [sys.executable, '-m', 'blf_dsc_controller.tools.bag_replay', str(path), '--play']
+    run = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert run.returncode == 1
+    assert f'bag_replay: {path} is empty' in run.stderr
+    assert 'Traceback' not in run.stderr

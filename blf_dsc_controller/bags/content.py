@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from blf_dsc_controller.bags.errors import EmptyTopicError, MissingTopicError
+from blf_dsc_controller.bags.errors import EmptyBagError, MissingTopicError
 from blf_dsc_controller.bags.lookup import find
 from blf_dsc_controller.bags.name_map import NO_NAMES, NameMap
 from blf_dsc_controller.bags.sources import open_bag
@@ -83,16 +83,16 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
     Raises:
         UnreadableBagError: there is no bag, or it is damaged.
         MissingTopicError: it holds no joint states, or not a topic of `names`.
-        EmptyTopicError: it holds no message of the joint states.
+        EmptyBagError: it holds no message of the joint states.
         AmbiguousTopicError: it holds the topics of several robots.
     """
     with open_bag(path) as bag:
         found = {topic: _find(topic, bag.held, namespace, names) for topic in _OF_INTEREST}
         states = found[JOINT_STATES]
+        if not bag.held:
+            raise EmptyBagError(path)
         if states is None:
             raise MissingTopicError(JOINT_STATES.name, JOINT_STATES.type, bag.held)
-        if not bag.counts[states]:
-            raise EmptyTopicError(path, states)
         topics = {topic: Recorded(name) for topic, name in found.items() if name is not None}
         types = dict(bag.held)
         for topic, recorded in topics.items():
@@ -103,6 +103,8 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
             recorded.received.append(received)
             recorded.raw.append(raw)
         counts = bag.counts
+    if not topics[JOINT_STATES].raw:
+        raise EmptyBagError(path, states)
     for recorded in topics.values():
         recorded.sort()
     return Content({topic: one for topic, one in topics.items() if one.raw}, counts)

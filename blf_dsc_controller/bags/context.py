@@ -18,6 +18,7 @@ from mcap.reader import make_reader
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.errors import NoConfigurationError, OtherVersionError
 from blf_dsc_controller.bags.losses import NOTHING_MISSED
+from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.topics import TOPICS
 from blf_dsc_controller.configuration.builtin import is_builtin
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -104,14 +105,22 @@ class Context:
         """Tell which controller ran, and how it was configured.
 
         Raises:
+            UnreadableBagError: there is no bag, or it is damaged.
             NoConfigurationError: the bag does not tell.
             OtherVersionError: it tells of a configuration that this version cannot run.
         """
+        damage = ''
         for stored, text in self.configurations:
-            for section in parse(text):
+            try:
+                sections = parse(text)
+            except (SectionError, yaml.YAMLError) as error:
+                damage = str(error).partition('\n')[0]
+                continue
+            for section in sections:
                 if section.entries.keys() >= _OF_CONTROLLER:
                     return Recorded(section.pattern, self._config(section), stored)
-        raise NoConfigurationError(self.path)
+        with open_bag(self.path):  # if it is no bag, that is what is to be told
+            raise NoConfigurationError(self.path, damage)
 
     def _config(self, section: Section) -> ControllerConfig:
         values = {

@@ -41,10 +41,19 @@ class MissingJointError(MessageError):
     def __init__(self, joint: str, names: tuple[str, ...]) -> None:
         self.joint = joint
         self.names = names
-        super().__init__(
-            f'joint {joint!r} is not in the message, which names {", ".join(names) or "nothing"}: '
-            'set the parameter `joints` to names from this list, or publish the joint'
+        self.fact = (
+            f'joint {joint!r} is not in the message, which names {", ".join(names) or "none"}'
         )
+        super().__init__(
+            f'{self.fact}: set the parameter `joints` to names from this list, or publish the joint'
+        )
+
+
+class UnnamedJointsError(MessageError):
+    """A joint state that names no joint at all."""
+
+    def __init__(self) -> None:
+        super().__init__('it names no joint, so its values cannot be told apart')
 
 
 class DuplicatedJointError(MessageError):
@@ -130,20 +139,22 @@ class MissingTopicError(BlfDscError):
         self.wanted = wanted
         self.type_name = type_name
         self.held = tuple(held)
-        listing = ''.join(f'\n  {name} ({type_})' for name, type_ in self.held) or ' no topic'
+        listing = ''.join(
+            f'\n  {name} ({type_ or "of a type it does not tell"})' for name, type_ in self.held
+        )
         named = 'called' if wanted.startswith('/') else 'whose name ends in'
         super().__init__(
             f'the bag has no topic {named} {wanted!r} of type {type_name}; it holds:{listing}'
         )
 
 
-class EmptyTopicError(BlfDscError):
-    """A bag without a message of an essential topic."""
+class EmptyBagError(BlfDscError):
+    """A bag without a message; with a `topic`, without one of that."""
 
-    def __init__(self, path: Path, topic: str) -> None:
+    def __init__(self, path: Path, topic: str = '') -> None:
         self.path = path
         self.topic = topic
-        super().__init__(f'{path} is empty: it holds no message of {topic}')
+        super().__init__(f'{path} is empty: it holds no message{topic and f" of {topic}"}')
 
 
 class NameMapError(BlfDscError):
@@ -175,7 +186,13 @@ class UnreadableMessageError(BlfDscError):
     def __init__(self, topic: str, index: int, error: MessageError) -> None:
         self.topic = topic
         self.index = index
-        super().__init__(f'message {index + 1} of {topic} cannot be read: {error}')
+        reason = str(error)
+        if isinstance(error, MissingJointError):
+            reason = (
+                f'{error.fact}: the bag is of another robot, or has other names for its joints, '
+                f'as in bag_replay --config FILE --map {error.joint}=ITS_NAME'
+            )
+        super().__init__(f'message {index + 1} of {topic} cannot be read: {reason}')
 
 
 class UnknownFormatError(BlfDscError):
@@ -199,14 +216,17 @@ class NoParquetError(BlfDscError):
 
 
 class NoConfigurationError(BlfDscError):
-    """A bag that does not tell how the controller was configured."""
+    """A bag that does not tell how the controller was configured, or not in a readable way."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, damage: str = '') -> None:
         self.path = path
-        super().__init__(
-            f'{path} does not hold the configuration of a controller: it was recorded by something '
-            'else, or without the controller; name one, as in --config recommended'
+        reason = (
+            f'{path} holds a configuration that cannot be read ({damage})'
+            if damage
+            else f'{path} does not hold the configuration of a controller: it was recorded by '
+            'something else, or without the controller'
         )
+        super().__init__(f'{reason}; name one, as in --config recommended')
 
 
 class OtherVersionError(BlfDscError):

@@ -12,7 +12,11 @@ import numpy as np
 from blf_dsc_controller.bags.batch import decode_arrays, decode_joint_states
 from blf_dsc_controller.bags.cdr import JointStateLayout
 from blf_dsc_controller.bags.content import Content, Recorded, read_content
-from blf_dsc_controller.bags.errors import MessageError, UnreadableMessageError
+from blf_dsc_controller.bags.errors import (
+    MessageError,
+    UnnamedJointsError,
+    UnreadableMessageError,
+)
 from blf_dsc_controller.bags.run import Floats, Run, Series, Stamps
 from blf_dsc_controller.bags.topics import (
     BOUND,
@@ -101,9 +105,12 @@ def _joints(content: Content) -> tuple[str, ...]:
 
 def _names(recorded: Recorded) -> tuple[str, ...]:
     try:
-        return JointStateLayout.parse(recorded.raw[0]).names
+        names = JointStateLayout.parse(recorded.raw[0]).names
+        if not names:
+            raise UnnamedJointsError
     except MessageError as error:
         raise UnreadableMessageError(recorded.name, 0, error) from error
+    return names
 
 
 def _decode(recorded: Recorded, names: Sequence[str]) -> _Decoded:

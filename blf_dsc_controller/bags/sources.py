@@ -17,12 +17,16 @@ from blf_dsc_controller.bags.mcap_messages import McapMessages
 from blf_dsc_controller.bags.types import typestore
 from blf_dsc_controller.errors import BlfDscError
 
+_TOLD = {'__schemaless__': ''}
+_NEWEST = 9  # version of rosbag2's metadata.yaml that is known
+_STORAGES = ('mcap', 'sqlite3')
+
 
 class Source(Protocol):
     """An open bag.
 
     Attributes:
-        held: name and type of each topic.
+        held: name and type of each topic; the type is empty where the bag does not tell it.
         counts: number of messages of each topic.
     """
 
@@ -40,7 +44,7 @@ class _Bag2:
     def __init__(self, reader: Reader2, files: list[Path]) -> None:
         self._reader = reader
         self._files = files
-        self.held = [(one.topic, one.msgtype) for one in reader.connections]
+        self.held = [(one.topic, _TOLD.get(one.msgtype, one.msgtype)) for one in reader.connections]
         self.counts = {one.topic: one.msgcount for one in reader.connections}
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
@@ -103,16 +107,34 @@ def _mcap_files(path: Path) -> list[Path]:
 def _reason(path: Path, error: Exception) -> str:
     if not path.exists():
         return 'there is no such folder'
-    if path.is_dir() and not (path / 'metadata.yaml').exists():
-        if any(path.glob('*.mcap')):
+    remedy = f'to save what is whole: bag_recover {path}'
+    if not path.is_dir():
+        return f'{_said(error)}; {remedy}' if path.suffix == '.mcap' else _said(error)
+    has_mcap = any(path.glob('*.mcap'))
+    if not (path / 'metadata.yaml').exists():
+        if has_mcap:
             return (
                 'the folder has no metadata.yaml; was the recording ended before it was complete? '
                 f'Make a clean bag of it: bag_recover {path}'
             )
         return 'the folder has no metadata.yaml: it is no bag'
-    remedy = f'; to save what is whole: bag_recover {path}' if _mcap_inside(path) else ''
-    return f'{error or type(error).__name__}{remedy}'
+    reason = _other_format(path / 'metadata.yaml') or _said(error)
+    return f'{reason}; {remedy}' if has_mcap else reason
 
 
-def _mcap_inside(path: Path) -> bool:
-    return path.suffix == '.mcap' or any(path.glob('*.mcap'))
+def _said(error: Exception) -> str:
+    return str(error).rstrip('.') or type(error).__name__
+
+
+def _other_format(metadata: Path) -> str:
+    """What a metadata.yaml says that is not known here, empty if that is not what is wrong."""
+    try:
+        told = yaml.safe_load(metadata.read_text(encoding='utf-8'))['rosbag2_bagfile_information']
+        version, storage = told['version'], told['storage_identifier']
+    except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError):
+        return 'its metadata.yaml does not describe a bag'
+    if isinstance(version, int) and version > _NEWEST:
+        return f'its format is version {version} of rosbag2, and up to {_NEWEST} is known here'
+    if storage not in _STORAGES:
+        return f'its storage is {storage!r}, and only {" and ".join(_STORAGES)} are known here'
+    return ''

@@ -74,7 +74,7 @@ class BagWriter:
         type_name: str,
         offered: Sequence[Quality],
         *,
-        text: str = '',
+        text: str | None = None,
         hash_: str = '',
         encoding: str = 'ros2msg',
     ) -> int:
@@ -84,15 +84,18 @@ class BagWriter:
             name: full name.
             type_name: such as `sensor_msgs/msg/JointState`.
             offered: quality of service of each publisher.
-            text: definition of the type and all nested ones, if not a common type of Jazzy.
+            text: definition of the type and all nested ones, if not a common type of Jazzy; empty
+                if there is none to be had.
             hash_: of the type, likewise.
             encoding: of the definition.
 
         Raises:
             UnknownTypeError: no `text` is given and the type is none of the common ones.
         """
-        topic = TopicInformation(name, type_name, tuple(offered), hash_ or type_hash(type_name))
-        self._definitions.append((text or definition(type_name), encoding))
+        if text is None:
+            text, hash_ = definition(type_name), hash_ or type_hash(type_name)
+        topic = TopicInformation(name, type_name, tuple(offered), hash_)
+        self._definitions.append((text, encoding))
         self._bag.topics.append(topic)
         return self._file.add_channel(topic, *self._definitions[-1])
 

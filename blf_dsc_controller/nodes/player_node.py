@@ -18,6 +18,7 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from blf_dsc_controller.bags.encoders import encode_clock
+from blf_dsc_controller.bags.errors import EmptyBagError
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.topics import CLOCK, HISTORY, STREAM
 from blf_dsc_controller.nodes.endpoints import message_class, profile
@@ -42,6 +43,7 @@ class PlayerNode(Node):
 
     Raises:
         UnreadableBagError: there is no bag, or it is damaged.
+        EmptyBagError: it holds nothing that can be played here.
     """
 
     def __init__(self, path: Path, rate: float, *, loop: bool, clock: bool, **options: Any) -> None:
@@ -51,6 +53,8 @@ class PlayerNode(Node):
             outputs = {name: self._output(name, type_) for name, type_ in types.items()}
             known = {name for name, output in outputs.items() if output is not None}
             messages = sorted(bag.messages(known), key=lambda message: message[1])
+        if not messages:
+            raise EmptyBagError(path)
         self._messages = [(outputs[name], raw) for name, _, raw in messages]
         self._outputs = [output for output in outputs.values() if output is not None]
         self.timeline = Timeline([at for _, at, _ in messages], rate, loop=loop)

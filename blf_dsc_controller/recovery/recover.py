@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from mmap import ACCESS_READ, mmap
@@ -13,7 +13,7 @@ from blf_dsc_controller.bags.context import ATTACHMENT, MESSAGES, RECORD
 from blf_dsc_controller.bags.errors import UnknownTypeError, UnreadableBagError
 from blf_dsc_controller.bags.losses import Losses
 from blf_dsc_controller.bags.mcap_file import CHANNEL_RECORD
-from blf_dsc_controller.bags.mcap_records import Channel, Message, Schema
+from blf_dsc_controller.bags.mcap_records import Channel, Message
 from blf_dsc_controller.bags.metadata import qualities
 from blf_dsc_controller.bags.types import definition, type_hash
 from blf_dsc_controller.bags.writer import BagWriter
@@ -33,7 +33,7 @@ class Recovery:
         before: numbers missing before the first one, by topic.
         losses: pieces of the files that could not be read.
         unfinished: files that were not ended properly, and the time of their last message [ns].
-        unknown: messages of topics of which nothing is known any more.
+        unknown: messages of topics whose name or type is not told any more.
     """
 
     path: Path
@@ -113,22 +113,19 @@ class _Transfer:
         return True
 
     def _announce(self, salvage: Salvage, channel: Channel) -> int | None:
-        type_ = channel.metadata.get('topic_type', '')
         schema = salvage.schemas.get(channel.schema)
-        try:
-            if schema is None:
-                schema = Schema(0, type_, 'ros2msg', definition(type_))
-            hash_ = channel.metadata.get('topic_type_hash') or _hash(schema.name)
-        except UnknownTypeError:
+        type_ = channel.metadata.get('topic_type', '') if schema is None else schema.name
+        if not type_:
             return None
+        told = '' if schema is None else schema.text
         offered = qualities(channel.metadata.get('offered_qos_profiles', ''))
         handle = self._bag.add_topic(
             channel.topic,
-            schema.name,
+            type_,
             offered,
-            text=schema.text,
-            hash_=hash_,
-            encoding=schema.encoding,
+            text=told or _known(definition, type_),
+            hash_=channel.metadata.get('topic_type_hash') or _known(type_hash, type_),
+            encoding=schema.encoding if schema is not None and told else 'ros2msg',
         )
         self._handles[channel.topic] = handle
         self.losses[channel.topic] = Losses(len(offered))
@@ -156,9 +153,10 @@ def _repeated(salvage: Salvage, number: int) -> Channel | None:
     return Channel(number, 0, entries['topic'], 'cdr', entries)
 
 
-def _hash(type_name: str) -> str:
+def _known(ask: Callable[[str], str], type_name: str) -> str:
+    """What is known of a type here, empty if nothing; a message is saved also without."""
     try:
-        return type_hash(type_name)
+        return ask(type_name)
     except UnknownTypeError:
         return ''
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.configuration.sections import parse
 from blf_dsc_controller.reports.panels import colour
 from blf_dsc_controller.reports.subject import Subject
 
@@ -47,8 +46,7 @@ def _arm(subject: Subject, shade: str) -> dict[str, Any]:
 def lengths(subject: Subject) -> list[float]:
     """Length of each link [m]."""
     told: dict[str, float] = {}
-    text = subject.context.configuration
-    for section in parse(text) if text else ():
+    for section in subject.sections:
         for name in ('arm.l1', 'arm.l2'):
             if name in section.entries:
                 told[name] = float(str(section.entries[name].value))

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from blf_dsc_controller.bags.context import Context, read_context
 from blf_dsc_controller.bags.reader import read_run
@@ -16,7 +17,7 @@ from blf_dsc_controller.bags.run import Run
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.topics import DIAGNOSTICS
 from blf_dsc_controller.bags.types import typestore
-from blf_dsc_controller.configuration.sections import parse
+from blf_dsc_controller.configuration.sections import Section, SectionError, parse
 from blf_dsc_controller.reports.estimation import latch_time, refused_columns
 
 _LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
@@ -44,12 +45,19 @@ class Subject:
     events: tuple[Event, ...]
 
     @property
+    def sections(self) -> list[Section]:
+        """Sections of the recorded configuration, none if it is not there or cannot be read."""
+        try:
+            return parse(self.context.configuration)
+        except (SectionError, yaml.YAMLError):
+            return []
+
+    @property
     def parameters(self) -> dict[str, str]:
         """Every recorded parameter, `node name: parameter` to its value as text."""
-        text = self.context.configuration
         return {
             f'{section.pattern.removeprefix("/")}: {name}': _shown(entry.value)
-            for section in (parse(text) if text else ())
+            for section in self.sections
             for name, entry in sorted(section.entries.items())
         }
 

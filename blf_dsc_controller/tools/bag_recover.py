@@ -55,7 +55,7 @@ def _lines(recovery: Recovery) -> Iterator[str]:
             'at most 0.1 s if the recorder was killed'
         )
     if recovery.unknown:
-        yield f'LOST {recovery.unknown} messages of topics of which nothing is known any more'
+        yield f'LOST {recovery.unknown} messages of topics whose name or type is not told'
     if recovery.is_whole:
         yield 'nothing was lost of what had been recorded'
     yield f'wrote {recovery.path}'

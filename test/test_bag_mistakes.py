@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag that is not what a command needs: one clear line from each of them, and no traceback.
+
+A wrong topic, a missing type definition, an empty bag, the bag of another robot, another version.
+"""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+import recorded_run
+from mcap.writer import Writer
+from rosbags.rosbag2 import Reader
+
+from blf_dsc_controller.bags.context import ATTACHMENT, read_context
+from blf_dsc_controller.bags.encoders import JointStateEncoder
+from blf_dsc_controller.bags.topics import JOINT_STATE, JOINT_STATES
+from blf_dsc_controller.bags.types import definition
+from blf_dsc_controller.tools import bag_export, bag_plot, bag_recover, bag_replay, bag_report
+
+pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
+
+ODD = 'my_msgs/msg/Odd'  # of a package that nobody has
+ODD_MESSAGE = ['/odd', ODD, 5, b'\0\1\0\0\7\0\0\0']
+METADATA = 'metadata.yaml'
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    return recorded_run.record(tmp_path_factory.mktemp('recorded') / 'bag', 0.3)
+
+
+@pytest.fixture(scope='module')
+def entries(bag):
+    return recorded_run.messages(bag)
+
+
+@pytest.fixture
+def copy(bag, tmp_path):
+    """A copy of the bag, to be damaged."""
+    return shutil.copytree(bag, tmp_path / 'copy')
+
+
+@pytest.fixture
+def rewritten(bag, tmp_path):
+    """Writes a bag of other messages under the configuration of the first."""
+    configuration = read_context(bag).configuration
+    return lambda entries: recorded_run.write(tmp_path / 'changed', entries, configuration)
+
+
+@pytest.fixture
+def readers(tmp_path):
+    """Every way to read a bag, by the name of its command."""
+    return {
+        'replay': lambda bag: bag_replay.main([str(bag)]),
+        'replay --config': lambda bag: bag_replay.main([str(bag), '--config', 'recommended']),
+        'replay --learn': lambda bag: bag_replay.main([str(bag), '--learn']),
+        'report': lambda bag: bag_report.main([str(bag), '--out', str(tmp_path / 'page.html')]),
+        'export': lambda bag: bag_export.main([str(bag), '--out', str(tmp_path / 'table.csv')]),
+        'plot': lambda bag: bag_plot.main([str(bag), '--out', str(tmp_path / 'plots')]),
+    }
+
+
+@pytest.fixture
+def all_say(readers, capsys):
+    """Asserts that every command ends with these words in its one complaint."""
+
+    def assert_it(bag, *words):
+        for name, command in readers.items():
+            assert command(bag) == 1, name
+            out, complaint = capsys.readouterr()
+            assert complaint.startswith(f'bag_{name.split()[0]}: '), name
+            for word in words:
+                assert word in complaint, name
+            assert out == ''
+
+    return assert_it
+
+
+def write_mcap(folder, entries, schema, configuration=''):
+    """Write one MCAP file; `schema` gives encoding and text of a type, or None for no schema."""
+    folder.mkdir()
+    with (folder / 'bag_0.mcap').open('wb') as stream:
+        writer = Writer(stream)
+        writer.start('ros2', 'another')
+        writer.add_attachment(0, 0, ATTACHMENT, 'application/yaml', configuration.encode())
+        channels = {}
+        for topic, type_name, at, raw in entries:
+            if topic not in channels:
+                told = schema(type_name)
+                number = 0 if told is None else writer.register_schema(type_name, *told)
+                channels[topic] = writer.register_channel(topic, 'cdr', number)
+            writer.add_message(channels[topic], at, raw, at)
+        writer.finish()
+    return folder / 'bag_0.mcap'
+
+
+def test_a_wrong_topic(entries, rewritten, all_say):
+    others = [entry for entry in entries if entry[0] != JOINT_STATES.resolved]
+    held = '/blf_dsc_controller/commands (std_msgs/msg/Float64MultiArray)'
+    all_say(rewritten(others), "no topic whose name ends in 'joint_states' of type", held)
+
+
+def test_a_topic_of_a_wrong_type(entries, rewritten, all_say):
+    states = [(*entry[:1], 'std_msgs/msg/String', *entry[2:]) for entry in entries]
+    all_say(rewritten(states), 'of type sensor_msgs/msg/JointState', '(std_msgs/msg/String)')
+
+
+@pytest.mark.parametrize('told', [('', b''), ('ros2msg', b'{{ no definition'), None])
+def test_a_missing_definition_of_another_topic_costs_no_other_message(
+    entries, readers, tmp_path, capsys, told
+):
+    file = write_mcap(
+        tmp_path / 'bag',
+        [ODD_MESSAGE, *entries],
+        lambda type_name: told if type_name == ODD else ('ros2msg', definition(type_name).encode()),
+    )
+    for name in ('replay --config', 'report', 'export', 'plot'):
+        assert readers[name](file) == 0, capsys.readouterr().err
+    assert bag_recover.main([str(file), '--out', str(tmp_path / 'clean')]) == 0
+    said = capsys.readouterr().out
+    with Reader(tmp_path / 'clean') as reader:
+        found = {one.topic: one.msgcount for one in reader.connections}
+    assert found['/joint_states'] == 301
+    if told is None:  # not even its name is there
+        assert 'LOST 1 messages of topics whose name or type is not told' in said
+    else:
+        assert found['/odd'] == 1
+
+
+def test_the_types_of_this_package_need_no_definition(entries, readers, tmp_path, capsys):
+    file = write_mcap(tmp_path / 'bag', entries, lambda _: ('', b''))
+    assert readers['replay --config'](file) == 0
+    assert bag_recover.main([str(file), '--out', str(tmp_path / 'clean')]) == 0
+    capsys.readouterr()
+    with Reader(tmp_path / 'clean') as reader:
+        text = {one.msgtype: one.msgdef.data for one in reader.connections}
+    assert 'float64[] position' in text[JOINT_STATE]
+
+
+def test_topics_without_any_type(bag, entries, tmp_path, all_say, capsys):
+    configuration = read_context(bag).configuration
+    file = write_mcap(tmp_path / 'bag', entries, lambda _: None, configuration)
+    all_say(file, '/joint_states (of a type it does not tell)')
+    assert bag_recover.main([str(file), '--out', str(tmp_path / 'clean')]) == 0
+    assert f'LOST {len(entries)} messages of topics whose' in capsys.readouterr().out
+
+
+def test_an_empty_bag(rewritten, all_say, tmp_path, capsys):
+    path = rewritten([])
+    all_say(path, f'{path} is empty: it holds no message')
+    assert bag_recover.main([str(path), '--out', str(tmp_path / 'clean')]) == 0
+    assert 'nothing was lost' in capsys.readouterr().out
+
+
+def test_a_bag_whose_metadata_promises_what_is_not_there(copy, entries, all_say, tmp_path):
+    others = [entry for entry in entries if entry[0] != JOINT_STATES.resolved]
+    other = recorded_run.write(tmp_path / 'bag', others, read_context(copy).configuration)
+    shutil.copy(other / 'bag_0.mcap', copy)
+    all_say(copy, 'is empty: it holds no message of /joint_states')
+
+
+def test_a_folder_without_its_file(copy, all_say, tmp_path, capsys):
+    (copy / 'bag_0.mcap').unlink()
+    all_say(copy, f'{copy} cannot be read as a bag', 'bag_0.mcap')
+    assert bag_recover.main([str(copy), '--out', str(tmp_path / 'clean')]) == 1
+    assert 'there is no MCAP file to recover' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('joints', [('wheel', 'arm'), ('base', 'shoulder', 'elbow')])
+def test_the_bag_of_another_robot(entries, rewritten, all_say, joints):
+    encoder = JointStateEncoder(joints)
+    zero = [0.0] * len(joints)
+    changed = [
+        [*entry[:3], encoder.encode(entry[2], zero, zero, zero)]
+        if entry[0] == JOINT_STATES.resolved
+        else entry
+        for entry in entries
+    ]
+    all_say(
+        rewritten(changed),
+        f"'joint1' is not in the message, which names {', '.join(joints)}",
+        'another robot',
+        '--map joint1=ITS_NAME',
+    )
+
+
+def test_joint_states_that_name_no_joint(readers, tmp_path, capsys):
+    nameless = JointStateEncoder(())
+    path = recorded_run.write(
+        tmp_path / 'bag',
+        [['/joint_states', JOINT_STATE, k, nameless.encode(k, [], [], [])] for k in range(9)],
+    )
+    for name in ('report', 'export', 'plot'):
+        assert readers[name](path) == 1
+        assert 'it names no joint' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('here', 'there', 'words'),
+    [
+        ('version: 9', 'version: 99', 'its format is version 99 of rosbag2, and up to 9 is known'),
+        ('identifier: mcap', 'identifier: tape', "its storage is 'tape', and only mcap and sqlite"),
+        ('rosbag2_bagfile_information', 'other', 'its metadata.yaml does not describe a bag'),
+    ],
+)
+def test_a_bag_of_another_format(copy, all_say, here, there, words, tmp_path, capsys):
+    text = (copy / METADATA).read_text()
+    assert here in text
+    (copy / METADATA).write_text(text.replace(here, there))
+    all_say(copy, words, f'to save what is whole: bag_recover {copy}')
+    assert bag_recover.main([str(copy), '--out', str(tmp_path / 'clean')]) == 0
+    assert 'nothing was lost' in capsys.readouterr().out
+
+
+def test_a_configuration_that_is_damaged(entries, readers, tmp_path, capsys):
+    path = recorded_run.write(tmp_path / 'bag', entries, '{{{')
+    for name in ('replay', 'replay --learn'):
+        assert readers[name](path) == 1
+        said = capsys.readouterr().err
+        assert 'holds a configuration that cannot be read' in said
+        assert '--config recommended' in said
+    for name in ('report', 'export', 'plot', 'replay --config'):
+        assert readers[name](path) == 0
+    assert '<p>not recorded in the bag</p>' in (tmp_path / 'page.html').read_text()
