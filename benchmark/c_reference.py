@@ -6,7 +6,7 @@ from __future__ import annotations
 import ctypes
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 from blf_dsc_controller.assembly import settings_of_config
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from sim_plant.configuration import PlantConfig
+from sim_plant.sensors import generator
 
 SOURCE = Path(__file__).with_name('reference.c')
 # The package's kernels are compiled for this very processor too; contraction would change the
@@ -30,7 +31,11 @@ _Joint = ctypes.c_double * _N
 class _Settings(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_double) for name in ('l1', 'l2', 'm1', 'm2', 'g')),
-        *((name, _Joint) for name in ('constant', 'amplitude', 'frequency', 'phase', 'q0')),
+        *((name, _Joint) for name in ('constant', 'amplitude', 'frequency', 'phase')),
+        *((name, _Joint) for name in ('viscous', 'coulomb')),
+        ('coulomb_velocity', ctypes.c_double),
+        *((name, _Joint) for name in ('q0', 'dq0')),
+        *((name, ctypes.c_double) for name in ('position_noise', 'velocity_noise')),
         ('offset', _Joint),
         ('swing', _Joint),
         ('tone', ctypes.c_double),
@@ -44,33 +49,64 @@ class _Settings(ctypes.Structure):
         ('T', ctypes.c_double),
         ('window', ctypes.c_long),
         ('interval', ctypes.c_long),
+        ('differenced', ctypes.c_long),
+        ('delay', ctypes.c_long),
     )
 
 
-def compiled() -> Callable[[ControllerConfig, PlantConfig], np.ndarray]:
-    """Compile the reference and return it as a function of both configurations.
-
-    The function runs `duration` and returns the rows (samples, COLUMNS).
+class Reference:
+    """The reference, compiled.
 
     Raises:
         FileNotFoundError: there is no C compiler called cc.
         subprocess.CalledProcessError: it does not compile.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        library = Path(folder, 'reference.so')
-        command = ['cc', *FLAGS, '-shared', '-fPIC', '-o', str(library), str(SOURCE), '-lm']
-        subprocess.run(command, check=True)
-        run = ctypes.CDLL(str(library)).run
-    run.argtypes = (ctypes.POINTER(_Settings), ctypes.c_long, ctypes.c_void_p)
 
-    def call(controller: ControllerConfig, plant: PlantConfig) -> np.ndarray:
+    def __init__(self) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            library = Path(folder, 'reference.so')
+            command = ['cc', *FLAGS, '-shared', '-fPIC', '-o', str(library), str(SOURCE), '-lm']
+            subprocess.run(command, check=True)
+            self._run = ctypes.CDLL(str(library)).run
+        vectors = [ctypes.c_void_p] * 3
+        self._run.argtypes = (ctypes.POINTER(_Settings), ctypes.c_long, ctypes.c_long, *vectors)
+
+    def rows(self, controller: ControllerConfig, plant: PlantConfig) -> np.ndarray:
+        """Rows (samples, COLUMNS) of a run without noise; the sample at `duration` is left out."""
         settings = _settings(controller, plant)
         rows = np.zeros((round(plant.duration / plant.sample_time), COLUMNS))
-        if run(ctypes.byref(settings), len(rows), rows.ctypes.data) != 0:
-            raise MemoryError
+        self._call(settings, len(rows), 0, None, rows, None)
         return rows
 
-    return call
+    def study(
+        self, controller: ControllerConfig, plants: Sequence[PlantConfig], settled_after: float
+    ) -> Callable[[], np.ndarray]:
+        """Runs of `duration` of many plants, to be called; it returns their figures (plants, 4).
+
+        These are the largest abs(xi1)/k_c and the rms of xi1 [rad] from `settled_after` [s] on, of
+        both joints.  The settings are laid out here; a call draws the noise, by numpy, and runs.
+        """
+        laid_out = [(_settings(controller, plant), plant) for plant in plants]
+
+        def run_all() -> np.ndarray:
+            figures = np.zeros((len(laid_out), 2 * _N))
+            for (settings, plant), row in zip(laid_out, figures, strict=True):
+                samples = round(plant.duration / plant.sample_time) + 1
+                noise = None
+                if settings.position_noise > 0.0 or settings.velocity_noise > 0.0:
+                    noise = generator(plant.seed).standard_normal((samples, 2 * _N))
+                settled = round(settled_after / plant.sample_time)
+                self._call(settings, samples, settled, noise, None, row)
+            return figures
+
+        return run_all
+
+    def _call(
+        self, settings: _Settings, samples: int, settled: int, *vectors: np.ndarray | None
+    ) -> None:
+        addresses = (None if vector is None else vector.ctypes.data for vector in vectors)
+        if self._run(ctypes.byref(settings), samples, settled, *addresses) != 0:
+            raise MemoryError
 
 
 def _settings(controller: ControllerConfig, plant: PlantConfig) -> _Settings:
@@ -86,7 +122,15 @@ def _settings(controller: ControllerConfig, plant: PlantConfig) -> _Settings:
         'amplitude': disturbance.amplitude,
         'frequency': disturbance.frequency,
         'phase': disturbance.phase,
+        'viscous': disturbance.viscous,
+        'coulomb': disturbance.coulomb,
+        'coulomb_velocity': disturbance.coulomb_velocity,
         'q0': plant.initial.position,
+        'dq0': plant.initial.velocity,
+        'position_noise': plant.sensor.position_noise,
+        'velocity_noise': plant.sensor.velocity_noise,
+        'differenced': plant.sensor.velocity == 'differenced',
+        'delay': plant.actuator.delay,
         'offset': controller.reference.offset,
         'swing': controller.reference.amplitude,
         'tone': controller.reference.frequency[0],

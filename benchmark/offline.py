@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from c_reference import compiled
+from c_reference import Reference
 from peers import loops
 from peers.octave import octave_loop
 from timing import Ratio, interleaved, ratio
@@ -47,7 +47,7 @@ def measure() -> Iterator[Ratio]:
 def disagreement() -> float:
     """Largest difference to the C reference over 10 s in errors [rad], torques and estimates."""
     plant = replace(loops.PLANT, duration=_AGREEMENT)
-    rows = compiled()(loops.CONTROLLER, plant)
+    rows = Reference().rows(loops.CONTROLLER, plant)
     record = simulate(loops.CONTROLLER, plant)
     told = [record.sample(k) for k in range(len(rows))]
     mine = np.array([np.concatenate((s.xi1, s.torque, s.estimate)) for s in told])
@@ -64,11 +64,11 @@ def _peer(loop: Callable[[float], np.ndarray]) -> int:
 
 
 def _beside_c() -> Iterator[Ratio]:
-    run = compiled()
+    reference = Reference()
     plant = replace(loops.PLANT, duration=_LONG)
     contestants = {
         PACKAGE: _package(_LONG),
-        C: lambda: len(run(loops.CONTROLLER, plant)),
+        C: lambda: len(reference.rows(loops.CONTROLLER, plant)),
     }
     times = interleaved(contestants, 4 * _ROUNDS)
     yield ratio(

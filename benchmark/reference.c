@@ -8,23 +8,26 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { N = 2, P = 3, M = 5, W = M + 1, STAGES = 6 };
+enum { N = 2, P = 3, M = 5, W = M + 1, STAGES = 6, MOST_DELAY = 16 };
 
 typedef struct {
     double l1, l2, m1, m2, g;                            /* arm */
     double constant[N], amplitude[N], frequency[N], phase[N]; /* tau_dist */
-    double q0[N];
+    double viscous[N], coulomb[N], coulomb_velocity;
+    double q0[N], dq0[N];
+    double position_noise, velocity_noise;
     double offset[N], swing[N], tone;                    /* reference */
     double bound[N], weight[N], slope_limit[N], knee[N]; /* barrier */
     double K[N], mu[N], lambda;                          /* surface */
     double Kp[N], gamma[N], limit[N];
     double P0[P], Gamma[M], kappa, rho, sigma, start, pole, radius;
     double T;
-    long window, interval;
+    long window, interval, differenced, delay;
 } settings;
 
 typedef struct {
-    double q[N], dq[N];                                  /* plant */
+    double y[2 * N], applied[N], sent[MOST_DELAY][N];    /* plant */
+    double q[N], dq[N];                                  /* measured */
     double alpha2[N], torque[N], d3[N], theta[M];
     double Yp[N][P], Yr[N][M];
     double filter1[N][W], filter2[N][W];
@@ -230,6 +233,14 @@ static void control(const settings *s, loop *x, double t, double xi1[N])
     x->samples++;
 }
 
+static double load(const settings *s, int i, double t, double dq)
+{
+    double torque = s->constant[i] + s->amplitude[i] * sin(s->frequency[i] * t + s->phase[i]);
+    torque += s->viscous[i] * dq;
+    if (s->coulomb[i] != 0.0) torque += s->coulomb[i] * tanh(dq / s->coulomb_velocity);
+    return torque;
+}
+
 static void motion(const settings *s, double t, const double y[2 * N], const double torque[N],
                    double dy[2 * N])
 {
@@ -240,7 +251,7 @@ static void motion(const settings *s, double t, const double y[2 * N], const dou
     double g1 = (s->m1 + s->m2) * s->g * s->l1 * cos(y[0]) + g2;
     double f[N], det = m11 * outer - m12 * m12;
     for (int i = 0; i < N; i++)
-        f[i] = torque[i] - s->constant[i] - s->amplitude[i] * sin(s->frequency[i] * t + s->phase[i]);
+        f[i] = torque[i] - load(s, i, t, y[N + i]);
     f[0] += c * y[3] * (2.0 * y[2] + y[3]) - g1;
     f[1] -= c * y[2] * y[2] + g2;
     dy[0] = y[2];
@@ -261,42 +272,84 @@ static void integrate(const settings *s, loop *x, double t)
         {9017.0 / 3168, -355.0 / 33, 46732.0 / 5247, 49.0 / 176, -5103.0 / 18656}};
     static const double B[STAGES] = {35.0 / 384,       0.0,           500.0 / 1113,
                                      125.0 / 192, -2187.0 / 6784, 11.0 / 84};
-    double y[2 * N] = {x->q[0], x->q[1], x->dq[0], x->dq[1]}, k[STAGES][2 * N], z[2 * N];
+    double *y = x->y, k[STAGES][2 * N], z[2 * N];
     for (int stage = 0; stage < STAGES; stage++) {
         for (int i = 0; i < 2 * N; i++) {
             double slope = 0.0;
             for (int j = 0; j < stage; j++) slope += A[stage][j] * k[j][i];
             z[i] = y[i] + s->T * slope;
         }
-        motion(s, t + C[stage] * s->T, z, x->torque, k[stage]);
+        motion(s, t + C[stage] * s->T, z, x->applied, k[stage]);
     }
     for (int i = 0; i < 2 * N; i++) {
         double slope = 0.0;
         for (int j = 0; j < STAGES; j++) slope += B[j] * k[j][i];
         y[i] += s->T * slope;
     }
-    memcpy(x->q, y, sizeof x->q);
-    memcpy(x->dq, y + N, sizeof x->dq);
 }
 
-/* Run `samples` samples; each leaves [xi1, torque, theta] in its row of `out` (samples x 9). */
-int run(const settings *s, long samples, double *out)
+static void sense(const settings *s, loop *x, long k, const double *noise)
 {
+    for (int i = 0; i < N; i++) {
+        double q = x->y[i], dq = x->y[N + i];
+        if (noise) q += s->position_noise * noise[2 * N * k + i];
+        if (!s->differenced && noise) dq += s->velocity_noise * noise[2 * N * k + N + i];
+        x->dq[i] = s->differenced && k > 0 ? (q - x->q[i]) / s->T : dq;
+        x->q[i] = q;
+    }
+}
+
+static void actuate(const settings *s, loop *x, long k)
+{
+    for (int i = 0; i < N; i++) {
+        double torque = x->torque[i];
+        if (s->delay > 0) {
+            double *slot = &x->sent[k % s->delay][i];
+            torque = *slot;
+            *slot = x->torque[i];
+        }
+        x->applied[i] = torque;
+    }
+}
+
+/* Run `samples` samples. Each leaves [xi1, torque, theta] in its row of `out` (samples x 9), and
+ * the largest |xi1| / bound of all, then the rms of xi1 from sample `settled` on, are left in
+ * `figures` (4), where these are given. `noise`, if any, is standard normal (samples x 4). Returns 0,
+ * or 1 where there is no memory. */
+int run(const settings *s, long samples, long settled, const double *noise, double *out,
+        double *figures)
+{
+    double largest[N] = {0.0}, squares[N] = {0.0}, xi1[N];
     loop *x = calloc(1, sizeof *x);
     if (x) x->ring = calloc((size_t)s->window, sizeof *x->ring);
     if (!x || !x->ring) {
         free(x);
         return 1;
     }
-    memcpy(x->q, s->q0, sizeof x->q);
+    memcpy(x->y, s->q0, sizeof s->q0);
+    memcpy(x->y + N, s->dq0, sizeof s->dq0);
     memcpy(x->theta, s->P0, sizeof s->P0);
     for (int i = 0; i < M; i++) x->weakest[i] = 1.0 / sqrt(M);
     for (long k = 0; k < samples; k++) {
-        double t = (double)k * (s->T * 1e9) * 1e-9, *row = out + k * (2 * N + M);
-        control(s, x, t, row);
-        memcpy(row + N, x->torque, sizeof x->torque);
-        memcpy(row + 2 * N, x->theta, sizeof x->theta);
+        double t = (double)k * (s->T * 1e9) * 1e-9;
+        sense(s, x, k, noise);
+        control(s, x, t, xi1);
+        for (int i = 0; i < N; i++) {
+            largest[i] = fmax(largest[i], fabs(xi1[i]) / s->bound[i]);
+            if (k >= settled) squares[i] += xi1[i] * xi1[i];
+        }
+        if (out) {
+            double *row = out + k * (2 * N + M);
+            memcpy(row, xi1, sizeof xi1);
+            memcpy(row + N, x->torque, sizeof x->torque);
+            memcpy(row + 2 * N, x->theta, sizeof x->theta);
+        }
+        actuate(s, x, k);
         integrate(s, x, t);
+    }
+    for (int i = 0; figures && i < N; i++) {
+        figures[i] = largest[i];
+        figures[N + i] = sqrt(squares[i] / (samples - settled));
     }
     free(x->ring);
     free(x);

@@ -20,7 +20,7 @@ from timing import Ratio
 
 from blf_dsc_controller import __version__
 
-_GROUPS = ('offline', 'growth', 'node', 'recording', 'replay', 'startup')
+_GROUPS = ('offline', 'montecarlo', 'growth', 'node', 'recording', 'replay', 'startup')
 _HERE = Path(__file__).parent
 _PACKAGES = ('numpy', 'numba', 'scipy', 'mujoco', 'drake', 'pin', 'ros-jazzy-rclpy')
 

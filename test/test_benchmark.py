@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from blf_dsc_controller.montecarlo.chunk import run_chunk
+
 BENCHMARK = Path(__file__).parents[1] / 'benchmark'
 MODULES = [
     '.'.join(path.relative_to(BENCHMARK).with_suffix('').parts)
@@ -70,6 +72,22 @@ def test_loop_beside_c_and_numpy(monkeypatch):
 def test_c_reference_gives_the_same_trajectory():
     # Issued for 10 s, in which learning begins; angles, torques and estimates are of order 1 to 10.
     assert importlib.import_module('offline').disagreement() < 1e-9
+
+
+@pytest.mark.skipif(shutil.which('cc') is None, reason='there is no C compiler')
+def test_study_beside_c_and_on_two_processes(monkeypatch):
+    sizes = {'_DURATION': 0.05, '_RUNS': 2, '_CHUNKS': 2, '_CHUNK': 1}
+    montecarlo = tiny(monkeypatch, 'montecarlo', **sizes)
+    assert len(contestants(list(montecarlo.measure()))) == 2
+
+
+@pytest.mark.skipif(shutil.which('cc') is None, reason='there is no C compiler')
+def test_c_reference_runs_the_same_study(monkeypatch):
+    montecarlo = tiny(monkeypatch, 'montecarlo', _RUNS=8, _DURATION=9.0)  # learning from 6.8 s on
+    drawn = run_chunk(montecarlo.preset(), 0, 8)
+    assert set(drawn['plant.sensor.velocity']) == {'measured', 'differenced'}
+    assert set(drawn['plant.actuator.delay']) == {0, 1, 2}
+    assert montecarlo.disagreement(montecarlo.preset()) < 1e-9
 
 
 def test_recorder_beside_raw_subscriber(monkeypatch):
