@@ -16,6 +16,7 @@ from blf_dsc_controller.bags.offline import write_bag
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.reports.monitors_figure import draw_monitors
 from blf_dsc_controller.reports.summary import summarize
+from blf_dsc_controller.reports.table import format_table
 from blf_dsc_controller.simulation import simulate
 
 LARGEST = np.linalg.eigvalsh([[2.12, 0.72], [0.72, 0.32]])[-1]  # kg m^2, of M stretched
@@ -104,10 +105,12 @@ def refusing_run(tmp_path_factory):
     return read_run(path)
 
 
-def test_refused_columns_reach_the_summary_by_name(refusing_run):
+def test_refused_columns_reach_the_summary_with_their_reason(refusing_run):
     learning = summarize(refusing_run)['learning']
-    (refused,) = learning['refused_columns']
+    ((refused, reason),) = learning['refused_columns'].items()
     assert refused.startswith('cos 1 rad/s ')
+    assert reason.startswith(f'{refused} is not estimated: on this window it cannot be told from ')
+    assert f'refused     {reason}' in format_table(summarize(refusing_run))
     assert learning['final_relative_error'] < 0.5
 
 
@@ -115,7 +118,7 @@ def test_a_run_that_refuses_nothing_says_so(tmp_path):
     config = configured('recommended', 8.0)
     write_bag(tmp_path / 'bag', simulate(*config[1::-1]), config.controller, 'none')
     run = read_run(tmp_path / 'bag')
-    assert summarize(run)['learning']['refused_columns'] == []
+    assert summarize(run)['learning']['refused_columns'] == {}
     assert 'V barrier' not in run.monitor.names
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names under which values travel: in the vectors (learning, truth, timing), and in `~/state`."""
+"""Names under which values travel: in the vectors (learning, truth, timing), and beside them."""
 
 from __future__ import annotations
 
@@ -16,6 +16,10 @@ COMPUTE_TIME = 'compute_time'
 LATENCY = 'latency'
 LATENESS = 'lateness'
 LATE_STEPS = 'late_steps'
+
+REFUSED = (
+    'refused '  # of the values of /diagnostics: followed by the column, which is not estimated
+)
 
 # Of the values of ~/state.
 PHASE = 'phase'

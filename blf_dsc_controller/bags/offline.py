@@ -11,6 +11,7 @@ import numpy as np
 from blf_dsc_controller.assembly import estimate_names, model_of
 from blf_dsc_controller.bags import topics
 from blf_dsc_controller.bags.monitor import Monitor
+from blf_dsc_controller.bags.refused import diagnosis
 from blf_dsc_controller.bags.telemetry import (
     DECIMATION,
     ControllerTelemetry,
@@ -20,6 +21,7 @@ from blf_dsc_controller.bags.telemetry import (
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.dump import text
+from blf_dsc_controller.refusals import refusals
 from blf_dsc_controller.simulation import Record
 from sim_plant.configuration import PlantConfig
 
@@ -57,6 +59,12 @@ def write_bag(
             if topic not in handles:
                 handles[topic] = bag.add_topic(topic.resolved, topic.type, [topic.offered])
             bag.write(handles[topic], raw, stamp)
+        refused = refusals(record.controller, estimate_names(config))
+        if refused:
+            stamp = START + int(record.stamps[-1])
+            topic = topics.DIAGNOSTICS
+            handle = bag.add_topic(topic.resolved, topic.type, [topic.offered])
+            bag.write(handle, diagnosis(stamp, refused), stamp)
 
 
 def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, Message]]:

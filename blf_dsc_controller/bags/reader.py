@@ -17,6 +17,7 @@ from blf_dsc_controller.bags.errors import (
     UnnamedJointsError,
     UnreadableMessageError,
 )
+from blf_dsc_controller.bags.refused import refused
 from blf_dsc_controller.bags.run import Floats, Run, Series, Stamps
 from blf_dsc_controller.bags.topics import (
     BOUND,
@@ -54,6 +55,7 @@ def read_run(path: str | Path, namespace: str = '') -> Run:
     errors = _optional(content, TRACKING_ERROR, joints)
     references = _optional(content, REFERENCE, joints)
     bounds = _optional(content, BOUND, joints)
+    learning = _vector(content, LEARNING)
     reference = None if references is None else references.position.exact(states.stamp)
     error = None if errors is None else errors.position.exact(states.stamp)
     if error is None and reference is not None:
@@ -69,11 +71,12 @@ def read_run(path: str | Path, namespace: str = '') -> Run:
         error=error,
         bound=None if bounds is None else bounds.position.held(states.stamp),
         torque_limit=None if bounds is None else bounds.effort.held(states.stamp),
-        learning=_vector(content, LEARNING),
+        learning=learning,
         truth=_vector(content, TRUTH),
         timing=_vector(content, TIMING),
         monitor=_vector(content, MONITOR),
         message_counts=content.message_counts,
+        refused=refused(Path(path), learning, namespace),
     )
 
 

@@ -61,6 +61,7 @@ class Run:
     timing: Series | None
     monitor: Series | None
     message_counts: Mapping[str, int]
+    refused: Mapping[str, str]  # disturbance columns that are not estimated, and why
 
     @property
     def time(self) -> Floats:

@@ -207,6 +207,8 @@ class ControllerNode(ManagedNode):
         self._status.refusals = refusals(guard.controller, self._estimates)
         for refusal in self._status.refusals:
             self.get_logger().warning(f'{refusal}')
+        if self._status.refusals:
+            self._report()
 
     def _command(self, torque: np.ndarray) -> None:
         self._publish(self._telemetry.command(torque))

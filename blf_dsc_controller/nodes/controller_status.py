@@ -10,7 +10,15 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
 from blf_dsc_controller.bags import topics
-from blf_dsc_controller.bags.names import LAST_STATE, OPERATION, OPERATIONS, PHASE, REASON, STOPS
+from blf_dsc_controller.bags.names import (
+    LAST_STATE,
+    OPERATION,
+    OPERATIONS,
+    PHASE,
+    REASON,
+    REFUSED,
+    STOPS,
+)
 from blf_dsc_controller.nodes.board import ERROR, OK, STALE, WARN, Board
 from blf_dsc_controller.nodes.trajectory import TrajectoryInput
 from blf_dsc_controller.refusals import Refusal
@@ -127,7 +135,7 @@ class ControllerStatus:
         state = guard.controller.state
         learning = 'latched' if state.latched[0] else 'not yet excited'
         values = {'lambda_min': f'{state.lambda_min[0]:.3g}', 'learning': learning}
-        values |= {f'refused {refusal.column}': f'{refusal}' for refusal in self.refusals}
+        values |= {f'{REFUSED}{refusal.column}': f'{refusal}' for refusal in self.refusals}
         if self.refusals:
             columns = ', '.join(refusal.column for refusal in self.refusals)
             return self._board.status('learning', WARN, f'not estimated: {columns}', values)

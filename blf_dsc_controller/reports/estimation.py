@@ -53,14 +53,6 @@ class Estimation:
         return np.asarray(error / np.linalg.norm(self.true, axis=1))
 
 
-def refused_columns(run: Run) -> tuple[str, ...]:
-    """Disturbance columns that the learning has refused: they are told as NaN from then on."""
-    if run.learning is None:
-        return ()
-    last = dict(zip(run.learning.names, run.learning.values[-1], strict=True))
-    return tuple(name for name, value in last.items() if name != COMPUTE_TIME and np.isnan(value))
-
-
 def latch_time(run: Run) -> float | None:
     """Time at which learning began [s], None if it never did or the bag does not tell."""
     if run.learning is None or LATCHED not in run.learning.names:

@@ -18,7 +18,7 @@ from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.topics import DIAGNOSTICS
 from blf_dsc_controller.bags.types import typestore
 from blf_dsc_controller.configuration.sections import Section, SectionError, parse
-from blf_dsc_controller.reports.estimation import latch_time, refused_columns
+from blf_dsc_controller.reports.estimation import latch_time
 
 _LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 _MOST_OF_A_KIND = 50
@@ -100,8 +100,9 @@ def _learning_events(run: Run) -> Iterator[Event]:
     latched = latch_time(run)
     if latched is not None:
         yield Event(latched, 'learning', 'the first window was excited enough: learning began')
-    for column in refused_columns(run):
-        yield Event(run.duration, 'learning', f'{column} is not estimated: its column was refused')
+    for column, reason in run.refused.items():
+        text = reason or f'{column} is not estimated: its column was refused'
+        yield Event(run.duration, 'learning', text)
 
 
 def _bound_events(run: Run) -> Iterator[Event]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from blf_dsc_controller.bags.names import COMPUTE_TIME, LATE_STEPS, LATENCY
 from blf_dsc_controller.bags.run import Floats, Run, Series
-from blf_dsc_controller.reports.estimation import Estimation, latch_time, refused_columns
+from blf_dsc_controller.reports.estimation import Estimation, latch_time
 
 Summary = dict[str, Any]
 
@@ -82,7 +82,7 @@ def _learning(run: Run) -> Summary | None:
             name: None if np.isnan(value) else float(value)
             for name, value in zip(estimation.names, estimation.estimate[-1], strict=True)
         },
-        'refused_columns': list(refused_columns(run)),
+        'refused_columns': {name: reason or None for name, reason in run.refused.items()},
         'true': None,
     }
     error = estimation.relative_error

@@ -68,8 +68,8 @@ def _verdict(tracking: dict[str, Any]) -> str:
 def _learning(learning: dict[str, Any]) -> Iterator[str]:
     latched = learning['latch_time_s']
     yield f'learning    {"never began" if latched is None else f"began at {latched:.3f} s"}'
-    if learning['refused_columns']:
-        yield f'refused     {", ".join(learning["refused_columns"])}: see the log for the reason'
+    for column, reason in learning['refused_columns'].items():
+        yield f'refused     {reason or f"{column}: see the log for the reason"}'
     if learning['final_relative_error'] is None:
         return
     moments = [f'{moment} s {_percent(e)}' for moment, e in learning['relative_error_at_s'].items()]
