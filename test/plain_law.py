@@ -8,6 +8,7 @@ window is the list of its rows, the Newton step solves its equations.
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import brentq
 
 
 def dynamics(P, r, q, dq):
@@ -106,9 +107,11 @@ class PlainLaw:
         if w @ w >= g.radius**2 * (1.0 - 1e-12) and w @ v[:3] > 0.0:
             v[:3] -= g.Gamma[:3] * w * (w @ v[:3]) / (w @ (g.Gamma[:3] * w))
         self.theta = self.theta + dt * v
-        norm = np.linalg.norm(self.theta[:3])
-        if norm > g.radius:
-            self.theta[:3] *= g.radius / norm
+        w, gain = self.theta[:3].copy(), np.array(g.Gamma[:3])
+        if np.linalg.norm(w) > g.radius:
+            # Nearest point of the ball: the multiplier that ends the way out on the sphere.
+            out = lambda nu: np.linalg.norm(w / (1.0 + nu * gain)) - g.radius  # noqa: E731
+            self.theta[:3] = w / (1.0 + brentq(out, 0.0, 1e9, xtol=1e-18) * gain)
 
     def update(self, t, dt, qr, dqr, measurement):
         """Torque (28) for a measurement; `tau`, what went out last, is the caller's to set."""

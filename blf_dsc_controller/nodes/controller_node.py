@@ -71,7 +71,7 @@ class ControllerNode(ManagedNode):
         self._publisher_of: dict[topics.Topic, Publisher] = {}
         self._status = ControllerStatus(self, joints)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._look = self.create_timer(_FIRST_LOOK, self._on_look, clock=steady)
+        self._look = self.create_timer(_FIRST_LOOK, self._tick, clock=steady)
         self.create_timer(_DIAGNOSTICS_PERIOD, self._report, clock=steady)
         parameters.on_change(self, ControllerConfig, self._retune, self._objections)
         self.create_service(Trigger, '~/reset', self._on_reset)
@@ -226,7 +226,7 @@ class ControllerNode(ManagedNode):
         observers = self.config.wait_for_subscribers
         return are_observed(self._publisher_of, topics.COMMANDS, observers)
 
-    def _on_look(self) -> None:
+    def _tick(self) -> None:
         """Watch, and be woken again when there may be something to see: waking has its price."""
         wait = _FIRST_LOOK
         if self.guard is not None:
