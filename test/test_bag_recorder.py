@@ -16,6 +16,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from recorder_rig import messages_on_disk
 from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -228,6 +229,27 @@ def test_a_type_that_is_not_installed_is_warned_of_once(loop, monkeypatch, capfd
     said = capfd.readouterr().err
     assert said.count('/joint_states is not recorded') == 1
     assert 'its type sensor_msgs/msg/JointState is not installed here' in said
+
+
+def test_nothing_waits_in_the_recorder_while_it_imports_a_type(loop, monkeypatch):
+    def import_slowly(type_name):
+        on_disk.append(messages_on_disk(run.bag / 'bag_0.mcap'))
+        return original(type_name)
+
+    run, on_disk = loop(topics=['joint_states', 'goals']), []
+    publisher = run.source.create_publisher(JointState, 'joint_states', 100)
+    run.spin_until(lambda: publisher.get_subscription_count() > 0)
+    original = recorder_node.message_class
+    monkeypatch.setattr(recorder_node, 'message_class', import_slowly)
+    run.source.create_publisher(Goals, 'goals', 10)
+    for _ in range(50):
+        publisher.publish(JointState())
+    assert publisher.wait_for_all_acked()
+    deadline = time.monotonic() + PATIENCE
+    while not on_disk:  # only the search for topics: no other turn of the recorder
+        assert time.monotonic() < deadline, 'still waiting'
+        run.recorder._discover()
+    assert on_disk == [50]
 
 
 def test_the_end_tells_what_was_recorded(loop, capfd):

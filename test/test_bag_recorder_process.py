@@ -14,10 +14,10 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import rclpy
-from mcap.stream_reader import StreamReader
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from recorder_rig import messages_on_disk
 from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
 
@@ -132,17 +132,6 @@ def test_an_existing_folder_ends_it_with_one_clear_line(tmp_path):
     assert run.returncode == 1
     assert f'{tmp_path} exists already' in run.stderr
     assert 'Traceback' not in run.stderr
-
-
-def messages_on_disk(path):
-    """Number of messages in a file that nobody has closed."""
-    count = 0
-    try:
-        for record in StreamReader(path.open('rb'), record_size_limit=None).records:
-            count += type(record).__name__ == 'Message'
-    except Exception:  # noqa: BLE001 - what follows the last whole record is not of interest
-        return count
-    return count
 
 
 def test_a_kill_loses_nothing_but_the_last_moment(recording, tmp_path):

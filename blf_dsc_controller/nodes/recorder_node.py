@@ -106,6 +106,7 @@ class BagRecorderNode(RunnableNode):
             self._pass_over(topic, f'it has several types, {" and ".join(types)}')
             return
         offered = [quality_of(publisher.qos_profile) for publisher in publishers]
+        self._record(hand_over=True)  # importing a type, and its first subscription, may take 0.1 s
         try:
             message_class(types[0])
             learn(types[0])
@@ -115,6 +116,9 @@ class BagRecorderNode(RunnableNode):
         self._start(topic, types[0], offered)
 
     def _start(self, topic: str, type_name: str, offered: list[Quality]) -> None:
+        self._record(hand_over=True)
+        if self.failure is not None:
+            return
         handle = self._sink.add_topic(topic, type_name, offered)
         self._losses[topic] = self._by_handle[handle] = Losses(len(offered))
         self._intake.subscribe(topic, type_name, offered, handle)
@@ -127,7 +131,8 @@ class BagRecorderNode(RunnableNode):
         self._passed_over.add(topic)
         self.get_logger().warning(f'{topic} is not recorded: {reason}')
 
-    def _record(self) -> None:
+    def _record(self, *, hand_over: bool = False) -> None:
+        """Take what has come; `hand_over` all of it to the disk, or what has waited long enough."""
         if self.failure is not None:
             return
         try:
@@ -135,7 +140,10 @@ class BagRecorderNode(RunnableNode):
                 self._by_handle[arrival.handle].count(arrival.sequence)
                 self._sink.write(arrival)
             self._inquiry.go_on()
-            self._sink.flush_if_due()
+            if hand_over:
+                self._sink.flush()
+            else:
+                self._sink.flush_if_due()
         except (DiskFullError, OSError) as error:
             self.failure = error if isinstance(error, DiskFullError) else WriteError(error)
             self.finished = True

@@ -68,6 +68,10 @@ class Recording:
         """Hand over to the disk what has waited long enough; DiskFullError if there is no room."""
         self._writer.flush_if_due()
 
+    def flush(self) -> None:
+        """Hand over to the disk all that has come; DiskFullError if there is no room."""
+        self._writer.flush()
+
     def close(self, statistics: dict[str, str]) -> None:
         """Complete the bag."""
         if not self._writer.closed:
@@ -115,6 +119,9 @@ class BlackBox:
 
     def flush_if_due(self) -> None:
         """Do nothing: what is kept stays in memory."""
+
+    def flush(self) -> None:
+        """Likewise."""
 
     def close(self, _: dict[str, str]) -> None:
         """Do nothing: what nobody has asked for is let go."""
