@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import Protocol
 
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.tools.domain import own_domain
@@ -19,6 +20,18 @@ _START_UP = 120.0  # s, kernels may have to be compiled
 _ENDING = 20.0  # s from SIGINT to the end
 _LAST_WORDS = 2000  # characters of stderr that an error repeats
 _CPUCLOCK_SCHED = 2  # as clock_getcpuclockid(3) does it: nanoseconds, where /proc has hundredths
+
+
+class Watched(Protocol):
+    """What is waited for: a process, or a node in this one."""
+
+    name: str
+
+    def check(self) -> None:
+        """Raise ContestantError if it cannot go on."""
+
+    def cpu_time(self) -> float:
+        """CPU time so far [s]."""
 
 
 class ContestantError(BlfDscError):
@@ -75,7 +88,7 @@ class Contestant:
 def wait_for(
     condition: Callable[[], bool],
     what: str,
-    contestants: Sequence[Contestant] = (),
+    contestants: Sequence[Watched] = (),
     pause: Callable[[], object] = lambda: time.sleep(0.02),
     patience: float = _START_UP,
 ) -> None:

@@ -2,7 +2,8 @@
 """The controller node beside a node that echoes a torque at once.
 
 This process plays the arm: it publishes the joint states of a recorded run and takes the torques.
-Every contestant is a process of its own, started anew in each round.
+Every contestant is started anew in each round: a process of its own, or a node of this process, on
+the arm's executor.
 """
 
 from __future__ import annotations
@@ -10,13 +11,13 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from contestant import Contestant, ContestantError, own_graph, wait_for
+from contestant import Contestant, ContestantError, Watched, own_graph, wait_for
 from timing import Ratio, ratio
 
 from blf_dsc_controller.bags import topics
@@ -39,6 +40,8 @@ _NULL_TYPED = 'null node, typed messages'
 _QUIET = 'controller, telemetry off'
 _TELLING = 'controller, telemetry on'
 _RECORDED = 'controller, telemetry and recorder on'
+_PROCESSES = (_NULL, _NULL_TYPED, _QUIET, _TELLING, _RECORDED)
+_GUESTS = (_NULL, _QUIET, _TELLING)
 _HERE = Path(__file__).parent
 
 
@@ -50,18 +53,51 @@ class Run(NamedTuple):
     cpu: float  # s of the node's process
 
 
+def _silent(context: Any) -> dict[str, Any]:
+    """Options of a node whose log nobody follows; nodes of one name would quarrel over it."""
+    return {'context': context, 'enable_rosout': False}
+
+
+class Guest:
+    """A contestant that is a node of this process; its CPU time is that of both sides."""
+
+    def __init__(self, name: str, context: Any) -> None:
+        import rclpy
+        from null_node import echo
+        from rclpy.parameter import Parameter
+
+        from blf_dsc_controller.nodes.controller_node import ControllerNode
+
+        self.name = name
+        if name == _NULL:
+            self.node: Any = rclpy.create_node(topics.CONTROLLER, **_silent(context))
+            echo(self.node, 'raw')
+        else:
+            parameter: Any = Parameter  # rclpy's, without types
+            telemetry = parameter('telemetry.enabled', value=name != _QUIET)
+            self.node = ControllerNode(parameter_overrides=[telemetry], **_silent(context))
+
+    def check(self) -> None:
+        """Nothing to be seen: an error of the node is one of this process."""
+
+    def cpu_time(self) -> float:
+        """CPU time of this process [s]."""
+        return time.process_time()
+
+
 class Arm:
     """Publishes recorded states and waits for torques, in lock-step or at 1 kHz."""
 
-    def __init__(self) -> None:
+    def __init__(self, messages: Sequence[bytes]) -> None:
         import rclpy
         from rclpy.experimental import EventsExecutor
 
         from blf_dsc_controller.nodes.endpoints import message_class, profile
 
-        rclpy.init()
-        self.node = rclpy.create_node('sim_plant')
-        self.executor = EventsExecutor()
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node: Any = rclpy.create_node('sim_plant', **_silent(self.context))
+        self.executor: Any = EventsExecutor(context=self.context)
         self.executor.add_node(self.node)
         states, commands = topics.JOINT_STATES, topics.COMMANDS
         self.commands = commands.relative
@@ -76,12 +112,12 @@ class Arm:
             raw=True,
         )
         self.answered = False
-        self.messages = _recorded_states()
+        self.messages = messages
 
     def _take(self, _torque: bytes) -> None:
         self.answered = True
 
-    def play(self, contestants: Sequence[Contestant], period: float) -> Run:
+    def play(self, contestants: Sequence[Watched], period: float) -> Run:
         """Play all states, each `period` [s] after the last; 0: each when the last is answered.
 
         The last of the contestants is the node; the others are beside it.
@@ -89,7 +125,9 @@ class Arm:
         takers = len(contestants)  # a recorder takes the states, too
         self._wait_for(lambda: self.publisher.get_subscription_count() == takers, contestants)
         self._wait_for(lambda: self.node.count_publishers(self.commands) == 1, contestants)
-        time.sleep(_SETTLING)
+        settled = time.perf_counter() + _SETTLING
+        while time.perf_counter() < settled:  # for a guest, whose executor this is
+            self.executor.spin_once(timeout_sec=0.01)
         node = contestants[-1]
         latency = np.zeros(len(self.messages))
         begin = time.perf_counter()
@@ -116,33 +154,55 @@ class Arm:
             contestant.check()
         return Run(latency[_WARM_UP:], elapsed, node.cpu_time() - busy)
 
+    @contextmanager
+    def host(self, name: str) -> Iterator[list[Guest]]:
+        """A contestant as a node of this process."""
+        guest = Guest(name, self.context)
+        self.executor.add_node(guest.node)
+        try:
+            yield [guest]
+        finally:
+            self.executor.remove_node(guest.node)
+            self.executor.spin_once(timeout_sec=0.1)  # what was on its way to the node runs out
+            guest.node.destroy_node()
+
+    def close(self) -> None:
+        """End the arm's node."""
+        self.executor.remove_node(self.node)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
     def left_alone(self) -> None:
         """Wait until the last contestant has gone."""
         self._wait_for(lambda: self.publisher.get_subscription_count() == 0)
         self._wait_for(lambda: self.node.count_publishers(self.commands) == 0)
 
-    def _wait_for(
-        self, condition: Callable[[], bool], contestants: Sequence[Contestant] = ()
-    ) -> None:
+    def _wait_for(self, condition: Callable[[], bool], contestants: Sequence[Watched] = ()) -> None:
         what = f'{contestants[-1].name} to appear' if contestants else 'a contestant to disappear'
         wait_for(condition, what, contestants, lambda: self.executor.spin_once(timeout_sec=0.05))
 
 
 def measure() -> Iterator[Ratio]:
     """Latency, CPU and lock-step rate of the controller node relative to the null node."""
-    contestants = (_NULL, _NULL_TYPED, _QUIET, _TELLING, _RECORDED)
-    real: dict[str, list[Run]] = {name: [] for name in contestants}
-    lockstep: dict[str, list[Run]] = {name: [] for name in contestants}
-    with own_graph(), tempfile.TemporaryDirectory() as folder:
-        arm = Arm()
+    real: dict[str, list[Run]] = {name: [] for name in _PROCESSES}
+    lockstep: dict[str, list[Run]] = {name: [] for name in _PROCESSES}
+    together: dict[str, list[Run]] = {name: [] for name in _GUESTS}
+    states = _recorded_states()
+    with own_graph(), tempfile.TemporaryDirectory() as folder, closing(Arm(states)) as arm:
         for k in range(_ROUNDS):
-            for name in contestants:
+            for name in _PROCESSES:
                 for runs, period in ((real, 1e-3), (lockstep, 0.0)):
                     with _started(name, Path(folder), f'{k}-{name}-{period}') as these:
                         runs[name].append(arm.play(these, period))
                     arm.left_alone()
+            for name, each in together.items():
+                # An arm of its own: readers within its process hear nothing from a publisher that
+                # has sent more than it keeps for those who come late.
+                with closing(Arm(states)) as here, here.host(name) as guests:
+                    each.append(here.play(guests, 0.0))
     yield from _real_time(real)
-    yield from _rates(lockstep)
+    yield from _rates('node, lock-step', lockstep)
+    yield from _rates('node and arm in one process, lock-step', together)
 
 
 def _real_time(runs: dict[str, list[Run]]) -> Iterator[Ratio]:
@@ -160,13 +220,13 @@ def _real_time(runs: dict[str, list[Run]]) -> Iterator[Ratio]:
             yield ratio(group, f'{name}: CPU', _NULL, cpu[name], cpu[_NULL])
 
 
-def _rates(runs: dict[str, list[Run]]) -> Iterator[Ratio]:
+def _rates(group: str, runs: dict[str, list[Run]]) -> Iterator[Ratio]:
     rate = {name: np.array([_STEPS / r.elapsed for r in each]) for name, each in runs.items()}
     for name in runs:
         if name != _NULL:
             note = f'{np.median(rate[name]):.0f} steps a second here'
             what = f'{name}: steps a second'
-            yield ratio('node, lock-step', what, _NULL, rate[name], rate[_NULL], note)
+            yield ratio(group, what, _NULL, rate[name], rate[_NULL], note)
 
 
 @contextmanager

@@ -20,14 +20,10 @@ from blf_dsc_controller.bags import topics
 from blf_dsc_controller.nodes.endpoints import profile
 
 
-def main() -> None:
-    """Answer every joint state with the same torque until the process is ended."""
-    rclpy.init(args=sys.argv)
-    node = rclpy.create_node('blf_dsc_controller')
-    executor = EventsExecutor()
-    executor.add_node(node)
+def echo(node: Any, kind: str) -> None:
+    """Let a node answer every joint state with the same torque, `typed` or `raw`."""
     publisher = node.create_publisher(
-        Float64MultiArray, topics.COMMANDS.name, profile(topics.COMMANDS.offered)
+        Float64MultiArray, topics.COMMANDS.relative, profile(topics.COMMANDS.offered)
     )
     answer = Float64MultiArray(data=[1.0, 2.0])
     serialised = serialize_message(answer)
@@ -43,10 +39,19 @@ def main() -> None:
     node.create_subscription(
         JointState,
         topics.JOINT_STATES.relative,
-        callbacks[sys.argv[1]],
+        callbacks[kind],
         profile(topics.JOINT_STATES.requested),
-        raw=sys.argv[1] == 'raw',
+        raw=kind == 'raw',
     )
+
+
+def main() -> None:
+    """Answer until the process is ended."""
+    rclpy.init(args=sys.argv)
+    node = rclpy.create_node(topics.CONTROLLER)
+    echo(node, sys.argv[1])
+    executor = EventsExecutor()
+    executor.add_node(node)
     while True:
         executor.spin_once(timeout_sec=0.1)
 

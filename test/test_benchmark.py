@@ -90,6 +90,27 @@ def test_c_reference_runs_the_same_study(monkeypatch):
     assert montecarlo.disagreement(montecarlo.preset()) < 1e-9
 
 
+def test_node_beside_null_node_in_two_processes_and_in_one(monkeypatch):
+    node = tiny(monkeypatch, 'node', _STEPS=20, _WARM_UP=2, _SETTLING=0.05)
+    monkeypatch.setattr(node, '_PROCESSES', (node._NULL,))
+    played = []
+
+    def counting(group, runs):
+        played.append((group, {name: len(each) for name, each in runs.items()}))
+        return rates(group, runs)
+
+    rates = node._rates
+    monkeypatch.setattr(node, '_rates', counting)
+    assert contestants(list(node.measure())) == [
+        'controller, telemetry off: steps a second',
+        'controller, telemetry on: steps a second',
+    ]
+    assert played == [
+        ('node, lock-step', {node._NULL: 1}),
+        ('node and arm in one process, lock-step', dict.fromkeys(node._GUESTS, 1)),
+    ]
+
+
 def test_recorder_beside_raw_subscriber(monkeypatch):
     sizes = {'_TOPICS': 2, '_MESSAGES': 20, '_SETTLING': 0.0, '_RECORDERS': {'recorder': 'none'}}
     recording = tiny(monkeypatch, 'recording', **sizes)
