@@ -12,10 +12,10 @@ import recorded_run
 from blf_dsc_controller.assembly import controller_of, estimate_names
 from blf_dsc_controller.bags import context as contexts
 from blf_dsc_controller.bags.batch import decode_joint_states
-from blf_dsc_controller.bags.content import read_content
+from blf_dsc_controller.bags.content import Content, Recorded, read_content
 from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.decoders import JointStateDecoder
-from blf_dsc_controller.bags.encoders import JointStateEncoder
+from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.bags.errors import (
     NoConfigurationError,
     OtherVersionError,
@@ -35,9 +35,11 @@ from blf_dsc_controller.bags.types import typestore
 from blf_dsc_controller.configuration.dump import text
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.replay.comparison import Commands, compare
 from blf_dsc_controller.replay.errors import NothingToCompareError
 from blf_dsc_controller.replay.open_loop import answer
 from blf_dsc_controller.replay.recorded import replay
+from blf_dsc_controller.replay.states import States
 from blf_dsc_controller.safety.tuning import transfer
 
 START = 1_000_000_000  # ns
@@ -334,3 +336,25 @@ def test_the_bag_of_another_robot_is_told_by_its_joints(entries, rewritten):
         foreign.append([topic, type_name, at, told])
     with pytest.raises(UnreadableMessageError, match=r"'joint1' is not in .*names wheel, arm"):
         replay(rewritten(foreign))
+
+
+@pytest.mark.parametrize('in_step', [True, False])
+def test_a_safe_torque_that_does_not_match_may_be_another_states_in_real_time(in_step):
+    """Of four commands the law's are two; the last is of a state that the replay does not know."""
+    torque = np.arange(8.0).reshape(4, 2)
+    encoder = Float64MultiArrayEncoder(2)
+    raw = [encoder.encode(row) for row in (*torque[:3], torque[3] + 1.0)]
+    content = Content({COMMANDS: Recorded(COMMANDS.resolved, COMMANDS.type, [0] * 4, raw)}, {})
+    of_law = np.array([True, True, False, False])
+    stamp = START + np.arange(4) * MILLISECOND
+    commands = Commands(stamp, torque, of_law, 4, '', in_step)
+    states = States(stamp[:2], torque[:2])
+    columns = {COMMANDS: {'effort of joint1': torque[:2, 0], 'effort of joint2': torque[:2, 1]}}
+    (found,) = compare(content, states, columns, (), commands)
+    if in_step:
+        assert found.difference.stamp == stamp[3]
+        assert found.left_out == ''
+    else:
+        assert found.difference is None
+        assert found.values == 2 * 3
+        assert found.left_out.startswith('1 torques from one on that does not match')

@@ -275,3 +275,26 @@ def test_a_stop_that_only_one_of_the_two_makes_is_a_difference(
 
     outcome = replay(rewritten(stopped, configure=configure))
     assert outcome.difference.field.startswith(departure)
+
+
+def test_a_stop_for_silence_leaves_its_torques_out_and_the_law_is_followed_again(tmp_path):
+    run = Recording(tmp_path / 'bag', safety__watchdog='on', safety__state_timeout=0.2, **DAMPED)
+    run.run(50)
+    deactivate(run.ros, run.arm)
+    run.ros.until(lambda: run.law.stopped)
+    silent = run.law.guard.last_stamp
+    activate(run.ros, run.arm)
+    run.run(20)
+    run.ros.reset(run.law)
+    run.run(50)
+    outcome = replay(run.end())
+    assert outcome.difference is None
+    assert outcome.done[0].startswith(
+        'replayed in turn: activate, safe stop (state timeout), reset'
+    )
+    (commands,) = [one for one in outcome.comparisons if one.topic == COMMANDS.resolved]
+    assert 'state timeout' in commands.left_out
+    before = np.count_nonzero(outcome.states.stamp <= silent)
+    assert commands.values == 2 * before
+    assert outcome.states.stamp.size >= before + 30
+    assert compared(outcome)['tracking_error'] == 6 * outcome.states.stamp.size

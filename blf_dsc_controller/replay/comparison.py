@@ -137,12 +137,15 @@ def _compare_commands(
         return Comparison(recorded.name, 0, None, f'they are not {len(fields)} values each')
     compared = min(count, commands.known)
     left_out = _left_out(values, commands)
-    if not commands.in_step and not _alike(values[:compared], commands.torque[:compared]).all():
-        compared = sure
-        left_out = (
-            f'{count - sure} torques from the first stop or deactivation on, which do not match: '
-            'in real time a state may have been missed'
-        )
+    if not commands.in_step:
+        alike = _alike(values[sure:compared], commands.torque[sure:compared]).all(axis=1)
+        if not alike.all():
+            compared = sure + int(np.argmin(alike))
+            left_out = (
+                f'{count - compared} torques from one on that does not match after a stop or '
+                'deactivation: in real time a state may have been missed there, or the watch on '
+                'the steady clock have spoken'
+            )
     columns = dict(zip(fields, commands.torque[:compared].T, strict=True))
     moments = States(commands.stamp[:compared], commands.torque[:compared])
     return _compare(

@@ -135,7 +135,7 @@ class _Run:
             self._log.commanded(stamp, guard.answer(stamp, self._came.measurement[k]))
         elif self._told is None or (stamp in self._told and stamp != self._log.last):
             self._answer(k, stamp)
-        elif self._queue and isinstance(self._queue[0], Stop) and self._queue[0].after == stamp:
+        elif self._is_stop_by(stamp):
             self._log.commanded(stamp, guard.answer(stamp, self._came.measurement[k]))
         else:
             self._passed_over += 1
@@ -153,7 +153,8 @@ class _Run:
             self._log.answered(k, stamp, torque)
             return
         self._log.commanded(stamp, torque)
-        if self._told is not None:
+        # A state that led to a stop may come once more, after a reset, and be answered then.
+        if self._told is not None and not self._is_stop_by(stamp):
             self._departure = self._difference(f'answered ({guard.supervisor.text})', stamp)
 
     def _is_obstructed(self, stamp: int) -> bool:
@@ -180,6 +181,10 @@ class _Run:
         phase = self._guard.supervisor.phase
         return phase is Phase.SAFE_STOP or phase is Phase.INACTIVE
 
+    def _is_stop_by(self, stamp: int) -> bool:
+        head = self._queue[0] if self._queue else None
+        return isinstance(head, Stop) and head.after == stamp
+
     def _is_stop_by_message(self) -> bool:
         head = self._queue[0] if self._queue else None
         if not isinstance(head, Stop) or head.reason not in UNREADABLE:
@@ -192,6 +197,8 @@ class _Run:
             stamp = self._guard.last_seen
         while self._queue and self._queue[0].after == stamp and self._departure is None:
             head = self._queue[0]
+            if k + 1 in self._came.errors and self._came.received[k + 1] < head.told:
+                return  # that message has no stamp to tell whether it came before, but came first
             if isinstance(head, Stop) and head.reason not in SILENT:
                 if self._guard.supervisor.phase is not Phase.SAFE_STOP:
                     return  # the next message of this stamp may be what leads to it

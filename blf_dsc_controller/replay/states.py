@@ -97,11 +97,13 @@ class Arrivals:
         stamp: of each [ns]; 0 where the message cannot be read.
         measurement: (N, 3 n) as in `States`.
         errors: why a message cannot be read, by its number.
+        received: when the recorder got each [ns].
     """
 
     stamp: list[int]
     measurement: Floats
     errors: Mapping[int, MessageError]
+    received: list[int]
 
 
 def arrivals(
@@ -119,7 +121,7 @@ def arrivals(
         stamp, values = decode_joint_states(taken, joints, required)
     except UnreadableMessageError:
         return _one_by_one(taken, joints, required)
-    return Arrivals(stamp.tolist(), values.reshape(count, -1), {})
+    return Arrivals(stamp.tolist(), values.reshape(count, -1), {}, taken.received)
 
 
 def _one_by_one(recorded: Recorded, joints: Sequence[str], required: Sequence[str]) -> Arrivals:
@@ -135,4 +137,4 @@ def _one_by_one(recorded: Recorded, joints: Sequence[str], required: Sequence[st
             errors[k] = error
     if len(errors) == len(recorded.raw):
         raise UnreadableMessageError(recorded.name, 0, errors[0])
-    return Arrivals(stamp, measurement, errors)
+    return Arrivals(stamp, measurement, errors, recorded.received)

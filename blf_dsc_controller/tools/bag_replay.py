@@ -13,6 +13,7 @@ import numpy as np
 
 from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.name_map import NameMap
+from blf_dsc_controller.bags.topics import COMMANDS
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.params_file import load, locate
@@ -153,7 +154,10 @@ def _told(outcome: Outcome) -> Iterator[str]:
         yield f'{outcome.states.passed_over} states passed over: the controller did not answer them'
     yield from (f'note: {remark}' for remark in outcome.remarks)
     if outcome.difference is None:
-        yield 'bit-equal: the controller says again what the bag holds'
+        commands = [one for one in outcome.comparisons if one.topic.endswith(COMMANDS.leaf)]
+        is_whole = not any(one.left_out for one in commands)
+        held = 'what the bag holds' if is_whole else 'what could be compared, which is not all'
+        yield f'bit-equal: the controller says again {held}'
     else:
         yield f'DIFFERENT, first at {outcome.difference}'
 
