@@ -28,8 +28,8 @@ from blf_dsc_controller.montecarlo.study_file import load_study
 
 _DURATION = 10.0  # s
 _RUNS = 50  # of each round beside C
-_CHUNKS = 40  # of each round of the engine
-_CHUNK = 10  # runs
+_CHUNKS = 100  # of each round of the engine
+_CHUNK = 4  # runs, few: who ends first waits for at most one chunk of the other
 _ROUNDS = 9
 _C = 'C -O3, in a loop'
 _PACKAGE = 'run_chunk'
