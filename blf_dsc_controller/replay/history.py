@@ -24,6 +24,14 @@ from blf_dsc_controller.safety.reasons import Operation, Phase, Reason
 
 TRAJECTORY = 'trajectory'
 PARAMETERS = 'parameters'
+SILENT = frozenset((Reason.STATE_TIMEOUT, Reason.FAILED))
+"""Reasons that lie in no joint state."""
+
+UNREADABLE = frozenset(
+    (Reason.BAD_MESSAGE, Reason.JOINT_MISSING, Reason.JOINT_DUPLICATED, Reason.FIELD_MISSING)
+)
+"""Reasons that lie in a message without a stamp."""
+
 OUT_OF_ORDER = frozenset((Reason.STAMP_BACKWARD, Reason.STAMP_MISSING))
 """Reasons that lie in a stamp which says nothing of the order in time."""
 

@@ -20,20 +20,20 @@ from blf_dsc_controller.bags.topics import FOREVER, TRACKING_ERROR
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.motion.errors import TrajectoryError
 from blf_dsc_controller.replay.comparison import Commands, Difference
-from blf_dsc_controller.replay.history import OUT_OF_ORDER, Event, History, Order, Stop
+from blf_dsc_controller.replay.history import (
+    OUT_OF_ORDER,
+    SILENT,
+    UNREADABLE,
+    Event,
+    History,
+    Order,
+    Stop,
+)
 from blf_dsc_controller.replay.law import Replayed
 from blf_dsc_controller.replay.log import Log
 from blf_dsc_controller.replay.states import Arrivals, States
 from blf_dsc_controller.safety.guard import Guard
-from blf_dsc_controller.safety.reasons import Phase, Reason
-
-SILENT = frozenset((Reason.STATE_TIMEOUT, Reason.FAILED))
-"""Reasons that lie in no joint state."""
-
-UNREADABLE = frozenset(
-    (Reason.BAD_MESSAGE, Reason.JOINT_MISSING, Reason.JOINT_DUPLICATED, Reason.FIELD_MISSING)
-)
-"""Reasons that lie in a message without a stamp."""
+from blf_dsc_controller.safety.reasons import Phase
 
 
 @dataclass(frozen=True)
