@@ -145,3 +145,14 @@ def test_model_names_its_parameters():
     assert MODEL.parameter_names == ('(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2')
     assert (MODEL.n, MODEL.p) == (2, 3)
     assert models.two_link_arm(0.5, 9.8).constants == (19.6,)
+
+
+@pytest.mark.parametrize('model', [MODEL, models.planar_arm(3, 1.0, 9.8)], ids=['two', 'chain'])
+def test_both_regressors_at_once_are_each_of_them(random, model):
+    q, dq, v, a = random.normal(size=(4, model.n))
+    constants, shape = np.array(model.constants), (model.n, model.p)
+    each, both = np.full((2, 3, *shape), np.nan)
+    models.regressor(model.code, constants, q, dq, v, a, each[0])
+    models.momentum_regressor(model.code, constants, q, dq, each[1], each[2])
+    models.regressors(model.code, constants, q, dq, v, a, *both)
+    np.testing.assert_array_equal(both, each)

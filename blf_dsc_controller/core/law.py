@@ -24,7 +24,7 @@ from blf_dsc_controller.core import (
 )
 from blf_dsc_controller.core.borrowed import part
 from blf_dsc_controller.core.kernel import inner
-from blf_dsc_controller.core.settings import EFFORT, LINEAR, Settings
+from blf_dsc_controller.core.settings import EFFORT, FILTERED, LINEAR, Settings
 from blf_dsc_controller.core.state import Signals, State
 
 
@@ -93,6 +93,19 @@ def track(
         filtered_surface(settings, state, signals, dt)
     for i in range(settings.n):
         signals.xi2[i] = dq[i] - state.alpha2[i]
+
+
+@inner
+def regress(
+    settings: Settings, state: State, signals: Signals, q: np.ndarray, dq: np.ndarray
+) -> None:
+    """H(q, dq, alpha2, alpha2') and, for the prediction that needs them, Yp and Yr."""
+    model, constants, H = settings.model, settings.constants, signals.H
+    if settings.prediction != FILTERED:
+        models.regressor(model, constants, q, dq, state.alpha2, signals.dalpha2, H)
+        return
+    Yp, Yr = signals.momentum, signals.rest
+    models.regressors(model, constants, q, dq, state.alpha2, signals.dalpha2, H, Yp, Yr)
 
 
 @inner
@@ -185,9 +198,7 @@ def answer(
     known_disturbance(settings, signals, t)
     funnel.narrow(settings, signals, t)
     track(settings, state, signals, dt, q, dq)
-    models.regressor(
-        settings.model, settings.constants, q, dq, state.alpha2, signals.dalpha2, signals.H
-    )
+    regress(settings, state, signals, q, dq)
     learn(settings, state, signals, t, dt, q, dq, applied)
     command(settings, state, signals)
     saturated = limits.cut_torque(settings, state, signals, dt)

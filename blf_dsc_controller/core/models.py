@@ -82,3 +82,23 @@ def momentum_regressor(
         two_link.momentum_regressor(constants, q, dq, Yp, Yr)
     else:
         planar_chain.momentum_regressor(constants, q, dq, Yp, Yr)
+
+
+@inner
+def regressors(
+    code: int,
+    constants: np.ndarray,
+    q: np.ndarray,
+    dq: np.ndarray,
+    v: np.ndarray,
+    a: np.ndarray,
+    H: np.ndarray,
+    Yp: np.ndarray,
+    Yr: np.ndarray,
+) -> None:
+    """`regressor` and `momentum_regressor` of one state."""
+    if code == TWO_LINK:
+        two_link.regressors(constants, q, dq, v, a, H, Yp, Yr)
+    else:
+        planar_chain.regressor(constants, q, dq, v, a, H)
+        planar_chain.momentum_regressor(constants, q, dq, Yp, Yr)

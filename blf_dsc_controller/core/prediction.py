@@ -130,7 +130,8 @@ def form_row(
     Args:
         settings: the law's settings.
         state: the law's state.
-        signals: of this sample: H, alpha2', xi2 and the columns D are read.
+        signals: of this sample: H, alpha2', xi2, the columns D and, where they are needed, Yp and
+            Yr are read.
         dt: length of the interval [s].
         q: joint positions (n,) [rad].
         dq: joint velocities (n,) [rad/s].
@@ -140,9 +141,6 @@ def form_row(
         differentiate(settings, state, signals, dt)
         accelerated_row(settings, state, signals, q, dq, torque)
         return
-    models.momentum_regressor(
-        settings.model, settings.constants, q, dq, signals.momentum, signals.rest
-    )
     if state.samples[0] > 0.0:
         filter_row(settings, state, signals, dt, torque)
     remember(settings, state, signals)

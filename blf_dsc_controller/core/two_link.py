@@ -20,6 +20,16 @@ JOINTS = 2
 PARAMETER_NAMES = ('(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2')
 
 
+Angles = tuple[float, float, float, float]
+"""cos q1, cos q2, sin q2, cos(q1 + q2)."""
+
+
+@inner
+def angles_of(q: np.ndarray) -> Angles:
+    """Sines and cosines that the regressors are made of."""
+    return cos(q[0]), cos(q[1]), sin(q[1]), cos(q[0] + q[1])
+
+
 @inner
 def regressor(
     constants: np.ndarray,
@@ -30,11 +40,16 @@ def regressor(
     H: np.ndarray,
 ) -> None:
     """Fill H (2 x 3) so that H P = M(q) a + C(q, dq) v + G(q)   [N m], Property III."""
-    r = constants[0]
-    c2 = cos(q[1])
-    s2 = sin(q[1])
-    c12 = cos(q[0] + q[1])
-    H[0, 0] = a[0] + r * cos(q[0])
+    fill_regressor(constants[0], angles_of(q), dq, v, a, H)
+
+
+@inner
+def fill_regressor(
+    r: float, angles: Angles, dq: np.ndarray, v: np.ndarray, a: np.ndarray, H: np.ndarray
+) -> None:
+    """`regressor` from the angles' sines and cosines."""
+    c1, c2, s2, c12 = angles
+    H[0, 0] = a[0] + r * c1
     H[0, 1] = a[0] + a[1]
     H[0, 2] = c2 * (2.0 * a[0] + a[1]) - s2 * (dq[1] * v[0] + (dq[0] + dq[1]) * v[1]) + r * c12
     H[1, 0] = 0.0
@@ -50,21 +65,44 @@ def momentum_regressor(
 
     Then d/dt(Yp P) + Yr P = tau - tau_dist: the dynamics without the acceleration.
     """
-    r = constants[0]
-    c2 = cos(q[1])
-    c12 = cos(q[0] + q[1])
+    fill_momentum_regressor(constants[0], angles_of(q), dq, Yp, Yr)
+
+
+@inner
+def fill_momentum_regressor(
+    r: float, angles: Angles, dq: np.ndarray, Yp: np.ndarray, Yr: np.ndarray
+) -> None:
+    """`momentum_regressor` from the angles' sines and cosines."""
+    c1, c2, s2, c12 = angles
     Yp[0, 0] = dq[0]
     Yp[0, 1] = dq[0] + dq[1]
     Yp[0, 2] = c2 * (2.0 * dq[0] + dq[1])
     Yp[1, 0] = 0.0
     Yp[1, 1] = dq[0] + dq[1]
     Yp[1, 2] = c2 * dq[0]
-    Yr[0, 0] = r * cos(q[0])
+    Yr[0, 0] = r * c1
     Yr[0, 1] = 0.0
     Yr[0, 2] = r * c12
     Yr[1, 0] = 0.0
     Yr[1, 1] = 0.0
-    Yr[1, 2] = sin(q[1]) * dq[0] * (dq[0] + dq[1]) + r * c12
+    Yr[1, 2] = s2 * dq[0] * (dq[0] + dq[1]) + r * c12
+
+
+@inner
+def regressors(
+    constants: np.ndarray,
+    q: np.ndarray,
+    dq: np.ndarray,
+    v: np.ndarray,
+    a: np.ndarray,
+    H: np.ndarray,
+    Yp: np.ndarray,
+    Yr: np.ndarray,
+) -> None:
+    """Both regressors from one computation of the sines and cosines, which cost most of them."""
+    angles = angles_of(q)
+    fill_regressor(constants[0], angles, dq, v, a, H)
+    fill_momentum_regressor(constants[0], angles, dq, Yp, Yr)
 
 
 @inner
