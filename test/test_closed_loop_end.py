@@ -78,7 +78,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_loop(tmp_path, mode, duratio
         recorded = closed_loop(*run, disk / 'out')
         assert recorded.returncode == 1
         said = recorded.stderr
-        assert 'bag_recorder has ended: the loop goes on and is no longer recorded' in said
+        assert 'bag_recorder has ended: the loop goes on and is not recorded' in said
         assert 'bag_recorder ended with exit code 1 while the loop went on without it' in said
         assert said.count('the disk is full') == 1
         assert f'what was recorded until then is in {disk / "out" / "bag"}' in said

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import os
+import time
+from math import inf
 from pathlib import Path
 
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER
@@ -19,6 +21,7 @@ _MODULES = {
     CONTROLLER: 'blf_dsc_controller.nodes.controller_node',
     PLANT: 'sim_plant.node',
 }
+_PATIENCE = 5.0  # s, at most, until a loop that runs is seen to do so, also on a busy machine
 
 
 def run_session(plant: PlantConfig, out: Path, domain: int) -> bool:
@@ -61,20 +64,22 @@ def run_session(plant: PlantConfig, out: Path, domain: int) -> bool:
 def _watch(plant: PlantConfig, nodes: list[NodeProcess], interruption: Interruption) -> str:
     """Watch over the nodes until the plant ends; return what is to be said of the recorder's end.
 
-    A loop that has begun goes on without its recorder.
+    A loop that has begun goes on without its recorder; its first sign may come a little later.
     """
     from blf_dsc_controller.tools.watch import Watch
 
     recorder, *loop = nodes
-    remark = ''
+    ended, said = inf, False
     with Watch(plant) as watch:
         while loop[-1].is_running and not interruption.came:
             for node in loop:
                 node.check()
-            if not watch.has_begun:
-                recorder.check()
-            elif not (recorder.is_running or remark):
-                remark = ' while the loop went on without it'
-                watch.say(f'{recorder.name} has ended: the loop goes on and is no longer recorded')
+            if not recorder.is_running:
+                ended = min(ended, time.monotonic())
+                if watch.has_begun and not said:
+                    said = True
+                    watch.say(f'{recorder.name} has ended: the loop goes on and is not recorded')
+                if not watch.has_begun and time.monotonic() > ended + _PATIENCE:
+                    recorder.check()
             watch.wait(0.1)
-    return remark
+    return '' if recorder.is_running else ' while the loop went on without it'
