@@ -4,13 +4,16 @@
 This process plays the arm: it publishes the joint states of a recorded run and takes the torques.
 Every contestant is started anew in each round: a process of its own, or a node of this process, on
 the arm's executor.
+
+There are two null nodes: one as users of rclpy write it, and one that passes serialised messages
+without a look at them, which is the least that Python can do.
 """
 
 from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -36,8 +39,8 @@ _START = 1_000_000_000
 _SETTLING = 0.5  # s until both sides have found each other, or a message has come
 _PATIENCE = 10.0  # s for one torque
 _GREETINGS = 40
-_NULL = 'null node'
-_NULL_TYPED = 'null node, typed messages'
+_NULL = 'null node, serialised messages'
+_NULL_TYPED = 'null node'
 _QUIET = 'controller, telemetry off'
 _TELLING = 'controller, telemetry on'
 _RECORDED = 'controller, telemetry and recorder on'
@@ -229,20 +232,24 @@ def _real_time(runs: dict[str, list[Run]]) -> Iterator[Ratio]:
         for name, each in runs.items()
     }
     cpu = {name: np.array([r.cpu for r in each]) for name, each in runs.items()}
-    for name in runs:
-        if name != _NULL:
-            yield ratio(group, f'{name}: median latency', _NULL, median[name], median[_NULL])
-            yield ratio(group, f'{name}: p99.9 latency', _NULL, tail[name], tail[_NULL])
-            yield ratio(group, f'{name}: CPU', _NULL, cpu[name], cpu[_NULL])
+    for name, base in _pairs(runs):
+        yield ratio(group, f'{name}: median latency', base, median[name], median[base])
+        yield ratio(group, f'{name}: p99.9 latency', base, tail[name], tail[base])
+        yield ratio(group, f'{name}: CPU', base, cpu[name], cpu[base])
 
 
 def _rates(group: str, runs: dict[str, list[Run]]) -> Iterator[Ratio]:
     rate = {name: np.array([_STEPS / r.elapsed for r in each]) for name, each in runs.items()}
-    for name in runs:
-        if name != _NULL:
-            note = f'{np.median(rate[name]):.0f} steps a second here'
-            what = f'{name}: steps a second'
-            yield ratio(group, what, _NULL, rate[name], rate[_NULL], note)
+    for name, base in _pairs(runs):
+        note = f'{np.median(rate[name]):.0f} steps a second here'
+        yield ratio(group, f'{name}: steps a second', base, rate[name], rate[base], note)
+
+
+def _pairs(runs: Collection[str]) -> Iterator[tuple[str, str]]:
+    """Each contestant beside each null node."""
+    for base in (_NULL_TYPED, _NULL):
+        if base in runs:
+            yield from ((name, base) for name in runs if name not in (_NULL_TYPED, _NULL))
 
 
 @contextmanager
