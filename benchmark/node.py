@@ -11,6 +11,7 @@ without a look at them, which is the least that Python can do.
 
 from __future__ import annotations
 
+import gc
 import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -105,7 +106,7 @@ class Arm:
         self.executor.add_node(self.node)
         states, commands = topics.JOINT_STATES, topics.COMMANDS
         self.commands = commands.relative
-        self.publisher = self.node.create_publisher(
+        self.publisher: Any = self.node.create_publisher(
             message_class(states.type), states.name, profile(states.offered)
         )
         self.node.create_subscription(
@@ -184,12 +185,15 @@ class Arm:
             self.executor.remove_node(guest.node)
             self.executor.spin_once(timeout_sec=0.1)  # what was on its way to the node runs out
             guest.node.destroy_node()
+            guest.node = None
 
     def close(self) -> None:
-        """End the arm's node."""
+        """End the arm's node, and leave no participant to be heard in a later round."""
         self.executor.remove_node(self.node)
         self.node.destroy_node()
         self.context.try_shutdown()
+        self.node = self.publisher = self.executor = None
+        gc.collect()
 
     def left_alone(self) -> None:
         """Wait until the last contestant has gone."""

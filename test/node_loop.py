@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 
 import numpy as np
@@ -77,6 +78,10 @@ class NodeLoop:
             self.executor.remove_node(node)
             node.destroy_node()
         self.context.try_shutdown()
+        # A node's services hold its participant until it is collected, for others to hear.
+        self.nodes.clear()
+        self.tester = self.executor = None
+        gc.collect()
 
 
 class Arm:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from functools import partial
 
@@ -44,9 +45,13 @@ class RosRig:
         return node
 
     def close(self):
-        for node in list(self.nodes):
-            self.kill(node)
+        while self.nodes:
+            self.kill(self.nodes[-1])
         rclpy.try_shutdown(context=self.context)
+        # A node's services hold its participant until it is collected, for others to hear.
+        self.tester = self.executor = None
+        self._clients.clear()
+        gc.collect()
 
     def kill(self, node):
         """End a node without a word to the others."""
