@@ -34,7 +34,7 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*', 'sim_plant', 'sim_plant.*']),
-    package_data={NAME: ['py.typed', 'reports/page/page.*'], 'sim_plant': ['py.typed']},
+    package_data={NAME: ['py.typed', 'analysis/page_template/page.*'], 'sim_plant': ['py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (SHARE, ['package.xml']),
@@ -65,7 +65,7 @@ setup(
             'ros-jazzy-rosgraph-msgs',
             'ros-jazzy-ament-index-python',
         ],
-        # To tune the compared laws again (blf_dsc_controller.study.tune); running needs none of it.
+        # To tune the compared laws again (blf_dsc_controller.paper.tune); running needs none of it.
         'study': ['scipy>=1.15'],
         # Only for `monte_carlo`: its results are Parquet files; a robot has no use for 50 MB more.
         'monte-carlo': ['pyarrow'],
@@ -90,23 +90,30 @@ setup(
         # The peers that `make bench` compares with; Octave and a C compiler are the system's.
         'bench': ['mujoco', 'drake', 'pin', 'scipy'],
         # Fixed, because with nearly every rule on, each release of the linter finds something new.
-        'lint': ['ruff~=0.17.5', 'mypy~=2.4.1', 'types-PyYAML', 'types-tqdm', 'pre-commit'],
+        'lint': [
+            'ruff~=0.17.5',
+            'mypy~=2.4.1',
+            'types-PyYAML',
+            'types-tqdm',
+            'pre-commit',
+            'import-linter',
+        ],
     },
     entry_points={
         'console_scripts': [
-            'sim_plant = blf_dsc_controller.tools.entry:sim_plant',
-            'blf_dsc_controller = blf_dsc_controller.tools.entry:blf_dsc_controller',
-            'arm_markers = blf_dsc_controller.tools.entry:arm_markers',
-            'bag_recorder = blf_dsc_controller.tools.entry:bag_recorder',
-            'closed_loop = blf_dsc_controller.tools.closed_loop:main',
-            'bag_replay = blf_dsc_controller.tools.bag_replay:main',
-            'bag_recover = blf_dsc_controller.tools.bag_recover:main',
-            'bag_report = blf_dsc_controller.tools.bag_report:main',
-            'bag_export = blf_dsc_controller.tools.bag_export:main',
-            'bag_plot = blf_dsc_controller.tools.bag_plot:main',
-            'excite = blf_dsc_controller.tools.excite:main',
-            'paper_study = blf_dsc_controller.tools.paper_study:main',
-            'monte_carlo = blf_dsc_controller.tools.monte_carlo:main',
+            'sim_plant = blf_dsc_controller.cli.entry:sim_plant',
+            'blf_dsc_controller = blf_dsc_controller.cli.entry:blf_dsc_controller',
+            'arm_markers = blf_dsc_controller.cli.entry:arm_markers',
+            'bag_recorder = blf_dsc_controller.cli.entry:bag_recorder',
+            'closed_loop = blf_dsc_controller.cli.closed_loop:main',
+            'bag_replay = blf_dsc_controller.cli.bag_replay:main',
+            'bag_recover = blf_dsc_controller.cli.bag_recover:main',
+            'bag_report = blf_dsc_controller.cli.bag_report:main',
+            'bag_export = blf_dsc_controller.cli.bag_export:main',
+            'bag_plot = blf_dsc_controller.cli.bag_plot:main',
+            'excite = blf_dsc_controller.cli.excite:main',
+            'paper_study = blf_dsc_controller.cli.paper_study:main',
+            'monte_carlo = blf_dsc_controller.cli.monte_carlo:main',
         ],
     },
     # The digest of the compiled kernels' cache is taken over the source files on disk.

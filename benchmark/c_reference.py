@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.assembly import settings_of_config
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from sim_plant.configuration import PlantConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.law.factory import settings_of_config
 from sim_plant.sensors import generator
 
 SOURCE = Path(__file__).with_name('reference.c')

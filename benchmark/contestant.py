@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Protocol
 
+from blf_dsc_controller.cli.domain import own_domain
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.tools.domain import own_domain
 
 _START_UP = 120.0  # s, kernels may have to be compiled
 _ENDING = 20.0  # s from SIGINT to the end

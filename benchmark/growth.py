@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from timing import Ratio, interleaved, ratio
 
-from blf_dsc_controller.assembly import controller_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, flatten, parameters
-from blf_dsc_controller.core.controller import Controller
-from blf_dsc_controller.core.reference import sampled
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.reference.terms import sampled
 
 _ROUNDS = 9
 _UPDATES = 2000

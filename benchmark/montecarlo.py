@@ -17,14 +17,14 @@ import numpy as np
 from c_reference import Reference
 from timing import Ratio, interleaved, ratio
 
-from blf_dsc_controller.assembly import controller_of
 from blf_dsc_controller.configuration.params_file import locate
-from blf_dsc_controller.montecarlo import engines
-from blf_dsc_controller.montecarlo.chunk import run_chunk, warm_up
-from blf_dsc_controller.montecarlo.computation import compute
-from blf_dsc_controller.montecarlo.store import Span
-from blf_dsc_controller.montecarlo.study import Study, draw, origin_of, plant_of_draw
-from blf_dsc_controller.montecarlo.study_file import load_study
+from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.monte_carlo import executors as engines
+from blf_dsc_controller.monte_carlo.chunk import run_chunk, warm_up
+from blf_dsc_controller.monte_carlo.computation import compute
+from blf_dsc_controller.monte_carlo.store import Span
+from blf_dsc_controller.monte_carlo.study import Study, draw, origin_of, plant_of_draw
+from blf_dsc_controller.monte_carlo.study_file import load_study
 
 _DURATION = 10.0  # s
 _RUNS = 50  # of each round beside C

@@ -24,14 +24,14 @@ import numpy as np
 from contestant import Contestant, ContestantError, Watched, own_graph, wait_for
 from timing import Ratio, ratio
 
-from blf_dsc_controller.bags import topics
-from blf_dsc_controller.bags.telemetry import PlantTelemetry
+from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.dump import dump
 from blf_dsc_controller.configuration.nodes import CONTROLLER
-from blf_dsc_controller.core.two_link import PARAMETER_NAMES
-from blf_dsc_controller.simulation import simulate
-from sim_plant.configuration import PlantConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.telemetry import PlantTelemetry
+from blf_dsc_controller.simulation.loop import simulate
 
 _ROUNDS = 5
 _STEPS = 5000

@@ -16,7 +16,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from blf_dsc_controller.bags import topics
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.endpoints import profile
 
 

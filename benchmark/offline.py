@@ -15,7 +15,7 @@ from peers import loops
 from peers.octave import octave_loop
 from timing import Ratio, interleaved, ratio
 
-from blf_dsc_controller.simulation import simulate
+from blf_dsc_controller.simulation.loop import simulate
 
 GROUP = 'closed loop offline'
 PACKAGE = 'blf_dsc_controller'

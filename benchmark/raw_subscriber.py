@@ -12,9 +12,9 @@ import rclpy
 from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import JointState
 
-from blf_dsc_controller.bags.topics import STREAM
 from blf_dsc_controller.configuration.recorder import RecorderConfig
-from blf_dsc_controller.nodes.intake import requested
+from blf_dsc_controller.messages.topics import STREAM
+from blf_dsc_controller.nodes.raw_subscriptions import requested
 
 
 def main() -> None:

@@ -13,8 +13,8 @@ import numpy as np
 from contestant import Contestant, own_graph, wait_for
 from timing import Ratio, ratio
 
-from blf_dsc_controller.bags.encoders import JointStateEncoder
-from blf_dsc_controller.bags.topics import STREAM
+from blf_dsc_controller.messages.encoders import JointStateEncoder
+from blf_dsc_controller.messages.topics import STREAM
 
 _ROUNDS = 5
 _TOPICS = 5

@@ -12,11 +12,11 @@ from mcap.reader import make_reader
 from timing import Ratio, interleaved, ratio
 
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.bags.offline import write_bag
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.replay.recorded import replay
-from blf_dsc_controller.simulation import simulate
-from sim_plant.configuration import PlantConfig
+from blf_dsc_controller.simulation.bag import write_bag
+from blf_dsc_controller.simulation.loop import simulate
 
 _DURATION = 60.0  # s
 _ROUNDS = 5

@@ -14,7 +14,7 @@ import numpy as np
 from contestant import Contestant, own_graph, wait_for
 from timing import Ratio, ratio
 
-from blf_dsc_controller.bags import topics
+from blf_dsc_controller.messages import topics
 
 _ROUNDS = 3
 _NULL = 'null node'
@@ -42,7 +42,7 @@ def _first_torque(name: str, cache: str) -> float:
     import rclpy
     from rclpy.experimental import EventsExecutor
 
-    from blf_dsc_controller.bags.telemetry import PlantTelemetry
+    from blf_dsc_controller.messages.telemetry import PlantTelemetry
     from blf_dsc_controller.nodes.endpoints import message_class, profile
 
     context = rclpy.Context()

@@ -9,11 +9,11 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
+from blf_dsc_controller.arms.two_link_urdf import urdf
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.params_file import load, locate
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.share import config_file
-from blf_dsc_controller.description.urdf import urdf
-from sim_plant.configuration import PlantConfig
 
 PACKAGE = 'blf_dsc_controller'
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.core.kernel import inner
+from blf_dsc_controller.compiled.jit import inner
 
 
 class Actuator(NamedTuple):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from blf_dsc_controller.core.kernel import inner
+from blf_dsc_controller.compiled.jit import inner
 
 DISTURBANCE_TERMS = 7
 

@@ -9,7 +9,7 @@ from typing import Any
 from rclpy.lifecycle import LifecycleNode
 from std_srvs.srv import Trigger
 
-from blf_dsc_controller.bags import topics
+from blf_dsc_controller.messages import topics
 
 _SETTLING = 0.2  # s from having found every peer until they have found this node too
 _PATIENCE = 2.0  # s that a controller may take to answer

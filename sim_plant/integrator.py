@@ -9,9 +9,9 @@ x + h sum_j a_ij k_j, the step ends at x + h sum_i b_i k_i.
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.core.borrowed import part
-from blf_dsc_controller.core.kernel import inner
-from sim_plant.arm import JOINTS, Arm
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.views import part
+from sim_plant.dynamics import JOINTS, Arm
 from sim_plant.motion import motion
 
 RK4 = 0

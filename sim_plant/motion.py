@@ -4,10 +4,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.core.borrowed import part
-from blf_dsc_controller.core.kernel import inner
-from sim_plant.arm import JOINTS, Arm, acceleration
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.views import part
 from sim_plant.disturbance import disturbance_torque
+from sim_plant.dynamics import JOINTS, Arm, acceleration
 
 
 @inner

@@ -24,21 +24,22 @@ from rclpy.timer import Timer
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from blf_dsc_controller.bags import topics
-from blf_dsc_controller.bags.decoders import Float64MultiArrayDecoder
-from blf_dsc_controller.bags.errors import MessageError
-from blf_dsc_controller.bags.telemetry import DECIMATION, Message, PlantTelemetry
-from blf_dsc_controller.core.two_link import PARAMETER_NAMES
-from blf_dsc_controller.description.urdf import urdf
+from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
+from blf_dsc_controller.arms.two_link_urdf import urdf
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder
+from blf_dsc_controller.messages.errors import MessageError
+from blf_dsc_controller.messages.telemetry import DECIMATION, Message, PlantTelemetry
 from blf_dsc_controller.nodes import compilation, executor, parameters, realtime
 from blf_dsc_controller.nodes.endpoints import are_observed, publisher, subscribe
 from blf_dsc_controller.nodes.latency import Latency
-from blf_dsc_controller.nodes.managed import ManagedNode
-from sim_plant.assembly import plant_of, steps_of
-from sim_plant.configuration import PlantConfig
+from blf_dsc_controller.nodes.lifecycle import ManagedNode
+from sim_plant import plant as plant_kernels
+from sim_plant.command_input import Reception
+from sim_plant.factory import plant_of, steps_of
 from sim_plant.handshake import Handshake
-from sim_plant.reception import Reception
-from sim_plant.simulated import Plant
+from sim_plant.sampled import Plant
 from sim_plant.status import PlantStatus
 
 LOCKSTEP_START = 1_000_000_000
@@ -106,7 +107,7 @@ class PlantNode(ManagedNode):
 
     def configure(self) -> None:
         """Put the arm at its start; from the first time on, its topics are there."""
-        if not compilation.is_compiled(*compilation.PLANT):
+        if not compilation.is_compiled(*plant_kernels.KERNELS):
             self.get_logger().info(compilation.NOTICE)
         self.plant = plant_of(self.config)
         self.plant.measure()

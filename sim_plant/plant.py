@@ -11,22 +11,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from blf_dsc_controller.core.borrowed import borrowed, part
-from blf_dsc_controller.core.kernel import inner, kernel
+from blf_dsc_controller.compiled.jit import inner, kernel
+from blf_dsc_controller.compiled.views import borrowed, part
 from blf_dsc_controller.errors import ConfigurationError
 from sim_plant.actuator import Actuator, ActuatorState, actuate, actuator_view
-from sim_plant.arm import ARM_SIZE, Arm, arm_view, parameters
 from sim_plant.disturbance import DISTURBANCE_TERMS, disturbance_torque
+from sim_plant.dynamics import ARM_SIZE, Arm, arm_view, parameters
 from sim_plant.integrator import integrate, scratch_size
-from sim_plant.sensors import (
-    SENSOR_SIZE,
-    Sensor,
-    SensorState,
-    draw,
-    is_noisy,
-    sense,
-    sensor_view,
-)
+from sim_plant.sensors import SENSOR_SIZE, Sensor, SensorState, draw, is_noisy, sense, sensor_view
 
 PARAMETERS = 3
 _SCALARS = 2 + ARM_SIZE + SENSOR_SIZE + 1
@@ -241,3 +233,7 @@ def truth(
     """Write what no sensor tells, (3 + 3n,): [P, tau_dist, q, dq] of this sample."""
     plant, now = plant_of(settings, state)
     reveal(plant, now, out)
+
+
+KERNELS = (observe, step, truth)
+"""What Python calls of a plant; compiled before the node starts."""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.core.kernel import inner
+from blf_dsc_controller.compiled.jit import inner
 
 MEASURED = 0
 DIFFERENCED = 1

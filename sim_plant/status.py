@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 from rclpy.node import Node
 
-from blf_dsc_controller.nodes.board import ERROR, OK, STALE, WARN, Board
-from sim_plant.reception import Reception
+from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, Board
+from sim_plant.command_input import Reception
 
 
 class PlantStatus:

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from closed_loop_case import recommended
 
-from blf_dsc_controller.core.settings import Settings
-from blf_dsc_controller.core.state import (
+from blf_dsc_controller.law.settings import Settings
+from blf_dsc_controller.law.state import (
     Signals,
     State,
     signals_of,

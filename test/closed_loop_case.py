@@ -10,18 +10,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.assembly import settings_of_config
+from blf_dsc_controller.arms import models
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.core import barrier, models, reference
-from blf_dsc_controller.core.controller import Controller
-from blf_dsc_controller.core.settings import Settings, pack
+from blf_dsc_controller.law import barrier
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.law.settings import Settings, pack
+from blf_dsc_controller.reference import terms as reference
 from sim_plant.actuator import Actuator
-from sim_plant.arm import Arm
 from sim_plant.disturbance import disturbance_vector
+from sim_plant.dynamics import Arm
 from sim_plant.integrator import DOPRI5
 from sim_plant.plant import PlantSettings
+from sim_plant.sampled import Plant
 from sim_plant.sensors import DIFFERENCED, MEASURED, Sensor
-from sim_plant.simulated import Plant
 
 T = 1e-3
 P = np.array([1.0, 0.32, 0.4])

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 PATIENCE = 120.0  # s, until a test gives up on what should take seconds
-COMMAND = (sys.executable, '-m', 'blf_dsc_controller.tools.closed_loop')
+COMMAND = (sys.executable, '-m', 'blf_dsc_controller.cli.closed_loop')
 
 
 def closed_loop(*arguments, **options):

@@ -10,15 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.bags.decoders import Float64MultiArrayDecoder, JointStateDecoder
-from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
-from blf_dsc_controller.bags.errors import MessageError
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.safety.guard import Guard
-from sim_plant.assembly import plant_of
-from sim_plant.configuration import PlantConfig
-from sim_plant.reception import Reception
+from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder, JointStateDecoder
+from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.errors import MessageError
+from blf_dsc_controller.supervision.guard import Guard
+from sim_plant.command_input import Reception
+from sim_plant.factory import plant_of
 
 JOINTS = ('joint1', 'joint2')
 MILLISECOND = 1_000_000  # ns

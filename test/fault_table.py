@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from fault_rig import JOINTS, MILLISECOND, Rig
 
-from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
-from blf_dsc_controller.safety.reasons import Phase, Reason
+from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.supervision.reasons import Phase, Reason
 
 LEAD = 40  # samples that run well before the fault
 WATCHED = 120  # samples after it
@@ -300,8 +300,8 @@ def refused(**changes) -> Callable[[Rig], None]:
 
 def replaced(*, possible: bool) -> Callable[[Rig], None]:
     """Another trajectory each 30 ms, before the last one is through; or one that is too fast."""
-    from blf_dsc_controller.motion.errors import TrajectoryError
-    from blf_dsc_controller.motion.trajectory import Point, Request
+    from blf_dsc_controller.reference.errors import TrajectoryError
+    from blf_dsc_controller.reference.trajectory import Point, Request
 
     def inject(rig):
         def sense(state):

@@ -14,14 +14,14 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from blf_dsc_controller.bags import topics
-from blf_dsc_controller.bags.decoders import Float64MultiArrayDecoder, JointStateDecoder
-from blf_dsc_controller.bags.encoders import JointStateEncoder
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder, JointStateDecoder
+from blf_dsc_controller.messages.encoders import JointStateEncoder
 from blf_dsc_controller.nodes.endpoints import message_class, profile
-from blf_dsc_controller.simulation import simulate
-from sim_plant.configuration import PlantConfig
+from blf_dsc_controller.simulation.loop import simulate
 
 PATIENCE = 60.0  # s, until a test gives up on what should take a moment
 JOINTS = ('joint1', 'joint2')

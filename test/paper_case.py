@@ -11,8 +11,8 @@ import numpy as np
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.params_file import load_loop, locate
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.core.sample import sample_of
-from blf_dsc_controller.simulation import simulate
+from blf_dsc_controller.law.sample import sample_of
+from blf_dsc_controller.simulation.loop import simulate
 
 P = np.array([1.0, 0.32, 0.4])
 NO_DISTURBANCE = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}

@@ -4,12 +4,12 @@
 import numpy as np
 
 from sim_plant.actuator import Actuator
-from sim_plant.arm import Arm
 from sim_plant.disturbance import disturbance_vector
+from sim_plant.dynamics import Arm
 from sim_plant.integrator import DOPRI5
 from sim_plant.plant import PlantSettings
+from sim_plant.sampled import Plant
 from sim_plant.sensors import MEASURED, Sensor
-from sim_plant.simulated import Plant
 
 ARM = Arm(l1=1.0, l2=0.8, m1=0.5, m2=0.5, g=9.8)
 ODD_ARM = Arm(l1=0.7, l2=1.1, m1=1.3, m2=0.4, g=9.81)  # no two of its numbers are the same

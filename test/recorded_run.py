@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-from blf_dsc_controller.bags.offline import write_bag
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
 from blf_dsc_controller.configuration.params_file import load_loop, locate
 from blf_dsc_controller.configuration.share import config_file
-from blf_dsc_controller.simulation import simulate
+from blf_dsc_controller.simulation.bag import write_bag
+from blf_dsc_controller.simulation.loop import simulate
 
 # Learns within the second: a window of half a second, which this excites less.
 QUICK = {

@@ -16,7 +16,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from blf_dsc_controller.bags import topics
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import message_class, profile
 from sim_plant.node import PlantNode

@@ -7,7 +7,7 @@ import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from blf_dsc_controller.bags import topics
+from blf_dsc_controller.messages import topics
 
 JOINTS = ('joint1', 'joint2')
 SECOND = 1_000_000_000

@@ -25,11 +25,11 @@ from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from ros_rig import RosRig, activate, deactivate
 
-from blf_dsc_controller.bags import topics
-from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import message_class, profile
-from blf_dsc_controller.safety.reasons import Phase
+from blf_dsc_controller.supervision.reasons import Phase
 from sim_plant.node import PlantNode
 
 START = (2.293, 1.696)

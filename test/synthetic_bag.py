@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
-from blf_dsc_controller.bags.topics import (
+from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.topics import (
     BOUND,
     COMMANDS,
     JOINT_STATES,
@@ -16,7 +17,6 @@ from blf_dsc_controller.bags.topics import (
     TRACKING_ERROR,
     TRUTH,
 )
-from blf_dsc_controller.bags.writer import BagWriter
 
 START = 1_000_000_000  # ns
 MILLISECOND = 1_000_000  # ns

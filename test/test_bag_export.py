@@ -10,8 +10,8 @@ import pytest
 import synthetic_bag
 from synthetic_bag import Synthetic
 
-from blf_dsc_controller.bags.topics import REFERENCE
-from blf_dsc_controller.tools.bag_export import main
+from blf_dsc_controller.cli.bag_export import main
+from blf_dsc_controller.messages.topics import REFERENCE
 
 SAMPLES = 200
 

@@ -11,12 +11,12 @@ from rosbags.rosbag2 import Reader
 from small_disk import small_disk
 
 from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.encoders import JointStateEncoder
 from blf_dsc_controller.bags.errors import DiskFullError
+from blf_dsc_controller.bags.recover import recover
 from blf_dsc_controller.bags.ring import Ring
-from blf_dsc_controller.bags.topics import BOUND, JOINT_STATES, STREAM
 from blf_dsc_controller.bags.writer import BagWriter, Limits
-from blf_dsc_controller.recovery.recover import recover
+from blf_dsc_controller.messages.encoders import JointStateEncoder
+from blf_dsc_controller.messages.topics import BOUND, JOINT_STATES, STREAM
 
 SECOND = 1_000_000_000
 CONFIGURATION = '/blf_dsc_controller:\n  ros__parameters:\n    law: "blf_dsc"\n'

@@ -8,20 +8,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from blf_dsc_controller.bags.decoders import Float64MultiArrayDecoder, JointStateDecoder
-from blf_dsc_controller.bags.encoders import (
+from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder, JointStateDecoder
+from blf_dsc_controller.messages.encoders import (
     Float64MultiArrayEncoder,
     JointStateEncoder,
     encode_clock,
 )
-from blf_dsc_controller.bags.errors import (
+from blf_dsc_controller.messages.errors import (
     DuplicatedJointError,
     MessageEncodingError,
     MissingJointError,
     ShortArrayError,
     TruncatedMessageError,
 )
-from blf_dsc_controller.bags.types import typestore
+from blf_dsc_controller.messages.types import typestore
 
 STAMP = 1_734_000_123_456_789_012
 NAMES = st.lists(st.text('abé/_ ', max_size=9), min_size=1, max_size=8, unique=True)

@@ -16,11 +16,11 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from blf_dsc_controller.bags.cdr import JointStateLayout
-from blf_dsc_controller.bags.decoders import Float64MultiArrayDecoder, JointStateDecoder
-from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
-from blf_dsc_controller.bags.topics import TOPICS
-from blf_dsc_controller.bags.types import type_hash
+from blf_dsc_controller.messages.cdr import JointStateLayout
+from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder, JointStateDecoder
+from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.topics import TOPICS
+from blf_dsc_controller.messages.types import type_hash
 from blf_dsc_controller.nodes.endpoints import message_class
 
 STAMP = 1_734_000_123_456_789_012

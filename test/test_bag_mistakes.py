@@ -14,10 +14,10 @@ from mcap.writer import Writer
 from rosbags.rosbag2 import Reader
 
 from blf_dsc_controller.bags.context import ATTACHMENT, read_context
-from blf_dsc_controller.bags.encoders import JointStateEncoder
-from blf_dsc_controller.bags.topics import JOINT_STATE, JOINT_STATES
-from blf_dsc_controller.bags.types import definition
-from blf_dsc_controller.tools import bag_export, bag_plot, bag_recover, bag_replay, bag_report
+from blf_dsc_controller.cli import bag_export, bag_plot, bag_recover, bag_replay, bag_report
+from blf_dsc_controller.messages.encoders import JointStateEncoder
+from blf_dsc_controller.messages.topics import JOINT_STATE, JOINT_STATES
+from blf_dsc_controller.messages.types import definition
 
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 

@@ -14,7 +14,7 @@ from synthetic_bag import Synthetic
 WITHOUT_ROS = """
 import sys
 sys.modules['rclpy'] = None  # any import of it fails
-from blf_dsc_controller.tools.bag_plot import main
+from blf_dsc_controller.cli.bag_plot import main
 sys.exit(main(sys.argv[1:]))
 """
 

@@ -9,7 +9,6 @@ import synthetic_bag
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from synthetic_bag import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 
-from blf_dsc_controller.bags.encoders import JointStateEncoder
 from blf_dsc_controller.bags.errors import (
     AmbiguousTopicError,
     MissingTopicError,
@@ -17,7 +16,8 @@ from blf_dsc_controller.bags.errors import (
     UnreadableMessageError,
 )
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.bags.topics import (
+from blf_dsc_controller.messages.encoders import JointStateEncoder
+from blf_dsc_controller.messages.topics import (
     COMMANDS,
     DIAGNOSTICS,
     JOINT_STATES,
@@ -25,7 +25,7 @@ from blf_dsc_controller.bags.topics import (
     REFERENCE,
     TRACKING_ERROR,
 )
-from blf_dsc_controller.bags.types import typestore
+from blf_dsc_controller.messages.types import typestore
 
 SAMPLES = 200
 

@@ -21,17 +21,17 @@ from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from blf_dsc_controller.analysis.subject import read_subjects
 from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.encoders import JointStateEncoder
 from blf_dsc_controller.bags.errors import BagExistsError
 from blf_dsc_controller.bags.losses import Losses
-from blf_dsc_controller.bags.topics import FOREVER, JOINT_STATES, Quality
-from blf_dsc_controller.bags.types import type_hash
 from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.messages.encoders import JointStateEncoder
+from blf_dsc_controller.messages.topics import FOREVER, JOINT_STATES, Quality
+from blf_dsc_controller.messages.types import type_hash
 from blf_dsc_controller.nodes import recorder_node
-from blf_dsc_controller.nodes.intake import quality_of
+from blf_dsc_controller.nodes.raw_subscriptions import quality_of
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
-from blf_dsc_controller.reports.subject import read_subjects
 
 PATIENCE = 20.0  # s, until a test gives up on what should take a moment
 

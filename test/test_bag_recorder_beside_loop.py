@@ -16,8 +16,8 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from command import closed_loop
 from mcap.reader import make_reader
 
-from blf_dsc_controller.bags import topics
 from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.messages import topics
 
 DURATION = 60 if os.environ.get('LONG_TESTS') else 3  # s
 SAMPLES = DURATION * 1000 + 1

@@ -23,7 +23,7 @@ from mcap.reader import make_reader
 from rclpy.qos import QoSProfile
 from recorder_rig import Rig, read
 
-from blf_dsc_controller.recovery.recover import recover
+from blf_dsc_controller.bags.recover import recover
 
 LONG = bool(os.environ.get('LONG_TESTS'))
 KILLS = 10 if LONG else 3

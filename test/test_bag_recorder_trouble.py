@@ -15,7 +15,7 @@ from small_disk import small_disk
 from std_srvs.srv import Trigger
 
 from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.recovery.recover import recover
+from blf_dsc_controller.bags.recover import recover
 
 
 @pytest.fixture

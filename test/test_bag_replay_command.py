@@ -10,13 +10,13 @@ import pytest
 import recorded_run
 
 from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.topics import COMMANDS
-from blf_dsc_controller.tools.bag_replay import DIFFERENT, main
+from blf_dsc_controller.cli.bag_replay import DIFFERENT, main
+from blf_dsc_controller.messages.topics import COMMANDS
 
 WITHOUT_ROS = """
 import sys
 sys.modules['rclpy'] = None  # any import of it fails
-from blf_dsc_controller.tools.bag_replay import main
+from blf_dsc_controller.cli.bag_replay import main
 sys.exit(main(sys.argv[1:]))
 """
 

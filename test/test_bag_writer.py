@@ -12,10 +12,11 @@ import yaml
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
-from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
-from blf_dsc_controller.bags.errors import BagExistsError, UnknownTypeError
-from blf_dsc_controller.bags.topics import BOUND, COMMANDS, JOINT_STATES, Quality
+from blf_dsc_controller.bags.errors import BagExistsError
 from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.errors import UnknownTypeError
+from blf_dsc_controller.messages.topics import BOUND, COMMANDS, JOINT_STATES, Quality
 
 START = 1_734_000_000_000_000_000
 MILLISECOND = 1_000_000
@@ -247,7 +248,7 @@ def test_data_leaves_the_process_as_time_goes_by(tmp_path):
 
 KILLED = """
 import os, signal, sys
-from blf_dsc_controller.bags.topics import COMMANDS
+from blf_dsc_controller.messages.topics import COMMANDS
 from blf_dsc_controller.bags.writer import BagWriter
 
 bag = BagWriter(sys.argv[1], flush_interval=None, compression=sys.argv[2])

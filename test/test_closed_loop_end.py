@@ -15,7 +15,7 @@ from command import Running, closed_loop, wait_for
 from small_disk import small_disk
 
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.recovery.recover import recover
+from blf_dsc_controller.bags.recover import recover
 
 
 @pytest.fixture

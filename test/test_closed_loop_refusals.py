@@ -20,7 +20,7 @@ class Hidden:
         return None if name.split('.')[0] == 'rclpy' else PathFinder.find_spec(name, path, target)
 
 sys.meta_path[:] = [Hidden if finder is PathFinder else finder for finder in sys.meta_path]
-from blf_dsc_controller.tools import closed_loop, entry
+from blf_dsc_controller.cli import closed_loop, entry
 start = getattr(entry, sys.argv[1], None) or (lambda: closed_loop.main(sys.argv[2:]))
 sys.exit(start())
 """

@@ -11,10 +11,10 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.dump import dump, written
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.params_file import load, load_loop
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.recorder import RecorderConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.configuration.sections import parse
-from sim_plant.configuration import PlantConfig
 
 CHANGED = LoopConfig(
     build(

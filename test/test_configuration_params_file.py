@@ -9,8 +9,8 @@ import pytest
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.params_file import load, load_loop, locate, read
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import ConfigurationError
-from sim_plant.configuration import PlantConfig
 
 
 @pytest.fixture

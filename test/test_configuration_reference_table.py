@@ -7,21 +7,21 @@ import subprocess
 import sys
 from pathlib import Path
 
+from blf_dsc_controller.configuration.documentation import reference_table
 from blf_dsc_controller.configuration.nodes import known_names
-from blf_dsc_controller.configuration.reference_table import reference_table
 
 COMMITTED = Path(__file__).parents[1] / 'doc' / 'parameters.md'
 
 
 def test_the_committed_table_is_up_to_date():
     assert COMMITTED.read_text(encoding='utf-8') == reference_table(), (
-        'run: python -m blf_dsc_controller.configuration.reference_table doc/parameters.md'
+        'run: python -m blf_dsc_controller.configuration.documentation doc/parameters.md'
     )
 
 
 def test_the_command_it_names_writes_it(tmp_path):
     page = tmp_path / 'parameters.md'
-    module = 'blf_dsc_controller.configuration.reference_table'
+    module = 'blf_dsc_controller.configuration.documentation'
     subprocess.run([sys.executable, '-m', module, str(page)], check=True, cwd=COMMITTED.parents[1])
     assert page.read_text(encoding='utf-8') == reference_table()
 

@@ -8,8 +8,8 @@ import pytest
 from arbitrary_case import arbitrary
 from closed_loop_case import controller, plant, quick, record
 
-from blf_dsc_controller.core import adaptation, cholesky
-from blf_dsc_controller.core.settings import UPDATES
+from blf_dsc_controller.law import adaptation, cholesky
+from blf_dsc_controller.law.settings import UPDATES
 
 DT = 1e-3
 SHAPES = [(1, 1), (2, 3), (3, 4)]

@@ -10,7 +10,7 @@ from math import pi
 import numpy as np
 import pytest
 
-from blf_dsc_controller.core import barrier
+from blf_dsc_controller.law import barrier
 
 BOUND, WEIGHT, LIMIT = 0.002, 1000.0, 2e4
 KNEE = barrier.knee(BOUND, WEIGHT, LIMIT)

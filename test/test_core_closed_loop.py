@@ -15,7 +15,8 @@ from closed_loop_case import (
     record,
 )
 
-from blf_dsc_controller.core import barrier, two_link
+from blf_dsc_controller.arms import two_link
+from blf_dsc_controller.law import barrier
 
 BOUND = 2e-3  # rad
 DISTURBANCE = 0.1  # N m, the constant part of the case's

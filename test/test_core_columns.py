@@ -8,10 +8,10 @@ import pytest
 from closed_loop_case import closed_loop, controller, plant, recommended
 from paper_case import configured, run
 
-from blf_dsc_controller.assembly import column_names, controller_of
-from blf_dsc_controller.core import columns
-from blf_dsc_controller.core.settings import LATCHES
-from sim_plant.assembly import plant_of
+from blf_dsc_controller.law import columns
+from blf_dsc_controller.law.factory import column_names, controller_of
+from blf_dsc_controller.law.settings import LATCHES
+from sim_plant.factory import plant_of
 
 
 def test_columns_are_those_of_their_names():

@@ -11,8 +11,8 @@ from closed_loop_case import controller, plant, recommended
 from plain_law import dynamics
 from scipy.integrate import solve_ivp
 
-from blf_dsc_controller.core import cholesky
-from blf_dsc_controller.core.controller import Controller
+from blf_dsc_controller.law import cholesky
+from blf_dsc_controller.law.controller import Controller
 
 TRUE = np.array([1.0, 0.32, 0.4])
 R = 9.8  # 1/s^2

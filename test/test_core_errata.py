@@ -17,8 +17,9 @@ from closed_loop_case import (
     recommended,
 )
 
-from blf_dsc_controller.core import surface, two_link
+from blf_dsc_controller.arms import two_link
 from blf_dsc_controller.errors import OutsideBarrierError
+from blf_dsc_controller.law import surface
 
 
 def work_around_a_circle(torque, radius=0.3, centre=(2.0, np.pi / 2.0), points=400):

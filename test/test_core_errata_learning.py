@@ -18,8 +18,9 @@ from closed_loop_case import (
     record,
 )
 
-from blf_dsc_controller.core import adaptation, cholesky, projection, two_link
-from blf_dsc_controller.core.settings import EFFORT
+from blf_dsc_controller.arms import two_link
+from blf_dsc_controller.law import adaptation, cholesky, projection
+from blf_dsc_controller.law.settings import EFFORT
 
 NO_SINE = (0.0, 0.0)
 

@@ -10,7 +10,8 @@ import pytest
 from arbitrary_case import arbitrary
 from closed_loop_case import P, closed_loop, controller, plant, recommended
 
-from blf_dsc_controller.core import barrier, funnel, surface, two_link
+from blf_dsc_controller.arms import two_link
+from blf_dsc_controller.law import barrier, funnel, surface
 
 K0, K, RATE = 0.02, 0.0015, 2.0
 WEIGHT, LIMIT = 1000.0, 2e4

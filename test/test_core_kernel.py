@@ -8,7 +8,7 @@ from pathlib import Path
 
 import blf_dsc_controller
 import sim_plant
-from blf_dsc_controller.core.kernel import ground_floor_sources
+from blf_dsc_controller.compiled.jit import ground_floor_sources
 
 
 def test_every_file_with_a_kernel_is_in_the_digest_of_the_cache():

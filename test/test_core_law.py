@@ -8,7 +8,7 @@ import pytest
 from closed_loop_case import closed_loop, controller, plant, quick, record
 from plain_law import PlainLaw
 
-from blf_dsc_controller.core.settings import EFFORT, UPDATES
+from blf_dsc_controller.law.settings import EFFORT, UPDATES
 
 # A window that is no multiple of the interval, and nearly a second more to learn in. So short a
 # window conditions Phi as 1e7; rho = 10 keeps the rounding that this multiplies below 1e-12.

@@ -9,8 +9,8 @@ from closed_loop_case import plant
 from paper_case import EXACT, NO_DISTURBANCE, P, configured, run
 from plain_law import PlainLaw, dynamics
 
-from blf_dsc_controller.assembly import controller_of
 from blf_dsc_controller.configuration.controller import LAWS
+from blf_dsc_controller.law.factory import controller_of
 
 ROUNDING = 1e-10
 R = 9.8  # 1/s^2, g / l1

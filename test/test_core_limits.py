@@ -8,7 +8,7 @@ import pytest
 from arbitrary_case import arbitrary
 from closed_loop_case import closed_loop, controller, plant, quick, recommended, record
 
-from blf_dsc_controller.core.limits import LEVEL_CUT, RATE_CUT, cut_torque
+from blf_dsc_controller.law.saturation import LEVEL_CUT, RATE_CUT, cut_torque
 
 DT = 2e-3  # s: with 500 N m/s, 1 N m from sample to sample
 

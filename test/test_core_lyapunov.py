@@ -9,7 +9,7 @@ from closed_loop_case import plant
 from paper_case import EXACT, P, configured
 from plain_law import dynamics
 
-from blf_dsc_controller.assembly import controller_of
+from blf_dsc_controller.law.factory import controller_of
 
 GAINS = {
     'learning.adaptation_gain': [0.5, 2.0, 1.5],

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from closed_loop_case import ARM, CONSTANTS, MODEL, P, plant
 
-import sim_plant.arm as physics
-from blf_dsc_controller.core import models, two_link
+import sim_plant.dynamics as physics
+from blf_dsc_controller.arms import models, two_link
 
 STATES = range(20)
 CLOSE = {'rtol': 0.0, 'atol': 1e-9}

@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blf_dsc_controller.assembly import controller_of
+from blf_dsc_controller.arms import planar_chain, two_link
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, flatten, parameters
-from blf_dsc_controller.core import planar_chain, two_link
+from blf_dsc_controller.law.factory import controller_of
 
 R = np.array([9.8])  # 1/s^2, r = g / l1 with l1 = 1 m
 SIZES = (1, 2, 3, 7)

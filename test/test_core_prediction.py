@@ -18,8 +18,8 @@ from closed_loop_case import (
     record,
 )
 
-from blf_dsc_controller.core import prediction
-from blf_dsc_controller.core.settings import EFFORT
+from blf_dsc_controller.law import prediction
+from blf_dsc_controller.law.settings import EFFORT
 
 BIAS = (0.3, -0.2)
 

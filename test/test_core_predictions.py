@@ -11,10 +11,10 @@ from paper_case import NO_DISTURBANCE, P, configured, run
 from plain_law import dynamics
 from scipy.signal import cont2discrete
 
-from blf_dsc_controller.assembly import controller_of
-from blf_dsc_controller.core import prediction
-from blf_dsc_controller.core.settings import EFFORT, PREDICTIONS
-from sim_plant.assembly import plant_of
+from blf_dsc_controller.law import prediction
+from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.law.settings import EFFORT, PREDICTIONS
+from sim_plant.factory import plant_of
 
 R = 9.8  # 1/s^2, g / l1
 ACCELERATION = PREDICTIONS.index('acceleration')

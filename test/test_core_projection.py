@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-from blf_dsc_controller.core import projection
+from blf_dsc_controller.law import projection
 
 RADIUS = 3.0
 GAIN = np.array([0.05, 1.0, 20.0])

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blf_dsc_controller.core import reference
-from blf_dsc_controller.core.reference import pack, sinusoids_term, spline_term, unpack
+from blf_dsc_controller.reference import terms as reference
+from blf_dsc_controller.reference.terms import pack, sinusoids_term, spline_term, unpack
 
 OFFSET = (0.5, -1.0, 2.0)
 FREQUENCY, PHASE = (1.0, 2.7), (0.3, -1.1)

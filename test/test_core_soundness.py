@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from closed_loop_case import controller, plant, recommended
 
-from blf_dsc_controller.core.soundness import OUTSIDE, SUSPECT, look, state_is_sound
+from blf_dsc_controller.supervision.checks import OUTSIDE, SUSPECT, look, state_is_sound
 
 DT = 1e-3
 

@@ -24,15 +24,10 @@ from closed_loop_case import (
 )
 from numba.core.runtime import _nrt_python, rtsys
 
-from blf_dsc_controller.core.controller import respond
-from blf_dsc_controller.core.sample import sample_of, sample_size
-from blf_dsc_controller.core.settings import Settings, pack, settings_of
-from blf_dsc_controller.core.state import (
-    signals_of,
-    signals_size,
-    state_of,
-    state_size,
-)
+from blf_dsc_controller.law.controller import respond
+from blf_dsc_controller.law.sample import sample_of, sample_size
+from blf_dsc_controller.law.settings import Settings, pack, settings_of
+from blf_dsc_controller.law.state import signals_of, signals_size, state_of, state_size
 
 SHAPES = [(1, 1), (2, 3), (3, 4), (6, 30)]
 SIZES = ('n', 'p', 'm', 'tones')

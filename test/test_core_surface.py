@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from closed_loop_case import REFERENCE, controller, recommended
 
-from blf_dsc_controller.core import reference, surface
+from blf_dsc_controller.law import surface
+from blf_dsc_controller.reference import terms as reference
 
 BOUND, K, MU, DQR = 0.002, 150.0, 20.0, -0.3
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-from blf_dsc_controller.core import window
+from blf_dsc_controller.law import window
 
 
 class Window:

@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from blf_dsc_controller.arms.two_link_urdf import urdf
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.description.urdf import urdf
-from sim_plant import arm as arms
-from sim_plant.configuration import PlantConfig
+from sim_plant import dynamics as arms
 
 CONFIG = build(PlantConfig, {'arm.l1': 1.1, 'arm.l2': 0.7, 'arm.m1': 0.6, 'arm.m2': 0.45})
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from paper_case import EXACT, NO_DISTURBANCE, P, configured, run
 
-from blf_dsc_controller.assembly import settings_of_config
+from blf_dsc_controller.cli import closed_loop
 from blf_dsc_controller.configuration.params_file import load_loop, locate
-from blf_dsc_controller.feasibility import concerns, rehearse
-from blf_dsc_controller.tools import closed_loop
+from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.supervision.config_warnings import concerns, rehearse
 
 BOUND = 0.002  # rad
 

@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 from fault_rig import MILLISECOND, Rig
 
+from blf_dsc_controller.arms.two_link import gravity
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.safety import Safety
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.core.two_link import gravity
-from blf_dsc_controller.safety.fallback import Ramp, safe_torque
-from blf_dsc_controller.safety.monitors import Overruns, Silence
-from blf_dsc_controller.safety.reasons import Phase, Reason
+from blf_dsc_controller.supervision.reasons import Phase, Reason
+from blf_dsc_controller.supervision.safe_torque import Ramp, safe_torque
+from blf_dsc_controller.supervision.watchdogs import Overruns, Silence
 
 Q, DQ = np.array([0.3, -0.4]), np.array([0.5, -2.0])
 P = np.array([1.0, 0.32, 0.4])
 
 
 def settings(**given):
-    from blf_dsc_controller import assembly
+    from blf_dsc_controller.law import factory as assembly
 
     return assembly.settings_of_config(change(ControllerConfig(), given))
 
@@ -238,7 +238,7 @@ def jump(given, *, bumpless, samples=1):
         assert rig.guard.objections(candidate) == []
         rig.guard.retune(candidate)
     else:
-        from blf_dsc_controller.safety import tuning
+        from blf_dsc_controller.supervision import retuning as tuning
 
         tuning.take(rig.guard.controller, candidate)
     rig.step(samples)

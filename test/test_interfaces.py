@@ -20,15 +20,15 @@ from ros_rig import RosRig, deactivate
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
-from blf_dsc_controller.bags import topics
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.core.sample import sample_of
+from blf_dsc_controller.law.sample import sample_of
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import message_class
 from blf_dsc_controller.nodes.markers_node import MarkersNode
-from blf_dsc_controller.simulation import simulate
-from sim_plant.configuration import PlantConfig
+from blf_dsc_controller.simulation.loop import simulate
 from sim_plant.node import PlantNode
 
 CONFIG = Path(__file__).parents[1] / 'config'

@@ -11,7 +11,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from ros_rig import RosRig, activate, cleanup, configure, deactivate, shutdown, torques, values
 
 import sim_plant.node
-from blf_dsc_controller.bags import topics
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from sim_plant.node import PlantNode
 

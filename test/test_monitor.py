@@ -8,16 +8,21 @@ import numpy as np
 import pytest
 from paper_case import EXACT, configured
 
-from blf_dsc_controller.assembly import controller_of, estimate_names, settings_of_config
-from blf_dsc_controller.bags import topics
-from blf_dsc_controller.bags.decoders import JointStateDecoder
-from blf_dsc_controller.bags.monitor import ExponentialBound, Monitor, decay_rate, largest_inertia
-from blf_dsc_controller.bags.offline import write_bag
+from blf_dsc_controller.analysis.monitors_figure import draw_monitors
+from blf_dsc_controller.analysis.summary import summarize
+from blf_dsc_controller.analysis.table import format_table
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.reports.monitors_figure import draw_monitors
-from blf_dsc_controller.reports.summary import summarize
-from blf_dsc_controller.reports.table import format_table
-from blf_dsc_controller.simulation import simulate
+from blf_dsc_controller.law.factory import controller_of, estimate_names, settings_of_config
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.decoders import JointStateDecoder
+from blf_dsc_controller.messages.monitor import (
+    ExponentialBound,
+    Monitor,
+    decay_rate,
+    largest_inertia,
+)
+from blf_dsc_controller.simulation.bag import write_bag
+from blf_dsc_controller.simulation.loop import simulate
 
 LARGEST = np.linalg.eigvalsh([[2.12, 0.72], [0.72, 0.32]])[-1]  # kg m^2, of M stretched
 LEAKY = EXACT | {'disturbance.leakage': 0.02, 'disturbance.gain': [50.0, 80.0]}

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from montecarlo_case import RUNS, same, study, whole
 
-from blf_dsc_controller.montecarlo import engines
-from blf_dsc_controller.montecarlo.chunk import warm_up
-from blf_dsc_controller.montecarlo.computation import PATIENCE, chunk_size, compute
-from blf_dsc_controller.montecarlo.errors import WorkersLostError
-from blf_dsc_controller.montecarlo.store import Span
+from blf_dsc_controller.monte_carlo import executors as engines
+from blf_dsc_controller.monte_carlo.chunk import warm_up
+from blf_dsc_controller.monte_carlo.computation import PATIENCE, chunk_size, compute
+from blf_dsc_controller.monte_carlo.errors import WorkersLostError
+from blf_dsc_controller.monte_carlo.store import Span
 
 
 @pytest.fixture(scope='module')

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from montecarlo_case import LOOP, STUDY, study, whole
 
-from blf_dsc_controller.core.sample import sample_of
-from blf_dsc_controller.montecarlo.chunk import run_chunk
-from blf_dsc_controller.montecarlo.reproduction import plant_of_run
-from blf_dsc_controller.simulation import simulate
+from blf_dsc_controller.law.sample import sample_of
+from blf_dsc_controller.monte_carlo.chunk import run_chunk
+from blf_dsc_controller.monte_carlo.reproduction import plant_of_run
+from blf_dsc_controller.simulation.loop import simulate
 
 LIMITS = 'blf_dsc_controller:\n  ros__parameters:\n'
 WEAK = LOOP.replace(LIMITS, LIMITS + '    torque: {limit: [8.0, 20.0]}\n')

@@ -17,14 +17,14 @@ from montecarlo_case import RUNS, study, whole
 from scipy.stats import binomtest
 
 from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.cli import monte_carlo
 from blf_dsc_controller.configuration.params_file import load_loop
-from blf_dsc_controller.montecarlo.errors import NotReproducedError
-from blf_dsc_controller.montecarlo.judgement import influence, judge, wilson, worst_first
-from blf_dsc_controller.montecarlo.report import write_report
-from blf_dsc_controller.montecarlo.reproduction import plant_of_run, reproduce
-from blf_dsc_controller.montecarlo.store import Span, Store
-from blf_dsc_controller.simulation import simulate
-from blf_dsc_controller.tools import monte_carlo
+from blf_dsc_controller.monte_carlo.errors import NotReproducedError
+from blf_dsc_controller.monte_carlo.report import write_report
+from blf_dsc_controller.monte_carlo.reproduction import plant_of_run, reproduce
+from blf_dsc_controller.monte_carlo.statistics import influence, judge, wilson, worst_first
+from blf_dsc_controller.monte_carlo.store import Span, Store
+from blf_dsc_controller.simulation.loop import simulate
 
 
 @pytest.fixture(scope='module')

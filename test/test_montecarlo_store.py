@@ -15,18 +15,18 @@ import pyarrow.parquet
 import pytest
 from montecarlo_case import LOOP, RUNS, STUDY, same, study, whole, write
 
-from blf_dsc_controller.montecarlo import store as stores
-from blf_dsc_controller.montecarlo.chunk import run_chunk
-from blf_dsc_controller.montecarlo.errors import (
+from blf_dsc_controller.cli import monte_carlo
+from blf_dsc_controller.monte_carlo import store as stores
+from blf_dsc_controller.monte_carlo.chunk import run_chunk
+from blf_dsc_controller.monte_carlo.errors import (
     NotAStudyError,
     OtherStudyError,
     StudyInUseError,
     UnreadablePartError,
 )
-from blf_dsc_controller.montecarlo.store import Span, Store
-from blf_dsc_controller.tools import monte_carlo
+from blf_dsc_controller.monte_carlo.store import Span, Store
 
-MODULE = 'blf_dsc_controller.tools.monte_carlo'
+MODULE = 'blf_dsc_controller.cli.monte_carlo'
 PATIENCE = 300.0  # s; the machine may be busy, and kernels may have to be compiled
 
 

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from montecarlo_case import LOOP, STUDY, study, write
 from scipy import stats
 
-from blf_dsc_controller.assembly import controller_of
 from blf_dsc_controller.configuration.parameter import Kind
 from blf_dsc_controller.configuration.params_file import locate
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.montecarlo.distribution import TAIL, parse
-from blf_dsc_controller.montecarlo.study import draw, origin_of, plant_of_draw
-from blf_dsc_controller.montecarlo.study_file import load_study, write_study
+from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.monte_carlo.distribution import TAIL, parse
+from blf_dsc_controller.monte_carlo.study import draw, origin_of, plant_of_draw
+from blf_dsc_controller.monte_carlo.study_file import load_study, write_study
 
 SHARES = st.floats(0.0, 1.0, exclude_max=True)
 

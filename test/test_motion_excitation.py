@@ -11,13 +11,13 @@ import pytest
 
 pytest.importorskip('scipy')
 
+from blf_dsc_controller.cli.excite import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.params_file import load_loop, locate
 from blf_dsc_controller.configuration.reference import Limits
-from blf_dsc_controller.motion.errors import ExcitationError
-from blf_dsc_controller.motion.excitation import Excitation, excite
-from blf_dsc_controller.simulation import simulate
-from blf_dsc_controller.tools.excite import main
+from blf_dsc_controller.law.exciting_reference import Excitation, excite
+from blf_dsc_controller.reference.errors import ExcitationError
+from blf_dsc_controller.simulation.loop import simulate
 
 P = np.array([1.0, 0.32, 0.4])
 SIGMA = ControllerConfig().learning.excitation_threshold

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blf_dsc_controller.core.reference import pack, sampled
-from blf_dsc_controller.motion.polynomials import hermite, minimum_jerk
+from blf_dsc_controller.reference.polynomials import hermite, minimum_jerk
+from blf_dsc_controller.reference.terms import pack, sampled
 
 TIMES = np.array([0.5, 1.0, 1.2, 2.5, 4.0])
 POINTS = np.random.default_rng(3).normal(size=(3, 5, 2))

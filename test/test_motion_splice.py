@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blf_dsc_controller.core.reference import pack, sampled, sinusoids_term
-from blf_dsc_controller.motion.errors import ApproachError, MotionError, ReferenceLimitError
-from blf_dsc_controller.motion.limits import Limits, excess
-from blf_dsc_controller.motion.polynomials import minimum_jerk
-from blf_dsc_controller.motion.splice import Rules, splice, stop
+from blf_dsc_controller.reference.errors import ApproachError, MotionError, ReferenceLimitError
+from blf_dsc_controller.reference.limits import Limits, excess
+from blf_dsc_controller.reference.polynomials import minimum_jerk
+from blf_dsc_controller.reference.splice import Rules, splice, stop
+from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
 
 JOINTS = ('shoulder', 'elbow')
 PAPER = sinusoids_term((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from fault_rig import Rig
 
-from blf_dsc_controller.assembly import controller_of
-from blf_dsc_controller.bags.offline import write_bag
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.plant import Initial, PlantConfig
 from blf_dsc_controller.configuration.reference import Approach, Reference
 from blf_dsc_controller.configuration.schema import build, change
-from blf_dsc_controller.core.reference import sampled
 from blf_dsc_controller.errors import ConfigurationError, OutsideBarrierError
-from blf_dsc_controller.motion.start import begin, reference_of
-from blf_dsc_controller.simulation import simulate
-from sim_plant.configuration import Initial, PlantConfig
+from blf_dsc_controller.law.factory import begin, controller_of
+from blf_dsc_controller.reference.start import reference_of
+from blf_dsc_controller.reference.terms import sampled
+from blf_dsc_controller.simulation.bag import write_bag
+from blf_dsc_controller.simulation.loop import simulate
 
 CONFIG = ControllerConfig()
 PAPER = np.array([2.2935, 1.6961])  # qr(0)

@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blf_dsc_controller.core.reference import pack, sampled, sinusoids_term, unpack
-from blf_dsc_controller.motion.errors import MotionError, TrajectoryError
-from blf_dsc_controller.motion.limits import Limits
-from blf_dsc_controller.motion.splice import Rules
-from blf_dsc_controller.motion.trajectory import Point, Request, follow
+from blf_dsc_controller.reference.errors import MotionError, TrajectoryError
+from blf_dsc_controller.reference.limits import Limits
+from blf_dsc_controller.reference.splice import Rules
+from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term, unpack
+from blf_dsc_controller.reference.trajectory import Point, Request, follow
 
 JOINTS = ('shoulder', 'elbow')
 TOP = np.array([4.0, 3.0])

@@ -15,7 +15,7 @@ pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
 from ros_rig import RosRig
 
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from blf_dsc_controller.safety.reasons import Phase
+from blf_dsc_controller.supervision.reasons import Phase
 
 EXAMPLE = Path(__file__).parents[1] / 'examples/mujoco_plant/mujoco_plant.py'
 P = np.array([1.0, 0.32, 0.4])  # (m1+m2) l1^2, m2 l2^2, m2 l1 l2 of arm.xml
@@ -33,7 +33,7 @@ def test_its_arm_has_the_inertia_and_the_weight_that_the_model_says(example):
     """MuJoCo's M(q) and its bias torque at rest against the paper's (33), (34)."""
     import mujoco
 
-    from blf_dsc_controller.core.two_link import gravity, inertia
+    from blf_dsc_controller.arms.two_link import gravity, inertia
 
     model = mujoco.MjModel.from_xml_path(str(EXAMPLE.with_name('arm.xml')))
     data = mujoco.MjData(model)

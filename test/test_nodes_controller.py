@@ -12,11 +12,11 @@ from node_loop import JOINTS, START, Arm, NodeLoop, torques
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
-from blf_dsc_controller import assembly
-from blf_dsc_controller.bags import topics
-from blf_dsc_controller.bags.encoders import JointStateEncoder
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import ConfigurationError, OutsideBarrierError
+from blf_dsc_controller.law import factory as assembly
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.encoders import JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 
 NOTHING = (0.0, 0.0)

@@ -11,11 +11,11 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from node_loop import NodeLoop, simulated_torques, states, torques
 from rclpy.time import Time
 
-from blf_dsc_controller.bags import topics
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.core import reference
-from blf_dsc_controller.motion.start import reference_of
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.reference import terms as reference
+from blf_dsc_controller.reference.start import reference_of
 from sim_plant.node import LOCKSTEP_START, PlantNode
 
 MILLISECOND = 1_000_000  # ns

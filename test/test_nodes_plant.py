@@ -10,11 +10,11 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from node_loop import NodeLoop, states
 
-from blf_dsc_controller.bags import topics
-from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import ConfigurationError
-from sim_plant.assembly import plant_of
-from sim_plant.configuration import PlantConfig
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder
+from sim_plant.factory import plant_of
 from sim_plant.node import PlantNode
 
 TORQUE = (5.0, 3.0)  # N m

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from plants import ARM, ODD_ARM
 
-from blf_dsc_controller.core.two_link import regressor
-from sim_plant.arm import (
+from blf_dsc_controller.arms.two_link import regressor
+from sim_plant.dynamics import (
     acceleration,
     coriolis,
     gravity,

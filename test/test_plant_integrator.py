@@ -6,7 +6,7 @@ import pytest
 from plants import ARM, PERIOD, START, commands, disturbance, rough_disturbance
 from scipy.integrate import RK45, simpson, solve_ivp
 
-from sim_plant.arm import kinetic_energy, potential_energy
+from sim_plant.dynamics import kinetic_energy, potential_energy
 from sim_plant.integrator import DOPRI5, RK4, integrate, scratch_size
 from sim_plant.motion import motion
 

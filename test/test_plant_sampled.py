@@ -13,11 +13,11 @@ import pytest
 from numba.core.runtime import _nrt_python, rtsys
 from plants import ARM, START, commands, plant, rough_disturbance, run, settings
 
-from blf_dsc_controller.core.kernel import kernel
+from blf_dsc_controller.compiled.jit import kernel
 from sim_plant.integrator import DOPRI5, RK4, integrate, scratch_size
 from sim_plant.plant import initial_state, measure, settings_vector, settings_view, step
+from sim_plant.sampled import Plant
 from sim_plant.sensors import DIFFERENCED, MEASURED, generator
-from sim_plant.simulated import Plant
 
 EVERYTHING = {
     'position_noise': 1e-5,

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.cli import closed_loop
 from blf_dsc_controller.configuration.params_file import load_loop, locate
 from blf_dsc_controller.configuration.share import config_file
-from blf_dsc_controller.tools import closed_loop
 
 PRESETS = sorted(path.stem for path in config_file('').glob('*.yaml'))
 LAW = {'comparison': 'backstepping', 'comparison_detuned': 'backstepping'} | {

@@ -13,15 +13,15 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.bags.errors import BagExistsError, UnreadableBagError
 from blf_dsc_controller.bags.mcap_records import CHUNK, HEAD, MAGIC, chunk_of, head
-from blf_dsc_controller.bags.topics import COMMANDS, JOINT_STATES
-from blf_dsc_controller.bags.types import typestore
+from blf_dsc_controller.bags.recover import recover
+from blf_dsc_controller.bags.salvage import Salvage
 from blf_dsc_controller.bags.writer import BagWriter
-from blf_dsc_controller.recovery.recover import recover
-from blf_dsc_controller.recovery.salvage import Salvage
-from blf_dsc_controller.tools.bag_recover import main
+from blf_dsc_controller.cli.bag_recover import main
+from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES
+from blf_dsc_controller.messages.types import typestore
 
 START = 1_734_000_000_000_000_000
 MILLISECOND = 1_000_000

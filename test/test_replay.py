@@ -9,20 +9,23 @@ import numpy as np
 import pytest
 import recorded_run
 
-from blf_dsc_controller.assembly import controller_of, estimate_names
 from blf_dsc_controller.bags import context as contexts
 from blf_dsc_controller.bags.batch import decode_joint_states
 from blf_dsc_controller.bags.content import Content, Recorded, read_content
 from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.decoders import JointStateDecoder
-from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.bags.errors import (
     NoConfigurationError,
     OtherVersionError,
     UnreadableMessageError,
 )
-from blf_dsc_controller.bags.telemetry import ControllerTelemetry
-from blf_dsc_controller.bags.topics import (
+from blf_dsc_controller.configuration.dump import text
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.law.factory import controller_of, estimate_names
+from blf_dsc_controller.messages.decoders import JointStateDecoder
+from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.telemetry import ControllerTelemetry
+from blf_dsc_controller.messages.topics import (
     COMMANDS,
     JOINT_STATES,
     JOINT_TRAJECTORY,
@@ -31,16 +34,13 @@ from blf_dsc_controller.bags.topics import (
     REFERENCE,
     TRACKING_ERROR,
 )
-from blf_dsc_controller.bags.types import typestore
-from blf_dsc_controller.configuration.dump import text
-from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.replay.comparison import Commands, compare
 from blf_dsc_controller.replay.errors import NothingToCompareError
 from blf_dsc_controller.replay.open_loop import answer
 from blf_dsc_controller.replay.recorded import replay
 from blf_dsc_controller.replay.states import States
-from blf_dsc_controller.safety.tuning import transfer
+from blf_dsc_controller.supervision.retuning import transfer
 
 START = 1_000_000_000  # ns
 MILLISECOND = 1_000_000  # ns

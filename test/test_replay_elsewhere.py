@@ -12,7 +12,6 @@ from rosbags.typesys import Stores, get_typestore
 
 from blf_dsc_controller.bags.batch import decode_joint_states
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.bags.encoders import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.bags.errors import (
     EmptyBagError,
     MissingTopicError,
@@ -21,11 +20,12 @@ from blf_dsc_controller.bags.errors import (
     UnreadableMessageError,
 )
 from blf_dsc_controller.bags.name_map import NameMap
-from blf_dsc_controller.bags.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE, JOINT_STATES
-from blf_dsc_controller.bags.types import typestore
+from blf_dsc_controller.cli.bag_replay import main
+from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE, JOINT_STATES
+from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.replay.errors import NoCommandOrderError, NoTorqueError
 from blf_dsc_controller.replay.open_loop import answer
-from blf_dsc_controller.tools.bag_replay import main
 
 SHUFFLED = ('gripper', 'elbow_pitch', 'base', 'shoulder_pitch')
 MAP = [

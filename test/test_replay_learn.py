@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import recorded_run
 
-from blf_dsc_controller.bags.offline import write_bag
-from blf_dsc_controller.bags.topics import JOINT_STATES
+from blf_dsc_controller.cli.bag_replay import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.replay.errors import ShortBagError
 from blf_dsc_controller.replay.identify import identify
-from blf_dsc_controller.simulation import simulate
-from blf_dsc_controller.tools.bag_replay import main
+from blf_dsc_controller.simulation.bag import write_bag
+from blf_dsc_controller.simulation.loop import simulate
 
 TRUE = np.array([1.0, 0.32, 0.4])  # of the recommended plant: (m1+m2) l1^2, m2 l2^2, m2 l1 l2
 

@@ -10,7 +10,7 @@ import time
 import pytest
 import recorded_run
 
-from blf_dsc_controller.bags.topics import JOINT_STATES
+from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.replay.timeline import Timeline
 
 TIMES = [100, 110, 120, 200]
@@ -91,7 +91,7 @@ def test_a_bag_is_played_over_ros_byte_by_byte_under_another_name(tmp_path):
         return future.result()
 
     words = ['--play', '--start-paused', '--rate', '0', '--remap', 'joint_states:=again']
-    command = [sys.executable, '-m', 'blf_dsc_controller.tools.bag_replay', str(path), *words]
+    command = [sys.executable, '-m', 'blf_dsc_controller.cli.bag_replay', str(path), *words]
     player = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
         wait_for(lambda: node.count_publishers('/again') > 0)
@@ -116,7 +116,7 @@ def test_a_bag_is_played_over_ros_byte_by_byte_under_another_name(tmp_path):
 def test_a_bag_with_nothing_to_play_is_called_empty(tmp_path):
     pytest.importorskip('rclpy', reason='needs ROS 2')
     path = recorded_run.write(tmp_path / 'bag', [])
-    command = [sys.executable, '-m', 'blf_dsc_controller.tools.bag_replay', str(path), '--play']
+    command = [sys.executable, '-m', 'blf_dsc_controller.cli.bag_replay', str(path), '--play']
     run = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert run.returncode == 1
     assert f'bag_replay: {path} is empty' in run.stderr

@@ -15,10 +15,10 @@ from rclpy.parameter import Parameter
 from ros_rig import RosRig, activate, configure, deactivate
 from sent_trajectory import JOINTS, SECOND, send, trajectory
 
-from blf_dsc_controller.bags.cdr import STAMP_OFFSET
 from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.encoders import JointStateEncoder
-from blf_dsc_controller.bags.topics import (
+from blf_dsc_controller.messages.cdr import STAMP_OFFSET
+from blf_dsc_controller.messages.encoders import JointStateEncoder
+from blf_dsc_controller.messages.topics import (
     ACCEPTED_TRAJECTORY,
     COMMANDS,
     JOINT_STATES,
@@ -26,7 +26,7 @@ from blf_dsc_controller.bags.topics import (
     REFERENCE,
     TRACKING_ERROR,
 )
-from blf_dsc_controller.bags.types import typestore
+from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.nodes.endpoints import message_class, profile
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.replay.recorded import replay

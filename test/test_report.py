@@ -13,12 +13,12 @@ import recorded_run
 import synthetic_bag
 from synthetic_bag import JOINTS, Synthetic
 
-from blf_dsc_controller.bags.topics import JOINT_STATES
-from blf_dsc_controller.reports.html import write_page
-from blf_dsc_controller.reports.motion import animation, lengths
-from blf_dsc_controller.reports.panels import panels
-from blf_dsc_controller.reports.subject import read_subjects
-from blf_dsc_controller.tools.bag_report import main
+from blf_dsc_controller.analysis.animation import animation, lengths
+from blf_dsc_controller.analysis.page import write_page
+from blf_dsc_controller.analysis.panels import panels
+from blf_dsc_controller.analysis.subject import read_subjects
+from blf_dsc_controller.cli.bag_report import main
+from blf_dsc_controller.messages.topics import JOINT_STATES
 
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 

@@ -16,8 +16,8 @@ import recorded_run
 
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 
-from blf_dsc_controller.reports.html import write_page
-from blf_dsc_controller.reports.subject import read_subjects
+from blf_dsc_controller.analysis.page import write_page
+from blf_dsc_controller.analysis.subject import read_subjects
 
 pytestmark = [
     pytest.mark.skipif(chromium.find() is None, reason='there is no Chromium here'),

@@ -16,10 +16,10 @@ from matplotlib import rcParams
 from matplotlib.colors import to_hex, to_rgb
 from synthetic_bag import Synthetic
 
+from blf_dsc_controller.analysis.envelope import envelope
+from blf_dsc_controller.analysis.figures import draw
+from blf_dsc_controller.analysis.style import COLOURS, formula
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.reports.envelope import envelope
-from blf_dsc_controller.reports.figures import draw
-from blf_dsc_controller.reports.style import COLOURS, formula
 
 
 @pytest.fixture(scope='module')

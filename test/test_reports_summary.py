@@ -11,10 +11,10 @@ import pytest
 import synthetic_bag
 from synthetic_bag import BOUND_RAD, JOINTS, LATCH_S, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 
+from blf_dsc_controller.analysis.summary import summarize, write_summary
+from blf_dsc_controller.analysis.table import format_table
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.bags.topics import BOUND, JOINT_STATES, LEARNING, TRUTH
-from blf_dsc_controller.reports.summary import summarize, write_summary
-from blf_dsc_controller.reports.table import format_table
+from blf_dsc_controller.messages.topics import BOUND, JOINT_STATES, LEARNING, TRUTH
 
 SAMPLES = 10_000
 

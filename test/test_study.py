@@ -11,16 +11,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from blf_dsc_controller.cli import paper_study
 from blf_dsc_controller.configuration.params_file import load_loop, locate
-from blf_dsc_controller.simulation import simulate
-from blf_dsc_controller.study import claims, tune
-from blf_dsc_controller.study.cases import SIDE_BY_SIDE, VARIATIONS
-from blf_dsc_controller.study.evidence import FAILS, HOLDS, ONLY_IF, verdict
-from blf_dsc_controller.study.metrics import Courses, measure
-from blf_dsc_controller.study.runs import Outcome
-from blf_dsc_controller.study.sweeps import SWEEPS, case_name
-from blf_dsc_controller.study.tables import kept_bounds
-from blf_dsc_controller.tools import paper_study
+from blf_dsc_controller.paper import claims, tune
+from blf_dsc_controller.paper.cases import SIDE_BY_SIDE, VARIATIONS
+from blf_dsc_controller.paper.evidence import FAILS, HOLDS, ONLY_IF, verdict
+from blf_dsc_controller.paper.metrics import Courses, measure
+from blf_dsc_controller.paper.runs import Outcome
+from blf_dsc_controller.paper.sweeps import SWEEPS, case_name
+from blf_dsc_controller.paper.tables import kept_bounds
+from blf_dsc_controller.simulation.loop import simulate
 
 BOUND = np.array([0.002, 0.004])
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.safety import Safety
-from blf_dsc_controller.safety.reasons import Phase
-from blf_dsc_controller.safety.supervisor import Supervisor, Trust
+from blf_dsc_controller.supervision.reasons import Phase
+from blf_dsc_controller.supervision.supervisor import Supervisor, Trust
 
 STILL = np.zeros(2)
 SAFETY = Safety()

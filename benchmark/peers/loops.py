@@ -12,9 +12,9 @@ from collections.abc import Callable
 import numpy as np
 from peers.numpy_law import NumpyLaw
 
-from blf_dsc_controller.assembly import settings_of_config
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from sim_plant.configuration import PlantConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.law.factory import settings_of_config
 
 Step = Callable[[float, np.ndarray], None]
 State = Callable[[], tuple[np.ndarray, np.ndarray]]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from blf_dsc_controller.core.settings import Settings
+from blf_dsc_controller.law.settings import Settings
 
 
 class NumpyLaw:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages and MCAP bags, in and out, without a ROS installation."""
+"""MCAP bags: write, read, recover; without a ROS installation."""

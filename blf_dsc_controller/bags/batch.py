@@ -8,12 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.bags.cdr import STAMP_OFFSET, ArrayLayout, Doubles, JointStateLayout
 from blf_dsc_controller.bags.content import Recorded
-from blf_dsc_controller.bags.decoders import Float64MultiArrayDecoder, JointStateDecoder
-from blf_dsc_controller.bags.encoders import NANOSECONDS
-from blf_dsc_controller.bags.errors import MessageError, UnreadableMessageError
-from blf_dsc_controller.bags.run import Floats, Stamps
+from blf_dsc_controller.bags.errors import UnreadableMessageError
+from blf_dsc_controller.messages.cdr import STAMP_OFFSET, ArrayLayout, Doubles, JointStateLayout
+from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder, JointStateDecoder
+from blf_dsc_controller.messages.encoders import NANOSECONDS
+from blf_dsc_controller.messages.errors import MessageError
+from blf_dsc_controller.run import Floats, Stamps
 
 _STAMP_SIZE = 8
 _FEWEST = 8  # messages, below which the loop is as good

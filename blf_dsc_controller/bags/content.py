@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from blf_dsc_controller.bags.errors import EmptyBagError, MissingTopicError
-from blf_dsc_controller.bags.lookup import find
 from blf_dsc_controller.bags.name_map import NO_NAMES, NameMap
 from blf_dsc_controller.bags.sources import open_bag
-from blf_dsc_controller.bags.topics import (
+from blf_dsc_controller.bags.topic_lookup import find
+from blf_dsc_controller.messages.topics import (
     ACCEPTED_TRAJECTORY,
     BOUND,
     COMMANDS,

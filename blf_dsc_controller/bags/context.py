@@ -19,12 +19,12 @@ from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.errors import NoConfigurationError, OtherVersionError
 from blf_dsc_controller.bags.losses import NOTHING_MISSED
 from blf_dsc_controller.bags.sources import open_bag
-from blf_dsc_controller.bags.topics import TOPICS
 from blf_dsc_controller.configuration.builtin import is_builtin
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.configuration.sections import Section, SectionError, parse
 from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.messages.topics import TOPICS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from blf_dsc_controller.bags.errors import NoParquetError, UnknownFormatError
-from blf_dsc_controller.bags.run import Floats, Run, Series
+from blf_dsc_controller.run import Floats, Run, Series
 
 Table = dict[str, Any]
 """Columns (N,) by name; `stamp` [ns] is of integers, all else of floats, NaN where unknown."""

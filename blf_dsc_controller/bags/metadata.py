@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from blf_dsc_controller.bags.topics import FOREVER, Quality
+from blf_dsc_controller.messages.topics import FOREVER, Quality
 
 VERSION = 9
 ROS_DISTRO = 'jazzy'

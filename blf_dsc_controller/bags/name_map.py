@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from blf_dsc_controller.bags.errors import NameMapError
-from blf_dsc_controller.bags.topics import TOPICS
+from blf_dsc_controller.messages.topics import TOPICS
 
 _LEAVES = tuple(topic.leaf for topic in TOPICS)
 

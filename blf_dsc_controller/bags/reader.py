@@ -10,16 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from blf_dsc_controller.bags.batch import decode_arrays, decode_joint_states
-from blf_dsc_controller.bags.cdr import JointStateLayout
 from blf_dsc_controller.bags.content import Content, Recorded, read_content
-from blf_dsc_controller.bags.errors import (
-    MessageError,
-    UnnamedJointsError,
-    UnreadableMessageError,
-)
-from blf_dsc_controller.bags.refused import refused
-from blf_dsc_controller.bags.run import Floats, Run, Series, Stamps
-from blf_dsc_controller.bags.topics import (
+from blf_dsc_controller.bags.errors import UnreadableMessageError
+from blf_dsc_controller.bags.rejected_columns import refused
+from blf_dsc_controller.messages.cdr import JointStateLayout
+from blf_dsc_controller.messages.errors import MessageError, UnnamedJointsError
+from blf_dsc_controller.messages.topics import (
     BOUND,
     COMMANDS,
     JOINT_STATES,
@@ -31,6 +27,7 @@ from blf_dsc_controller.bags.topics import (
     TRUTH,
     Topic,
 )
+from blf_dsc_controller.run import Floats, Run, Series, Stamps
 
 
 def read_run(path: str | Path, namespace: str = '') -> Run:

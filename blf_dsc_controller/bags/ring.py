@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from blf_dsc_controller.bags.topics import Quality
 from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.messages.topics import Quality
 
 _NANOSECONDS = 1_000_000_000
 

@@ -13,9 +13,9 @@ from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 
 from blf_dsc_controller.bags.errors import UnreadableBagError
-from blf_dsc_controller.bags.mcap_messages import McapMessages
-from blf_dsc_controller.bags.types import typestore
+from blf_dsc_controller.bags.mcap_reader import McapMessages
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages.types import typestore
 
 _TOLD = {'__schemaless__': ''}
 _NEWEST = 9  # version of rosbag2's metadata.yaml that is known

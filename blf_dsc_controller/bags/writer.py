@@ -13,10 +13,10 @@ from typing import final
 
 from blf_dsc_controller.bags.context import ATTACHMENT, MEDIA_TYPE, RECORD, facts_of
 from blf_dsc_controller.bags.errors import BagExistsError, DiskFullError
-from blf_dsc_controller.bags.mcap_file import McapFile
+from blf_dsc_controller.bags.mcap_writer import McapFile
 from blf_dsc_controller.bags.metadata import BagInformation, TopicInformation
-from blf_dsc_controller.bags.topics import Quality
-from blf_dsc_controller.bags.types import definition, type_hash
+from blf_dsc_controller.messages.topics import Quality
+from blf_dsc_controller.messages.types import definition, type_hash
 
 
 @dataclass(frozen=True)

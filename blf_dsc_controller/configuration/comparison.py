@@ -92,7 +92,7 @@ class Truth:
         read_only=_GIVEN,
     )
     feed_forward: bool = parameter(
-        False,  # noqa: FBT003
+        False,
         'compensate the known disturbance; model_based always does',
         read_only=_GIVEN,
     )

@@ -6,13 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from blf_dsc_controller.configuration.comparison import Comparison, Truth
-from blf_dsc_controller.configuration.gains import (
-    Barrier,
-    Disturbance,
-    Feedback,
-    Surface,
-    Torque,
-)
+from blf_dsc_controller.configuration.gains import Barrier, Disturbance, Feedback, Surface, Torque
 from blf_dsc_controller.configuration.learning import Learning
 from blf_dsc_controller.configuration.parameter import parameter
 from blf_dsc_controller.configuration.reference import Approach, Limits, Reference
@@ -63,7 +57,7 @@ class Telemetry:
     """What the controller tells beside its commands."""
 
     enabled: bool = parameter(
-        True,  # noqa: FBT003
+        True,
         'publish reference, errors, estimates and monitors',
         read_only=_TOPICS,
     )

@@ -97,17 +97,17 @@ class Learning:
         read_only=_FILTERED,
     )
     bias: bool = parameter(
-        True,  # noqa: FBT003
+        True,
         'also estimate a constant disturbance of each joint',
         read_only=_SIZES,
     )
     viscous: bool = parameter(
-        False,  # noqa: FBT003
+        False,
         'also estimate the viscous friction of each joint',
         read_only=_SIZES,
     )
     coulomb: bool = parameter(
-        False,  # noqa: FBT003
+        False,
         'also estimate the Coulomb friction of each joint',
         read_only=_SIZES,
     )

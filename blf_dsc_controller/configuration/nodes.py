@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.markers import MarkersConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.recorder import RecorderConfig
 from blf_dsc_controller.configuration.schema import parameters
-from sim_plant.configuration import PlantConfig
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

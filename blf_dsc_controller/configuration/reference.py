@@ -82,7 +82,7 @@ class Approach:
     """The way to the reference from a start outside the bound, tracked within it."""
 
     enabled: bool = parameter(
-        True,  # noqa: FBT003
+        True,
         'lead an arm that starts outside the bound to the reference, instead of refusing',
     )
     longest: float = parameter(

@@ -88,6 +88,6 @@ class Safety:
         0.5, 'the same when the node is deactivated', unit='s', at_least=0.0
     )
     keep_estimates: bool = parameter(
-        True,  # noqa: FBT003
+        True,
         'go on from what was learned when the node is activated again; a reset forgets it',
     )

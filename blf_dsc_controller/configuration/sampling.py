@@ -26,7 +26,7 @@ class Realtime:
         read_only=_AT_START,
     )
     lock_memory: bool = parameter(
-        False,  # noqa: FBT003
+        False,
         'keep all memory of the process from being swapped out',
         read_only=_AT_START,
     )
@@ -35,7 +35,7 @@ class Realtime:
 def autostart() -> Any:
     """Field of a managed node that says whether it waits for a manager."""
     return parameter(
-        True,  # noqa: FBT003
+        True,
         'configure and activate the node at once; false: wait for a manager to do it',
         read_only='it only matters at the start',
     )

@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-from blf_dsc_controller.core.controller import respond
-from blf_dsc_controller.core.kernel import is_compiled
-from sim_plant import plant
+from blf_dsc_controller.compiled.jit import is_compiled
+from blf_dsc_controller.law.controller import respond
 
 CONTROLLER = (respond,)
-PLANT = (plant.observe, plant.step, plant.truth)
 
 NOTICE = 'compiling the kernels, once for this version: this takes 10 to 60 s'
 """What to say."""
 
-__all__ = ['CONTROLLER', 'NOTICE', 'PLANT', 'is_compiled']
+__all__ = ['CONTROLLER', 'NOTICE', 'is_compiled']

@@ -11,23 +11,23 @@ from rclpy.clock import Clock, ClockType
 from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
-from blf_dsc_controller import assembly
-from blf_dsc_controller.bags import topics
-from blf_dsc_controller.bags.decoders import JointStateDecoder
-from blf_dsc_controller.bags.errors import MessageError
-from blf_dsc_controller.bags.monitor import Monitor
-from blf_dsc_controller.bags.telemetry import DECIMATION, ControllerTelemetry, Message
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.core.controller import Controller
-from blf_dsc_controller.feasibility import concerns
+from blf_dsc_controller.law import factory as assembly
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.rejected_columns import refusals
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.decoders import JointStateDecoder
+from blf_dsc_controller.messages.errors import MessageError
+from blf_dsc_controller.messages.monitor import Monitor
+from blf_dsc_controller.messages.telemetry import DECIMATION, ControllerTelemetry, Message
 from blf_dsc_controller.nodes import compilation, executor, parameters, realtime
 from blf_dsc_controller.nodes.controller_status import ControllerStatus
 from blf_dsc_controller.nodes.endpoints import are_observed, publisher, subscribe
-from blf_dsc_controller.nodes.managed import ManagedNode
-from blf_dsc_controller.nodes.trajectory import TrajectoryInput
-from blf_dsc_controller.refusals import refusals
-from blf_dsc_controller.safety.guard import Guard
-from blf_dsc_controller.safety.reasons import Phase
+from blf_dsc_controller.nodes.lifecycle import ManagedNode
+from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
+from blf_dsc_controller.supervision.config_warnings import concerns
+from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.reasons import Phase
 
 _FIRST_LOOK = 0.01  # s, and the time between two looks for who listens
 _DIAGNOSTICS_PERIOD = 1.0  # s

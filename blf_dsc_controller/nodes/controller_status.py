@@ -9,8 +9,9 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
-from blf_dsc_controller.bags import topics
-from blf_dsc_controller.bags.names import (
+from blf_dsc_controller.law.rejected_columns import Refusal
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.names import (
     LAST_STATE,
     OPERATION,
     OPERATIONS,
@@ -19,11 +20,10 @@ from blf_dsc_controller.bags.names import (
     REFUSED,
     STOPS,
 )
-from blf_dsc_controller.nodes.board import ERROR, OK, STALE, WARN, Board
-from blf_dsc_controller.nodes.trajectory import TrajectoryInput
-from blf_dsc_controller.refusals import Refusal
-from blf_dsc_controller.safety.guard import Guard
-from blf_dsc_controller.safety.reasons import Phase, Reason
+from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, Board
+from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
+from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.reasons import Phase, Reason
 
 _LEVELS = {
     Phase.INACTIVE: STALE,

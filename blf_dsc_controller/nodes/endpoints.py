@@ -12,7 +12,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from blf_dsc_controller.bags.topics import Quality, Topic
+from blf_dsc_controller.messages.topics import Quality, Topic
 
 
 def message_class(type_name: str) -> Any:

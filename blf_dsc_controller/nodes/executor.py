@@ -19,7 +19,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.nodes.managed import ManagedNode
+from blf_dsc_controller.nodes.lifecycle import ManagedNode
 
 _POLL = 0.1  # s; EventsExecutor has no usable spin()
 _GRACE = 10.0  # s for all topics; a recorder on a busy machine has been seen 2 s behind

@@ -15,15 +15,15 @@ from rclpy.clock import Clock, ClockType
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from blf_dsc_controller.bags import topics
-from blf_dsc_controller.bags.decoders import JointStateDecoder
-from blf_dsc_controller.bags.errors import MessageError
+from blf_dsc_controller.arms.two_link_pose import points, tip_radius
 from blf_dsc_controller.configuration.markers import MarkersConfig
-from blf_dsc_controller.description.pose import points, tip_radius
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.decoders import JointStateDecoder
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.nodes.endpoints import profile
 from blf_dsc_controller.nodes.executor import RunnableNode, run
-from blf_dsc_controller.nodes.intake import Intake
 from blf_dsc_controller.nodes.parameters import declare
+from blf_dsc_controller.nodes.raw_subscriptions import Intake
 
 NAME = 'arm_markers'
 _DEPTH = 1  # only the newest counts

@@ -17,10 +17,10 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from blf_dsc_controller.bags.encoders import encode_clock
 from blf_dsc_controller.bags.errors import EmptyBagError
 from blf_dsc_controller.bags.sources import open_bag
-from blf_dsc_controller.bags.topics import CLOCK, HISTORY, STREAM
+from blf_dsc_controller.messages.encoders import encode_clock
+from blf_dsc_controller.messages.topics import CLOCK, HISTORY, STREAM
 from blf_dsc_controller.nodes.endpoints import message_class, profile
 from blf_dsc_controller.nodes.executor import drain
 from blf_dsc_controller.replay.timeline import Timeline

@@ -10,18 +10,19 @@ from typing import Any
 from rclpy.clock import Clock, ClockType
 
 from blf_dsc_controller.bags.context import MESSAGES
-from blf_dsc_controller.bags.errors import DiskFullError, UnknownTypeError, WriteError
+from blf_dsc_controller.bags.errors import DiskFullError, WriteError
 from blf_dsc_controller.bags.losses import Losses
-from blf_dsc_controller.bags.topics import Quality
 from blf_dsc_controller.configuration.dump import text_of_values
 from blf_dsc_controller.configuration.recorder import RecorderConfig
-from blf_dsc_controller.nodes.definitions import learn
+from blf_dsc_controller.messages.errors import UnknownTypeError
+from blf_dsc_controller.messages.topics import Quality
+from blf_dsc_controller.nodes.bag_sinks import BlackBox, Recording
 from blf_dsc_controller.nodes.endpoints import message_class
 from blf_dsc_controller.nodes.executor import RunnableNode, run
-from blf_dsc_controller.nodes.inquiry import Inquiry, Values
-from blf_dsc_controller.nodes.intake import Intake, quality_of
+from blf_dsc_controller.nodes.message_definitions import learn
+from blf_dsc_controller.nodes.parameter_client import Inquiry, Values
 from blf_dsc_controller.nodes.parameters import declare
-from blf_dsc_controller.nodes.sinks import BlackBox, Recording
+from blf_dsc_controller.nodes.raw_subscriptions import Intake, quality_of
 
 _DISCOVERY_PERIOD = 0.1  # s
 _TAKE_PERIOD = 0.01  # s

@@ -14,12 +14,12 @@ import numpy as np
 
 from blf_dsc_controller.bags.batch import decode_joint_states
 from blf_dsc_controller.bags.content import Content, Recorded
-from blf_dsc_controller.bags.run import Stamps
-from blf_dsc_controller.bags.topics import BOUND, FOREVER, PARAMETER_EVENTS, REFERENCE
-from blf_dsc_controller.bags.types import typestore
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change, parameters
+from blf_dsc_controller.messages.topics import BOUND, FOREVER, PARAMETER_EVENTS, REFERENCE
+from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.replay.law import Change
+from blf_dsc_controller.run import Stamps
 
 _FIELDS = {
     1: 'bool_value',

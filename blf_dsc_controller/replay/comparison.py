@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.batch import decode_arrays, decode_joint_states
-from blf_dsc_controller.bags.cdr import JointStateLayout
 from blf_dsc_controller.bags.content import Content, Recorded
-from blf_dsc_controller.bags.encoders import JOINT_STATE_FIELDS
-from blf_dsc_controller.bags.run import Floats, Stamps
-from blf_dsc_controller.bags.topics import COMMANDS, LEARNING, MONITOR, Topic
+from blf_dsc_controller.messages.cdr import JointStateLayout
+from blf_dsc_controller.messages.encoders import JOINT_STATE_FIELDS
+from blf_dsc_controller.messages.topics import COMMANDS, LEARNING, MONITOR, Topic
 from blf_dsc_controller.replay.expected import Columns
 from blf_dsc_controller.replay.states import States
+from blf_dsc_controller.run import Floats, Stamps
 
 _NAMED = (LEARNING, MONITOR)
 

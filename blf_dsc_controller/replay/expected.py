@@ -7,15 +7,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from blf_dsc_controller.assembly import estimate_names
 from blf_dsc_controller.bags.batch import decode_joint_states
-from blf_dsc_controller.bags.cdr import JointStateLayout
 from blf_dsc_controller.bags.content import Recorded
-from blf_dsc_controller.bags.monitor import Monitor
-from blf_dsc_controller.bags.names import LAMBDA_MIN, LATCHED
-from blf_dsc_controller.bags.run import Floats
-from blf_dsc_controller.bags.telemetry import DECIMATION, disturbance_names
-from blf_dsc_controller.bags.topics import (
+from blf_dsc_controller.law.factory import estimate_names
+from blf_dsc_controller.messages.cdr import JointStateLayout
+from blf_dsc_controller.messages.monitor import Monitor
+from blf_dsc_controller.messages.names import LAMBDA_MIN, LATCHED
+from blf_dsc_controller.messages.telemetry import DECIMATION, disturbance_names
+from blf_dsc_controller.messages.topics import (
     COMMANDS,
     LEARNING,
     MONITOR,
@@ -25,6 +24,7 @@ from blf_dsc_controller.bags.topics import (
 )
 from blf_dsc_controller.replay.law import Replayed
 from blf_dsc_controller.replay.states import States
+from blf_dsc_controller.run import Floats
 
 Columns = Mapping[str, Floats]
 """Values (N,) by the field that holds them, as in `velocity of joint1` or `lambda_min`."""

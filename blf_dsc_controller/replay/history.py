@@ -14,13 +14,20 @@ from functools import partial
 from typing import Any
 
 from blf_dsc_controller.bags.content import Content, Recorded
-from blf_dsc_controller.bags.names import LAST_STATE, OPERATION, OPERATIONS, PHASE, REASON, STOPS
-from blf_dsc_controller.bags.topics import ACCEPTED_TRAJECTORY, FOREVER, STATE
-from blf_dsc_controller.bags.types import typestore
-from blf_dsc_controller.motion.message import nanoseconds, told_request
+from blf_dsc_controller.messages.names import (
+    LAST_STATE,
+    OPERATION,
+    OPERATIONS,
+    PHASE,
+    REASON,
+    STOPS,
+)
+from blf_dsc_controller.messages.topics import ACCEPTED_TRAJECTORY, FOREVER, STATE
+from blf_dsc_controller.messages.trajectory import nanoseconds, told_request
+from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.replay.law import Change
-from blf_dsc_controller.safety.guard import Guard
-from blf_dsc_controller.safety.reasons import Operation, Phase, Reason
+from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.reasons import Operation, Phase, Reason
 
 TRAJECTORY = 'trajectory'
 PARAMETERS = 'parameters'

@@ -14,15 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from blf_dsc_controller.assembly import controller_of, estimate_names
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.name_map import NO_NAMES, NameMap
-from blf_dsc_controller.bags.run import Floats
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.motion.start import begin
+from blf_dsc_controller.law.factory import begin, controller_of, estimate_names
 from blf_dsc_controller.replay.errors import ShortBagError
 from blf_dsc_controller.replay.states import States, answered_states
 from blf_dsc_controller.replay.torques import applied_torque
+from blf_dsc_controller.run import Floats
 
 _NANO = 1e-9
 _CANDIDATES = 600  # windows that are looked at

@@ -8,15 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from blf_dsc_controller.assembly import controller_of
-from blf_dsc_controller.bags.run import Floats
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.core.sample import Sample, sample_of
-from blf_dsc_controller.core.settings import Settings
-from blf_dsc_controller.motion.start import begin
+from blf_dsc_controller.law.factory import begin, controller_of
+from blf_dsc_controller.law.sample import Sample, sample_of
+from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.replay.states import States
-from blf_dsc_controller.safety.tuning import transfer
-from blf_dsc_controller.safety.velocity import Velocity
+from blf_dsc_controller.run import Floats
+from blf_dsc_controller.supervision.retuning import transfer
+from blf_dsc_controller.supervision.velocity import Velocity
 
 _NANO = 1e-9
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from blf_dsc_controller.assembly import estimate_names
-from blf_dsc_controller.bags.monitor import Monitor
-from blf_dsc_controller.bags.run import Floats, Stamps
-from blf_dsc_controller.bags.telemetry import DECIMATION
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.factory import estimate_names
+from blf_dsc_controller.messages.monitor import Monitor
+from blf_dsc_controller.messages.telemetry import DECIMATION
 from blf_dsc_controller.replay.law import Replayed, replayed_of
-from blf_dsc_controller.safety.guard import Guard
+from blf_dsc_controller.run import Floats, Stamps
+from blf_dsc_controller.supervision.guard import Guard
 
 
 class Log:

@@ -14,11 +14,11 @@ import numpy as np
 
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.name_map import NO_NAMES, NameMap
-from blf_dsc_controller.bags.run import Floats
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.replay.law import Replayed, run_law
 from blf_dsc_controller.replay.states import States, answered_states
 from blf_dsc_controller.replay.torques import applied_torque
+from blf_dsc_controller.run import Floats
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.assembly import required_fields
 from blf_dsc_controller.bags.content import Content, read_content
 from blf_dsc_controller.bags.context import Context, read_context
 from blf_dsc_controller.bags.context import Recorded as RecordedController
-from blf_dsc_controller.bags.topics import (
+from blf_dsc_controller.law.factory import required_fields
+from blf_dsc_controller.messages.topics import (
     ACCEPTED_TRAJECTORY,
     COMMANDS,
     FOREVER,

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from blf_dsc_controller.bags.run import Stamps
-from blf_dsc_controller.bags.topics import FOREVER, TRACKING_ERROR
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.motion.errors import TrajectoryError
+from blf_dsc_controller.messages.topics import FOREVER, TRACKING_ERROR
+from blf_dsc_controller.reference.errors import TrajectoryError
 from blf_dsc_controller.replay.comparison import Commands, Difference
 from blf_dsc_controller.replay.history import (
     OUT_OF_ORDER,
@@ -32,8 +31,9 @@ from blf_dsc_controller.replay.history import (
 from blf_dsc_controller.replay.law import Replayed
 from blf_dsc_controller.replay.log import Log
 from blf_dsc_controller.replay.states import Arrivals, States
-from blf_dsc_controller.safety.guard import Guard
-from blf_dsc_controller.safety.reasons import Phase
+from blf_dsc_controller.run import Stamps
+from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.reasons import Phase
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,11 @@ import numpy as np
 
 from blf_dsc_controller.bags.batch import decode_joint_states
 from blf_dsc_controller.bags.content import Content, Recorded
-from blf_dsc_controller.bags.decoders import JointStateDecoder
-from blf_dsc_controller.bags.errors import MessageError, UnreadableMessageError
-from blf_dsc_controller.bags.run import Floats, Stamps
-from blf_dsc_controller.bags.topics import JOINT_STATES, LEARNING, REFERENCE, TRACKING_ERROR
+from blf_dsc_controller.bags.errors import UnreadableMessageError
+from blf_dsc_controller.messages.decoders import JointStateDecoder
+from blf_dsc_controller.messages.errors import MessageError
+from blf_dsc_controller.messages.topics import JOINT_STATES, LEARNING, REFERENCE, TRACKING_ERROR
+from blf_dsc_controller.run import Floats, Stamps
 
 _TOLD_OF_EACH = (TRACKING_ERROR, REFERENCE, LEARNING)
 

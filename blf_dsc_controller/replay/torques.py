@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from blf_dsc_controller.bags.batch import array_size, decode_arrays, decode_joint_states
-from blf_dsc_controller.bags.cdr import JointStateLayout
 from blf_dsc_controller.bags.content import Content, Recorded
-from blf_dsc_controller.bags.decoders import columns_of
-from blf_dsc_controller.bags.run import Floats, Series, Stamps
-from blf_dsc_controller.bags.topics import COMMANDS, JOINT_STATE, JOINT_STATES, TRACKING_ERROR
+from blf_dsc_controller.messages.cdr import JointStateLayout
+from blf_dsc_controller.messages.decoders import columns_of
+from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE, JOINT_STATES, TRACKING_ERROR
 from blf_dsc_controller.replay.errors import NoCommandOrderError, NoTorqueError
 from blf_dsc_controller.replay.states import States
+from blf_dsc_controller.run import Floats, Series, Stamps
 
 
 def applied_torque(

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Thinning of a long series for a picture without losing its peaks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from blf_dsc_controller.run import Floats
+
+
+def envelope(time: Floats, values: Floats, pieces: int = 1500) -> tuple[Floats, Floats]:
+    """Lowest and highest sample of each piece of a series, in their order.
+
+    Args:
+        time: (N,) any unit.
+        values: (N,), NaN where unknown; a piece in which nothing is known stays a gap.
+        pieces: how many to divide the series into, about one for each pixel.
+
+    Returns:
+        Samples of the series, at most two for each piece; all of them if they are so few.
+    """
+    if values.size <= 2 * pieces:
+        return time, values
+    edges = np.linspace(0, values.size, pieces + 1).astype(np.intp)[:-1]
+    low = _extreme(np.where(np.isnan(values), np.inf, values), edges, np.minimum)
+    high = _extreme(np.where(np.isnan(values), -np.inf, values), edges, np.maximum)
+    kept = np.sort(np.stack([low, high]), axis=0).T.ravel()
+    return time[kept], values[kept]
+
+
+def _extreme(values: Floats, edges: np.ndarray, reduction: np.ufunc) -> np.ndarray:
+    """Index of the first sample of each piece that is its extreme one."""
+    extremes = np.repeat(reduction.reduceat(values, edges), np.diff([*edges, values.size]))
+    found = np.where(values == extremes, np.arange(values.size), values.size)
+    return np.asarray(np.minimum.reduceat(found, edges))

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One bag as the page shows it: the run, its configuration, and what happened in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from blf_dsc_controller.analysis.estimation import latch_time
+from blf_dsc_controller.bags.context import Context, read_context
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.bags.sources import open_bag
+from blf_dsc_controller.configuration.sections import Section, SectionError, parse
+from blf_dsc_controller.messages.topics import DIAGNOSTICS
+from blf_dsc_controller.messages.types import typestore
+from blf_dsc_controller.run import Run
+
+_LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
+_MOST_OF_A_KIND = 50
+_NANO = 1e-9
+_AT_LIMIT = 1.0 - 1e-9
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened."""
+
+    time: float  # s since the first sample
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A bag under the name that the page gives it."""
+
+    name: str
+    run: Run
+    context: Context
+    events: tuple[Event, ...]
+
+    @property
+    def sections(self) -> list[Section]:
+        """Sections of the recorded configuration, none if it is not there or cannot be read."""
+        try:
+            return parse(self.context.configuration)
+        except (SectionError, yaml.YAMLError):
+            return []
+
+    @property
+    def parameters(self) -> dict[str, str]:
+        """Every recorded parameter, `node name: parameter` to its value as text."""
+        return {
+            f'{section.pattern.removeprefix("/")}: {name}': _shown(entry.value)
+            for section in self.sections
+            for name, entry in sorted(section.entries.items())
+        }
+
+
+def read_subjects(paths: Sequence[Path], namespace: str = '') -> list[Subject]:
+    """Read bags; each is named by its folder, and those above it where that is not enough.
+
+    Raises:
+        BlfDscError: one of them cannot be read.
+    """
+    names = _names(paths)
+    return [_read(path, name, namespace) for path, name in zip(paths, names, strict=True)]
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    parts = [path.resolve().parts[1:] for path in paths]
+    depth = 1
+    while len({one[-depth:] for one in parts}) < len({*parts}):
+        depth += 1
+    names = ['/'.join(one[-depth:]) for one in parts]
+    if set(names) == {'bag'}:
+        names = ['/'.join(one[-2:]) for one in parts]
+    return [
+        f'{name} ({names[: k + 1].count(name)})' if names.count(name) > 1 else name
+        for k, name in enumerate(names)
+    ]
+
+
+def _read(path: Path, name: str, namespace: str) -> Subject:
+    run = read_run(path, namespace)
+    events = [*_learning_events(run), *_bound_events(run), *_torque_events(run)]
+    events += _diagnosed(path, run)
+    context = read_context(path)
+    events += (Event(0.0, 'lost', f'{topic}: {text}') for topic, text in context.losses.items())
+    events.sort(key=lambda event: event.time)
+    return Subject(name, run, context, tuple(events))
+
+
+def _learning_events(run: Run) -> Iterator[Event]:
+    latched = latch_time(run)
+    if latched is not None:
+        yield Event(latched, 'learning', 'the first window was excited enough: learning began')
+    for column, reason in run.refused.items():
+        text = reason or f'{column} is not estimated: its column was refused'
+        yield Event(run.duration, 'learning', text)
+
+
+def _bound_events(run: Run) -> Iterator[Event]:
+    if run.error is None or run.bound is None:
+        return
+    outside = np.abs(run.error) >= run.bound
+    yield from _spells(run, outside, 'violation', 'outside of its bound')
+
+
+def _torque_events(run: Run) -> Iterator[Event]:
+    if run.torque_limit is None:
+        return
+    limited = np.abs(run.torque) >= _AT_LIMIT * run.torque_limit
+    yield from _spells(run, limited, 'saturation', 'at its torque limit')
+
+
+def _spells(run: Run, holds: np.ndarray, kind: str, what: str) -> Iterator[Event]:
+    for i, joint in enumerate(run.joints):
+        edges = np.diff(np.concatenate([[0], holds[:, i].astype(np.int8), [0]]))
+        begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+        for begin, end in list(zip(begins, ends, strict=True))[:_MOST_OF_A_KIND]:
+            length = f'{end - begin} samples'
+            yield Event(float(run.time[begin]), kind, f'{joint} {what} for {length}')
+        if begins.size > _MOST_OF_A_KIND:
+            more = begins.size - _MOST_OF_A_KIND
+            at = float(run.time[begins[_MOST_OF_A_KIND]])
+            yield Event(at, kind, f'{joint}: {more} more spells, which are left out here')
+
+
+def _diagnosed(path: Path, run: Run) -> Iterator[Event]:
+    """Each change of a level or a message, at the time of the sample received last."""
+    said: dict[str, tuple[int, str]] = {}
+    with open_bag(path) as bag:
+        if (DIAGNOSTICS.resolved, DIAGNOSTICS.type) not in bag.held:
+            return
+        for _, received, raw in bag.messages({DIAGNOSTICS.resolved}):
+            message: Any = typestore().deserialize_cdr(raw, DIAGNOSTICS.type)
+            for status in message.status:
+                now = (int(status.level), str(status.message))
+                if said.get(status.name) == now:
+                    continue
+                said[status.name] = now
+                level = _LEVELS[min(now[0], len(_LEVELS) - 1)]
+                yield Event(_moment(run, received), level, f'{status.name}: {now[1]}')
+
+
+def _moment(run: Run, received: int) -> float:
+    k = int(np.searchsorted(run.received, received)) - 1
+    if k < 0:
+        return (received - int(run.received[0])) * _NANO
+    return float(run.time[k])
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, list):
+        return '[' + ', '.join(_shown(entry) for entry in value) + ']'
+    return f'{value}'

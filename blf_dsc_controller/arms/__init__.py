@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arm models: regressors and inertia of each arm, behind one interface."""

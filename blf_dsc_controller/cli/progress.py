@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a running loop is doing, in one line."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import numpy as np
+from numpy.typing import ArrayLike
+from tqdm import tqdm
+
+from blf_dsc_controller.configuration.plant import PlantConfig
+from sim_plant import dynamics as arm
+
+_FORMAT = '{desc} |{bar}| {n:.1f}/{total:g} s [{elapsed}<{remaining}]{postfix}'
+_LINE_PERIOD = 10.0  # s between two lines where there is no terminal to draw a bar on
+
+
+class Progress:
+    """Progress over simulated time, with the largest |xi1| / k_c and the parameter error.
+
+    A bar on a terminal; elsewhere, such as in a log, a line now and then.
+
+    Args:
+        config: of the plant, whose true parameters the estimates are held against.
+    """
+
+    def __init__(self, config: PlantConfig) -> None:
+        self._truth = np.zeros(3)
+        lengths = (config.arm.l1, config.arm.l2)
+        masses = (config.arm.m1, config.arm.m2)
+        arm.parameters(arm.Arm(*lengths, *masses, config.arm.gravity), self._truth)
+        self._duration = config.duration
+        self._line = ''
+        self._due = time.monotonic() + _LINE_PERIOD
+        self._bar = tqdm(
+            total=config.duration,
+            desc='closed loop',
+            bar_format=_FORMAT,
+            mininterval=0.2,
+            disable=not sys.stderr.isatty(),
+        )
+
+    def show(self, elapsed: float, ratio: float, estimate: ArrayLike) -> None:
+        """Show the simulated time [s], the largest |xi1| / k_c so far, and P^ (3,)."""
+        error = np.linalg.norm(np.asarray(estimate) - self._truth) / np.linalg.norm(self._truth)
+        told = f'max|xi1|/bound {ratio:.2f}, parameter error {100 * error:.2f} %'
+        self._bar.set_postfix_str(told, refresh=False)
+        self._bar.update(min(elapsed, self._duration) - self._bar.n)
+        self._line = f'closed loop {elapsed:.1f}/{self._duration:g} s, {told}'
+        if time.monotonic() >= self._due:
+            self._print_line()
+
+    def say(self, text: str) -> None:
+        """Print a line of its own, which the bar does not run into."""
+        self._bar.write(text, file=sys.stderr)
+        sys.stderr.flush()
+
+    def close(self) -> None:
+        """Leave the bar, or a last line, as it is."""
+        self._bar.close()
+        self._print_line()
+
+    def _print_line(self) -> None:
+        if self._bar.disable and self._line:
+            print(self._line, file=sys.stderr, flush=True)
+            self._line = ''
+            self._due = time.monotonic() + _LINE_PERIOD

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Composite learning: the update law (20) with the latched prediction error (26).
+
+    eps = b_e - Phi_e theta^                                theta^ = [P^; d^], the current one
+    theta^' = Proj( -Gamma (H^T xi2 - kappa W eps) )        W = I, or (Phi_e + rho I)^-1 (newton)
+
+(20) prints + kappa eps, which drives P^ to the projection ball as soon as learning starts.
+H^T xi2, with the leakage W_c P^ of the comparison law (35), acts on P^ alone.  With Newton's W
+every excited direction converges at the rate Gamma kappa; the gradient's rates are spread as the
+eigenvalues of Phi_e.
+"""
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.views import part
+from blf_dsc_controller.law import cholesky, projection
+from blf_dsc_controller.law.settings import NEWTON, Settings
+from blf_dsc_controller.law.state import Signals, State
+
+
+@inner
+def prediction_error(settings: Settings, state: State, signals: Signals) -> None:
+    """Leave W eps (m,) in `signals.rate`; zero before the first latch."""
+    for i in range(settings.m):
+        signals.rate[i] = 0.0
+    if state.latched[0] == 0.0:
+        return
+    for i in range(settings.m):
+        signals.rate[i] = state.b[i]
+        for j in range(settings.m):
+            signals.rate[i] -= state.Phi[i, j] * state.estimate[j]
+    if settings.update == NEWTON:
+        cholesky.solve(state.factor, signals.rate)
+
+
+@inner
+def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturated: bool) -> None:
+    """Step theta^ and d^3 by `dt` [s]: (20), (30).
+
+    While a torque is at its limit the tracking error tells of the limit, not of the parameters:
+    then only the prediction error, which knows the applied torque, goes on correcting.
+    """
+    prediction_error(settings, state, signals)
+    for j in range(settings.m):
+        tracking = 0.0
+        if j < settings.p and not saturated:
+            for i in range(settings.n):
+                tracking += signals.H[i, j] * signals.xi2[i]
+            tracking += settings.Wc * state.estimate[j]
+        signals.rate[j] = settings.Gamma[j] * (settings.kappa * signals.rate[j] - tracking)
+    p = settings.p
+    parameters = part(state.estimate, 0, (p,))
+    gain = part(settings.Gamma, 0, (p,))
+    projection.project(parameters, part(signals.rate, 0, (p,)), gain, settings.radius)
+    for j in range(settings.m):
+        state.estimate[j] += dt * signals.rate[j]
+    projection.retract(parameters, gain, settings.radius)
+    if not saturated:
+        for i in range(settings.n):
+            state.disturbance[i] -= (
+                dt * settings.gamma[i] * (signals.xi2[i] + settings.eta * state.disturbance[i])
+            )

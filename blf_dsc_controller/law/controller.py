@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The controller as its users see it: an explicit state, `reset`, and `update` once a sample."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from blf_dsc_controller.compiled.jit import inner, kernel
+from blf_dsc_controller.compiled.views import part
+from blf_dsc_controller.law import funnel
+from blf_dsc_controller.law import step as law
+from blf_dsc_controller.law.sample import Sample, sample_of, sample_size, tell, tell_energies
+from blf_dsc_controller.law.settings import Settings, settings_of
+from blf_dsc_controller.law.state import (
+    Signals,
+    State,
+    signals_of,
+    signals_size,
+    state_of,
+    state_size,
+)
+from blf_dsc_controller.reference import terms as reference
+from blf_dsc_controller.reference.start import check_start
+
+
+@inner
+def decide(
+    settings: Settings,
+    reference_vector: np.ndarray,
+    state: State,
+    signals: Signals,
+    t: float,
+    dt: float,
+    measurement: np.ndarray,
+    sample: Sample,
+) -> None:
+    """`answer`, without the energies of the sample."""
+    reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
+    law.answer(settings, state, signals, t, dt, measurement)
+    tell(settings, state, signals, sample)
+
+
+@inner
+def answer(
+    settings: Settings,
+    reference_vector: np.ndarray,
+    state: State,
+    signals: Signals,
+    t: float,
+    dt: float,
+    measurement: np.ndarray,
+    sample: Sample,
+) -> None:
+    """Reference at t, then the law: everything between a measurement and its torque.
+
+    Args:
+        settings: of the law.
+        reference_vector: of `reference.pack`.
+        state: moved on by one sample.
+        signals: overwritten.
+        t: time since the start [s].
+        dt: time since the last sample [s].
+        measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
+        sample: filled.
+    """
+    decide(settings, reference_vector, state, signals, t, dt, measurement, sample)
+    tell_energies(settings, state, signals, part(measurement, 0, (settings.n,)), sample)
+
+
+@kernel
+def respond(
+    settings_vector: np.ndarray,
+    reference_vector: np.ndarray,
+    state_vector: np.ndarray,
+    signals_vector: np.ndarray,
+    t: float,
+    dt: float,
+    measurement: np.ndarray,
+    sample_vector: np.ndarray,
+) -> None:
+    """`answer`, with settings, state, signals and sample as packed vectors."""
+    settings = settings_of(settings_vector)
+    answer(
+        settings,
+        reference_vector,
+        state_of(state_vector, settings),
+        signals_of(signals_vector, settings),
+        t,
+        dt,
+        measurement,
+        sample_of(sample_vector, settings.n, settings.m),
+    )
+
+
+class Controller:
+    """A law with its settings, its reference and its state.
+
+    Attributes:
+        settings: names of the settings vector's parts.
+        state: views on `state_vector`, which is all the controller remembers.
+        signals: views on what the last update computed.
+        sample: views on what is told of it; `sample.torque` is the answer.
+    """
+
+    def __init__(self, settings_vector: np.ndarray, reference_vector: np.ndarray) -> None:
+        """Allocate for packed settings (`settings.pack`) and reference; compile the kernels."""
+        self.settings_vector = settings_vector
+        self.reference_vector = reference_vector
+        self.settings = settings_of(settings_vector)
+        self.state_vector = np.zeros(state_size(self.settings))
+        self.signals_vector = np.zeros(signals_size(self.settings))
+        self.state = state_of(self.state_vector, self.settings)
+        self.signals = signals_of(self.signals_vector, self.settings)
+        self.sample_vector = np.zeros(sample_size(self.settings.n, self.settings.m))
+        self.sample = sample_of(self.sample_vector, self.settings.n, self.settings.m)
+        self.reset()
+        self.reference_at(0.0)
+        self.update(0.0, 1e-3, np.zeros(3 * self.settings.n))
+        self.reset()
+
+    def bound_at(self, t: float) -> np.ndarray:
+        """Bound k(t) (n,) [rad] at a time [s] since the start."""
+        funnel.narrow(self.settings, self.signals, t)
+        return self.signals.bound.copy()
+
+    def reference_at(self, t: float) -> np.ndarray:
+        """Reference at a time [s] since the start: qr, dqr, ddqr (3, n)."""
+        (now,) = reference.sampled(self.reference_vector, np.array([t]))
+        return np.asarray(now)
+
+    @property
+    def samples(self) -> int:
+        """Samples answered since the start."""
+        return int(self.state.samples[0])
+
+    def reset(self) -> None:
+        """Forget everything: estimates back to P^(0), filters and window empty."""
+        self.state_vector.fill(0.0)
+        self.state.estimate[:] = self.settings.initial_estimate
+        self.state.weakest.fill(self.settings.m**-0.5)
+        self.state.active.fill(1.0)
+
+    def check_start(self, joints: tuple[str, ...], q: np.ndarray, t: float = 0.0) -> None:
+        """Refuse measured positions (n,) [rad] outside the barrier: see `check_start`."""
+        check_start(joints, q, self.bound_at(t), self.reference_vector, t)
+
+    def update(self, t: float, dt: float, measurement: np.ndarray) -> np.ndarray:
+        """Torque (n,) [N m] for a measurement; a view that the next update overwrites.
+
+        Args:
+            t: time since the start [s].
+            dt: time since the last sample [s].
+            measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
+        """
+        respond(
+            self.settings_vector,
+            self.reference_vector,
+            self.state_vector,
+            self.signals_vector,
+            t,
+            dt,
+            measurement,
+            self.sample_vector,
+        )
+        return self.sample.torque
+
+    def save(self) -> np.ndarray:
+        """Copy of the whole state."""
+        return self.state_vector.copy()
+
+    def restore(self, saved: np.ndarray) -> None:
+        """Go back to a saved state; the loop continues from there bit for bit."""
+        self.state_vector[:] = saved

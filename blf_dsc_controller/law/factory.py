@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a configuration to what runs: the model, the packed settings, the controller.
+
+Here a law's name becomes gains.  All laws share one kernel; they differ in the surface and in which
+gains are zero:
+
+    blf_dsc       (28): filtered surface, barrier, composite learning, d^3
+    model_based   (16): the same with P^ = P and the disturbance known, nothing adapted
+    backstepping  (35): linear surface, position gain, leaky adaptation by the tracking error
+    slotine_li    tau = H P^ - K_p s, P^' = -Gamma H^T s: (35) without its extra terms
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from blf_dsc_controller.arms import models
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law import barrier
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.settings import (
+    LATCHES,
+    PREDICTIONS,
+    SURFACES,
+    TORQUE_SOURCES,
+    UPDATES,
+    Settings,
+    pack,
+)
+from blf_dsc_controller.reference.start import plan, reference_of
+
+COLUMN_GAIN = 1.0
+"""Entry of Gamma for the disturbance columns: they do not act on the torque."""
+
+
+def model_of(config: ControllerConfig) -> models.Model:
+    """Model named by `model`, with the geometry that the controller is told."""
+    if config.model == 'planar_chain':
+        return models.planar_arm(len(config.joints), config.arm.l1, config.arm.gravity)
+    return models.two_link_arm(config.arm.l1, config.arm.gravity)
+
+
+def column_names(config: ControllerConfig) -> tuple[str, ...]:
+    """Name of each disturbance column, in the order of `core.columns`."""
+    learning = config.learning
+    switched = {'bias': learning.bias, 'viscous': learning.viscous, 'coulomb': learning.coulomb}
+    blocks = [name for name, is_on in switched.items() if is_on]
+    blocks += [f'{wave} {w:g} rad/s' for w in learning.frequencies for wave in ('sin', 'cos')]
+    return tuple(f'{block} {joint}' for block in blocks for joint in config.joints)
+
+
+def estimate_names(config: ControllerConfig) -> tuple[str, ...]:
+    """Name of each entry of theta^: the model's parameters, then the disturbance columns."""
+    return model_of(config).parameter_names + column_names(config)
+
+
+def required_fields(config: ControllerConfig) -> tuple[str, ...]:
+    """Fields of a joint state that the controller cannot do without."""
+    velocity = ('velocity',) if config.safety.velocity == 'measured' else ()
+    effort = ('effort',) if config.learning.torque_source == 'effort' else ()
+    return ('position', *velocity, *effort)
+
+
+def settings_of_config(config: ControllerConfig) -> Settings:
+    """Translate the configuration's words into the paper's symbols."""
+    model = model_of(config)
+    learning = config.learning
+    columns = len(column_names(config))
+    truth = config.truth
+    per_joint = zip(
+        config.barrier.bound, config.barrier.weight, config.barrier.slope_limit, strict=True
+    )
+    settings = Settings(
+        n=model.n,
+        p=model.p,
+        m=model.p + columns,
+        model=model.code,
+        surface=SURFACES.index('filtered'),
+        prediction=PREDICTIONS.index(learning.prediction),
+        latch=LATCHES.index(learning.latch),
+        update=UPDATES.index(learning.update),
+        torque_source=TORQUE_SOURCES.index(learning.torque_source),
+        window=round(learning.window / config.sample_time),
+        interval=learning.interval,
+        bias=int(learning.bias),
+        viscous=int(learning.viscous),
+        coulomb=int(learning.coulomb),
+        tones=len(learning.frequencies),
+        truth_known=int(bool(truth.parameters)),
+        feed_forward=int(truth.feed_forward),
+        time_constant=config.surface.time_constant,
+        boundary_layer=config.feedback.boundary_layer,
+        eta=config.disturbance.leakage,
+        kappa=learning.weight,
+        rho=learning.regularization,
+        sigma=learning.excitation_threshold,
+        learning_start=learning.window + learning.settling_time,
+        pole=learning.filter_pole,
+        omega=learning.derivative_filter,
+        coulomb_velocity=learning.coulomb_velocity,
+        radius=learning.radius,
+        Wc=0.0,
+        funnel_rate=config.barrier.funnel_rate,
+        bound=np.array(config.barrier.bound),
+        initial_bound=np.array(config.barrier.widest),
+        weight=np.array(config.barrier.weight),
+        slope_limit=np.array(config.barrier.slope_limit),
+        knee=np.array([barrier.knee(*joint) for joint in per_joint]),
+        K=np.array(config.surface.gain),
+        mu=np.array(config.surface.mu),
+        Kp=np.array(config.feedback.gain),
+        d2=np.array(config.feedback.damping),
+        mu_bar=np.zeros(model.n),
+        gamma=np.array(config.disturbance.gain),
+        torque_limit=np.array(config.torque.limit),
+        rate_limit=np.array(config.torque.rate_limit),
+        true_disturbance=np.array((truth.constant, truth.amplitude, truth.frequency, truth.phase)),
+        Gamma=np.array(learning.adaptation_gain + (COLUMN_GAIN,) * columns),
+        initial_estimate=np.array(learning.initial_estimate + (0.0,) * columns),
+        true_parameters=np.array(truth.parameters or (0.0,) * model.p),
+        frequencies=np.array(learning.frequencies),
+        constants=np.array(model.constants),
+    )
+    return settings._replace(**_of_law(config, settings))
+
+
+def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
+    comparison = config.comparison
+    nothing = np.zeros(settings.n)
+    linear = {
+        'surface': SURFACES.index('linear'),
+        'K': np.array(comparison.surface_gain),
+        'd2': nothing,
+        'gamma': nothing,
+        'kappa': 0.0,
+    }
+    laws: dict[str, dict[str, Any]] = {
+        'blf_dsc': {},
+        'model_based': {
+            'initial_estimate': np.concatenate(
+                (settings.true_parameters, settings.initial_estimate[settings.p :])
+            ),
+            'feed_forward': 1,
+            'd2': nothing,
+            'gamma': nothing,
+            'Gamma': np.zeros(settings.m),
+        },
+        'backstepping': linear
+        | {
+            'weight': np.array(comparison.position_gain),
+            'mu_bar': np.array(comparison.robust_gain),
+            'Wc': comparison.leakage,
+        },
+        'slotine_li': linear | {'weight': nothing},
+    }
+    return laws[config.law]
+
+
+def controller_of(config: ControllerConfig) -> Controller:
+    """Controller of a configuration, compiled and at rest."""
+    return Controller(pack(settings_of_config(config)), reference_of(config))
+
+
+def begin(
+    controller: Controller,
+    config: ControllerConfig,
+    q: np.ndarray,
+    dq: np.ndarray,
+    t: float = 0.0,
+) -> float:
+    """Give the controller the planned reference; returns when [s] the approach is over, or `t`.
+
+    Arguments and errors as in `reference.start.plan`.
+    """
+    motion = plan(config, controller.bound_at(t), q, dq, t)
+    controller.reference_vector = motion.vector
+    return motion.settled

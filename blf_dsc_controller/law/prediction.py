@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows [X | u] of the prediction error: X theta = u holds for the true theta = [P; d].
+
+`filtered` (default).  d/dt(Yp P) + Yr P + D d = tau, integrated over a sample of held torque, is
+
+    X_k = (Yp_k - Yp_{k-1}) / T + (Yr_k + Yr_{k-1}) / 2,      X_k P + D_k d = tau on [k-1, k]
+
+up to O(T^2).  Both sides pass the same two cascaded poles, which leaves the identity untouched and
+takes the noise off the difference quotient.  No acceleration is needed.
+
+`acceleration`.  ddq^ = alpha2' + xi2'^ with xi2'^ from the filter (8): X = H(q, dq, dq, ddq^).
+
+`lambda`.  The paper's (24): X = H(q, dq, alpha2, alpha2'), u = Lambda tau with the scalar
+Lambda = x^T y / x^T x,  x = [xi2'^ + alpha2'; xi2 + alpha2; 1],  y = [alpha2'; alpha2; 1].  Since
+tau = [M C G] x and H P = [M C G] y, this is exact only where y is parallel to x: its error is of
+first order in xi2 and xi2', and changes with the units.
+"""
+
+from math import exp
+
+import numpy as np
+
+from blf_dsc_controller.arms import models
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.law import surface
+from blf_dsc_controller.law.settings import FILTERED, LAMBDA, Settings
+from blf_dsc_controller.law.state import Signals, State
+
+
+@inner
+def filter_row(
+    settings: Settings, state: State, signals: Signals, dt: float, torque: np.ndarray
+) -> None:
+    """Pass [X | u] of the last interval through both poles, leaving it in `signals.row`.
+
+    Args:
+        settings: the law's settings.
+        state: holds Yp and [Yr | D] of the last sample and the filter's state.
+        signals: holds Yp and [Yr | D] of this sample.
+        dt: length of the interval [s].
+        torque: torque applied over the interval (n,) [N m].
+    """
+    gain = surface.filter_gain(1.0 / settings.pole, dt)
+    p = settings.p
+    m = settings.m
+    row = signals.row
+    for i in range(settings.n):
+        for j in range(m):
+            row[i, j] = 0.5 * (signals.rest[i, j] + state.rest[i, j])
+        for j in range(p):
+            row[i, j] += (signals.momentum[i, j] - state.momentum[i, j]) * (1.0 / dt)
+        row[i, m] = torque[i]
+        for j in range(m + 1):
+            state.filter1[i, j] += gain * (row[i, j] - state.filter1[i, j])
+            state.filter2[i, j] += gain * (state.filter1[i, j] - state.filter2[i, j])
+            row[i, j] = state.filter2[i, j]
+
+
+@inner
+def remember(settings: Settings, state: State, signals: Signals) -> None:
+    """Keep this sample's Yp and [Yr | D] for the next interval."""
+    for i in range(settings.n):
+        for j in range(settings.m):
+            state.rest[i, j] = signals.rest[i, j]
+            if j < settings.p:
+                state.momentum[i, j] = signals.momentum[i, j]
+
+
+@inner
+def differentiate(settings: Settings, state: State, signals: Signals, dt: float) -> None:
+    """Filter (8) with damping 1, exact for xi2 held over the interval; leaves ddq^ in `signals`."""
+    decay = exp(-settings.omega * dt)
+    for i in range(settings.n):
+        if state.samples[0] == 0.0:
+            state.observed[i] = signals.xi2[i]
+            state.observed_rate[i] = 0.0
+        else:
+            offset = state.observed[i] - signals.xi2[i]
+            slope = state.observed_rate[i] + settings.omega * offset
+            state.observed[i] = signals.xi2[i] + (offset + slope * dt) * decay
+            state.observed_rate[i] = (state.observed_rate[i] - settings.omega * slope * dt) * decay
+        signals.acceleration[i] = signals.dalpha2[i] + state.observed_rate[i]
+
+
+@inner
+def heuristic_factor(settings: Settings, state: State, signals: Signals, dq: np.ndarray) -> float:
+    """Lambda of (24), dimensionless only by neglect of the units."""
+    products = 1.0
+    squares = 1.0
+    for i in range(settings.n):
+        products += signals.acceleration[i] * signals.dalpha2[i] + dq[i] * state.alpha2[i]
+        squares += signals.acceleration[i] ** 2 + dq[i] ** 2
+    return products / squares
+
+
+@inner
+def accelerated_row(
+    settings: Settings,
+    state: State,
+    signals: Signals,
+    q: np.ndarray,
+    dq: np.ndarray,
+    torque: np.ndarray,
+) -> None:
+    """Rows `acceleration` and `lambda`, from ddq^ of `differentiate`, into `signals.row`."""
+    scale = 1.0
+    X = signals.H
+    if settings.prediction == LAMBDA:
+        scale = heuristic_factor(settings, state, signals, dq)
+    else:
+        X = signals.momentum
+        models.regressor(settings.model, settings.constants, q, dq, dq, signals.acceleration, X)
+    for i in range(settings.n):
+        for j in range(settings.m):
+            signals.row[i, j] = X[i, j] if j < settings.p else scale * signals.rest[i, j]
+        signals.row[i, settings.m] = scale * torque[i]
+
+
+@inner
+def form_row(
+    settings: Settings,
+    state: State,
+    signals: Signals,
+    dt: float,
+    q: np.ndarray,
+    dq: np.ndarray,
+    torque: np.ndarray,
+) -> None:
+    """Leave the configured row of the last interval in `signals.row` (n, m + 1).
+
+    Args:
+        settings: the law's settings.
+        state: the law's state.
+        signals: of this sample: H, alpha2', xi2, the columns D and, where they are needed, Yp and
+            Yr are read.
+        dt: length of the interval [s].
+        q: joint positions (n,) [rad].
+        dq: joint velocities (n,) [rad/s].
+        torque: torque applied over the interval (n,) [N m].
+    """
+    if settings.prediction != FILTERED:
+        differentiate(settings, state, signals, dt)
+        accelerated_row(settings, state, signals, q, dq, torque)
+        return
+    if state.samples[0] > 0.0:
+        filter_row(settings, state, signals, dt, torque)
+    remember(settings, state, signals)

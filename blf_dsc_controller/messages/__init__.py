@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The messages of the package: topics, CDR encoding, telemetry."""

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What controller and plant tell in each sample, as (topic, bytes).
+
+The nodes publish these messages and the offline loop writes them into a bag: one place says what is
+on the wire.  Vectors of named values travel as JointState with the values in `position`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TypeAlias
+
+import numpy as np
+
+from blf_dsc_controller.law.sample import Sample
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.encoders import (
+    Float64MultiArrayEncoder,
+    JointStateEncoder,
+    encode_clock,
+)
+from blf_dsc_controller.messages.names import (
+    COMPUTE_TIME,
+    DISTURBANCE,
+    LAMBDA_MIN,
+    LATCHED,
+    LATE_STEPS,
+    LATENCY,
+    LATENESS,
+    POSITION,
+    VELOCITY,
+)
+
+Message: TypeAlias = tuple[topics.Topic, bytes]
+
+DECIMATION = 10
+"""Samples from one slow message (monitor, truth) to the next."""
+
+
+def disturbance_names(joints: Sequence[str]) -> tuple[str, ...]:
+    """Names of the disturbance torques, estimated or true."""
+    return tuple(DISTURBANCE + joint for joint in joints)
+
+
+class ControllerTelemetry:
+    """Messages of the controller.
+
+    Args:
+        joints: names of the n joints.
+        estimates: names of the m entries of theta^.
+    """
+
+    def __init__(self, joints: Sequence[str], estimates: Sequence[str]) -> None:
+        learning = (*estimates, *disturbance_names(joints), LAMBDA_MIN, LATCHED, COMPUTE_TIME)
+        self._command = Float64MultiArrayEncoder(len(joints))
+        self._reference = JointStateEncoder(joints, ('position', 'velocity'))
+        self._error = JointStateEncoder(joints)
+        self._bound = JointStateEncoder(joints, ('position', 'effort'))
+        self._learning = JointStateEncoder(learning, ('position',))
+        self._values = np.zeros(len(learning))
+
+    def command(self, torque: np.ndarray) -> Message:
+        """Commanded torque (n,) [N m]."""
+        return topics.COMMANDS, self._command.encode(torque)
+
+    def bound(self, stamp: int, bound: np.ndarray, torque_limit: np.ndarray) -> Message:
+        """Bound k_c (n,) [rad] on the tracking error, and the torque limit (n,) [N m]."""
+        message = self._bound.encode(stamp, position=bound, effort=torque_limit)
+        return topics.BOUND, message
+
+    def sample(self, stamp: int, told: Sample, compute_time: float) -> Iterator[Message]:
+        """Messages of one sample.
+
+        Args:
+            stamp: of the answered state [ns].
+            told: what the law tells of it.
+            compute_time: time the law took [s].
+        """
+        yield topics.REFERENCE, self._reference.encode(stamp, told.qr, told.dqr)
+        yield (
+            topics.TRACKING_ERROR,
+            self._error.encode(stamp, told.xi1, told.xi2, told.torque),
+        )
+        n = told.xi1.size
+        m = told.estimate.size
+        values = self._values
+        values[:m] = told.estimate
+        values[m : m + n] = told.disturbance
+        values[m + n] = told.lambda_min[0]
+        values[m + n + 1] = told.latched[0]
+        values[m + n + 2] = compute_time
+        yield topics.LEARNING, self._learning.encode(stamp, values)
+
+
+class PlantTelemetry:
+    """Messages of the plant.
+
+    Args:
+        joints: names of the n joints.
+        parameters: names of the p true parameters.
+    """
+
+    def __init__(self, joints: Sequence[str], parameters: Sequence[str]) -> None:
+        true_state = [what + joint for what in (POSITION, VELOCITY) for joint in joints]
+        self._joints = len(joints)
+        self._joint_states = JointStateEncoder(joints)
+        self._truth = JointStateEncoder(
+            (*parameters, *disturbance_names(joints), *true_state), ('position',)
+        )
+        self._timing = JointStateEncoder((LATENCY, LATENESS, LATE_STEPS), ('position',))
+
+    def joint_states(self, stamp: int, measurement: np.ndarray) -> Message:
+        """Measured [q, dq, applied torque of the last interval] (3 n,)."""
+        fields = measurement.reshape(3, self._joints)
+        return topics.JOINT_STATES, self._joint_states.encode(stamp, *fields)
+
+    def truth(self, stamp: int, truth: np.ndarray) -> Message:
+        """True [P, tau_dist, q, dq] (p + 3 n,)."""
+        return topics.TRUTH, self._truth.encode(stamp, truth)
+
+    def timing(self, stamp: int, latency: float, lateness: float, late_steps: int) -> Message:
+        """How well real time was kept in the step that led to this sample [s, s, count]."""
+        return topics.TIMING, self._timing.encode(stamp, (latency, lateness, late_steps))
+
+    def clock(self, stamp: int) -> Message:
+        """Plant time [ns] on /clock."""
+        return topics.CLOCK, encode_clock(stamp)

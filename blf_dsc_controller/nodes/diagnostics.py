@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a node tells of its health: `/diagnostics`, once a second and at once on a change.
+
+Names are paths (`left/blf_dsc_controller/loop`), which rqt_robot_monitor shows as a tree; the
+hardware is named by its joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.nodes.endpoints import message_class, profile, publisher
+
+OK = DiagnosticStatus.OK
+WARN = DiagnosticStatus.WARN
+ERROR = DiagnosticStatus.ERROR
+STALE = DiagnosticStatus.STALE
+
+
+class Board:
+    """Statuses of one node.
+
+    Args:
+        node: that tells.
+        joints: names of the hardware.
+        state: topic of its latched state; None if it has none.
+    """
+
+    def __init__(
+        self, node: Node, joints: Sequence[str], state: topics.Topic | None = None
+    ) -> None:
+        self._node = node
+        self._name = node.get_fully_qualified_name().removeprefix('/')
+        self._hardware = ' '.join(joints)
+        self._diagnostics = node.create_publisher(
+            message_class(topics.DIAGNOSTICS.type),
+            topics.DIAGNOSTICS.name,
+            profile(topics.DIAGNOSTICS.offered),
+        )
+        self._state = publisher(node, state) if state else None
+
+    def status(
+        self, part: str, level: bytes, message: str, values: Mapping[str, Any]
+    ) -> DiagnosticStatus:
+        """Status of a part of the node."""
+        return DiagnosticStatus(
+            level=level,
+            name=f'{self._name}/{part}',
+            message=message,
+            hardware_id=self._hardware,
+            values=[KeyValue(key=key, value=f'{value}') for key, value in values.items()],
+        )
+
+    def report(self, statuses: Sequence[DiagnosticStatus]) -> None:
+        """Publish statuses on /diagnostics."""
+        array = DiagnosticArray(status=list(statuses))
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+
+    def announce(self, status: DiagnosticStatus) -> None:
+        """Publish the state, which stays for whoever asks later."""
+        if self._state is not None:
+            self._state.publish(status)

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gains for the laws that are compared, all found by one procedure, objective and budget.
+
+    python -m blf_dsc_controller.paper.tune proposed      config/paper_tuned.yaml
+    python -m blf_dsc_controller.paper.tune comparison    config/comparison.yaml
+    python -m blf_dsc_controller.paper.tune slotine_li    config/slotine_li.yaml
+
+Equal for all: the arm, its disturbance, reference, start, P^(0), sample time and torque limit; two
+runs of 30 s, on exact sensors and on real ones (preset noisy); the objective; the number of gains
+(slotine_li has fewer) and the ranges of those that they share; the optimiser, its seed and budget.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from blf_dsc_controller.configuration.dump import written
+from blf_dsc_controller.configuration.nodes import LoopConfig
+from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.paper.metrics import Courses, Metrics, measure
+from blf_dsc_controller.run import Floats
+from blf_dsc_controller.simulation.loop import simulate
+
+SEED = 1
+POPULATION = 96
+GENERATIONS = 12
+DURATION = 30.0  # s
+ROUGHEST = 2.0  # N m, rms change of a torque from sample to sample that a motor is to be spared
+HOPELESS = 30.0
+
+PLANTS = ('recommended', 'noisy')
+"""Presets whose plants a law is tuned on."""
+
+
+@dataclass(frozen=True)
+class Gain:
+    """One tuned number: the parameter it sets, for which of two joints, and its range."""
+
+    name: str
+    least: float
+    most: float
+    joint: int = -1  # 0 or 1; -1: both, or a scalar
+    length: int = 2  # entries of the parameter; 0: a scalar
+
+
+SHARED = (
+    Gain('feedback.gain', 5.0, 200.0, joint=0),
+    Gain('feedback.gain', 2.0, 100.0, joint=1),
+    Gain('learning.adaptation_gain', 0.01, 30.0, length=3),
+)
+SURFACE_OF_35 = Gain('comparison.surface_gain', 10.0, 300.0)
+
+
+@dataclass(frozen=True)
+class Task:
+    """A law to tune: the preset or choices it starts from, and its gains."""
+
+    title: str
+    preset: str
+    fixed: Mapping[str, object]
+    gains: tuple[Gain, ...]
+
+
+TASKS = {
+    'proposed': Task(
+        "The proposed law in the paper's own form (preset paper), its gains tuned",
+        'paper',
+        {},
+        (
+            *SHARED,
+            Gain('surface.gain', 10.0, 600.0),
+            Gain('surface.mu', 1.0, 100.0),
+            Gain('disturbance.gain', 0.1, 300.0),
+            Gain('learning.weight', 0.1, 100.0, length=0),
+        ),
+    ),
+    'comparison': Task(
+        'The comparison controller (35), its gains tuned',
+        'recommended',
+        {'law': 'backstepping'},
+        (
+            *SHARED,
+            SURFACE_OF_35,
+            Gain('comparison.position_gain', 0.1, 1e4),
+            Gain('comparison.robust_gain', 1e-3, 5.0),
+            Gain('comparison.leakage', 1e-5, 1.0, length=0),
+        ),
+    ),
+    'slotine_li': Task(
+        'The classical adaptive law of Slotine and Li, its gains tuned',
+        'recommended',
+        {'law': 'slotine_li'},
+        (*SHARED, SURFACE_OF_35),
+    ),
+}
+
+
+def settings_of(task: Task, exponents: Floats) -> dict[str, object]:
+    """Parameters of a point, of which each coordinate is a gain's decimal logarithm."""
+    chosen: dict[str, object] = dict(task.fixed)
+    per_joint: dict[str, list[float]] = {}
+    for gain, exponent in zip(task.gains, exponents, strict=True):
+        value = float(f'{10.0**exponent:.3g}')
+        if gain.joint >= 0:
+            per_joint.setdefault(gain.name, [0.0, 0.0])[gain.joint] = value
+        else:
+            chosen[gain.name] = [value] * gain.length if gain.length else value
+    return {**chosen, **per_joint}
+
+
+def judge(metrics: Metrics, sample_time: float) -> float:
+    """Objective of one run, in decades: largest error, rms error and parameter error; less is more.
+
+    Leaving the bound costs ten decades a decade, and so does a torque rougher than `ROUGHEST`.
+    """
+    largest = np.log10(metrics.largest_ratio)
+    typical = np.log10(np.linalg.norm(metrics.rms_error))
+    learned = np.log10(metrics.tail_error + 1e-12)
+    rough = np.log10(max(metrics.torque_rate) * sample_time / ROUGHEST)
+    value = largest + typical + learned + 10.0 * (max(largest, 0.0) + max(rough, 0.0))
+    return float(value) if np.isfinite(value) else HOPELESS
+
+
+def objective(exponents: Floats, task: Task, loops: Sequence[LoopConfig]) -> float:
+    """Mean of `judge` over the plants."""
+    changes = settings_of(task, exponents)
+    values = []
+    for loop in loops:
+        config = change(loop.controller, changes)
+        with np.errstate(all='ignore'):
+            courses = Courses.of(simulate(config, loop.plant))
+            metrics = measure(courses, np.array(config.barrier.bound))
+            values.append(judge(metrics, config.sample_time))
+    return min(float(np.mean(values)), HOPELESS)
+
+
+def loops_of(task: Task) -> list[LoopConfig]:
+    """The task's controller against each plant, for the duration of the tuning."""
+    law = load_loop(locate(task.preset)).controller
+    loops = (load_loop(locate(name), {'sim_plant': {'duration': DURATION}}) for name in PLANTS)
+    return [loop._replace(controller=law) for loop in loops]
+
+
+def tune(task: Task, generations: int = GENERATIONS) -> tuple[Floats, float, int]:
+    """Best exponents, their objective, and how many times it was evaluated."""
+    from scipy.optimize import differential_evolution
+
+    loops = loops_of(task)
+    ranges = [(np.log10(gain.least), np.log10(gain.most)) for gain in task.gains]
+    with tqdm(total=POPULATION * (generations + 1), desc='tuning', unit='run') as bar:
+
+        def cost(exponents: Floats) -> float:
+            bar.update()
+            return objective(exponents, task, loops)
+
+        found = differential_evolution(
+            cost,
+            ranges,
+            init=first_population(len(ranges)) * np.diff(ranges).T + np.array(ranges)[:, 0],
+            maxiter=generations,
+            tol=0.0,
+            polish=False,
+            rng=np.random.default_rng(SEED),
+        )
+    return found.x, float(found.fun), int(found.nfev)
+
+
+def first_population(dimensions: int) -> Floats:
+    """Evenly spread points of the unit cube, as many for every law."""
+    from scipy.stats import qmc
+
+    sampler = qmc.LatinHypercube(dimensions, rng=np.random.default_rng(SEED))
+    return np.asarray(sampler.random(POPULATION))
+
+
+def preset(name: str, exponents: Floats, value: float, evaluations: int) -> str:
+    """Text of the parameter file that holds the result."""
+    task = TASKS[name]
+    base = load_loop(locate(task.preset)).controller
+    changes = {**_differences(base), **settings_of(task, exponents)}
+    lines = ''.join(
+        f'    {key}: {written(tuple(entry) if isinstance(entry, list) else entry)}\n'  # type: ignore[arg-type]
+        for key, entry in changes.items()
+    )
+    return (
+        f'# {task.title}.\n'
+        f'# Made by `python -m blf_dsc_controller.paper.tune {name} FILE`:\n'
+        f'# {evaluations} evaluations, objective {value:.3f} (decades of error; less is better).\n'
+        f'\nblf_dsc_controller:\n  ros__parameters:\n{lines}'
+    )
+
+
+def _differences(config: object) -> dict[str, object]:
+    """What a preset changes of the defaults, and the truth that the monitors show."""
+    from blf_dsc_controller.configuration.schema import flatten
+
+    plain = flatten(type(config)())
+    truth = flatten(load_loop(locate('paper')).controller)
+    return {
+        key: value
+        for key, value in {**flatten(config), **_truth(truth)}.items()
+        if value != plain[key]
+    }
+
+
+def _truth(flat: Mapping[str, object]) -> dict[str, object]:
+    return {key: value for key, value in flat.items() if key.startswith('truth.')}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Tune one law and write its preset."""
+    options = argparse.ArgumentParser(prog='tune', description='Tune one of the compared laws.')
+    options.add_argument('law', choices=TASKS)
+    options.add_argument('out', type=Path, help='parameter file to write')
+    chosen = options.parse_args(arguments)
+    try:
+        exponents, value, evaluations = tune(TASKS[chosen.law])
+        chosen.out.write_text(preset(chosen.law, exponents, value, evaluations), encoding='utf-8')
+    except BlfDscError as error:
+        print(f'tune: {error}', file=sys.stderr)
+        return 1
+    print(f'wrote {chosen.out}: objective {value:.4f} after {evaluations} evaluations')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The bag of an offline run: the topics and messages that the nodes would have published."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from blf_dsc_controller.bags.rejected_columns import diagnosis
+from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.dump import text
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.law.factory import estimate_names, model_of
+from blf_dsc_controller.law.rejected_columns import refusals
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.monitor import Monitor
+from blf_dsc_controller.messages.telemetry import (
+    DECIMATION,
+    ControllerTelemetry,
+    Message,
+    PlantTelemetry,
+)
+from blf_dsc_controller.simulation.loop import Record
+
+START = 1_000_000_000
+"""Stamp of the first sample [ns], as in lock-step."""
+
+
+def write_bag(
+    path: Path,
+    record: Record,
+    config: ControllerConfig,
+    compression: str,
+    plant: PlantConfig | None = None,
+) -> None:
+    """Write a run as a bag.
+
+    Args:
+        path: folder of the bag, which must not exist yet.
+        record: the run.
+        config: of the controller that ran.
+        compression: `none` or `zstd`.
+        plant: configuration of the arm, to be stored beside that of the controller.
+
+    Raises:
+        BagExistsError: `path` is there already.
+    """
+    with BagWriter(path, compression=compression, flush_interval=None) as bag:
+        nodes: dict[str, object] = {topics.CONTROLLER: config}
+        if plant is not None:
+            nodes[topics.PLANT] = plant
+        bag.configure(text(nodes))
+        bag.note({'clock': 'offline'})
+        handles: dict[topics.Topic, int] = {}
+        for stamp, (topic, raw) in _messages(record, config):
+            if topic not in handles:
+                handles[topic] = bag.add_topic(topic.resolved, topic.type, [topic.offered])
+            bag.write(handles[topic], raw, stamp)
+        refused = refusals(record.controller, estimate_names(config))
+        if refused:
+            stamp = START + int(record.stamps[-1])
+            topic = topics.DIAGNOSTICS
+            handle = bag.add_topic(topic.resolved, topic.type, [topic.offered])
+            bag.write(handle, diagnosis(stamp, refused), stamp)
+
+
+def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, Message]]:
+    plant = PlantTelemetry(config.joints, model_of(config).parameter_names)
+    controller = ControllerTelemetry(config.joints, estimate_names(config))
+    monitor = Monitor(config.joints, estimate_names(config), record.controller.settings)
+    limit = np.array(config.torque.limit)
+    ratio = np.zeros(record.joints)
+    bound = np.zeros(record.joints)
+    for row, elapsed in enumerate(record.stamps.tolist()):
+        stamp = START + elapsed
+        told = record.sample(row)
+        np.maximum(ratio, np.abs(told.xi1) / told.bound, out=ratio)
+        if not np.array_equal(told.bound, bound):
+            bound = told.bound
+            yield stamp, controller.bound(stamp, bound, limit)
+        yield stamp, plant.joint_states(stamp, record.measurements[row])
+        yield stamp, controller.command(told.torque)
+        for message in controller.sample(stamp, told, float('nan')):
+            yield stamp, message
+        if row % DECIMATION == 0:
+            yield stamp, plant.truth(stamp, record.truths[row])
+            yield stamp, monitor.message(stamp, told, ratio, bound)
