@@ -26,8 +26,8 @@ from timing import Ratio, ratio
 
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.dump import dump
 from blf_dsc_controller.configuration.nodes import CONTROLLER
+from blf_dsc_controller.configuration.params_file import dump
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.telemetry import PlantTelemetry

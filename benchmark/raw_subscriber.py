@@ -12,7 +12,7 @@ import rclpy
 from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import JointState
 
-from blf_dsc_controller.configuration.recorder import RecorderConfig
+from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.messages.topics import STREAM
 from blf_dsc_controller.nodes.raw_subscriptions import requested
 

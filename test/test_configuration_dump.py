@@ -8,13 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.dump import dump, written
-from blf_dsc_controller.configuration.nodes import LoopConfig
-from blf_dsc_controller.configuration.params_file import load, load_loop
+from blf_dsc_controller.configuration.nodes import LoopConfig, RecorderConfig
+from blf_dsc_controller.configuration.params_file import dump, format_value, load, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.recorder import RecorderConfig
+from blf_dsc_controller.configuration.ros_yaml import parse
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.configuration.sections import parse
 
 CHANGED = LoopConfig(
     build(
@@ -59,7 +57,7 @@ def test_a_node_in_a_namespace_is_written_under_its_full_name(tmp_path):
     )
 )
 def test_a_value_is_read_back_as_itself_here_and_by_any_yaml_library(value):
-    text = f'n:\n  ros__parameters:\n    a: {written(value)}\n'
+    text = f'n:\n  ros__parameters:\n    a: {format_value(value)}\n'
     here = parse(text)[0].entries['a'].value
     there = yaml.safe_load(text)['n']['ros__parameters']['a']
     for found in (here, there):

@@ -10,10 +10,9 @@ import pytest
 
 from blf_dsc_controller.arms import planar_chain, two_link
 from blf_dsc_controller.configuration.controller import MODELS, ControllerConfig
-from blf_dsc_controller.configuration.nodes import NODES, LoopConfig, known_names
+from blf_dsc_controller.configuration.nodes import NODES, LoopConfig, RecorderConfig, known_names
 from blf_dsc_controller.configuration.params_file import load_loop, locate, read
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.recorder import RecorderConfig
 from blf_dsc_controller.configuration.schema import build, change, parameters
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law import factory as assembly

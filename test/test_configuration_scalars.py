@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from blf_dsc_controller.configuration.scalars import meaning
+from blf_dsc_controller.configuration.ros_yaml import parse_scalar
 
 
 @pytest.mark.parametrize(
@@ -47,10 +47,10 @@ from blf_dsc_controller.configuration.scalars import meaning
     ],
 )
 def test_a_word_means_what_it_means_to_ros(word, value):
-    assert meaning(word) == value
-    assert type(meaning(word)) is type(value)
+    assert parse_scalar(word) == value
+    assert type(parse_scalar(word)) is type(value)
 
 
 @pytest.mark.parametrize('word', ['nan', '.NaN', '-nan', 'NAN'])
 def test_not_a_number_is_a_double(word):
-    assert math.isnan(meaning(word))
+    assert math.isnan(parse_scalar(word))

@@ -8,8 +8,14 @@ from dataclasses import dataclass
 
 import pytest
 
-from blf_dsc_controller.configuration.parameter import Kind, parameter
-from blf_dsc_controller.configuration.schema import build, change, flatten, parameters
+from blf_dsc_controller.configuration.schema import (
+    Kind,
+    build,
+    change,
+    flatten,
+    parameter,
+    parameters,
+)
 from blf_dsc_controller.errors import ConfigurationError
 
 

@@ -8,8 +8,7 @@ import pytest
 from fault_rig import MILLISECOND, Rig
 
 from blf_dsc_controller.arms.two_link import gravity
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.safety import Safety
+from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.supervision.reasons import Phase, Reason
 from blf_dsc_controller.supervision.safe_torque import Ramp, safe_torque

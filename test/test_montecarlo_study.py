@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from montecarlo_case import LOOP, STUDY, study, write
 from scipy import stats
 
-from blf_dsc_controller.configuration.parameter import Kind
 from blf_dsc_controller.configuration.params_file import locate
+from blf_dsc_controller.configuration.schema import Kind
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.monte_carlo.distribution import TAIL, parse

@@ -14,7 +14,7 @@ pytest.importorskip('scipy')
 from blf_dsc_controller.cli.excite import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.params_file import load_loop, locate
-from blf_dsc_controller.configuration.reference import Limits
+from blf_dsc_controller.configuration.reference import MotionLimits
 from blf_dsc_controller.law.exciting_reference import Excitation, excite
 from blf_dsc_controller.reference.errors import ExcitationError
 from blf_dsc_controller.simulation.loop import simulate
@@ -72,7 +72,7 @@ def test_chosen_reference_tells_the_worst_disturbance_from_the_parameters():
 
 
 def test_search_keeps_its_limits_is_repeatable_and_beats_where_it_starts():
-    config = replace(ControllerConfig(), limits=Limits(velocity=(0.5, 0.8)))
+    config = replace(ControllerConfig(), limits=MotionLimits(velocity=(0.5, 0.8)))
     excitation = Excitation(config, P, 0.5, 1)
     (series, reached), (again, _) = (excite(excitation, 3, 1) for _ in range(2))
     np.testing.assert_array_equal(series.cosines, again.cosines)
@@ -88,7 +88,8 @@ def test_search_keeps_its_limits_is_repeatable_and_beats_where_it_starts():
 
 def test_without_torque_to_spare_none_is_found():
     still = replace(
-        ControllerConfig(), limits=Limits(position_lower=(0.0, 0.0), position_upper=(0.5, 0.5))
+        ControllerConfig(),
+        limits=MotionLimits(position_lower=(0.0, 0.0), position_upper=(0.5, 0.5)),
     )
     with pytest.raises(ExcitationError, match='in 1 searches'):
         excite(Excitation(still, P, 0.1, 1), 0, 1)

@@ -18,7 +18,7 @@ from blf_dsc_controller.bags.errors import (
     OtherVersionError,
     UnreadableMessageError,
 )
-from blf_dsc_controller.configuration.dump import text
+from blf_dsc_controller.configuration.params_file import dumps
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import controller_of, estimate_names
@@ -315,7 +315,7 @@ def test_another_version_is_remarked(bag, monkeypatch):
 
 
 def test_a_configuration_of_another_version_is_refused_as_that(entries, tmp_path, monkeypatch):
-    config = text({'blf_dsc_controller': recorded_run.loop_config().controller})
+    config = dumps({'blf_dsc_controller': recorded_run.loop_config().controller})
     newer = config + '    barrier.shape: 2.0\n'
     path = recorded_run.write(tmp_path / 'bag', entries, newer)
     with pytest.raises(ConfigurationError, match=r'barrier\.shape'):

@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from blf_dsc_controller.configuration.safety import Safety
+from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.supervision.reasons import Phase
 from blf_dsc_controller.supervision.supervisor import Supervisor, Trust
 

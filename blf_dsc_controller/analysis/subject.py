@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from blf_dsc_controller.analysis.estimation import latch_time
 from blf_dsc_controller.bags.context import Context, read_context
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.sources import open_bag
-from blf_dsc_controller.configuration.sections import Section, SectionError, parse
+from blf_dsc_controller.configuration.ros_yaml import Section, parse
+from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages.topics import DIAGNOSTICS
 from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Run
@@ -49,7 +49,7 @@ class Subject:
         """Sections of the recorded configuration, none if it is not there or cannot be read."""
         try:
             return parse(self.context.configuration)
-        except (SectionError, yaml.YAMLError):
+        except ConfigurationError:
             return []
 
     @property

@@ -12,17 +12,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import yaml
 from mcap.reader import make_reader
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.errors import NoConfigurationError, OtherVersionError
 from blf_dsc_controller.bags.losses import NOTHING_MISSED
 from blf_dsc_controller.bags.sources import open_bag
-from blf_dsc_controller.configuration.builtin import is_builtin
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import is_builtin
+from blf_dsc_controller.configuration.ros_yaml import Section, parse
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.configuration.sections import Section, SectionError, parse
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages.topics import TOPICS
 
@@ -113,8 +112,8 @@ class Context:
         for stored, text in self.configurations:
             try:
                 sections = parse(text)
-            except (SectionError, yaml.YAMLError) as error:
-                damage = str(error).partition('\n')[0]
+            except ConfigurationError as error:
+                damage = error.problems[0].partition('\n')[0]
                 continue
             for section in sections:
                 if section.entries.keys() >= _OF_CONTROLLER:
@@ -139,7 +138,7 @@ def facts_of(configuration: str) -> dict[str, str]:
     facts = {VERSION: __version__}
     try:
         sections = parse(configuration)
-    except (SectionError, yaml.YAMLError):  # of a node with parameters that no file can hold
+    except ConfigurationError:  # of a node with parameters that no file can hold
         return facts
     for section in sections:
         for name, fact in _FACTS.items():

@@ -25,9 +25,8 @@ from blf_dsc_controller.cli.output_folder import DEFAULT, OutputError, make_fold
 from blf_dsc_controller.cli.processes import NodeFailedError
 from blf_dsc_controller.cli.progress import Progress
 from blf_dsc_controller.cli.session import run_session
-from blf_dsc_controller.configuration.dump import dump
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
-from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.configuration.params_file import dump, load_loop, locate
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import estimate_names

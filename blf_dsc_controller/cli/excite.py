@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.dump import written
 from blf_dsc_controller.configuration.nodes import CONTROLLER
-from blf_dsc_controller.configuration.params_file import load, locate
+from blf_dsc_controller.configuration.params_file import format_value, load, locate
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.exciting_reference import Course, Excitation, Series, excite
 
@@ -66,7 +65,7 @@ def preset(series: Series, course: Course, before: float, command: str) -> str:
     ]
     units = {'frequency': 'rad/s, of the cosines, then of the sines'}
     for name, value in series.parameters.items():
-        lines += [f'      # {units.get(name, "rad")}', f'      {name}: {written(value)}']
+        lines += [f'      # {units.get(name, "rad")}', f'      {name}: {format_value(value)}']
     return '\n'.join(lines) + '\n'
 
 

@@ -10,14 +10,14 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from blf_dsc_controller.configuration.dump import written
 from blf_dsc_controller.configuration.nodes import NODES
+from blf_dsc_controller.configuration.params_file import format_value
 from blf_dsc_controller.configuration.schema import parameters
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from blf_dsc_controller.configuration.parameter import Parameter
+    from blf_dsc_controller.configuration.schema import Parameter
 
 _PREFACE = """\
 # Parameters
@@ -54,7 +54,7 @@ def _rows(listed: list[Parameter]) -> Iterator[str]:
             one.rule.symbol,
             one.rule.unit,
             one.kind.value,
-            f'`{written(one.default)}`',
+            f'`{format_value(one.default)}`',
             _range(one),
             '' if one.rule.read_only else '•',
             one.rule.description,

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from blf_dsc_controller.configuration.parameter import parameter
+from blf_dsc_controller.configuration.schema import parameter
 
 _SIZES = 'it sizes the memory of the learning, which is laid out at the start'
 _FILTERED = 'what is already in the excitation window was filtered with it'

@@ -1,30 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS 2 parameter files, read without ROS, with the meaning that ROS gives them."""
+"""Load and write the configurations of nodes as ROS 2 parameter files."""
 
 from __future__ import annotations
 
 import difflib
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import yaml
-
-from blf_dsc_controller.configuration.builtin import is_builtin
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
     NODES,
     PLANT,
     RECORDER,
     LoopConfig,
+    is_builtin,
     known_names,
 )
-from blf_dsc_controller.configuration.schema import build, parameters, unknown
-from blf_dsc_controller.configuration.sections import Entry, Section, SectionError, parse
+from blf_dsc_controller.configuration.ros_yaml import Entry, Section, parse
+from blf_dsc_controller.configuration.schema import build, flatten, parameters, unknown
 from blf_dsc_controller.configuration.share import config_file
 from blf_dsc_controller.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
+
+    from blf_dsc_controller.configuration.schema import Value
 
 Config = TypeVar('Config')
 
@@ -52,14 +53,10 @@ def read(path: str | Path) -> list[Section]:
     """Read the sections of a parameter file; ConfigurationError names the file and the line."""
     try:
         return parse(Path(path).read_text(encoding='utf-8'))
-    except (SectionError, UnicodeDecodeError, OSError) as error:
+    except (UnicodeDecodeError, OSError) as error:
         raise ConfigurationError([str(error)], str(path)) from error
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        line = f'line {mark.line + 1}: ' if mark else ''
-        raise ConfigurationError([f'{line}no valid YAML: {error.problem}'], str(path)) from error
-    except yaml.YAMLError as error:
-        raise ConfigurationError([f'no valid YAML: {error}'], str(path)) from error
+    except ConfigurationError as error:
+        raise ConfigurationError(error.problems, str(path)) from error
 
 
 def load(
@@ -154,3 +151,45 @@ def _stray_sections(sections: list[Section]) -> Iterator[str]:
         close = difflib.get_close_matches(name, absent, n=1, cutoff=0.8)
         if close and name not in NODES:
             yield f'line {section.line}: no node is called {name}: did you mean {close[0]}?'
+
+
+def dump(path: Path, configs: Mapping[str, object]) -> None:
+    """Write every parameter of every node into the ROS 2 parameter file `path`.
+
+    `configs` are configurations by the names of their nodes, which may carry a namespace.
+    """
+    path.write_text(dumps(configs), encoding='utf-8')
+
+
+def dumps(configs: Mapping[str, object]) -> str:
+    """Return what `dump` writes."""
+    return dumps_values({node: flatten(config) for node, config in configs.items()})
+
+
+def dumps_values(nodes: Mapping[str, Mapping[str, Value]]) -> str:
+    """Return the parameter file of values by dotted name, for each node by its name."""
+    return ''.join(_lines(nodes))
+
+
+def format_value(value: Value) -> str:
+    """Return a value as YAML that both ROS and YAML libraries read as the same type."""
+    if isinstance(value, tuple):
+        return '[' + ', '.join(format_value(entry) for entry in value) + ']'
+    if isinstance(value, bool):
+        return 'true' if value else 'false'
+    if isinstance(value, float):
+        return _number(value)
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _number(value: float) -> str:
+    """Keep a point in 1e-05, which is a text to many YAML libraries without it."""
+    mantissa, exponent, power = repr(value).partition('e')
+    return mantissa + ('' if '.' in mantissa or not exponent else '.0') + exponent + power
+
+
+def _lines(nodes: Mapping[str, Mapping[str, Value]]) -> Iterator[str]:
+    for node, values in nodes.items():
+        yield f'/{node.removeprefix("/")}:\n  ros__parameters:\n'
+        for name, value in values.items():
+            yield f'    {name}: {format_value(value)}\n'

@@ -5,21 +5,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from blf_dsc_controller.configuration.parameter import parameter
-from blf_dsc_controller.configuration.sampling import (
+from blf_dsc_controller.configuration.common import (
     Realtime,
     autostart,
     joint_problems,
     nanoseconds,
     sample_time_problems,
 )
+from blf_dsc_controller.configuration.schema import parameter
 
 _BUILT = 'the plant is built once, when the node starts'
 _PER_JOINT = ('joints',)
 
 
 @dataclass(frozen=True)
-class Arm:
+class PlantArm:
     """Two links with point masses at their ends."""
 
     l1: float = parameter(
@@ -72,7 +72,7 @@ class Initial:
 
 
 @dataclass(frozen=True)
-class Disturbance:
+class PlantDisturbance:
     """The torque that works against each joint, `tau_dist` in the equation of motion.
 
     tau_dist = constant + amplitude*sin(frequency*t + phase)
@@ -233,9 +233,9 @@ class PlantConfig:
         choices=('dopri5', 'rk4'),
         read_only=_BUILT,
     )
-    arm: Arm = Arm()
+    arm: PlantArm = PlantArm()
     initial: Initial = Initial()
-    disturbance: Disturbance = Disturbance()
+    disturbance: PlantDisturbance = PlantDisturbance()
     sensor: Sensor = Sensor()
     actuator: Actuator = Actuator()
     realtime: Realtime = field(default_factory=Realtime)

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-from blf_dsc_controller.configuration.parameter import parameter
+from blf_dsc_controller.configuration.schema import parameter
 
 _PER_JOINT = ('joints',)
 _TONES = ('reference.frequency',)
@@ -91,7 +91,7 @@ class Approach:
 
 
 @dataclass(frozen=True)
-class Limits:
+class MotionLimits:
     """What an approach or a trajectory that is sent may ask of the joints."""
 
     position_lower: tuple[float, ...] = parameter(

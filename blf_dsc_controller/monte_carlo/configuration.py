@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from blf_dsc_controller.configuration.parameter import parameter
+from blf_dsc_controller.configuration.schema import parameter
 
 _ONE_STUDY = 'a study is one configuration from its first run to its last'
 

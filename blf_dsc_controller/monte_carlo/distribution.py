@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from statistics import NormalDist
 from typing import cast
 
-from blf_dsc_controller.configuration.parameter import Kind
+from blf_dsc_controller.configuration.schema import Kind
 
 Value = float | int | str
 

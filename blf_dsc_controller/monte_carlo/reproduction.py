@@ -12,8 +12,8 @@ from pathlib import Path
 from blf_dsc_controller.analysis.figures import draw as draw_run
 from blf_dsc_controller.analysis.summary import Summary, summarize, write_summary
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.configuration.dump import dump
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
+from blf_dsc_controller.configuration.params_file import dump
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.monte_carlo import measure

@@ -16,9 +16,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from blf_dsc_controller.configuration.dump import dump, written
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
-from blf_dsc_controller.configuration.params_file import load_loop, read
+from blf_dsc_controller.configuration.params_file import dump, format_value, load_loop, read
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.monte_carlo.configuration import MonteCarloConfig
@@ -71,7 +70,7 @@ def write_study(study: Study, path: Path) -> None:
     dump(path, nodes)
     with path.open('a', encoding='utf-8') as file:
         file.writelines(
-            f'    {_VARY}{name}: {written(text)}\n' for name, text in study.varied().items()
+            f'    {_VARY}{name}: {format_value(text)}\n' for name, text in study.varied().items()
         )
 
 

@@ -12,9 +12,8 @@ import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from blf_dsc_controller.configuration.parameter import Kind, Parameter, parameter
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import parameters, unknown
+from blf_dsc_controller.configuration.schema import Kind, Parameter, parameter, parameters, unknown
 from blf_dsc_controller.monte_carlo.distribution import FORMS, Distribution, parse
 
 _GROUPS = ('arm.', 'disturbance.', 'sensor.', 'actuator.')

@@ -14,7 +14,7 @@ from std_srvs.srv import Trigger
 
 from blf_dsc_controller.bags.ring import Ring
 from blf_dsc_controller.bags.writer import BagWriter, Limits
-from blf_dsc_controller.configuration.recorder import RecorderConfig
+from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import Quality
 from blf_dsc_controller.nodes.raw_subscriptions import Arrival

@@ -14,10 +14,15 @@ from rcl_interfaces.msg import (
 )
 from rclpy.parameter import Parameter as RosParameter
 
-from blf_dsc_controller.configuration.builtin import is_builtin
-from blf_dsc_controller.configuration.nodes import known_names
-from blf_dsc_controller.configuration.parameter import Kind, Parameter
-from blf_dsc_controller.configuration.schema import build, change, flatten, parameters
+from blf_dsc_controller.configuration.nodes import is_builtin, known_names
+from blf_dsc_controller.configuration.schema import (
+    Kind,
+    Parameter,
+    build,
+    change,
+    flatten,
+    parameters,
+)
 from blf_dsc_controller.errors import ConfigurationError
 
 if TYPE_CHECKING:

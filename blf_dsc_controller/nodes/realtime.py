@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
-from blf_dsc_controller.configuration.sampling import Realtime
+from blf_dsc_controller.configuration.common import Realtime
 
 _THREADS = Path('/proc/self/task')
 

@@ -12,8 +12,8 @@ from rclpy.clock import Clock, ClockType
 from blf_dsc_controller.bags.context import MESSAGES
 from blf_dsc_controller.bags.errors import DiskFullError, WriteError
 from blf_dsc_controller.bags.losses import Losses
-from blf_dsc_controller.configuration.dump import text_of_values
-from blf_dsc_controller.configuration.recorder import RecorderConfig
+from blf_dsc_controller.configuration.nodes import RecorderConfig
+from blf_dsc_controller.configuration.params_file import dumps_values
 from blf_dsc_controller.messages.errors import UnknownTypeError
 from blf_dsc_controller.messages.topics import Quality
 from blf_dsc_controller.nodes.bag_sinks import BlackBox, Recording
@@ -92,7 +92,7 @@ class BagRecorderNode(RunnableNode):
 
     def _on_parameters(self, node: str, values: Values) -> None:
         self._parameters[node] = values
-        self._sink.configure(text_of_values(self._parameters))
+        self._sink.configure(dumps_values(self._parameters))
 
     def _wanted(self, topic: str) -> bool:
         if self._chosen:

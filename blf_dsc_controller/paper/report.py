@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from blf_dsc_controller.configuration.dump import dump
+from blf_dsc_controller.configuration.params_file import dump
 from blf_dsc_controller.paper import page, tune
 from blf_dsc_controller.paper.cases import SIDE_BY_SIDE, VARIATIONS
 from blf_dsc_controller.paper.claims import claims

@@ -21,9 +21,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from blf_dsc_controller.configuration.dump import written
 from blf_dsc_controller.configuration.nodes import LoopConfig
-from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.configuration.params_file import format_value, load_loop, locate
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.paper.metrics import Courses, Metrics, measure
@@ -188,7 +187,7 @@ def preset(name: str, exponents: Floats, value: float, evaluations: int) -> str:
     base = load_loop(locate(task.preset)).controller
     changes = {**_differences(base), **settings_of(task, exponents)}
     lines = ''.join(
-        f'    {key}: {written(tuple(entry) if isinstance(entry, list) else entry)}\n'  # type: ignore[arg-type]
+        f'    {key}: {format_value(tuple(entry) if isinstance(entry, list) else entry)}\n'  # type: ignore[arg-type]
         for key, entry in changes.items()
     )
     return (

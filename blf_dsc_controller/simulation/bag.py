@@ -11,7 +11,7 @@ import numpy as np
 from blf_dsc_controller.bags.rejected_columns import diagnosis
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.dump import text
+from blf_dsc_controller.configuration.params_file import dumps
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.law.factory import estimate_names, model_of
 from blf_dsc_controller.law.rejected_columns import refusals
@@ -52,7 +52,7 @@ def write_bag(
         nodes: dict[str, object] = {topics.CONTROLLER: config}
         if plant is not None:
             nodes[topics.PLANT] = plant
-        bag.configure(text(nodes))
+        bag.configure(dumps(nodes))
         bag.note({'clock': 'offline'})
         handles: dict[topics.Topic, int] = {}
         for stamp, (topic, raw) in _messages(record, config):

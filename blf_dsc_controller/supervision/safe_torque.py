@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms import models
-from blf_dsc_controller.configuration.safety import Safety
+from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.law.settings import Settings
 
 Vector = NDArray[np.float64]

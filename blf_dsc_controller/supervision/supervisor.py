@@ -12,7 +12,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.configuration.safety import Safety
+from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.sample import Sample
 from blf_dsc_controller.law.settings import LINEAR, Settings

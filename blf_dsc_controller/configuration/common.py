@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from blf_dsc_controller.configuration.parameter import parameter
+from blf_dsc_controller.configuration.schema import parameter
 
 _ROUNDING = 1e-12
 """Relative; the product of a decimal fraction and 1e9 is off by a few 1e-16."""
