@@ -30,7 +30,9 @@ P = np.array([1.0, 0.32, 0.4])
 ARM = Arm(l1=1.0, l2=0.8, m1=0.5, m2=0.5, g=9.8)
 MODEL = models.two_link_arm(1.0, 9.8)
 CONSTANTS = np.array(MODEL.constants)
-REFERENCE = reference.sinusoids_vector((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))
+REFERENCE = reference.pack(
+    2, [reference.sinusoids_term((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))]
+)
 JOINTS = ('shoulder', 'elbow')
 START = (2.293, 1.696)
 QUIET = (0.0, 0.0)

@@ -300,16 +300,19 @@ def refused(**changes) -> Callable[[Rig], None]:
 
 def replaced(*, possible: bool) -> Callable[[Rig], None]:
     """Another trajectory each 30 ms, before the last one is through; or one that is too fast."""
-    from blf_dsc_controller.reference.errors import TrajectoryError
-    from blf_dsc_controller.reference.trajectory import Point, Request
+    from blf_dsc_controller.reference.trajectory import (
+        Trajectory,
+        TrajectoryError,
+        TrajectoryPoint,
+    )
 
     def inject(rig):
         def sense(state):
             if rig.plant.sample % 30 == 0:
                 goal = tuple(state.q + (0.2 if rig.plant.sample % 60 else -0.2))
-                point = Point(time=1.5 if possible else 0.001, positions=goal)
+                point = TrajectoryPoint(time=1.5 if possible else 0.001, positions=goal)
                 try:
-                    rig.guard.follow(Request(JOINTS, (point,)))
+                    rig.guard.follow(Trajectory(JOINTS, (point,)))
                 except TrajectoryError:
                     assert not possible
                 else:

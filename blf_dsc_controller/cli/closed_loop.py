@@ -32,7 +32,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.rejected_columns import refusals
 from blf_dsc_controller.nodes import compilation
-from blf_dsc_controller.reference.start import plan
+from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import Record, loop, simulate
 from blf_dsc_controller.supervision.config_warnings import concerns
@@ -97,7 +97,7 @@ def _check_start(config: LoopConfig) -> None:
     """Find a start that will be refused now, by the true state; the controller measures it."""
     controller, plant = config.controller, config.plant
     order = [plant.joints.index(joint) for joint in controller.joints]
-    plan(
+    plan_start(
         controller,
         np.array(controller.barrier.widest),
         np.array(plant.initial.position)[order],

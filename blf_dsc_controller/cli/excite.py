@@ -15,7 +15,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.params_file import format_value, load, locate
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.exciting_reference import Course, Excitation, Series, excite
+from blf_dsc_controller.law import exciting_reference
 
 _DIGITS = 4  # of a radian, in the file
 
@@ -50,9 +50,11 @@ def parser() -> argparse.ArgumentParser:
     return options
 
 
-def preset(series: Series, course: Course, before: float, command: str) -> str:
+def preset(
+    parameters: dict[str, tuple[float, ...]], after: float, before: float, command: str
+) -> str:
     """Text of the parameter file."""
-    gain = f'{course.lambda_min:.3g}, instead of {before:.3g} with the reference of that file'
+    gain = f'{after:.3g}, instead of {before:.3g} with the reference of that file'
     lines = [
         '# The reference that excites the learning most within the limits of joints and torque:',
         f'# least eigenvalue of the excitation matrix {gain}.',
@@ -64,7 +66,7 @@ def preset(series: Series, course: Course, before: float, command: str) -> str:
         '      type: sinusoids',
     ]
     units = {'frequency': 'rad/s, of the cosines, then of the sines'}
-    for name, value in series.parameters.items():
+    for name, value in parameters.items():
         lines += [f'      # {units.get(name, "rad")}', f'      {name}: {format_value(value)}']
     return '\n'.join(lines) + '\n'
 
@@ -75,7 +77,7 @@ def search(options: argparse.Namespace) -> str:
     Raises:
         ConfigurationError: the configuration makes no controller.
         ExciteError: the guess does not fit the model, or scipy is not installed.
-        ExcitationError: no reference was found that keeps the limits.
+        MotionError: no reference was found that keeps the limits.
     """
     if importlib.util.find_spec('scipy') is None:
         raise ExciteError("the search needs scipy: pip install 'blf_dsc_controller[study]'")
@@ -86,11 +88,13 @@ def search(options: argparse.Namespace) -> str:
             f'--guess has {len(guess)} values, but the model {config.model} has '
             f'{len(config.learning.initial_estimate)} parameters'
         )
-    excitation = Excitation(config, np.array(guess), options.share, options.harmonics)
-    series, _ = excite(excitation, options.seed, options.starts)
-    series = series.rounded(_DIGITS)
+    problem = exciting_reference.ExcitationProblem(
+        config, np.array(guess), options.share, options.harmonics
+    )
+    x = exciting_reference.search(problem, options.seed, options.starts)
+    parameters = problem.parameters(np.round(x, _DIGITS))
     told = config.reference
-    before = excitation.course(
+    before = problem.evaluate(
         {
             'offset': told.offset,
             'amplitude': told.amplitude,
@@ -103,8 +107,8 @@ def search(options: argparse.Namespace) -> str:
         f'--share {options.share:g} --harmonics {options.harmonics} --starts {options.starts} '
         f'--seed {options.seed}'
     )
-    course = excitation.course(series.parameters)
-    return preset(series, course, before.lambda_min, command)
+    after = problem.evaluate(parameters)
+    return preset(parameters, after.lambda_min, before.lambda_min, command)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -36,12 +36,12 @@ _GROUND_FLOOR = (
     'sim_plant/*.py',
 )
 _ABOVE = {
+    'approach.py',
     'command_input.py',
     'exciting_reference.py',
     'factory.py',
     'handshake.py',
     'node.py',
-    'start.py',
     'status.py',
 }
 

@@ -20,7 +20,7 @@ from blf_dsc_controller.law.state import (
     state_size,
 )
 from blf_dsc_controller.reference import terms as reference
-from blf_dsc_controller.reference.start import check_start
+from blf_dsc_controller.reference.approach import check_start
 
 
 @inner

@@ -1,175 +1,138 @@
 # SPDX-License-Identifier: Apache-2.0
-"""References chosen to teach: the sum of sinusoids that excites the learning most.
+"""Search for the sum of sinusoids that excites the learning most.
 
-The least eigenvalue of the excitation matrix says how well the worst known combination of
+The minimum eigenvalue of the excitation matrix says how well the worst determined combination of
 parameters and disturbance columns can be told from a window.  For a reference whose period is the
 window it is, in the steady state,
 
     Phi = 1/tau_d int X_f^T X_f dt,      X_f = [H(q, dq, dq, ddq) | D] behind the learning's filter
 
-which Parseval's theorem gives from the harmonics of X.  It is maximised over offset, cosines and
-sines of each joint, as far as joints and motors allow; the torque is that of a guess at P.
+which follows from the harmonics of X by Parseval's theorem.  It is maximised over offset, cosines
+and sines of each joint within the limits of joints and torque; the torque is that of a guess of P.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.rows import rows_along
-from blf_dsc_controller.law.settings import pack
-from blf_dsc_controller.reference.errors import ExcitationError
-from blf_dsc_controller.reference.terms import sampled, sinusoids_vector
+from blf_dsc_controller.law.settings import pack as pack_settings
+from blf_dsc_controller.reference.limits import MotionError
+from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
 
-_LOOKS_PER_HARMONIC = 64
-_MARGIN = 1e-3  # of each limit, for what happens between two looks
+_SAMPLES_PER_HARMONIC = 64
+_MARGIN = 1e-3  # of each limit, for peaks between two samples
 _ITERATIONS = 150
 _SPREAD = 0.4  # rad, of the amplitudes that a search starts from
 
 
-@dataclass(frozen=True)
-class Course:
-    """What a periodic reference asks for and teaches, in the steady state.
+class Excitation(NamedTuple):
+    """Excitation by a periodic reference in the steady state, and how it uses the limits."""
 
-    Attributes:
-        lambda_min: least eigenvalue of Phi.
-        ratios: largest position, velocity, acceleration and torque of each joint against its limit
-            (4, n).
-    """
-
-    lambda_min: float
-    ratios: np.ndarray
+    lambda_min: float  # minimum eigenvalue of Phi
+    ratios: np.ndarray  # (4, n) largest position, velocity, acceleration, torque over its limit
 
 
-@dataclass(frozen=True)
-class Series:
-    """A sum of harmonics of the window: offset (n,), cosines and sines (n, h) [rad]."""
+class ExcitationProblem:
+    """Excitation of a controller as a function of its periodic reference.
 
-    base: float  # rad/s, of the first harmonic
-    offset: np.ndarray
-    cosines: np.ndarray
-    sines: np.ndarray
-
-    def rounded(self, digits: int) -> Series:
-        """The same to so many digits of a radian."""
-        parts = (np.round(part, digits) for part in (self.offset, self.cosines, self.sines))
-        return Series(self.base, *parts)
-
-    @property
-    def parameters(self) -> dict[str, tuple[float, ...]]:
-        """The same as parameters of `reference`: cosines, then sines as cosines of phase -pi/2."""
-        harmonics = self.base * np.arange(1, self.cosines.shape[1] + 1)
-        amplitude = np.concatenate((self.cosines, self.sines), axis=1)
-        quarter = np.repeat((0.0, -0.5 * np.pi), harmonics.size)
-        return {
-            'offset': tuple(self.offset.tolist()),
-            'amplitude': tuple(amplitude.ravel().tolist()),
-            'frequency': tuple(np.tile(harmonics, 2).tolist()),
-            'phase': tuple(quarter.tolist()),
-        }
-
-
-class Excitation:
-    """Judges periodic references for a controller.
-
-    Args:
-        config: of the controller: model, columns, filter, window and limits.
-        guess: parameters P (p,) that the torque is reckoned with.
-        share: part of the torque limit that may be used.
-        harmonics: highest harmonic of the window in the reference.
+    The torque is computed with the parameters `guess` (p,) and limited to `torque_fraction` of the
+    configured limit; `harmonics` is the highest harmonic of the window in the reference.
     """
 
     def __init__(
-        self, config: ControllerConfig, guess: np.ndarray, share: float, harmonics: int
+        self, config: ControllerConfig, guess: np.ndarray, torque_fraction: float, harmonics: int
     ) -> None:
         self._settings = settings_of_config(config)
-        self._vector = pack(self._settings)
+        self._vector = pack_settings(self._settings)
         self._guess = guess
-        self._torque = share * self._settings.torque_limit
         limits = config.limits
         lower, upper = np.array(limits.position_lower), np.array(limits.position_upper)
-        self._middle, self._reach = 0.5 * (lower + upper), 0.5 * (upper - lower)
-        self._speed, self._change = np.array(limits.velocity), np.array(limits.acceleration)
-        self.base = 2.0 * np.pi / config.learning.window
+        self._middle = 0.5 * (lower + upper)
+        torque = torque_fraction * self._settings.torque_limit
+        self._limits = (0.5 * (upper - lower), limits.velocity, limits.acceleration, torque)
+        self.n = self._settings.n
         self.harmonics = harmonics
-        looks = _LOOKS_PER_HARMONIC * max(harmonics, 2)
-        self._times = np.arange(looks) * (config.learning.window / looks)
-        omega = self.base * np.arange(looks // 2 + 1)
-        # Two poles in a row: the power of a harmonic falls by the fourth power of the first one.
+        self._base = 2.0 * np.pi / config.learning.window
+        samples = _SAMPLES_PER_HARMONIC * max(harmonics, 2)
+        self._times = np.arange(samples) * (config.learning.window / samples)
+        omega = self._base * np.arange(samples // 2 + 1)
+        # Two poles in series: the power of a harmonic falls by the fourth power of one pole's gain.
         self._gain = 1.0 / (1.0 + (omega / self._settings.pole) ** 2) ** 2
         self._gain[1:] *= 2.0  # the harmonics of negative frequency
 
-    @property
-    def n(self) -> int:
-        """Number of joints."""
-        return self._settings.n
+    def parameters(self, x: np.ndarray) -> dict[str, tuple[float, ...]]:
+        """Parameters of `reference` for x: offsets (n,), cosines (n, h) and sines (n, h) [rad].
 
-    def course(self, parameters: dict[str, tuple[float, ...]]) -> Course:
-        """Judge a reference, given as the parameters offset, amplitude, frequency and phase."""
-        motion = sampled(sinusoids_vector(**parameters), self._times)
-        rows = np.zeros((self._times.size, self._settings.n, self._settings.m))
-        rows_along(self._vector, self._times, motion, rows)
-        torque = rows[:, :, : self._settings.p] @ self._guess
-        peaks = (
-            np.abs(motion[:, 0] - self._middle).max(axis=0) / self._reach,
-            np.abs(motion[:, 1]).max(axis=0) / self._speed,
-            np.abs(motion[:, 2]).max(axis=0) / self._change,
-            np.abs(torque).max(axis=0) / self._torque,
-        )
-        return Course(float(np.linalg.eigvalsh(self._phi(rows))[0]), np.array(peaks))
-
-    def _phi(self, rows: np.ndarray) -> np.ndarray:
-        harmonics = np.fft.rfft(rows, axis=0) / self._times.size
-        return np.asarray(
-            np.einsum('k,kij,kil->jl', self._gain, harmonics.conj(), harmonics, optimize=True).real
-        )
-
-    def series(self, x: np.ndarray) -> Series:
-        """Series of a vector: offsets (n,), cosines (n, h), sines (n, h)."""
+        Sines are cosines of phase -pi/2.
+        """
         n, h = self.n, self.harmonics
-        cosines, sines = x[n:].reshape(2, n, h)
-        return Series(self.base, x[:n], cosines, sines)
+        amplitude = np.concatenate(list(x[n:].reshape(2, n, h)), axis=1)
+        return {
+            'offset': tuple(x[:n].tolist()),
+            'amplitude': tuple(amplitude.ravel().tolist()),
+            'frequency': tuple(np.tile(self._base * np.arange(1, h + 1), 2).tolist()),
+            'phase': tuple(np.repeat((0.0, -0.5 * np.pi), h).tolist()),
+        }
+
+    def evaluate(self, parameters: dict[str, tuple[float, ...]]) -> Excitation:
+        """Excitation by the reference with parameters offset, amplitude, frequency and phase."""
+        settings = self._settings
+        motion = sampled(pack(self.n, [sinusoids_term(**parameters)]), self._times)
+        rows = np.zeros((self._times.size, settings.n, settings.m))
+        rows_along(self._vector, self._times, motion, rows)
+        torque = rows[:, :, : settings.p] @ self._guess
+        values = (motion[:, 0] - self._middle, motion[:, 1], motion[:, 2], torque)
+        ratios = [
+            np.abs(value).max(axis=0) / limit
+            for value, limit in zip(values, self._limits, strict=True)
+        ]
+        X = np.fft.rfft(rows, axis=0) / self._times.size
+        Phi = np.einsum('k,kij,kil->jl', self._gain, X.conj(), X, optimize=True).real
+        return Excitation(float(np.linalg.eigvalsh(Phi)[0]), np.array(ratios))
 
 
-def excite(excitation: Excitation, seed: int, starts: int) -> tuple[Series, Course]:
-    """Find the reference that excites most, of searches from so many random ones.
+def search(problem: ExcitationProblem, seed: int, starts: int) -> np.ndarray:
+    """Best x (see `ExcitationProblem.parameters`) of searches from random starting points.
 
     Raises:
-        ExcitationError: none of them keeps the limits.
+        MotionError: none of the searches found a reference that keeps the limits.
     """
     from scipy.optimize import minimize
 
     random = np.random.default_rng(seed)
-    n, h = excitation.n, excitation.harmonics
+    n, h = problem.n, problem.harmonics
 
-    def course(x: np.ndarray) -> Course:
-        return excitation.course(excitation.series(x).parameters)
+    def evaluate(x: np.ndarray) -> Excitation:
+        return problem.evaluate(problem.parameters(x))
 
     def cost(x: np.ndarray) -> float:
-        return float(-np.log(max(course(x).lambda_min, 1e-12)))
+        return float(-np.log(max(evaluate(x).lambda_min, 1e-12)))
 
     def slack(x: np.ndarray) -> np.ndarray:
-        return 1.0 - _MARGIN - course(x).ratios.ravel()
+        return 1.0 - _MARGIN - evaluate(x).ratios.ravel()
 
-    best: tuple[Series, Course] | None = None
+    best, most = None, -np.inf
     for _ in range(starts):
-        start = np.concatenate(
-            (random.uniform(-np.pi, np.pi, n), random.normal(0.0, _SPREAD, 2 * n * h))
-        )
+        start = (random.uniform(-np.pi, np.pi, n), random.normal(0.0, _SPREAD, 2 * n * h))
         found = minimize(
             cost,
-            start,
+            np.concatenate(start),
             method='SLSQP',
             constraints={'type': 'ineq', 'fun': slack},
             options={'maxiter': _ITERATIONS, 'ftol': 1e-6},
         )
-        reached = course(found.x)
-        keeps = bool(np.all(reached.ratios <= 1.0))
-        if keeps and (best is None or reached.lambda_min > best[1].lambda_min):
-            best = excitation.series(found.x), reached
+        lambda_min, ratios = evaluate(found.x)
+        if np.all(ratios <= 1.0) and lambda_min > most:
+            best, most = found.x, lambda_min
     if best is None:
-        raise ExcitationError(starts)
-    return best
+        raise MotionError(
+            f'no reference was found, in {starts} searches, that keeps positions, velocities, '
+            'accelerations and torques within their limits: allow a larger fraction of the '
+            'torque, widen limits, or search from more starts'
+        )
+    return np.asarray(best)

@@ -29,7 +29,7 @@ from blf_dsc_controller.law.settings import (
     Settings,
     pack,
 )
-from blf_dsc_controller.reference.start import plan, reference_of
+from blf_dsc_controller.reference.approach import plan_start, reference_of
 
 COLUMN_GAIN = 1.0
 """Entry of Gamma for the disturbance columns: they do not act on the torque."""
@@ -172,8 +172,8 @@ def begin(
 ) -> float:
     """Give the controller the planned reference; returns when [s] the approach is over, or `t`.
 
-    Arguments and errors as in `reference.start.plan`.
+    Arguments and errors as in `plan_start`.
     """
-    motion = plan(config, controller.bound_at(t), q, dq, t)
+    motion = plan_start(config, controller.bound_at(t), q, dq, t)
     controller.reference_vector = motion.vector
     return motion.settled

@@ -16,18 +16,18 @@ from __future__ import annotations
 
 from typing import Any
 
-from blf_dsc_controller.reference.trajectory import Point, Request
+from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 
 _NANO = 1e-9
 _SECOND = 1_000_000_000
 
 
-def request_of(message: Any, start_stamp: int) -> Request:
+def request_of(message: Any, start_stamp: int) -> Trajectory:
     """Trajectory of a sent message, in times since the controller's start_stamp [ns]."""
     return _request(message, start_stamp, nanoseconds(message.header.stamp))
 
 
-def told_request(message: Any, start_stamp: int) -> Request:
+def told_request(message: Any, start_stamp: int) -> Trajectory:
     """Trajectory of a told message: the very request that was taken.
 
     Raises:
@@ -47,9 +47,9 @@ def nanoseconds(time: Any) -> int:
     return int(time.sec) * _SECOND + int(time.nanosec)
 
 
-def _request(message: Any, start_stamp: int, begin_stamp: int) -> Request:
+def _request(message: Any, start_stamp: int, begin_stamp: int) -> Trajectory:
     points = tuple(
-        Point(
+        TrajectoryPoint(
             nanoseconds(point.time_from_start) * _NANO,
             tuple(point.positions),
             tuple(point.velocities),
@@ -59,4 +59,4 @@ def _request(message: Any, start_stamp: int, begin_stamp: int) -> Request:
         for point in message.points
     )
     begin = (begin_stamp - start_stamp) * _NANO if begin_stamp else None
-    return Request(tuple(message.joint_names), points, begin)
+    return Trajectory(tuple(message.joint_names), points, begin)

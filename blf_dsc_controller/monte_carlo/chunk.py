@@ -13,7 +13,7 @@ from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.monte_carlo import measure
 from blf_dsc_controller.monte_carlo.study import Origin, Study, draw, origin_of, plant_of_draw
-from blf_dsc_controller.reference.errors import MotionError
+from blf_dsc_controller.reference.limits import MotionError
 from blf_dsc_controller.simulation import figures_loop as trajectory
 from sim_plant.factory import plant_of
 

@@ -17,7 +17,7 @@ from blf_dsc_controller.messages.encoders import NANOSECONDS
 from blf_dsc_controller.messages.topics import ACCEPTED_TRAJECTORY, JOINT_TRAJECTORY
 from blf_dsc_controller.messages.trajectory import request_of, told_begin
 from blf_dsc_controller.nodes.endpoints import profile, publisher
-from blf_dsc_controller.reference.errors import TrajectoryError
+from blf_dsc_controller.reference.trajectory import TrajectoryError
 from blf_dsc_controller.supervision.guard import Guard
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a reference keeps within what the joints may do."""
+"""The limits of a motion, and where it violates them."""
 
 from __future__ import annotations
 
@@ -7,31 +7,82 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.reference.errors import Excess
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.reference.terms import sampled
 
-_PERIOD = 0.005  # s, between two looks at a reference
-_LEAST = 200  # looks, so that a short motion is seen as well
-_ROUNDING = 1e-9  # relative: a motion that was made to reach its limit keeps it
+_PERIOD = 0.005  # s, between two samples that are checked
+_LEAST = 200  # samples, for short motions
+_ROUNDING = 1e-9  # relative, for motions that just reach a limit
 
 
-class Limits(NamedTuple):
-    """What each of the n joints may be asked for."""
+class MotionLimits(NamedTuple):
+    """Limits of the n joints, and of the time an approach or a blend may take."""
 
     joints: tuple[str, ...]
     lower: np.ndarray  # (n,) rad
     upper: np.ndarray  # (n,) rad
     velocity: np.ndarray  # (n,) rad/s
     acceleration: np.ndarray  # (n,) rad/s^2
+    longest: float  # s
 
 
-def looks(begin: float, end: float) -> np.ndarray:
-    """Times from `begin` to `end` [s] close enough to see a motion's largest velocity."""
+class Violation(NamedTuple):
+    """The largest violation of a limit by a motion."""
+
+    joint: str
+    quantity: str  # position, velocity or acceleration
+    value: float
+    limit: float
+    time: float  # s
+    ratio: float  # of value to limit; positions count from the middle of their range
+
+    def __str__(self) -> str:
+        """Joint, quantity, value and limit with their unit."""
+        unit = {'position': 'rad', 'velocity': 'rad/s', 'acceleration': 'rad/s^2'}[self.quantity]
+        return (
+            f'the {self.quantity} of joint {self.joint!r} would be {self.value:.6g} {unit} at '
+            f't = {self.time:.6g} s, past its limit of {self.limit:.6g} {unit}'
+        )
+
+    @property
+    def parameters(self) -> str:
+        """The configuration parameters that set this limit."""
+        if self.quantity == 'position':
+            return 'limits.position_lower and limits.position_upper'
+        return f'limits.{self.quantity}'
+
+
+class MotionError(BlfDscError):
+    """No motion that keeps the limits; `violation` is where the best one breaks them."""
+
+    def __init__(self, message: str, violation: Violation | None = None) -> None:
+        self.violation = violation
+        super().__init__(message)
+
+
+def limits_of(config: ControllerConfig) -> MotionLimits:
+    """Limits of approaches and trajectories in a controller's configuration."""
+    limits = config.limits
+    return MotionLimits(
+        config.joints,
+        np.array(limits.position_lower),
+        np.array(limits.position_upper),
+        np.array(limits.velocity),
+        np.array(limits.acceleration),
+        config.approach.longest,
+    )
+
+
+def check_times(begin: float, end: float) -> np.ndarray:
+    """Times from `begin` to `end` [s], close enough to catch the largest velocity of a motion."""
     return np.linspace(begin, end, max(_LEAST, 1 + int((end - begin) / _PERIOD)))
 
 
-def excess(vector: np.ndarray, times: np.ndarray, limits: Limits) -> Excess | None:
-    """Worst excess of a packed reference at these times (k,) [s]; None if it keeps the limits."""
+def worst_violation(
+    vector: np.ndarray, times: np.ndarray, limits: MotionLimits
+) -> Violation | None:
+    """Largest violation of a packed reference at times (k,) [s]; None if it keeps the limits."""
     qr, dqr, ddqr = sampled(vector, times).transpose(1, 0, 2)
     middle, reach = 0.5 * (limits.upper + limits.lower), 0.5 * (limits.upper - limits.lower)
     worst = None
@@ -46,7 +97,8 @@ def excess(vector: np.ndarray, times: np.ndarray, limits: Limits) -> Excess | No
         if ratio <= 1.0 + _ROUNDING or (worst is not None and ratio <= worst.ratio):
             continue
         shift = float(middle[i]) if quantity == 'position' else 0.0
-        asked = float(value[at, i])
-        limit = shift + float(np.copysign(allowed[i], asked))
-        worst = Excess(limits.joints[i], quantity, shift + asked, limit, float(times[at]), ratio)
+        reached = float(value[at, i])
+        limit = shift + float(np.copysign(allowed[i], reached))
+        time = float(times[at])
+        worst = Violation(limits.joints[i], quantity, shift + reached, limit, time, ratio)
     return worst

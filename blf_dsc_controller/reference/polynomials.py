@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splines through given points: by their derivatives there, or of least jerk.
+"""Splines through given points: by their derivatives there, or of minimum jerk.
 
 The quintic with given position, velocity and acceleration at both ends is the one of least
-integrated squared jerk between them (Flash and Hogan, 1985).  Through several points the least is
+integrated squared jerk between them (Flash and Hogan, 1985).  Through several points the optimum is
 the spline of such pieces whose jerk and snap are continuous too.
 """
 
@@ -14,45 +14,32 @@ from blf_dsc_controller.reference.terms import Term, spline_term
 
 
 def quintics(h: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Coefficients (pieces, n, 6) of the quintics between two ends.
+    """Coefficients (pieces, n, 6) of quintics of durations h (pieces,) [s].
 
-    Args:
-        h: durations (pieces,) [s].
-        begin: positions, velocities and accelerations at the beginning (3, pieces, n).
-        end: those at the end (3, pieces, n).
+    `begin` and `end` are the positions, velocities and accelerations (3, pieces, n) at the ends.
     """
     h = np.asarray(h, dtype=np.float64)[:, np.newaxis]
     p, v, a = begin
     dp = end[0] - p - v * h - 0.5 * a * h**2
     dv = (end[1] - v - a * h) * h
     da = 0.5 * (end[2] - a) * h**2
-    return np.stack(
-        (
-            p,
-            v,
-            0.5 * a,
-            (10.0 * dp - 4.0 * dv + da) / h**3,
-            (-15.0 * dp + 7.0 * dv - 2.0 * da) / h**4,
-            (6.0 * dp - 3.0 * dv + da) / h**5,
-        ),
-        axis=-1,
-    )
+    c3 = (10.0 * dp - 4.0 * dv + da) / h**3
+    c4 = (-15.0 * dp + 7.0 * dv - 2.0 * da) / h**4
+    c5 = (6.0 * dp - 3.0 * dv + da) / h**5
+    return np.stack((p, v, 0.5 * a, c3, c4, c5), axis=-1)
 
 
 def cubics(h: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Coefficients (pieces, n, 6) of the cubics between two ends.
+    """Coefficients (pieces, n, 6) of cubics of durations h (pieces,) [s].
 
-    Args:
-        h: durations (pieces,) [s].
-        begin: positions and velocities at the beginning (2, pieces, n).
-        end: those at the end (2, pieces, n).
+    `begin` and `end` are the positions and velocities (2, pieces, n) at the ends.
     """
     h = np.asarray(h, dtype=np.float64)[:, np.newaxis]
     mean = (end[0] - begin[0]) / h
-    nothing = np.zeros_like(mean)
     c2 = (3.0 * mean - 2.0 * begin[1] - end[1]) / h
     c3 = (begin[1] + end[1] - 2.0 * mean) / h**2
-    return np.stack((begin[0], begin[1], c2, c3, nothing, nothing), axis=-1)
+    zero = np.zeros_like(mean)
+    return np.stack((begin[0], begin[1], c2, c3, zero, zero), axis=-1)
 
 
 def at_rest(position: np.ndarray) -> np.ndarray:
@@ -63,23 +50,20 @@ def at_rest(position: np.ndarray) -> np.ndarray:
 
 
 def ending_at_rest(knots: np.ndarray, coefficients: np.ndarray, position: np.ndarray) -> Term:
-    """Term of the pieces between the knots (k,) [s] that stays at `position` (n,) afterwards."""
+    """Spline of the pieces between the knots (k,) [s] that stays at `position` (n,) afterwards."""
     return spline_term(knots, np.concatenate((coefficients, at_rest(position))))
 
 
 def hermite(times: np.ndarray, points: np.ndarray) -> Term:
-    """Quintics through positions, velocities and accelerations (3, k, n) at `times` (k,) [s]."""
+    """Quintics through positions, velocities and accelerations (3, k, n) at times (k,) [s]."""
     pieces = quintics(np.diff(times), points[:, :-1], points[:, 1:])
     return ending_at_rest(times, pieces, points[0, -1])
 
 
 def minimum_jerk(times: np.ndarray, positions: np.ndarray, begin: np.ndarray | None = None) -> Term:
-    """Reference of least jerk through points, at rest at the end.
+    """Minimum jerk through positions (k, n) [rad] at increasing times (k,) [s], ending at rest.
 
-    Args:
-        times: (k,) [s], increasing.
-        positions: (k, n) [rad].
-        begin: velocity and acceleration at the first point (2, n); at rest if not given.
+    `begin` is the velocity and acceleration (2, n) at the first point, by default zero.
     """
     k, n = positions.shape
     points = np.zeros((3, k, n))
@@ -87,36 +71,32 @@ def minimum_jerk(times: np.ndarray, positions: np.ndarray, begin: np.ndarray | N
     if begin is not None:
         points[1:, 0] = begin
     if k > 2:
-        _fill_inside(np.diff(times), points)
+        _solve_inner_points(np.diff(times), points)
     return hermite(times, points)
 
 
-def _fill_inside(h: np.ndarray, points: np.ndarray) -> None:
-    """Velocities and accelerations of the inner points that make jerk and snap continuous.
+def _solve_inner_points(h: np.ndarray, points: np.ndarray) -> None:
+    """Fill in the velocities and accelerations that make jerk and snap continuous.
 
-    Block elimination: each point's pair of equations knows its own and its neighbours' pairs.
+    A block tridiagonal system, two equations for each inner point, solved by elimination.
     """
     rise = np.diff(points[0], axis=0)
-    inside = range(1, len(h))
-    ahead, known = [np.zeros((2, 2))], [points[1:, 0]]
-    for k in inside:
+    inner = range(1, len(h))
+    upper, right = [np.zeros((2, 2))], [points[1:, 0]]
+    for k in inner:
         l, r = h[k - 1], h[k]
-        before = np.array(((-24.0 / l**2, -3.0 / l), (-168.0 / l**3, -24.0 / l**2)))
+        before = np.array([[-24.0 / l**2, -3.0 / l], [-168.0 / l**3, -24.0 / l**2]])
+        after = np.array([[24.0 / r**2, -3.0 / r], [-168.0 / r**3, 24.0 / r**2]])
         here = np.array(
-            (
-                (-36.0 / l**2 + 36.0 / r**2, 9.0 / l + 9.0 / r),
-                (-192.0 / l**3 - 192.0 / r**3, 36.0 / l**2 - 36.0 / r**2),
-            )
+            [
+                [-36.0 / l**2 + 36.0 / r**2, 9.0 / l + 9.0 / r],
+                [-192.0 / l**3 - 192.0 / r**3, 36.0 / l**2 - 36.0 / r**2],
+            ]
         )
-        after = np.array(((24.0 / r**2, -3.0 / r), (-168.0 / r**3, 24.0 / r**2)))
-        right = np.stack(
-            (
-                60.0 * (rise[k] / r**3 - rise[k - 1] / l**3),
-                -360.0 * (rise[k] / r**4 + rise[k - 1] / l**4),
-            )
-        )
-        here = here - before @ ahead[-1]
-        ahead.append(np.linalg.solve(here, after))
-        known.append(np.linalg.solve(here, right - before @ known[-1]))
-    for k in reversed(inside):
-        points[1:, k] = known[k] - ahead[k] @ points[1:, k + 1]
+        jerk = 60.0 * (rise[k] / r**3 - rise[k - 1] / l**3)
+        snap = -360.0 * (rise[k] / r**4 + rise[k - 1] / l**4)
+        here = here - before @ upper[-1]
+        upper.append(np.linalg.solve(here, after))
+        right.append(np.linalg.solve(here, np.stack((jerk, snap)) - before @ right[-1]))
+    for k in reversed(inner):
+        points[1:, k] = right[k] - upper[k] @ points[1:, k + 1]

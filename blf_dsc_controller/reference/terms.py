@@ -1,31 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The reference qr(t): terms of which each takes over from the one before.
+"""The reference qr(t): a list of terms, each of which takes over from the one before.
 
-From its `begin` on, for the time `fade`, a term is mixed into what there was before it:
+    sinusoids   qr_i = offset_i + sum_k amplitude_ik cos(frequency_k t + phase_k)
+    spline      qr_i = sum_j c_kij (t - knot_k)^j, j = 0 .. 5, from knot k to knot k + 1
+
+The last piece of a spline holds for ever; before the first knot the spline is at rest where it
+begins.  From its `begin` on, during the time `fade`, a term is blended into the one before:
 
     qr(t) = (1 - s) before(t) + s term(t),    s = 10 x^3 - 15 x^4 + 6 x^5,   x = (t - begin) / fade
 
-s is the minimum-jerk step: the sum leaves and arrives with continuous acceleration, whatever is
-mixed, and a mixture of two motions is never faster than they are but for s' times their distance.
-From begin + fade on the reference is the term, to the last bit.
+s is the minimum-jerk step, so the blend starts and ends with continuous acceleration, and is never
+faster than its parts but for s' times their distance.  From begin + fade on the reference equals
+the term bit for bit.
 
     vector = [n, number of terms, term, term, ...],   term = [code, size, begin, fade, content]
 """
 
 from __future__ import annotations
 
-from math import inf
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Sequence
+from math import cos, inf, sin
+from typing import NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.views import borrowed
-from blf_dsc_controller.reference.sinusoids import sinusoids, sinusoids_content
-from blf_dsc_controller.reference.spline import spline, spline_content
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+from blf_dsc_controller.compiled.views import borrowed, part
 
 SINUSOIDS = 0
 SPLINE = 1
@@ -35,7 +35,7 @@ _HEAD = 4
 
 
 class Term(NamedTuple):
-    """One term of a reference: what it is, when it takes over [s], and in what time [s]."""
+    """One term of a reference: its kind and content, when it takes over [s], and how fast [s]."""
 
     code: int
     content: np.ndarray
@@ -54,13 +54,19 @@ def sinusoids_term(
     frequency: Sequence[float],
     phase: Sequence[float],
 ) -> Term:
-    """Sum of cosines; arguments as in `sinusoids_content`."""
-    return Term(SINUSOIDS, sinusoids_content(offset, amplitude, frequency, phase))
+    """Sum of cosines.
+
+    `offset` (n,) and `amplitude` (n * tones,) in rad, all tones of the first joint first;
+    `frequency` (tones,) in rad/s, `phase` (tones,) in rad.
+    """
+    content = (len(frequency), *offset, *frequency, *phase, *amplitude)
+    return Term(SINUSOIDS, np.array(content, dtype=np.float64))
 
 
 def spline_term(knots: np.ndarray, coefficients: np.ndarray) -> Term:
-    """Piecewise quintic; arguments as in `spline_content`."""
-    return Term(SPLINE, spline_content(knots, coefficients))
+    """Piecewise quintic of increasing knots (pieces,) [s] and c_kij (pieces, n, 6) [rad/s^j]."""
+    content = ([float(len(knots))], knots, np.ravel(coefficients))
+    return Term(SPLINE, np.concatenate(content))
 
 
 def pack(n: int, terms: Sequence[Term]) -> np.ndarray:
@@ -84,19 +90,63 @@ def unpack(vector: np.ndarray) -> list[Term]:
     return terms
 
 
-def sinusoids_vector(
-    offset: Sequence[float],
-    amplitude: Sequence[float],
-    frequency: Sequence[float],
-    phase: Sequence[float],
-) -> np.ndarray:
-    """Reference that is a sum of cosines; arguments as in `sinusoids_content`."""
-    return pack(len(offset), [sinusoids_term(offset, amplitude, frequency, phase)])
+@inner
+def sinusoids(vector: np.ndarray, at: int, n: int, i: int, t: float) -> tuple[float, float, float]:
+    """Joint i of n of the sinusoids whose content starts at entry `at`: q, q', q'' at t [s]."""
+    tones = int(vector[at])
+    offset = part(vector, at + 1, (n,))
+    frequency = part(vector, at + 1 + n, (tones,))
+    phase = part(vector, at + 1 + n + tones, (tones,))
+    amplitude = part(vector, at + 1 + n + 2 * tones, (n, tones))
+    position = offset[i]
+    velocity = 0.0
+    acceleration = 0.0
+    for k in range(tones):
+        angle = frequency[k] * t + phase[k]
+        rate = frequency[k] * amplitude[i, k]
+        position += amplitude[i, k] * cos(angle)
+        velocity -= rate * sin(angle)
+        acceleration -= rate * frequency[k] * cos(angle)
+    return position, velocity, acceleration
+
+
+@inner
+def piece_at(knots: np.ndarray, t: float) -> int:
+    """Last piece that has begun at time t; the first before the first knot."""
+    low = 0
+    high = knots.size
+    while high - low > 1:
+        middle = (low + high) // 2
+        if knots[middle] <= t:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@inner
+def spline(vector: np.ndarray, at: int, n: int, i: int, t: float) -> tuple[float, float, float]:
+    """Joint i of n of the spline whose content starts at entry `at`: q, q', q'' at t [s]."""
+    pieces = int(vector[at])
+    knots = part(vector, at + 1, (pieces,))
+    if t < knots[0]:
+        return vector[at + 1 + pieces + 6 * i], 0.0, 0.0
+    k = piece_at(knots, t)
+    x = t - knots[k]
+    c = part(vector, at + 1 + pieces + 6 * (k * n + i), (6,))
+    position = c[5]
+    velocity = 0.0
+    curvature = 0.0
+    for j in range(4, -1, -1):
+        curvature = curvature * x + velocity
+        velocity = velocity * x + position
+        position = position * x + c[j]
+    return position, velocity, 2.0 * curvature
 
 
 @inner
 def term_in_force(vector: np.ndarray, t: float) -> tuple[int, int]:
-    """Entry at which the last term starts that has taken over wholly, and its number."""
+    """Entry at which the last term starts that has taken over completely, and its number."""
     found = _VECTOR_HEAD
     number = 0
     at = _VECTOR_HEAD
@@ -110,7 +160,7 @@ def term_in_force(vector: np.ndarray, t: float) -> tuple[int, int]:
 
 @inner
 def term_at(vector: np.ndarray, at: int, n: int, i: int, t: float) -> tuple[float, float, float]:
-    """Joint i of the term that starts at entry `at`: q, q', q'' at time t [s]."""
+    """Joint i of n of the term that starts at entry `at`: q, q', q'' at time t [s]."""
     if vector[at] == SPLINE:
         return spline(vector, at + _HEAD, n, i, t)
     return sinusoids(vector, at + _HEAD, n, i, t)
@@ -120,7 +170,7 @@ def term_at(vector: np.ndarray, at: int, n: int, i: int, t: float) -> tuple[floa
 def evaluate(
     vector: np.ndarray, t: float, qr: np.ndarray, dqr: np.ndarray, ddqr: np.ndarray
 ) -> None:
-    """Leave qr [rad], dqr [rad/s] and ddqr [rad/s^2] (n,) of time t [s] in the last arguments."""
+    """Write qr [rad], dqr [rad/s] and ddqr [rad/s^2] (n,) of time t [s]."""
     n = qr.size
     at, first = term_in_force(vector, t)
     for i in range(n):
@@ -146,21 +196,13 @@ def evaluate(
 
 @kernel
 def _sample(vector: np.ndarray, times: np.ndarray, out: np.ndarray) -> None:
-    unshared = borrowed(vector)
+    view = borrowed(vector)
     for k in range(times.size):
-        evaluate(unshared, times[k], out[k, 0], out[k, 1], out[k, 2])
+        evaluate(view, times[k], out[k, 0], out[k, 1], out[k, 2])
 
 
 def sampled(vector: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Reference at many times at once.
-
-    Args:
-        vector: packed reference.
-        times: (k,) [s].
-
-    Returns:
-        (k, 3, n): qr, dqr and ddqr at each time.
-    """
+    """qr, dqr and ddqr (k, 3, n) of a packed reference at times (k,) [s]."""
     out = np.zeros((len(times), 3, int(vector[0])))
     _sample(vector, np.asarray(times, dtype=np.float64), out)
     return out

@@ -1,27 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A trajectory that is sent while the controller runs, in place of the reference there is.
+"""A trajectory that is sent while the controller runs and replaces the present reference.
 
-Read as joint_trajectory_controller reads it, but for what would jump:
+Interpolated as by joint_trajectory_controller, except where that would jump:
 
     positions, velocities, accelerations   quintic from point to point
     positions, velocities                  cubic from point to point
-    positions alone                        least jerk through all points, at rest at the last one
+    positions only                         minimum jerk through all points, at rest at the last one
 
-(There, positions alone are joined by straight lines, whose velocity jumps at each point.)  The way
-to the first point leads on from the position, velocity and acceleration that the reference has at
-the trajectory's beginning.  If the first point is at the beginning itself, the trajectory is mixed
-into what there is, as fast as the limits allow.  Points whose time is over are passed over.  The
-last point is held.
+(There, positions only are joined by straight lines, whose velocity jumps at each point.)  The first
+point is reached from the position, velocity and acceleration of the present reference when the
+trajectory begins.  If the first point is at the beginning itself, the trajectory is blended into
+the present reference as fast as the limits allow.  Points in the past are skipped.  The last point
+is held.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.reference.errors import MotionError, TrajectoryError
-from blf_dsc_controller.reference.limits import excess, looks
+from blf_dsc_controller.reference.approach import Motion, blend
+from blf_dsc_controller.reference.limits import (
+    MotionError,
+    MotionLimits,
+    check_times,
+    worst_violation,
+)
 from blf_dsc_controller.reference.polynomials import (
     cubics,
     ending_at_rest,
@@ -29,91 +36,93 @@ from blf_dsc_controller.reference.polynomials import (
     minimum_jerk,
     quintics,
 )
-from blf_dsc_controller.reference.splice import Motion, Rules, splice
 from blf_dsc_controller.reference.terms import Term, pack, sampled, unpack
-from blf_dsc_controller.reference.validation import Complaints
+
+_FIELDS = ('positions', 'velocities', 'accelerations')
 
 
-class Point(NamedTuple):
-    """A point of a trajectory; what is empty is not given."""
+class TrajectoryError(MotionError):
+    """A trajectory that is rejected, with all problems found."""
 
-    time: float  # since the trajectory's beginning, s
+    def __init__(self, problems: list[str]) -> None:
+        self.problems = problems
+        super().__init__('trajectory rejected: ' + '; '.join(problems))
+
+
+class TrajectoryPoint(NamedTuple):
+    """A point of a trajectory; fields that are not given are empty."""
+
+    time: float  # s, since the trajectory's beginning
     positions: tuple[float, ...]  # rad
     velocities: tuple[float, ...] = ()  # rad/s
     accelerations: tuple[float, ...] = ()  # rad/s^2
     effort: tuple[float, ...] = ()  # N m
 
 
-class Request(NamedTuple):
+class Trajectory(NamedTuple):
     """A trajectory as it was sent; its values are in the order of its own joints."""
 
     joints: tuple[str, ...]
-    points: tuple[Point, ...]
+    points: tuple[TrajectoryPoint, ...]
     begin: float | None = None  # s since the start of the controller; None: at once
 
 
-def follow(request: Request, vector: np.ndarray, now: float, rules: Rules) -> Motion:
-    """Reference that goes on along the present one and, from its beginning on, the request.
-
-    Args:
-        request: trajectory to follow.
-        vector: packed reference in force.
-        now: time of the last sample [s].
-        rules: limits, and how long a mixture may take.
-
-    Returns:
-        The reference, and when no mixture of several is left in it.
+def plan_trajectory(
+    trajectory: Trajectory, vector: np.ndarray, now: float, limits: MotionLimits
+) -> Motion:
+    """Packed reference that continues `vector` at time now [s] and then follows the trajectory.
 
     Raises:
-        TrajectoryError: it makes no sense, comes too late, or goes past a limit.
+        TrajectoryError: it is not valid, too late, or violates a limit.
     """
-    Complaints(request, rules.limits.joints).check(now)
-    t0 = now if request.begin is None else max(now, request.begin)
-    begin = now if request.begin is None else request.begin
-    times, points = _sorted(request, rules.limits.joints, begin, t0)
-    before = _still_needed(vector, now, t0)
+    problems = _problems(trajectory, limits.joints, now)
+    if problems:
+        raise TrajectoryError(problems)
+    begin = now if trajectory.begin is None else trajectory.begin
+    t0 = max(now, begin)
+    times, points = _remaining_points(trajectory, limits.joints, begin, t0)
+    before = _terms_until(vector, now, t0)
+    n = len(limits.joints)
     try:
         if times[0] > t0:
-            present = sampled(pack(points.shape[2], before), np.array([t0]))[0]
-            term = _from(present, t0, times, points)._replace(begin=t0)
-            mixed = max((one.settled for one in before if one.fade > 0.0), default=now)
-            motion = Motion(pack(points.shape[2], [*before, term]), min(mixed, t0))
+            present = sampled(pack(n, before), np.array([t0]))[0]
+            term = _from_state(present, t0, times, points)._replace(begin=t0)
+            blended = max((one.settled for one in before if one.fade > 0.0), default=now)
+            motion = Motion(pack(n, [*before, term]), min(blended, t0))
         else:
-            motion = splice(before, _through(times, points), t0, rules)
+            motion = blend(before, _through_points(times, points), t0, limits)
     except MotionError as error:
         raise TrajectoryError([str(error)]) from error
     end = max(float(times[-1]), motion.settled)
-    too_much = excess(motion.vector, looks(t0, end), rules.limits)
-    if too_much is not None:
-        raise TrajectoryError([f'{too_much}; ask for less, or raise {too_much.remedy}'])
+    found = worst_violation(motion.vector, check_times(t0, end), limits)
+    if found is not None:
+        raise TrajectoryError([f'{found}; ask for less, or raise {found.parameters}'])
     return motion
 
 
-def _sorted(
-    request: Request, joints: tuple[str, ...], begin: float, t0: float
+def _remaining_points(
+    trajectory: Trajectory, joints: tuple[str, ...], begin: float, t0: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times (k,) [s] and what is given (1 to 3, k, n) of the points to come, in our order."""
-    order = [request.joints.index(joint) for joint in joints]
-    times = np.array([begin + point.time for point in request.points])
+    """Times (k,) [s] and given fields (1 to 3, k, n) of the points from t0 on, in our order."""
+    order = [trajectory.joints.index(joint) for joint in joints]
+    times = np.array([begin + point.time for point in trajectory.points])
     given = [
-        np.array([field[i] for i in order])
-        for point in request.points
-        for field in (point.positions, point.velocities, point.accelerations)
-        if field
+        [[values[i] for i in order] for values in point[1:4] if values]
+        for point in trajectory.points
     ]
-    points = np.reshape(given, (times.size, -1, len(joints))).transpose(1, 0, 2)
-    to_come = times >= t0
-    return times[to_come], points[:, to_come]
+    points = np.array(given, dtype=np.float64).transpose(1, 0, 2)
+    remaining = times >= t0
+    return times[remaining], points[:, remaining]
 
 
-def _still_needed(vector: np.ndarray, now: float, t0: float) -> list[Term]:
-    """Terms of the reference that can be seen from now on until t0 [s]."""
+def _terms_until(vector: np.ndarray, now: float, t0: float) -> list[Term]:
+    """Terms of the reference that have an effect from now until t0 [s]."""
     terms = [term for term in unpack(vector) if term.begin < t0]
     in_force = max((k for k, term in enumerate(terms) if term.settled <= now), default=0)
     return terms[in_force:]
 
 
-def _through(times: np.ndarray, points: np.ndarray) -> Term:
+def _through_points(times: np.ndarray, points: np.ndarray) -> Term:
     """Term through the points (1 to 3, k, n), held before the first and after the last."""
     if len(points) == 1:
         return minimum_jerk(times, points[0])
@@ -123,7 +132,7 @@ def _through(times: np.ndarray, points: np.ndarray) -> Term:
     return ending_at_rest(times, pieces, points[0, -1])
 
 
-def _from(present: np.ndarray, t0: float, times: np.ndarray, points: np.ndarray) -> Term:
+def _from_state(present: np.ndarray, t0: float, times: np.ndarray, points: np.ndarray) -> Term:
     """Term from the present qr, dqr, ddqr (3, n) at t0 [s] through the points."""
     knots = np.concatenate(([t0], times))
     if len(points) == 1:
@@ -137,3 +146,75 @@ def _from(present: np.ndarray, t0: float, times: np.ndarray, points: np.ndarray)
         arrival[2, 0] = 2.0 * pieces[0, :, 2]
     first = quintics(knots[1:2] - t0, present[:, np.newaxis], arrival)
     return ending_at_rest(knots, np.concatenate((first, pieces)), points[0, -1])
+
+
+def _problems(trajectory: Trajectory, joints: tuple[str, ...], now: float) -> list[str]:
+    """Everything that is wrong with a trajectory before its motion is computed."""
+    problems = [*_joint_problems(trajectory.joints, joints), *_point_problems(trajectory)]
+    return problems or list(_time_problems(trajectory, now))
+
+
+def _joint_problems(given: tuple[str, ...], joints: tuple[str, ...]) -> Iterator[str]:
+    unknown = sorted(set(given) - set(joints))
+    missing = [joint for joint in joints if joint not in given]
+    repeated = sorted({joint for joint in given if given.count(joint) > 1})
+    if unknown:
+        yield f'there is no joint {_listed(unknown)} here, only {_listed(joints)}'
+    if missing:
+        yield f'joint {_listed(missing)} is missing: name all of {_listed(joints)}'
+    if repeated:
+        yield f'joint {_listed(repeated)} is named more than once'
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ', '.join(repr(name) for name in names)
+
+
+def _point_problems(trajectory: Trajectory) -> Iterator[str]:
+    if not trajectory.points:
+        yield 'it has no points'
+    for number, point in enumerate(trajectory.points, start=1):
+        for problem in _problems_of(point, len(trajectory.joints)):
+            yield f'point {number} has {problem}'
+    if len({tuple(map(bool, point[1:4])) for point in trajectory.points}) > 1:
+        yield 'its points do not all give the same of ' + ', '.join(_FIELDS)
+
+
+def _problems_of(point: TrajectoryPoint, count: int) -> Iterator[str]:
+    if point.effort:
+        yield 'an effort, which is not supported: leave effort empty'
+    if not point.positions:
+        yield 'no positions'
+    if point.accelerations and not point.velocities:
+        yield 'accelerations, but no velocities'
+    if not np.isfinite(point.time):
+        yield f'no finite time: {point.time}'
+    for field, values in zip(_FIELDS, point[1:4], strict=True):
+        if values and len(values) != count:
+            yield f'{len(values)} {field} for {count} joints'
+        elif not np.isfinite(values).all():
+            yield f'{field} that are not finite: {list(values)}'
+
+
+def _time_problems(trajectory: Trajectory, now: float) -> Iterator[str]:
+    points = trajectory.points
+    if points[0].time < 0.0:
+        yield f'point 1 is {-points[0].time:g} s before the beginning'
+    for number, (before, after) in enumerate(pairwise(points), start=2):
+        if after.time <= before.time:
+            yield (
+                f'point {number} is at {after.time:g} s, not after the one before it, '
+                f'at {before.time:g} s'
+            )
+    begin = trajectory.begin
+    if begin is not None and begin + points[-1].time < now:
+        yield (
+            f'all of it lies in the past: it ends {now - begin - points[-1].time:.6g} s ago; '
+            'stamp it with the time it is to begin, or with 0 for at once'
+        )
+    for joint, velocity in zip(trajectory.joints, points[-1].velocities, strict=False):
+        if velocity != 0.0:
+            yield (
+                f'it ends with {joint} at {velocity:g} rad/s, but the last point is held: '
+                'end with velocity 0'
+            )

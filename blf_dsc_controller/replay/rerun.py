@@ -17,7 +17,7 @@ import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.messages.topics import FOREVER, TRACKING_ERROR
-from blf_dsc_controller.reference.errors import TrajectoryError
+from blf_dsc_controller.reference.trajectory import TrajectoryError
 from blf_dsc_controller.replay.comparison import Commands, Difference
 from blf_dsc_controller.replay.history import (
     OUT_OF_ORDER,

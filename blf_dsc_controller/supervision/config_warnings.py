@@ -18,7 +18,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import model_of, settings_of_config
 from blf_dsc_controller.law.settings import FILTERED, LINEAR, NEWTON, Settings
 from blf_dsc_controller.reference import terms as reference
-from blf_dsc_controller.reference.start import reference_of
+from blf_dsc_controller.reference.approach import reference_of
 
 Floats = NDArray[np.float64]
 

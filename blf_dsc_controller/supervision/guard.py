@@ -25,9 +25,8 @@ from blf_dsc_controller.messages.errors import (
     MissingJointError,
     ShortArrayError,
 )
-from blf_dsc_controller.reference.errors import MotionError, TrajectoryError
-from blf_dsc_controller.reference.start import rules_of
-from blf_dsc_controller.reference.trajectory import Request, follow
+from blf_dsc_controller.reference.limits import MotionError, limits_of
+from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, plan_trajectory
 from blf_dsc_controller.supervision import checks as soundness
 from blf_dsc_controller.supervision import retuning as tuning
 from blf_dsc_controller.supervision.reasons import Operation, Phase, Reason
@@ -152,7 +151,7 @@ class Guard:
         self._keep()
         self._start_over()
 
-    def follow(self, request: Request) -> None:
+    def follow(self, trajectory: Trajectory) -> None:
         """Follow another trajectory from the next sample on.
 
         Raises:
@@ -161,7 +160,8 @@ class Guard:
         if not self.supervisor.running:
             raise TrajectoryError([f'the controller is not in command: {self._situation()}'])
         now = (self.last_stamp - self.start_stamp) * _NANO
-        motion = follow(request, self.controller.reference_vector, now, rules_of(self.config))
+        vector, limits = self.controller.reference_vector, limits_of(self.config)
+        motion = plan_trajectory(trajectory, vector, now, limits)
         self.controller.reference_vector = motion.vector
         self.settled = motion.settled
         self.supervisor.enter(Phase.APPROACHING if motion.settled > now else Phase.TRACKING)

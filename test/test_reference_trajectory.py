@@ -1,20 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectories that are sent: what is followed, how it is joined on, and every refusal."""
+"""Trajectories that are sent: what is followed, how it is joined on, and every rejection."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from blf_dsc_controller.reference.errors import MotionError, TrajectoryError
-from blf_dsc_controller.reference.limits import Limits
-from blf_dsc_controller.reference.splice import Rules
+from blf_dsc_controller.reference.limits import MotionError, MotionLimits
 from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term, unpack
-from blf_dsc_controller.reference.trajectory import Point, Request, follow
+from blf_dsc_controller.reference.trajectory import (
+    Trajectory,
+    TrajectoryError,
+    TrajectoryPoint,
+    plan_trajectory,
+)
 
 JOINTS = ('shoulder', 'elbow')
 TOP = np.array([4.0, 3.0])
-RULES = Rules(Limits(JOINTS, -TOP, TOP, np.full(2, 1.5), np.full(2, 6.0)), 30.0)
+LIMITS = MotionLimits(JOINTS, -TOP, TOP, np.full(2, 1.5), np.full(2, 6.0), 30.0)
 PAPER = pack(2, [sinusoids_term((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))])
 NOW = 3.3  # s
 GOALS = np.array([[1.6, 1.2], [2.0, 1.5], [1.8, 1.0]])
@@ -29,10 +32,12 @@ FIELDS = {
 }
 
 
-def request(fields=(GOALS,), times=TIMES, joints=JOINTS, begin=None):
+def trajectory(fields=(GOALS,), times=TIMES, joints=JOINTS, begin=None):
     rows = zip(times, *fields, strict=True)
-    points = tuple(Point(t, *(tuple(row.tolist()) for row in given)) for t, *given in rows)
-    return Request(joints, points, begin)
+    points = tuple(
+        TrajectoryPoint(t, *(tuple(row.tolist()) for row in given)) for t, *given in rows
+    )
+    return Trajectory(joints, points, begin)
 
 
 def one(vector, t):
@@ -41,7 +46,7 @@ def one(vector, t):
 
 @pytest.mark.parametrize('fields', FIELDS.values(), ids=FIELDS)
 def test_points_are_passed_at_their_times_with_what_is_given(fields):
-    motion = follow(request(fields), PAPER, NOW, RULES)
+    motion = plan_trajectory(trajectory(fields), PAPER, NOW, LIMITS)
     for k, t in enumerate(TIMES):
         now = one(motion.vector, NOW + t)
         for row, given in enumerate(fields):
@@ -50,7 +55,7 @@ def test_points_are_passed_at_their_times_with_what_is_given(fields):
 
 @pytest.mark.parametrize('fields', FIELDS.values(), ids=FIELDS)
 def test_it_leads_on_from_the_present_reference_without_a_jump(fields):
-    motion = follow(request(fields), PAPER, NOW, RULES)
+    motion = plan_trajectory(trajectory(fields), PAPER, NOW, LIMITS)
     np.testing.assert_allclose(one(motion.vector, NOW), one(PAPER, NOW), atol=1e-13)
     np.testing.assert_allclose(one(motion.vector, NOW + 1e-8), one(PAPER, NOW), atol=1e-6)
     assert motion.settled == NOW
@@ -58,7 +63,7 @@ def test_it_leads_on_from_the_present_reference_without_a_jump(fields):
 
 @pytest.mark.parametrize('fields', FIELDS.values(), ids=FIELDS)
 def test_it_has_no_jump_in_velocity_anywhere_and_is_held_at_the_end(fields):
-    motion = follow(request(fields), PAPER, NOW, RULES)
+    motion = plan_trajectory(trajectory(fields), PAPER, NOW, LIMITS)
     times = np.linspace(NOW, NOW + 4.0, 40_001)
     qr, dqr, ddqr = sampled(motion.vector, times).transpose(1, 0, 2)
     # 6 rad/s^2 times 1e-4 s is the most that a velocity may change from one time to the next.
@@ -70,7 +75,7 @@ def test_it_has_no_jump_in_velocity_anywhere_and_is_held_at_the_end(fields):
 
 
 def test_the_way_to_the_first_point_of_cubics_arrives_with_their_acceleration():
-    motion = follow(request((GOALS, SPEEDS)), PAPER, NOW, RULES)
+    motion = plan_trajectory(trajectory((GOALS, SPEEDS)), PAPER, NOW, LIMITS)
     before, after = (one(motion.vector, NOW + 1.0 + side)[2] for side in (-1e-9, 1e-9))
     np.testing.assert_allclose(before, after, atol=1e-6)
     assert np.abs(after).min() > 0.1
@@ -78,7 +83,7 @@ def test_the_way_to_the_first_point_of_cubics_arrives_with_their_acceleration():
 
 def test_cubics_are_hermite_s():
     """Halfway between two points, h apart: their mean, and h/8 times the fall of the velocity."""
-    motion = follow(request((GOALS, SPEEDS)), PAPER, NOW, RULES)
+    motion = plan_trajectory(trajectory((GOALS, SPEEDS)), PAPER, NOW, LIMITS)
     halfway = one(motion.vector, NOW + 1.5)[0]
     expected = 0.5 * (GOALS[0] + GOALS[1]) + (SPEEDS[0] - SPEEDS[1]) / 8.0
     np.testing.assert_allclose(halfway, expected, atol=1e-12)
@@ -86,23 +91,24 @@ def test_cubics_are_hermite_s():
 
 @pytest.mark.parametrize('fields', FIELDS.values(), ids=FIELDS)
 def test_joints_are_matched_by_name(fields):
-    swapped = request(tuple(field[:, ::-1] for field in fields), joints=JOINTS[::-1])
-    assert swapped.points != request(fields).points
+    swapped = trajectory(tuple(field[:, ::-1] for field in fields), joints=JOINTS[::-1])
+    assert swapped.points != trajectory(fields).points
     np.testing.assert_array_equal(
-        follow(swapped, PAPER, NOW, RULES).vector, follow(request(fields), PAPER, NOW, RULES).vector
+        plan_trajectory(swapped, PAPER, NOW, LIMITS).vector,
+        plan_trajectory(trajectory(fields), PAPER, NOW, LIMITS).vector,
     )
 
 
 def test_a_trajectory_that_begins_now_somewhere_else_is_mixed_in():
     fields = (np.vstack((GOALS[2], GOALS[1], GOALS[0])),)
-    motion = follow(request(fields, times=(0.0, 4.0, 8.0)), PAPER, NOW, RULES)
+    motion = plan_trajectory(trajectory(fields, times=(0.0, 4.0, 8.0)), PAPER, NOW, LIMITS)
     assert NOW < motion.settled < NOW + 4.0
     np.testing.assert_allclose(one(motion.vector, NOW), one(PAPER, NOW), atol=1e-13)
     np.testing.assert_allclose(one(motion.vector, NOW + 4.0)[0], GOALS[1], atol=1e-12)
 
 
 def test_one_point_at_once_is_gone_to_as_fast_as_the_limits_allow():
-    motion = follow(request((GOALS[:1],), times=(0.0,)), PAPER, NOW, RULES)
+    motion = plan_trajectory(trajectory((GOALS[:1],), times=(0.0,)), PAPER, NOW, LIMITS)
     after = one(motion.vector, motion.settled)
     np.testing.assert_allclose(after, [GOALS[0], (0, 0), (0, 0)], atol=1e-12)
     _, dqr, ddqr = sampled(motion.vector, np.linspace(NOW, motion.settled, 5001)).transpose(1, 0, 2)
@@ -111,7 +117,7 @@ def test_one_point_at_once_is_gone_to_as_fast_as_the_limits_allow():
 
 
 def test_until_it_begins_the_present_reference_goes_on():
-    motion = follow(request(begin=5.0), PAPER, NOW, RULES)
+    motion = plan_trajectory(trajectory(begin=5.0), PAPER, NOW, LIMITS)
     for t in (NOW, 4.0, 4.999):
         np.testing.assert_array_equal(one(motion.vector, t), one(PAPER, t))
     np.testing.assert_allclose(one(motion.vector, 5.0), one(PAPER, 5.0), atol=1e-13)
@@ -119,15 +125,15 @@ def test_until_it_begins_the_present_reference_goes_on():
 
 
 def test_points_whose_time_is_over_are_passed_over():
-    motion = follow(request(begin=NOW - 1.5), PAPER, NOW, RULES)
+    motion = plan_trajectory(trajectory(begin=NOW - 1.5), PAPER, NOW, LIMITS)
     np.testing.assert_allclose(one(motion.vector, NOW), one(PAPER, NOW), atol=1e-13)
     np.testing.assert_allclose(one(motion.vector, NOW + 0.5)[0], GOALS[1], atol=1e-12)
 
 
 def test_a_later_one_replaces_those_that_run_or_wait():
-    first = follow(request(), PAPER, NOW, RULES).vector
-    waiting = follow(request(begin=20.0), first, NOW + 1.0, RULES).vector
-    last = follow(request((GOALS[::-1] + 0.1,)), waiting, NOW + 1.5, RULES).vector
+    first = plan_trajectory(trajectory(), PAPER, NOW, LIMITS).vector
+    waiting = plan_trajectory(trajectory(begin=20.0), first, NOW + 1.0, LIMITS).vector
+    last = plan_trajectory(trajectory((GOALS[::-1] + 0.1,)), waiting, NOW + 1.5, LIMITS).vector
     np.testing.assert_allclose(one(last, NOW + 1.5), one(first, NOW + 1.5), atol=1e-12)
     np.testing.assert_allclose(one(last, NOW + 5.0)[0], GOALS[0] + 0.1, atol=1e-12)
     np.testing.assert_allclose(one(last, 22.0)[0], GOALS[0] + 0.1, atol=1e-12)
@@ -137,89 +143,93 @@ def test_a_later_one_replaces_those_that_run_or_wait():
 def test_what_is_over_is_forgotten():
     vector = PAPER
     for k in range(20):
-        vector = follow(request((GOALS + 0.01 * k,)), vector, NOW + k, RULES).vector
+        vector = plan_trajectory(trajectory((GOALS + 0.01 * k,)), vector, NOW + k, LIMITS).vector
     assert len(unpack(vector)) == 2
 
 
 NAN = float('nan')
 BAD = {
-    'unknown joint': (request(joints=('shoulder', 'wrist')), "no joint 'wrist' here"),
+    'unknown joint': (trajectory(joints=('shoulder', 'wrist')), "no joint 'wrist' here"),
     'missing joint': (
-        request((GOALS[:, :1],), joints=JOINTS[:1]),
-        "says nothing of joint 'elbow'",
+        trajectory((GOALS[:, :1],), joints=JOINTS[:1]),
+        "joint 'elbow' is missing",
     ),
     'repeated joint': (
-        request((np.hstack((GOALS, GOALS[:, 1:])),), joints=(*JOINTS, 'elbow')),
+        trajectory((np.hstack((GOALS, GOALS[:, 1:])),), joints=(*JOINTS, 'elbow')),
         "joint 'elbow' is named more than once",
     ),
-    'no joints': (Request((), ()), "says nothing of joint 'shoulder', 'elbow'"),
-    'no points': (Request(JOINTS, ()), 'it has no points'),
-    'no positions': (Request(JOINTS, (Point(1.0, ()),)), 'point 1 has no positions'),
+    'no joints': (Trajectory((), ()), "joint 'shoulder', 'elbow' is missing"),
+    'no points': (Trajectory(JOINTS, ()), 'it has no points'),
+    'no positions': (Trajectory(JOINTS, (TrajectoryPoint(1.0, ()),)), 'point 1 has no positions'),
     'too few positions': (
-        Request(JOINTS, (Point(1.0, (1.0,)),)),
+        Trajectory(JOINTS, (TrajectoryPoint(1.0, (1.0,)),)),
         'point 1 has 1 positions for 2 joints',
     ),
     'too many velocities': (
-        Request(JOINTS, (Point(1.0, (1.0, 1.0), (0.0, 0.0, 0.0)),)),
+        Trajectory(JOINTS, (TrajectoryPoint(1.0, (1.0, 1.0), (0.0, 0.0, 0.0)),)),
         'point 1 has 3 velocities for 2 joints',
     ),
     'accelerations alone': (
-        Request(JOINTS, (Point(1.0, (1.0, 1.0), (), (0.0, 0.0)),)),
+        Trajectory(JOINTS, (TrajectoryPoint(1.0, (1.0, 1.0), (), (0.0, 0.0)),)),
         'accelerations, but no velocities',
     ),
     'effort': (
-        Request(JOINTS, (Point(1.0, (1.0, 1.0), effort=(1.0, 1.0)),)),
+        Trajectory(JOINTS, (TrajectoryPoint(1.0, (1.0, 1.0), effort=(1.0, 1.0)),)),
         'leave effort empty',
     ),
     'a mixture of fields': (
-        Request(JOINTS, (Point(1.0, (1.6, 1.2), (0.0, 0.0)), Point(2.0, (1.6, 1.2)))),
+        Trajectory(
+            JOINTS, (TrajectoryPoint(1.0, (1.6, 1.2), (0.0, 0.0)), TrajectoryPoint(2.0, (1.6, 1.2)))
+        ),
         'do not all give the same',
     ),
     'NaN': (
-        request((np.array([[1.6, NAN], [2.0, 1.5], [1.8, 1.0]]),)),
+        trajectory((np.array([[1.6, NAN], [2.0, 1.5], [1.8, 1.0]]),)),
         'point 1 has positions that are not finite: [1.6, nan]',
     ),
     'infinite velocity': (
-        request((GOALS, SPEEDS + np.array([[0.0], [np.inf], [0.0]]))),
+        trajectory((GOALS, SPEEDS + np.array([[0.0], [np.inf], [0.0]]))),
         'point 2 has velocities that are not finite',
     ),
-    'equal times': (request(times=(1.0, 1.0, 2.0)), 'point 2 is at 1 s, not after'),
-    'falling times': (request(times=(1.0, 2.0, 1.5)), 'point 3 is at 1.5 s, not after'),
-    'negative time': (request(times=(-1.0, 1.0, 2.0)), 'point 1 is 1 s before the beginning'),
-    'all in the past': (request(begin=-0.5), 'it ends 0.3 s ago'),
+    'equal times': (trajectory(times=(1.0, 1.0, 2.0)), 'point 2 is at 1 s, not after'),
+    'falling times': (trajectory(times=(1.0, 2.0, 1.5)), 'point 3 is at 1.5 s, not after'),
+    'negative time': (trajectory(times=(-1.0, 1.0, 2.0)), 'point 1 is 1 s before the beginning'),
+    'all in the past': (trajectory(begin=-0.5), 'it ends 0.3 s ago'),
     'moving at the end': (
-        request((GOALS, SPEEDS[::-1])),
+        trajectory((GOALS, SPEEDS[::-1])),
         'it ends with shoulder at 0.2 rad/s, but the last point is held',
     ),
     'too fast': (
-        request((GOALS * [[1.0, 1.0], [1.9, 1.0], [1.0, 1.0]],), times=(2.0, 3.0, 6.0)),
+        trajectory((GOALS * [[1.0, 1.0], [1.9, 1.0], [1.0, 1.0]],), times=(2.0, 3.0, 6.0)),
         "the velocity of joint 'shoulder' would be",
     ),
     'too sudden': (
-        request((GOALS[:1],), times=(0.2,)),
+        trajectory((GOALS[:1],), times=(0.2,)),
         'past its limit of -6 rad/s^2',
     ),
     'too far': (
-        request((FAR,), times=(5.0, 10.0, 15.0)),
+        trajectory((FAR,), times=(5.0, 10.0, 15.0)),
         "the position of joint 'elbow' would be",
     ),
     'out of reach when mixed in': (
-        request((FAR,), times=(0.0, 5.0, 10.0)),
+        trajectory((FAR,), times=(0.0, 5.0, 10.0)),
         'limits.position_lower',
     ),
 }
 
 
 @pytest.mark.parametrize(('bad', 'reason'), BAD.values(), ids=BAD)
-def test_what_cannot_be_followed_is_refused_with_the_reason(bad, reason):
-    with pytest.raises(TrajectoryError) as refusal:
-        follow(bad, PAPER, NOW, RULES)
-    assert isinstance(refusal.value, MotionError)
-    assert reason in str(refusal.value)
+def test_what_cannot_be_followed_is_rejected_with_the_reason(bad, reason):
+    with pytest.raises(TrajectoryError) as rejection:
+        plan_trajectory(bad, PAPER, NOW, LIMITS)
+    assert isinstance(rejection.value, MotionError)
+    assert reason in str(rejection.value)
 
 
-def test_every_reason_is_told_at_once():
-    bad = Request(('shoulder', 'wrist'), (Point(1.0, (1.0,)), Point(2.0, (NAN, 1.0))))
-    with pytest.raises(TrajectoryError) as refusal:
-        follow(bad, PAPER, NOW, RULES)
-    assert len(refusal.value.reasons) == 4
+def test_all_problems_are_reported_at_once():
+    bad = Trajectory(
+        ('shoulder', 'wrist'), (TrajectoryPoint(1.0, (1.0,)), TrajectoryPoint(2.0, (NAN, 1.0)))
+    )
+    with pytest.raises(TrajectoryError) as rejection:
+        plan_trajectory(bad, PAPER, NOW, LIMITS)
+    assert len(rejection.value.problems) == 4

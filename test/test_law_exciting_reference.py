@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A reference chosen to teach: as predicted, within limits, and what it is good for."""
+"""An exciting reference: as predicted, within limits, and what it is good for."""
 
 from __future__ import annotations
 
@@ -9,25 +9,23 @@ from functools import cache
 import numpy as np
 import pytest
 
-pytest.importorskip('scipy')
-
 from blf_dsc_controller.cli.excite import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.params_file import load_loop, locate
 from blf_dsc_controller.configuration.reference import MotionLimits
-from blf_dsc_controller.law.exciting_reference import Excitation, excite
-from blf_dsc_controller.reference.errors import ExcitationError
+from blf_dsc_controller.law.exciting_reference import ExcitationProblem, search
+from blf_dsc_controller.reference.limits import MotionError
 from blf_dsc_controller.simulation.loop import simulate
 
 P = np.array([1.0, 0.32, 0.4])
 SIGMA = ControllerConfig().learning.excitation_threshold
 
 
-def course(name):
-    told = load_loop(locate(name)).controller.reference
+def excitation(name):
+    reference = load_loop(locate(name)).controller.reference
     names = ('offset', 'amplitude', 'frequency', 'phase')
-    parameters = {one: getattr(told, one) for one in names}
-    return Excitation(ControllerConfig(), P, 0.8, 2).course(parameters)
+    parameters = {one: getattr(reference, one) for one in names}
+    return ExcitationProblem(ControllerConfig(), P, 0.8, 2).evaluate(parameters)
 
 
 @cache
@@ -47,18 +45,18 @@ def parameter_error(record):
 def test_predicted_excitation_is_the_loop_s(name):
     """The loop's is sampled, and of the arm's own motion, which is within a milliradian."""
     measured = run(name).sample(-1).lambda_min[0]
-    assert course(name).lambda_min == pytest.approx(measured, rel=0.01)
+    assert excitation(name).lambda_min == pytest.approx(measured, rel=0.01)
 
 
 def test_chosen_reference_excites_far_more_than_the_paper_s():
-    paper, chosen = course('recommended').lambda_min, course('excitation').lambda_min
+    paper, chosen = excitation('recommended').lambda_min, excitation('excitation').lambda_min
     assert SIGMA < paper < 2.0 * SIGMA
     # A bias column alone brings an eigenvalue of 1: with these columns there is no more to have.
     assert 0.99 < chosen <= 1.0
 
 
 def test_chosen_reference_keeps_the_limits_and_is_tracked_within_the_bound():
-    assert course('excitation').ratios.max() <= 1.0
+    assert excitation('excitation').ratios.max() <= 1.0
     record = run('excitation')
     xi1, bound = record.samples[:, 4:6], record.samples[:, 12:14]
     assert np.abs(xi1 / bound).max() < 1.0
@@ -73,17 +71,17 @@ def test_chosen_reference_tells_the_worst_disturbance_from_the_parameters():
 
 def test_search_keeps_its_limits_is_repeatable_and_beats_where_it_starts():
     config = replace(ControllerConfig(), limits=MotionLimits(velocity=(0.5, 0.8)))
-    excitation = Excitation(config, P, 0.5, 1)
-    (series, reached), (again, _) = (excite(excitation, 3, 1) for _ in range(2))
-    np.testing.assert_array_equal(series.cosines, again.cosines)
+    problem = ExcitationProblem(config, P, 0.5, 1)
+    x, again = (search(problem, 3, 1) for _ in range(2))
+    np.testing.assert_array_equal(x, again)
+    reached = problem.evaluate(problem.parameters(x))
     assert reached.ratios.max() <= 1.0
     assert reached.ratios[1].max() > 0.9  # the velocity is what holds it back
     random = np.random.default_rng(0)
     for _ in range(20):
-        other = excitation.series(random.normal(0.0, 0.2, 6))
-        judged = excitation.course(other.parameters)
-        if judged.ratios.max() <= 1.0:
-            assert judged.lambda_min < reached.lambda_min
+        other = problem.evaluate(problem.parameters(random.normal(0.0, 0.2, 6)))
+        if other.ratios.max() <= 1.0:
+            assert other.lambda_min < reached.lambda_min
 
 
 def test_without_torque_to_spare_none_is_found():
@@ -91,17 +89,17 @@ def test_without_torque_to_spare_none_is_found():
         ControllerConfig(),
         limits=MotionLimits(position_lower=(0.0, 0.0), position_upper=(0.5, 0.5)),
     )
-    with pytest.raises(ExcitationError, match='in 1 searches'):
-        excite(Excitation(still, P, 0.1, 1), 0, 1)
+    with pytest.raises(MotionError, match='in 1 searches'):
+        search(ExcitationProblem(still, P, 0.1, 1), 0, 1)
 
 
 def test_the_tool_writes_a_preset_that_loads(tmp_path, capsys):
     path = tmp_path / 'mine.yaml'
     assert main([str(path), '--harmonics', '1', '--starts', '1']) == 0
-    told = load_loop(path).controller.reference
-    assert told.frequency == (1.0, 1.0)
-    assert told.phase == (0.0, -0.5 * np.pi)
-    assert len(told.amplitude) == 4
+    reference = load_loop(path).controller.reference
+    assert reference.frequency == (1.0, 1.0)
+    assert reference.phase == (0.0, -0.5 * np.pi)
+    assert len(reference.amplitude) == 4
     assert main([str(path)]) == 1
     assert 'is there already' in capsys.readouterr().err
     assert main([str(tmp_path / 'other.yaml'), '--guess', '1.0']) == 1

@@ -66,10 +66,10 @@ def test_derivatives_are_those_of_the_reference(terms, t):
     np.testing.assert_allclose(ddqr, rate[1], atol=1e-9)
 
 
-@pytest.mark.parametrize(('t', 'share'), [(0.5, 0.0), (1.3, 0.5), (2.1, 1.0)])
-def test_a_term_is_mixed_into_the_one_before_by_the_minimum_jerk_step(t, share):
+@pytest.mark.parametrize(('t', 's'), [(0.5, 0.0), (1.3, 0.5), (2.1, 1.0)])
+def test_a_term_is_mixed_into_the_one_before_by_the_minimum_jerk_step(t, s):
     old, new = at([SINUSOIDS], t)[0], at([SPLINE], t)[0]
-    expected = (1.0 - share) * old + share * new
+    expected = (1.0 - s) * old + s * new
     np.testing.assert_allclose(at([SINUSOIDS, LATER], t)[0], expected, rtol=1e-13)
 
 
@@ -108,7 +108,7 @@ def test_many_times_at_once_give_what_each_gives():
 
 
 def test_papers_reference_is_at_rest_at_the_start():
-    vector = reference.sinusoids_vector((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))
+    vector = pack(2, [sinusoids_term((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))])
     qr, dqr, ddqr = np.full((3, 2), np.nan)
     reference.evaluate(vector, 0.0, qr, dqr, ddqr)
     np.testing.assert_allclose(qr, [2.2935, 1.6961], rtol=1e-15)

@@ -16,7 +16,7 @@ from blf_dsc_controller.configuration.reference import Approach, Reference
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError, OutsideBarrierError
 from blf_dsc_controller.law.factory import begin, controller_of
-from blf_dsc_controller.reference.start import reference_of
+from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The configured reference, and the approach to it from where the arm is.
+
+The reference is blended into the present motion (see `terms`), starting at t0, in the shortest time
+that keeps the limits, found in 10 % steps and refined by bisection.  A blend is never faster than
+its parts but for their distance over its duration, so there is one wherever both parts keep
+strictly within the limits and their distance is finite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.errors import OutsideBarrierError
+from blf_dsc_controller.reference.limits import (
+    MotionError,
+    MotionLimits,
+    Violation,
+    check_times,
+    limits_of,
+    worst_violation,
+)
+from blf_dsc_controller.reference.polynomials import at_rest, hermite, minimum_jerk
+from blf_dsc_controller.reference.terms import (
+    Term,
+    evaluate,
+    pack,
+    sinusoids_term,
+    spline_term,
+    unpack,
+)
+
+_SHORTEST = 0.02  # s
+_STEP = 1.1
+_BISECTIONS = 5
+_BRAKE = 3.0
+"""Braking from v in the time h takes up to 1.5 v / h: twice the time needs half the limit."""
+
+
+class Motion(NamedTuple):
+    """A packed reference, and the time [s] at which its last blend is over."""
+
+    vector: np.ndarray
+    settled: float
+
+
+def hold(position: np.ndarray) -> Term:
+    """Stay at `position` (n,) [rad]."""
+    return spline_term(np.zeros(1), at_rest(position))
+
+
+def stop(t0: float, q: np.ndarray, dq: np.ndarray, limits: MotionLimits) -> Term:
+    """Come to rest from q (n,) [rad] and dq (n,) [rad/s] at t0 [s]."""
+    h = max(_SHORTEST, float(np.max(_BRAKE * np.abs(dq) / limits.acceleration)))
+    points = np.zeros((3, 2, q.size))
+    points[0] = q, q + 0.5 * h * dq
+    points[1, 0] = dq
+    return hermite(np.array([t0, t0 + h]), points)
+
+
+def blend(before: Sequence[Term], target: Term, t0: float, limits: MotionLimits) -> Motion:
+    """Go over from `before` to `target`, starting at t0 [s], as fast as the limits allow.
+
+    Raises:
+        MotionError: `target` itself violates a limit, or every blend that is short enough does.
+    """
+    n = len(limits.joints)
+    found = worst_violation(pack(n, [target]), check_times(t0, t0 + limits.longest), limits)
+    if found is not None:
+        raise MotionError(
+            f'the reference goes past the limits of the arm: {found}; ask for less, or raise '
+            f'{found.parameters}',
+            found,
+        )
+
+    def attempt(duration: float) -> np.ndarray:
+        return pack(n, [*before, target._replace(begin=t0, fade=duration)])
+
+    def violation(duration: float) -> Violation | None:
+        return worst_violation(attempt(duration), check_times(t0, t0 + duration), limits)
+
+    too_short, duration = 0.0, min(_SHORTEST, limits.longest)
+    closest = None
+    while (found := violation(duration)) is not None:
+        if closest is None or found.ratio < closest.ratio:
+            closest = found
+        if duration >= limits.longest:
+            raise MotionError(
+                f'no motion of at most {limits.longest:g} s from here to the reference keeps '
+                f'within the limits of the arm: in the one that comes closest {closest}; start '
+                f'closer and at rest, or raise {closest.parameters} or approach.longest',
+                closest,
+            )
+        too_short, duration = duration, min(duration * _STEP, limits.longest)
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (too_short + duration)
+        if violation(middle) is None:
+            duration = middle
+        else:
+            too_short = middle
+    return Motion(attempt(duration), t0 + duration)
+
+
+def reference_of(config: ControllerConfig) -> np.ndarray:
+    """Pack the configured reference; `hold` is at reference.offset until `plan_start`."""
+    reference = config.reference
+    if reference.type == 'hold':
+        term = hold(np.array(reference.offset))
+    elif reference.type == 'waypoints':
+        points = np.reshape(reference.points, (len(config.joints), -1)).T
+        term = minimum_jerk(np.array(reference.times), points)
+    else:
+        term = sinusoids_term(
+            reference.offset, reference.amplitude, reference.frequency, reference.phase
+        )
+    return pack(len(config.joints), [term])
+
+
+def check_start(
+    joints: tuple[str, ...],
+    q: np.ndarray,
+    bound: np.ndarray,
+    reference_vector: np.ndarray,
+    t: float = 0.0,
+) -> None:
+    """Check that positions q (n,) [rad] at time t [s] are inside the bound k(t) (n,) [rad].
+
+    Raises:
+        OutsideBarrierError: some |xi1_i| >= k_i(t), where the law is not defined.
+    """
+    qr, dqr, ddqr = np.zeros((3, len(joints)))
+    evaluate(reference_vector, t, qr, dqr, ddqr)
+    for joint, error, limit in zip(joints, q - qr, bound, strict=True):
+        if not abs(error) < limit:
+            raise OutsideBarrierError(joint, float(error), float(limit))
+
+
+def plan_start(
+    config: ControllerConfig, bound: np.ndarray, q: np.ndarray, dq: np.ndarray, t: float = 0.0
+) -> Motion:
+    """Configured reference, with an approach to it if the arm is outside the bound.
+
+    The arm is at q (n,) [rad] with dq (n,) [rad/s] at time t [s], when the bound is `bound` (n,)
+    [rad].
+
+    Raises:
+        OutsideBarrierError: the arm is outside the bound, and approach.enabled is false.
+        MotionError: no approach keeps the limits.
+    """
+    if config.reference.type == 'hold':
+        return Motion(pack(q.size, [hold(q)]), t)
+    vector = reference_of(config)
+    try:
+        check_start(config.joints, q, bound, vector, t)
+    except OutsideBarrierError:
+        if not config.approach.enabled:
+            raise
+        limits = limits_of(config)
+        (target,) = unpack(vector)
+        return blend([stop(t, q, dq, limits)], target, t, limits)
+    return Motion(vector, t)
