@@ -29,3 +29,15 @@ class OutsideBarrierError(BlfDscError):
             f'joint {joint!r} starts {error:+.6g} rad from the reference, outside its bound of '
             f'{bound:.6g} rad: start closer to the reference, or widen barrier.bound'
         )
+
+
+class MissingExtraError(BlfDscError):
+    """A package of one of the extras is not installed."""
+
+    def __init__(self, module: str, extra: str, purpose: str) -> None:
+        self.module = module
+        self.extra = extra
+        super().__init__(
+            f'{purpose} needs {module}, which is not installed: '
+            f"pip install 'blf_dsc_controller[{extra}]'"
+        )

@@ -14,8 +14,8 @@ import synthetic_bag
 from synthetic_bag import JOINTS, Synthetic
 
 from blf_dsc_controller.analysis.animation import animation, lengths
-from blf_dsc_controller.analysis.page import write_page
 from blf_dsc_controller.analysis.panels import panels
+from blf_dsc_controller.analysis.report import write_report
 from blf_dsc_controller.analysis.subject import read_subjects
 from blf_dsc_controller.cli.bag_report import main
 from blf_dsc_controller.messages.topics import JOINT_STATES
@@ -77,7 +77,7 @@ def test_several_bags_lie_over_each_other_and_their_differences_are_told(folder,
         f'{bag}: {what}' for bag in ('one', 'other') for what in ('error', *['bound'] * 2)
     ]
     assert panel['traces'][0]['line']['color'] != panel['traces'][3]['line']['color']
-    write_page(subjects, tmp_path / 'page.html')
+    write_report(subjects, tmp_path / 'page.html')
     text = (tmp_path / 'page.html').read_text()
     assert '<p>1 parameters differ.</p>' in text
     row = 'blf_dsc_controller: feedback.gain</td><td>[60.0, 20.0]</td><td>[30.0, 10.0]</td>'
@@ -101,7 +101,7 @@ def test_the_arm_has_its_lengths_and_moves_as_measured(folder):
 def test_a_page_is_one_file_whose_data_no_name_can_break(folder, tmp_path):
     (subject,) = read_subjects([folder / 'one'])
     nasty = '</script><b>&{{data}}'
-    write_page([replace(subject, name=nasty)], tmp_path / 'page.html')
+    write_report([replace(subject, name=nasty)], tmp_path / 'page.html')
     text = (tmp_path / 'page.html').read_text()
     ours = text.split('<script>')[0] + text.rsplit('<script>', 1)[1]  # without plotly's own script
     assert not re.search(r'(?:src|href)="(?!#|data:)|https?:', ours)

@@ -16,7 +16,7 @@ import recorded_run
 
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 
-from blf_dsc_controller.analysis.page import write_page
+from blf_dsc_controller.analysis.report import write_report
 from blf_dsc_controller.analysis.subject import read_subjects
 
 pytestmark = [
@@ -34,8 +34,8 @@ def pages(tmp_path_factory):
     folder = tmp_path_factory.mktemp('pages')
     one = recorded_run.record(folder / 'one', 4.0)
     other = recorded_run.record(folder / 'other', 4.0, **{'feedback.gain': [30.0, 10.0]})
-    write_page(read_subjects([one]), folder / 'one.html')
-    write_page(read_subjects([one, other]), folder / 'both.html')
+    write_report(read_subjects([one]), folder / 'one.html')
+    write_report(read_subjects([one, other]), folder / 'both.html')
     return folder
 
 

@@ -124,16 +124,6 @@ class UnknownFormatError(BlfDscError):
         )
 
 
-class NoParquetError(BlfDscError):
-    """The library that writes Parquet is not installed."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            'Parquet files are written by pyarrow, which is not installed: '
-            "pip install 'blf_dsc_controller[parquet]', or choose a .csv file"
-        )
-
-
 class NoConfigurationError(BlfDscError):
     """A bag that does not tell how the controller was configured, or not in a readable way."""
 

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.bags.errors import NoParquetError, UnknownFormatError
+from blf_dsc_controller.bags.errors import UnknownFormatError
+from blf_dsc_controller.errors import MissingExtraError
 from blf_dsc_controller.run import Floats, Run, Series
 
 Table = dict[str, Any]
@@ -50,7 +51,7 @@ def export(run: Run, path: Path) -> int:
 
     Raises:
         UnknownFormatError: the ending is neither .csv nor .parquet.
-        NoParquetError: pyarrow is not installed.
+        MissingExtraError: pyarrow is not installed.
     """
     columns = table(run)
     if path.suffix == '.csv':
@@ -78,5 +79,5 @@ def _write_parquet(columns: Table, path: Path) -> None:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError:
-        raise NoParquetError from None
+        raise MissingExtraError('pyarrow', 'parquet', 'writing Parquet') from None
     parquet.write_table(pa.table(columns), path)

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from blf_dsc_controller.analysis.page import write_page
+from blf_dsc_controller.analysis.report import write_report
 from blf_dsc_controller.analysis.subject import read_subjects
 from blf_dsc_controller.errors import BlfDscError
 
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = parser().parse_args(arguments)
     try:
-        write_page(read_subjects(options.bags, options.namespace), options.out)
+        write_report(read_subjects(options.bags, options.namespace), options.out)
     except (BlfDscError, OSError) as error:
         print(f'bag_report: {error}', file=sys.stderr)
         return 1

@@ -9,18 +9,6 @@ from pathlib import Path
 from blf_dsc_controller.errors import BlfDscError
 
 
-class MissingExtraError(BlfDscError):
-    """A package that only this command needs is not installed."""
-
-    def __init__(self, module: str, extra: str, purpose: str) -> None:
-        self.module = module
-        self.extra = extra
-        super().__init__(
-            f'{purpose} needs {module}, which is not installed: '
-            f"pip install 'blf_dsc_controller[{extra}]'"
-        )
-
-
 class NotAStudyError(BlfDscError):
     """A folder that is there already, but holds no study."""
 

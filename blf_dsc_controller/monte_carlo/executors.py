@@ -21,7 +21,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from multiprocessing import connection
 
-from blf_dsc_controller.monte_carlo.errors import MissingExtraError
+from blf_dsc_controller.errors import MissingExtraError
 
 _PRELOADED = 'blf_dsc_controller.monte_carlo.chunk'
 

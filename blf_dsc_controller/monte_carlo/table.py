@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from blf_dsc_controller.errors import MissingExtraError
 from blf_dsc_controller.monte_carlo.chunk import Columns
-from blf_dsc_controller.monte_carlo.errors import MissingExtraError, UnreadablePartError
+from blf_dsc_controller.monte_carlo.errors import UnreadablePartError
 
 
 def require_pyarrow() -> Any:

@@ -65,7 +65,7 @@ async function drawAll() {
       group = panel.group;
       const heading = document.createElement('h2');
       heading.textContent = group;
-      heading.id = group;
+      heading.id = group.toLowerCase().replaceAll(' ', '-');
       grid = document.createElement('div');
       grid.className = 'grid';
       plots.append(heading, grid);
