@@ -2,7 +2,7 @@
 """Bytes to arrays, joints matched by name.
 
 The places of the values are found once and kept for as long as the messages have the same names
-and lengths, which is then a comparison of bytes and not a parse.
+and lengths: a comparison of bytes instead of a parse.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.messages.cdr import (
+    NANOSECONDS,
     ORIGIN,
     STAMP_OFFSET,
     ArrayLayout,
-    Doubles,
     JointStateLayout,
 )
-from blf_dsc_controller.messages.encoders import JOINT_STATE_FIELDS, NANOSECONDS
+from blf_dsc_controller.messages.encoders import JOINT_STATE_FIELDS
 from blf_dsc_controller.messages.errors import (
     DuplicatedJointError,
     MissingJointError,
@@ -36,11 +36,11 @@ _USUAL_START = 20
 class JointStateDecoder:
     """Decodes sensor_msgs/JointState into arrays in the order of `joints`.
 
-    Other joints in the message are passed over. A field that is not required and that the message
-    leaves empty reads as NaN. Values are not checked: NaN in the message is NaN here.
+    Other joints in the message are ignored. A field that is not required and is empty in the
+    message reads as NaN. Values are not checked: NaN passes through.
 
     Args:
-        joints: the n names wanted.
+        joints: names of the n joints to read.
         required: fields that must hold a value for each name of the message.
 
     Attributes:
@@ -56,18 +56,14 @@ class JointStateDecoder:
         self._joints = tuple(joints)
         self._required = frozenset(required)
         self.values = np.full(3 * len(self._joints), np.nan)
-        fields = self.values.reshape(3, -1)
-        self.position: NDArray[np.float64] = fields[0]
-        self.velocity: NDArray[np.float64] = fields[1]
-        self.effort: NDArray[np.float64] = fields[2]
+        self.position, self.velocity, self.effort = self.values.reshape(3, -1)
         self._length = -1
 
     def decode(self, raw: bytes) -> int:
         """Fill the arrays from a serialised message and return its stamp [ns].
 
         Raises:
-            MessageEncodingError: not plain CDR.
-            TruncatedMessageError: `raw` ends too early.
+            MessageError: not plain CDR, or `raw` ends too early.
             MissingJointError: one of `joints` is not named.
             DuplicatedJointError: one of `joints` is named twice.
             ShortArrayError: an array is not as long as the names.
@@ -79,54 +75,48 @@ class JointStateDecoder:
             and raw[self._velocity_at : self._velocity_at + 4] == self._velocity_size
             and raw[self._effort_at : self._effort_at + 4] == self._effort_size
         ):
-            self._learn(raw)
+            self._parse(raw)
         self._buffer[12:] = raw
         self._grid.take(self._index, out=self.values, mode='clip')
         seconds, nanoseconds = self._stamp.unpack_from(raw, STAMP_OFFSET)
         return int(seconds * NANOSECONDS + nanoseconds)
 
-    def _learn(self, raw: bytes) -> None:
+    def _parse(self, raw: bytes) -> None:
         layout = JointStateLayout.parse(raw)
+        position, velocity, effort = layout.arrays
         # The message lies in the buffer such that its doubles stand on the float64 grid, of which
         # the first value is the NaN of the empty fields and the third the message's fifth byte.
-        self._index = self._places(layout)
+        self._index = self._grid_index(layout)
         self._buffer = bytearray(12 + len(raw))
         self._grid = np.frombuffer(self._buffer, layout.byte_order + 'f8', len(self._buffer) // 8)
         self._grid[0] = np.nan
         self._stamp = _STAMPS[layout.byte_order]
         self._encapsulation = raw[:2]
-        self._names_end = layout.position.size_offset + 4
+        self._names_end = position.size_offset + 4
         self._names = raw[_NAMES_START : self._names_end]
-        self._velocity_at = layout.velocity.size_offset
+        self._velocity_at = velocity.size_offset
         self._velocity_size = raw[self._velocity_at : self._velocity_at + 4]
-        self._effort_at = layout.effort.size_offset
+        self._effort_at = effort.size_offset
         self._effort_size = raw[self._effort_at : self._effort_at + 4]
         self._length = len(raw)
 
-    def _places(self, layout: JointStateLayout) -> NDArray[np.intp]:
+    def _grid_index(self, layout: JointStateLayout) -> NDArray[np.intp]:
         columns = np.array(columns_of(self._joints, layout.names), dtype=np.intp)
-        arrays = (layout.position, layout.velocity, layout.effort)
-        places = [
-            self._places_in(field, doubles, len(layout.names), columns)
-            for field, doubles in zip(JOINT_STATE_FIELDS, arrays, strict=True)
-        ]
-        return np.concatenate(places)
-
-    def _places_in(
-        self, field: str, doubles: Doubles, names: int, columns: NDArray[np.intp]
-    ) -> NDArray[np.intp]:
-        if doubles.size == 0 and field not in self._required:
-            return np.zeros_like(columns)
-        if doubles.size != names:
-            raise ShortArrayError(field, names, doubles.size)
-        return columns + 2 + (doubles.offset - ORIGIN) // 8
+        index = np.zeros((3, columns.size), dtype=np.intp)
+        for row, field, array in zip(index, JOINT_STATE_FIELDS, layout.arrays, strict=True):
+            if array.size == 0 and field not in self._required:
+                continue
+            if array.size != len(layout.names):
+                raise ShortArrayError(
+                    f'`{field}` of the message holds {array.size} values for {len(layout.names)} '
+                    'names: publish one value for each name'
+                )
+            row[:] = columns + 2 + (array.offset - ORIGIN) // 8
+        return index.reshape(-1)
 
 
 class Float64MultiArrayDecoder:
-    """Decodes std_msgs/Float64MultiArray of an expected size; dimensions are passed over.
-
-    Args:
-        size: number of values expected.
+    """Decodes std_msgs/Float64MultiArray of an expected size; dimensions are skipped.
 
     Attributes:
         data: (size,) values of the last message of that size.
@@ -141,18 +131,14 @@ class Float64MultiArrayDecoder:
         """Return the number of values in the message; fill `data` if it is the expected one.
 
         Raises:
-            MessageEncodingError: not plain CDR.
-            TruncatedMessageError: `raw` ends too early.
+            MessageError: not plain CDR, or `raw` ends too early.
         """
         if raw[4:16] == self._usual_head and raw[:2] == b'\0\1' and len(raw) >= self._usual_end:
             self.data[:] = np.frombuffer(raw, '<f8', self.data.size, _USUAL_START)
             return self.data.size
-        layout = ArrayLayout.parse(raw)
-        size = layout.data.size
+        order, (_, offset, size) = ArrayLayout.parse(raw)
         if size == self.data.size:
-            self.data[:] = np.frombuffer(
-                raw, layout.byte_order + 'f8', size, layout.data.offset if size else 0
-            )
+            self.data[:] = np.frombuffer(raw, order + 'f8', size, offset if size else 0)
         return size
 
 
@@ -167,5 +153,8 @@ def columns_of(joints: Sequence[str], names: tuple[str, ...]) -> list[int]:
         if joint not in names:
             raise MissingJointError(joint, names)
         if names.count(joint) > 1:
-            raise DuplicatedJointError(joint, names)
+            raise DuplicatedJointError(
+                f'joint {joint!r} appears {names.count(joint)} times in the message '
+                f'({", ".join(names)}): name each joint once'
+            )
     return [names.index(joint) for joint in joints]

@@ -1,23 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages to bytes: one template is serialised in full, then only its numbers are overwritten.
+"""Messages to bytes: a template is serialised once, then only its numbers are overwritten.
 
-A node publishes these bytes as they are (rclpy takes serialised messages) and a bag stores them as
-they are, so a message costs about a microsecond and looks the same on both ways.
+A node publishes these bytes and a bag stores them as they are, so that a message costs about a
+microsecond and is the same in both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from struct import Struct
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from blf_dsc_controller.messages.cdr import STAMP_OFFSET, ArrayLayout, Doubles, JointStateLayout
+from blf_dsc_controller.messages.cdr import (
+    NANOSECONDS,
+    STAMP_OFFSET,
+    ArrayLayout,
+    Doubles,
+    JointStateLayout,
+)
 from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
 from blf_dsc_controller.messages.types import typestore
 
-NANOSECONDS = 1_000_000_000
 JOINT_STATE_FIELDS = ('position', 'velocity', 'effort')
 _STAMP = Struct('<iI')
 
@@ -34,15 +39,18 @@ class JointStateEncoder:
     def __init__(
         self,
         names: Sequence[str],
-        fields: Iterable[str] = JOINT_STATE_FIELDS,
+        fields: Collection[str] = JOINT_STATE_FIELDS,
         frame_id: str = '',
     ) -> None:
-        chosen = frozenset(fields)
-        self._buffer = bytearray(_joint_state_template(names, chosen, frame_id))
-        layout = JointStateLayout.parse(bytes(self._buffer))
-        self._position = _view(self._buffer, layout.position)
-        self._velocity = _view(self._buffer, layout.velocity)
-        self._effort = _view(self._buffer, layout.effort)
+        types = typestore().types
+        stamp = types['builtin_interfaces/msg/Time'](sec=0, nanosec=0)
+        header = types['std_msgs/msg/Header'](stamp=stamp, frame_id=frame_id)
+        arrays = [np.zeros(len(names) * (field in fields)) for field in JOINT_STATE_FIELDS]
+        message = types[JOINT_STATE](header, list(names), *arrays)
+        self._buffer = bytearray(typestore().serialize_cdr(message, JOINT_STATE))
+        self._position, self._velocity, self._effort = (
+            _view(self._buffer, array) for array in JointStateLayout.parse(self._buffer).arrays
+        )
 
     def encode(
         self,
@@ -55,7 +63,7 @@ class JointStateEncoder:
 
         Args:
             stamp_ns: header stamp [ns].
-            position: (n,) values, nothing if the field is not among `fields`.
+            position: (n,) values, or () if the field is not among `fields`.
             velocity: (n,) likewise.
             effort: (n,) likewise.
 
@@ -70,25 +78,17 @@ class JointStateEncoder:
 
 
 class Float64MultiArrayEncoder:
-    """Encodes std_msgs/Float64MultiArray of a fixed size, without dimensions.
-
-    Args:
-        size: number of values.
-    """
+    """Encodes std_msgs/Float64MultiArray of a fixed size, without dimensions."""
 
     def __init__(self, size: int) -> None:
         types = typestore().types
         layout = types['std_msgs/msg/MultiArrayLayout'](dim=[], data_offset=0)
         message = types[FLOAT64_MULTI_ARRAY](layout=layout, data=np.zeros(size))
         self._buffer = bytearray(typestore().serialize_cdr(message, FLOAT64_MULTI_ARRAY))
-        self._data = _view(self._buffer, ArrayLayout.parse(bytes(self._buffer)).data)
+        self._data = _view(self._buffer, ArrayLayout.parse(self._buffer).data)
 
     def encode(self, data: ArrayLike) -> bytes:
-        """Return the serialised message of `data` (size,).
-
-        Raises:
-            ValueError: an array of another length.
-        """
+        """Return the serialised message of `data` (size,); ValueError for another length."""
         self._data[:] = data
         return bytes(self._buffer)
 
@@ -96,19 +96,6 @@ class Float64MultiArrayEncoder:
 def encode_clock(stamp_ns: int) -> bytes:
     """Return a serialised rosgraph_msgs/Clock of the time `stamp_ns` [ns]."""
     return b'\x00\x01\x00\x00' + _STAMP.pack(*divmod(stamp_ns, NANOSECONDS))
-
-
-def _joint_state_template(names: Sequence[str], fields: frozenset[str], frame_id: str) -> bytes:
-    unknown = sorted(fields.difference(JOINT_STATE_FIELDS))
-    if unknown:
-        reason = f'fields {unknown} given, those of a JointState are {list(JOINT_STATE_FIELDS)}'
-        raise ValueError(reason)
-    types = typestore().types
-    stamp = types['builtin_interfaces/msg/Time'](sec=0, nanosec=0)
-    header = types['std_msgs/msg/Header'](stamp=stamp, frame_id=frame_id)
-    arrays = {field: np.zeros(len(names) if field in fields else 0) for field in JOINT_STATE_FIELDS}
-    message = types[JOINT_STATE](header=header, name=list(names), **arrays)
-    return bytes(typestore().serialize_cdr(message, JOINT_STATE))
 
 
 def _view(buffer: bytearray, doubles: Doubles) -> NDArray[np.float64]:

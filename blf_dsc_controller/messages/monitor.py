@@ -90,7 +90,7 @@ class ExponentialBound:
 
 
 class Monitor:
-    """Messages on how a controller is doing.
+    """Builds the messages of `~/monitor`.
 
     Args:
         joints: names of the n joints.
@@ -109,21 +109,21 @@ class Monitor:
         self._start: int | None = None
 
     def message(
-        self, stamp: int, told: Sample, ratio: np.ndarray, bound: np.ndarray
+        self, stamp: int, sample: Sample, ratio: np.ndarray, bound: np.ndarray
     ) -> tuple[topics.Topic, bytes]:
-        """Message of a sample.
+        """Message of a telemetry sample.
 
         Args:
             stamp: of the sample [ns].
-            told: what the law tells of it.
+            sample: telemetry of the law.
             ratio: largest |xi1| / k_c so far (n,).
-            bound: k_c now (n,) [rad].
+            bound: present k_c (n,) [rad].
         """
-        distance = bound - np.abs(told.xi1)
-        values = [*ratio, *distance, *told.estimate, told.lambda_min[0], told.latched[0]]
+        distance = bound - np.abs(sample.xi1)
+        values = [*ratio, *distance, *sample.estimate, sample.lambda_min[0], sample.latched[0]]
         if self._ceiling is not None:
             self._start = stamp if self._start is None else self._start
-            V = float(told.lyapunov.sum())
+            V = float(sample.lyapunov.sum())
             t = (stamp - self._start) * 1e-9
-            values += [*told.lyapunov, self._ceiling.at(t, V, bool(told.latched[0]))]
+            values += [*sample.lyapunov, self._ceiling.at(t, V, bool(sample.latched[0]))]
         return topics.MONITOR, self._encoder.encode(stamp, values)

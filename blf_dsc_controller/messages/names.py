@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names under which values travel: in the vectors (learning, truth, timing), and beside them."""
+"""Names of the values in the published vectors, in `/diagnostics` and in `~/state`."""
 
 from __future__ import annotations
 
+# In the vectors learning, truth, timing, monitor.
 DISTURBANCE = 'disturbance '  # followed by the joint
-BIAS = 'bias '  # likewise, a constant torque that is learned
-POSITION = 'position '  # likewise
-VELOCITY = 'velocity '  # likewise
-RATIO = 'max_error_ratio '  # likewise, the largest |xi1| / k_c so far
-DISTANCE = 'distance_to_bound '  # likewise, k_c - |xi1|
+BIAS = 'bias '  # followed by the joint: a constant torque that is learned
+POSITION = 'position '  # followed by the joint
+VELOCITY = 'velocity '  # followed by the joint
+RATIO = 'max_error_ratio '  # followed by the joint: the largest |xi1| / k_c so far
+DISTANCE = 'distance_to_bound '  # followed by the joint: k_c - |xi1|
 LYAPUNOV = 'V '  # followed by the term of (29), or by `bound` for (32)
 LAMBDA_MIN = 'lambda_min'
 LATCHED = 'latched'
@@ -17,14 +18,13 @@ LATENCY = 'latency'
 LATENESS = 'lateness'
 LATE_STEPS = 'late_steps'
 
-REFUSED = (
-    'refused '  # of the values of /diagnostics: followed by the column, which is not estimated
-)
+# In /diagnostics.
+REJECTED = 'rejected '  # followed by the column that is not estimated
 
-# Of the values of ~/state.
+# In ~/state.
 PHASE = 'phase'
 REASON = 'reason'
 STOPS = 'stops'  # since the node was configured
-OPERATIONS = 'operations'  # likewise: activations, deactivations and resets
+OPERATIONS = 'operations'  # activations, deactivations and resets since the node was configured
 OPERATION = 'last operation'
-LAST_STATE = 'last state'  # stamp of the last joint state that came by then, ns
+LAST_STATE = 'last state'  # stamp of the last joint state before the operation [ns]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What controller and plant tell in each sample, as (topic, bytes).
+"""The messages that controller and plant publish in each sample, as (topic, bytes).
 
-The nodes publish these messages and the offline loop writes them into a bag: one place says what is
-on the wire.  Vectors of named values travel as JointState with the values in `position`.
+The nodes publish them and the offline loop writes them into a bag. Vectors of named values are sent
+as JointState with the values in `position`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ from typing import TypeAlias
 
 import numpy as np
 
+from blf_dsc_controller.law.rejected_columns import Refusal
 from blf_dsc_controller.law.sample import Sample
 from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.encoders import (
     Float64MultiArrayEncoder,
     JointStateEncoder,
@@ -28,8 +30,10 @@ from blf_dsc_controller.messages.names import (
     LATENCY,
     LATENESS,
     POSITION,
+    REJECTED,
     VELOCITY,
 )
+from blf_dsc_controller.messages.types import typestore
 
 Message: TypeAlias = tuple[topics.Topic, bytes]
 
@@ -68,26 +72,20 @@ class ControllerTelemetry:
         message = self._bound.encode(stamp, position=bound, effort=torque_limit)
         return topics.BOUND, message
 
-    def sample(self, stamp: int, told: Sample, compute_time: float) -> Iterator[Message]:
-        """Messages of one sample.
-
-        Args:
-            stamp: of the answered state [ns].
-            told: what the law tells of it.
-            compute_time: time the law took [s].
-        """
-        yield topics.REFERENCE, self._reference.encode(stamp, told.qr, told.dqr)
+    def sample(self, stamp: int, sample: Sample, compute_time: float) -> Iterator[Message]:
+        """Messages of the telemetry sample of a state's stamp [ns]; time of the update [s]."""
+        yield topics.REFERENCE, self._reference.encode(stamp, sample.qr, sample.dqr)
         yield (
             topics.TRACKING_ERROR,
-            self._error.encode(stamp, told.xi1, told.xi2, told.torque),
+            self._error.encode(stamp, sample.xi1, sample.xi2, sample.torque),
         )
-        n = told.xi1.size
-        m = told.estimate.size
+        n = sample.xi1.size
+        m = sample.estimate.size
         values = self._values
-        values[:m] = told.estimate
-        values[m : m + n] = told.disturbance
-        values[m + n] = told.lambda_min[0]
-        values[m + n + 1] = told.latched[0]
+        values[:m] = sample.estimate
+        values[m : m + n] = sample.disturbance
+        values[m + n] = sample.lambda_min[0]
+        values[m + n + 1] = sample.latched[0]
         values[m + n + 2] = compute_time
         yield topics.LEARNING, self._learning.encode(stamp, values)
 
@@ -125,3 +123,20 @@ class PlantTelemetry:
     def clock(self, stamp: int) -> Message:
         """Plant time [ns] on /clock."""
         return topics.CLOCK, encode_clock(stamp)
+
+
+def encode_rejected_columns(stamp: int, columns: Sequence[Refusal]) -> bytes:
+    """Return /diagnostics at a time [ns] with the reason for each rejected column."""
+    types = typestore().types
+    key_value = types['diagnostic_msgs/msg/KeyValue']
+    status = types['diagnostic_msgs/msg/DiagnosticStatus'](
+        level=1,  # WARN
+        name=f'{topics.CONTROLLER}/learning',
+        message=f'not estimated: {", ".join(one.column for one in columns)}',
+        hardware_id='',
+        values=[key_value(f'{REJECTED}{one.column}', f'{one}') for one in columns],
+    )
+    time = types['builtin_interfaces/msg/Time'](*divmod(stamp, NANOSECONDS))
+    header = types['std_msgs/msg/Header'](stamp=time, frame_id='')
+    message = types[topics.DIAGNOSTICS.type](header=header, status=[status])
+    return bytes(typestore().serialize_cdr(message, topics.DIAGNOSTICS.type))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics of the package in one table: name, message type, quality of service.
+"""The topics of the package: name, message type, quality of service.
 
-The nodes, the offline writer and the reader take them from here, so that a bag made without ROS
-holds the very topics that a recording of the running nodes holds.
+Nodes, offline writer and reader share this table, so that a bag made without ROS holds the same
+topics as a recording of the running nodes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ FOREVER = 2**63 - 1  # ns
 
 @dataclass(frozen=True)
 class Quality:
-    """Quality of service as plain data, in the words of ROS 2; durations in ns."""
+    """Quality of service as plain data, with ROS 2's names; durations in ns."""
 
     depth: int
     reliability: str = 'reliable'
@@ -31,7 +31,7 @@ class Quality:
 
 @dataclass(frozen=True, eq=False)
 class Topic:
-    """One topic, which is itself only: the nodes look their publishers up by it in each sample.
+    """One topic; compared by identity, because publishers are looked up by it in each sample.
 
     `name` is as its publisher `node` writes it: `~/x` is private to the node, `x` relative to the
     namespace, `/x` absolute. `offered` is the publisher's quality, `requested` the subscriber's.
@@ -55,24 +55,24 @@ class Topic:
 
     @property
     def leaf(self) -> str:
-        """Last part of the name, kept under any namespace and node name, e.g. `truth`."""
+        """Last part of the name, the same under any namespace and node name, e.g. `truth`."""
         return self.name.rsplit('/', 1)[-1]
 
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 FLOAT64_MULTI_ARRAY = 'std_msgs/msg/Float64MultiArray'
 
-# A late state or torque is worth nothing once the next one is there, so the two ends of the loop
-# keep one; publishers keep more, because a recorder beside the loop must not miss any. They do not
-# keep it for who comes late, least of all torques, of which an arm must never be given an old one;
-# a recorder that hears them late says so, and closed_loop waits until it listens.
+# The subscribers of the control loop keep one message: a late state or torque is useless once the
+# next one has come. Publishers keep more, so that a recorder misses none. Most are volatile: an arm
+# must never receive an old torque. A recorder that starts late reports it, and closed_loop waits
+# until the recorder has subscribed.
 LATEST = Quality(depth=1)
 STREAM = Quality(depth=5000)
 HISTORY = Quality(depth=5000, durability='transient_local')
 LATCHED = Quality(depth=1, durability='transient_local')
 DIAGNOSTIC = Quality(depth=10)
 
-# Kept for who comes late: a recorder may match the plant a moment after the plant has matched it.
+# Transient local: a recorder may be matched a moment after the controller.
 JOINT_STATES = Topic(PLANT, 'joint_states', JOINT_STATE, HISTORY, LATEST)
 COMMANDS = Topic(CONTROLLER, '~/commands', FLOAT64_MULTI_ARRAY, STREAM, LATEST)
 REFERENCE = Topic(CONTROLLER, '~/reference', JOINT_STATE, STREAM, STREAM)
@@ -90,9 +90,9 @@ DIAGNOSTICS = Topic(
 PARAMETER_EVENTS = Topic(
     CONTROLLER, '/parameter_events', 'rcl_interfaces/msg/ParameterEvent', STREAM, STREAM
 )
-"""ROS's own, of every node."""
+"""Published by every ROS node."""
 ROBOT_DESCRIPTION = Topic(PLANT, 'robot_description', 'std_msgs/msg/String', LATCHED, LATCHED)
-"""The URDF; not among the topics of a run, which a bag without ROS holds as well."""
+"""The URDF; not in TOPICS, since the offline writer does not write it."""
 JOINT_TRAJECTORY = Topic(
     CONTROLLER,
     '~/joint_trajectory',
@@ -100,7 +100,7 @@ JOINT_TRAJECTORY = Topic(
     DIAGNOSTIC,
     DIAGNOSTIC,
 )
-"""Of other nodes, to the controller."""
+"""Published by other nodes for the controller."""
 ACCEPTED_TRAJECTORY = Topic(
     CONTROLLER,
     '~/accepted_trajectory',
@@ -108,7 +108,7 @@ ACCEPTED_TRAJECTORY = Topic(
     Quality(depth=100, durability='transient_local'),
     LATCHED,
 )
-"""What the controller took of those, and when: see motion.message."""
+"""The trajectories that took effect, and when: see messages.trajectory."""
 
 TOPICS = (
     JOINT_STATES,
