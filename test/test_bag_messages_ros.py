@@ -20,7 +20,7 @@ from blf_dsc_controller.messages.cdr import JointStateLayout
 from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder, JointStateDecoder
 from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import TOPICS
-from blf_dsc_controller.messages.types import type_hash
+from blf_dsc_controller.messages.types import definition
 from blf_dsc_controller.nodes.endpoints import message_class
 
 STAMP = 1_734_000_123_456_789_012
@@ -50,7 +50,7 @@ def test_type_hashes_are_those_of_ros(node, type_name):
     while not (publishers := node.get_publishers_info_by_topic(topic)):
         assert time.monotonic() < deadline, 'the graph does not show the publisher'
         time.sleep(0.01)
-    assert str(publishers[0].topic_type_hash) == type_hash(type_name)
+    assert str(publishers[0].topic_type_hash) == definition(type_name)[1]
 
 
 def message_of(frame_id, names):
@@ -67,9 +67,8 @@ def message_of(frame_id, names):
 def without_padding(raw):
     """The meaningful pieces of a JointState: rclpy leaves its padding bytes uninitialised."""
     layout = JointStateLayout.parse(raw)
-    arrays = (layout.position, layout.velocity, layout.effort)
     return [raw[:2], raw[4:12], layout.frame_id, layout.names] + [
-        raw[array.offset : array.offset + 8 * array.size] for array in arrays
+        raw[array.offset : array.offset + 8 * array.size] for array in layout.arrays
     ]
 
 

@@ -114,7 +114,9 @@ def test_a_missing_definition_of_another_topic_costs_no_other_message(
     file = write_mcap(
         tmp_path / 'bag',
         [ODD_MESSAGE, *entries],
-        lambda type_name: told if type_name == ODD else ('ros2msg', definition(type_name).encode()),
+        lambda type_name: (
+            told if type_name == ODD else ('ros2msg', definition(type_name)[0].encode())
+        ),
     )
     for name in ('replay --config', 'report', 'export', 'plot'):
         assert readers[name](file) == 0, capsys.readouterr().err

@@ -28,7 +28,7 @@ from blf_dsc_controller.bags.losses import Losses
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages.encoders import JointStateEncoder
 from blf_dsc_controller.messages.topics import FOREVER, JOINT_STATES, Quality
-from blf_dsc_controller.messages.types import type_hash
+from blf_dsc_controller.messages.types import definition
 from blf_dsc_controller.nodes import recorder_node
 from blf_dsc_controller.nodes.raw_subscriptions import quality_of
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
@@ -185,7 +185,7 @@ def test_quality_and_type_are_those_of_the_graph(loop):
     run.close()
     with Reader(run.bag) as reader:
         (found,) = [c for c in reader.connections if c.topic == '/commands']
-    assert str(seen.topic_type_hash) == found.digest == type_hash(found.msgtype)
+    assert str(seen.topic_type_hash) == found.digest == definition(found.msgtype)[1]
     assert [profile.durability.name for profile in found.ext.offered_qos_profiles] == [
         'TRANSIENT_LOCAL'
     ]

@@ -10,9 +10,14 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.content import Recorded
 from blf_dsc_controller.bags.errors import UnreadableMessageError
-from blf_dsc_controller.messages.cdr import STAMP_OFFSET, ArrayLayout, Doubles, JointStateLayout
+from blf_dsc_controller.messages.cdr import (
+    NANOSECONDS,
+    STAMP_OFFSET,
+    ArrayLayout,
+    Doubles,
+    JointStateLayout,
+)
 from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder, JointStateDecoder
-from blf_dsc_controller.messages.encoders import NANOSECONDS
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.run import Floats, Stamps
 
@@ -93,8 +98,7 @@ def _alike(
     table = np.frombuffer(b''.join(recorded.raw), np.uint8).reshape(count, -1)
     fixed = np.ones(len(first), dtype=bool)
     fixed[STAMP_OFFSET : STAMP_OFFSET + _STAMP_SIZE] = False
-    arrays = (layout.position, layout.velocity, layout.effort)
-    for doubles in arrays:
+    for doubles in layout.arrays:
         fixed[doubles.offset : doubles.offset + 8 * doubles.size] = False
     if (table[:, fixed] != table[0, fixed]).any():
         return None
@@ -102,7 +106,7 @@ def _alike(
     seconds = _column(table, STAMP_OFFSET, order + 'i4').astype(np.int64)
     nanoseconds = _column(table, STAMP_OFFSET + 4, order + 'u4')
     columns = [layout.names.index(name) for name in names]
-    values = np.stack([_doubles(table, one, order, columns) for one in arrays], axis=1)
+    values = np.stack([_doubles(table, one, order, columns) for one in layout.arrays], axis=1)
     return seconds * NANOSECONDS + nanoseconds, values
 
 

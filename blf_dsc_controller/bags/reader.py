@@ -14,7 +14,7 @@ from blf_dsc_controller.bags.content import Content, Recorded, read_content
 from blf_dsc_controller.bags.errors import UnreadableMessageError
 from blf_dsc_controller.bags.rejected_columns import refused
 from blf_dsc_controller.messages.cdr import JointStateLayout
-from blf_dsc_controller.messages.errors import MessageError, UnnamedJointsError
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.topics import (
     BOUND,
     COMMANDS,
@@ -106,10 +106,11 @@ def _joints(content: Content) -> tuple[str, ...]:
 def _names(recorded: Recorded) -> tuple[str, ...]:
     try:
         names = JointStateLayout.parse(recorded.raw[0]).names
-        if not names:
-            raise UnnamedJointsError
     except MessageError as error:
         raise UnreadableMessageError(recorded.name, 0, error) from error
+    if not names:
+        unnamed = MessageError('it names no joint, so its values cannot be told apart')
+        raise UnreadableMessageError(recorded.name, 0, unnamed)
     return names
 
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from mmap import ACCESS_READ, mmap
@@ -20,7 +20,7 @@ from blf_dsc_controller.bags.salvage import Salvage
 from blf_dsc_controller.bags.scan import Data
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.messages.errors import UnknownTypeError
-from blf_dsc_controller.messages.types import definition, type_hash
+from blf_dsc_controller.messages.types import definition
 
 
 @dataclass
@@ -119,13 +119,14 @@ class _Transfer:
         if not type_:
             return None
         told = '' if schema is None else schema.text
+        known_text, known_hash = _known(type_)
         offered = qualities(channel.metadata.get('offered_qos_profiles', ''))
         handle = self._bag.add_topic(
             channel.topic,
             type_,
             offered,
-            text=told or _known(definition, type_),
-            hash_=channel.metadata.get('topic_type_hash') or _known(type_hash, type_),
+            text=told or known_text,
+            hash_=channel.metadata.get('topic_type_hash') or known_hash,
             encoding=schema.encoding if schema is not None and told else 'ros2msg',
         )
         self._handles[channel.topic] = handle
@@ -154,12 +155,12 @@ def _repeated(salvage: Salvage, number: int) -> Channel | None:
     return Channel(number, 0, entries['topic'], 'cdr', entries)
 
 
-def _known(ask: Callable[[str], str], type_name: str) -> str:
-    """What is known of a type here, empty if nothing; a message is saved also without."""
+def _known(type_name: str) -> tuple[str, str]:
+    """Definition and hash of a type, empty if it is not known."""
     try:
-        return ask(type_name)
+        return definition(type_name)
     except UnknownTypeError:
-        return ''
+        return '', ''
 
 
 def _number(path: Path) -> tuple[int, str]:

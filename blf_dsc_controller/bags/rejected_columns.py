@@ -6,21 +6,16 @@ The controller says it there; the offline run writes the same message.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from blf_dsc_controller.bags.sources import open_bag
-from blf_dsc_controller.law.rejected_columns import Refusal
-from blf_dsc_controller.messages.names import COMPUTE_TIME, REFUSED
-from blf_dsc_controller.messages.topics import CONTROLLER, DIAGNOSTICS
+from blf_dsc_controller.messages.names import COMPUTE_TIME, REJECTED
+from blf_dsc_controller.messages.topics import DIAGNOSTICS
 from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Series
-
-_WARN = 1
-_NANOSECONDS = 1_000_000_000
 
 
 def refused(path: Path, learning: Series | None, namespace: str = '') -> dict[str, str]:
@@ -42,24 +37,6 @@ def refused(path: Path, learning: Series | None, namespace: str = '') -> dict[st
     return {column: reasons.get(column, '') for column in columns}
 
 
-def diagnosis(stamp: int, refusals: Sequence[Refusal]) -> bytes:
-    """The message by which the controller tells of its refusals at a time [ns]."""
-    types = typestore().types
-    words = {f'{REFUSED}{one.column}': f'{one}' for one in refusals}
-    status = types['diagnostic_msgs/msg/DiagnosticStatus'](
-        level=_WARN,
-        name=f'{CONTROLLER}/learning',
-        message=f'not estimated: {", ".join(one.column for one in refusals)}',
-        hardware_id='',
-        values=[types['diagnostic_msgs/msg/KeyValue'](key=k, value=v) for k, v in words.items()],
-    )
-    seconds, nanoseconds = divmod(stamp, _NANOSECONDS)
-    time = types['builtin_interfaces/msg/Time'](sec=seconds, nanosec=nanoseconds)
-    header = types['std_msgs/msg/Header'](stamp=time, frame_id='')
-    message = types[DIAGNOSTICS.type](header=header, status=[status])
-    return bytes(typestore().serialize_cdr(message, DIAGNOSTICS.type))
-
-
 def _reasons(path: Path, namespace: str) -> dict[str, str]:
     """Reasons by column, from the last message that holds any."""
     with open_bag(path) as bag:
@@ -68,11 +45,11 @@ def _reasons(path: Path, namespace: str) -> dict[str, str]:
         for _, _, raw in reversed(list(bag.messages({DIAGNOSTICS.resolved}))):
             message: Any = typestore().deserialize_cdr(raw, DIAGNOSTICS.type)
             found = {
-                pair.key.removeprefix(REFUSED): pair.value
+                pair.key.removeprefix(REJECTED): pair.value
                 for status in message.status
                 if status.name.startswith(namespace)
                 for pair in status.values
-                if pair.key.startswith(REFUSED)
+                if pair.key.startswith(REJECTED)
             }
             if found:
                 return found

@@ -16,7 +16,7 @@ from blf_dsc_controller.bags.errors import BagExistsError, DiskFullError
 from blf_dsc_controller.bags.mcap_writer import McapFile
 from blf_dsc_controller.bags.metadata import BagInformation, TopicInformation
 from blf_dsc_controller.messages.topics import Quality
-from blf_dsc_controller.messages.types import definition, type_hash
+from blf_dsc_controller.messages.types import definition
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,8 @@ class BagWriter:
             UnknownTypeError: no `text` is given and the type is none of the common ones.
         """
         if text is None:
-            text, hash_ = definition(type_name), hash_ or type_hash(type_name)
+            text, known_hash = definition(type_name)
+            hash_ = hash_ or known_hash
         topic = TopicInformation(name, type_name, tuple(offered), hash_)
         self._definitions.append((text, encoding))
         self._bag.topics.append(topic)

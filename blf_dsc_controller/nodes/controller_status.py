@@ -17,7 +17,7 @@ from blf_dsc_controller.messages.names import (
     OPERATIONS,
     PHASE,
     REASON,
-    REFUSED,
+    REJECTED,
     STOPS,
 )
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, Board
@@ -135,7 +135,7 @@ class ControllerStatus:
         state = guard.controller.state
         learning = 'latched' if state.latched[0] else 'not yet excited'
         values = {'lambda_min': f'{state.lambda_min[0]:.3g}', 'learning': learning}
-        values |= {f'{REFUSED}{refusal.column}': f'{refusal}' for refusal in self.refusals}
+        values |= {f'{REJECTED}{refusal.column}': f'{refusal}' for refusal in self.refusals}
         if self.refusals:
             columns = ', '.join(refusal.column for refusal in self.refusals)
             return self._board.status('learning', WARN, f'not estimated: {columns}', values)

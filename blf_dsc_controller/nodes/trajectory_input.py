@@ -13,7 +13,7 @@ from rclpy.node import Node
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
-from blf_dsc_controller.messages.encoders import NANOSECONDS
+from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.topics import ACCEPTED_TRAJECTORY, JOINT_TRAJECTORY
 from blf_dsc_controller.messages.trajectory import request_of, told_begin
 from blf_dsc_controller.nodes.endpoints import profile, publisher

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from blf_dsc_controller.bags.rejected_columns import diagnosis
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.params_file import dumps
@@ -22,6 +21,7 @@ from blf_dsc_controller.messages.telemetry import (
     ControllerTelemetry,
     Message,
     PlantTelemetry,
+    encode_rejected_columns,
 )
 from blf_dsc_controller.simulation.loop import Record
 
@@ -64,7 +64,7 @@ def write_bag(
             stamp = START + int(record.stamps[-1])
             topic = topics.DIAGNOSTICS
             handle = bag.add_topic(topic.resolved, topic.type, [topic.offered])
-            bag.write(handle, diagnosis(stamp, refused), stamp)
+            bag.write(handle, encode_rejected_columns(stamp, refused), stamp)
 
 
 def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, Message]]:
