@@ -11,11 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.arms import models
+from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.law.settings import Settings, pack
+from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.reference import terms as reference
 from sim_plant.actuator import Actuator
 from sim_plant.disturbance import disturbance_vector

@@ -60,7 +60,7 @@ class Loop(NamedTuple):
 def run(config: LoopConfig) -> Loop:
     """Run a configuration offline."""
     record = simulate(config.controller, config.plant)
-    columns = sample_of(np.arange(record.samples.shape[1]), 2, record.estimates)
+    columns = sample_of(np.arange(record.samples.shape[1]), record.controller.settings)
     names = ('xi1', 'xi2', 'torque', 'estimate', 'lyapunov')
     parts = (record.samples[:, getattr(columns, name)] for name in names)
     return Loop(record.stamps * 1e-9, *parts, record.samples[:, columns.latched[0]])

@@ -24,13 +24,14 @@ from closed_loop_case import (
 )
 from numba.core.runtime import _nrt_python, rtsys
 
+from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.law.controller import respond
 from blf_dsc_controller.law.sample import sample_of, sample_size
-from blf_dsc_controller.law.settings import Settings, pack, settings_of
+from blf_dsc_controller.law.settings import Settings, settings_of
 from blf_dsc_controller.law.state import signals_of, signals_size, state_of, state_size
 
 SHAPES = [(1, 1), (2, 3), (3, 4), (6, 30)]
-SIZES = ('n', 'p', 'm', 'tones')
+SIZES = ('n', 'p', 'm', 'tones', 'geometry')
 
 
 def distinct_settings(n, p):
@@ -64,14 +65,14 @@ def test_settings_come_out_of_their_vector_as_they_went_in(n, p):
 @pytest.mark.parametrize(('n', 'p'), SHAPES)
 def test_views_cover_their_vectors_exactly_once(n, p):
     settings = arbitrary_settings(np.random.default_rng(0), n, p)
-    sizes = state_size(settings), signals_size(settings), sample_size(n, settings.m)
+    sizes = state_size(settings), signals_size(settings), sample_size(settings)
     state, signals, sample = (np.arange(float(size)) for size in sizes)
 
     for places, size in zip(
         (
             state_of(state, settings),
             signals_of(signals, settings),
-            sample_of(sample, n, settings.m),
+            sample_of(sample, settings),
         ),
         sizes,
         strict=True,

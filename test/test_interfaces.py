@@ -46,7 +46,7 @@ def alone(**given):
     plant = build(PlantConfig, {'mode': 'lockstep', 'duration': 0.2, **given})
     record = simulate(ControllerConfig(), plant)
     rows = record.samples
-    return np.array([sample_of(row, 2, record.estimates).torque for row in rows])
+    return np.array([sample_of(row, record.controller.settings).torque for row in rows])
 
 
 def test_two_arms_in_one_domain_do_not_hear_each_other(ros):

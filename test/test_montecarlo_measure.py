@@ -29,7 +29,7 @@ def plainly(a_study, run):
     """Figures of a run from its whole record, as their definitions say."""
     plant = plant_of_run(a_study, run)
     record = simulate(a_study.controller, plant)
-    names = sample_of(np.arange(record.samples.shape[1]), 2, record.estimates)
+    names = sample_of(np.arange(record.samples.shape[1]), record.controller.settings)
     t = record.stamps * 1e-9
     error = np.abs(record.samples[:, names.xi1])
     torque = np.abs(record.samples[:, names.torque])

@@ -88,7 +88,7 @@ def respond(
         t,
         dt,
         measurement,
-        sample_of(sample_vector, settings.n, settings.m),
+        sample_of(sample_vector, settings),
     )
 
 
@@ -111,8 +111,8 @@ class Controller:
         self.signals_vector = np.zeros(signals_size(self.settings))
         self.state = state_of(self.state_vector, self.settings)
         self.signals = signals_of(self.signals_vector, self.settings)
-        self.sample_vector = np.zeros(sample_size(self.settings.n, self.settings.m))
-        self.sample = sample_of(self.sample_vector, self.settings.n, self.settings.m)
+        self.sample_vector = np.zeros(sample_size(self.settings))
+        self.sample = sample_of(self.sample_vector, self.settings)
         self.reset()
         self.reference_at(0.0)
         self.update(0.0, 1e-3, np.zeros(3 * self.settings.n))

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from blf_dsc_controller.arms import models
+from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
@@ -27,7 +28,6 @@ from blf_dsc_controller.law.settings import (
     TORQUE_SOURCES,
     UPDATES,
     Settings,
-    pack,
 )
 from blf_dsc_controller.reference.approach import plan_start, reference_of
 
@@ -88,6 +88,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         viscous=int(learning.viscous),
         coulomb=int(learning.coulomb),
         tones=len(learning.frequencies),
+        geometry=len(model.constants),
         truth_known=int(bool(truth.parameters)),
         feed_forward=int(truth.feed_forward),
         time_constant=config.surface.time_constant,

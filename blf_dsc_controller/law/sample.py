@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 from math import nan
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.views import part
+from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
 from blf_dsc_controller.law import lyapunov
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Signals, State
@@ -18,44 +18,21 @@ from blf_dsc_controller.law.state import Signals, State
 class Sample(NamedTuple):
     """Views on a sample vector; a run is a matrix of such rows."""
 
-    qr: np.ndarray  # (n,) rad
-    dqr: np.ndarray  # (n,) rad/s
-    xi1: np.ndarray  # (n,) rad
-    xi2: np.ndarray  # (n,) rad/s
-    torque: np.ndarray  # (n,) commanded, after the limit, N m
-    disturbance: np.ndarray  # (n,) d^3, N m
-    bound: np.ndarray  # (n,) k(t), rad
-    cuts: np.ndarray  # (n,) 0, or LEVEL_CUT + RATE_CUT as the torque was cut in this sample
-    estimate: np.ndarray  # (m,) theta^; NaN for a disturbance column that has been refused
-    lyapunov: np.ndarray  # (4,) terms of (29): error, kinetic, parameters, disturbance; or NaN
-    lambda_min: np.ndarray  # (1,) of the present window's Phi
-    latched: np.ndarray  # (1,) 0 or 1
+    qr: Annotated[Array, 'n']  # rad
+    dqr: Annotated[Array, 'n']  # rad/s
+    xi1: Annotated[Array, 'n']  # rad
+    xi2: Annotated[Array, 'n']  # rad/s
+    torque: Annotated[Array, 'n']  # commanded, after the limit, N m
+    disturbance: Annotated[Array, 'n']  # d^3, N m
+    bound: Annotated[Array, 'n']  # k(t), rad
+    cuts: Annotated[Array, 'n']  # 0, or LEVEL_CUT + RATE_CUT as the torque was cut in this sample
+    estimate: Annotated[Array, 'm']  # theta^; NaN for a disturbance column that has been refused
+    lyapunov: Annotated[Array, 4]  # terms of (29): error, kinetic, parameters, disturbance; or NaN
+    lambda_min: Cell  # of the present window's Phi
+    latched: Cell  # 0 or 1
 
 
-@inner
-def sample_size(n: int, m: int) -> int:
-    """Length of a sample vector."""
-    return 8 * n + m + 6
-
-
-@inner
-def sample_of(vector: np.ndarray, n: int, m: int) -> Sample:
-    """Name the parts of a sample vector."""
-    at = 8 * n + m
-    return Sample(
-        qr=part(vector, 0, (n,)),
-        dqr=part(vector, n, (n,)),
-        xi1=part(vector, 2 * n, (n,)),
-        xi2=part(vector, 3 * n, (n,)),
-        torque=part(vector, 4 * n, (n,)),
-        disturbance=part(vector, 5 * n, (n,)),
-        bound=part(vector, 6 * n, (n,)),
-        cuts=part(vector, 7 * n, (n,)),
-        estimate=part(vector, 8 * n, (m,)),
-        lyapunov=part(vector, at, (4,)),
-        lambda_min=part(vector, at + 4, (1,)),
-        latched=part(vector, at + 5, (1,)),
-    )
+sample_of, sample_size = view_of(Sample), size_of(Sample)
 
 
 @inner

@@ -35,6 +35,7 @@ def figures_of_record(study: Study, plant: PlantConfig, record: Record) -> measu
     """Measure a run of which every sample is there, as if it were one of the study."""
     figures = measure.empty_figures(study)
     trajectory.weigh_record(
+        record.controller.settings_vector,
         record.stamps,
         record.measurements,
         record.samples,

@@ -40,7 +40,9 @@ class Courses:
         """Take them from the record of a run."""
         n = record.joints
         p = record.truths.shape[1] - 3 * n
-        at = sample_of(np.arange(record.samples.shape[1], dtype=np.float64), n, record.estimates)
+        at = sample_of(
+            np.arange(record.samples.shape[1], dtype=np.float64), record.controller.settings
+        )
         part = {name: record.samples[:, getattr(at, name).astype(int)] for name in at._fields}
         return cls(
             time=record.stamps * 1e-9,

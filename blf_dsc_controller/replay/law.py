@@ -53,7 +53,7 @@ class Replayed:
 
     def sample(self, row: int) -> Sample:
         """Names for one row of `rows`."""
-        return sample_of(self.rows[row], self.settings.n, self.settings.m)
+        return sample_of(self.rows[row], self.settings)
 
 
 def run_law(config: ControllerConfig, states: States, changes: Sequence[Change] = ()) -> Replayed:
@@ -93,6 +93,6 @@ def run_law(config: ControllerConfig, states: States, changes: Sequence[Change] 
 
 def replayed_of(config: ControllerConfig, rows: Floats, settings: Settings) -> Replayed:
     """Give the columns of `rows` their names: their places are found on a row of indices."""
-    places = sample_of(np.arange(rows.shape[1], dtype=np.float64), settings.n, settings.m)
+    places = sample_of(np.arange(rows.shape[1], dtype=np.float64), settings)
     told = Sample(*(rows[:, part.astype(np.intp)] for part in places))
     return Replayed(config, rows, told, settings)

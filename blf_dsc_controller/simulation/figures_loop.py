@@ -15,7 +15,7 @@ import numpy as np
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.views import borrowed, part
 from blf_dsc_controller.law.controller import decide
-from blf_dsc_controller.law.sample import Sample, sample_of, sample_size
+from blf_dsc_controller.law.sample import Sample, sample_of
 from blf_dsc_controller.law.settings import settings_of
 from blf_dsc_controller.law.state import signals_of, state_of
 from sim_plant import plant as plants
@@ -205,8 +205,8 @@ def run(
     wanted_motion = borrowed(reference)
     wanted = wanted_of(borrowed(wanted_vector))
     figures = figures_of(borrowed(figures_vector), n)
-    told = sample_of(borrowed(sample), n, sample.size - sample_size(n, 0))
     law = settings_of(settings)
+    told = sample_of(borrowed(sample), law)
     law_state = state_of(state, law)
     law_signals = signals_of(signals, law)
     arm, now = plants.plant_of(plant_settings, plant_state)
@@ -226,6 +226,7 @@ def run(
 
 @kernel
 def weigh_record(
+    settings: np.ndarray,
     stamps: np.ndarray,
     measurements: np.ndarray,
     samples: np.ndarray,
@@ -233,12 +234,12 @@ def weigh_record(
     figures_vector: np.ndarray,
 ) -> None:
     """Fill the figures of a run of which every sample is there (`simulation.Record`)."""
-    n = measurements.shape[1] // 3
+    law = settings_of(settings)
     wanted = wanted_of(borrowed(wanted_vector))
-    figures = figures_of(borrowed(figures_vector), n)
+    figures = figures_of(borrowed(figures_vector), law.n)
     begin(figures)
     for k in range(stamps.size):
-        told = sample_of(samples[k], n, samples.shape[1] - sample_size(n, 0))
+        told = sample_of(samples[k], law)
         weigh(wanted, figures, stamps[k] * 1e-9, measurements[k], told)
         if figures.finite[0] == 0.0:
             return

@@ -51,7 +51,7 @@ class Record:
 
     def sample(self, row: int) -> Sample:
         """Names for one row of `samples`."""
-        return sample_of(self.samples[row], self.joints, self.estimates)
+        return sample_of(self.samples[row], self.controller.settings)
 
 
 @kernel
@@ -79,7 +79,7 @@ def loop(
     period = arm.period_ns * 1e-9
     rows = stamps.size
     for k in range(rows):
-        sample = sample_of(told[k], law.n, law.m)
+        sample = sample_of(told[k], law)
         plants.draw_next(arm, now, rng)
         plants.read(arm, now, seen[k])
         plants.reveal(arm, now, true[k])

@@ -58,7 +58,7 @@ def look(
     m = settings.m
     state = state_of(state_vector, settings)
     signals = signals_of(signals_vector, settings)
-    told = sample_of(sample_vector, n, m)
+    told = sample_of(sample_vector, settings)
     verdict = 0
     for i in range(n):
         now = abs(told.xi1[i]) / told.bound[i]

@@ -15,11 +15,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law import factory as assembly
 from blf_dsc_controller.law import funnel
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.settings import LINEAR, pack
+from blf_dsc_controller.law.settings import LINEAR
 
 Vector = NDArray[np.float64]
 _STABLE = 2.0  # of a step along a rate: x += -a x diverges from a = 2 on

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Flat vectors with named parts, each described once: by the annotated fields of a `NamedTuple`.
+
+Kernels take one float64 vector for all settings, one for the whole state, and so on: handing over
+many arrays would cost more than a step.  A `NamedTuple` names the parts of such a vector, in order:
+
+    class State(NamedTuple):
+        samples: Cell  # one number that kernels write, as state.samples[0]
+        alpha2: Annotated[Array, 'n']  # rad/s
+        ring: Annotated[Array, 'N', 'n', 'm + 1']  # an array of shape (N, n, m + 1)
+
+    state_of, state_size = view_of(State), size_of(State)
+
+    vector = np.zeros(state_size(settings))
+    state = state_of(vector, settings)           # in Python and in kernels alike; nothing is copied
+
+Lengths are expressions in the attributes of the second argument, here `settings.n`, `settings.m`
+and `settings.N`; `'actuator.delay'` works as well, and any named tuple or object serves (a named
+tuple in kernels).  Fields of type `int` and `float` are numbers, read when the view is made.  A
+layout that has an `int` field of the name of a length reads it from there; with all of them in the
+vector the view takes the vector alone, and `pack` of the tuple makes it.  A field may be a
+`NamedTuple` with a layout itself.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any, TypeVar, get_type_hints
+
+import numpy as np
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.views import part
+
+Array = np.ndarray
+Cell = Annotated[Array, '1']
+"""One number of a vector that kernels write."""
+
+T = TypeVar('T')
+
+
+def pack(layout: Any) -> Array:
+    """Vector of a layout's numbers and arrays (or sequences), in the order of its fields."""
+    if isinstance(layout, tuple) and hasattr(layout, '_fields'):
+        return np.concatenate([pack(part) for part in layout])
+    return np.ravel(np.asarray(layout, dtype=np.float64))
+
+
+def size_of(layout: type) -> Callable[..., int]:
+    """Function of the lengths (see above) that returns the size of a layout's vector."""
+    terms = ['*'.join(f'({length})' for length in shape) for shape in _shapes(layout, ())]
+    size: Callable[..., int] = _defined('size', '_sizes', [f'return {" + ".join(terms)}'], {})
+    return size
+
+
+def view_of(layout: type[T]) -> Callable[..., T]:
+    """Function of a vector, and of the lengths where they are not in it, that returns the layout.
+
+    Kernels may call it; its arrays are views that must not outlive the vector (`views.part`).
+    """
+    names: dict[str, Any] = {'_part': part}  # no field's name starts with an underscore
+    hints = get_type_hints(layout, include_extras=True)
+    own = tuple(name for name, hint in hints.items() if hint is int)
+    lines = ['_at = 0']
+    expression = _view(layout, own, lines, names, '')
+    arguments = '_vector, _sizes' if any('_sizes.' in line for line in lines) else '_vector'
+    view: Callable[..., T] = _defined('view', arguments, [*lines, f'return {expression}'], names)
+    return inner(view)
+
+
+def _view(
+    layout: type, own: tuple[str, ...], lines: list[str], names: dict[str, Any], prefix: str
+) -> str:
+    """Append the reading of each field to `lines` and return the call that builds the tuple."""
+    names[f'{prefix}{layout.__name__}'] = layout
+    values = []
+    for name, hint in get_type_hints(layout, include_extras=True).items():
+        local = f'{prefix}{name}'
+        if hasattr(hint, '_fields'):
+            values.append(f'{name}={_view(hint, own, lines, names, f"{local}_")}')
+            continue
+        values.append(f'{name}={local}')
+        if hint in (int, float):
+            lines += [f'{local} = {"int(_vector[_at])" if hint is int else "_vector[_at]"}']
+            lines += ['_at += 1']
+            continue
+        shape = [_length(length, own) for length in hint.__metadata__]
+        lines += [f'{local} = _part(_vector, _at, ({", ".join(shape)},))']
+        lines += [f'_at += {"*".join(f"({length})" for length in shape)}']
+    return f'{prefix}{layout.__name__}({", ".join(values)})'
+
+
+def _shapes(layout: type, own: tuple[str, ...]) -> Iterator[list[str]]:
+    for hint in get_type_hints(layout, include_extras=True).values():
+        if hasattr(hint, '_fields'):
+            yield from _shapes(hint, own)
+        else:
+            yield [_length(length, own) for length in getattr(hint, '__metadata__', ('1',))]
+
+
+def _length(expression: object, own: tuple[str, ...]) -> str:
+    """Length with each name read from `_sizes`, unless it is one of the layout's own."""
+
+    class FromSizes(ast.NodeTransformer):
+        def visit_Name(self, node: ast.Name) -> ast.expr:
+            if node.id in own:
+                return node
+            return ast.Attribute(ast.Name('_sizes', ast.Load()), node.id, ast.Load())
+
+    return ast.unparse(FromSizes().visit(ast.parse(str(expression), mode='eval')))
+
+
+def _defined(name: str, arguments: str, lines: list[str], names: dict[str, Any]) -> Any:
+    """Python function of generated source."""
+    source = f'def {name}({arguments}):\n' + ''.join(f'    {line}\n' for line in lines)
+    exec(source, names)  # noqa: S102 - generated above, of the package's own annotations
+    return names[name]
