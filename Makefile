@@ -51,14 +51,14 @@ venv: $(READY) ## Install everything into .venv (the others do it when needed)
 demo: $(READY) ## Run the closed loop over ROS 2 (CONFIG, DURATION in s) and draw it, into out/
 	@mkdir -p out; out=out/demo; n=1; \
 	while [ -e "$$out" ]; do n=$$((n + 1)); out=out/demo-$$n; done; \
-	$(RUN) -m blf_dsc_controller.cli.closed_loop --mode lockstep --config "$(CONFIG)" \
+	$(RUN) -m blf_dsc_controller run --mode lockstep --config "$(CONFIG)" \
 	    --duration "$(DURATION)" --out "$$out" && \
 	echo && echo "Pictures to look at:" && ls "$$out"/*.png && echo "The recording: $$out/bag"
 
 paper: $(READY) ## Run the paper's simulation with every law and judge its claims, into out/
 	@mkdir -p out; out=out/paper; n=1; \
 	while [ -e "$$out" ]; do n=$$((n + 1)); out=out/paper-$$n; done; \
-	$(RUN) -m blf_dsc_controller.cli.paper_study --out "$$out"
+	$(RUN) -m blf_dsc_controller paper --out "$$out"
 
 # A file's tests stay together on one of the workers, for what they set up is shared.
 test: $(READY) ## Run the tests (TESTS=test/test_x.py for some, WORKERS=0 in one process)

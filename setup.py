@@ -53,6 +53,7 @@ setup(
         'pyyaml',
         'tqdm',
         'jinja2',
+        'scipy>=1.15',
     ],
     extras_require={
         # ROS 2 Jazzy itself, as wheels. An extra, because a sourced Jazzy has its own.
@@ -66,8 +67,6 @@ setup(
             'ros-jazzy-rosgraph-msgs',
             'ros-jazzy-ament-index-python',
         ],
-        # To tune the compared laws again (blf_dsc_controller.paper.tune); running needs none of it.
-        'study': ['scipy>=1.15'],
         # Only for `monte_carlo`: its results are Parquet files; a robot has no use for 50 MB more.
         'monte-carlo': ['pyarrow'],
         'dask': ['pyarrow', 'distributed'],
@@ -80,7 +79,6 @@ setup(
             'pytest>=7',
             'pytest-xdist',
             'hypothesis',
-            'scipy',
             'coverage',
             'mujoco',
             'setuptools>=70.1',
@@ -89,7 +87,7 @@ setup(
             'plotly>=6',
         ],
         # The peers that `make bench` compares with; Octave and a C compiler are the system's.
-        'bench': ['mujoco', 'drake', 'pin', 'scipy'],
+        'bench': ['mujoco', 'drake', 'pin'],
         # Fixed, because with nearly every rule on, each release of the linter finds something new.
         'lint': [
             'ruff~=0.17.5',
@@ -102,19 +100,22 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            'sim_plant = blf_dsc_controller.cli.entry:sim_plant',
-            'blf_dsc_controller = blf_dsc_controller.cli.entry:blf_dsc_controller',
-            'arm_markers = blf_dsc_controller.cli.entry:arm_markers',
-            'bag_recorder = blf_dsc_controller.cli.entry:bag_recorder',
-            'closed_loop = blf_dsc_controller.cli.closed_loop:main',
-            'bag_replay = blf_dsc_controller.cli.bag_replay:main',
-            'bag_recover = blf_dsc_controller.cli.bag_recover:main',
-            'bag_report = blf_dsc_controller.cli.bag_report:main',
-            'bag_export = blf_dsc_controller.cli.bag_export:main',
-            'bag_plot = blf_dsc_controller.cli.bag_plot:main',
-            'excite = blf_dsc_controller.cli.excite:main',
-            'paper_study = blf_dsc_controller.cli.paper_study:main',
-            'monte_carlo = blf_dsc_controller.cli.monte_carlo:main',
+            'blf_dsc = blf_dsc_controller.cli.main:main',
+            # The nodes, for `ros2 run` and the launch file.
+            'sim_plant = blf_dsc_controller.cli.main:sim_plant',
+            'blf_dsc_controller = blf_dsc_controller.cli.main:blf_dsc_controller',
+            'bag_recorder = blf_dsc_controller.cli.main:bag_recorder',
+            'arm_markers = blf_dsc_controller.cli.main:arm_markers',
+            # Aliases of sub-commands: run, replay, report, ...
+            'closed_loop = blf_dsc_controller.cli.main:closed_loop',
+            'bag_replay = blf_dsc_controller.cli.main:bag_replay',
+            'bag_report = blf_dsc_controller.cli.main:bag_report',
+            'bag_recover = blf_dsc_controller.cli.main:bag_recover',
+            'bag_export = blf_dsc_controller.cli.main:bag_export',
+            'bag_plot = blf_dsc_controller.cli.main:bag_plot',
+            'excite = blf_dsc_controller.cli.main:excite',
+            'paper_study = blf_dsc_controller.cli.main:paper_study',
+            'monte_carlo = blf_dsc_controller.cli.main:monte_carlo',
         ],
     },
     # The digest of the compiled kernels' cache is taken over the source files on disk.

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Protocol
 
-from blf_dsc_controller.cli.domain import own_domain
+from blf_dsc_controller.cli.session import own_domain
 from blf_dsc_controller.errors import BlfDscError
 
 _START_UP = 120.0  # s, kernels may have to be compiled

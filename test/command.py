@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`closed_loop` as a process of its own, as a user starts it, and the processes it starts."""
+"""`blf_dsc run` as a process of its own, as a user starts it, and the processes it starts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 PATIENCE = 120.0  # s, until a test gives up on what should take seconds
-COMMAND = (sys.executable, '-m', 'blf_dsc_controller.cli.closed_loop')
+COMMAND = (sys.executable, '-m', 'blf_dsc_controller', 'run')
 
 
 def closed_loop(*arguments, **options):

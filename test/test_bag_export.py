@@ -10,7 +10,7 @@ import pytest
 import synthetic_bag
 from synthetic_bag import Synthetic
 
-from blf_dsc_controller.cli.bag_export import main
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.topics import REFERENCE
 
 SAMPLES = 200
@@ -41,7 +41,7 @@ def test_every_number_reads_back_equal_in_its_row(tmp_path, made, bag, ending):
     if ending == 'parquet':
         pytest.importorskip('pyarrow', reason='needs pyarrow')
     out = tmp_path / f'table.{ending}'
-    assert main([str(bag), '--out', str(out)]) == 0
+    assert main(['export', str(bag), '--out', str(out)]) == 0
     found = read(out)
     np.testing.assert_array_equal(found['stamp'], made.stamp)
     np.testing.assert_array_equal(found['position elbow'], made.position[:, 1])
@@ -57,5 +57,5 @@ def test_every_number_reads_back_equal_in_its_row(tmp_path, made, bag, ending):
 
 
 def test_another_ending_is_refused(tmp_path, bag, capsys):
-    assert main([str(bag), '--out', str(tmp_path / 'table.xlsx')]) == 1
+    assert main(['export', str(bag), '--out', str(tmp_path / 'table.xlsx')]) == 1
     assert 'neither .csv nor .parquet' in capsys.readouterr().err

@@ -14,7 +14,7 @@ from mcap.writer import Writer
 from rosbags.rosbag2 import Reader
 
 from blf_dsc_controller.bags.context import ATTACHMENT, read_context
-from blf_dsc_controller.cli import bag_export, bag_plot, bag_recover, bag_replay, bag_report
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.encoders import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE, JOINT_STATES
 from blf_dsc_controller.messages.types import definition
@@ -53,12 +53,12 @@ def rewritten(bag, tmp_path):
 def readers(tmp_path):
     """Every way to read a bag, by the name of its command."""
     return {
-        'replay': lambda bag: bag_replay.main([str(bag)]),
-        'replay --config': lambda bag: bag_replay.main([str(bag), '--config', 'recommended']),
-        'replay --learn': lambda bag: bag_replay.main([str(bag), '--learn']),
-        'report': lambda bag: bag_report.main([str(bag), '--out', str(tmp_path / 'page.html')]),
-        'export': lambda bag: bag_export.main([str(bag), '--out', str(tmp_path / 'table.csv')]),
-        'plot': lambda bag: bag_plot.main([str(bag), '--out', str(tmp_path / 'plots')]),
+        'replay': lambda bag: main(['replay', str(bag)]),
+        'replay --config': lambda bag: main(['replay', str(bag), '--config', 'recommended']),
+        'replay --learn': lambda bag: main(['replay', str(bag), '--learn']),
+        'report': lambda bag: main(['report', str(bag), '--out', str(tmp_path / 'page.html')]),
+        'export': lambda bag: main(['export', str(bag), '--out', str(tmp_path / 'table.csv')]),
+        'plot': lambda bag: main(['plot', str(bag), '--out', str(tmp_path / 'plots')]),
     }
 
 
@@ -70,7 +70,7 @@ def all_say(readers, capsys):
         for name, command in readers.items():
             assert command(bag) == 1, name
             out, complaint = capsys.readouterr()
-            assert complaint.startswith(f'bag_{name.split()[0]}: '), name
+            assert complaint.startswith(f'blf_dsc {name.split()[0]}: '), name
             for word in words:
                 assert word in complaint, name
             assert out == ''
@@ -120,13 +120,13 @@ def test_a_missing_definition_of_another_topic_costs_no_other_message(
     )
     for name in ('replay --config', 'report', 'export', 'plot'):
         assert readers[name](file) == 0, capsys.readouterr().err
-    assert bag_recover.main([str(file), '--out', str(tmp_path / 'clean')]) == 0
+    assert main(['recover', str(file), '--out', str(tmp_path / 'clean')]) == 0
     said = capsys.readouterr().out
     with Reader(tmp_path / 'clean') as reader:
         found = {one.topic: one.msgcount for one in reader.connections}
     assert found['/joint_states'] == 301
     if told is None:  # not even its name is there
-        assert 'LOST 1 messages of topics whose name or type is not told' in said
+        assert 'LOST 1 messages of topics whose name or type is unknown' in said
     else:
         assert found['/odd'] == 1
 
@@ -134,7 +134,7 @@ def test_a_missing_definition_of_another_topic_costs_no_other_message(
 def test_the_types_of_this_package_need_no_definition(entries, readers, tmp_path, capsys):
     file = write_mcap(tmp_path / 'bag', entries, lambda _: ('', b''))
     assert readers['replay --config'](file) == 0
-    assert bag_recover.main([str(file), '--out', str(tmp_path / 'clean')]) == 0
+    assert main(['recover', str(file), '--out', str(tmp_path / 'clean')]) == 0
     capsys.readouterr()
     with Reader(tmp_path / 'clean') as reader:
         text = {one.msgtype: one.msgdef.data for one in reader.connections}
@@ -145,14 +145,14 @@ def test_topics_without_any_type(bag, entries, tmp_path, all_say, capsys):
     configuration = read_context(bag).configuration
     file = write_mcap(tmp_path / 'bag', entries, lambda _: None, configuration)
     all_say(file, '/joint_states (of a type it does not tell)')
-    assert bag_recover.main([str(file), '--out', str(tmp_path / 'clean')]) == 0
+    assert main(['recover', str(file), '--out', str(tmp_path / 'clean')]) == 0
     assert f'LOST {len(entries)} messages of topics whose' in capsys.readouterr().out
 
 
 def test_an_empty_bag(rewritten, all_say, tmp_path, capsys):
     path = rewritten([])
     all_say(path, f'{path} is empty: it holds no message')
-    assert bag_recover.main([str(path), '--out', str(tmp_path / 'clean')]) == 0
+    assert main(['recover', str(path), '--out', str(tmp_path / 'clean')]) == 0
     assert 'nothing was lost' in capsys.readouterr().out
 
 
@@ -166,7 +166,7 @@ def test_a_bag_whose_metadata_promises_what_is_not_there(copy, entries, all_say,
 def test_a_folder_without_its_file(copy, all_say, tmp_path, capsys):
     (copy / 'bag_0.mcap').unlink()
     all_say(copy, f'{copy} cannot be read as a bag', 'bag_0.mcap')
-    assert bag_recover.main([str(copy), '--out', str(tmp_path / 'clean')]) == 1
+    assert main(['recover', str(copy), '--out', str(tmp_path / 'clean')]) == 1
     assert 'there is no MCAP file to recover' in capsys.readouterr().err
 
 
@@ -212,7 +212,7 @@ def test_a_bag_of_another_format(copy, all_say, here, there, words, tmp_path, ca
     assert here in text
     (copy / METADATA).write_text(text.replace(here, there))
     all_say(copy, words, f'to save what is whole: bag_recover {copy}')
-    assert bag_recover.main([str(copy), '--out', str(tmp_path / 'clean')]) == 0
+    assert main(['recover', str(copy), '--out', str(tmp_path / 'clean')]) == 0
     assert 'nothing was lost' in capsys.readouterr().out
 
 

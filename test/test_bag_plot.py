@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`bag_plot` as a user runs it: a process of its own, without ROS."""
+"""`blf_dsc plot` as a user runs it: a process of its own, without ROS."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from synthetic_bag import Synthetic
 WITHOUT_ROS = """
 import sys
 sys.modules['rclpy'] = None  # any import of it fails
-from blf_dsc_controller.cli.bag_plot import main
-sys.exit(main(sys.argv[1:]))
+from blf_dsc_controller.cli.main import main
+sys.exit(main(['plot', *sys.argv[1:]]))
 """
 
 
@@ -39,7 +39,7 @@ def test_pictures_and_summary_are_written(tmp_path, part):
 def test_what_is_wrong_with_a_bag_is_one_message(tmp_path):
     run = bag_plot(tmp_path / 'nowhere', '--out', tmp_path / 'out')
     assert run.returncode == 1
-    assert run.stderr.startswith('bag_plot: ')
+    assert run.stderr.startswith('blf_dsc plot: ')
     assert 'nowhere cannot be read as a bag: there is no such folder' in run.stderr
     assert 'Traceback' not in run.stderr
     assert not (tmp_path / 'out').exists()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`bag_replay` as a user runs it, without ROS."""
+"""`blf_dsc replay` as a user runs it, without ROS."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ import pytest
 import recorded_run
 
 from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.cli.bag_replay import DIFFERENT, main
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.cli.replay import DIFFERENT
 from blf_dsc_controller.messages.topics import COMMANDS
 
 WITHOUT_ROS = """
 import sys
 sys.modules['rclpy'] = None  # any import of it fails
-from blf_dsc_controller.cli.bag_replay import main
-sys.exit(main(sys.argv[1:]))
+from blf_dsc_controller.cli.main import main
+sys.exit(main(['replay', *sys.argv[1:]]))
 """
 
 
@@ -39,14 +40,14 @@ def test_a_difference_is_the_exit_code_and_the_last_line(bag, tmp_path, capsys):
     second = [entry for entry in entries if entry[0] == COMMANDS.resolved][1]
     second[3] = second[3][:-1] + bytes([second[3][-1] ^ 0x80])  # the sign
     path = recorded_run.write(tmp_path / 'bag', entries, read_context(bag).configuration)
-    assert main([str(path)]) == DIFFERENT
+    assert main(['replay', str(path)]) == DIFFERENT
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith('DIFFERENT, first at 0.001000 s (stamp 1001000000 ns), /blf_dsc_c')
     assert 'effort of joint2: recorded ' in last
 
 
 def test_another_configuration_is_said_to_be_open_loop(bag, capsys):
-    assert main([str(bag), '--config', 'recommended']) == 0
+    assert main(['replay', str(bag), '--config', 'recommended']) == 0
     said = capsys.readouterr().out
     assert 'OPEN LOOP' in said
     assert 'joint2: torque differs from the recorded by rms' in said
@@ -61,7 +62,7 @@ def test_another_configuration_is_said_to_be_open_loop(bag, capsys):
     ],
 )
 def test_what_is_wrong_is_one_message(arguments, said, capsys):
-    assert main(arguments) == 1
+    assert main(['replay', *arguments]) == 1
     error = capsys.readouterr().err
-    assert error.startswith('bag_replay: ')
+    assert error.startswith('blf_dsc replay: ')
     assert said in error

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`closed_loop` over three processes: what it leaves behind, and that nothing is lost."""
+"""`blf_dsc run` over three processes: what it leaves behind, and that nothing is lost."""
 
 from __future__ import annotations
 

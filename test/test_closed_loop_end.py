@@ -49,7 +49,7 @@ def test_a_node_that_is_killed_ends_the_others_and_is_named(running):
     os.kill(running.child('controller_node'), signal.SIGKILL)
     code, _, complaints = running.end()
     assert code == 1
-    assert 'closed_loop: blf_dsc_controller was ended by SIGKILL' in complaints
+    assert 'blf_dsc run: blf_dsc_controller was ended by SIGKILL' in complaints
     assert f'what was recorded until then is in {running.out / "bag"}' in complaints
     assert 'Traceback' not in complaints
     running.wait_for_children()

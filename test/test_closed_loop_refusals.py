@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bad input to `closed_loop` and to the nodes: one clear paragraph, and nothing lost or left."""
+"""Bad input to `blf_dsc run` and to the nodes: one clear paragraph, and nothing lost or left."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 import pytest
-from command import COMMAND, PATIENCE, closed_loop
+from command import PATIENCE, closed_loop
 
 WITHOUT_ROS = """
 import sys
@@ -20,9 +20,9 @@ class Hidden:
         return None if name.split('.')[0] == 'rclpy' else PathFinder.find_spec(name, path, target)
 
 sys.meta_path[:] = [Hidden if finder is PathFinder else finder for finder in sys.meta_path]
-from blf_dsc_controller.cli import closed_loop, entry
-start = getattr(entry, sys.argv[1], None) or (lambda: closed_loop.main(sys.argv[2:]))
-sys.exit(start())
+from blf_dsc_controller.cli import main
+command = sys.argv.pop(1)
+sys.exit(getattr(main, command)())
 """
 
 
@@ -57,7 +57,7 @@ def test_a_configuration_that_cannot_run_is_refused_before_anything_starts(
     out = tmp_path / 'out'
     run = closed_loop('--config', written(tmp_path, plant, controller), '--out', out)
     assert run.returncode == 1
-    assert run.stderr.startswith('closed_loop: ')
+    assert run.stderr.startswith('blf_dsc run: ')
     assert told in run.stderr
     assert 'Traceback' not in run.stderr
     assert run.stdout == ''
@@ -177,6 +177,7 @@ def test_a_node_says_which_argument_ros_does_not_know():
 def test_the_options_are_listed():
     run = closed_loop('--help')
     assert run.returncode == 0
-    assert COMMAND[-1].rsplit('.', 1)[-1] in run.stdout
+    assert 'usage: blf_dsc run' in run.stdout
+    assert 'Example:\n  blf_dsc run --config' in run.stdout
     for option in ('--config', '--duration', '--mode', '--seed', '--offline', '--out'):
         assert option in run.stdout

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from paper_case import EXACT, NO_DISTURBANCE, P, configured, run
 
-from blf_dsc_controller.cli import closed_loop
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.params_file import load_loop, locate
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.supervision.config_warnings import concerns, rehearse
@@ -115,5 +115,5 @@ def test_closed_loop_warns_before_it_runs(tmp_path, capsys):
         'blf_dsc_controller:\n  ros__parameters:\n    learning: {window: 5.0}\n', encoding='utf-8'
     )
     arguments = ['--config', str(path), '--offline', '--duration', '0.1']
-    assert closed_loop.main([*arguments, '--out', str(tmp_path / 'out')]) == 0
+    assert main(['run', *arguments, '--out', str(tmp_path / 'out')]) == 0
     assert 'warning: learning.window: 5 s are 0.796 periods' in capsys.readouterr().err

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from blf_dsc_controller.cli.excite import main
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.params_file import load_loop, locate
 from blf_dsc_controller.configuration.reference import MotionLimits
@@ -95,12 +95,12 @@ def test_without_torque_to_spare_none_is_found():
 
 def test_the_tool_writes_a_preset_that_loads(tmp_path, capsys):
     path = tmp_path / 'mine.yaml'
-    assert main([str(path), '--harmonics', '1', '--starts', '1']) == 0
+    assert main(['excite', str(path), '--harmonics', '1', '--starts', '1']) == 0
     reference = load_loop(path).controller.reference
     assert reference.frequency == (1.0, 1.0)
     assert reference.phase == (0.0, -0.5 * np.pi)
     assert len(reference.amplitude) == 4
-    assert main([str(path)]) == 1
-    assert 'is there already' in capsys.readouterr().err
-    assert main([str(tmp_path / 'other.yaml'), '--guess', '1.0']) == 1
+    assert main(['excite', str(path)]) == 1
+    assert 'exists already' in capsys.readouterr().err
+    assert main(['excite', str(tmp_path / 'other.yaml'), '--guess', '1.0']) == 1
     assert '--guess has 1 values' in capsys.readouterr().err

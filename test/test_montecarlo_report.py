@@ -17,7 +17,7 @@ from montecarlo_case import RUNS, study, whole
 from scipy.stats import binomtest
 
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.cli import monte_carlo
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.monte_carlo.errors import NotReproducedError
 from blf_dsc_controller.monte_carlo.report import write_report
@@ -102,7 +102,7 @@ def test_worst_ten_are_reproduced_by_the_commands_of_the_report(store, tmp_path,
     assert len(commands) == 10
     monkeypatch.chdir(tmp_path)
     arguments = shlex.split(commands[0])[1:]
-    assert monte_carlo.main(arguments) == 0
+    assert main(['monte-carlo', *arguments]) == 0
     run, out = int(arguments[2]), tmp_path / arguments[4]
     written = {path.name for path in out.iterdir()}
     assert {'bag', 'config.yaml', 'summary.json', 'tracking.png', 'parameters.png'} <= written
@@ -118,7 +118,7 @@ def test_worst_ten_are_reproduced_by_the_commands_of_the_report(store, tmp_path,
     again = simulate(loop.controller, loop.plant)
     np.testing.assert_array_equal(again.measurements[:, :2], bag.position)
     # It does not overwrite.
-    assert monte_carlo.main(arguments) == 1
+    assert main(['monte-carlo', *arguments]) == 1
 
 
 def test_run_that_is_not_what_it_was_is_told(store, tmp_path):
@@ -133,8 +133,15 @@ def test_run_that_is_not_what_it_was_is_told(store, tmp_path):
 
 
 def test_run_that_is_not_there_is_told(store, tmp_path, capsys):
-    command = ['--reproduce', str(store.folder), '24', '--out', str(tmp_path / 'run')]
-    assert monte_carlo.main(command) == 1
+    command = [
+        'monte-carlo',
+        '--reproduce',
+        str(store.folder),
+        '24',
+        '--out',
+        str(tmp_path / 'run'),
+    ]
+    assert main(command) == 1
     assert 'has no run 24' in capsys.readouterr().err
 
 

@@ -15,7 +15,7 @@ import pyarrow.parquet
 import pytest
 from montecarlo_case import LOOP, RUNS, STUDY, same, study, whole, write
 
-from blf_dsc_controller.cli import monte_carlo
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.monte_carlo import store as stores
 from blf_dsc_controller.monte_carlo.chunk import run_chunk
 from blf_dsc_controller.monte_carlo.errors import (
@@ -26,7 +26,6 @@ from blf_dsc_controller.monte_carlo.errors import (
 )
 from blf_dsc_controller.monte_carlo.store import Span, Store
 
-MODULE = 'blf_dsc_controller.cli.monte_carlo'
 PATIENCE = 300.0  # s; the machine may be busy, and kernels may have to be compiled
 
 
@@ -67,7 +66,16 @@ def marked(mark):
 def test_study_killed_in_the_middle_goes_on(tmp_path):
     loop = LOOP.replace('duration: 0.3', 'duration: 3.0')
     path, out = write(tmp_path, loop + STUDY), tmp_path / 'out'
-    command = [sys.executable, '-m', MODULE, '--config', path, '--out', out]
+    command = [
+        sys.executable,
+        '-m',
+        'blf_dsc_controller',
+        'monte-carlo',
+        '--config',
+        path,
+        '--out',
+        out,
+    ]
     command += ['--workers', '2', '--chunk', '1']
     mark = str(uuid.uuid4())
     with subprocess.Popen(
@@ -93,10 +101,10 @@ def test_study_killed_in_the_middle_goes_on(tmp_path):
 
 def test_complete_study_is_not_computed_again(tmp_path, capsys):
     path, out = write(tmp_path), tmp_path / 'out'
-    command = ['--config', str(path), '--out', str(out), '--engine', 'threads']
-    assert monte_carlo.main(command) == 0
+    command = ['monte-carlo', '--config', str(path), '--out', str(out), '--engine', 'threads']
+    assert main(command) == 0
     before = stamps(out)
-    assert monte_carlo.main(command) == 0
+    assert main(command) == 0
     assert stamps(out) == before
     assert 'of the runs kept the bound' in capsys.readouterr().out
 
@@ -153,7 +161,7 @@ def test_folder_of_something_else_is_left_alone(tmp_path, capsys):
     (out / 'chapter1.txt').write_text('In the beginning')
     with pytest.raises(NotAStudyError, match='holds no study'):
         Store.create_or_open(out, study(tmp_path))
-    assert monte_carlo.main(['--config', str(write(tmp_path)), '--out', str(out)]) == 1
+    assert main(['monte-carlo', '--config', str(write(tmp_path)), '--out', str(out)]) == 1
     assert 'choose another folder' in capsys.readouterr().err
     assert [path.name for path in out.iterdir()] == ['chapter1.txt']
 

@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 NAME = 'blf_dsc_controller'
 PACKAGES = (NAME, 'sim_plant')
 EXECUTABLES = {
+    'blf_dsc',
     'sim_plant',
     'blf_dsc_controller',
     'bag_recorder',
@@ -42,6 +43,8 @@ ROSDEP_KEYS = {
     'matplotlib': 'python3-matplotlib',
     'pyyaml': 'python3-yaml',
     'tqdm': 'python3-tqdm',
+    'scipy': 'python3-scipy',
+    'jinja2': 'python3-jinja2',
     'mcap': 'mcap-ros2-support',
     'lz4': 'mcap-ros2-support',  # by way of mcap
     'zstandard': 'mcap-ros2-support',
@@ -154,13 +157,7 @@ def test_wheel_shares_what_ros_looks_for(wheel):
 def test_every_executable_has_its_main(entry_points):
     assert {entry.name for entry in entry_points} == EXECUTABLES
     for entry in entry_points:
-        source = ROOT / (entry.module.replace('.', '/') + '.py')
-        functions = [
-            node.name
-            for node in ast.parse(source.read_text()).body
-            if isinstance(node, ast.FunctionDef)
-        ]
-        assert entry.attr in functions, source
+        assert callable(entry.load())
 
 
 def test_executables_go_where_ros2_run_looks():
@@ -193,7 +190,7 @@ def test_all_that_is_imported_is_declared(metadata):
     used |= set(imports(ROOT / 'launch/closed_loop.launch.py'))
     foreign = used - set(sys.stdlib_module_names) - set(PACKAGES) - {'llvmlite'}  # a part of numba
     distributions = {'pyyaml' if name == 'yaml' else name for name in foreign}
-    extras = ('study', 'monte-carlo', 'dask', 'mpi', 'report')
+    extras = ('monte-carlo', 'dask', 'mpi', 'report')
     optional = set().union(*(requirements(metadata, extra) for extra in extras))
     assert distributions <= requirements(metadata) | optional | depends('exec_depend')
 

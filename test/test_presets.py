@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.cli import closed_loop
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.params_file import load_loop, locate
 from blf_dsc_controller.configuration.share import config_file
 
@@ -22,7 +22,7 @@ LAW = {'comparison': 'backstepping', 'comparison_detuned': 'backstepping'} | {
 
 def offline(preset, out, duration):
     arguments = ['--config', preset, '--offline', '--duration', str(duration), '--out', str(out)]
-    return closed_loop.main(arguments)
+    return main(['run', *arguments])
 
 
 @pytest.mark.parametrize('preset', PRESETS)
@@ -63,7 +63,7 @@ def test_a_variant_over_ros_is_its_offline_run_bit_for_bit(tmp_path):
     """Lambda prediction, gradient, all columns off, the truth told: not the defaults' path."""
     assert offline('paper', tmp_path / 'offline', 1.0) == 0
     over_ros = ['--config', 'paper', '--mode', 'lockstep', '--duration', '1.0']
-    assert closed_loop.main([*over_ros, '--out', str(tmp_path / 'ros')]) == 0
+    assert main(['run', *over_ros, '--out', str(tmp_path / 'ros')]) == 0
 
     runs = [read_run(tmp_path / name / 'bag') for name in ('offline', 'ros')]
     np.testing.assert_array_equal(runs[0].error, runs[1].error)

@@ -18,7 +18,7 @@ from blf_dsc_controller.bags.mcap_records import CHUNK, HEAD, MAGIC, chunk_of, h
 from blf_dsc_controller.bags.recover import recover
 from blf_dsc_controller.bags.salvage import Salvage
 from blf_dsc_controller.bags.writer import BagWriter
-from blf_dsc_controller.cli.bag_recover import main
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES
 from blf_dsc_controller.messages.types import typestore
@@ -178,7 +178,7 @@ def test_a_whole_bag_has_lost_nothing(whole, tmp_path, capsys):
     recovery = recover(whole.parent, tmp_path / 'clean')
     assert recovery.is_whole
     assert read(recovery.path) == read(whole.parent)
-    assert main([str(whole.parent), '--out', str(tmp_path / 'again')]) == 0
+    assert main(['recover', str(whole.parent), '--out', str(tmp_path / 'again')]) == 0
     assert 'nothing was lost' in capsys.readouterr().out
 
 
@@ -187,7 +187,7 @@ def test_what_the_recorder_did_not_get_is_told_of_the_clean_bag_too(tmp_path, ca
         handle = bag.add_topic(JOINT_STATES.resolved, JOINT_STATES.type, [JOINT_STATES.offered])
         for number in (6, 7, 9):
             bag.write(handle, JointStateEncoder(['x']).encode(0, [0], [0], [0]), 0, 0, number)
-    assert main([str(tmp_path / 'bag'), '--out', str(tmp_path / 'clean')]) == 0
+    assert main(['recover', str(tmp_path / 'bag'), '--out', str(tmp_path / 'clean')]) == 0
     said = capsys.readouterr().out
     assert '3 messages, 1 numbers missing in between, 5 numbers missing before the first' in said
     assert read_context(tmp_path / 'clean').losses == {
@@ -220,14 +220,14 @@ def test_a_bag_of_another_writer_is_recovered(tmp_path):
 def test_what_is_no_bag_is_one_message(tmp_path, capsys):
     with pytest.raises(UnreadableBagError, match='there is no MCAP file'):
         recover(tmp_path, tmp_path / 'clean')
-    assert main([str(tmp_path / 'nowhere')]) == 1
-    assert capsys.readouterr().err.startswith('bag_recover: ')
+    assert main(['recover', str(tmp_path / 'nowhere')]) == 1
+    assert capsys.readouterr().err.startswith('blf_dsc recover: ')
     assert not Path(tmp_path / 'clean').exists()
 
 
 def test_the_command_tells_what_was_lost_in_words(plain, tmp_path, capsys):
     folder = damaged(tmp_path / 'bag', plain.read_bytes()[: chunks(plain.read_bytes())[-1][0]])
-    assert main([str(folder)]) == 0
+    assert main(['recover', str(folder)]) == 0
     said = capsys.readouterr().out
     assert 'bag_0.mcap: the recording was not ended; it ends at 1734000000.024000001 s' in said
     assert 'missing' not in said

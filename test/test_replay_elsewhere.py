@@ -20,7 +20,7 @@ from blf_dsc_controller.bags.errors import (
     UnreadableMessageError,
 )
 from blf_dsc_controller.bags.name_map import NameMap
-from blf_dsc_controller.cli.bag_replay import main
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE, JOINT_STATES
 from blf_dsc_controller.messages.types import typestore
@@ -148,7 +148,7 @@ def test_commands_at_another_rate_are_those_that_had_come(run, tmp_path):
 def test_the_command_reads_them_too(run, tmp_path, capsys):
     path = write(tmp_path / 'bag', foreign(run), StoragePlugin.SQLITE3)
     words = [word for entry in MAP for word in ('--map', entry)]
-    assert main([str(path), '--config', 'recommended', *words]) == 0
+    assert main(['replay', str(path), '--config', 'recommended', *words]) == 0
     assert 'recorded torque: /arm/torque' in capsys.readouterr().out
 
 

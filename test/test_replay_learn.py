@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import recorded_run
 
-from blf_dsc_controller.cli.bag_replay import main
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.params_file import load_loop, locate
@@ -71,8 +71,8 @@ def test_a_bag_too_short_is_told(tmp_path):
 
 
 def test_the_command_tells_figures_and_excitation(bag, capsys):
-    assert main([str(bag), '--learn']) == 0
+    assert main(['replay', str(bag), '--learn']) == 0
     said = capsys.readouterr().out
     assert '(m1+m2)*l1^2' in said
     assert ' +- ' in said
-    assert ': enough; left over' in said
+    assert ': enough; residual' in said

@@ -91,7 +91,7 @@ def test_a_bag_is_played_over_ros_byte_by_byte_under_another_name(tmp_path):
         return future.result()
 
     words = ['--play', '--start-paused', '--rate', '0', '--remap', 'joint_states:=again']
-    command = [sys.executable, '-m', 'blf_dsc_controller.cli.bag_replay', str(path), *words]
+    command = [sys.executable, '-m', 'blf_dsc_controller', 'replay', str(path), *words]
     player = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
         wait_for(lambda: node.count_publishers('/again') > 0)
@@ -116,8 +116,8 @@ def test_a_bag_is_played_over_ros_byte_by_byte_under_another_name(tmp_path):
 def test_a_bag_with_nothing_to_play_is_called_empty(tmp_path):
     pytest.importorskip('rclpy', reason='needs ROS 2')
     path = recorded_run.write(tmp_path / 'bag', [])
-    command = [sys.executable, '-m', 'blf_dsc_controller.cli.bag_replay', str(path), '--play']
+    command = [sys.executable, '-m', 'blf_dsc_controller', 'replay', str(path), '--play']
     run = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert run.returncode == 1
-    assert f'bag_replay: {path} is empty' in run.stderr
+    assert f'blf_dsc replay: {path} is empty' in run.stderr
     assert 'Traceback' not in run.stderr

@@ -17,7 +17,7 @@ from blf_dsc_controller.analysis.animation import animation, lengths
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.analysis.report import write_report
 from blf_dsc_controller.analysis.subject import read_subjects
-from blf_dsc_controller.cli.bag_report import main
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.topics import JOINT_STATES
 
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
@@ -113,11 +113,11 @@ def test_a_page_is_one_file_whose_data_no_name_can_break(folder, tmp_path):
 def test_joint_states_alone_make_a_page(tmp_path):
     states = [one for one in Synthetic(500).messages() if one[0] is JOINT_STATES]
     synthetic_bag.write(tmp_path / 'bag', states)
-    assert main([str(tmp_path / 'bag'), '--out', str(tmp_path / 'page.html')]) == 0
+    assert main(['report', str(tmp_path / 'bag'), '--out', str(tmp_path / 'page.html')]) == 0
     assert 'not recorded in the bag' in (tmp_path / 'page.html').read_text()
 
 
 def test_what_is_wrong_is_one_message(tmp_path, capsys):
-    assert main([str(tmp_path / 'nowhere'), '--out', str(tmp_path / 'page.html')]) == 1
-    assert capsys.readouterr().err.startswith('bag_report: ')
+    assert main(['report', str(tmp_path / 'nowhere'), '--out', str(tmp_path / 'page.html')]) == 1
+    assert capsys.readouterr().err.startswith('blf_dsc report: ')
     assert not (tmp_path / 'page.html').exists()

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from blf_dsc_controller.cli import paper_study
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.params_file import load_loop, locate
 from blf_dsc_controller.paper import claims, tune
 from blf_dsc_controller.paper.cases import SIDE_BY_SIDE, VARIATIONS
@@ -105,7 +105,7 @@ def test_committed_gains_beat_the_middle_of_their_ranges(name):
 def report(tmp_path_factory):
     """The whole study, once: some 20 s of two cores."""
     out = tmp_path_factory.mktemp('study') / 'report'
-    assert paper_study.main(['--out', str(out)]) == 0
+    assert main(['paper', '--out', str(out)]) == 0
     return out
 
 
@@ -180,7 +180,7 @@ def test_barrier_of_the_paper_gives_next_to_nothing_where_it_is_needed(report):
 
 def test_study_does_not_overwrite(report, capsys):
     before = (report / 'index.html').stat().st_mtime_ns
-    assert paper_study.main(['--out', str(report)]) == 1
+    assert main(['paper', '--out', str(report)]) == 1
     assert 'not overwritten' in capsys.readouterr().err
     assert (report / 'index.html').stat().st_mtime_ns == before
 

@@ -4,16 +4,14 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
 from blf_dsc_controller.analysis.table import format_table
-from blf_dsc_controller.cli.output_folder import make_folder
+from blf_dsc_controller.cli.run import make_folder
 from blf_dsc_controller.compiled.jit import is_compiled
 from blf_dsc_controller.configuration.params_file import locate
 from blf_dsc_controller.errors import BlfDscError
@@ -31,42 +29,16 @@ from blf_dsc_controller.monte_carlo.table import require_pyarrow
 from blf_dsc_controller.nodes import compilation
 from blf_dsc_controller.simulation.figures_loop import run
 
-_INTERRUPTED = 130
 _PAUSE_IN_A_LOG = 10.0  # s between two states of the bar
 
 
-def parser() -> argparse.ArgumentParser:
-    """Command-line options."""
-    options = argparse.ArgumentParser(
-        prog='monte_carlo',
-        description='Run thousands of closed loops with random plants, in parallel, and report '
-        'how many kept the bound. Started again, it goes on where it stopped.',
-    )
-    options.add_argument(
-        '--config', default='monte_carlo', help='file of the study, or a preset (monte_carlo)'
-    )
-    options.add_argument('--runs', type=int, help='how many (as configured)')
-    options.add_argument('--seed', type=int, help='of the study (as configured)')
-    options.add_argument(
-        '--engine',
-        choices=('processes', 'threads', 'dask', 'mpi'),
-        default='processes',
-        help='what computes the runs (processes)',
-    )
-    options.add_argument('--workers', type=_positive, help='how many (the cores there are)')
-    options.add_argument('--address', default='', help='scheduler of a dask cluster (a local one)')
-    options.add_argument('--chunk', type=_positive, help='runs handed out at a time')
-    options.add_argument(
-        '--report', type=Path, metavar='DIR', help='only report what is in the folder of a study'
-    )
-    options.add_argument(
-        '--reproduce',
-        nargs=2,
-        metavar=('DIR', 'RUN'),
-        help='run one of a study once more, with a bag and pictures, into --out',
-    )
-    options.add_argument('--out', type=Path, help='folder of the study (monte_carlo)')
-    return options
+def monte_carlo(options: argparse.Namespace) -> int:
+    """Run the command."""
+    if options.reproduce:
+        return reproduce_run(Path(options.reproduce[0]), options.reproduce[1], options.out)
+    if options.report:
+        return _report(Store(options.report))
+    return run_study(options)
 
 
 def run_study(options: argparse.Namespace) -> int:
@@ -128,24 +100,6 @@ def reproduce_run(folder: Path, index: str, out: Path | None) -> int:
     return 0
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command."""
-    options = parser().parse_args(arguments)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        if options.reproduce:
-            return reproduce_run(Path(options.reproduce[0]), options.reproduce[1], options.out)
-        if options.report:
-            return _report(Store(options.report))
-        return run_study(options)
-    except BlfDscError as error:
-        print(f'monte_carlo: {error}', file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print('monte_carlo: interrupted; the same command goes on from here', file=sys.stderr)
-        return _INTERRUPTED
-
-
 def _engine(options: argparse.Namespace) -> Engine:
     workers = options.workers or engines.cores()
     if options.engine == 'dask':
@@ -157,14 +111,3 @@ def _engine(options: argparse.Namespace) -> Engine:
 def _announce() -> None:
     if not is_compiled(run):
         print(compilation.NOTICE, file=sys.stderr, flush=True)
-
-
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f'{text} is not above 0')
-    return value
-
-
-if __name__ == '__main__':
-    sys.exit(main())

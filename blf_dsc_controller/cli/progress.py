@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a running loop is doing, in one line."""
+"""Progress of a running loop, in one line."""
 
 from __future__ import annotations
 
@@ -21,9 +21,6 @@ class Progress:
     """Progress over simulated time, with the largest |xi1| / k_c and the parameter error.
 
     A bar on a terminal; elsewhere, such as in a log, a line now and then.
-
-    Args:
-        config: of the plant, whose true parameters the estimates are held against.
     """
 
     def __init__(self, config: PlantConfig) -> None:
@@ -45,15 +42,15 @@ class Progress:
     def show(self, elapsed: float, ratio: float, estimate: ArrayLike) -> None:
         """Show the simulated time [s], the largest |xi1| / k_c so far, and P^ (3,)."""
         error = np.linalg.norm(np.asarray(estimate) - self._truth) / np.linalg.norm(self._truth)
-        told = f'max|xi1|/bound {ratio:.2f}, parameter error {100 * error:.2f} %'
-        self._bar.set_postfix_str(told, refresh=False)
+        status = f'max|xi1|/bound {ratio:.2f}, parameter error {100 * error:.2f} %'
+        self._bar.set_postfix_str(status, refresh=False)
         self._bar.update(min(elapsed, self._duration) - self._bar.n)
-        self._line = f'closed loop {elapsed:.1f}/{self._duration:g} s, {told}'
+        self._line = f'closed loop {elapsed:.1f}/{self._duration:g} s, {status}'
         if time.monotonic() >= self._due:
             self._print_line()
 
-    def say(self, text: str) -> None:
-        """Print a line of its own, which the bar does not run into."""
+    def write(self, text: str) -> None:
+        """Print a line beside the bar."""
         self._bar.write(text, file=sys.stderr)
         sys.stderr.flush()
 

@@ -1,85 +1,256 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One run over ROS: arm, controller and recorder as processes, from their start to their end."""
+"""One run over ROS: plant, controller and recorder as processes, from their start to their end."""
 
 from __future__ import annotations
 
+import ctypes
 import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from math import inf
 from pathlib import Path
+from types import TracebackType
 
-from blf_dsc_controller.cli.entry import require_ros
-from blf_dsc_controller.cli.processes import NodeProcess
-from blf_dsc_controller.cli.signals import Interruption
+import rclpy
+from rclpy.experimental import EventsExecutor
+from sensor_msgs.msg import JointState
+
+from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
+from blf_dsc_controller.cli.progress import Progress
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER
 from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.names import RATIO
+from blf_dsc_controller.nodes.endpoints import profile
 
-# In the order in which they start. They end the other way round: the recorder last, since it is to
-# have what the others say until their end.
+# In the order in which they start. They end in reverse: the recorder last, to get every message.
 _MODULES = {
     RECORDER: 'blf_dsc_controller.nodes.recorder_node',
     CONTROLLER: 'blf_dsc_controller.nodes.controller_node',
     PLANT: 'sim_plant.node',
 }
-_PATIENCE = 5.0  # s, at most, until a loop that runs is seen to do so, also on a busy machine
+_DOMAINS = range(1, 101)  # 0 is the default; above 101 are the ports that the system hands out
+_FIRST_SIGN = 5.0  # s, at most, until a running loop is seen to run, also on a busy machine
+_LAST = 0.05  # s without a message after which the last one has come
+_LINGER = 0.5  # s for all of them: a loop that is being interrupted still runs
+_ENDING = 20.0  # s that a node may take to end before it is killed
+_TAIL = 12  # lines of a failed node's log that are shown
+_ROOM = 1_000_000  # bytes that a log needs at least
+_PR_SET_PDEATHSIG = 1
 
 
-def run_session(plant: PlantConfig, out: Path, domain: int) -> bool:
+def run_session(plant: PlantConfig, out: Path, domain: int | None) -> bool:
     """Run the three nodes on `out/config.yaml` until the plant has ended.
 
-    Returns:
-        False if SIGINT or SIGTERM ended it before.
-
-    Raises:
-        NoRosError: rclpy is not installed.
-        NodeFailedError: a node ended with an error.
+    In a ROS domain of its own, unless one is given. Returns False if SIGINT or SIGTERM ended the
+    run; raises NodeFailedError if a node ended with an error.
     """
-    require_ros()
     logs = out / 'logs'
     logs.mkdir()
-    environment = {
-        'ROS_DOMAIN_ID': str(domain),
-        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        'ROS_LOG_DIR': str(logs / 'ros'),
-    }
-    os.environ.update(environment)
-    nodes: list[NodeProcess] = []
-    remark = ''
-    with Interruption() as interruption:
+    with own_domain() if domain is None else nullcontext(domain) as chosen:
+        environment = {
+            'ROS_DOMAIN_ID': str(chosen),
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+            'ROS_LOG_DIR': str(logs / 'ros'),
+        }
+        os.environ.update(environment)
         try:
-            for name, module in _MODULES.items():
-                log = logs / f'{name}.log'
-                nodes.append(NodeProcess(name, module, out / 'config.yaml', log, environment))
-            remark = _watch(plant, nodes, interruption)
+            return _run_nodes(plant, out / 'config.yaml', logs, environment)
+        except NodeFailedError:
+            if shutil.disk_usage(out).free < _ROOM:
+                print(f'there is no room left on the disk of {out}', file=sys.stderr)
+            if (out / 'bag' / 'metadata.yaml').exists():
+                print(f'what was recorded until then is in {out / "bag"}', file=sys.stderr)
+            raise
+
+
+@contextmanager
+def own_domain() -> Iterator[int]:
+    """Hold a ROS domain that no other run on this machine holds; BlfDscError if none is free."""
+    first = os.getpid() % len(_DOMAINS)
+    with socket.socket(socket.AF_UNIX) as claim:
+        for domain in (*_DOMAINS[first:], *_DOMAINS[:first]):
+            try:
+                claim.bind(f'\0blf_dsc_controller domain {domain}')
+            except OSError:  # held by another process; the system releases it when that ends
+                continue
+            yield domain
+            return
+    raise BlfDscError(f'{len(_DOMAINS)} runs are going on at once: name a ROS domain by --domain')
+
+
+class NodeFailedError(BlfDscError):
+    """A node ended with an error of its own."""
+
+
+class NodeProcess:
+    """One node in a process of its own, which does not outlive this one."""
+
+    def __init__(
+        self, name: str, params_file: Path, log: Path, environment: dict[str, str]
+    ) -> None:
+        self.name = name
+        self._log = log
+        command = [sys.executable, '-m', _MODULES[name], '--ros-args', '--params-file']
+        with log.open('wb') as output:
+            # A session of its own: Ctrl-C reaches the parent alone, which ends the nodes in order.
+            self._process = subprocess.Popen(
+                [*command, str(params_file)],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, 'PYTHONUNBUFFERED': '1', **environment},
+                start_new_session=True,
+                preexec_fn=_die_with_parent,  # noqa: PLW1509 - no threads have been started yet
+            )
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the process is alive."""
+        return self._process.poll() is None
+
+    def check(self, remark: str = '') -> None:
+        """Raise NodeFailedError, with the end of the log, if the node ended with an error."""
+        code = self._process.poll()
+        if not code:
+            return
+        end = f'was ended by {_signal_name(-code)}' if code < 0 else f'ended with exit code {code}'
+        lines = self._log.read_text(encoding='utf-8', errors='replace').splitlines()[-_TAIL:]
+        tail = ''.join(f'\n  {line}' for line in lines)
+        raise NodeFailedError(f'{self.name} {end}{remark}:{tail}\n(its whole log: {self._log})')
+
+    def stop(self) -> None:
+        """Interrupt the node and wait for its end; kill it if it takes too long."""
+        if self.is_running:
+            self._process.send_signal(signal.SIGINT)
+        try:
+            self._process.wait(_ENDING)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+class Monitor:
+    """Shows the progress of the loop that runs in this process's ROS domain."""
+
+    def __init__(self, config: PlantConfig) -> None:
+        self.progress = Progress(config)
+        self._start = -1.0
+        self._latest: JointState | None = None
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, signal_handler_options=rclpy.SignalHandlerOptions.NO)
+        self._node = rclpy.create_node('closed_loop', context=self._context, enable_rosout=False)
+        self._executor = EventsExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._node.create_subscription(
+            JointState, topics.MONITOR.relative, self._receive, profile(topics.MONITOR.offered)
+        )
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether the loop has been seen to run."""
+        return self._start >= 0.0
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for a message and show it; False if none came."""
+        self._executor.spin_once(timeout_sec=seconds)
+        message, self._latest = self._latest, None
+        if message is None:
+            return False
+        stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        if not self.has_begun:
+            self._start = stamp
+        values = dict(zip(message.name, message.position, strict=True))
+        ratio = max(value for name, value in values.items() if name.startswith(RATIO))
+        self.progress.show(stamp - self._start, ratio, [values[name] for name in PARAMETER_NAMES])
+        return True
+
+    def __enter__(self) -> Monitor:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        end = time.monotonic() + _LINGER
+        while kind is None and time.monotonic() < end and self.wait(_LAST):
+            pass
+        self.progress.close()
+        self._executor.remove_node(self._node)
+        self._node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    def _receive(self, message: JointState) -> None:
+        self._latest = message
+
+
+def _run_nodes(
+    plant: PlantConfig, params_file: Path, logs: Path, environment: dict[str, str]
+) -> bool:
+    nodes: list[NodeProcess] = []
+    interrupts: list[int] = []
+    remark = ''
+    handlers = {
+        number: signal.signal(number, lambda number, _: interrupts.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        try:
+            for name in _MODULES:
+                nodes.append(NodeProcess(name, params_file, logs / f'{name}.log', environment))  # noqa: PERF401 - those that started are stopped
+            remark = _monitor(plant, nodes, interrupts)
         finally:
             for node in reversed(nodes):
                 node.stop()
-        recorder, *loop = nodes
-        for node in loop:
-            node.check()
-        recorder.check(remark)
-        return not interruption.came
-
-
-def _watch(plant: PlantConfig, nodes: list[NodeProcess], interruption: Interruption) -> str:
-    """Watch over the nodes until the plant ends; return what is to be said of the recorder's end.
-
-    A loop that has begun goes on without its recorder; its first sign may come a little later.
-    """
-    from blf_dsc_controller.cli.progress_watch import Watch
-
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
     recorder, *loop = nodes
-    ended, said = inf, False
-    with Watch(plant) as watch:
-        while loop[-1].is_running and not interruption.came:
+    for node in loop:
+        node.check()
+    recorder.check(remark)
+    return not interrupts
+
+
+def _monitor(plant: PlantConfig, nodes: list[NodeProcess], interrupts: list[int]) -> str:
+    """Show the progress until the plant ends or a signal comes; return a remark on the recorder.
+
+    A loop that has begun continues without its recorder; its first message may come a little later.
+    """
+    recorder, *loop = nodes
+    ended, warned = inf, False
+    with Monitor(plant) as monitor:
+        while loop[-1].is_running and not interrupts:
             for node in loop:
                 node.check()
             if not recorder.is_running:
                 ended = min(ended, time.monotonic())
-                if watch.has_begun and not said:
-                    said = True
-                    watch.say(f'{recorder.name} has ended: the loop goes on and is not recorded')
-                if not watch.has_begun and time.monotonic() > ended + _PATIENCE:
+                if monitor.has_begun and not warned:
+                    warned = True
+                    monitor.progress.write(
+                        f'{recorder.name} has ended: the loop goes on and is not recorded'
+                    )
+                if not monitor.has_begun and time.monotonic() > ended + _FIRST_SIGN:
                     recorder.check()
-            watch.wait(0.1)
+            monitor.wait(0.1)
     return '' if recorder.is_running else ' while the loop went on without it'
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f'signal {number}'
+
+
+def _die_with_parent() -> None:
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blf_dsc report`, `recover`, `export` and `plot`: what is made of bags."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections.abc import Iterator
+
+from blf_dsc_controller.analysis import figures, subject, summary, table
+from blf_dsc_controller.analysis.report import write_report
+from blf_dsc_controller.bags import recover as recovering
+from blf_dsc_controller.bags.damage import clock
+from blf_dsc_controller.bags.export import export as export_run
+from blf_dsc_controller.bags.reader import read_run
+
+
+def report(options: Namespace) -> None:
+    """Write the HTML page of one or several bags."""
+    write_report(subject.read_subjects(options.bags, options.namespace), options.out)
+    print(f'wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB)')
+
+
+def export(options: Namespace) -> None:
+    """Write the table of a bag."""
+    run = read_run(options.bag, options.namespace)
+    columns = export_run(run, options.out)
+    print(f'wrote {options.out}: {run.stamp.size} rows of {columns} columns')
+
+
+def plot(options: Namespace) -> None:
+    """Draw and summarise a bag."""
+    run = read_run(options.bag, options.namespace)
+    metrics = summary.summarize(run)
+    options.out.mkdir(parents=True, exist_ok=True)
+    summary.write_summary(metrics, options.out / 'summary.json')
+    written = [options.out / 'summary.json', *figures.draw(run, options.out)]
+    print(table.format_table(metrics))
+    print('wrote', ', '.join(str(path) for path in written))
+
+
+def recover(options: Namespace) -> None:
+    """Make a clean bag of a damaged one and list what was lost."""
+    bag = options.bag.resolve()
+    out = options.out or bag.with_name(f'{bag.stem}_recovered')
+    print('\n'.join(_losses(recovering.recover(options.bag, out))))
+
+
+def _losses(recovery: recovering.Recovery) -> Iterator[str]:
+    for topic, count in recovery.messages.items():
+        missed, before = recovery.missed[topic], recovery.before[topic]
+        gaps = f', {missed} numbers missing in between' if missed else ''
+        begun = f', {before} numbers missing before the first' if before else ''
+        yield f'{topic}: {count} messages{gaps}{begun}'
+    for loss in recovery.losses:
+        yield f'LOST {loss}'
+    for name, last in recovery.unfinished:
+        after = 'nothing in it could be read' if last is None else f'it ends at {clock(last)}'
+        yield (
+            f'{name}: the recording was not ended; {after}. What came later is not in the file: '
+            'at most 0.1 s if the recorder was killed'
+        )
+    if recovery.unknown:
+        yield f'LOST {recovery.unknown} messages of topics whose name or type is unknown'
+    if recovery.is_whole:
+        yield 'nothing was lost of what had been recorded'
+    yield f'wrote {recovery.path}'

@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command `blf_dsc` with its sub-commands, their aliases, and the executables of the nodes.
+
+A sub-command is imported when it runs, so `--help` is fast and needs neither ROS nor any extra.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import signal
+import sys
+import textwrap
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from blf_dsc_controller.errors import BlfDscError
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C."""
+
+_BAG = 'folder of the bag, or its .mcap or .db3 file'
+_WIDTH = 88
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a sub-command and return its exit code; an error is one message on stderr and 1."""
+    options = _parser().parse_args(arguments)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    module, function = options.handler
+    try:
+        handler = getattr(importlib.import_module(f'blf_dsc_controller.cli.{module}'), function)
+        code: int | None = handler(options)
+    except (BlfDscError, OSError) as error:
+        print(f'blf_dsc {options.command}: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        remedy = '; the same command resumes the study' if module == 'monte_carlo' else ''
+        print(f'blf_dsc {options.command}: interrupted{remedy}', file=sys.stderr)
+        return INTERRUPTED
+    return code or 0
+
+
+def require_ros() -> None:
+    """Raise BlfDscError if ROS 2 cannot be imported."""
+    try:
+        importlib.import_module('rclpy')
+    except ImportError as error:
+        raise BlfDscError(
+            f'ROS 2 cannot be imported ({error}): source a ROS 2 Jazzy '
+            '(source /opt/ros/jazzy/setup.bash), or install it as wheels '
+            "(pip install 'blf_dsc_controller[ros]')"
+        ) from error
+
+
+def _alias(command: str) -> int:
+    return main([command, *sys.argv[1:]])
+
+
+closed_loop = partial(_alias, 'run')
+bag_replay = partial(_alias, 'replay')
+bag_report = partial(_alias, 'report')
+bag_recover = partial(_alias, 'recover')
+bag_export = partial(_alias, 'export')
+bag_plot = partial(_alias, 'plot')
+excite = partial(_alias, 'excite')
+paper_study = partial(_alias, 'paper')
+monte_carlo = partial(_alias, 'monte-carlo')
+
+
+def _node(module: str) -> int:
+    try:
+        require_ros()
+    except BlfDscError as error:
+        print(error, file=sys.stderr)
+        return 1
+    code: int = importlib.import_module(module).main()
+    return code
+
+
+sim_plant = partial(_node, 'sim_plant.node')
+blf_dsc_controller = partial(_node, 'blf_dsc_controller.nodes.controller_node')
+bag_recorder = partial(_node, 'blf_dsc_controller.nodes.recorder_node')
+arm_markers = partial(_node, 'blf_dsc_controller.nodes.markers_node')
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='blf_dsc',
+        description='Output-constrained tracking control of robot arms: run it, look at its bags, '
+        'study it.',
+        epilog='blf_dsc COMMAND --help lists the options of a command, with an example.',
+    )
+    commands = parser.add_subparsers(
+        title='commands', dest='command', metavar='COMMAND', required=True
+    )
+
+    def command(
+        name: str, handler: tuple[str, str], summary: str, about: str, example: str
+    ) -> argparse.ArgumentParser:
+        one = commands.add_parser(
+            name,
+            help=summary,
+            description=textwrap.fill(about, _WIDTH),
+            epilog=f'Example:\n  blf_dsc {name} {example}',
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        one.set_defaults(handler=handler)
+        return one
+
+    _run_options(
+        command(
+            'run',
+            ('run', 'run'),
+            'run the closed loop and draw what it did',
+            'Run the simulated arm, the controller and the recorder over ROS 2, and draw what '
+            'they did: a bag, pictures and summary.json in a new folder.',
+            '--config noisy --duration 30 --mode realtime --out first',
+        )
+    )
+    _replay_options(
+        command(
+            'replay',
+            ('replay', 'replay'),
+            'run a bag through the controller again and compare bit for bit',
+            'Feed the joint states of a bag through the controller with the recorded '
+            'configuration, and compare every output bit for bit. '
+            'Exit code: 0 bit-equal, 3 different, 1 an error.',
+            'run1/bag --config my.yaml',
+        )
+    )
+    report = command(
+        'report',
+        ('bags', 'report'),
+        'show one or several bags on one HTML page',
+        'Write one HTML page that shows a bag, or several over each other: plots to zoom into, '
+        'events, configuration and the moving arm. It needs no network.',
+        'run1/bag run2/bag --out comparison.html',
+    )
+    report.add_argument('bags', type=Path, nargs='+', metavar='BAG', help=_BAG)
+    report.add_argument('--out', type=Path, default=Path('report.html'), help='file (report.html)')
+    recover = command(
+        'recover',
+        ('bags', 'recover'),
+        'make a clean bag of a damaged one',
+        'Make a clean bag of one that was cut off or damaged, and list what was lost. '
+        'The damaged bag is not touched.',
+        'run1/bag --out rescued',
+    )
+    recover.add_argument('bag', type=Path, help='folder of the bag, or its .mcap file')
+    recover.add_argument('--out', type=Path, help='new folder (BAG_recovered)')
+    export = command(
+        'export',
+        ('bags', 'export'),
+        'write a bag as a table, in CSV or Parquet',
+        'Write the series of a bag as one table, a row for each joint state.',
+        'run1/bag --out run1.csv',
+    )
+    export.add_argument('bag', type=Path, help=_BAG)
+    export.add_argument('--out', type=Path, required=True, help='FILE.csv or FILE.parquet')
+    plot = command(
+        'plot',
+        ('bags', 'plot'),
+        'draw a bag and summarise it',
+        'Draw tracking.png and parameters.png of a bag and write summary.json.',
+        'run1/bag --out pictures',
+    )
+    plot.add_argument('bag', type=Path, help=_BAG)
+    plot.add_argument('--out', type=Path, default=Path(), help='folder to write into (.)')
+    for one in (report, export, plot):
+        _namespace(one)
+    _excite_options(
+        command(
+            'excite',
+            ('excite', 'excite'),
+            'find a reference that excites the learning',
+            'Find the sum of sinusoids, of the period of the learning window, that excites the '
+            'learning most within the limits of joints and torque, and write it as a preset.',
+            'exciting.yaml --config my.yaml --guess 1 0.32 0.4',
+        )
+    )
+    paper = command(
+        'paper',
+        ('paper', 'paper'),
+        "compare all laws in the paper's simulation",
+        "Run the paper's simulation with every law, check its claims, and find where each law "
+        'breaks; offline, on all cores.',
+        '--out paper_study',
+    )
+    paper.add_argument(
+        '--out', type=Path, default=Path('paper_study'), help='new folder for the report'
+    )
+    _monte_carlo_options(
+        command(
+            'monte-carlo',
+            ('monte_carlo', 'monte_carlo'),
+            'run a study of many random plants',
+            'Run thousands of closed loops with random plants, in parallel, and report how many '
+            'kept the bound. Interrupted studies resume: start the same command again.',
+            '--config my_study.yaml --out study\n  blf_dsc monte-carlo --reproduce study 365',
+        )
+    )
+    return parser
+
+
+def _namespace(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--namespace', default='', help='of the robot, if a bag holds several')
+
+
+def _run_options(parser: argparse.ArgumentParser) -> None:
+    option = parser.add_argument
+    option('--config', default='recommended', help='parameter file, or a preset (recommended)')
+    option('--duration', type=float, help='simulated time [s] (as configured, or else 60)')
+    option('--mode', choices=('realtime', 'lockstep'), help='of the plant (as configured)')
+    option('--seed', type=int, help='of the sensor noise (as configured)')
+    option('--offline', action='store_true', help='without ROS: no processes, no topics')
+    option('--domain', type=int, help='ROS domain (one that is free)')
+    option('--out', type=Path, help='new folder (closed_loop, closed_loop-2, ...)')
+
+
+def _replay_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('bag', type=Path, help='folder of the bag, or its .mcap, .db3 or .bag')
+    parser.add_argument(
+        '--config', help='parameter file or preset: what it would have commanded (open loop)'
+    )
+    parser.add_argument(
+        '--map',
+        action='append',
+        default=[],
+        metavar='OURS=THEIRS',
+        help='name of a topic or a joint in the bag, such as commands=/arm/torque or '
+        'joint1=shoulder; with --config',
+    )
+    _namespace(parser)
+    parser.add_argument(
+        '--learn',
+        action='store_true',
+        help='identify the arm: run the learning alone on the recorded states and torques',
+    )
+    option = parser.add_argument_group('playing over ROS').add_argument
+    option('--play', action='store_true', help='publish the recorded topics')
+    option('--rate', type=float, default=1.0, help='speed; 0: as fast as possible (1)')
+    option('--clock', action='store_true', help="publish the bag's time on /clock")
+    option('--loop', action='store_true', help='start again at the end')
+    option('--start-paused', action='store_true', help='wait for ~/resume')
+    option('--delay', type=float, default=1.0, help='time for discovery [s] (1)')
+    option('--remap', action='append', default=[], metavar='FROM:=TO', help='as ROS remaps')
+
+
+def _excite_options(parser: argparse.ArgumentParser) -> None:
+    option = parser.add_argument
+    option('out', type=Path, help='parameter file to write; it must not exist yet')
+    option('--config', default='recommended', help='parameter file, or a preset (recommended)')
+    option(
+        '--guess',
+        type=float,
+        nargs='+',
+        help='parameters P for computing the torque (learning.initial_estimate)',
+    )
+    option(
+        '--torque-fraction', type=float, default=0.8, help='of the torque limit to stay below (0.8)'
+    )
+    option('--harmonics', type=int, default=2, help='of the window (2)')
+    option('--starts', type=int, default=8, help='searches, of which the best counts (8)')
+    option('--seed', type=int, default=0, help='of the starts (0)')
+
+
+def _monte_carlo_options(parser: argparse.ArgumentParser) -> None:
+    option = parser.add_argument
+    option('--config', default='monte_carlo', help='study file, or a preset (monte_carlo)')
+    option('--runs', type=int, help='number of runs (as configured)')
+    option('--seed', type=int, help='of the study (as configured)')
+    option(
+        '--engine',
+        choices=('processes', 'threads', 'dask', 'mpi'),
+        default='processes',
+        help='what computes the runs (processes)',
+    )
+    option('--workers', type=_positive, help='number of workers (the cores there are)')
+    option('--address', default='', help='scheduler of a dask cluster (a local one)')
+    option('--chunk', type=_positive, help='runs handed to a worker at a time')
+    option('--report', type=Path, metavar='DIR', help='only report the study in this folder')
+    option(
+        '--reproduce',
+        nargs=2,
+        metavar=('DIR', 'RUN'),
+        help='compute one run of a study again, with a bag and pictures, into --out',
+    )
+    option('--out', type=Path, help='folder of the study (monte_carlo)')
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f'{text} is not above 0')
+    return value

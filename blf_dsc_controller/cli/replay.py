@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blf_dsc replay`: a bag through the controller again: verify, what-if, identify or play."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections.abc import Iterator
+from time import perf_counter
+
+import numpy as np
+
+from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.bags.name_map import NameMap
+from blf_dsc_controller.cli.main import require_ros
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER
+from blf_dsc_controller.configuration.params_file import load, locate
+from blf_dsc_controller.messages.topics import COMMANDS
+from blf_dsc_controller.replay.identify import identify
+from blf_dsc_controller.replay.open_loop import Answer, answer
+from blf_dsc_controller.replay.recorded import Outcome
+from blf_dsc_controller.replay.recorded import replay as verify
+from blf_dsc_controller.replay.states import States
+
+DIFFERENT = 3
+"""Exit code where the replay differs from the bag."""
+
+
+def replay(options: Namespace) -> int:
+    """Replay a bag in the mode that the options choose, and print the result."""
+    if options.play:
+        return _play(options)
+    if options.learn:
+        return _identify(options)
+    begin = perf_counter()
+    if options.config is None:
+        outcome = verify(options.bag, options.namespace)
+        _print_speed(outcome.states, perf_counter() - begin)
+        print('\n'.join(_verification(outcome)))
+        return 0 if outcome.difference is None else DIFFERENT
+    config = load(locate(options.config), CONTROLLER, ControllerConfig)
+    found = answer(options.bag, config, options.namespace, NameMap.parse(options.map))
+    _print_speed(found.states, perf_counter() - begin)
+    print('\n'.join(_open_loop(found)))
+    return 0
+
+
+def _play(options: Namespace) -> int:
+    require_ros()
+    from blf_dsc_controller.nodes.player_node import play
+
+    play(
+        options.bag,
+        options.rate,
+        loop=options.loop,
+        clock=options.clock,
+        paused=options.start_paused,
+        delay=options.delay,
+        remaps=options.remap,
+    )
+    return 0
+
+
+def _identify(options: Namespace) -> int:
+    if options.config is None:
+        config = read_context(options.bag).controller().config
+    else:
+        config = load(locate(options.config), CONTROLLER, ControllerConfig)
+    found = identify(options.bag, config, options.namespace, NameMap.parse(options.map))
+    print(f'torque: {found.source}; window from {found.begin:.3f} s to {found.end:.3f} s')
+    width = max(len(name) for name in found.names)
+    for name, value, deviation in zip(found.names, found.estimate, found.deviation, strict=True):
+        if np.isnan(value):
+            print(f'{name:{width}}  unidentifiable: its column is rejected')
+        else:
+            print(f'{name:{width}}  {value:10.6g} +- {2 * deviation:.2g} (95 %)')
+    verdict = 'enough' if found.is_excited else 'NOT ENOUGH: do not trust these figures'
+    print(
+        f'excitation {found.excitation:.3g}, threshold {found.threshold:.3g}: {verdict}; '
+        f'residual {found.residual:.3g} N m rms'
+    )
+    return 0
+
+
+def _print_speed(states: States, took: float) -> None:
+    seconds = states.duration
+    print(
+        f'{states.stamp.size} samples, {seconds:.3f} s in {took:.2f} s: '
+        f'{seconds / took:.0f}x real time'
+    )
+
+
+def _verification(outcome: Outcome) -> Iterator[str]:
+    for one in outcome.comparisons:
+        verdict = 'bit-equal' if one.difference is None else 'DIFFERENT'
+        left_out = f' (not compared: {one.left_out})' if one.left_out else ''
+        yield f'{one.topic}: {one.values} values {verdict}{left_out}'
+    if outcome.changes:
+        yield f'{outcome.changes} changes of parameters replayed where they took effect'
+    yield from outcome.done
+    if outcome.states.passed_over:
+        yield f'{outcome.states.passed_over} states skipped: the controller did not answer them'
+    yield from (f'note: {remark}' for remark in outcome.remarks)
+    if outcome.difference is not None:
+        yield f'DIFFERENT, first at {outcome.difference}'
+        return
+    commands = [one for one in outcome.comparisons if one.topic.endswith(COMMANDS.leaf)]
+    is_whole = not any(one.left_out for one in commands)
+    compared = 'all outputs' if is_whole else 'what could be compared, which is not all'
+    yield f'bit-equal: {compared}'
+
+
+def _open_loop(found: Answer) -> Iterator[str]:
+    yield 'OPEN LOOP: the arm moved under the recorded torques and does not feel these'
+    yield f'recorded torque: {found.source}'
+    config = found.replayed.config
+    for i, joint in enumerate(config.joints):
+        known = found.difference[np.isfinite(found.difference[:, i]), i]
+        difference = (
+            f'differs from the recorded by rms {np.sqrt(np.mean(known**2)):.4g}, '
+            f'max {np.abs(known).max():.4g} N m'
+            if known.size
+            else 'cannot be compared: no torque was recorded'
+        )
+        at_limit = np.mean(np.abs(found.replayed.told.torque[:, i]) >= config.torque.limit[i])
+        yield (
+            f'{joint}: torque {difference}; at its limit {100 * at_limit:.3g} % of the time; '
+            f'max |xi1| / bound {found.error_ratio[i]:.3g}'
+        )

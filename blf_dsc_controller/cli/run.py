@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blf_dsc run`: plant, controller and recorder in one command, with a bag and pictures of it."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from blf_dsc_controller.analysis.figures import draw
+from blf_dsc_controller.analysis.summary import summarize, write_summary
+from blf_dsc_controller.analysis.table import format_table
+from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.cli.main import INTERRUPTED, require_ros
+from blf_dsc_controller.cli.progress import Progress
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
+from blf_dsc_controller.configuration.params_file import dump, load_loop, locate
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.law.factory import estimate_names
+from blf_dsc_controller.law.rejected_columns import refusals
+from blf_dsc_controller.nodes import compilation
+from blf_dsc_controller.reference.approach import plan_start
+from blf_dsc_controller.simulation.bag import write_bag
+from blf_dsc_controller.simulation.loop import Record, loop, simulate
+from blf_dsc_controller.supervision.config_warnings import concerns
+from sim_plant import plant as plant_kernels
+
+_FOLDER = 'closed_loop'
+_DURATION = 60.0  # s, where neither the file nor an option gives one
+
+
+def run(options: Namespace) -> int:
+    """Run the closed loop into a new folder."""
+    config = _configuration(options)
+    order = [config.plant.joints.index(joint) for joint in config.controller.joints]
+    for warning in concerns(config.controller, np.array(config.plant.initial.position)[order]):
+        print(f'warning: {warning}', file=sys.stderr)
+    if not options.offline:
+        require_ros()
+    out = make_folder(options.out)
+    try:
+        recorder = {'output': str(out / 'bag')}
+        config = config._replace(recorder=change(config.recorder, recorder))
+        dump(out / 'config.yaml', config.by_node)
+        if options.offline:
+            completed = True
+            _run_offline(config, out / 'bag')
+        else:
+            completed = _run_over_ros(config, out, options.domain)
+        try:
+            _report(out)
+        except BlfDscError as error:
+            if completed:
+                raise
+            print(f'blf_dsc run: interrupted, and nothing to draw: {error}', file=sys.stderr)
+    except OSError as error:
+        raise _not_writable(out, error) from error
+    return 0 if completed else INTERRUPTED
+
+
+def make_folder(chosen: Path | None) -> Path:
+    """Make the chosen folder, or else the first free one of closed_loop, closed_loop-2 ...
+
+    Raises BlfDscError if the chosen one exists already, or if it cannot be made.
+    """
+    for number in itertools.count(1):
+        path = chosen or Path(_FOLDER if number == 1 else f'{_FOLDER}-{number}')
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            if chosen:
+                raise BlfDscError(
+                    f'{path} exists already and is not overwritten: choose another --out'
+                ) from None
+        except OSError as error:
+            raise _not_writable(path, error) from error
+        else:
+            return path
+    raise AssertionError
+
+
+def _not_writable(path: Path, error: OSError) -> BlfDscError:
+    return BlfDscError(
+        f'{error.filename or path} cannot be written ({error.strerror}): make room or choose '
+        'another --out'
+    )
+
+
+def _configuration(options: Namespace) -> LoopConfig:
+    """Configuration of the three nodes, from the file and the options that override it.
+
+    A start that the controller would reject raises here, by the true state.
+    """
+    chosen = {'duration': options.duration, 'mode': options.mode, 'seed': options.seed}
+    given = {name: value for name, value in chosen.items() if value is not None}
+    path = locate(options.config)
+    overrides: dict[str, dict[str, Any]] = {
+        PLANT: {**given, 'wait_for_subscribers': 1},
+        CONTROLLER: {'wait_for_subscribers': 1},
+    }
+    config = load_loop(path, overrides)
+    if config.plant.duration == 0.0:
+        overrides[PLANT]['duration'] = _DURATION
+        config = load_loop(path, overrides)
+    controller, plant = config.controller, config.plant
+    order = [plant.joints.index(joint) for joint in controller.joints]
+    plan_start(
+        controller,
+        np.array(controller.barrier.widest),
+        np.array(plant.initial.position)[order],
+        np.array(plant.initial.velocity)[order],
+    )
+    return config
+
+
+def _run_offline(config: LoopConfig, bag: Path) -> None:
+    _announce_compilation(loop)
+    progress = Progress(config.plant)
+
+    def show(record: Record, rows: int) -> None:
+        n = record.joints
+        errors = abs(record.samples[:rows, 2 * n : 3 * n] / record.samples[:rows, 6 * n : 7 * n])
+        estimate = record.sample(rows - 1).estimate[:3]
+        progress.show(record.stamps[rows - 1] * 1e-9, errors.max(), estimate)
+
+    record = simulate(config.controller, config.plant, show)
+    progress.close()
+    for refusal in refusals(record.controller, estimate_names(config.controller)):
+        print(f'warning: {refusal}')
+    write_bag(bag, record, config.controller, config.recorder.compression, config.plant)
+
+
+def _run_over_ros(config: LoopConfig, out: Path, domain: int | None) -> bool:
+    """Run the three nodes; False if a signal ended the run."""
+    from blf_dsc_controller.cli.session import run_session
+
+    _announce_compilation(*compilation.CONTROLLER, *plant_kernels.KERNELS)
+    return run_session(config.plant, out, domain)
+
+
+def _announce_compilation(*kernels: Any) -> None:
+    if not compilation.is_compiled(*kernels):
+        print(compilation.NOTICE, file=sys.stderr, flush=True)
+
+
+def _report(out: Path) -> None:
+    """Draw and summarise the bag of a run."""
+    recorded = read_run(out / 'bag')
+    summary = summarize(recorded)
+    write_summary(summary, out / 'summary.json')
+    pictures = draw(recorded, out)
+    print(format_table(summary))
+    for topic, text in read_context(out / 'bag').losses.items():
+        print(f'warning: messages of {topic} are missing in the bag: {text}')
+    print(f'wrote       {out}: bag, summary.json, {", ".join(path.name for path in pictures)}')
