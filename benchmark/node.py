@@ -97,7 +97,7 @@ class Arm:
         import rclpy
         from rclpy.experimental import EventsExecutor
 
-        from blf_dsc_controller.nodes.endpoints import message_class, profile
+        from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 
         self.context = rclpy.Context()
         rclpy.init(context=self.context)
@@ -107,13 +107,13 @@ class Arm:
         states, commands = topics.JOINT_STATES, topics.COMMANDS
         self.commands = commands.relative
         self.publisher: Any = self.node.create_publisher(
-            message_class(states.type), states.name, profile(states.offered)
+            message_class(states.type), states.name, qos_profile(states.offered)
         )
         self.node.create_subscription(
             message_class(commands.type),
             commands.relative,
             self._take,
-            profile(commands.requested),
+            qos_profile(commands.requested),
             raw=True,
         )
         self.answered = False

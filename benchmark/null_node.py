@@ -17,13 +17,13 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.nodes.endpoints import profile
+from blf_dsc_controller.nodes.endpoints import qos_profile
 
 
 def echo(node: Any, kind: str) -> None:
     """Let a node answer every joint state with the same torque, `typed` or `raw`."""
     publisher = node.create_publisher(
-        Float64MultiArray, topics.COMMANDS.relative, profile(topics.COMMANDS.offered)
+        Float64MultiArray, topics.COMMANDS.relative, qos_profile(topics.COMMANDS.offered)
     )
     answer = Float64MultiArray(data=[1.0, 2.0])
     serialised = serialize_message(answer)
@@ -40,7 +40,7 @@ def echo(node: Any, kind: str) -> None:
         JointState,
         topics.JOINT_STATES.relative,
         callbacks[kind],
-        profile(topics.JOINT_STATES.requested),
+        qos_profile(topics.JOINT_STATES.requested),
         raw=kind == 'raw',
     )
 

@@ -14,14 +14,14 @@ from sensor_msgs.msg import JointState
 
 from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.messages.topics import STREAM
-from blf_dsc_controller.nodes.raw_subscriptions import requested
+from blf_dsc_controller.nodes.raw_subscriptions import compatible_profile
 
 
 def main() -> None:
     """Take messages, of the quality that the recorder asks for, until the process is ended."""
     rclpy.init()
     node = rclpy.create_node('raw_subscriber')
-    profile = requested([STREAM], RecorderConfig().queue_depth)
+    profile = compatible_profile([STREAM], RecorderConfig().queue_depth)
     for i in range(int(sys.argv[1])):
         node.create_subscription(JointState, f'topic{i}', _drop, profile, raw=True)
     executor = EventsExecutor()

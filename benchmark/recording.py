@@ -65,10 +65,10 @@ def _play(node: Any, contestant: Contestant) -> float:
     """CPU time [s] that a contestant spends on all messages."""
     from sensor_msgs.msg import JointState
 
-    from blf_dsc_controller.nodes.endpoints import profile
+    from blf_dsc_controller.nodes.endpoints import qos_profile
 
     publishers = [
-        node.create_publisher(JointState, f'topic{i}', profile(STREAM)) for i in range(_TOPICS)
+        node.create_publisher(JointState, f'topic{i}', qos_profile(STREAM)) for i in range(_TOPICS)
     ]
     encoder = JointStateEncoder(('joint1', 'joint2'))
     try:

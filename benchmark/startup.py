@@ -43,7 +43,7 @@ def _first_torque(name: str, cache: str) -> float:
     from rclpy.experimental import EventsExecutor
 
     from blf_dsc_controller.messages.telemetry import PlantTelemetry
-    from blf_dsc_controller.nodes.endpoints import message_class, profile
+    from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 
     context = rclpy.Context()
     rclpy.init(context=context)
@@ -53,13 +53,13 @@ def _first_torque(name: str, cache: str) -> float:
     came: list[float] = []
     states, commands = topics.JOINT_STATES, topics.COMMANDS
     publisher = node.create_publisher(
-        message_class(states.type), states.name, profile(states.offered)
+        message_class(states.type), states.name, qos_profile(states.offered)
     )
     node.create_subscription(
         message_class(commands.type),
         commands.relative,
         lambda _torque: came.append(time.perf_counter()),
-        profile(commands.requested),
+        qos_profile(commands.requested),
         raw=True,
     )
     encoder = PlantTelemetry(('joint1', 'joint2'), ())

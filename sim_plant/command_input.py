@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The torques that reach the plant: which are taken, and how old the last one is.
+"""The torques that reach the plant: which are applied, how old the last one is, how late it came.
 
-The mirror of what the controller does with joint states: a motor that goes on with a command from
-long ago, or takes one that is no number, is as dangerous as a law that does.
+The counterpart of the controller's checks of joint states: a motor that applies a torque from long
+ago, or one that is not finite, is as dangerous as a law that does.
 """
 
 from __future__ import annotations
@@ -11,24 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-class Reception:
-    """The last torque taken, and what was not taken.
+class TorqueInput:
+    """The last valid torque, and what was rejected.
 
     Args:
         joints: names of the n joints.
 
     Attributes:
-        torque: (n,) taken last [N m].
-        wrong_length: commands passed over because they were not of n values.
-        not_finite: commands passed over because of a value that is no number.
-        complaint: what was wrong with the last command that was passed over.
+        torque: (n,) the last valid one [N m].
+        wrong_length: commands rejected because they were not of n values.
+        not_finite: commands rejected because of NaN or infinity.
+        problem: what was wrong with the last rejected command.
         stale_steps: steps for which the torque was too old.
     """
 
     def __init__(self, joints: tuple[str, ...]) -> None:
         self._joints = joints
         self.torque = np.zeros(len(joints))
-        self.complaint = ''
+        self.problem = ''
         self.wrong_length = 0
         self.not_finite = 0
         self.stale_steps = 0
@@ -36,29 +36,24 @@ class Reception:
 
     @property
     def rejected(self) -> int:
-        """Commands passed over."""
+        """Number of rejected commands."""
         return self.wrong_length + self.not_finite
 
     def take(self, size: int, torque: NDArray[np.float64], sample: int) -> bool:
-        """Take a command, or say in `complaint` why not.
+        """Take a command of `size` values, `torque` (n,), at a sample of the plant.
 
-        Args:
-            size: number of values that came.
-            torque: (n,) the values, where there were n.
-            sample: of the plant.
+        Returns:
+            Whether it is valid; `problem` says why not.
         """
         if size != self.torque.size:
             self.wrong_length += 1
-            self.complaint = f'command passed over: {size} values, {self.torque.size} expected'
+            self.problem = f'command rejected: {size} values, {self.torque.size} expected'
             return False
-        if not np.isfinite(torque).all():
+        finite = np.isfinite(torque)
+        if not finite.all():
             self.not_finite += 1
-            broken = [
-                name
-                for name, value in zip(self._joints, torque, strict=True)
-                if not np.isfinite(value)
-            ]
-            self.complaint = f'command passed over: not finite: {torque} (for {", ".join(broken)})'
+            names = ', '.join(np.array(self._joints)[~finite])
+            self.problem = f'command rejected: not finite: {torque} (for {names})'
             return False
         self.torque[:] = torque
         self._taken_at = sample
@@ -78,3 +73,38 @@ class Reception:
     def renew(self, sample: int) -> None:
         """Count the age of the torque from `sample` on."""
         self._taken_at = sample
+
+
+class Latency:
+    """Time from a published state to the torque that follows it, and the number of late steps.
+
+    A torque does not say which state it belongs to. It is matched with the oldest state that has
+    had no torque yet, so that a late torque counts with its whole delay. Times are in s.
+
+    Attributes:
+        late_steps: steps taken before any torque had come for their state.
+    """
+
+    def __init__(self) -> None:
+        self.late_steps = 0
+        self._since: float | None = None
+        self._longest = 0.0
+
+    def state_published(self, now: float) -> None:
+        """Start waiting, unless an older state still waits."""
+        if self._since is None:
+            self._since = now
+
+    def torque_received(self, now: float) -> None:
+        """Stop waiting."""
+        if self._since is not None:
+            self._longest = max(self._longest, now - self._since)
+            self._since = None
+
+    def step(self, now: float) -> float:
+        """End a sample: the longest wait in it, or how long the oldest state has waited so far."""
+        if self._since is not None:
+            self.late_steps += 1
+            return now - self._since
+        longest, self._longest = self._longest, 0.0
+        return longest

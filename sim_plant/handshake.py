@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What happens between a plant that is ready and its first state: peers found, controller asked."""
+"""Before the first state of a run: peers are discovered, and the controller is reset."""
 
 from __future__ import annotations
 
-from time import perf_counter
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.lifecycle import LifecycleNode
@@ -11,59 +11,57 @@ from std_srvs.srv import Trigger
 
 from blf_dsc_controller.messages import topics
 
-_SETTLING = 0.2  # s from having found every peer until they have found this node too
-_PATIENCE = 2.0  # s that a controller may take to answer
+_SETTLING_TIME = 0.2  # s from having found every peer until they have found this node too
+_RESET_TIMEOUT = 2.0  # s that a controller may take to respond
 
 
 class Handshake:
     """Waits until the first state can be sent.
 
-    After a reset the wait also lets torques for the run before run out, and the controller is
-    asked to start anew, where it has the service; another controller has to be told by hand.
+    After a reset of the plant the wait also lets torques of the previous run expire, and the
+    controller is reset if it has the service; any other controller has to be reset by hand.
 
     Args:
         node: of the plant.
+        clock: steady clock [s].
     """
 
-    def __init__(self, node: LifecycleNode) -> None:
-        self._node = node
+    def __init__(self, node: LifecycleNode, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._log = node.get_logger()
         self._client = node.create_client(Trigger, f'{topics.CONTROLLER}/reset')
-        self._since = 0.0
-        self._ask = False
-        self._answer: Any = None
-        self._asked = 0.0
+        self.begin(reset=False)
 
-    def begin(self, *, ask: bool) -> None:
-        """Start to wait; `ask` the controller for a reset when everybody is there."""
-        self._since = 0.0
-        self._ask = ask
-        self._answer = None
+    def begin(self, *, reset: bool) -> None:
+        """Start waiting; with `reset` the controller is reset when everybody is there."""
+        self._complete_since: float | None = None
+        self._to_reset = reset
+        self._response: Any = None
+        self._requested = 0.0
 
     def is_done(self, *, observed: bool) -> bool:
-        """Whether the state can be sent; to be called again and again, with whether all listen."""
+        """Whether the state can be sent; `observed`: whether all topics have subscribers now."""
+        now = self._clock()
         if not observed:
-            self._since = 0.0
+            self._complete_since = None
             return False
-        now = perf_counter()
-        self._since = self._since or now
-        if now - self._since < _SETTLING:
+        if self._complete_since is None:
+            self._complete_since = now
+        if now - self._complete_since < _SETTLING_TIME:
             return False
-        if self._ask:
-            self._ask = False
+        if self._to_reset:
+            self._to_reset = False
             if self._client.service_is_ready():
-                self._answer = self._client.call_async(Trigger.Request())
-                self._asked = now
-        return self._is_answered(now)
-
-    def _is_answered(self, now: float) -> bool:
-        if self._answer is None:
+                self._response = self._client.call_async(Trigger.Request())
+                self._requested = now
+        if self._response is None:
             return True
-        if self._answer.done():
-            said = self._answer.result()
-            if not said.success:
-                self._node.get_logger().warning(f'the controller was not reset: {said.message}')
+        if self._response.done():
+            result = self._response.result()
+            if not result.success:
+                self._log.warning(f'the controller was not reset: {result.message}')
             return True
-        if now - self._asked < _PATIENCE:
+        if now - self._requested < _RESET_TIMEOUT:
             return False
-        self._node.get_logger().warning('the controller did not answer to be reset: going on')
+        self._log.warning('the controller did not respond to its reset: starting without')
         return True

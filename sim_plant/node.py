@@ -2,23 +2,22 @@
 """The node `sim_plant`: the arm, and the owner of time.
 
 Lock-step takes the next step when the torque for the last state has arrived: deterministic, as fast
-as the machine allows.  Real time takes a step each sample time of the steady clock, holding the
-last torque where the new one is late, and says how late; past `actuator.command_timeout` it holds
-it no longer.  In both the arm stands braked at its first state until the first torque comes.
+as the machine allows. Real time takes a step each sample time of the steady clock, holding the
+last torque where the new one is late, and publishes how late; a torque older than
+`actuator.command_timeout` is not applied. In both the arm is braked until the first torque comes.
 
-A reset takes the arm back to its start, which no real arm does by itself: so it is this node that
-asks the controller, if there is one, to start anew before it sends the first state.
+A reset takes the arm back to its start, which no real arm does by itself: therefore this node also
+resets the controller, if there is one, before it sends the first state.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from time import perf_counter
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from rclpy.clock import Clock, ClockType
 from rclpy.publisher import Publisher
 from rclpy.timer import Timer
 from std_msgs.msg import String
@@ -31,21 +30,25 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.telemetry import DECIMATION, Message, PlantTelemetry
-from blf_dsc_controller.nodes import compilation, executor, parameters, realtime
-from blf_dsc_controller.nodes.endpoints import are_observed, publisher, subscribe
-from blf_dsc_controller.nodes.latency import Latency
+from blf_dsc_controller.nodes import parameters, process
+from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher
+from blf_dsc_controller.nodes.endpoints import (
+    create_publisher,
+    create_steady_timer,
+    create_subscription,
+    have_subscribers,
+)
 from blf_dsc_controller.nodes.lifecycle import ManagedNode
 from sim_plant import plant as plant_kernels
-from sim_plant.command_input import Reception
+from sim_plant.command_input import Latency, TorqueInput
 from sim_plant.factory import plant_of, steps_of
 from sim_plant.handshake import Handshake
 from sim_plant.sampled import Plant
-from sim_plant.status import PlantStatus
 
 LOCKSTEP_START = 1_000_000_000
 """First stamp in lock-step [ns]: a zero stamp says 'not set' in ROS."""
 
-_TICK = 0.01  # s
+_POLL_PERIOD = 0.01  # s
 _REPEAT_PERIOD = 3.0  # s, for a state that nobody has answered
 _DIAGNOSTICS_PERIOD = 1.0  # s
 _EARLY = 0.05  # of a sample: a timer that fires this much early is on time
@@ -53,22 +56,33 @@ _BETWEEN_RUNS = 1_000_000_000  # ns from the last stamp before a reset to the fi
 
 
 class PlantNode(ManagedNode):
-    """Publishes measured joint states and applies the torques that answer them.
+    """Publishes measured joint states and applies the torques that come back.
+
+    Args:
+        steady: steady clock [ns], which paces real time.
+        wall: time of day [ns], with which stamps begin in real time.
+        options: of rclpy's LifecycleNode.
 
     Attributes:
         config: the configuration.
         plant: the simulated arm.
-        reception: the torques that came.
+        input: the torques received.
         latency: how long, in real time, the arm waits for its torques.
+
+    Raises:
+        ConfigurationError: the parameters do not describe a plant.
     """
 
-    def __init__(self, **options: Any) -> None:
-        """Read the parameters and, with `autostart`, wait until a controller listens.
-
-        Raises:
-            ConfigurationError: the parameters do not describe a plant.
-        """
+    def __init__(
+        self,
+        *,
+        steady: Callable[[], int] = time.monotonic_ns,
+        wall: Callable[[], int] = time.time_ns,
+        **options: Any,
+    ) -> None:
         super().__init__(topics.PLANT, **options)
+        self._now = lambda: steady() * 1e-9
+        self._wall = wall
         self.config = parameters.declare(self, PlantConfig)
         parameters.on_change(self, PlantConfig, self._reconfigure)
         self.latency = Latency()
@@ -77,15 +91,15 @@ class PlantNode(ManagedNode):
         self._lockstep = self.config.mode == 'lockstep'
         self._telemetry = PlantTelemetry(joints, PARAMETER_NAMES)
         self._decoder = Float64MultiArrayDecoder(len(joints))
-        self.reception = Reception(joints)
-        self._publisher_of: dict[topics.Topic, Publisher] = {}
-        self._status = PlantStatus(self, joints)
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._beat: Timer | None = None
+        self.input = TorqueInput(joints)
+        self._reported_stale = self._reported_rejected = 0
+        self._outputs: dict[topics.Topic, Publisher] = {}
+        self._diagnostics = DiagnosticsPublisher(self, joints)
+        self._step_timer: Timer | None = None
         self._start_stamp = LOCKSTEP_START
-        self._handshake = Handshake(self)
-        self.create_timer(_TICK, self._tick, clock=self._steady)
-        self.create_timer(_DIAGNOSTICS_PERIOD, self._report, clock=self._steady)
+        self._handshake = Handshake(self, self._now)
+        create_steady_timer(self, _POLL_PERIOD, self._on_poll)
+        create_steady_timer(self, _DIAGNOSTICS_PERIOD, self._report)
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.plant: Plant
         self._rest()
@@ -93,43 +107,42 @@ class PlantNode(ManagedNode):
             self.autostart()
 
     def _rest(self) -> None:
-        """Stand still: neither offering a state nor running."""
+        """Stand still: neither sending states nor running."""
         self._offered = self._running = self._active = False
-        self._answered = True
+        self._has_torque = True
         self._published = self._began = 0.0
         self._first = 0
-        self._answer_waits = self._stale = False
-        if self._beat is not None:
-            self.destroy_timer(self._beat)
-            self._beat = None
+        self._torque_waits = self._stale = False
+        if self._step_timer is not None:
+            self.destroy_timer(self._step_timer)
+            self._step_timer = None
 
-    # The life of the node.
+    # Life cycle.
 
     def configure(self) -> None:
-        """Put the arm at its start; from the first time on, its topics are there."""
-        if not compilation.is_compiled(*plant_kernels.KERNELS):
-            self.get_logger().info(compilation.NOTICE)
+        """Put the arm at its start; create its topics the first time."""
+        process.log_compilation(self.get_logger(), *plant_kernels.KERNELS)
         self.plant = plant_of(self.config)
         self.plant.measure()
         self.plant.truth()
         self.plant.step(np.zeros(len(self.config.joints)))
         self.plant.reset()
         self._rest()
-        if not self._publisher_of:
-            self._publisher_of = {topic: publisher(self, topic) for topic in self._output_topics()}
+        if not self._outputs:
+            self._outputs = {one: create_publisher(self, one) for one in self._output_topics()}
             self._publish_description()
-            subscribe(self, topics.COMMANDS, self._on_command)
-            realtime.request(self.config.realtime, self.get_logger())
+            create_subscription(self, topics.COMMANDS, self._on_command)
+            process.request_realtime(self.config.realtime, self.get_logger())
 
     def _publish_description(self) -> None:
         limits = self.config.actuator.torque_limit
         text = urdf(topics.PLANT, self.config.joints, self.config.arm, limits)
-        publisher(self, topics.ROBOT_DESCRIPTION).publish(String(data=text))
+        create_publisher(self, topics.ROBOT_DESCRIPTION).publish(String(data=text))
 
     def activate(self) -> None:
-        """Send the present state once a controller listens, and go on from its answer."""
+        """Send the present state once a controller listens, and continue with its torque."""
         self._active = True
-        self._handshake.begin(ask=False)
+        self._handshake.begin(reset=False)
         self.get_logger().info(f'{self.config.mode}, waiting for a controller')
 
     def deactivate(self) -> None:
@@ -137,12 +150,12 @@ class PlantNode(ManagedNode):
         self._rest()
 
     def release(self) -> None:
-        """Let go of the arm."""
+        """Stop time, as when deactivated."""
         self._rest()
 
     def close(self) -> None:
-        """See that every subscriber has the last messages."""
-        executor.drain(self._publisher_of.values())
+        """Wait until every subscriber has the last messages."""
+        process.drain(self._outputs.values())
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = self._active
@@ -153,15 +166,10 @@ class PlantNode(ManagedNode):
         self._rest()
         self._active = True
         self.plant.reset()
-        self.reception.restart()
-        self._handshake.begin(ask=True)
+        self.input.restart()
+        self._handshake.begin(reset=True)
         response.message = 'the arm is at its start, braked until the first torque comes'
         return response
-
-    @property
-    def rejected(self) -> int:
-        """Commands passed over because of their length or a number that is not finite."""
-        return self.reception.rejected
 
     @property
     def stamp(self) -> int:
@@ -178,7 +186,7 @@ class PlantNode(ManagedNode):
 
     # The loop.
 
-    def _tick(self) -> None:
+    def _on_poll(self) -> None:
         if not self._active or self.finished:
             return
         if not self._offered:
@@ -190,14 +198,14 @@ class PlantNode(ManagedNode):
 
     def _is_overdue(self) -> bool:
         waits = self._lockstep or not self._running
-        silent = perf_counter() - self._published
-        return waits and not self._answered and silent > _REPEAT_PERIOD
+        silent = self._now() - self._published
+        return waits and not self._has_torque and silent > _REPEAT_PERIOD
 
     def _offer(self) -> None:
         if not self._lockstep:
-            self._start_stamp = time.time_ns() - self.plant.elapsed_ns
+            self._start_stamp = self._wall() - self.plant.elapsed_ns
         self._offered = True
-        if self._lockstep and self._answer_waits:
+        if self._lockstep and self._torque_waits:
             self._running = True
             self._advance()
         else:
@@ -205,24 +213,24 @@ class PlantNode(ManagedNode):
 
     def _is_observed(self) -> bool:
         observers = self.config.wait_for_subscribers
-        return are_observed(self._publisher_of, topics.JOINT_STATES, observers)
+        return have_subscribers(self._outputs, topics.JOINT_STATES, observers)
 
     def _on_command(self, raw: bytes) -> None:
         try:
             size = self._decoder.decode(raw)
         except MessageError as error:
-            self.get_logger().error(f'command passed over: {error}', throttle_duration_sec=1.0)
+            self.get_logger().error(f'command rejected: {error}', throttle_duration_sec=1.0)
             return
         if not self._offered and self.state_label != 'inactive':
             return
-        if not self.reception.take(size, self._decoder.data, self.plant.sample):
-            self.get_logger().error(self.reception.complaint, throttle_duration_sec=1.0)
+        if not self.input.take(size, self._decoder.data, self.plant.sample):
+            self.get_logger().error(self.input.problem, throttle_duration_sec=1.0)
             return
         if not self._offered:
-            self._answer_waits = self.plant.sample > 0
+            self._torque_waits = self.plant.sample > 0
             return
-        self.latency.answered(perf_counter())
-        self._answered = True
+        self.latency.torque_received(self._now())
+        self._has_torque = True
         if not self._running:
             self.get_logger().info('first torque received: brake off')
             self._release()
@@ -231,81 +239,101 @@ class PlantNode(ManagedNode):
 
     def _release(self) -> None:
         self._running = True
-        self._began = perf_counter()
-        self.latency = Latency()  # what it has waited for the controller's start is not counted
+        self._began = self._now()
+        self.latency = Latency()  # without the wait for the controller's start
         self._first = self.plant.sample
-        self.reception.renew(self.plant.sample)
+        self.input.renew(self.plant.sample)
         if not self._lockstep:
-            self._beat = self.create_timer(
-                self.config.sample_time, self._on_beat, clock=self._steady
+            self._step_timer = create_steady_timer(
+                self, self.config.sample_time, self._on_step_timer
             )
 
-    def _on_beat(self) -> None:
+    def _on_step_timer(self) -> None:
         """Take every step that is due: time does not wait for a late process."""
-        if not self._running:  # the timer was destroyed with this beat on its way
+        if not self._running:  # the timer was destroyed with this call on its way
             return
-        elapsed = perf_counter() - self._began
+        elapsed = self._now() - self._began
         due = self._first + int(elapsed / self.config.sample_time + _EARLY)
-        while self.plant.sample < due and not self.finished:
-            waited = self.latency.step(perf_counter())
+        while self.plant.sample < due and not self._is_over():
+            waited = self.latency.step(self._now())
             deadline = (self.plant.sample + 1 - self._first) * self.config.sample_time
             self._advance()
-            self._tell_timing(waited, max(0.0, perf_counter() - self._began - deadline))
+            self._publish_timing(waited, max(0.0, self._now() - self._began - deadline))
 
     def _advance(self) -> None:
-        if self._steps and self.plant.sample >= self._steps:
-            self.finished = True
+        if self._is_over():
             return
         was_stale, self._stale = self._stale, self._is_stale()
         if self._stale and self.config.actuator.without_command == 'brake':
             self.plant.hold()
         else:
             if self._stale:
-                self.reception.torque[:] = 0.0
-            self.plant.step(self.reception.torque)
+                self.input.torque[:] = 0.0
+            self.plant.step(self.input.torque)
         self._publish_state()
         if self._stale and not was_stale:
             self.get_logger().error('the torque is too old and not applied any more')
             self._report()
 
+    def _is_over(self) -> bool:
+        self.finished = self.finished or 0 < self._steps <= self.plant.sample
+        return self.finished
+
     def _is_stale(self) -> bool:
         if self._lockstep:
             return False
         limit = round(self.config.actuator.command_timeout / self.config.sample_time)
-        return self.reception.is_stale(self.plant.sample, limit)
+        return self.input.is_stale(self.plant.sample, limit)
 
     def _publish_state(self) -> None:
         stamp = self.stamp
         measurement = self.plant.measure()
-        self._answered = False
-        self._published = perf_counter()
-        self.latency.asked(self._published)
+        self._has_torque = False
+        self._published = self._now()
+        self.latency.state_published(self._published)
         self._publish(self._telemetry.joint_states(stamp, measurement))
         if self.plant.sample % DECIMATION == 0:
             self._publish(self._telemetry.truth(stamp, self.plant.truth()))
         if self.config.publish_clock:
             self._publish(self._telemetry.clock(stamp))
 
-    def _tell_timing(self, waited: float, lateness: float) -> None:
-        if not self.finished:
-            late_steps = self.latency.late_steps
-            self._publish(self._telemetry.timing(self.stamp, waited, lateness, late_steps))
+    def _publish_timing(self, waited: float, lateness: float) -> None:
+        late_steps = self.latency.late_steps
+        self._publish(self._telemetry.timing(self.stamp, waited, lateness, late_steps))
 
     def _publish(self, message: Message) -> None:
         topic, raw = message
-        self._publisher_of[topic].publish(raw)
+        self._outputs[topic].publish(raw)
 
     def _reconfigure(self, config: PlantConfig) -> None:
         self.config = config
 
     def _report(self) -> None:
-        phase = 'running' if self._running else 'waiting' if self._active else self.state_label
-        self._status.report(phase, self.reception, self.latency.late_steps)
+        """Publish diagnostics; the level depends on what happened since the last report."""
+        values = {
+            'commands of a wrong length': self.input.wrong_length,
+            'commands that were not finite': self.input.not_finite,
+            'steps with a torque that was too old': self.input.stale_steps,
+            'late steps': self.latency.late_steps,
+        }
+        if not self._running:
+            waits = WARN, 'braked: waiting for the first torque'
+            level, message = waits if self._active else (STALE, self.state_label)
+        elif self.input.stale_steps > self._reported_stale:
+            message = 'the last torque is too old (actuator.command_timeout): not applied'
+            level = ERROR
+        elif self.input.rejected > self._reported_rejected:
+            level, message = WARN, self.input.problem
+        else:
+            level, message = OK, 'running'
+        self._reported_stale = self.input.stale_steps
+        self._reported_rejected = self.input.rejected
+        self._diagnostics.publish([self._diagnostics.status('torque', level, message, values)])
 
 
 def main() -> int:
     """Run the node as a process."""
-    return executor.run(PlantNode)
+    return process.run(PlantNode)
 
 
 if __name__ == '__main__':

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A closed loop to break: arm, messages, guarded controller, and clocks that the test turns.
 
-Everything passes through the same decoders, supervisor and reception as in the nodes, without ROS.
+Everything passes through the same decoders, supervisor and torque input as in the nodes, without ROS.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder, Joint
 from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.supervision.guard import Guard
-from sim_plant.command_input import Reception
+from sim_plant.command_input import TorqueInput
 from sim_plant.factory import plant_of
 
 JOINTS = ('joint1', 'joint2')
@@ -52,7 +52,7 @@ class Rig:
         self.base = TODAY if live else LOCKSTEP
         self.guard = self.controller()
         self.plant = plant_of(build(PlantConfig, plant or {}))
-        self.reception = Reception(JOINTS)
+        self.input = TorqueInput(JOINTS)
         self.commands = []  # all torques commanded
         self.push = np.zeros(2)
         self.sense = lambda state: [state.raw()]  # messages that a state becomes
@@ -96,7 +96,7 @@ class Rig:
         for raw in self.actuate(Float64MultiArrayEncoder(2).encode(torque)):
             decoder = Float64MultiArrayDecoder(2)
             size = decoder.decode(raw)
-            self.reception.take(size, decoder.data, self.plant.sample)
+            self.input.take(size, decoder.data, self.plant.sample)
 
     def step(self, count=1):
         """Go on by milliseconds: measure, deliver, look at the clock now and then, move."""
@@ -104,7 +104,7 @@ class Rig:
             for raw in self.sense(self.state()):
                 self.deliver(raw)
             self.wait()
-            self.plant.step(self.reception.torque + self.push)
+            self.plant.step(self.input.torque + self.push)
 
     def wait(self, milliseconds=1):
         """Let the clocks go on, and the watch look at them when it wants to."""
@@ -124,5 +124,5 @@ class Rig:
         self.base = self.state().stamp + LOCKSTEP
         self.wall = max(self.wall, self.base) if self.live else self.wall
         self.plant.reset()
-        self.reception.restart()
+        self.input.restart()
         self.guard.reset()

@@ -67,7 +67,7 @@ def run(fault: Fault) -> Outcome:
     reason, text = rig.supervisor.reason, rig.supervisor.text
     error = float(rig.guard.ratio.max())
     before, after = np.array(rig.commands[start:stop]), np.array(rig.commands[stop:])
-    rejected = rig.reception.rejected
+    rejected = rig.input.rejected
     rig.mend()
     rig.step(LEAD)
     recovered = rig.supervisor.phase is Phase.TRACKING and bool(rig.guard.ratio.max() < 1.0)

@@ -20,7 +20,7 @@ from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder, JointStateDecoder
 from blf_dsc_controller.messages.encoders import JointStateEncoder
-from blf_dsc_controller.nodes.endpoints import message_class, profile
+from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.simulation.loop import simulate
 
 PATIENCE = 60.0  # s, until a test gives up on what should take a moment
@@ -54,7 +54,7 @@ class NodeLoop:
             message_class(topic.type),
             topic.relative,
             heard.append,
-            profile(topics.STREAM),
+            qos_profile(topics.STREAM),
             raw=True,
         )
         return heard
@@ -62,7 +62,7 @@ class NodeLoop:
     def publisher(self, topic):
         """Publisher of the test's own on a topic of another node."""
         return self.tester.create_publisher(
-            message_class(topic.type), topic.relative, profile(topic.offered)
+            message_class(topic.type), topic.relative, qos_profile(topic.offered)
         )
 
     def spin_until(self, condition):

@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from blf_dsc_controller.nodes.endpoints import message_class, profile
+from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from sim_plant.node import PlantNode
 
 PATIENCE = 30.0  # s until a test that waits in vain is given up
@@ -100,7 +100,7 @@ class RosRig:
         heard = []
         name = topic.relative if isinstance(topic, topics.Topic) else topic
         self.tester.create_subscription(
-            message_class(topic.type), name, heard.append, profile(topic.offered), raw=raw
+            message_class(topic.type), name, heard.append, qos_profile(topic.offered), raw=raw
         )
         return heard
 

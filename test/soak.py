@@ -28,7 +28,7 @@ from ros_rig import RosRig, activate, deactivate
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from blf_dsc_controller.nodes.endpoints import message_class, profile
+from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.supervision.reasons import Phase
 from sim_plant.node import PlantNode
 
@@ -74,7 +74,7 @@ class Soak:
     def _publisher(self, topic):
         node = self.ros.tester
         kind = message_class(topic.type)
-        return node.create_publisher(kind, topic.relative, profile(topic.offered))
+        return node.create_publisher(kind, topic.relative, qos_profile(topic.offered))
 
     def run(self, samples):
         """Run for a total of so many samples, faults not counted."""

@@ -47,7 +47,7 @@ def granted(ros, names):
 def is_recording_all(ros):
     """Whether the recorder has found every topic."""
     there = {name for name, _ in ros.tester.get_topic_names_and_types()}
-    found = ros.tester.get_subscriber_names_and_types_by_node('_bag_recorder_intake', '/')
+    found = ros.tester.get_subscriber_names_and_types_by_node('_bag_recorder_subscriptions', '/')
     published = {name for name in there if ros.tester.count_publishers(name)}
     return '/arm_markers/markers' in there and published <= {name for name, _ in found}
 
@@ -63,13 +63,15 @@ def live():
             ros.add(ControllerNode, sample_time=0.02)
             ros.add(MarkersNode)
             recorder = ros.add(BagRecorderNode, output=bag)
-            recorder._inquiry.of = lambda *_: None  # no clients that come and go in one process
+            recorder._parameter_client.request = lambda *_: (
+                None
+            )  # no clients that come and go in one process
             ros.until(lambda: is_recording_all(ros))
             nodes = {
                 'sim_plant': ['sim_plant'],
                 'blf_dsc_controller': ['blf_dsc_controller'],
-                'arm_markers': ['arm_markers', '_arm_markers_intake'],
-                'bag_recorder': ['bag_recorder', '_bag_recorder_intake'],
+                'arm_markers': ['arm_markers', '_arm_markers_subscriptions'],
+                'bag_recorder': ['bag_recorder', '_bag_recorder_subscriptions'],
             }
             found = {name: granted(ros, parts) for name, parts in nodes.items()}
             ros.executor.remove_node(recorder)

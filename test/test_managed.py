@@ -185,7 +185,7 @@ def test_in_real_time_a_torque_that_is_too_old_is_not_applied(ros, brake):
     ros.run(arm, 20)
     assert arm.plant.measure()[4:].any()
     ros.kill(law)
-    ros.until(lambda: arm.reception.stale_steps > 5)
+    ros.until(lambda: arm.input.stale_steps > 5)
     measured = arm.plant.measure()
     assert not measured[4:].any()
     assert measured[2:4].any() == (brake == 'zero')

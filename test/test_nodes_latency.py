@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-from blf_dsc_controller.nodes.latency import Latency
+from sim_plant.command_input import Latency
 
 
 def test_a_torque_in_time_counts_from_its_state():
     latency = Latency()
-    latency.asked(0.0)
-    latency.answered(0.2)
+    latency.state_published(0.0)
+    latency.torque_received(0.2)
     assert latency.step(1.0) == 0.2
     assert latency.late_steps == 0
 
@@ -17,25 +17,25 @@ def test_a_torque_in_time_counts_from_its_state():
 def test_a_late_torque_counts_with_all_of_its_lateness():
     """A controller that is 2.5 samples late must not pass for one that is half a sample late."""
     latency = Latency()
-    latency.asked(0.0)
+    latency.state_published(0.0)
     assert latency.step(1.0) == 1.0  # waited in vain so far
-    latency.asked(1.0)
+    latency.state_published(1.0)
     assert latency.step(2.0) == 2.0
-    latency.asked(2.0)
-    latency.answered(2.5)
+    latency.state_published(2.0)
+    latency.torque_received(2.5)
     assert latency.step(3.0) == 2.5
     assert latency.late_steps == 2
 
 
 def test_the_longest_wait_of_a_sample_is_told_once():
     latency = Latency()
-    latency.asked(0.0)
+    latency.state_published(0.0)
     latency.step(1.0)
-    latency.asked(1.0)
-    latency.answered(1.75)  # late, for the state at 0.0
-    latency.answered(1.875)  # for the state at 1.0
+    latency.state_published(1.0)
+    latency.torque_received(1.75)  # late, for the state at 0.0
+    latency.torque_received(1.875)  # for the state at 1.0
     assert latency.step(2.0) == 1.75
-    latency.asked(2.0)
-    latency.answered(2.25)
+    latency.state_published(2.0)
+    latency.torque_received(2.25)
     assert latency.step(3.0) == 0.25
     assert latency.late_steps == 1

@@ -46,7 +46,7 @@ def test_a_command_that_will_not_do_moves_nothing_and_is_counted(loop, wrong):
     send(TORQUE)
     loop.spin_until(lambda: node.plant.sample == 1)
     send(wrong)
-    loop.spin_until(lambda: node.rejected == 1)
+    loop.spin_until(lambda: node.input.rejected == 1)
     assert node.plant.sample == 1
     send(TORQUE)
     loop.spin_until(lambda: len(heard) == 3)
@@ -56,7 +56,7 @@ def test_a_command_that_will_not_do_moves_nothing_and_is_counted(loop, wrong):
     alone.step(np.array(TORQUE))
     _, told = states(heard)
     np.testing.assert_array_equal(told[2].ravel(), alone.measure())
-    assert node.rejected == 1
+    assert node.input.rejected == 1
 
 
 def test_the_brake_holds_until_the_first_torque(loop):

@@ -147,7 +147,7 @@ def happen(node, what, told):
     elif what == 'reset':
         node._on_reset(Trigger.Request(), Trigger.Response())
     elif what == 'tick':
-        node._tick()
+        node._on_poll()
         node._report()
     elif what == 'parameter':
         name, value = told
@@ -203,13 +203,13 @@ def test_the_plant_bears_everything(context, sequence):
         context=context, cli_args=[], enable_rosout=False, parameter_overrides=overrides
     )
     node._is_observed = lambda: True
-    node._handshake._since = 1e-9
+    node._handshake._complete_since = 0.0
     try:
         for what, told in sequence:
             if what == 'message':
                 node._on_command(told)
             happen(node, what, told)
-            assert np.isfinite(node.reception.torque).all()
+            assert np.isfinite(node.input.torque).all()
             if node.state_label == 'active':
                 measured = node.plant.measure()
                 assert np.isfinite(measured).all()

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from blf_dsc_controller.configuration.common import Realtime
-from blf_dsc_controller.nodes import realtime
+from blf_dsc_controller.nodes.process import request_realtime
 
 
 class Log:
@@ -59,7 +59,7 @@ def system(monkeypatch):
 
 def asked(**values):
     log = Log()
-    realtime.request(Realtime(**values), log)
+    request_realtime(Realtime(**values), log)
     return log
 
 

@@ -27,7 +27,7 @@ from blf_dsc_controller.messages.topics import (
     TRACKING_ERROR,
 )
 from blf_dsc_controller.messages.types import typestore
-from blf_dsc_controller.nodes.endpoints import message_class, profile
+from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.replay.recorded import replay
 
@@ -52,7 +52,7 @@ class Recording:
         configure(self.ros, self.arm)
         # What is changed from here on is not in the configuration that the bag begins with.
         name = self.law.get_fully_qualified_name()
-        self.ros.until(lambda: name in self.recorder._parameters)
+        self.ros.until(lambda: name in self.recorder.parameters_of)
         activate(self.ros, self.arm)
 
     def run(self, samples):
@@ -110,7 +110,7 @@ def stopped(tmp_path_factory):
     run.run(100)
     deactivate(run.ros, run.arm)  # so that what follows has a place among the states
     name, type_ = JOINT_STATES.relative, message_class(JOINT_STATES.type)
-    publisher = run.ros.tester.create_publisher(type_, name, profile(JOINT_STATES.offered))
+    publisher = run.ros.tester.create_publisher(type_, name, qos_profile(JOINT_STATES.offered))
     run.ros.until(lambda: publisher.get_subscription_count() >= 2)
     stamp = run.law.guard.last_stamp + MILLISECOND
     publisher.publish(JointStateEncoder(JOINTS[:1]).encode(stamp, [0.0], [0.0], [0.0]))

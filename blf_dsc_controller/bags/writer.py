@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from types import TracebackType
-from typing import final
 
 from blf_dsc_controller.bags.context import ATTACHMENT, MEDIA_TYPE, RECORD, facts_of
 from blf_dsc_controller.bags.errors import BagExistsError, DiskFullError
@@ -27,7 +26,6 @@ class Limits:
     duration: float = inf
 
 
-@final
 class BagWriter:
     """Writes serialised messages into a new bag.
 

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from blf_dsc_controller.analysis.table import format_table
 from blf_dsc_controller.cli.run import make_folder
+from blf_dsc_controller.compiled import COMPILATION_NOTICE
 from blf_dsc_controller.compiled.jit import is_compiled
 from blf_dsc_controller.configuration.params_file import locate
 from blf_dsc_controller.errors import BlfDscError
@@ -26,7 +27,6 @@ from blf_dsc_controller.monte_carlo.reproduction import reproduce
 from blf_dsc_controller.monte_carlo.store import Span, Store
 from blf_dsc_controller.monte_carlo.study_file import load_study
 from blf_dsc_controller.monte_carlo.table import require_pyarrow
-from blf_dsc_controller.nodes import compilation
 from blf_dsc_controller.simulation.figures_loop import run
 
 _PAUSE_IN_A_LOG = 10.0  # s between two states of the bar
@@ -110,4 +110,4 @@ def _engine(options: argparse.Namespace) -> Engine:
 
 def _announce() -> None:
     if not is_compiled(run):
-        print(compilation.NOTICE, file=sys.stderr, flush=True)
+        print(COMPILATION_NOTICE, file=sys.stderr, flush=True)

@@ -18,13 +18,15 @@ from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import INTERRUPTED, require_ros
 from blf_dsc_controller.cli.progress import Progress
+from blf_dsc_controller.compiled import COMPILATION_NOTICE
+from blf_dsc_controller.compiled.jit import is_compiled
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
 from blf_dsc_controller.configuration.params_file import dump, load_loop, locate
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.law.controller import respond
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.rejected_columns import refusals
-from blf_dsc_controller.nodes import compilation
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import Record, loop, simulate
@@ -140,13 +142,13 @@ def _run_over_ros(config: LoopConfig, out: Path, domain: int | None) -> bool:
     """Run the three nodes; False if a signal ended the run."""
     from blf_dsc_controller.cli.session import run_session
 
-    _announce_compilation(*compilation.CONTROLLER, *plant_kernels.KERNELS)
+    _announce_compilation(respond, *plant_kernels.KERNELS)
     return run_session(config.plant, out, domain)
 
 
 def _announce_compilation(*kernels: Any) -> None:
-    if not compilation.is_compiled(*kernels):
-        print(compilation.NOTICE, file=sys.stderr, flush=True)
+    if not is_compiled(*kernels):
+        print(COMPILATION_NOTICE, file=sys.stderr, flush=True)
 
 
 def _report(out: Path) -> None:

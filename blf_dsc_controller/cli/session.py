@@ -28,7 +28,7 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.names import RATIO
-from blf_dsc_controller.nodes.endpoints import profile
+from blf_dsc_controller.nodes.endpoints import qos_profile
 
 # In the order in which they start. They end in reverse: the recorder last, to get every message.
 _MODULES = {
@@ -150,7 +150,7 @@ class Monitor:
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._node.create_subscription(
-            JointState, topics.MONITOR.relative, self._receive, profile(topics.MONITOR.offered)
+            JointState, topics.MONITOR.relative, self._receive, qos_profile(topics.MONITOR.offered)
         )
 
     @property

@@ -4,32 +4,38 @@
 from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from rclpy.clock import Clock, ClockType
 from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law import factory as assembly
-from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.controller import Controller, respond
 from blf_dsc_controller.law.rejected_columns import refusals
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.decoders import JointStateDecoder
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.monitor import Monitor
 from blf_dsc_controller.messages.telemetry import DECIMATION, ControllerTelemetry, Message
-from blf_dsc_controller.nodes import compilation, executor, parameters, realtime
+from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.controller_status import ControllerStatus
-from blf_dsc_controller.nodes.endpoints import are_observed, publisher, subscribe
+from blf_dsc_controller.nodes.endpoints import (
+    create_publisher,
+    create_steady_timer,
+    create_subscription,
+    have_subscribers,
+)
 from blf_dsc_controller.nodes.lifecycle import ManagedNode
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
 from blf_dsc_controller.supervision.config_warnings import concerns
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.reasons import Phase
 
-_FIRST_LOOK = 0.01  # s, and the time between two looks for who listens
+_POLL_PERIOD = 0.01  # s, while waiting for subscribers
 _DIAGNOSTICS_PERIOD = 1.0  # s
 
 OUTPUTS = (
@@ -43,37 +49,46 @@ OUTPUTS = (
 
 
 class ControllerNode(ManagedNode):
-    """Answers each joint state with a torque on `~/commands`, and tells how it goes.
+    """Commands a torque on `~/commands` for each joint state, and publishes telemetry.
+
+    Args:
+        steady: steady clock of the watchdog [ns].
+        wall: time of day, by which live stamps are recognised [ns].
+        options: of rclpy's LifecycleNode.
 
     Attributes:
         config: the configuration in force.
         guard: the law behind its supervisor; None until configured.
+
+    Raises:
+        ConfigurationError: the parameters do not describe a law that can run.
     """
 
-    def __init__(self, **options: Any) -> None:
-        """Read the parameters and, with `autostart`, compile the law and wait for joint states.
-
-        Raises:
-            ConfigurationError: the parameters do not describe a law that can run.
-        """
+    def __init__(
+        self,
+        *,
+        steady: Callable[[], int] = time.monotonic_ns,
+        wall: Callable[[], int] = time.time_ns,
+        **options: Any,
+    ) -> None:
         super().__init__(topics.CONTROLLER, **options)
+        self._clocks = steady, wall
         self.config = parameters.declare(self, ControllerConfig)
         self.guard: Guard | None = None
         joints = self.config.joints
         self._estimates = assembly.estimate_names(self.config)
         self._telemetry = ControllerTelemetry(joints, self._estimates)
         self._monitor: Monitor | None = None
-        self._judged = False
-        self._told_bound = np.zeros(len(joints))
+        self._columns_checked = False
+        self._published_bound = np.zeros(len(joints))
         self._decoder = JointStateDecoder(joints, assembly.required_fields(self.config))
         self._pending: bytes | None = None
         self._observed = self._started = False
-        self._publisher_of: dict[topics.Topic, Publisher] = {}
+        self._outputs: dict[topics.Topic, Publisher] = {}
         self._status = ControllerStatus(self, joints)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._look = self.create_timer(_FIRST_LOOK, self._tick, clock=steady)
-        self.create_timer(_DIAGNOSTICS_PERIOD, self._report, clock=steady)
-        parameters.on_change(self, ControllerConfig, self._retune, self._objections)
+        self._watch_timer = create_steady_timer(self, _POLL_PERIOD, self._on_watch_timer)
+        create_steady_timer(self, _DIAGNOSTICS_PERIOD, self._report)
+        parameters.on_change(self, ControllerConfig, self._retune, self._problems)
         self.create_service(Trigger, '~/reset', self._on_reset)
         if self.config.autostart:
             self.autostart()
@@ -90,23 +105,22 @@ class ControllerNode(ManagedNode):
         """Why the controller is in its safe stop; empty while it is not."""
         return self.guard.supervisor.text if self.guard else ''
 
-    # The life of the node.
+    # Life cycle.
 
     def configure(self) -> None:
-        """Compile the law; from the first time on, the topics of the loop are there."""
-        if not compilation.is_compiled(*compilation.CONTROLLER):
-            self.get_logger().info(compilation.NOTICE)
-        self.guard = Guard(self.config)
-        for concern in concerns(self.config):
-            self.get_logger().warning(concern)
-        if not self._publisher_of:
+        """Compile the law; create the topics of the loop the first time."""
+        process.log_compilation(self.get_logger(), respond)
+        self.guard = Guard(self.config, *self._clocks)
+        for warning in concerns(self.config):
+            self.get_logger().warning(warning)
+        if not self._outputs:
             outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
-            self._publisher_of = {topic: publisher(self, topic) for topic in outputs}
-            subscribe(self, topics.JOINT_STATES, self._on_joint_state)
+            self._outputs = {topic: create_publisher(self, topic) for topic in outputs}
+            create_subscription(self, topics.JOINT_STATES, self._on_joint_state)
             self._status.trajectories = TrajectoryInput(
                 self, lambda: self.guard, telemetry=self.config.telemetry.enabled
             )
-            realtime.request(self.config.realtime, self.get_logger())
+            process.request_realtime(self.config.realtime, self.get_logger())
         self._report()
 
     def activate(self) -> None:
@@ -117,23 +131,23 @@ class ControllerNode(ManagedNode):
         self._report()
 
     def deactivate(self) -> None:
-        """Go to the safe torque on its ramp; joint states are answered with it from then on."""
+        """Go to the safe torque on its ramp, and command it for the joint states from then on."""
         if self.guard is not None:
             self.guard.deactivate()
         self._report()
 
     def release(self) -> None:
-        """Leave the arm without torque and let go of the law."""
-        self._leave()
+        """Command zero torque and release the law."""
+        self._command_zero()
         self.guard = None
         self._report()
 
     def close(self) -> None:
-        """Leave the arm without torque, and see that every subscriber has the last messages."""
-        self._leave()
-        executor.drain(self._publisher_of.values())
+        """Command zero torque and wait until every subscriber has the last messages."""
+        self._command_zero()
+        process.drain(self._outputs.values())
 
-    def _leave(self) -> None:
+    def _command_zero(self) -> None:
         """Command zero torque, as drivers hold the last command; unless the arm has gone."""
         states = self.resolve_topic_name(topics.JOINT_STATES.relative)
         if self.guard is not None and self.guard.commanding and self.count_publishers(states):
@@ -162,18 +176,17 @@ class ControllerNode(ManagedNode):
                 self._pending = raw
                 return
         try:
-            torque, stamp = self._answer(guard, raw)
-        except Exception as error:  # noqa: BLE001 - whatever it is, the arm must not hang on
+            torque, stamp = self._torque_for(guard, raw)
+        except Exception as error:  # noqa: BLE001 - whatever it is, the arm needs a torque
             self.get_logger().fatal(f'{type(error).__name__}: {error}')
             torque, stamp = guard.fail(error), 0
         if torque is not None:
             self._command(torque)
         if guard.answered:
-            self._tell(guard, stamp)
-        if self._status.is_news(guard):
-            self._take_note(guard)
+            self._publish_telemetry(guard, stamp)
+        self._report_if_changed(guard)
 
-    def _answer(self, guard: Guard, raw: bytes) -> tuple[np.ndarray | None, int]:
+    def _torque_for(self, guard: Guard, raw: bytes) -> tuple[np.ndarray | None, int]:
         try:
             stamp = self._decoder.decode(raw)
         except MessageError as error:
@@ -184,26 +197,25 @@ class ControllerNode(ManagedNode):
             return torque, 0
         return guard.answer(stamp, self._decoder.values), stamp
 
-    def _tell(self, guard: Guard, stamp: int) -> None:
-        if guard.controller.state.judged[0] != self._judged:
-            self._tell_refusals(guard)
+    def _publish_telemetry(self, guard: Guard, stamp: int) -> None:
+        if guard.controller.state.judged[0] != self._columns_checked:
+            self._report_rejected_columns(guard)
         if not self.config.telemetry.enabled:
             return
-        told = guard.controller.sample
+        sample = guard.controller.sample
         settings = guard.controller.settings
         if guard.controller.samples == 1 or self._monitor is None:
             self._monitor = Monitor(self.config.joints, self._estimates, settings)
-            self._publish_bound(stamp, told.bound)
-        elif settings.funnel_rate > 0.0 and not np.array_equal(told.bound, self._told_bound):
-            self._publish_bound(stamp, told.bound)
-        for message in self._telemetry.sample(stamp, told, guard.compute_time):
+            self._publish_bound(stamp, sample.bound)
+        elif settings.funnel_rate > 0.0 and not np.array_equal(sample.bound, self._published_bound):
+            self._publish_bound(stamp, sample.bound)
+        for message in self._telemetry.sample(stamp, sample, guard.compute_time):
             self._publish(message)
         if (guard.controller.samples - 1) % DECIMATION == 0:
-            self._publish(self._monitor.message(stamp, told, guard.ratio, told.bound))
+            self._publish(self._monitor.message(stamp, sample, guard.ratio, sample.bound))
 
-    def _tell_refusals(self, guard: Guard) -> None:
-        """Say which disturbance columns are not estimated, once they have been judged."""
-        self._judged = bool(guard.controller.state.judged[0])
+    def _report_rejected_columns(self, guard: Guard) -> None:
+        self._columns_checked = bool(guard.controller.state.judged[0])
         self._status.refusals = refusals(guard.controller, self._estimates)
         for refusal in self._status.refusals:
             self.get_logger().warning(f'{refusal}')
@@ -215,26 +227,26 @@ class ControllerNode(ManagedNode):
 
     def _publish(self, message: Message) -> None:
         topic, raw = message
-        self._publisher_of[topic].publish(raw)
+        self._outputs[topic].publish(raw)
 
     def _publish_bound(self, stamp: int, bound: np.ndarray) -> None:
-        self._told_bound[:] = bound
+        self._published_bound[:] = bound
         limit = self.controller.settings.torque_limit
         self._publish(self._telemetry.bound(stamp, bound, limit))
 
     def _is_observed(self) -> bool:
         observers = self.config.wait_for_subscribers
-        return are_observed(self._publisher_of, topics.COMMANDS, observers)
+        return have_subscribers(self._outputs, topics.COMMANDS, observers)
 
-    def _tick(self) -> None:
-        """Watch, and be woken again when there may be something to see: waking has its price."""
-        wait = _FIRST_LOOK
+    def _on_watch_timer(self) -> None:
+        """Watch, and set the timer to when there may be something to see: waking up is costly."""
+        wait = _POLL_PERIOD
         if self.guard is not None:
             self._watch(self.guard)
             if self._pending is None:
                 wait = self.guard.next_watch
-        self._look.timer_period_ns = int(1e9 * wait)
-        self._look.reset()
+        self._watch_timer.timer_period_ns = int(1e9 * wait)
+        self._watch_timer.reset()
 
     def _watch(self, guard: Guard) -> None:
         if self._pending is not None and self._is_observed():
@@ -243,12 +255,11 @@ class ControllerNode(ManagedNode):
         torque = guard.watch()
         if torque is not None:
             self._command(torque)
-        if self._status.is_news(guard):
-            self._take_note(guard)
+        self._report_if_changed(guard)
 
-    # Changes, and what is told of them.
+    # Changes of the configuration, and reports.
 
-    def _objections(self, config: ControllerConfig) -> list[str]:
+    def _problems(self, config: ControllerConfig) -> list[str]:
         return self.guard.objections(config) if self.guard else []
 
     def _retune(self, config: ControllerConfig) -> None:
@@ -260,7 +271,9 @@ class ControllerNode(ManagedNode):
                 t = (stamp - self.guard.start_stamp) * 1e-9
                 self._publish_bound(self.guard.last_seen, self.guard.controller.bound_at(t))
 
-    def _take_note(self, guard: Guard) -> None:
+    def _report_if_changed(self, guard: Guard) -> None:
+        if not self._status.is_news(guard):
+            return
         supervisor = guard.supervisor
         if supervisor.phase is Phase.SAFE_STOP:
             self.get_logger().fatal(f'{self.config.safety.torque} torque: {supervisor.text}')
@@ -275,7 +288,7 @@ class ControllerNode(ManagedNode):
 
 def main() -> int:
     """Run the node as a process."""
-    return executor.run(ControllerNode)
+    return process.run(ControllerNode)
 
 
 if __name__ == '__main__':

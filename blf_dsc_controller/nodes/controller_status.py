@@ -20,7 +20,7 @@ from blf_dsc_controller.messages.names import (
     REJECTED,
     STOPS,
 )
-from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, Board
+from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.reasons import Phase, Reason
@@ -56,7 +56,7 @@ class ControllerStatus:
         self.refusals: tuple[Refusal, ...] = ()
         self.trajectories: TrajectoryInput | None = None
         self._joints = tuple(joints)
-        self._board = Board(node, joints, topics.STATE)
+        self._diagnostics = DiagnosticsPublisher(node, joints, topics.STATE)
         self._told = -1
         self._announced: tuple[str, str, int, int] | None = None
 
@@ -73,11 +73,11 @@ class ControllerStatus:
         """
         state = self._state(life, guard)
         parts = [state] if guard is None else [state, self._loop(guard), self._learning(guard)]
-        self._board.report(parts)
+        self._diagnostics.publish(parts)
         counts = (guard.supervisor.stops, guard.operations) if guard else (0, 0)
         essence = (state.message, life, *counts)
         if essence != self._announced:
-            self._board.announce(state)
+            self._diagnostics.publish_state(state)
             self._announced = essence
         self._told = guard.supervisor.turns if guard else -1
 
@@ -95,7 +95,7 @@ class ControllerStatus:
             values[OPERATIONS] = guard.operations
             values[OPERATION] = guard.operation.value
             values[LAST_STATE] = guard.last_seen
-        return self._board.status('state', _LEVELS[phase], message, values)
+        return self._diagnostics.status('state', _LEVELS[phase], message, values)
 
     def _loop(self, guard: Guard) -> DiagnosticStatus:
         supervisor = guard.supervisor
@@ -112,14 +112,14 @@ class ControllerStatus:
             **(self.trajectories.told if self.trajectories else {}),
         }
         if guard.outside:
-            return self._board.status('loop', WARN, 'the error has left its bound', values)
+            return self._diagnostics.status('loop', WARN, 'the error has left its bound', values)
         if supervisor.saturation.lasted > 0.0:
             message = 'torque at its limit: adaptation by the tracking error is frozen'
-            return self._board.status('loop', WARN, message, values)
+            return self._diagnostics.status('loop', WARN, message, values)
         if guard.answered and guard.controller.sample.cuts.any():
             message = 'torque changes at its limit: adaptation by the tracking error is frozen'
-            return self._board.status('loop', WARN, message, values)
-        return self._board.status('loop', OK, _WORDS.get(supervisor.phase, 'stopped'), values)
+            return self._diagnostics.status('loop', WARN, message, values)
+        return self._diagnostics.status('loop', OK, _WORDS.get(supervisor.phase, 'stopped'), values)
 
     def _cuts(self, guard: Guard) -> dict[str, int]:
         """Samples in which the law's torque was cut, joint by joint."""
@@ -138,5 +138,5 @@ class ControllerStatus:
         values |= {f'{REJECTED}{refusal.column}': f'{refusal}' for refusal in self.refusals}
         if self.refusals:
             columns = ', '.join(refusal.column for refusal in self.refusals)
-            return self._board.status('learning', WARN, f'not estimated: {columns}', values)
-        return self._board.status('learning', OK, learning, values)
+            return self._diagnostics.status('learning', WARN, f'not estimated: {columns}', values)
+        return self._diagnostics.status('learning', OK, learning, values)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a node tells of its health: `/diagnostics`, once a second and at once on a change.
+"""The diagnostics of a node: `/diagnostics`, once a second and at once on a change.
 
 Names are paths (`left/blf_dsc_controller/loop`), which rqt_robot_monitor shows as a tree; the
 hardware is named by its joints.
@@ -14,7 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.nodes.endpoints import message_class, profile, publisher
+from blf_dsc_controller.nodes.endpoints import create_publisher, qos_profile
 
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
@@ -22,14 +22,8 @@ ERROR = DiagnosticStatus.ERROR
 STALE = DiagnosticStatus.STALE
 
 
-class Board:
-    """Statuses of one node.
-
-    Args:
-        node: that tells.
-        joints: names of the hardware.
-        state: topic of its latched state; None if it has none.
-    """
+class DiagnosticsPublisher:
+    """Publishes the statuses of a node and, if there is a topic for it, its latched state."""
 
     def __init__(
         self, node: Node, joints: Sequence[str], state: topics.Topic | None = None
@@ -38,11 +32,9 @@ class Board:
         self._name = node.get_fully_qualified_name().removeprefix('/')
         self._hardware = ' '.join(joints)
         self._diagnostics = node.create_publisher(
-            message_class(topics.DIAGNOSTICS.type),
-            topics.DIAGNOSTICS.name,
-            profile(topics.DIAGNOSTICS.offered),
+            DiagnosticArray, topics.DIAGNOSTICS.name, qos_profile(topics.DIAGNOSTICS.offered)
         )
-        self._state = publisher(node, state) if state else None
+        self._state = create_publisher(node, state) if state else None
 
     def status(
         self, part: str, level: bytes, message: str, values: Mapping[str, Any]
@@ -56,13 +48,13 @@ class Board:
             values=[KeyValue(key=key, value=f'{value}') for key, value in values.items()],
         )
 
-    def report(self, statuses: Sequence[DiagnosticStatus]) -> None:
+    def publish(self, statuses: Sequence[DiagnosticStatus]) -> None:
         """Publish statuses on /diagnostics."""
         array = DiagnosticArray(status=list(statuses))
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._diagnostics.publish(array)
 
-    def announce(self, status: DiagnosticStatus) -> None:
-        """Publish the state, which stays for whoever asks later."""
+    def publish_state(self, status: DiagnosticStatus) -> None:
+        """Publish the latched state, which late subscribers receive, too."""
         if self._state is not None:
             self._state.publish(status)

@@ -1,18 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishers and subscriptions of the package's topics, in serialised form."""
+"""Message types, qualities of service, publishers, subscriptions and timers."""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping
+import sysconfig
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
+from ament_index_python.packages import get_package_share_directory
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.timer import Timer
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import get_types_from_msg
 
+from blf_dsc_controller.messages.errors import UnknownTypeError
 from blf_dsc_controller.messages.topics import Quality, Topic
+from blf_dsc_controller.messages.types import typestore
 
 
 def message_class(type_name: str) -> Any:
@@ -26,8 +35,39 @@ def message_class(type_name: str) -> Any:
     return getattr(importlib.import_module(f'{package}.{kind}'), name)
 
 
-def profile(quality: Quality) -> QoSProfile:
-    """ROS's own form of a quality of service."""
+def register_definition(type_name: str) -> None:
+    """Register a type, and those nested in it, from the .msg files of its installed package.
+
+    Raises:
+        UnknownTypeError: there is no such file, also for a nested type.
+    """
+    if type_name in typestore().fielddefs:
+        return
+    package, kind, name = type_name.split('/')
+    try:
+        share = Path(get_package_share_directory(package))
+    except (LookupError, OSError):  # a pip install sets no AMENT_PREFIX_PATH
+        share = Path(sysconfig.get_path('data'), 'share', package)
+    try:
+        text = (share / kind / f'{name}.msg').read_text(encoding='utf-8')
+    except OSError:
+        raise UnknownTypeError(type_name) from None
+    found = get_types_from_msg(text, type_name)
+    for nested in _nested(found[type_name][1]):
+        register_definition(nested)
+    typestore().register(found)
+
+
+def _nested(fields: Iterable[tuple[str, Any]]) -> Iterator[str]:
+    for _, (node, content) in fields:
+        if node is Nodetype.NAME:
+            yield content
+        elif node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            yield from _nested([('', content[0])])
+
+
+def qos_profile(quality: Quality) -> QoSProfile:
+    """Quality of service as rclpy takes it."""
     return QoSProfile(
         depth=quality.depth,
         reliability=ReliabilityPolicy[quality.reliability.upper()],
@@ -35,36 +75,35 @@ def profile(quality: Quality) -> QoSProfile:
     )
 
 
-def publisher(node: Node, topic: Topic) -> Publisher:
-    """Publisher of a topic that belongs to `node`; it takes serialised messages."""
+def create_publisher(node: Node, topic: Topic) -> Publisher:
+    """Publisher of one of the node's own topics, for serialised messages."""
     return node.create_publisher(
         message_class(topic.type),
         topic.name,
-        profile(topic.offered),
+        qos_profile(topic.offered),
         qos_overriding_options=_overridable(),
     )
 
 
-def subscribe(node: Node, topic: Topic, callback: Callable[[bytes], None]) -> None:
-    """Subscribe `node` to a topic of another node; the callback gets serialised messages."""
+def create_subscription(node: Node, topic: Topic, callback: Callable[[bytes], None]) -> None:
+    """Subscribe to a topic of another node; the callback gets serialised messages."""
     node.create_subscription(
         message_class(topic.type),
         topic.relative,
         callback,
-        profile(topic.requested),
+        qos_profile(topic.requested),
         qos_overriding_options=_overridable(),
         raw=True,
     )
 
 
-def are_observed(publishers: Mapping[Topic, Publisher], loop: Topic, observers: int) -> bool:
-    """Whether each topic has its subscribers.
+def create_steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
+    """Timer [s] on the steady clock, which also runs while simulated time stands still."""
+    return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    Args:
-        publishers: of the topics.
-        loop: the one that the other side of the loop listens to as well.
-        observers: subscribers that each must have beside it.
-    """
+
+def have_subscribers(publishers: Mapping[Topic, Publisher], loop: Topic, observers: int) -> bool:
+    """Whether each topic has `observers` subscribers, and `loop` the peer's beside them."""
     return all(
         publisher.get_subscription_count() >= observers + (topic is loop)
         for topic, publisher in publishers.items()

@@ -8,26 +8,17 @@ from collections.abc import Callable
 from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
-from rclpy._rclpy_pybind11 import RCLError
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from blf_dsc_controller.errors import BlfDscError
-
-
-class TransitionError(BlfDscError):
-    """A node could not be brought into the state it was to start in."""
-
-    def __init__(self, node: str, step: str, reason: str) -> None:
-        self.node = node
-        self.step = step
-        super().__init__(f'{node} could not {step}: {reason}')
+from blf_dsc_controller.nodes.rclpy_internals import RCLError, lifecycle_state, wrap_change_state
 
 
 class ManagedNode(LifecycleNode):
-    """Base of the nodes: override `configure`, `activate`, `deactivate` and `release`.
+    """Base class of the nodes: override `configure`, `activate`, `deactivate` and `release`.
 
-    Topics, services and parameters are there for the life of the node; what it computes with is
-    made when it is configured and let go of when it is cleaned up.
+    Topics, services and parameters exist for the life of the node; what it computes with is made
+    when it is configured and released when it is cleaned up.
 
     Attributes:
         finished: True once the node has nothing more to do.
@@ -37,97 +28,94 @@ class ManagedNode(LifecycleNode):
     def __init__(self, name: str, **options: Any) -> None:
         self.finished = False
         self.failure: BlfDscError | None = None
-        self._obstacle: Exception | None = None
+        self._transition_error: Exception | None = None
         super().__init__(name, **options)
-        self._take_request = self._service_change_state.callback
-        self._service_change_state.callback = self._on_change_request
+        wrap_change_state(self, self._rejecting)
 
     def configure(self) -> None:
         """Make what the node computes with."""
 
     def activate(self) -> None:
-        """Begin to work."""
+        """Start working."""
 
     def deactivate(self) -> None:
-        """End to work."""
+        """Stop working."""
 
     def release(self) -> None:
-        """Let go of what `configure` made; also after an error, and when nothing was made."""
+        """Release what `configure` made; also called after an error, when nothing was made."""
 
     def close(self) -> None:
-        """Let go of everything that must not be lost, while ROS is still up."""
+        """Save and release what must not be lost, while ROS is still up."""
 
     @property
     def state_label(self) -> str:
-        """State of the node in the words of ROS: unconfigured, inactive, active, finalized."""
-        return str(self._state_machine.current_state[1])
+        """State of the node: unconfigured, inactive, active or finalized."""
+        return lifecycle_state(self)
 
     def autostart(self) -> None:
         """Configure and activate the node, as a manager would.
 
         Raises:
-            BlfDscError: what a step raised, or a TransitionError if that was no error of ours.
+            BlfDscError: a step failed; the error that it raised, if that was one of ours.
         """
-        for step, trigger in (
+        for name, step in (
             ('configure', self.trigger_configure),
             ('activate', self.trigger_activate),
         ):
-            if trigger() != TransitionCallbackReturn.SUCCESS:
-                obstacle = self._obstacle
-                if isinstance(obstacle, BlfDscError):
-                    raise obstacle
-                raise TransitionError(self.get_name(), step, repr(obstacle)) from obstacle
+            if step() != TransitionCallbackReturn.SUCCESS:
+                error = self._transition_error
+                if isinstance(error, BlfDscError):
+                    raise error
+                raise BlfDscError(f'{self.get_name()} could not {name}: {error!r}') from error
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Answer the request to configure."""
-        return self._attempt(self.configure, state)
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: D102
+        return self._try(self.configure, state)
 
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Answer the request to activate."""
-        return self._attempt(self.activate, state)
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: D102
+        return self._try(self.activate, state)
 
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Answer the request to deactivate."""
-        return self._attempt(self.deactivate, state)
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: D102
+        return self._try(self.deactivate, state)
 
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Answer the request to clean up."""
-        return self._attempt(self.release, state)
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: D102
+        return self._try(self.release, state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Answer the request to shut down, after which the process ends."""
-        answer = self._attempt(self.release, state)
+        """Release everything and end the process."""
+        result = self._try(self.release, state)
         self.finished = True
-        return answer
+        return result
 
     def on_error(self, _state: LifecycleState) -> TransitionCallbackReturn:
-        """Go back to unconfigured after an error nobody foresaw."""
+        """Return to unconfigured after an unforeseen error."""
         self.release()
         return TransitionCallbackReturn.SUCCESS
 
-    def _attempt(
-        self, step: Callable[[], None], _state: LifecycleState
-    ) -> TransitionCallbackReturn:
+    def _try(self, step: Callable[[], None], _state: LifecycleState) -> TransitionCallbackReturn:
         try:
             step()
         except BlfDscError as error:
-            self._obstacle = error
+            self._transition_error = error
             self.get_logger().error(str(error))
             return TransitionCallbackReturn.FAILURE
-        except Exception as error:  # noqa: BLE001 - rclpy would swallow it without a word
-            self._obstacle = error
+        except Exception as error:  # noqa: BLE001 - rclpy would drop it silently
+            self._transition_error = error
             self.get_logger().error(traceback.format_exc())
             return TransitionCallbackReturn.ERROR
         return TransitionCallbackReturn.SUCCESS
 
-    def _on_change_request(
-        self, request: ChangeState.Request, response: ChangeState.Response
-    ) -> ChangeState.Response:
-        """Refuse a transition that is not possible now: rclpy lets it end the process."""
-        try:
-            return self._take_request(request, response)
-        except RCLError:
-            wanted = request.transition.label or request.transition.id
-            self.get_logger().warning(f'no transition {wanted} from {self.state_label}: refused')
-            response.success = False
-            return response
+    def _rejecting(self, change_state: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        """Reject impossible transitions, which would otherwise end the process."""
+
+        def callback(request: ChangeState.Request, response: ChangeState.Response) -> Any:
+            try:
+                return change_state(request, response)
+            except RCLError:
+                wanted = request.transition.label or request.transition.id
+                self.get_logger().warning(
+                    f'no transition {wanted} from {self.state_label}: rejected'
+                )
+                response.success = False
+                return response
+
+        return callback

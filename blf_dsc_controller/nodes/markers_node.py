@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `arm_markers`: the reference as a ghost, the bound at its tip, torques as arrows.
 
-It looks at the newest messages a few times a second instead of being called for each of them.
+It takes the newest messages a few times a second instead of a callback for each of them.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Point
-from rclpy.clock import Clock, ClockType
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -20,10 +19,10 @@ from blf_dsc_controller.configuration.nodes import MarkersConfig
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.decoders import JointStateDecoder
 from blf_dsc_controller.messages.errors import MessageError
-from blf_dsc_controller.nodes.endpoints import profile
-from blf_dsc_controller.nodes.executor import RunnableNode, run
+from blf_dsc_controller.nodes.endpoints import create_steady_timer, qos_profile
 from blf_dsc_controller.nodes.parameters import declare
-from blf_dsc_controller.nodes.raw_subscriptions import Intake
+from blf_dsc_controller.nodes.process import PlainNode, run
+from blf_dsc_controller.nodes.raw_subscriptions import RawSubscriptions
 
 NAME = 'arm_markers'
 _DEPTH = 1  # only the newest counts
@@ -33,11 +32,8 @@ _TORQUE = ColorRGBA(r=0.9, g=0.2, b=0.2, a=0.9)
 _WIDTH = 0.01  # m
 
 
-class MarkersNode(RunnableNode):
+class MarkersNode(PlainNode):
     """Publishes `~/markers`.
-
-    Args:
-        options: of rclpy's Node (context, namespace, parameter_overrides, ...).
 
     Raises:
         ConfigurationError: a parameter is wrong.
@@ -49,22 +45,23 @@ class MarkersNode(RunnableNode):
         joints = self._config.joints
         watched = (topics.JOINT_STATES, topics.REFERENCE, topics.BOUND)
         self._decoders = [JointStateDecoder(joints, required=('position',)) for _ in watched]
-        self._intake = Intake(self.context, f'_{self.get_name()}_intake', _DEPTH)
+        self._raw_subscriptions = RawSubscriptions(
+            self.context, f'_{self.get_name()}_subscriptions', _DEPTH
+        )
         for handle, topic in enumerate(watched):
             name = self.resolve_topic_name(topic.relative)
-            self._intake.subscribe(name, topic.type, [topic.offered], handle)
-        self._markers = self.create_publisher(MarkerArray, '~/markers', profile(topics.LATEST))
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(self._config.period, self._draw, clock=steady)
+            self._raw_subscriptions.subscribe(name, topic.type, [topic.offered], handle)
+        self._markers = self.create_publisher(MarkerArray, '~/markers', qos_profile(topics.LATEST))
+        create_steady_timer(self, self._config.period, self._draw)
 
     def close(self) -> None:
         """End the subscriptions."""
-        self._intake.close()
+        self._raw_subscriptions.close()
 
     def _draw(self) -> None:
-        for arrival in self._intake.take():
+        for message in self._raw_subscriptions.take():
             try:
-                self._decoders[arrival.handle].decode(arrival.raw)
+                self._decoders[message.handle].decode(message.raw)
             except MessageError as error:
                 self.get_logger().warning(f'not drawn: {error}', throttle_duration_sec=10.0)
         state, reference, bound = self._decoders

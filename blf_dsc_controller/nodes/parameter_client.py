@@ -1,109 +1,90 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Asking other nodes for their parameters: the configuration that is really in force.
+"""Reads the parameters of other nodes: the configuration that is really in force.
 
-The clients belong to a node that no executor spins, and their answers are fetched by the owner: the
+The clients belong to a node that no executor spins, and the owner polls for the responses: the
 EventsExecutor of these releases crashes when clients come and go.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import GetParameters, ListParameters
+from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
+
+from blf_dsc_controller.nodes.rclpy_internals import take_response
 
 Values = Mapping[str, Any]
 
 _WITHOUT_YAML = (ParameterType.PARAMETER_NOT_SET, ParameterType.PARAMETER_BYTE_ARRAY)
 
 
-class Inquiry:
-    """Asks each node once, when its parameter services are there.
+class ParameterClient:
+    """Reads the parameters of each requested node once, when its services are there.
 
     Args:
-        tell: called with the full name of a node and the values of its parameters.
+        callback: called with the full name of a node and the values of its parameters.
     """
 
-    def __init__(self, tell: Callable[[str, Values], None]) -> None:
-        self._tell = tell
-        self._conversations: dict[str, _Conversation] = {}
+    def __init__(self, callback: Callable[[str, Values], None]) -> None:
+        self._callback = callback
+        self._requests: dict[str, Iterator[Values | None]] = {}
+        self._known: set[str] = set()
 
     @property
-    def unanswered(self) -> tuple[str, ...]:
-        """Nodes that have not answered yet."""
-        return tuple(name for name, one in self._conversations.items() if not one.is_over)
+    def pending(self) -> tuple[str, ...]:
+        """Nodes that have not responded yet."""
+        return tuple(self._requests)
 
-    def of(self, node: Node, name: str) -> None:
-        """Let `node`, which must not be spun, ask the node of this full name if it has not yet."""
-        if name not in self._conversations:
-            self._conversations[name] = _Conversation(node, name)
+    def request(self, node: Node, name: str) -> None:
+        """Read the parameters of the node of this full name by `node`, which must not be spun."""
+        if name not in self._known:
+            self._known.add(name)
+            self._requests[name] = _values_of(node, name)
 
-    def go_on(self) -> None:
-        """Ask whoever has become ready, and tell of whoever has answered."""
-        for name in self.unanswered:
-            values = self._conversations[name].go_on()
+    def poll(self) -> None:
+        """Send the requests that are possible now, and call back for complete responses."""
+        for name in self.pending:
+            values = next(self._requests[name])
             if values is not None:
-                self._tell(name, values)
+                del self._requests[name]
+                self._callback(name, values)
 
 
-class _Conversation:
-    """First which parameters there are, then what they hold.
+def _values_of(node: Node, name: str) -> Iterator[Values | None]:
+    """Yield None until the values have come: first the names are listed, then their values.
 
-    Where one of them is declared but not set, rclpy answers with nothing at all: the names are then
-    asked for in halves, down to the one that is not set.
+    Where one of them is declared but not set, rclpy's response is empty: the names are then
+    requested in halves, down to the one that is not set.
     """
-
-    def __init__(self, node: Node, name: str) -> None:
-        self._listing = node.create_client(ListParameters, f'{name}/list_parameters')
-        self._getting = node.create_client(GetParameters, f'{name}/get_parameters')
-        self._batches: list[list[str]] = []
-        self._values: dict[str, Any] = {}
-        self._step = self._list
-        self.is_over = False
-
-    def go_on(self) -> dict[str, Any] | None:
-        """Take the next step that is possible; the values, once all have come."""
-        self._step()
-        return dict(sorted(self._values.items())) if self.is_over else None
-
-    def _list(self) -> None:
-        if self._listing.service_is_ready() and self._getting.service_is_ready():
-            self._listing.call_async(ListParameters.Request())
-            self._step = self._take_list
-
-    def _take_list(self) -> None:
-        listed = _answer(self._listing)
-        if listed is not None:
-            self._batches = [listed.result.names]
-            self._get()
-
-    def _get(self) -> None:
-        self.is_over = not self._batches
-        if self._batches:
-            self._getting.call_async(GetParameters.Request(names=self._batches[-1]))
-            self._step = self._take_values
-
-    def _take_values(self) -> None:
-        got = _answer(self._getting)
-        if got is None:
-            return
-        names = self._batches.pop()
+    listing = node.create_client(ListParameters, f'{name}/list_parameters')
+    getting = node.create_client(GetParameters, f'{name}/get_parameters')
+    while not (listing.service_is_ready() and getting.service_is_ready()):
+        yield None
+    listed = yield from _call(listing, ListParameters.Request())
+    batches = [list(listed.result.names)]
+    found = {}
+    while batches:
+        names = batches.pop()
+        got = yield from _call(getting, GetParameters.Request(names=names))
         if len(got.values) == len(names):
-            for name, value in zip(names, got.values, strict=True):
+            for parameter, value in zip(names, got.values, strict=True):
                 if value.type not in _WITHOUT_YAML:
-                    self._values[name] = _plain(value)
+                    found[parameter] = _plain(value)
         elif len(names) > 1:
             middle = len(names) // 2
-            self._batches += [names[:middle], names[middle:]]
-        self._get()
+            batches += [names[:middle], names[middle:]]
+    yield dict(sorted(found.items()))
 
 
-def _answer(client: Any) -> Any:
-    """Response that waits, None if none does."""
-    _, response = client.handle.take_response(client.srv_type.Response)
+def _call(client: Client, request: Any) -> Any:
+    client.call_async(request)
+    while (response := take_response(client)) is None:
+        yield None
     return response
 
 

@@ -24,6 +24,7 @@ from blf_dsc_controller.configuration.schema import (
     parameters,
 )
 from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.nodes.rclpy_internals import parameter_overrides
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -154,7 +155,7 @@ def _given(node: Node, cls: type[Config]) -> dict[str, Any]:
     """
     own = {one.name: one.kind for one in parameters(cls)}
     others = known_names() - own.keys()
-    given = node._parameter_overrides  # noqa: SLF001 - rclpy shows them nowhere else
+    given = parameter_overrides(node)
     return {
         name: [] if parameter.value is None and _is_array(own.get(name)) else parameter.value
         for name, parameter in given.items()

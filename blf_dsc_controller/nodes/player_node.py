@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `rosbag2_player`: publishes a bag again, and is led by the services of rosbag2's player.
+"""The node `rosbag2_player`: plays a bag, with the services of rosbag2's player.
 
-They are called as rosbag2 calls them. Their types come without wheels, so std_srvs/Trigger stands
-in for all; `is_paused` answers in `success`, and `play_next` says there whether it played one.
+The services have rosbag2's names. Its service types are not available as wheels, so all of them
+are std_srvs/Trigger: `is_paused` and `play_next` return their result in `success`.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from blf_dsc_controller.bags.errors import EmptyBagError
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.messages.encoders import encode_clock
 from blf_dsc_controller.messages.topics import CLOCK, HISTORY, STREAM
-from blf_dsc_controller.nodes.endpoints import message_class, profile
-from blf_dsc_controller.nodes.executor import drain
+from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
+from blf_dsc_controller.nodes.process import drain
 from blf_dsc_controller.replay.timeline import Timeline
 
 _MOST_AT_ONCE = 100
@@ -32,7 +32,7 @@ _LATCHED = ('bound',)
 
 
 class PlayerNode(Node):
-    """Publishes the messages of a bag as time goes by.
+    """Publishes the messages of a bag in its time.
 
     Args:
         path: of the bag.
@@ -61,17 +61,17 @@ class PlayerNode(Node):
         self._clock_output = (
             self.create_publisher(message_class(CLOCK.type), '/clock', 10) if clock else None
         )
-        self._clock_told = 0
+        self._clock_published = 0
         for name, action in self._actions().items():
-            self.create_service(Trigger, f'~/{name}', _answer(action))
+            self.create_service(Trigger, f'~/{name}', _callback(action))
 
     def play(self) -> None:
         """Publish what is due."""
         now = time.monotonic_ns()
         for number in self.timeline.due(now, _MOST_AT_ONCE):
             self._publish(number)
-        if self._clock_output is not None and now - self._clock_told >= _CLOCK_PERIOD:
-            self._clock_told = now
+        if self._clock_output is not None and now - self._clock_published >= _CLOCK_PERIOD:
+            self._clock_published = now
             self._clock_output.publish(encode_clock(self.timeline.position(now)))
 
     def drain(self) -> None:
@@ -85,7 +85,7 @@ class PlayerNode(Node):
             self.get_logger().warning(f'{name} is not played: {type_name} is not installed here')
             return None
         quality = HISTORY if name.rsplit('/', 1)[-1] in _LATCHED else STREAM
-        return self.create_publisher(class_, name, profile(quality))
+        return self.create_publisher(class_, name, qos_profile(quality))
 
     def _publish(self, number: int) -> None:
         output, raw = self._messages[number]
@@ -116,12 +116,12 @@ class PlayerNode(Node):
         return True, f'message {number + 1} of {len(self._messages)}'
 
 
-def _answer(action: Callable[[], tuple[bool, str]]) -> Callable[[Any, Any], Any]:
-    def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+def _callback(action: Callable[[], tuple[bool, str]]) -> Callable[[Any, Any], Any]:
+    def callback(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success, response.message = action()
         return response
 
-    return answer
+    return callback
 
 
 def play(

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `bag_recorder`: every message of the chosen topics into a bag, undecoded."""
+"""The node `bag_recorder`: every message of the chosen topics into a bag, without decoding."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
 from typing import Any
-
-from rclpy.clock import Clock, ClockType
 
 from blf_dsc_controller.bags.context import MESSAGES
 from blf_dsc_controller.bags.errors import DiskFullError, WriteError
@@ -16,13 +14,16 @@ from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.configuration.params_file import dumps_values
 from blf_dsc_controller.messages.errors import UnknownTypeError
 from blf_dsc_controller.messages.topics import Quality
-from blf_dsc_controller.nodes.bag_sinks import BlackBox, Recording
-from blf_dsc_controller.nodes.endpoints import message_class
-from blf_dsc_controller.nodes.executor import RunnableNode, run
-from blf_dsc_controller.nodes.message_definitions import learn
-from blf_dsc_controller.nodes.parameter_client import Inquiry, Values
+from blf_dsc_controller.nodes.bag_sinks import BagSink, RingSink
+from blf_dsc_controller.nodes.endpoints import (
+    create_steady_timer,
+    message_class,
+    register_definition,
+)
+from blf_dsc_controller.nodes.parameter_client import ParameterClient, Values
 from blf_dsc_controller.nodes.parameters import declare
-from blf_dsc_controller.nodes.raw_subscriptions import Intake, quality_of
+from blf_dsc_controller.nodes.process import PlainNode, run
+from blf_dsc_controller.nodes.raw_subscriptions import RawSubscriptions, quality_of
 
 _DISCOVERY_PERIOD = 0.1  # s
 _TAKE_PERIOD = 0.01  # s
@@ -30,11 +31,8 @@ _UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'  # rmw's words
 _OF_EVERY_NODE = ('/parameter_events', '/rosout')
 
 
-class BagRecorderNode(RunnableNode):
-    """Subscribes to topics as they appear and writes what comes.
-
-    Args:
-        options: of rclpy's Node (context, namespace, parameter_overrides, ...).
+class BagRecorderNode(PlainNode):
+    """Subscribes to topics as they appear and records their messages.
 
     Raises:
         ConfigurationError: a parameter is wrong.
@@ -45,27 +43,28 @@ class BagRecorderNode(RunnableNode):
         super().__init__('bag_recorder', enable_rosout=False, **options)
         self._config = declare(self, RecorderConfig)
         self._chosen = {self.resolve_topic_name(name) for name in self._config.topics}
-        hidden_name = f'_{self.get_name()}_intake'
-        self._intake = Intake(self.context, hidden_name, self._config.queue_depth)
+        hidden_name = f'_{self.get_name()}_subscriptions'
+        self._raw_subscriptions = RawSubscriptions(
+            self.context, hidden_name, self._config.queue_depth
+        )
         self._losses: dict[str, Losses] = {}
-        self._by_handle: dict[int, Losses] = {}
-        self._passed_over: set[str] = set()
+        self._losses_by_handle: dict[int, Losses] = {}
+        self._skipped: set[str] = set()
         self._anonymous: set[str] = set()
-        self._inquiry = Inquiry(self._on_parameters)
-        self._parameters: dict[str, Values] = {}
-        steady = Clock(clock_type=ClockType.STEADY_TIME)  # not the plant's, which may wait for it
-        self.create_timer(_DISCOVERY_PERIOD, self._discover, clock=steady)
-        self.create_timer(_TAKE_PERIOD, self._record, clock=steady)
+        self._parameter_client = ParameterClient(self._on_parameters)
+        self.parameters_of: dict[str, Values] = {}
+        create_steady_timer(self, _DISCOVERY_PERIOD, self._discover)
+        create_steady_timer(self, _TAKE_PERIOD, self._record)
         # The folder comes last: whatever ends the node from here on also completes the bag.
-        self._sink = BlackBox(self, self._config) if self._config.ring else Recording(self._config)
-        self.get_logger().info(self._sink.beginning)
+        self._sink = RingSink(self, self._config) if self._config.ring else BagSink(self._config)
+        self.get_logger().info(self._sink.notice)
 
     def close(self) -> None:
-        """Write what still waits, complete the bag and tell what is in it."""
+        """Write what still waits, complete the bag and log a summary."""
         if self.failure is None:
             self._record()
-        self._intake.close()
-        self._sink.close(self._statistics())
+        self._raw_subscriptions.close()
+        self._sink.finish(self._statistics())
         for line in self._summary():
             self.get_logger().info(line)
 
@@ -74,25 +73,25 @@ class BagRecorderNode(RunnableNode):
             if topic in self._losses:
                 self._losses[topic].publishers_seen(self.count_publishers(topic))
                 if topic in self._anonymous:
-                    self._ask_publishers(topic)
-            elif topic not in self._passed_over and self._wanted(topic):
+                    self._request_parameters(topic)
+            elif topic not in self._skipped and self._wanted(topic):
                 self._consider(topic, types)
 
-    def _ask_publishers(self, topic: str) -> None:
-        """Ask them for their parameters; a node's name may become known after its publishers."""
+    def _request_parameters(self, topic: str) -> None:
+        """Request those of the publishers; a node's name may be discovered after its publishers."""
         names = [
             f'{one.node_namespace.rstrip("/")}/{one.node_name}'
             for one in self.get_publishers_info_by_topic(topic)
         ]
         known = [name for name in names if not name.endswith(_UNKNOWN_NODE)]
         for name in known:
-            self._inquiry.of(self._intake.node, name)
+            self._parameter_client.request(self._raw_subscriptions.node, name)
         if known == names:
             self._anonymous.discard(topic)
 
     def _on_parameters(self, node: str, values: Values) -> None:
-        self._parameters[node] = values
-        self._sink.configure(dumps_values(self._parameters))
+        self.parameters_of[node] = values
+        self._sink.configure(dumps_values(self.parameters_of))
 
     def _wanted(self, topic: str) -> bool:
         if self._chosen:
@@ -104,44 +103,50 @@ class BagRecorderNode(RunnableNode):
         if not publishers:
             return
         if len(types) > 1:
-            self._pass_over(topic, f'it has several types, {" and ".join(types)}')
+            self._skip(topic, f'it has several types, {" and ".join(types)}')
             return
         offered = [quality_of(publisher.qos_profile) for publisher in publishers]
-        self._record(hand_over=True)  # importing a type, and its first subscription, may take 0.1 s
+        self._record(flush=True)  # importing a type, and its first subscription, may take 0.1 s
         try:
             message_class(types[0])
-            learn(types[0])
+            register_definition(types[0])
         except (ImportError, AttributeError, UnknownTypeError):
-            self._pass_over(topic, f'its type {types[0]} is not installed here')
+            self._skip(topic, f'its type {types[0]} is not installed here')
             return
         self._start(topic, types[0], offered)
 
     def _start(self, topic: str, type_name: str, offered: list[Quality]) -> None:
-        self._record(hand_over=True)
+        self._record(flush=True)
         if self.failure is not None:
             return
         handle = self._sink.add_topic(topic, type_name, offered)
-        self._losses[topic] = self._by_handle[handle] = Losses(len(offered))
-        self._intake.subscribe(topic, type_name, offered, handle)
+        self._losses[topic] = self._losses_by_handle[handle] = Losses(len(offered))
+        self._raw_subscriptions.subscribe(topic, type_name, offered, handle)
         if topic not in _OF_EVERY_NODE:
             self._anonymous.add(topic)
-            self._ask_publishers(topic)
+            self._request_parameters(topic)
         self.get_logger().info(f'recording {topic} ({type_name})')
 
-    def _pass_over(self, topic: str, reason: str) -> None:
-        self._passed_over.add(topic)
+    def _skip(self, topic: str, reason: str) -> None:
+        self._skipped.add(topic)
         self.get_logger().warning(f'{topic} is not recorded: {reason}')
 
-    def _record(self, *, hand_over: bool = False) -> None:
-        """Take what has come; `hand_over` all of it to the disk, or what has waited long enough."""
+    def _record(self, *, flush: bool = False) -> None:
+        """Write the waiting messages; `flush` all of them to the disk, or what is due."""
         if self.failure is not None:
             return
         try:
-            for arrival in self._intake.take():
-                self._by_handle[arrival.handle].count(arrival.sequence)
-                self._sink.write(arrival)
-            self._inquiry.go_on()
-            if hand_over:
+            for message in self._raw_subscriptions.take():
+                self._losses_by_handle[message.handle].count(message.sequence)
+                self._sink.write(
+                    message.handle,
+                    message.raw,
+                    message.received,
+                    message.published,
+                    message.sequence,
+                )
+            self._parameter_client.poll()
+            if flush:
                 self._sink.flush()
             else:
                 self._sink.flush_if_due()
@@ -156,10 +161,10 @@ class BagRecorderNode(RunnableNode):
         }
 
     def _summary(self) -> Iterator[str]:
-        for topic in self._chosen.difference(self._losses, self._passed_over):
+        for topic in self._chosen.difference(self._losses, self._skipped):
             yield f'{topic}: never appeared'
-        for node in self._inquiry.unanswered:
-            yield f'{node}: did not tell its parameters'
+        for node in self._parameter_client.pending:
+            yield f'{node}: its parameters could not be read'
         for topic, count in self._sink.message_counts.items():
             yield f'{topic}: {count} messages{self._losses[topic].text()}'
 

@@ -16,7 +16,7 @@ from trajectory_msgs.msg import JointTrajectory
 from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.topics import ACCEPTED_TRAJECTORY, JOINT_TRAJECTORY
 from blf_dsc_controller.messages.trajectory import request_of, told_begin
-from blf_dsc_controller.nodes.endpoints import profile, publisher
+from blf_dsc_controller.nodes.endpoints import create_publisher, qos_profile
 from blf_dsc_controller.reference.trajectory import TrajectoryError
 from blf_dsc_controller.supervision.guard import Guard
 
@@ -41,8 +41,8 @@ class TrajectoryInput:
         self.reason = ''
         self._log = node.get_logger()
         self._guard = guard
-        self._accepted = publisher(node, ACCEPTED_TRAJECTORY) if telemetry else None
-        name, quality = JOINT_TRAJECTORY.name, profile(JOINT_TRAJECTORY.requested)
+        self._accepted = create_publisher(node, ACCEPTED_TRAJECTORY) if telemetry else None
+        name, quality = JOINT_TRAJECTORY.name, qos_profile(JOINT_TRAJECTORY.requested)
         node.create_subscription(JointTrajectory, name, self._take, quality)
 
     @property

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Running one node as a process: scheduling, spinning, and an end with the right exit code."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import TypeAlias
+
+import rclpy
+from rclpy.duration import Duration
+from rclpy.experimental import EventsExecutor
+from rclpy.impl.rcutils_logger import RcutilsLogger
+from rclpy.logging import get_logger
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+
+from blf_dsc_controller.compiled import COMPILATION_NOTICE
+from blf_dsc_controller.compiled.jit import is_compiled
+from blf_dsc_controller.configuration.common import Realtime
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.nodes.lifecycle import ManagedNode
+from blf_dsc_controller.nodes.rclpy_internals import RCLError, UnknownROSArgsError
+
+_POLL = 0.1  # s; EventsExecutor has no usable spin()
+_DRAIN_TIMEOUT = 10.0  # s for all topics; a recorder on a busy machine has been seen 2 s behind
+
+_THREADS = Path('/proc/self/task')
+_MCL_CURRENT = 1
+_MCL_FUTURE = 2
+
+
+class PlainNode(Node):
+    """A node without a life cycle for `run`.
+
+    Attributes:
+        finished: True once the node has nothing more to do.
+        failure: why the node cannot go on; the process ends with it.
+    """
+
+    finished = False
+    failure: BlfDscError | None = None
+
+    def close(self) -> None:
+        """Save and release what must not be lost, while ROS is still up."""
+
+
+Runnable: TypeAlias = PlainNode | ManagedNode
+
+
+def run(make_node: Callable[[], Runnable]) -> int:
+    """Run a node until it has finished, a signal comes, or it fails.
+
+    Returns:
+        Exit code: 0 at the end or on SIGINT and SIGTERM, 1 after an error, which is on stderr.
+    """
+    signals: list[int] = []  # a flag, so that no callback is cut off in the middle
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: signals.append(number))
+    node: Runnable | None = None
+    problem = ''
+    try:
+        rclpy.init(args=sys.argv, signal_handler_options=rclpy.SignalHandlerOptions.NO)
+        executor = EventsExecutor()
+        node = make_node()
+        executor.add_node(node)
+        while not (signals or node.finished):
+            executor.spin_once(timeout_sec=_POLL)
+        executor.remove_node(node)
+        if node.failure is not None:
+            raise node.failure
+    except UnknownROSArgsError as error:
+        problem = f'arguments after --ros-args that ROS does not know: {error}'
+    except (BlfDscError, RCLError, OSError) as error:
+        problem = str(error)
+    finally:
+        if node is not None:
+            _close(node)
+        rclpy.try_shutdown()
+    if problem:  # last, so that it stands at the end of the output
+        print(problem, file=sys.stderr)  # noqa: T201
+        return 1
+    return 0
+
+
+def _close(node: Runnable) -> None:
+    try:
+        node.close()
+    except OSError as error:  # such as a full disk, already reported if it ended the node
+        print(f'{node.get_name()} could not end in order: {error}', file=sys.stderr)  # noqa: T201
+    node.destroy_node()
+
+
+def drain(publishers: Iterable[Publisher]) -> None:
+    """Wait until every subscriber has received what was published, so that bags are complete."""
+    deadline = time.monotonic() + _DRAIN_TIMEOUT
+    for publisher in publishers:
+        left = max(0.0, deadline - time.monotonic())
+        if not publisher.wait_for_all_acked(Duration(seconds=left)):
+            get_logger('end').warning(
+                f'{publisher.topic_name}: the last messages have not reached every subscriber'
+            )
+
+
+def log_compilation(logger: RcutilsLogger, *kernels: Callable[..., object]) -> None:
+    """Log that kernels are about to be compiled, before a wait that would look like a fault."""
+    if not is_compiled(*kernels):
+        logger.info(COMPILATION_NOTICE)
+
+
+def request_realtime(realtime: Realtime, logger: RcutilsLogger) -> None:
+    """Request SCHED_FIFO and locked memory as configured; a refusal is logged as a warning."""
+    if realtime.priority > 0:
+        try:
+            _schedule(realtime.priority)
+        except OSError as error:
+            logger.warning(
+                f'SCHED_FIFO priority {realtime.priority} refused ({error.strerror}): running with '
+                'the default scheduling; allow it with a limit on rtprio for this user'
+            )
+        else:
+            logger.info(f'running with SCHED_FIFO priority {realtime.priority}')
+    if realtime.lock_memory:
+        libc = ctypes.CDLL(None, use_errno=True)
+        if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
+            reason = os.strerror(ctypes.get_errno())
+            logger.warning(
+                f'locking memory refused ({reason}): pages may be swapped out; allow it with a '
+                'limit on memlock for this user'
+            )
+        else:
+            logger.info('memory locked')
+
+
+def _schedule(priority: int) -> None:
+    """Schedule all threads alike: states and torques pass through the middleware's threads, too.
+
+    One left behind, even at the next lower priority, makes the others wait for it [measured].
+    """
+    for thread in _THREADS.iterdir():
+        with suppress(ProcessLookupError):  # it has ended meanwhile
+            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Everything that the nodes use of rclpy 7 that is private or undocumented."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
+from rclpy.client import Client
+from rclpy.lifecycle import LifecycleNode
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.subscription import Subscription
+
+__all__ = [
+    'RCLError',
+    'UnknownROSArgsError',
+    'lifecycle_state',
+    'parameter_overrides',
+    'take_messages',
+    'take_response',
+    'wrap_change_state',
+]
+
+
+def parameter_overrides(node: Node) -> Mapping[str, Parameter]:
+    """Parameters from the files and arguments a node was started with, declared or not."""
+    return node._parameter_overrides  # noqa: SLF001
+
+
+def take_messages(
+    subscription: Subscription, limit: int
+) -> Iterator[tuple[bytes, Mapping[str, int | None]]]:
+    """Take up to `limit` waiting messages of a subscription that no executor spins.
+
+    Yields:
+        The serialised message with `source_timestamp` [ns], `received_timestamp` [ns] and
+        `publication_sequence_number`, each None where the middleware does not know it.
+    """
+    take, type_ = subscription.handle.take_message, subscription.msg_type
+    for _ in range(limit):
+        taken = take(type_, True)  # noqa: FBT003 - serialised; positional in rclpy
+        if taken is None:
+            return
+        yield taken
+
+
+def take_response(client: Client) -> Any:
+    """Take a response from a client that no executor spins; None if none has come."""
+    type_: Any = client.srv_type
+    _, response = client.handle.take_response(type_.Response)
+    return response
+
+
+def lifecycle_state(node: LifecycleNode) -> str:
+    """State of a lifecycle node: unconfigured, inactive, active or finalized."""
+    return str(node._state_machine.current_state[1])  # noqa: SLF001
+
+
+def wrap_change_state(
+    node: LifecycleNode, wrap: Callable[[Callable[[Any, Any], Any]], Callable[[Any, Any], Any]]
+) -> None:
+    """Replace the callback of the service `~/change_state` by `wrap(callback)`."""
+    service = node._service_change_state  # noqa: SLF001
+    service.callback = wrap(service.callback)
