@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A closed loop to break: arm, messages, guarded controller, and clocks that the test turns.
 
-Everything passes through the same decoders, supervisor and torque input as in the nodes, without ROS.
+Everything passes through the same decoders, supervisor and torque input as in the nodes.
 """
 
 from __future__ import annotations

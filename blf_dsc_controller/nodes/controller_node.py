@@ -86,7 +86,7 @@ class ControllerNode(ManagedNode):
         self._observed = self._started = False
         self._outputs: dict[topics.Topic, Publisher] = {}
         self._status = ControllerStatus(self, joints)
-        self._watch_timer = create_steady_timer(self, _POLL_PERIOD, self._on_watch_timer)
+        self._watch_timer = create_steady_timer(self, _POLL_PERIOD, self._on_poll)
         create_steady_timer(self, _DIAGNOSTICS_PERIOD, self._report)
         parameters.on_change(self, ControllerConfig, self._retune, self._problems)
         self.create_service(Trigger, '~/reset', self._on_reset)
@@ -238,7 +238,7 @@ class ControllerNode(ManagedNode):
         observers = self.config.wait_for_subscribers
         return have_subscribers(self._outputs, topics.COMMANDS, observers)
 
-    def _on_watch_timer(self) -> None:
+    def _on_poll(self) -> None:
         """Watch, and set the timer to when there may be something to see: waking up is costly."""
         wait = _POLL_PERIOD
         if self.guard is not None:
