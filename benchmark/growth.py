@@ -38,7 +38,7 @@ def chain(n: int, **changes: Any) -> ControllerConfig:
     default: Mapping[str, Any] = flatten(ControllerConfig())
     values: dict[str, Any] = {'model': 'planar_chain', 'joints': [f'joint{i}' for i in range(n)]}
     for one in parameters(ControllerConfig):
-        if one.rule.length == ('joints',):
+        if one.length == ('joints',):
             values[one.name] = [default[one.name][0]] * n
     p = n * (n + 1) // 2
     values |= {

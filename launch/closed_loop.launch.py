@@ -13,7 +13,7 @@ from blf_dsc_controller.arms.two_link_urdf import urdf
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.params_file import load, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.share import config_file
+from blf_dsc_controller.configuration.share import share_folder
 
 PACKAGE = 'blf_dsc_controller'
 
@@ -101,6 +101,6 @@ def view(namespace: str, config: str) -> list[Node]:
             package='rviz2',
             executable='rviz2',
             namespace=namespace,
-            arguments=['-d', str(config_file('arm.rviz'))],
+            arguments=['-d', str(share_folder() / 'config' / 'arm.rviz')],
         ),
     ]

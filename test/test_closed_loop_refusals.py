@@ -39,7 +39,7 @@ def written(folder, plant='', controller=''):
 @pytest.mark.parametrize(
     ('plant', 'controller', 'told'),
     [
-        ('', 'barier.bound: [0.1, 0.1]', 'barier.bound: there is no parameter of this name'),
+        ('', 'barier.bound: [0.1, 0.1]', 'barier.bound: unknown parameter'),
         ('', 'barrier.bound: [0.1]', 'barrier.bound: got 1 entry, but 2 are needed'),
         ('', 'feedback.gain: [-6.0, 2.0]', 'feedback.gain: got -6.0 at entry 1'),
         ('', 'barrier.bound: [0.0, 0.1]', 'barrier.bound: got 0.0 at entry 1'),

@@ -7,14 +7,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-from blf_dsc_controller.configuration.documentation import reference_table
+from blf_dsc_controller.configuration.documentation import parameter_page
 from blf_dsc_controller.configuration.nodes import known_names
 
 COMMITTED = Path(__file__).parents[1] / 'doc' / 'parameters.md'
 
 
 def test_the_committed_table_is_up_to_date():
-    assert COMMITTED.read_text(encoding='utf-8') == reference_table(), (
+    assert COMMITTED.read_text(encoding='utf-8') == parameter_page(), (
         'run: python -m blf_dsc_controller.configuration.documentation doc/parameters.md'
     )
 
@@ -23,10 +23,10 @@ def test_the_command_it_names_writes_it(tmp_path):
     page = tmp_path / 'parameters.md'
     module = 'blf_dsc_controller.configuration.documentation'
     subprocess.run([sys.executable, '-m', module, str(page)], check=True, cwd=COMMITTED.parents[1])
-    assert page.read_text(encoding='utf-8') == reference_table()
+    assert page.read_text(encoding='utf-8') == parameter_page()
 
 
 def test_every_parameter_has_a_row_of_eight_cells():
-    rows = [row for row in reference_table().splitlines() if row.startswith('| `')]
+    rows = [row for row in parameter_page().splitlines() if row.startswith('| `')]
     assert {row.split('`')[1] for row in rows} == known_names()
     assert {row.replace('\\|', '').count('|') for row in rows} == {9}

@@ -110,7 +110,7 @@ def test_a_start_outside_the_bound_names_joint_error_and_bound(loop):
 @pytest.mark.parametrize(
     ('given', 'told'),
     [
-        ({'feedback.gian': [1.0, 1.0]}, 'feedback.gian: there is no parameter of this name'),
+        ({'feedback.gian': [1.0, 1.0]}, 'feedback.gian: unknown parameter'),
         ({'feedback.gain': [-1.0, 2.0]}, 'feedback.gain: got -1.0 at entry 1'),
         ({'barrier.bound': [0.002, 0.0]}, 'barrier.bound: got 0.0 at entry 2'),
         ({'torque.limit': [20.0]}, 'torque.limit: got 1 entry, but 2 are needed'),

@@ -103,8 +103,8 @@ def test_everything_wrong_is_told_at_once_and_nothing_is_declared(start):
     content = 'arm: {l1: 1}, seed: -1, integrator: euler, sensr.resolution: 1.0, initial: {v: x}'
     node = start(text=f'sim_plant:\n  ros__parameters: {{{content}}}\n')
     assert refused(node, PlantConfig) == [
-        'sensr.resolution: there is no parameter of this name: did you mean sensor.resolution?',
-        'initial.v: there is no parameter of this name: did you mean initial.velocity?',
+        'sensr.resolution: unknown parameter, did you mean sensor.resolution?',
+        'initial.v: unknown parameter, did you mean initial.velocity?',
         'seed: got -1, but it must be at least 0',
         "integrator: got 'euler', but it must be one of dopri5, rk4",
         'arm.l1: got 1, but a double is expected: write 1.0 instead of 1',
@@ -118,8 +118,8 @@ def test_everything_wrong_is_told_at_once_and_nothing_is_declared(start):
         ({'initial.position': [1.0]}, 'initial.position: got 1 entry, but 2 are needed'),
         ({'initial.position': [1, 2]}, 'initial.position: got [1, 2], but a double array is'),
         ({'sample_time': float('nan')}, 'sample_time: got nan, but a finite number is needed'),
-        ({'sample_time': 1 / 3000}, 'sample_time: got 0.0003333333333333333 s, no whole number'),
-        ({'joints': ['a', 'a']}, "joints: 'a' is there more than once"),
+        ({'sample_time': 1 / 3000}, 'sample_time: got 0.0003333333333333333 s, not a whole number'),
+        ({'joints': ['a', 'a']}, "joints: the name 'a' is repeated"),
         ({'mode': True}, 'mode: got true, but a string is expected'),
     ],
 )

@@ -12,9 +12,9 @@ import pytest
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.params_file import load_loop, locate
-from blf_dsc_controller.configuration.share import config_file
+from blf_dsc_controller.configuration.share import share_folder
 
-PRESETS = sorted(path.stem for path in config_file('').glob('*.yaml'))
+PRESETS = sorted(path.stem for path in (share_folder() / 'config').glob('*.yaml'))
 LAW = {'comparison': 'backstepping', 'comparison_detuned': 'backstepping'} | {
     name: name for name in ('model_based', 'slotine_li')
 }

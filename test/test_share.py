@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from blf_dsc_controller.configuration import share
-from blf_dsc_controller.configuration.share import config_file, share_folder
+from blf_dsc_controller.configuration.params_file import locate
+from blf_dsc_controller.configuration.share import share_folder
 from blf_dsc_controller.errors import BlfDscError
 
 
@@ -85,14 +86,15 @@ def test_current_folder_never_counts():
     assert str(Path.cwd()) not in str(error.value)
 
 
-@pytest.mark.parametrize('name', ['recommended', 'recommended.yaml'])
-def test_preset_by_name(tmp_path, name):
+@pytest.mark.parametrize('name', ['recommended', './recommended.yaml'])
+def test_the_name_of_a_preset_means_the_installed_one(tmp_path, name):
     folder = installed(data_folder(tmp_path, sysconfig.get_default_scheme()))
-    assert config_file(name) == folder / 'config' / 'recommended.yaml'
+    found = locate(name)
+    assert (found == folder / 'config' / 'recommended.yaml') == (name == 'recommended')
 
 
 def test_unknown_preset_is_answered_with_those_there_are(tmp_path):
     folder = installed(data_folder(tmp_path, sysconfig.get_default_scheme()))
     (folder / 'config' / 'paper.yaml').touch()
-    with pytest.raises(BlfDscError, match=r"no preset 'papre' .* are: paper, recommended"):
-        config_file('papre')
+    with pytest.raises(BlfDscError, match=r'papre does not exist: .* preset: paper, recommended'):
+        locate('papre')

@@ -1,65 +1,69 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each node that takes part in the loop is told about time and scheduling."""
+"""Parameters and checks that several nodes share."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
-from blf_dsc_controller.configuration.schema import parameter
+from blf_dsc_controller.configuration.schema import counted, non_negative, parameter
+
+PerJoint: TypeAlias = Annotated[tuple[float, ...], 'joints']
+"""An array with an entry for each joint."""
 
 _ROUNDING = 1e-12
 """Relative; the product of a decimal fraction and 1e9 is off by a few 1e-16."""
 
-_AT_START = 'the process asks for it once, before the first sample'
+_AT_START = 'the process requests it once, before the first sample'
 
 
 @dataclass(frozen=True)
 class Realtime:
-    """What the process asks of the operating system."""
+    """What the process requests from the operating system."""
 
-    priority: int = parameter(
+    priority: int = non_negative(
         0,
-        'SCHED_FIFO priority asked for; 0 leaves scheduling as it is',
-        at_least=0,
+        'SCHED_FIFO priority to request; 0: leave the scheduling as it is',
         at_most=99,
         read_only=_AT_START,
     )
     lock_memory: bool = parameter(
         False,
-        'keep all memory of the process from being swapped out',
+        'lock the memory of the process, so that it is never swapped out',
         read_only=_AT_START,
     )
 
 
 def autostart() -> Any:
-    """Field of a managed node that says whether it waits for a manager."""
+    """Declare whether a lifecycle node activates itself."""
     return parameter(
         True,
-        'configure and activate the node at once; false: wait for a manager to do it',
-        read_only='it only matters at the start',
+        'configure and activate the node at once; false: wait for a lifecycle manager',
+        read_only='it has no effect later',
     )
 
 
 def nanoseconds(sample_time: float) -> int:
-    """Return the sample time [s] in nanoseconds, the unit that stamps are counted in."""
+    """Return the sample time [s] in nanoseconds, the unit of the stamps."""
     return round(sample_time * 1e9)
 
 
 def sample_time_problems(sample_time: float) -> list[str]:
-    """Ask for whole nanoseconds, or stamps would drift from the time in the law."""
+    """Require whole nanoseconds: otherwise stamps drift from the time in the law."""
     whole = nanoseconds(sample_time)
     if abs(sample_time * 1e9 - whole) <= _ROUNDING * whole:
         return []
-    problem = (
-        f'sample_time: got {sample_time!r} s, no whole number of nanoseconds: '
-        f'write {whole * 1e-9:.9f}'
-    )
-    return [problem]
+    remedy = f'write {whole * 1e-9:.9f}'
+    return [f'sample_time: got {sample_time!r} s, not a whole number of nanoseconds: {remedy}']
 
 
-def joint_problems(joints: tuple[str, ...]) -> list[str]:
-    """Ask for a name of its own for each joint, since joints are matched by name."""
+def joint_problems(joints: tuple[str, ...], arm: str, needed: int | None) -> list[str]:
+    """Require distinct names, since joints are matched by name, and as many as the arm needs."""
     repeated = sorted({name for name in joints if joints.count(name) > 1})
-    problems = [f'joints: {name!r} is there more than once' for name in repeated]
-    return problems + ['joints: a name is empty'] * ('' in joints)
+    problems = [f'joints: the name {name!r} is repeated' for name in repeated]
+    if '' in joints:
+        problems.append('joints: a name is empty')
+    if needed is not None and len(joints) != needed:
+        got = counted(len(joints), 'name', 'names')
+        problems.append(f'joints: got {got}, but {arm} has {needed} joints')
+    return problems

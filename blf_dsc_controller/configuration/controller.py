@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from blf_dsc_controller.configuration.common import (
+    PerJoint,
     Realtime,
     autostart,
     joint_problems,
@@ -15,7 +16,7 @@ from blf_dsc_controller.configuration.common import (
 from blf_dsc_controller.configuration.gains import (
     Barrier,
     Comparison,
-    Disturbance,
+    DisturbanceEstimate,
     Feedback,
     Surface,
     Torque,
@@ -23,171 +24,123 @@ from blf_dsc_controller.configuration.gains import (
 )
 from blf_dsc_controller.configuration.learning import Learning
 from blf_dsc_controller.configuration.reference import Approach, MotionLimits, Reference
-from blf_dsc_controller.configuration.schema import parameter
+from blf_dsc_controller.configuration.schema import non_negative, parameter, positive
 
-SAFE_TORQUES = ('zero', 'damping', 'hold_gravity')
-
-
-WATCHDOGS = ('auto', 'on', 'off')
-
-
-VELOCITIES = ('measured', 'estimated')
-
-
-@dataclass(frozen=True)
-class Safety:
-    """MotionLimits past which the controller goes to its safe stop, and the torque it goes to."""
-
-    state_timeout: float = parameter(
-        0.04,
-        'time by which a joint state may be late, on the steady clock and by its stamp',
-        unit='s',
-        above=0.0,
-    )
-    watchdog: str = parameter(
-        'auto',
-        'watch for silence on the steady clock; auto: if the stamps are of this time of day, '
-        'which those of a lock-step plant are not',
-        choices=WATCHDOGS,
-    )
-    repeated_states: int = parameter(
-        3,
-        'states with the stamp of the last one that are passed over in a row',
-        unit='samples',
-        at_least=0,
-        at_most=1_000_000,
-    )
-    velocity: str = parameter(
-        'measured',
-        'velocity as measured, or estimated as the difference of two positions, from rest',
-        choices=VELOCITIES,
-        read_only='the filters hold what was measured with it',
-    )
-    velocity_limit: float = parameter(
-        50.0,
-        'velocity of a joint that is taken for a broken measurement',
-        unit='rad/s',
-        above=0.0,
-    )
-    error_ratio: float = parameter(
-        1.0,
-        'tracking error to stop at, as a multiple of the bound; only laws with a barrier are held '
-        'to it; 0: never',
-        at_least=0.0,
-    )
-    saturation_time: float = parameter(
-        0.5, 'time for which a torque may be at its limit without a break', unit='s', above=0.0
-    )
-    overrun_fraction: float = parameter(
-        0.4,
-        'part of the states that may be missed, on average over overrun_window',
-        above=0.0,
-        at_most=1.0,
-    )
-    overrun_window: float = parameter(
-        1.0, 'time over which missed states are averaged', unit='s', above=0.0
-    )
-    torque: str = parameter(
-        'zero',
-        'safe torque: none, damping -D dq, or the learned gravity with damping',
-        choices=SAFE_TORQUES,
-    )
-    damping: tuple[float, ...] = parameter(
-        (2.0, 1.0),
-        'damping of the safe torques that have any',
-        unit='N m s/rad',
-        symbol='D',
-        at_least=0.0,
-        length=('joints',),
-    )
-    stop_ramp: float = parameter(
-        0.0,
-        'time from the last torque of the law to the safe one after a fault; 0: at once',
-        unit='s',
-        at_least=0.0,
-    )
-    deactivation_ramp: float = parameter(
-        0.5, 'the same when the node is deactivated', unit='s', at_least=0.0
-    )
-    keep_estimates: bool = parameter(
-        True,
-        'go on from what was learned when the node is activated again; a reset forgets it',
-    )
-
-
-_LAID_OUT = 'the state of the law is laid out for it at the start'
-
-
-_MEASURED = 'what is already in the excitation window was measured with it'
-
-
+_SIZES = 'it sizes the state of the law'
+_WINDOW = 'the data in the excitation window depend on it'
 _TOPICS = 'topics are created once, when the node starts'
-
-
-@dataclass(frozen=True)
-class Model:
-    """Size of a model: how many joints it has, None for any number."""
-
-    joints: int | None
-
-    def parameters(self, joints: int) -> int:
-        """Number of unknown parameters: a planar arm has one for each pair of links."""
-        return joints * (joints + 1) // 2
-
 
 LAWS = ('blf_dsc', 'model_based', 'backstepping', 'slotine_li')
 
+MODELS: dict[str, int | None] = {'two_link': 2, 'planar_chain': None}
+"""Number of joints of each model of the arm; None: any number."""
 
-MODELS = {'two_link': Model(joints=2), 'planar_chain': Model(joints=None)}
+
+def parameter_count(joints: int) -> int:
+    """Return the number of unknown parameters of a planar arm: one for each pair of links."""
+    return joints * (joints + 1) // 2
 
 
 @dataclass(frozen=True)
 class ArmGeometry:
-    """The geometry that the regressor needs; masses and the second link's length are unknown."""
+    """Known geometry in the regressor; the masses and the length of the second link are learned."""
 
-    l1: float = parameter(
-        1.0, 'length of the first link', unit='m', symbol='l1', above=0.0, read_only=_MEASURED
-    )
+    l1: float = positive(1.0, 'length of the first link', 'm', 'l1', read_only=_WINDOW)
     gravity: float = parameter(
-        9.8, 'gravity; 0 for a horizontal arm', unit='m/s^2', symbol='g', read_only=_MEASURED
+        9.8, 'gravity; 0 for a horizontal arm', 'm/s^2', 'g', read_only=_WINDOW
+    )
+
+
+@dataclass(frozen=True)
+class Safety:
+    """Limits past which the controller makes a safe stop, and the torque of that stop."""
+
+    state_timeout: float = positive(
+        0.04, 'largest delay of a joint state, on the steady clock and by its stamp', 's'
+    )
+    watchdog: str = parameter(
+        'auto',
+        'steady-clock watchdog for missing joint states; auto: on if their stamps are wall-clock '
+        'time, which is not the case in lock-step',
+        choices=('auto', 'on', 'off'),
+    )
+    repeated_states: int = non_negative(
+        3,
+        'consecutive joint states with an unchanged stamp that are ignored',
+        'samples',
+        at_most=1_000_000,
+    )
+    velocity: str = parameter(
+        'measured',
+        'velocity as measured, or estimated from position differences, starting at rest',
+        choices=('measured', 'estimated'),
+        read_only='the filters hold data that depend on it',
+    )
+    velocity_limit: float = positive(
+        50.0, 'joint velocity above which a measurement is considered broken', 'rad/s'
+    )
+    error_ratio: float = non_negative(
+        1.0,
+        'tracking error to stop at, as a multiple of the bound, for laws with a barrier; 0: never',
+    )
+    saturation_time: float = positive(
+        0.5, 'longest uninterrupted time of a torque at its limit', 's'
+    )
+    overrun_fraction: float = positive(
+        0.4, 'largest fraction of missed states, averaged over overrun_window', at_most=1.0
+    )
+    overrun_window: float = positive(1.0, 'time over which missed states are averaged', 's')
+    torque: str = parameter(
+        'zero',
+        'safe torque: zero, damping -D dq, or the learned gravity with damping',
+        choices=('zero', 'damping', 'hold_gravity'),
+    )
+    damping: PerJoint = non_negative((2.0, 1.0), 'damping in the safe torque', 'N m s/rad', 'D')
+    stop_ramp: float = non_negative(
+        0.0,
+        'ramp from the last torque of the law to the safe torque after a fault; 0: at once',
+        's',
+    )
+    deactivation_ramp: float = non_negative(0.5, 'the same ramp when the node is deactivated', 's')
+    keep_estimates: bool = parameter(
+        True, 'keep the estimates when the node is activated again; a reset clears them'
     )
 
 
 @dataclass(frozen=True)
 class Telemetry:
-    """What the controller tells beside its commands."""
+    """What the controller publishes beside its commands."""
 
     enabled: bool = parameter(
-        True,
-        'publish reference, errors, estimates and monitors',
-        read_only=_TOPICS,
+        True, 'publish reference, errors, estimates and monitors', read_only=_TOPICS
     )
 
 
 @dataclass(frozen=True)
 class ControllerConfig:
-    """Parameters of `blf_dsc_controller`; the defaults are the recommended set."""
+    """Parameters of the node `blf_dsc_controller`; the defaults are the recommended set.
+
+    Make one with `load` from a parameter file, or with `build` and `change` from values by dotted
+    name: these validate. The constructor does not.
+    """
 
     joints: tuple[str, ...] = parameter(
-        ('joint1', 'joint2'), 'names of the joints, from the base on', read_only=_LAID_OUT
+        ('joint1', 'joint2'), 'names of the joints, from the base', read_only=_SIZES
     )
     sample_time: float = parameter(
         0.001,
-        'time between two joint states, over which the torque is held',
-        unit='s',
-        symbol='T',
+        'time between two joint states, for which the torque is held',
+        's',
+        'T',
         at_least=1e-5,
         at_most=1.0,
-        read_only=_LAID_OUT,
+        read_only=_SIZES,
     )
-    law: str = parameter('blf_dsc', 'control law', choices=LAWS, read_only=_LAID_OUT)
-    model: str = parameter(
-        'two_link', 'model of the arm', choices=tuple(MODELS), read_only=_LAID_OUT
-    )
-    wait_for_subscribers: int = parameter(
+    law: str = parameter('blf_dsc', 'control law', choices=LAWS, read_only=_SIZES)
+    model: str = parameter('two_link', 'model of the arm', choices=tuple(MODELS), read_only=_SIZES)
+    wait_for_subscribers: int = non_negative(
         0,
-        'observers each topic must have, beside the plant, before the first state is answered',
-        at_least=0,
+        'subscribers that each topic must have, beside the plant, before the first state is used',
         read_only=_TOPICS,
     )
     autostart: bool = autostart()
@@ -198,12 +151,12 @@ class ControllerConfig:
     barrier: Barrier = field(default_factory=Barrier)
     surface: Surface = field(default_factory=Surface)
     feedback: Feedback = field(default_factory=Feedback)
-    disturbance: Disturbance = field(default_factory=Disturbance)
+    disturbance: DisturbanceEstimate = field(default_factory=DisturbanceEstimate)
     torque: Torque = field(default_factory=Torque)
     learning: Learning = field(default_factory=Learning)
     comparison: Comparison = field(default_factory=Comparison)
     truth: Truth = field(default_factory=Truth)
-    safety: Safety = field(default_factory=Safety)
+    safety: Safety = Safety()
     telemetry: Telemetry = Telemetry()
     realtime: Realtime = field(default_factory=Realtime)
 
@@ -213,17 +166,15 @@ class ControllerConfig:
         return nanoseconds(self.sample_time)
 
     def problems(self) -> list[str]:
-        """Return what is wrong beside the ranges of single parameters, in words."""
-        model = MODELS[self.model]
-        problems = joint_problems(self.joints) + sample_time_problems(self.sample_time)
-        count = model.parameters(model.joints or len(self.joints))
-        if model.joints is not None and len(self.joints) != model.joints:
-            problems.append(
-                f'joints: got {len(self.joints)} {"name" if len(self.joints) == 1 else "names"}, '
-                f'but model {self.model} has {model.joints} joints'
-            )
-        problems += self.reference.problems() + self.limits.problems(self.joints)
-        problems += self.barrier.problems(self.joints)
-        problems += self.learning.window_problems(self.sample_time)
-        problems += self.truth.problems(self.law, self.model, count)
-        return problems + self.learning.estimate_problems(self.model, count)
+        """Check parameters against each other, and joints and estimates against the model."""
+        needed = MODELS[self.model]
+        count = parameter_count(needed or len(self.joints))
+        return [
+            *joint_problems(self.joints, f'model {self.model}', needed),
+            *sample_time_problems(self.sample_time),
+            *self.reference.problems(),
+            *self.limits.problems(self.joints),
+            *self.barrier.problems(self.joints),
+            *self.truth.problems(self.law, self.model, count),
+            *self.learning.problems(self.sample_time, self.model, count),
+        ]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of all parameters for the documentation, made from the configurations themselves.
+"""The generated page of all parameters.
 
-`python -m blf_dsc_controller.configuration.documentation doc/parameters.md` writes it anew.
+`python -m blf_dsc_controller.configuration.documentation doc/parameters.md` writes it.
 """
 
 from __future__ import annotations
@@ -15,60 +15,54 @@ from blf_dsc_controller.configuration.params_file import format_value
 from blf_dsc_controller.configuration.schema import parameters
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from blf_dsc_controller.configuration.schema import Parameter
 
 _PREFACE = """\
 # Parameters
 
 Every parameter of every node, with its default: the recommended set. One parameter file serves all
-nodes ([config/recommended.yaml](../config/recommended.yaml) shows all of it); a file need only say
-what it changes. Numbers of type double need a point: `1.0`, not `1`. Lists have an entry for each
-joint unless the range says otherwise.
+nodes ([config/recommended.yaml](../config/recommended.yaml) has all of them); a file needs only the
+parameters it changes. Values of type double need a decimal point: `1.0`, not `1`. Arrays have one
+entry per joint unless the range says otherwise.
 
-A parameter with a dot under *live* can be changed while the node runs (`ros2 param set`); the
-others are fixed at the start, and `ros2 param describe` says why.
+A dot under *live* marks a parameter that can change while the node runs (`ros2 param set`); the
+others are fixed at the start, and `ros2 param describe` gives the reason.
 
-This page is made from the code: `python -m blf_dsc_controller.configuration.documentation
+This page is generated: `python -m blf_dsc_controller.configuration.documentation
 doc/parameters.md`.
 """
 
 _HEADER = (
-    '| name | symbol | unit | type | default | range | live | what it is |\n'
+    '| name | symbol | unit | type | default | range | live | description |\n'
     '| --- | --- | --- | --- | --- | --- | --- | --- |\n'
 )
 
 
-def reference_table() -> str:
+def parameter_page() -> str:
     """Return the Markdown page of all parameters."""
-    return _PREFACE + ''.join(
-        f'\n## {node}\n\n{_HEADER}{"".join(_rows(parameters(cls)))}' for node, cls in NODES.items()
-    )
+    page = _PREFACE
+    for node, cls in NODES.items():
+        page += f'\n## {node}\n\n{_HEADER}{"".join(_row(one) for one in parameters(cls))}'
+    return page
 
 
-def _rows(listed: list[Parameter]) -> Iterator[str]:
-    for one in listed:
-        cells = (
-            f'`{one.name}`',
-            one.rule.symbol,
-            one.rule.unit,
-            one.kind.value,
-            f'`{format_value(one.default)}`',
-            _range(one),
-            '' if one.rule.read_only else '•',
-            one.rule.description,
-        )
-        yield '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |\n'
-
-
-def _range(one: Parameter) -> str:
-    lengths = [name for name in one.rule.length if name != 'joints']
-    if 'joints' in one.rule.length and lengths:
+def _row(one: Parameter) -> str:
+    lengths = [name for name in one.length if name != 'joints']
+    if 'joints' in one.length and lengths:
         lengths.insert(0, 'joint')
-    each = 'an entry for each ' + ' and '.join(lengths) if lengths else ''
-    return '; '.join(part for part in (one.allowed, each) if part)
+    each = 'one entry per ' + ' and '.join(lengths) if lengths else ''
+    cells = (
+        f'`{one.name}`',
+        one.symbol,
+        one.unit,
+        one.kind.value,
+        f'`{format_value(one.default)}`',
+        '; '.join(part for part in (one.allowed, each) if part),
+        '' if one.read_only else '•',
+        one.description,
+    )
+    return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |\n'
 
 
 if __name__ == '__main__':
-    Path(sys.argv[1]).write_text(reference_table(), encoding='utf-8')
+    Path(sys.argv[1]).write_text(parameter_page(), encoding='utf-8')

@@ -1,53 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The gains of the laws."""
+"""Gains of the control laws: (28), which can change while the controller runs, and (35)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
-from blf_dsc_controller.configuration.schema import parameter
+from blf_dsc_controller.configuration.common import PerJoint
+from blf_dsc_controller.configuration.schema import counted, non_negative, parameter, positive
 
-_PER_JOINT = ('joints',)
+_known = partial(parameter, read_only='it is known data, not a gain')
 
 
 @dataclass(frozen=True)
 class Barrier:
-    """The bound on the tracking error and the torque that keeps it."""
+    """Bound on the tracking error, and the barrier that enforces it."""
 
-    bound: tuple[float, ...] = parameter(
-        (0.002, 0.002),
-        'bound on the tracking error',
-        unit='rad',
-        symbol='k_c',
-        above=0.0,
-        length=_PER_JOINT,
-    )
-    initial_bound: tuple[float, ...] = parameter(
+    bound: PerJoint = positive((0.002, 0.002), 'bound on the tracking error', 'rad', 'k_c')
+    initial_bound: PerJoint = non_negative(
         (0.0, 0.0),
-        'bound at the start, that narrows to `bound`; 0: the bound stands still',
-        unit='rad',
-        symbol='k_0',
-        at_least=0.0,
-        length=_PER_JOINT,
+        'initial bound of a funnel that narrows to `bound`; 0: the bound is constant',
+        'rad',
+        'k_0',
     )
-    funnel_rate: float = parameter(
-        0.0, 'rate at which the bound narrows', unit='1/s', symbol='a', at_least=0.0
+    funnel_rate: float = non_negative(0.0, 'rate at which the funnel narrows', '1/s', 'a')
+    weight: PerJoint = positive(
+        (1000.0, 1000.0), 'stiffness of the barrier at zero error; 1 in the paper', 'N m/rad', 'w'
     )
-    weight: tuple[float, ...] = parameter(
-        (1000.0, 1000.0),
-        'stiffness of the barrier at no error; the paper has 1',
-        unit='N m/rad',
-        symbol='w',
-        above=0.0,
-        length=_PER_JOINT,
-    )
-    slope_limit: tuple[float, ...] = parameter(
+    slope_limit: PerJoint = positive(
         (2e4, 2e4),
-        'stiffness from which on the barrier continues along a line',
-        unit='N m/rad',
-        symbol='S_lim',
-        above=0.0,
-        length=_PER_JOINT,
+        'stiffness above which the barrier continues as a straight line',
+        'N m/rad',
+        'S_lim',
     )
 
     @property
@@ -58,7 +42,7 @@ class Barrier:
         )
 
     def problems(self, joints: tuple[str, ...]) -> list[str]:
-        """Where weight and slope limit, or the bounds of the funnel, contradict each other."""
+        """Check the weight against the slope limit, and the bounds of the funnel."""
         slopes = [
             f'barrier.slope_limit: got {limit:g} N m/rad for {joint}, but it must be above '
             f'barrier.weight, {weight:g} N m/rad'
@@ -66,214 +50,112 @@ class Barrier:
             if limit <= weight
         ]
         bounds = [
-            f'barrier.initial_bound: got {initial:g} rad for {joint}, but it must be 0 (none) or '
-            f'at least barrier.bound, {bound:g} rad'
+            f'barrier.initial_bound: got {initial:g} rad for {joint}, but it must be 0 (no funnel) '
+            f'or at least barrier.bound, {bound:g} rad'
             for joint, initial, bound in zip(joints, self.initial_bound, self.bound, strict=True)
             if 0.0 < initial < bound
         ]
         if self.funnel_rate == 0.0 and self.widest != self.bound:
             bounds.append(
-                'barrier.funnel_rate: got 0 1/s, but barrier.initial_bound is to narrow to '
-                'barrier.bound: give the rate at which it does'
+                'barrier.funnel_rate: got 0 1/s, but barrier.initial_bound must narrow to '
+                'barrier.bound: give the rate'
             )
         return slopes + bounds
 
 
 @dataclass(frozen=True)
 class Surface:
-    """The virtual control (15), (18) and the filter (13) that it passes through."""
+    """Virtual control (15), (18) and the surface filter (13)."""
 
-    gain: tuple[float, ...] = parameter(
-        (150.0, 150.0),
-        'gain of the virtual control on the tracking error',
-        unit='1/s',
-        symbol='K',
-        at_least=0.0,
-        length=_PER_JOINT,
+    gain: PerJoint = non_negative(
+        (150.0, 150.0), 'gain of the virtual control on the tracking error', '1/s', 'K'
     )
-    mu: tuple[float, ...] = parameter(
-        (20.0, 20.0),
-        'what is left of that gain at the bound',
-        unit='1/s',
-        symbol='mu',
-        at_least=0.0,
-        length=_PER_JOINT,
+    mu: PerJoint = non_negative(
+        (20.0, 20.0), 'part of that gain that remains at the bound', '1/s', 'mu'
     )
-    time_constant: float = parameter(
-        0.002, 'time constant of the surface filter', unit='s', symbol='lambda', above=0.0
-    )
+    time_constant: float = positive(0.002, 'time constant of the surface filter', 's', 'lambda')
 
 
 @dataclass(frozen=True)
 class Feedback:
-    """The feedback terms of the law (28)."""
+    """Feedback terms of the law (28)."""
 
-    gain: tuple[float, ...] = parameter(
-        (60.0, 20.0),
-        'gain on the velocity error',
-        unit='N m s/rad',
-        symbol='K_p',
-        at_least=0.0,
-        length=_PER_JOINT,
+    gain: PerJoint = non_negative((60.0, 20.0), 'gain on the velocity error', 'N m s/rad', 'K_p')
+    damping: PerJoint = non_negative(
+        (0.0, 0.0), 'gain of the robust term d2 |xi1| sat(xi2/b)', 'N m/rad', 'd2'
     )
-    damping: tuple[float, ...] = parameter(
-        (0.0, 0.0),
-        'gain of the robust term d2 |xi1| sat(xi2/b)',
-        unit='N m/rad',
-        symbol='d2',
-        at_least=0.0,
-        length=_PER_JOINT,
-    )
-    boundary_layer: float = parameter(
-        0.01,
-        'velocity error at which the robust term saturates',
-        unit='rad/s',
-        symbol='b',
-        above=0.0,
+    boundary_layer: float = positive(
+        0.01, 'velocity error at which the robust term saturates', 'rad/s', 'b'
     )
 
 
 @dataclass(frozen=True)
-class Disturbance:
-    """The disturbance estimate (30)."""
+class DisturbanceEstimate:
+    """Adaptive estimate of the disturbance (30)."""
 
-    gain: tuple[float, ...] = parameter(
+    gain: PerJoint = non_negative(
         (100.0, 100.0),
-        'adaptation gain of the disturbance estimate; 0: none',
-        unit='N m/rad',
-        symbol='gamma',
-        at_least=0.0,
-        length=_PER_JOINT,
+        'adaptation gain of the disturbance estimate; 0: no estimate',
+        'N m/rad',
+        'gamma',
     )
-    leakage: float = parameter(
-        0.0,
-        'leakage that draws the disturbance estimate to zero',
-        unit='rad/(N m s)',
-        symbol='eta',
-        at_least=0.0,
-    )
+    leakage: float = non_negative(0.0, 'leakage of the disturbance estimate', 'rad/(N m s)', 'eta')
 
 
 @dataclass(frozen=True)
 class Torque:
-    """What the motors can give."""
+    """Saturation of the commanded torque."""
 
-    limit: tuple[float, ...] = parameter(
-        (20.0, 20.0),
-        'largest torque commanded; learning sees the limited torque',
-        unit='N m',
-        above=0.0,
-        length=_PER_JOINT,
+    limit: PerJoint = positive(
+        (20.0, 20.0), 'largest commanded torque; learning uses the limited torque', 'N m'
     )
-    rate_limit: tuple[float, ...] = parameter(
-        (0.0, 0.0),
-        'largest change of the torque commanded; 0: none',
-        unit='N m/s',
-        at_least=0.0,
-        length=_PER_JOINT,
+    rate_limit: PerJoint = non_negative(
+        (0.0, 0.0), 'largest rate of the commanded torque; 0: no limit', 'N m/s'
     )
-
-
-_PER_JOINT = ('joints',)
-
-
-_GIVEN = 'it is what is given, not what is tuned'
 
 
 @dataclass(frozen=True)
 class Comparison:
     """Gains of the laws `backstepping` (35) and `slotine_li`, beside feedback and learning."""
 
-    surface_gain: tuple[float, ...] = parameter(
-        (70.0, 70.0),
-        'gain of the linear surface alpha2 = dqr - lambda_s z1',
-        unit='1/s',
-        symbol='lambda_s',
-        above=0.0,
-        length=_PER_JOINT,
+    surface_gain: PerJoint = positive(
+        (70.0, 70.0), 'gain of the linear surface alpha2 = dqr - lambda_s z1', '1/s', 'lambda_s'
     )
-    position_gain: tuple[float, ...] = parameter(
-        (1.0, 1.0),
-        'gain on the tracking error z1; slotine_li has none',
-        unit='N m/rad',
-        symbol='w',
-        at_least=0.0,
-        length=_PER_JOINT,
+    position_gain: PerJoint = non_negative(
+        (1.0, 1.0), 'gain on the tracking error z1; not used by slotine_li', 'N m/rad', 'w'
     )
-    robust_gain: tuple[float, ...] = parameter(
-        (0.0, 0.0),
-        'amplitude of the robust term; slotine_li has none',
-        unit='N m',
-        symbol='mu_bar',
-        at_least=0.0,
-        length=_PER_JOINT,
+    robust_gain: PerJoint = non_negative(
+        (0.0, 0.0), 'amplitude of the robust term; not used by slotine_li', 'N m', 'mu_bar'
     )
-    leakage: float = parameter(
-        0.001,
-        'leakage of the parameter estimate; slotine_li has none',
-        symbol='W_c',
-        at_least=0.0,
+    leakage: float = non_negative(
+        0.001, 'leakage of the parameter estimate; not used by slotine_li', symbol='W_c'
     )
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What is known of the arm: the law `model_based` needs it, the monitors show it.
+    """Known data of the arm: required by the law `model_based`, shown by the monitors.
 
     The known disturbance is constant + amplitude*sin(frequency*t + phase) on each joint.
     """
 
-    parameters: tuple[float, ...] = parameter(
-        (),
-        'true parameters; none: not known',
-        unit='kg m^2',
-        symbol='P',
-        may_be_empty=True,
-        read_only=_GIVEN,
+    parameters: tuple[float, ...] = _known(
+        (), 'true parameters; empty: unknown', 'kg m^2', 'P', may_be_empty=True
     )
-    constant: tuple[float, ...] = parameter(
-        (0.0, 0.0),
-        'constant part of the disturbance',
-        unit='N m',
-        length=_PER_JOINT,
-        read_only=_GIVEN,
+    constant: PerJoint = _known((0.0, 0.0), 'constant part of the disturbance', 'N m')
+    amplitude: PerJoint = _known((0.0, 0.0), 'amplitude of its sinusoid', 'N m')
+    frequency: PerJoint = _known(
+        (1.0, 1.0), 'angular frequency of its sinusoid', 'rad/s', at_least=0.0
     )
-    amplitude: tuple[float, ...] = parameter(
-        (0.0, 0.0),
-        'amplitude of its sinusoid',
-        unit='N m',
-        length=_PER_JOINT,
-        read_only=_GIVEN,
-    )
-    frequency: tuple[float, ...] = parameter(
-        (1.0, 1.0),
-        'angular frequency of its sinusoid',
-        unit='rad/s',
-        at_least=0.0,
-        length=_PER_JOINT,
-        read_only=_GIVEN,
-    )
-    phase: tuple[float, ...] = parameter(
-        (0.0, 0.0),
-        'phase of its sinusoid',
-        unit='rad',
-        length=_PER_JOINT,
-        read_only=_GIVEN,
-    )
-    feed_forward: bool = parameter(
-        False,
-        'compensate the known disturbance; model_based always does',
-        read_only=_GIVEN,
-    )
+    phase: PerJoint = _known((0.0, 0.0), 'phase of its sinusoid', 'rad')
+    feed_forward: bool = _known(False, 'compensate the known disturbance; model_based always does')
 
     def problems(self, law: str, model: str, count: int) -> list[str]:
-        """Whether the true parameters fit the model, and are there where the law needs them."""
+        """Check that the parameters fit the model, and are given if the law needs them."""
         given = len(self.parameters)
         if law == 'model_based' and given == 0:
             return ['truth.parameters: got none, but the law model_based needs them']
-        if given not in (0, count):
-            entries = 'entry' if given == 1 else 'entries'
-            return [
-                f'truth.parameters: got {given} {entries}, but model {model} has {count} parameters'
-            ]
-        return []
+        if given in (0, count):
+            return []
+        entries = counted(given, 'entry', 'entries')
+        return [f'truth.parameters: got {entries}, but model {model} has {count} parameters']

@@ -1,49 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the controller learns the parameters of the arm: equations (20) to (27) of the paper."""
+"""Composite learning of the parameters of the arm: equations (20) to (27) of the paper."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
-from blf_dsc_controller.configuration.schema import parameter
+from blf_dsc_controller.configuration.schema import counted, non_negative, parameter, positive
 
-_SIZES = 'it sizes the memory of the learning, which is laid out at the start'
-_FILTERED = 'what is already in the excitation window was filtered with it'
-_MEASURED = 'what is already in the excitation window was measured with it'
-_FIRST = 'it only matters at the start'
-_PER_PARAMETER = ('learning.initial_estimate',)
+_SIZES = 'it sizes the memory of the learning'
+_WINDOW = 'the data in the excitation window depend on it'
+_FIRST = 'it has no effect later'
 
 FEWEST_SAMPLES = 10
-"""In an excitation window: fewer cannot tell the parameters of an arm apart."""
+"""In an excitation window: fewer do not determine the parameters of an arm."""
 
 MOST_SAMPLES = 1_000_000
-"""In an excitation window: each holds a few hundred bytes, so this is some hundred megabytes."""
+"""In an excitation window: each takes a few hundred bytes, so this is some hundred megabytes."""
 
 
 @dataclass(frozen=True)
 class Learning:
-    """Composite learning of the parameters P and of a constant disturbance of each joint."""
+    """Composite learning of the parameters P and of the disturbance columns."""
 
     initial_estimate: tuple[float, ...] = parameter(
         (0.5, 0.16, 0.2),
-        'first estimate of the parameters (m1+m2)*l1^2, m2*l2^2, m2*l1*l2',
-        unit='kg m^2',
-        symbol='P^(0)',
+        'initial estimate of the parameters (m1+m2)*l1^2, m2*l2^2, m2*l1*l2',
+        'kg m^2',
+        'P^(0)',
         read_only=_FIRST,
     )
-    adaptation_gain: tuple[float, ...] = parameter(
-        (0.5, 0.5, 0.5),
-        'diagonal of the adaptation gain',
-        symbol='Gamma',
-        at_least=0.0,
-        length=_PER_PARAMETER,
+    adaptation_gain: Annotated[tuple[float, ...], 'learning.initial_estimate'] = non_negative(
+        (0.5, 0.5, 0.5), 'diagonal of the adaptation gain', symbol='Gamma'
     )
-    weight: float = parameter(
+    weight: float = non_negative(
         100.0,
         'weight of the prediction error against the tracking error; 0: no composite learning',
         symbol='kappa',
-        at_least=0.0,
     )
     update: str = parameter(
         'newton',
@@ -54,126 +48,95 @@ class Learning:
         'filtered',
         'prediction error: filtered regressor, Lambda of (24), or estimated acceleration',
         choices=('filtered', 'acceleration', 'lambda'),
-        read_only=_FILTERED,
+        read_only=_WINDOW,
     )
     latch: str = parameter(
         'last',
-        'window learned from: the last excited one (paper), or the best excited one',
+        'which excited window is latched: the last one (paper), or the best one',
         choices=('last', 'max'),
     )
-    regularization: float = parameter(
-        1e-5,
-        'added to the excitation matrix before the Newton step divides by it',
-        symbol='rho',
-        above=0.0,
+    regularization: float = positive(
+        1e-5, 'regularisation of the excitation matrix in the Newton step', symbol='rho'
     )
-    excitation_threshold: float = parameter(
+    excitation_threshold: float = positive(
         0.003,
-        'least eigenvalue of the excitation matrix from which on it is learned from',
+        'minimum eigenvalue of the excitation matrix from which the window counts as excited',
         symbol='sigma',
-        above=0.0,
     )
-    window: float = parameter(
+    window: float = positive(
         2.0 * math.pi,
-        'excitation window; a whole number of periods of the reference averages disturbances out',
-        unit='s',
-        symbol='tau_d',
-        above=0.0,
+        'length of the excitation window; whole periods of the reference average disturbances out',
+        's',
+        'tau_d',
         read_only=_SIZES,
     )
-    settling_time: float = parameter(
+    settling_time: float = non_negative(
         0.5,
-        'time left to the filters before the window counts',
-        unit='s',
-        symbol='T_a',
-        at_least=0.0,
+        'time for the filters to settle before the window is used',
+        's',
+        'T_a',
         read_only=_FIRST,
     )
-    filter_pole: float = parameter(
-        10.0,
-        'pole of both filters that the regressor and the torque pass through',
-        unit='rad/s',
-        above=0.0,
-        read_only=_FILTERED,
+    filter_pole: float = positive(
+        10.0, 'pole of the filters on regressor and torque', 'rad/s', read_only=_WINDOW
     )
     bias: bool = parameter(
-        True,
-        'also estimate a constant disturbance of each joint',
-        read_only=_SIZES,
+        True, 'also estimate a constant disturbance of each joint', read_only=_SIZES
     )
     viscous: bool = parameter(
-        False,
-        'also estimate the viscous friction of each joint',
-        read_only=_SIZES,
+        False, 'also estimate the viscous friction of each joint', read_only=_SIZES
     )
     coulomb: bool = parameter(
-        False,
-        'also estimate the Coulomb friction of each joint',
-        read_only=_SIZES,
+        False, 'also estimate the Coulomb friction of each joint', read_only=_SIZES
     )
-    coulomb_velocity: float = parameter(
-        0.01,
-        'velocity scale over which the Coulomb column changes sign',
-        unit='rad/s',
-        above=0.0,
-        read_only=_MEASURED,
+    coulomb_velocity: float = positive(
+        0.01, 'velocity scale of the sign change of the Coulomb column', 'rad/s', read_only=_WINDOW
     )
-    frequencies: tuple[float, ...] = parameter(
+    frequencies: tuple[float, ...] = positive(
         (),
-        'also estimate a sinusoidal disturbance of each of these frequencies on each joint',
-        unit='rad/s',
-        above=0.0,
+        'also estimate a sinusoidal disturbance of each joint at each of these frequencies',
+        'rad/s',
         may_be_empty=True,
         read_only=_SIZES,
     )
-    derivative_filter: float = parameter(
+    derivative_filter: float = positive(
         100.0,
-        'frequency of the filter (8) behind the predictions lambda and acceleration',
-        unit='rad/s',
-        symbol='omega',
-        above=0.0,
-        read_only=_FILTERED,
+        'frequency of the filter (8), for the predictions lambda and acceleration',
+        'rad/s',
+        'omega',
+        read_only=_WINDOW,
     )
-    radius: float = parameter(
-        3.0,
-        'radius of the ball that the estimate is kept in',
-        unit='kg m^2',
-        symbol='omega_a',
-        above=0.0,
+    radius: float = positive(
+        3.0, 'radius of the projection ball of the estimate', 'kg m^2', 'omega_a'
     )
     interval: int = parameter(
         10,
-        'samples from one look at the eigenvalues of the excitation matrix to the next',
-        unit='samples',
+        'samples between two eigenvalue checks of the excitation matrix',
+        'samples',
         at_least=1,
         read_only=_SIZES,
     )
     torque_source: str = parameter(
         'command',
-        'torque learned from: the limited command, or the effort reported with the joint states',
+        'torque used for learning: the limited command, or the effort of the joint states',
         choices=('command', 'effort'),
-        read_only=_MEASURED,
+        read_only=_WINDOW,
     )
 
-    def window_problems(self, sample_time: float) -> list[str]:
-        """Whether the window holds a sensible number of samples."""
-        samples = round(self.window / sample_time)
-        if FEWEST_SAMPLES <= samples <= MOST_SAMPLES:
-            return []
-        problem = (
-            f'learning.window: got {self.window:g} s, which is {samples} samples of '
-            f'{sample_time:g} s: between {FEWEST_SAMPLES} and {MOST_SAMPLES} are allowed'
-        )
-        return [problem]
-
-    def estimate_problems(self, model: str, count: int) -> list[str]:
-        """Whether the first estimate fits the model and lies in the ball."""
-        given = len(self.initial_estimate)
+    def problems(self, sample_time: float, model: str, count: int) -> list[str]:
+        """Check the size of the window, and the initial estimate against the model and the ball."""
         problems = []
-        if given != count:
+        samples = round(self.window / sample_time)
+        if not FEWEST_SAMPLES <= samples <= MOST_SAMPLES:
             problems.append(
-                f'learning.initial_estimate: got {given} '
-                f'{"entry" if given == 1 else "entries"}, but model {model} has {count} parameters'
+                f'learning.window: got {self.window:g} s, which is {samples} samples of '
+                f'{sample_time:g} s: between {FEWEST_SAMPLES} and {MOST_SAMPLES} are allowed'
+            )
+        if len(self.initial_estimate) != count:
+            entries = counted(len(self.initial_estimate), 'entry', 'entries')
+            problems.append(
+                f'learning.initial_estimate: got {entries}, but model {model} has {count} '
+                'parameters'
             )
         norm = math.hypot(*self.initial_estimate)
         if norm >= self.radius:

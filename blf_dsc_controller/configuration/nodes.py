@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes of the package, their configurations, and what they must agree on."""
+"""The nodes of the package by name, their configurations, and what they must agree on."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
+from blf_dsc_controller.configuration.common import joint_problems
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import parameter, parameters
@@ -13,124 +15,69 @@ from blf_dsc_controller.configuration.schema import parameter, parameters
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-_AT_START = 'a bag is opened once, when the recorder starts'
+PLANT = 'sim_plant'
+CONTROLLER = 'blf_dsc_controller'
+RECORDER = 'bag_recorder'
+MARKERS = 'arm_markers'
+
+_of_bag = partial(parameter, read_only='a bag is opened once, when the recorder starts')
+_of_markers = partial(parameter, read_only='it is read once, when the node starts')
 
 
 @dataclass(frozen=True)
 class RecorderConfig:
-    """Parameters of `bag_recorder`."""
+    """Parameters of the node `bag_recorder`."""
 
-    output: str = parameter(
-        'bag',
-        'folder the bag is written into; it must not exist yet',
-        read_only=_AT_START,
+    output: str = _of_bag('bag', 'folder of the bag; it must not exist yet')
+    topics: tuple[str, ...] = _of_bag((), 'topics to record; empty: all', may_be_empty=True)
+    compression: str = _of_bag(
+        'none', 'compression of the chunks of the bag', choices=('none', 'zstd')
     )
-    topics: tuple[str, ...] = parameter(
-        (),
-        'topics to record; none named: all that appear',
-        may_be_empty=True,
-        read_only=_AT_START,
+    queue_depth: int = _of_bag(
+        100_000, 'messages of a topic that can wait while the disk is busy', 'messages', at_least=1
     )
-    compression: str = parameter(
-        'none',
-        'compression of the chunks of the bag',
-        choices=('none', 'zstd'),
-        read_only=_AT_START,
+    split_size: float = _of_bag(
+        0.0, 'size at which the bag continues in a new file; 0: never', 'MB', at_least=0.0
     )
-    queue_depth: int = parameter(
-        100_000,
-        'messages of a topic that may wait while the disk is busy',
-        unit='messages',
-        at_least=1,
-        read_only=_AT_START,
+    split_duration: float = _of_bag(
+        0.0, 'duration at which the bag continues in a new file; 0: never', 's', at_least=0.0
     )
-
-    split_size: float = parameter(
+    ring: float = _of_bag(
         0.0,
-        'size at which a new file of the bag is begun; 0: never',
-        unit='MB',
+        'keep only the last messages, of this duration, in memory and write them on the service '
+        'trigger; 0: write all',
+        's',
         at_least=0.0,
-        read_only=_AT_START,
-    )
-    split_duration: float = parameter(
-        0.0,
-        'time after which a new file of the bag is begun; 0: never',
-        unit='s',
-        at_least=0.0,
-        read_only=_AT_START,
-    )
-    ring: float = parameter(
-        0.0,
-        'keep only this last time, in memory, and write it on the service trigger; 0: write all',
-        unit='s',
-        at_least=0.0,
-        read_only=_AT_START,
     )
 
     def problems(self) -> list[str]:
-        """Return what is wrong beside the ranges of single parameters, in words."""
+        """Check that the folder has a name."""
         return [] if self.output.strip() else ['output: got no folder name to write the bag into']
-
-
-_AT_START = 'it is looked at once, when the node starts'
 
 
 @dataclass(frozen=True)
 class DrawnArm:
-    """The lengths that it is drawn with."""
+    """Lengths of the arm in the picture."""
 
-    l1: float = parameter(
-        1.0, 'length of the first link', unit='m', symbol='l1', above=0.0, read_only=_AT_START
-    )
-    l2: float = parameter(
-        0.8, 'length of the second link', unit='m', symbol='l2', above=0.0, read_only=_AT_START
-    )
+    l1: float = _of_markers(1.0, 'length of the first link', 'm', 'l1', above=0.0)
+    l2: float = _of_markers(0.8, 'length of the second link', 'm', 'l2', above=0.0)
 
 
 @dataclass(frozen=True)
 class MarkersConfig:
-    """Parameters of `arm_markers`."""
+    """Parameters of the node `arm_markers`."""
 
-    joints: tuple[str, ...] = parameter(
-        ('joint1', 'joint2'), 'names of the joints, from the base on', read_only=_AT_START
+    joints: tuple[str, ...] = _of_markers(
+        ('joint1', 'joint2'), 'names of the joints, from the base'
     )
-    frame: str = parameter('base_link', 'frame that the markers are drawn in', read_only=_AT_START)
-    period: float = parameter(
-        0.1, 'time from one picture to the next', unit='s', above=0.0, read_only=_AT_START
-    )
-    torque_scale: float = parameter(
-        0.05, 'length of the arrow of a torque', unit='m/(N m)', above=0.0, read_only=_AT_START
-    )
+    frame: str = _of_markers('base_link', 'frame of the markers')
+    period: float = _of_markers(0.1, 'time between two updates of the markers', 's', above=0.0)
+    torque_scale: float = _of_markers(0.05, 'arrow length per torque', 'm/(N m)', above=0.0)
     arm: DrawnArm = DrawnArm()
 
     def problems(self) -> list[str]:
-        """Return what is wrong beside the ranges of single parameters, in words."""
-        if len(self.joints) == 2:
-            return []
-        return [f'joints: got {len(self.joints)}, but the arm that is drawn has 2']
-
-
-_NAMES = ('use_sim_time', 'start_type_description_service')
-
-
-_GROUPS = ('qos_overrides.',)
-
-
-def is_builtin(name: str) -> bool:
-    """Whether ROS, not this package, declares the parameter."""
-    return name in _NAMES or name.startswith(_GROUPS)
-
-
-PLANT = 'sim_plant'
-
-
-CONTROLLER = 'blf_dsc_controller'
-
-
-RECORDER = 'bag_recorder'
-
-
-MARKERS = 'arm_markers'
+        """Check the joints."""
+        return joint_problems(self.joints, 'the arm of the markers', 2)
 
 
 NODES: Mapping[str, type[PlantConfig | ControllerConfig | RecorderConfig | MarkersConfig]] = {
@@ -142,7 +89,7 @@ NODES: Mapping[str, type[PlantConfig | ControllerConfig | RecorderConfig | Marke
 
 
 class LoopConfig(NamedTuple):
-    """The configuration of all nodes of a closed loop."""
+    """The configurations of all nodes of a closed loop, as `load_loop` reads them."""
 
     plant: PlantConfig
     controller: ControllerConfig
@@ -150,11 +97,11 @@ class LoopConfig(NamedTuple):
 
     @property
     def by_node(self) -> dict[str, PlantConfig | ControllerConfig | RecorderConfig]:
-        """The configurations under the names of their nodes."""
+        """The configurations by node name."""
         return {PLANT: self.plant, CONTROLLER: self.controller, RECORDER: self.recorder}
 
     def problems(self) -> list[str]:
-        """Return where plant and controller contradict each other, in words."""
+        """Check that plant and controller agree on sample time and joints."""
         plant, controller = self.plant, self.controller
         problems = []
         if plant.sample_time_ns != controller.sample_time_ns:
@@ -171,5 +118,11 @@ class LoopConfig(NamedTuple):
 
 
 def known_names() -> frozenset[str]:
-    """Every parameter name that some node of the package has."""
+    """Return the parameter names of all nodes of the package."""
     return frozenset(one.name for cls in NODES.values() for one in parameters(cls))
+
+
+def is_builtin(name: str) -> bool:
+    """Whether ROS itself, not this package, declares the parameter."""
+    builtin = ('use_sim_time', 'start_type_description_service')
+    return name in builtin or name.startswith('qos_overrides.')

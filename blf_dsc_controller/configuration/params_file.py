@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Load and write the configurations of nodes as ROS 2 parameter files."""
+"""Configurations loaded from ROS 2 parameter files, and written to them, without ROS."""
 
 from __future__ import annotations
 
 import difflib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -19,11 +20,11 @@ from blf_dsc_controller.configuration.nodes import (
 )
 from blf_dsc_controller.configuration.ros_yaml import Entry, Section, parse
 from blf_dsc_controller.configuration.schema import build, flatten, parameters, unknown
-from blf_dsc_controller.configuration.share import config_file
+from blf_dsc_controller.configuration.share import share_folder
 from blf_dsc_controller.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
     from blf_dsc_controller.configuration.schema import Value
 
@@ -31,22 +32,22 @@ Config = TypeVar('Config')
 
 
 def locate(given: str | Path) -> Path:
-    """Return the preset of this name, or the file of this path.
+    """Return the path of a preset by its name, or of a file by its path.
 
-    A preset's name means the preset whatever lies in the current folder; `./name` means a file.
-    Raises ConfigurationError, which lists the presets, where there is neither.
+    The name of a preset means the preset, whatever is in the current folder; `./name` is a file.
+    Raises ConfigurationError, which lists the presets, if there is neither.
     """
-    presets = sorted(preset.stem for preset in config_file('').glob('*.yaml'))
-    path = Path(given)
-    if str(given) in presets:
-        return config_file(str(given))
+    presets = {path.stem: path for path in sorted((share_folder() / 'config').glob('*.yaml'))}
+    name, path = str(given), Path(given)
+    if name in presets:
+        return presets[name]
     if path.is_file():
         return path
-    if str(given).removesuffix('.yaml') in presets:
-        return config_file(str(given))
+    if name.removesuffix('.yaml') in presets:
+        return presets[name.removesuffix('.yaml')]
     what = 'is a folder' if path.is_dir() else 'does not exist'
-    problem = f'{given} {what}: give a parameter file, or a preset: {", ".join(presets)}'
-    raise ConfigurationError([problem])
+    remedy = f'give a parameter file, or a preset: {", ".join(presets)}'
+    raise ConfigurationError([f'{name} {what}: {remedy}'])
 
 
 def read(path: str | Path) -> list[Section]:
@@ -60,19 +61,16 @@ def read(path: str | Path) -> list[Section]:
 
 
 def load(
-    path: str | Path,
-    node: str,
-    cls: type[Config],
-    overrides: Mapping[str, object] | None = None,
+    path: str | Path, node: str, cls: type[Config], overrides: Mapping[str, object] | None = None
 ) -> Config:
-    """Read what a file says to the node, whose name may carry a namespace (`/left/sim_plant`).
+    """Load the configuration of one node, whose name may have a namespace (`/left/sim_plant`).
 
-    `overrides`, by dotted name, count more than the file. Raises ConfigurationError with all
-    problems and their lines. An unknown name in a section of that node is an error; in a section
-    for several nodes it is one if no node of the package knows it.
+    `overrides`, by dotted name, take precedence over the file. Raises ConfigurationError with all
+    problems and their line numbers. Unknown names are rejected; in a section for several nodes, a
+    name that any node of the package knows is accepted.
     """
     sections = read(path)
-    problems = list(_stray_names(sections))
+    problems = list(_unknown_names(sections))
     try:
         config = _load(sections, node, cls, overrides or {})
     except ConfigurationError as error:
@@ -85,13 +83,13 @@ def load(
 def load_loop(
     path: str | Path, overrides: Mapping[str, Mapping[str, object]] | None = None
 ) -> LoopConfig:
-    """Read what a file says to the plant, the controller and the recorder, all at once.
+    """Load the configurations of plant, controller and recorder from one file.
 
-    `overrides`, by node and dotted name, count more than the file. Raises ConfigurationError with
-    all problems of all nodes, and what plant and controller do not agree on.
+    `overrides`, by node and dotted name, take precedence over the file. Raises ConfigurationError
+    with the problems of all nodes, or where plant and controller disagree.
     """
     sections = read(path)
-    problems = [*_stray_names(sections), *_stray_sections(sections)]
+    problems = [*_unknown_names(sections), *_unknown_nodes(sections)]
     configs: dict[str, Any] = {}
     for node, cls in NODES.items():
         try:
@@ -106,6 +104,36 @@ def load_loop(
     return loop
 
 
+def dump(path: Path, nodes: Mapping[str, object]) -> None:
+    """Write every parameter of the nodes into a parameter file that loads back equal."""
+    path.write_text(dumps(nodes), encoding='utf-8')
+
+
+def dumps(nodes: Mapping[str, object]) -> str:
+    """Return the text of a parameter file.
+
+    `nodes` are configurations, or values by dotted name, by node name with or without a namespace.
+    """
+    lines = []
+    for node, config in nodes.items():
+        lines.append(f'/{node.removeprefix("/")}:\n  ros__parameters:\n')
+        values = config if isinstance(config, Mapping) else flatten(config)
+        lines += [f'    {name}: {format_value(value)}\n' for name, value in values.items()]
+    return ''.join(lines)
+
+
+def format_value(value: Value) -> str:
+    """Return a value as YAML that ROS and YAML libraries read as the same type."""
+    if isinstance(value, tuple):
+        return '[' + ', '.join(format_value(entry) for entry in value) + ']'
+    if isinstance(value, bool):
+        return 'true' if value else 'false'
+    if isinstance(value, float):  # 1e-05 is a string to many YAML libraries, 1.0e-05 is not
+        mantissa, exponent, power = repr(value).partition('e')
+        return mantissa + ('' if '.' in mantissa or not exponent else '.0') + exponent + power
+    return json.dumps(value, ensure_ascii=False)
+
+
 def _load(
     sections: list[Section], node: str, cls: type[Config], overrides: Mapping[str, object]
 ) -> Config:
@@ -115,11 +143,11 @@ def _load(
         return build(cls, {**values, **overrides})
     except ConfigurationError as error:
         lines = {name: entry.line for name, entry in entries.items() if name not in overrides}
-        raise ConfigurationError([_placed(problem, lines) for problem in error.problems]) from None
+        raise ConfigurationError([_located(problem, lines) for problem in error.problems]) from None
 
 
 def _entries(sections: list[Section], node: str, known: set[str]) -> dict[str, Entry]:
-    """Gather what speaks to the node; names for other nodes are left out of wildcard sections."""
+    """Return the entries for the node, without names of other nodes in wildcard sections."""
     return {
         name: entry
         for section in sections
@@ -129,13 +157,13 @@ def _entries(sections: list[Section], node: str, known: set[str]) -> dict[str, E
     }
 
 
-def _placed(problem: str, lines: Mapping[str, int]) -> str:
-    """Add the line, which is known for a problem that begins with the name of a parameter."""
+def _located(problem: str, lines: Mapping[str, int]) -> str:
+    """Prefix a problem that begins with the name of a parameter in the file with its line."""
     name = problem.split(':', 1)[0]
     return f'line {lines[name]}: {problem}' if name in lines else problem
 
 
-def _stray_names(sections: list[Section]) -> Iterator[str]:
+def _unknown_names(sections: list[Section]) -> Iterator[str]:
     known = known_names()
     for section in sections:
         for name, entry in section.entries.items():
@@ -143,53 +171,11 @@ def _stray_names(sections: list[Section]) -> Iterator[str]:
                 yield f'line {entry.line}: {unknown(name, known)}'
 
 
-def _stray_sections(sections: list[Section]) -> Iterator[str]:
-    """Complain of a misspelt node, whose section would go unread without a word."""
+def _unknown_nodes(sections: list[Section]) -> Iterator[str]:
+    """Find misspelt nodes, whose sections would be ignored."""
     names = {section.pattern.rsplit('/', 1)[-1]: section for section in sections}
     absent = [node for node in NODES if node not in names]
     for name, section in names.items():
         close = difflib.get_close_matches(name, absent, n=1, cutoff=0.8)
         if close and name not in NODES:
-            yield f'line {section.line}: no node is called {name}: did you mean {close[0]}?'
-
-
-def dump(path: Path, configs: Mapping[str, object]) -> None:
-    """Write every parameter of every node into the ROS 2 parameter file `path`.
-
-    `configs` are configurations by the names of their nodes, which may carry a namespace.
-    """
-    path.write_text(dumps(configs), encoding='utf-8')
-
-
-def dumps(configs: Mapping[str, object]) -> str:
-    """Return what `dump` writes."""
-    return dumps_values({node: flatten(config) for node, config in configs.items()})
-
-
-def dumps_values(nodes: Mapping[str, Mapping[str, Value]]) -> str:
-    """Return the parameter file of values by dotted name, for each node by its name."""
-    return ''.join(_lines(nodes))
-
-
-def format_value(value: Value) -> str:
-    """Return a value as YAML that both ROS and YAML libraries read as the same type."""
-    if isinstance(value, tuple):
-        return '[' + ', '.join(format_value(entry) for entry in value) + ']'
-    if isinstance(value, bool):
-        return 'true' if value else 'false'
-    if isinstance(value, float):
-        return _number(value)
-    return json.dumps(value, ensure_ascii=False)
-
-
-def _number(value: float) -> str:
-    """Keep a point in 1e-05, which is a text to many YAML libraries without it."""
-    mantissa, exponent, power = repr(value).partition('e')
-    return mantissa + ('' if '.' in mantissa or not exponent else '.0') + exponent + power
-
-
-def _lines(nodes: Mapping[str, Mapping[str, Value]]) -> Iterator[str]:
-    for node, values in nodes.items():
-        yield f'/{node.removeprefix("/")}:\n  ros__parameters:\n'
-        for name, value in values.items():
-            yield f'    {name}: {format_value(value)}\n'
+            yield f'line {section.line}: unknown node {name}, did you mean {close[0]}?'

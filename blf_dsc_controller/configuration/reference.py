@@ -1,73 +1,57 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What to follow, how to get there, and what a reference may ask of the joints."""
+"""The reference to track, the approach to it, and the limits of any motion."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
+from typing import Annotated
 
-from blf_dsc_controller.configuration.schema import parameter
+from blf_dsc_controller.configuration.common import PerJoint
+from blf_dsc_controller.configuration.schema import parameter, positive
 
-_PER_JOINT = ('joints',)
-_TONES = ('reference.frequency',)
-_JUMP = 'the reference would jump: send another on ~/joint_trajectory'
-_TURN = 6.283185307179586
-
-REFERENCES = ('sinusoids', 'waypoints', 'hold')
+_fixed = partial(
+    parameter, read_only='the reference would jump: send a trajectory on ~/joint_trajectory'
+)
 
 
 @dataclass(frozen=True)
 class Reference:
-    """The trajectory to follow, until another one is sent on `~/joint_trajectory`.
+    """The reference to track, until a trajectory arrives on `~/joint_trajectory`.
 
     sinusoids  qr_i = offset_i + sum_k amplitude_ik cos(frequency_k t + phase_k)
-    waypoints  the motion of least jerk through `points` at `times`, at rest at both ends
-    hold       the position at the start
+    waypoints  minimum jerk through `points` at `times`, at rest at both ends
+    hold       the initial position
 
-    `amplitude` and `points` hold a row for each joint, one row after the other.
+    `amplitude` and `points` hold one row per joint, row after row.
     """
 
-    type: str = parameter(
+    type: str = _fixed(
         'sinusoids',
-        "sinusoids (the paper's), waypoints (least jerk through points), or hold (stay there)",
-        choices=REFERENCES,
-        read_only=_JUMP,
+        "sinusoids (the paper's), waypoints (minimum jerk), or hold (the initial position)",
+        choices=('sinusoids', 'waypoints', 'hold'),
     )
-    offset: tuple[float, ...] = parameter(
-        (1.9935, 1.3961), 'middle of the motion', unit='rad', length=_PER_JOINT, read_only=_JUMP
+    offset: PerJoint = _fixed((1.9935, 1.3961), 'centre of the motion', 'rad')
+    amplitude: Annotated[tuple[float, ...], 'joints', 'reference.frequency'] = _fixed(
+        (0.3, 0.3), 'amplitude of each tone: one row per joint, row after row', 'rad'
     )
-    amplitude: tuple[float, ...] = parameter(
-        (0.3, 0.3),
-        'amplitude of each tone: a row for each joint, one after the other',
-        unit='rad',
-        length=('joints', 'reference.frequency'),
-        read_only=_JUMP,
+    frequency: tuple[float, ...] = _fixed(
+        (1.0,), 'angular frequency of each tone', 'rad/s', at_least=0.0
     )
-    frequency: tuple[float, ...] = parameter(
-        (1.0,), 'angular frequency of each tone', unit='rad/s', at_least=0.0, read_only=_JUMP
+    phase: Annotated[tuple[float, ...], 'reference.frequency'] = _fixed(
+        (0.0,), 'phase of each tone', 'rad'
     )
-    phase: tuple[float, ...] = parameter(
-        (0.0,), 'phase of each tone', unit='rad', length=_TONES, read_only=_JUMP
+    times: tuple[float, ...] = _fixed(
+        (), 'time of each waypoint from the start', 's', at_least=0.0, may_be_empty=True
     )
-    times: tuple[float, ...] = parameter(
-        (),
-        'time of each waypoint since the start',
-        unit='s',
-        at_least=0.0,
-        may_be_empty=True,
-        read_only=_JUMP,
-    )
-    points: tuple[float, ...] = parameter(
-        (),
-        'position at each waypoint: a row for each joint, one after the other',
-        unit='rad',
-        length=('joints', 'reference.times'),
-        may_be_empty=True,
-        read_only=_JUMP,
+    points: Annotated[tuple[float, ...], 'joints', 'reference.times'] = _fixed(
+        (), 'position at each waypoint: one row per joint, row after row', 'rad', may_be_empty=True
     )
 
     def problems(self) -> list[str]:
-        """Where times and points make no motion."""
+        """Check that there are waypoints if they are used, and that their times increase."""
         if self.type == 'waypoints' and not self.times:
             return ['reference.times: got none, but reference.type waypoints needs at least one']
         return [
@@ -79,41 +63,29 @@ class Reference:
 
 @dataclass(frozen=True)
 class Approach:
-    """The way to the reference from a start outside the bound, tracked within it."""
+    """Motion to the reference from a start outside the bound; the bound applies along it."""
 
     enabled: bool = parameter(
-        True,
-        'lead an arm that starts outside the bound to the reference, instead of refusing',
+        True, 'lead an arm that starts outside the bound to the reference; false: do not start'
     )
-    longest: float = parameter(
-        30.0, 'longest time that the way to the reference may take', unit='s', above=0.0
-    )
+    longest: float = positive(30.0, 'longest duration of the approach', 's')
 
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """What an approach or a trajectory that is sent may ask of the joints."""
+    """Limits of each joint for an approach or a received trajectory."""
 
-    position_lower: tuple[float, ...] = parameter(
-        (-_TURN, -_TURN), 'least position', unit='rad', length=_PER_JOINT
-    )
-    position_upper: tuple[float, ...] = parameter(
-        (_TURN, _TURN), 'largest position', unit='rad', length=_PER_JOINT
-    )
-    velocity: tuple[float, ...] = parameter(
-        (1.5, 1.5), 'largest velocity', unit='rad/s', above=0.0, length=_PER_JOINT
-    )
-    acceleration: tuple[float, ...] = parameter(
-        (2.0, 2.0), 'largest acceleration', unit='rad/s^2', above=0.0, length=_PER_JOINT
-    )
+    position_lower: PerJoint = parameter((-2.0 * math.pi,) * 2, 'lowest position', 'rad')
+    position_upper: PerJoint = parameter((2.0 * math.pi,) * 2, 'highest position', 'rad')
+    velocity: PerJoint = positive((1.5, 1.5), 'largest velocity', 'rad/s')
+    acceleration: PerJoint = positive((2.0, 2.0), 'largest acceleration', 'rad/s^2')
 
     def problems(self, joints: tuple[str, ...]) -> list[str]:
-        """Where no position is allowed."""
+        """Check that the position limits leave a range."""
+        limits = zip(joints, self.position_lower, self.position_upper, strict=True)
         return [
             f'limits.position_upper: got {upper:g} rad for {joint}, but it must be above '
             f'limits.position_lower, {lower:g} rad'
-            for joint, lower, upper in zip(
-                joints, self.position_lower, self.position_upper, strict=True
-            )
+            for joint, lower, upper in limits
             if upper <= lower
         ]

@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS 2 parameter files, read as rcl reads them, without ROS."""
+"""ROS 2 parameter files, read as rcl_yaml_param_parser reads them, but without ROS.
+
+Node names nest or are joined by `/`; `*` matches one part of a name, `**` any number of parts. Of
+all sections that match a node the last one wins, whichever is more specific. The types of unquoted
+words differ from those of YAML libraries: `1e-5` is a number and `1_000` a string for ROS, the
+other way round for PyYAML; `yes` is a bool, `010` is eight, `null` a string.
+"""
 
 from __future__ import annotations
 
@@ -18,76 +24,22 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 _TRUE = ('Y', 'y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON')
-
-
 _FALSE = ('N', 'n', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF')
-
-
 _INTEGER = re.compile(r'[+-]?(?:0[xX](?P<hex>[0-9a-fA-F]+)|(?P<octal>0[0-7]*)|[1-9][0-9]*)')
-
-
 _DECIMAL = re.compile(r'[+-]?(?P<digits>[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
-
-
 _HEXADECIMAL = re.compile(
     r'[+-]?0[xX](?:[0-9a-fA-F]+\.?[0-9a-fA-F]*|\.[0-9a-fA-F]+)(?:[pP][+-]?[0-9]+)?'
 )
-
-
-_SPECIAL = re.compile(r'[+-]?(?:inf|infinity|nan)', re.IGNORECASE)
-
-
-_DOTTED = re.compile(r'[+-]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)')
-
-
-_LARGEST_INTEGER = 2**63 - 1
-
-
-def parse_scalar(word: str) -> bool | int | float | str:
-    """The value that ROS reads in a word written without quotes."""
-    if word in _TRUE or word in _FALSE:
-        return word in _TRUE
-    integer = _integer(word)
-    if integer is not None:
-        return integer
-    number = _double(word)
-    return word if number is None else number
-
-
-def _integer(word: str) -> int | None:
-    match = _INTEGER.fullmatch(word)
-    if match is None:
-        return None
-    base = 16 if match['hex'] else 8 if match['octal'] else 10
-    value = int(word, base)
-    return value if -_LARGEST_INTEGER - 1 <= value <= _LARGEST_INTEGER else None
-
-
-def _double(word: str) -> float | None:
-    if _SPECIAL.fullmatch(word) or _DOTTED.fullmatch(word):
-        return float(word.replace('.', ''))
-    if _HEXADECIMAL.fullmatch(word):
-        return float.fromhex(word)
-    match = _DECIMAL.fullmatch(word)
-    if match is None:
-        return None
-    value = float(word)
-    underflow = abs(value) < sys.float_info.min and match['digits'].strip('0.') != ''
-    return None if math.isinf(value) or underflow else value
-
+_SPECIAL = re.compile(r'[+-]?(?i:inf|infinity|nan)|[+-]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)')
 
 _PARAMETERS = 'ros__parameters'
-
-
 _UNTAGGED = '?'
-
-
 _PART = re.compile(r'\*|\*\*|[A-Za-z_][A-Za-z0-9_]*')
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A value and the line it was written on."""
+    """A value with its line number."""
 
     value: object
     line: int
@@ -95,7 +47,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Section:
-    """The parameters under one `ros__parameters`, for all nodes that `pattern` matches."""
+    """The parameters under one `ros__parameters`, for all nodes that match `pattern`."""
 
     pattern: str
     line: int
@@ -103,45 +55,65 @@ class Section:
 
     @property
     def is_wildcard(self) -> bool:
-        """Whether the section may speak to nodes of several names."""
+        """Whether the section can match nodes of several names."""
         return '*' in self.pattern.rsplit('/', 1)[-1]
 
     def matches(self, node: str) -> bool:
-        """Whether the section speaks to the node of this fully qualified name."""
+        """Whether the section applies to the node of this fully qualified name."""
         expression = self.pattern.replace('/**', r'(?:/\w+)#').replace('/*', r'/\w+')
         return re.fullmatch(expression.replace('#', '*'), node) is not None
 
 
 def parse(text: str) -> list[Section]:
-    """Read the sections of a parameter file in the order they are written.
+    """Read the sections of a parameter file, in order.
 
-    Raises ConfigurationError, with the line, if the text is no YAML or no parameter file.
+    Raises ConfigurationError, with the line, if the text is not YAML or not a parameter file.
     """
     try:
         root = _Composer(text).get_single_node()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f'line {mark.line + 1}: ' if mark else ''
-        raise ConfigurationError([f'{line}no valid YAML: {error.problem}']) from error
+        raise ConfigurationError([f'{line}not valid YAML: {error.problem}']) from error
     except yaml.YAMLError as error:
-        raise ConfigurationError([f'no valid YAML: {error}']) from error
+        raise ConfigurationError([f'not valid YAML: {error}']) from error
     if root is None:
-        raise _error(1, 'the file is empty: expected node names with ros__parameters')
+        raise _error(1, f'the file is empty: expected node names with {_PARAMETERS}')
     return list(_sections(root, ''))
 
 
+def parse_scalar(word: str) -> bool | int | float | str:
+    """Return the value that ROS reads from an unquoted word, as get_value() of its parser does."""
+    if word in _TRUE or word in _FALSE:
+        return word in _TRUE
+    if match := _INTEGER.fullmatch(word):
+        value = int(word, 16 if match['hex'] else 8 if match['octal'] else 10)
+        if -(2**63) <= value < 2**63:
+            return value
+    if _SPECIAL.fullmatch(word):
+        return float(word.replace('.', ''))
+    if _HEXADECIMAL.fullmatch(word):
+        return float.fromhex(word)
+    if match := _DECIMAL.fullmatch(word):
+        number = float(word)
+        underflow = abs(number) < sys.float_info.min and match['digits'].strip('0.') != ''
+        if math.isfinite(number) and not underflow:
+            return number
+    return word
+
+
 class _Composer(yaml.BaseLoader):
-    """Keeps each word as written, and refuses the references that rcl refuses."""
+    """Keeps each word as written, and rejects aliases, as rcl does."""
 
     def resolve(self, kind: Any, value: Any, implicit: Any) -> str:
-        """Give no type to what carries no tag: see `scalars`."""
+        """Leave the types of untagged scalars to `parse_scalar`."""
         if kind is yaml.ScalarNode:
             return _UNTAGGED
         tag: str = super().resolve(kind, value, implicit)  # type: ignore[no-untyped-call]
         return tag
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Compose a node of the tree, which must not be a reference to another one."""
+        """Compose a node, which must not be an alias."""
         if self.check_event(yaml.AliasEvent):
             event: Any = self.get_event()  # type: ignore[no-untyped-call]
             raise _error(_line(event), f'ROS does not support the reference *{event.anchor}')
@@ -164,33 +136,31 @@ def _sections(node: yaml.Node, name: str) -> Iterator[Section]:
         elif isinstance(value, yaml.MappingNode):
             yield from _sections(value, f'{name}/{key.removeprefix("/") if not name else key}')
         else:
-            raise _error(_line(value), f'{key} has a value, but stands outside of {_PARAMETERS}')
+            raise _error(_line(value), f'{key} has a value, but is outside of {_PARAMETERS}')
 
 
 def _section(node: yaml.Node, name: str) -> Section:
     if not all(_PART.fullmatch(part) for part in name.split('/')[1:]):
-        raise _error(_line(node), f'{name or "nothing"} is not a name that a node can have')
+        raise _error(_line(node), f'{name} is not a valid node name')
     if not isinstance(node, yaml.MappingNode):
-        raise _error(_line(node), f'{_PARAMETERS} of {name} holds no parameters')
+        raise _error(_line(node), f'{_PARAMETERS} of {name} has no parameters')
     section = Section(name, _line(node))
     for key, entry in _entries(node, ''):
         if key in section.entries:
-            first = section.entries[key].line
-            raise _error(entry.line, f'{key} was given before, on line {first}')
+            raise _repeated(entry.line, key, section.entries[key].line)
         section.entries[key] = entry
     return section
 
 
 def _entries(node: yaml.MappingNode, prefix: str) -> Iterator[tuple[str, Entry]]:
     for key, value in _pairs(node):
-        if isinstance(value, yaml.MappingNode):
-            if not value.value:
-                raise _error(_line(value), f'{prefix}{key} holds no parameters')
-            yield from _entries(value, f'{prefix}{key}.')
-        elif isinstance(value, yaml.SequenceNode):
-            yield prefix + key, Entry(_sequence(value, prefix + key), _line(value))
+        name = prefix + key
+        if not isinstance(value, yaml.MappingNode):
+            yield name, Entry(_value(value, name), _line(value))
+        elif value.value:
+            yield from _entries(value, f'{name}.')
         else:
-            yield prefix + key, Entry(_scalar(value, prefix + key), _line(value))
+            raise _error(_line(value), f'{name} has no parameters')
 
 
 def _pairs(node: yaml.MappingNode) -> Iterator[tuple[str, yaml.Node]]:
@@ -199,24 +169,26 @@ def _pairs(node: yaml.MappingNode) -> Iterator[tuple[str, yaml.Node]]:
         if not isinstance(key, yaml.ScalarNode) or not key.value:
             raise _error(_line(key), 'expected a name before the colon')
         if key.value in seen:
-            raise _error(_line(key), f'{key.value} was given before, on line {seen[key.value]}')
+            raise _repeated(_line(key), key.value, seen[key.value])
         seen[key.value] = _line(key)
         yield key.value, value
 
 
-def _sequence(node: yaml.SequenceNode, name: str) -> list[object]:
+def _value(node: yaml.Node, name: str) -> object:
+    if not isinstance(node, yaml.SequenceNode):
+        return _scalar(node, name)
     values = [_scalar(entry, name) for entry in node.value]
     if len({type(value) for value in values}) > 1:
         raise _error(
             _line(node),
-            f'{name} mixes types, which ROS does not read: write all entries alike (1.0, not 1)',
+            f'{name} mixes types, which ROS rejects: write all entries alike (1.0, not 1)',
         )
     return values
 
 
 def _scalar(node: yaml.Node, name: str) -> object:
     if not isinstance(node, yaml.ScalarNode):
-        raise _error(_line(node), f'{name} holds a list in a list, which ROS does not read')
+        raise _error(_line(node), f'{name} has a list in a list, which ROS rejects')
     if node.style in ('"', "'") or node.tag == 'tag:yaml.org,2002:str':
         return node.value
     if not node.value:
@@ -224,9 +196,13 @@ def _scalar(node: yaml.Node, name: str) -> object:
     return parse_scalar(node.value)
 
 
-def _line(mark: Any) -> int:
-    return cast('int', mark.start_mark.line) + 1
+def _line(node: Any) -> int:
+    return cast('int', node.start_mark.line) + 1
 
 
-def _error(line: int, what: str) -> ConfigurationError:
-    return ConfigurationError([f'line {line}: {what}'])
+def _error(line: int, problem: str) -> ConfigurationError:
+    return ConfigurationError([f'line {line}: {problem}'])
+
+
+def _repeated(line: int, name: str, first: int) -> ConfigurationError:
+    return _error(line, f'{name} is repeated, first given on line {first}')

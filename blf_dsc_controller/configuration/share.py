@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the files that come with the package are: presets (config/) and launch files (launch/).
-
-The answer never depends on the current folder: a preset's name means the same wherever a command
-is started.
-"""
+"""Where the data files of the package are: presets (`config/`) and launch files (`launch/`)."""
 
 from __future__ import annotations
 
@@ -19,41 +15,25 @@ if TYPE_CHECKING:
 PACKAGE = 'blf_dsc_controller'
 
 _CHECKOUT = Path(__file__).resolve().parents[2]
-_PRESETS = 'config'
 
 
 def share_folder() -> Path:
-    """Locate the folder that holds `config/` and `launch/`.
+    """Return the folder that holds `config/` and `launch/`, whatever the current folder is.
 
-    The source tree comes first if the code itself runs from one: an editable install leaves these
-    files there, and another folder would belong to another version. Then what ROS's ament index
-    knows (colcon), then the data folder of this Python's packages (pip).
+    The source tree comes first if the code runs from one: an editable install leaves the files
+    there. Then the ament index (colcon), then the data folders of this Python (pip).
 
-    Raises BlfDscError, naming the places looked at, when it is in none of them.
+    Raises BlfDscError with the places searched if it is in none of them.
     """
     searched = []
     for folder in _candidates():
-        if (folder / _PRESETS).is_dir():
+        if (folder / 'config').is_dir():
             return folder
-        searched.append(f'\n  - {folder / _PRESETS}')
+        searched.append(f'\n  - {folder / "config"}')
     raise BlfDscError(
-        f'the files that come with {PACKAGE} were not found: install the package again. '
-        f'Looked at:{"".join(searched)}'
+        f'the data files of {PACKAGE} were not found: install the package again. '
+        f'Searched:{"".join(searched)}'
     )
-
-
-def config_file(name: str) -> Path:
-    """Locate a file in `config/` by its name or, a preset, by its name without `.yaml`.
-
-    An empty name gives the folder itself. Raises BlfDscError, with the presets there are, when
-    there is no such file.
-    """
-    folder = share_folder() / _PRESETS
-    for path in (folder / f'{name}.yaml', folder / name):
-        if path.exists():
-            return path
-    presets = ', '.join(sorted(path.stem for path in folder.glob('*.yaml'))) or 'none'
-    raise BlfDscError(f'there is no preset {name!r} in {folder}; the presets are: {presets}')
 
 
 def _candidates() -> Iterator[Path]:
@@ -67,9 +47,7 @@ def _candidates() -> Iterator[Path]:
 def _ament_index() -> Iterator[Path]:
     try:
         from ament_index_python.packages import get_package_share_directory
-    except ImportError:
-        return
-    try:
+
         yield Path(get_package_share_directory(PACKAGE))
-    except (LookupError, OSError):  # not in the index; no AMENT_PREFIX_PATH, hence no index
+    except (ImportError, LookupError, OSError):  # no ROS; not in the index; no AMENT_PREFIX_PATH
         return

@@ -116,9 +116,7 @@ def _distribution(one: Parameter, text: object) -> Distribution:
     distribution = parse(text, one.kind.element)
     scalar: Kind = one.kind.element
     for value in distribution.extremes:
-        try:
-            dataclasses.replace(one, kind=scalar).convert(value)
-        except ValueError as error:
-            complaint = str(error).removeprefix(f'{one.name}: ')
-            raise ValueError(f'{distribution} can give what is not allowed: {complaint}') from None
+        for problem in dataclasses.replace(one, kind=scalar).problems(value):
+            complaint = problem.removeprefix(f'{one.name}: ')
+            raise ValueError(f'{distribution} can give what is not allowed: {complaint}')
     return distribution

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A configuration as the parameters of a ROS 2 node: declared, read, and changed while it runs."""
+"""Configurations as parameters of ROS 2 nodes: declared, read, and changed while the node runs."""
 
 from __future__ import annotations
 
@@ -33,38 +33,31 @@ if TYPE_CHECKING:
 
 Config = TypeVar('Config')
 
-_TYPES = {
-    Kind.BOOL: RosParameter.Type.BOOL,
-    Kind.INTEGER: RosParameter.Type.INTEGER,
-    Kind.DOUBLE: RosParameter.Type.DOUBLE,
-    Kind.STRING: RosParameter.Type.STRING,
-    Kind.DOUBLE_ARRAY: RosParameter.Type.DOUBLE_ARRAY,
-    Kind.STRING_ARRAY: RosParameter.Type.STRING_ARRAY,
-}
-
 _LARGEST_INTEGER = 2**63 - 1
 
 
 def declare(node: Node, cls: type[Config]) -> Config:
-    """Declare every parameter of the configuration `cls` and return what the node was given.
+    """Declare every parameter of a configuration, and return the one the node was started with.
 
-    Raises ConfigurationError with everything that is wrong with the files and arguments the node
-    was started with; no parameter is declared then.
+    Raises ConfigurationError with all problems of the files and arguments the node was started
+    with; then no parameter is declared.
     """
-    config = build(cls, _given(node, cls), node.get_fully_qualified_name())
+    config = build(cls, _overrides(node, cls), node.get_fully_qualified_name())
     values = flatten(config)
     for one in parameters(cls):
         value = values[one.name]
         typed = list(value) if isinstance(value, tuple) else value
-        # rclpy takes an empty list for bytes: left unset under its type, it reads back as empty.
-        content = _TYPES[one.kind] if typed == [] else typed
+        # rclpy takes an empty list for bytes; declared by its type, it reads back as unset.
+        content = RosParameter.Type[one.kind.name] if typed == [] else typed
         node.declare_parameter(one.name, content, descriptor(one), ignore_override=True)
     return config
 
 
 def read(node: Node, cls: type[Config]) -> Config:
-    """Return the present configuration of a node that has declared it."""
-    return build(cls, _current(node, cls), node.get_fully_qualified_name())
+    """Return the current configuration of a node that has declared it."""
+    values = {one.name: node.get_parameter_or(one.name).value for one in parameters(cls)}
+    given = {name: [] if value is None else value for name, value in values.items()}
+    return build(cls, given, node.get_fully_qualified_name())
 
 
 def on_change(
@@ -73,16 +66,15 @@ def on_change(
     apply: Callable[[Config], None],
     problems: Callable[[Config], list[str]] | None = None,
 ) -> None:
-    """Let the parameters of a node be changed while it runs, all of one request or none.
+    """Accept parameter changes while the node runs: all of a request, or none.
 
-    To be called after `declare`. Each request is judged as the whole configuration it would lead
-    to, and refused with the reasons if that is no valid one, or if `problems` finds that the node
-    cannot take it now.
-    `apply` gets the new configuration once it is in force; it must not fail.
+    Call it after `declare`. A request is validated as the whole configuration it leads to, and
+    rejected with the reasons if that is invalid, or if `problems` finds that the node cannot accept
+    it now. `apply` receives the new configuration once it is in effect, and must not fail.
     """
     names = {one.name for one in parameters(cls)}
 
-    def judge(requested: list[RosParameter]) -> SetParametersResult:
+    def validate(requested: list[RosParameter]) -> SetParametersResult:
         values = {one.name: one.value for one in requested if one.name in names}
         if not values:
             return SetParametersResult(successful=True)
@@ -93,80 +85,61 @@ def on_change(
         found = problems(candidate) if problems else []
         return SetParametersResult(successful=not found, reason='\n'.join(found))
 
-    def take(changed: list[RosParameter]) -> None:
+    def apply_changes(changed: list[RosParameter]) -> None:
         if any(one.name in names for one in changed):
             apply(read(node, cls))
 
-    node.add_on_set_parameters_callback(judge)
-    node.add_post_set_parameters_callback(take)
+    node.add_on_set_parameters_callback(validate)
+    node.add_post_set_parameters_callback(apply_changes)
 
 
 def descriptor(one: Parameter) -> ParameterDescriptor:
-    """Say of a parameter what `ros2 param describe` shows."""
-    rule = one.rule
-    symbol = f'{rule.symbol}: ' if rule.symbol else ''
-    unit = f' [{rule.unit}]' if rule.unit else ''
-    told = ParameterDescriptor(
-        description=f'{symbol}{rule.description}{unit}',
-        read_only=bool(rule.read_only),
-        additional_constraints='; '.join(_constraints(one)),
+    """Return what `ros2 param describe` shows of a parameter.
+
+    ROS has inclusive ranges only, so `build` alone rejects an excluded limit.
+    """
+    symbol = f'{one.symbol}: ' if one.symbol else ''
+    unit = f' [{one.unit}]' if one.unit else ''
+    constraints = [one.allowed] if one.allowed else []
+    if one.length:
+        constraints.append('as many entries as ' + ' times '.join(one.length))
+    if one.read_only:
+        constraints.append(f'fixed at the start: {one.read_only}')
+    described = ParameterDescriptor(
+        description=f'{symbol}{one.description}{unit}',
+        read_only=bool(one.read_only),
+        additional_constraints='; '.join(constraints),
     )
-    low, high = _limits(one)
+    low = one.above if one.at_least is None else one.at_least
+    high = one.below if one.at_most is None else one.at_most
     if one.kind is Kind.DOUBLE and (low, high) != (None, None):
-        told.floating_point_range = [
+        largest = sys.float_info.max
+        described.floating_point_range = [
             FloatingPointRange(
-                from_value=-sys.float_info.max if low is None else low,
-                to_value=sys.float_info.max if high is None else high,
+                from_value=-largest if low is None else low,
+                to_value=largest if high is None else high,
             )
         ]
     if one.kind is Kind.INTEGER and (low, high) != (None, None):
-        told.integer_range = [
+        described.integer_range = [
             IntegerRange(
                 from_value=-_LARGEST_INTEGER if low is None else int(low),
                 to_value=_LARGEST_INTEGER if high is None else int(high),
             )
         ]
-    return told
+    return described
 
 
-def _limits(one: Parameter) -> tuple[float | None, float | None]:
-    """Give ROS the limits it can express: one that is itself excluded is left to `build`."""
-    rule = one.rule
-    low = rule.above if rule.at_least is None else rule.at_least
-    high = rule.below if rule.at_most is None else rule.at_most
-    return low, high
+def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
+    """Return what the node was started with, without parameters of other nodes.
 
-
-def _constraints(one: Parameter) -> list[str]:
-    rule = one.rule
-    constraints = [one.allowed] if one.allowed else []
-    if rule.length:
-        constraints.append('as many entries as ' + ' times '.join(rule.length))
-    if rule.read_only:
-        constraints.append(f'fixed at the start: {rule.read_only}')
-    return constraints
-
-
-def _given(node: Node, cls: type[Config]) -> dict[str, Any]:
-    """Return what the node was given in files and arguments, without what is for other nodes.
-
-    A section for several nodes looks here like one for this node alone, so that only names which
-    no node of the package has are unknown.
+    rclpy does not show which section they come from, so a name that any node of the package has is
+    accepted, as in a section for several nodes.
     """
     own = {one.name: one.kind for one in parameters(cls)}
     others = known_names() - own.keys()
-    given = parameter_overrides(node)
     return {
-        name: [] if parameter.value is None and _is_array(own.get(name)) else parameter.value
-        for name, parameter in given.items()
+        name: [] if given.value is None and name in own and own[name].is_array else given.value
+        for name, given in parameter_overrides(node).items()
         if name not in others and not is_builtin(name)
     }
-
-
-def _current(node: Node, cls: type[Config]) -> dict[str, Any]:
-    values = {one.name: node.get_parameter_or(one.name).value for one in parameters(cls)}
-    return {name: [] if value is None else value for name, value in values.items()}
-
-
-def _is_array(kind: Kind | None) -> bool:
-    return kind is not None and kind.is_array

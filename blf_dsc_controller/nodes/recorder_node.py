@@ -11,7 +11,7 @@ from blf_dsc_controller.bags.context import MESSAGES
 from blf_dsc_controller.bags.errors import DiskFullError, WriteError
 from blf_dsc_controller.bags.losses import Losses
 from blf_dsc_controller.configuration.nodes import RecorderConfig
-from blf_dsc_controller.configuration.params_file import dumps_values
+from blf_dsc_controller.configuration.params_file import dumps
 from blf_dsc_controller.messages.errors import UnknownTypeError
 from blf_dsc_controller.messages.topics import Quality
 from blf_dsc_controller.nodes.bag_sinks import BagSink, RingSink
@@ -91,7 +91,7 @@ class BagRecorderNode(PlainNode):
 
     def _on_parameters(self, node: str, values: Values) -> None:
         self.parameters_of[node] = values
-        self._sink.configure(dumps_values(self.parameters_of))
+        self._sink.configure(dumps(self.parameters_of))
 
     def _wanted(self, topic: str) -> bool:
         if self._chosen:
