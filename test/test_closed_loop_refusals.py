@@ -140,7 +140,7 @@ def test_offline_needs_no_ros(tmp_path):
     ('content', 'told'),
     [
         ('sim_plant:\n  ros__parameters:\n    seed: [1,\n', 'params'),
-        ('sim_plant:\n  ros__parameters:\n    sede: 1\n', 'sede: there is no parameter'),
+        ('sim_plant:\n  ros__parameters:\n    sede: 1\n', 'sede: unknown parameter'),
     ],
     ids=['no YAML', 'unknown name'],
 )

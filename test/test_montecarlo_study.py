@@ -62,8 +62,8 @@ def test_preset_is_a_study_of_ten_thousand_runs():
 @pytest.mark.parametrize(
     ('before', 'after', 'expected'),
     [
-        ('arm.m2', 'arm.m3', r'line 15: vary.arm.m3: there is no parameter .* mean arm.m[12]\?'),
-        ('arm.m2', 'initial.position', r'vary.initial.position: there is no parameter'),
+        ('arm.m2', 'arm.m3', r'line 15: vary.arm.m3: unknown parameter.* mean arm.m[12]\?'),
+        ('arm.m2', 'initial.position', r'vary.initial.position: unknown parameter'),
         (
             'uniform(0.3',
             'unifrm(0.3',
