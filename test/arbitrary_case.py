@@ -40,7 +40,7 @@ def arbitrary_settings(random: np.random.Generator, n: int, p: int, **changes) -
         'n': n,
         'p': p,
         'm': p + n,
-        'model': -1,
+        'model': None,
         'window': 8,
         'interval': 1,
         'eta': 0.3,

@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.arms import models
-from blf_dsc_controller.compiled.layout import pack
+from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
@@ -29,8 +28,8 @@ from sim_plant.sensors import DIFFERENCED, MEASURED, Sensor
 T = 1e-3
 P = np.array([1.0, 0.32, 0.4])
 ARM = Arm(l1=1.0, l2=0.8, m1=0.5, m2=0.5, g=9.8)
-MODEL = models.two_link_arm(1.0, 9.8)
-CONSTANTS = np.array(MODEL.constants)
+R = 9.8  # 1/s^2, g / l1
+MODEL = TwoLink(R)
 REFERENCE = reference.pack(
     2, [reference.sinusoids_term((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))]
 )
@@ -55,7 +54,7 @@ def quick(**changes) -> Settings:
 
 def controller(settings: Settings) -> Controller:
     """Controller of the paper's reference."""
-    return Controller(pack(settings), REFERENCE)
+    return Controller(settings, REFERENCE)
 
 
 def plant(

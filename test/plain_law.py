@@ -62,13 +62,13 @@ class PlainLaw:
 
     def regressor(self, q, dq, v, a):
         """H, column by column: M a + C v + G of each unit parameter."""
-        columns = (dynamics(e, self.gains.constants[0], q, dq) for e in np.eye(3))
+        columns = (dynamics(e, self.gains.model.r, q, dq) for e in np.eye(3))
         return np.column_stack([M @ a + C @ v + G for M, C, G in columns])
 
     def take_in(self, t, dt, q, dq, applied):
         """Filter and keep the row of the last interval; latch the window when it is time."""
         g = self.gains
-        columns = [dynamics(e, g.constants[0], q, dq) for e in np.eye(3)]
+        columns = [dynamics(e, g.model.r, q, dq) for e in np.eye(3)]
         Yp = np.column_stack([M @ dq for M, _, _ in columns])
         Yr = np.column_stack([G - C.T @ dq for _, C, G in columns])
         if self.previous is not None:

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from blf_dsc_controller.arms import planar_chain, two_link
+from blf_dsc_controller.arms.model import arm_model
 from blf_dsc_controller.configuration.controller import MODELS, ControllerConfig, parameter_count
 from blf_dsc_controller.configuration.nodes import NODES, LoopConfig, RecorderConfig, known_names
 from blf_dsc_controller.configuration.params_file import load_loop, locate, read
@@ -55,10 +55,11 @@ def test_the_noisy_preset_changes_sensors_and_delay_alone():
 
 
 def test_models_and_choices_are_those_of_the_law():
-    assert MODELS == {'two_link': two_link.JOINTS, 'planar_chain': None}
-    assert parameter_count(two_link.JOINTS) == len(two_link.PARAMETER_NAMES)
-    for n in (1, 2, 7):
-        assert parameter_count(n) == len(planar_chain.parameter_names(n))
+    assert MODELS == {'two_link': 2, 'planar_chain': None}
+    for name, n in (('two_link', 2), *(('planar_chain', n) for n in (1, 2, 7))):
+        model = arm_model(name, n, l1=1.0, gravity=9.8)
+        assert model.n == n
+        assert parameter_count(n) == len(model.parameter_names)
     choices = {one.name: one.choices for one in parameters(ControllerConfig)}
     for law in choices['law']:
         given = {'law': law, 'truth.parameters': [1.0, 0.32, 0.4]}  # model_based asks for them

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from closed_loop_case import (
     P,
+    R,
     closed_loop,
     controller,
     plant,
@@ -14,8 +15,8 @@ from closed_loop_case import (
     recommended_minute,
     record,
 )
+from plain_law import dynamics
 
-from blf_dsc_controller.arms import two_link
 from blf_dsc_controller.law import barrier
 
 BOUND = 2e-3  # rad
@@ -73,8 +74,7 @@ def lyapunov_function(law, measurement):
         settings.knee,
         strict=True,
     )
-    M = np.zeros((2, 2))
-    two_link.inertia(P, measurement[:2], M)
+    M, _, _ = dynamics(P, R, measurement[:2], measurement[2:4])
     error = law.state.estimate[:3] - P
     return (
         sum(barrier.potential(*joint) for joint in joints)

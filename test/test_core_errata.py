@@ -9,15 +9,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from closed_loop_case import (
-    CONSTANTS,
     JOINTS,
     START,
     P,
+    R,
     controller,
     recommended,
 )
+from plain_law import dynamics
 
-from blf_dsc_controller.arms import two_link
 from blf_dsc_controller.errors import OutsideBarrierError
 from blf_dsc_controller.law import surface
 
@@ -35,13 +35,11 @@ def test_erratum_4_first_gravity_term_has_cos_q1():
     """(34) prints cos q2: a gravity that gains work on a closed path."""
 
     def corrected(q):
-        G = np.zeros(2)
-        two_link.gravity(CONSTANTS, P, q, G)
-        return G
+        return dynamics(P, R, q, (0.0, 0.0))[2]
 
     def printed(q):
-        outer = P[2] * CONSTANTS[0] * np.cos(q[0] + q[1])
-        return np.array([P[0] * CONSTANTS[0] * np.cos(q[1]) + outer, outer])
+        outer = P[2] * R * np.cos(q[0] + q[1])
+        return np.array([P[0] * R * np.cos(q[1]) + outer, outer])
 
     assert abs(work_around_a_circle(corrected)) < 1e-12
     # The curl of the printed field is P1 r sin q2, 9.8 N m/rad over a circle of 0.28 rad^2.

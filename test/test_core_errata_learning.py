@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from closed_loop_case import (
-    CONSTANTS,
+    MODEL,
     P,
     closed_loop,
     controller,
@@ -18,7 +18,6 @@ from closed_loop_case import (
     record,
 )
 
-from blf_dsc_controller.arms import two_link
 from blf_dsc_controller.law import adaptation, cholesky, projection
 from blf_dsc_controller.law.settings import EFFORT
 
@@ -179,7 +178,7 @@ def test_erratum_23_the_reference_excites_every_parameter_and_the_second_weakly(
     for each in t:
         q = np.array([1.9935, 1.3961]) + 0.3 * np.cos(each)
         dq, ddq = np.full(2, -0.3 * np.sin(each)), np.full(2, -0.3 * np.cos(each))
-        two_link.regressor(CONSTANTS, q, dq, dq, ddq, H)
+        MODEL.regressor(q, dq, dq, ddq, H)
         Phi += H.T @ H / t.size
     values, vectors = np.linalg.eigh(Phi)
 

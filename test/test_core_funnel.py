@@ -8,9 +8,9 @@ from math import exp, pi
 import numpy as np
 import pytest
 from arbitrary_case import arbitrary
-from closed_loop_case import P, closed_loop, controller, plant, recommended
+from closed_loop_case import P, R, closed_loop, controller, plant, recommended
+from plain_law import dynamics
 
-from blf_dsc_controller.arms import two_link
 from blf_dsc_controller.law import barrier, funnel, surface
 
 K0, K, RATE = 0.02, 0.0015, 2.0
@@ -144,8 +144,7 @@ def test_lyapunov_function_falls_while_the_bound_narrows():
     arm = plant(start=START, constant=(0.0, 0.0), amplitude=(0.0, 0.0))
     V = []
     for sample in closed_loop(law, arm, 2.0):
-        M = np.zeros((2, 2))
-        two_link.inertia(P, sample.measurement[:2], M)
+        M, _, _ = dynamics(P, R, sample.measurement[:2], sample.measurement[2:4])
         V.append(law.sample.lyapunov[0] + 0.5 * law.signals.xi2 @ M @ law.signals.xi2)
     # At the first sample alpha2 takes the whole step of the virtual control: V2 begins there.
     assert np.diff(V).max() < 1e-6 * V[0]

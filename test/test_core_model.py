@@ -9,10 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from closed_loop_case import ARM, CONSTANTS, MODEL, P, plant
+from closed_loop_case import ARM, MODEL, P, R, plant
+from plain_law import dynamics
 
 import sim_plant.dynamics as physics
-from blf_dsc_controller.arms import models, two_link
+from blf_dsc_controller.arms.model import arm_model
+from blf_dsc_controller.arms.planar_chain import PlanarChain
+from blf_dsc_controller.arms.two_link import TwoLink
 
 STATES = range(20)
 CLOSE = {'rtol': 0.0, 'atol': 1e-9}
@@ -32,20 +35,24 @@ def filled(kernel, shape, *arguments):
 
 
 def inertia(P, q):
-    return filled(two_link.inertia, (2, 2), P, q)
+    return dynamics(P, R, q, np.zeros(2))[0]
 
 
 def coriolis(P, q, dq):
-    return filled(two_link.coriolis, (2, 2), P, q, dq)
+    return dynamics(P, R, q, dq)[1]
 
 
 def gravity(P, q):
-    return filled(two_link.gravity, 2, CONSTANTS, P, q)
+    return dynamics(P, R, q, np.zeros(2))[2]
+
+
+def potential(P, q):
+    return P[0] * R * np.sin(q[0]) + P[2] * R * np.sin(q[0] + q[1])
 
 
 def momentum_regressor(q, dq):
     Yp, Yr = np.full((2, 2, 3), np.nan)
-    models.momentum_regressor(MODEL.code, CONSTANTS, q, dq, Yp, Yr)
+    MODEL.momentum_regressor(q, dq, Yp, Yr)
     return Yp, Yr
 
 
@@ -63,7 +70,7 @@ def state(random):
 def test_regressor_times_parameters_is_the_dynamics(state, random):
     P, q, dq = state
     v, a = random.uniform(-5.0, 5.0, (2, 2))
-    H = filled(models.regressor, (2, 3), MODEL.code, CONSTANTS, q, dq, v, a)
+    H = filled(MODEL.regressor, (2, 3), q, dq, v, a)
 
     np.testing.assert_allclose(
         H @ P, inertia(P, q) @ a + coriolis(P, q, dq) @ v + gravity(P, q), rtol=0.0, atol=1e-12
@@ -83,7 +90,7 @@ def test_momentum_regressor_times_parameters_is_the_momentum_and_the_rest(state)
 def test_both_regressors_describe_the_same_motion(state, random):
     _, q, dq = state
     ddq = random.uniform(-5.0, 5.0, 2)
-    H = filled(models.regressor, (2, 3), MODEL.code, CONSTANTS, q, dq, dq, ddq)
+    H = filled(MODEL.regressor, (2, 3), q, dq, dq, ddq)
     _, Yr = momentum_regressor(q, dq)
 
     rate = derivative(lambda s: momentum_regressor(q + s * dq + 0.5 * s * s * ddq, dq + s * ddq)[0])
@@ -102,10 +109,7 @@ def test_inertia_rate_minus_twice_coriolis_is_skew(state):
 def test_gravity_is_the_gradient_of_the_potential(state):
     P, q, _ = state
 
-    gradient = [
-        derivative(lambda s, axis=axis: two_link.potential(CONSTANTS, P, q + s * axis))
-        for axis in np.eye(2)
-    ]
+    gradient = [derivative(lambda s, axis=axis: potential(P, q + s * axis)) for axis in np.eye(2)]
 
     np.testing.assert_allclose(gradient, gravity(P, q), **CLOSE)
 
@@ -119,9 +123,7 @@ def test_parameters_are_those_of_the_simulated_arm(state):
         coriolis(P, q, dq), filled(physics.coriolis, (2, 2), ARM, q, dq), **CLOSE
     )
     np.testing.assert_allclose(gravity(P, q), filled(physics.gravity, 2, ARM, q), **CLOSE)
-    assert two_link.potential(CONSTANTS, P, q) == pytest.approx(
-        physics.potential_energy(ARM, q), abs=1e-12
-    )
+    assert potential(P, q) == pytest.approx(physics.potential_energy(ARM, q), abs=1e-12)
 
 
 def test_momentum_balance_holds_along_a_simulated_motion():
@@ -143,16 +145,16 @@ def test_momentum_balance_holds_along_a_simulated_motion():
 
 def test_model_names_its_parameters():
     assert MODEL.parameter_names == ('(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2')
-    assert (MODEL.n, MODEL.p) == (2, 3)
-    assert models.two_link_arm(0.5, 9.8).constants == (19.6,)
+    assert MODEL.parameter_units == ('kg m^2',) * 3
+    assert MODEL.n == 2
+    assert arm_model('two_link', 2, l1=0.5, gravity=9.8) == TwoLink(19.6)
 
 
-@pytest.mark.parametrize('model', [MODEL, models.planar_arm(3, 1.0, 9.8)], ids=['two', 'chain'])
+@pytest.mark.parametrize('model', [MODEL, PlanarChain(3, R)], ids=['two', 'chain'])
 def test_both_regressors_at_once_are_each_of_them(random, model):
     q, dq, v, a = random.normal(size=(4, model.n))
-    constants, shape = np.array(model.constants), (model.n, model.p)
-    each, both = np.full((2, 3, *shape), np.nan)
-    models.regressor(model.code, constants, q, dq, v, a, each[0])
-    models.momentum_regressor(model.code, constants, q, dq, each[1], each[2])
-    models.regressors(model.code, constants, q, dq, v, a, *both)
+    each, both = np.full((2, 3, model.n, len(model.parameter_names)), np.nan)
+    model.regressor(q, dq, v, a, each[0])
+    model.momentum_regressor(q, dq, each[1], each[2])
+    model.regressors(q, dq, v, a, *both)
     np.testing.assert_array_equal(both, each)

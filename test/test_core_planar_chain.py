@@ -6,12 +6,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blf_dsc_controller.arms import planar_chain, two_link
+from blf_dsc_controller.arms.planar_chain import PlanarChain
+from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, flatten, parameters
 from blf_dsc_controller.law.factory import controller_of
 
-R = np.array([9.8])  # 1/s^2, r = g / l1 with l1 = 1 m
+R = 9.8  # 1/s^2, r = g / l1 with l1 = 1 m
 SIZES = (1, 2, 3, 7)
 
 PER_JOINT = {
@@ -33,14 +34,16 @@ def case(n):
 
 
 def regressor(q, dq, v, a):
-    H = np.full((q.size, len(planar_chain.parameter_names(q.size))), np.nan)
-    planar_chain.regressor(R, q, dq, v, a, H)
+    arm = PlanarChain(q.size, R)
+    H = np.full((q.size, len(arm.parameter_names)), np.nan)
+    arm.regressor(q, dq, v, a, H)
     return H
 
 
 def momentum(q, dq):
-    Yp, Yr = np.full((2, q.size, len(planar_chain.parameter_names(q.size))), np.nan)
-    planar_chain.momentum_regressor(R, q, dq, Yp, Yr)
+    arm = PlanarChain(q.size, R)
+    Yp, Yr = np.full((2, q.size, len(arm.parameter_names)), np.nan)
+    arm.momentum_regressor(q, dq, Yp, Yr)
     return Yp, Yr
 
 
@@ -97,7 +100,7 @@ def test_coriolis_is_in_christoffel_form(n):
 def test_two_links_are_the_arm_of_section_iv():
     _, _, _, (q, dq, v, a) = case(2)
     H = np.zeros((2, 3))
-    two_link.regressor(R, q, dq, v, a, H)
+    TwoLink(R).regressor(q, dq, v, a, H)
     np.testing.assert_allclose(regressor(q, dq, v, a)[:, [0, 2, 1]], H, atol=1e-13)
 
 

@@ -31,7 +31,7 @@ from blf_dsc_controller.law.settings import Settings, settings_of
 from blf_dsc_controller.law.state import signals_of, signals_size, state_of, state_size
 
 SHAPES = [(1, 1), (2, 3), (3, 4), (6, 30)]
-SIZES = ('n', 'p', 'm', 'tones', 'geometry')
+SIZES = ('n', 'p', 'm', 'tones', 'model')
 
 
 def distinct_settings(n, p):
@@ -53,7 +53,7 @@ def distinct_settings(n, p):
 def test_settings_come_out_of_their_vector_as_they_went_in(n, p):
     settings = distinct_settings(n, p)
 
-    unpacked = settings_of(pack(settings))
+    unpacked = settings_of(pack(settings), settings.model)
 
     for name in Settings._fields:
         np.testing.assert_array_equal(
@@ -160,17 +160,22 @@ def test_a_restored_loop_continues_bit_for_bit():
 
 
 @numba.njit
-def many_updates(settings, reference, state, signals, measurement, sample, count):
+def many_updates(model, settings, reference, state, signals, measurement, sample, count):
     for k in range(count):
-        respond(settings, reference, state, signals, k * 1e-3, 1e-3, measurement, sample)
+        respond(model, settings, reference, state, signals, k * 1e-3, 1e-3, measurement, sample)
 
 
 def test_updates_in_a_compiled_loop_allocate_nothing():
     """Handing over the vectors costs a few, the same however many updates there are."""
-    settings = pack(quick(window=50, learning_start=0.01, sigma=-1.0))
-    law = controller(settings_of(settings))
+    law = controller(quick(window=50, learning_start=0.01, sigma=-1.0))
     measurement = np.array([*START, *np.zeros(4)])
-    vectors = (settings, REFERENCE, law.state_vector, law.signals_vector)
+    vectors = (
+        law.settings.model,
+        law.settings_vector,
+        REFERENCE,
+        law.state_vector,
+        law.signals_vector,
+    )
     arguments = (*vectors, measurement, law.sample_vector)
     many_updates(*arguments, 1)
     allocations = []

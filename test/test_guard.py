@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fault_rig import MILLISECOND, Rig
+from plain_law import dynamics
 
-from blf_dsc_controller.arms.two_link import gravity
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.supervision.reasons import Phase, Reason
@@ -25,10 +25,8 @@ def settings(**given):
 
 
 def weight(q):
-    """Gravity torque of the true parameters, from the potential."""
-    G = np.zeros(2)
-    gravity(np.array([9.8]), P, q, G)
-    return G
+    """Gravity torque of the true parameters."""
+    return dynamics(P, 9.8, q, (0.0, 0.0))[2]
 
 
 def safe(torque, q=Q, dq=DQ, estimate=P, **given):

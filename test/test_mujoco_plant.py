@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
 
+from plain_law import dynamics
 from ros_rig import RosRig
 
 from blf_dsc_controller.nodes.controller_node import ControllerNode
@@ -33,18 +34,15 @@ def test_its_arm_has_the_inertia_and_the_weight_that_the_model_says(example):
     """MuJoCo's M(q) and its bias torque at rest against the paper's (33), (34)."""
     import mujoco
 
-    from blf_dsc_controller.arms.two_link import gravity, inertia
-
     model = mujoco.MjModel.from_xml_path(str(EXAMPLE.with_name('arm.xml')))
     data = mujoco.MjData(model)
     for q in np.random.default_rng(0).uniform(-3.0, 3.0, (20, 2)):
         data.qpos[:] = q
         mujoco.mj_forward(model, data)
-        theirs, ours, weight = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2)
+        theirs = np.zeros((2, 2))
         for i in range(2):
             mujoco.mj_mulM(model, data, theirs[i], np.eye(2)[i])
-        inertia(P, q, ours)
-        gravity(np.array([9.8]), P, q, weight)
+        ours, _, weight = dynamics(P, 9.8, q, (0.0, 0.0))
         np.testing.assert_allclose(theirs, ours, atol=1e-8)  # the masses have 1e-9 kg m^2
         np.testing.assert_allclose(data.qfrc_bias, weight, atol=1e-8)
     assert example.COMMANDED == ('joint1', 'joint2')

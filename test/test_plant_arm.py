@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from plants import ARM, ODD_ARM
 
-from blf_dsc_controller.arms.two_link import regressor
+from blf_dsc_controller.arms.two_link import TwoLink
 from sim_plant.dynamics import (
     acceleration,
     coriolis,
@@ -119,7 +119,7 @@ def test_regressor_of_the_controller_describes_this_arm(arm, state):
     q, dq, a = state
     v = dq[::-1] + 0.3
     H = np.empty((2, 3))
-    regressor(np.array([arm.g / arm.l1]), q, dq, v, a, H)
+    TwoLink(arm.g / arm.l1).regressor(q, dq, v, a, H)
     M, C, G = matrix(mass_matrix, arm, q), matrix(coriolis, arm, q, dq), vector(gravity, arm, q)
     assert H @ vector(parameters, arm, size=3) == pytest.approx(M @ a + C @ v + G, abs=1e-11)
 

@@ -7,8 +7,11 @@ compiled.
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 
+from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.law.settings import Settings
 
 
@@ -34,6 +37,7 @@ class NumpyLaw:
         self.samples = 0
         self.latched: tuple[np.ndarray, np.ndarray] | None = None
         self.pole = 1.0 - np.exp(-s.pole * sample_time)
+        self.gravity = cast('TwoLink', settings.model).r
         self.share = 1.0 - np.exp(-sample_time / s.time_constant)
 
     def update(
@@ -64,7 +68,7 @@ class NumpyLaw:
         return self.tau
 
     def _regressor(self, q: np.ndarray, dq: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        r = self.s.constants[0]
+        r = self.gravity
         c2, s2, c12 = np.cos(q[1]), np.sin(q[1]), np.cos(q[0] + q[1])
         coriolis = s2 * (dq[1] * v[0] + (dq[0] + dq[1]) * v[1])
         return np.array(
@@ -75,7 +79,7 @@ class NumpyLaw:
         )
 
     def _momentum(self, q: np.ndarray, dq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        r = self.s.constants[0]
+        r = self.gravity
         c2, s2, c12 = np.cos(q[1]), np.sin(q[1]), np.cos(q[0] + q[1])
         both = dq[0] + dq[1]
         Yp = np.array([[dq[0], both, c2 * (dq[0] + both)], [0.0, both, c2 * dq[0]]])

@@ -14,79 +14,102 @@ of Section IV, its parameters in the order 11, 12, 22.
 from __future__ import annotations
 
 from math import cos, sin
+from typing import NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
 
 
-def parameter_names(n: int) -> tuple[str, ...]:
-    """Names of the P_ij, in the order of the regressor's columns."""
-    return tuple(f'P{i + 1}{j + 1}' for i in range(n) for j in range(i, n))
+class PlanarChain(NamedTuple):
+    """Planar arm of n links: an `ArmModel`."""
 
+    n: int
+    r: float  # g / l1, 1/s^2
 
-@inner
-def regressor(
-    constants: np.ndarray,
-    q: np.ndarray,
-    dq: np.ndarray,
-    v: np.ndarray,
-    a: np.ndarray,
-    H: np.ndarray,
-) -> None:
-    """Fill H (n x p) so that H P = M(q) a + C(q, dq) v + G(q)   [N m], Property III."""
-    n = q.size
-    column = 0
-    phi_i, w_i, v_i, a_i = 0.0, 0.0, 0.0, 0.0
-    for i in range(n):
-        phi_i += q[i]
-        w_i += dq[i]
-        v_i += v[i]
-        a_i += a[i]
-        difference, w_j, v_j, a_j = 0.0, w_i, v_i, a_i
-        for j in range(i, n):
-            if j > i:
-                difference -= q[j]  # phi_i - phi_j
-                w_j += dq[j]
-                v_j += v[j]
-                a_j += a[j]
-            c = cos(difference)
-            s = sin(difference)
-            for k in range(n):
-                H[k, column] = 0.0
-            Q_i = c * a_j + s * w_j * v_j
-            Q_j = c * a_i - s * w_i * v_i
-            if i == 0:
-                Q_j += constants[0] * cos(phi_i - difference)
-            add_column(H, column, i, j, Q_i, Q_j)
-            column += 1
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the P_ij, in the order of the regressor's columns."""
+        return tuple(f'P{i + 1}{j + 1}' for i in range(self.n) for j in range(i, self.n))
 
+    @property
+    def parameter_units(self) -> tuple[str, ...]:
+        """Units of the P_ij."""
+        return ('kg m^2',) * (self.n * (self.n + 1) // 2)
 
-@inner
-def momentum_regressor(
-    constants: np.ndarray, q: np.ndarray, dq: np.ndarray, Yp: np.ndarray, Yr: np.ndarray
-) -> None:
-    """Fill Yp, Yr (n x p) so that Yp P = M dq [kg m^2/s] and Yr P = G - C^T dq [N m]."""
-    n = q.size
-    column = 0
-    phi_i, w_i = 0.0, 0.0
-    for i in range(n):
-        phi_i += q[i]
-        w_i += dq[i]
-        difference, w_j = 0.0, w_i
-        for j in range(i, n):
-            if j > i:
-                difference -= q[j]
-                w_j += dq[j]
-            c = cos(difference)
-            s = sin(difference)
-            for k in range(n):
-                Yp[k, column] = 0.0
-                Yr[k, column] = 0.0
-            gravity = constants[0] * cos(phi_i - difference) if i == 0 else 0.0
-            add_column(Yp, column, i, j, c * w_j, c * w_i)
-            add_column(Yr, column, i, j, s * w_i * w_j, gravity - s * w_i * w_j)
-            column += 1
+    def regressor(
+        self,
+        q: np.ndarray,
+        dq: np.ndarray,
+        v: np.ndarray,
+        a: np.ndarray,
+        H: np.ndarray,
+    ) -> None:
+        """Fill H (n, p) so that H P = M(q) a + C(q, dq) v + G(q)   [N m], Property III."""
+        n = q.size
+        column = 0
+        phi_i, w_i, v_i, a_i = 0.0, 0.0, 0.0, 0.0
+        for i in range(n):
+            phi_i += q[i]
+            w_i += dq[i]
+            v_i += v[i]
+            a_i += a[i]
+            difference, w_j, v_j, a_j = 0.0, w_i, v_i, a_i
+            for j in range(i, n):
+                if j > i:
+                    difference -= q[j]  # phi_i - phi_j
+                    w_j += dq[j]
+                    v_j += v[j]
+                    a_j += a[j]
+                c = cos(difference)
+                s = sin(difference)
+                for k in range(n):
+                    H[k, column] = 0.0
+                Q_i = c * a_j + s * w_j * v_j
+                Q_j = c * a_i - s * w_i * v_i
+                if i == 0:
+                    Q_j += self.r * cos(phi_i - difference)
+                add_column(H, column, i, j, Q_i, Q_j)
+                column += 1
+
+    def momentum_regressor(
+        self, q: np.ndarray, dq: np.ndarray, Yp: np.ndarray, Yr: np.ndarray
+    ) -> None:
+        """Fill Yp, Yr (n, p) so that Yp P = M dq [N m s] and Yr P = G - C^T dq [N m]."""
+        n = q.size
+        column = 0
+        phi_i, w_i = 0.0, 0.0
+        for i in range(n):
+            phi_i += q[i]
+            w_i += dq[i]
+            difference, w_j = 0.0, w_i
+            for j in range(i, n):
+                if j > i:
+                    difference -= q[j]
+                    w_j += dq[j]
+                c = cos(difference)
+                s = sin(difference)
+                for k in range(n):
+                    Yp[k, column] = 0.0
+                    Yr[k, column] = 0.0
+                gravity = self.r * cos(phi_i - difference) if i == 0 else 0.0
+                add_column(Yp, column, i, j, c * w_j, c * w_i)
+                add_column(Yr, column, i, j, s * w_i * w_j, gravity - s * w_i * w_j)
+                column += 1
+
+    def regressors(
+        self,
+        q: np.ndarray,
+        dq: np.ndarray,
+        v: np.ndarray,
+        a: np.ndarray,
+        H: np.ndarray,
+        Yp: np.ndarray,
+        Yr: np.ndarray,
+    ) -> None:
+        """`regressor` and `momentum_regressor` of one state."""
+        self.regressor(q, dq, v, a, H)
+        self.momentum_regressor(q, dq, Yp, Yr)
 
 
 @inner

@@ -25,6 +25,9 @@ from numba.extending import register_jitable
 
 F = TypeVar('F', bound=Callable[..., object])
 
+INLINED = {'error_model': 'numpy', 'forceinline': True, 'no_cfunc_wrapper': True}
+"""Compiler options of functions that are compiled into kernels."""
+
 _PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 _GROUND_FLOOR = (
     'blf_dsc_controller/compiled/*.py',
@@ -95,7 +98,7 @@ def _file_stem(function: Callable[..., object]) -> str:
 
 def inner(function: F) -> F:
     """Let kernels call `function`, which is compiled into them; in Python it stays what it is."""
-    register_jitable(error_model='numpy', forceinline=True, no_cfunc_wrapper=True)(function)
+    register_jitable(**INLINED)(function)
     return function
 
 

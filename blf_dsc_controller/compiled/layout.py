@@ -12,14 +12,14 @@ many arrays would cost more than a step.  A `NamedTuple` names the parts of such
     state_of, state_size = view_of(State), size_of(State)
 
     vector = np.zeros(state_size(settings))
-    state = state_of(vector, settings)           # in Python and in kernels alike; nothing is copied
+    state = state_of(vector, settings)  # in Python and in kernels alike; nothing is copied
 
 Lengths are expressions in the attributes of the second argument, here `settings.n`, `settings.m`
 and `settings.N`; `'actuator.delay'` works as well, and any named tuple or object serves (a named
-tuple in kernels).  Fields of type `int` and `float` are numbers, read when the view is made.  A
-layout that has an `int` field of the name of a length reads it from there; with all of them in the
-vector the view takes the vector alone, and `pack` of the tuple makes it.  A field may be a
-`NamedTuple` with a layout itself.
+tuple in kernels).  Fields of type `int` and `float` are numbers, read when the view is made.  An
+`int` field of the layout itself serves as a length, too; with all of them in the vector the view
+takes the vector alone, and `pack` of the tuple makes it.  A field may be a `NamedTuple` with a
+layout itself.  A field of any other type is in no vector: the view takes it as a further argument.
 """
 
 from __future__ import annotations
@@ -40,17 +40,21 @@ Cell = Annotated[Array, '1']
 T = TypeVar('T')
 
 
-def pack(layout: Any) -> Array:
+def pack(layout: Any) -> np.ndarray:
     """Vector of a layout's numbers and arrays (or sequences), in the order of its fields."""
-    if isinstance(layout, tuple) and hasattr(layout, '_fields'):
-        return np.concatenate([pack(part) for part in layout])
-    return np.ravel(np.asarray(layout, dtype=np.float64))
+    parts = [
+        pack(getattr(layout, name))
+        if hasattr(hint, '_fields')
+        else np.ravel(np.asarray(getattr(layout, name), dtype=np.float64))
+        for name, hint in _hints(type(layout)).items()
+        if _is_part(hint)
+    ]
+    return np.concatenate(parts)
 
 
 def size_of(layout: type) -> Callable[..., int]:
     """Function of the lengths (see above) that returns the size of a layout's vector."""
-    terms = ['*'.join(f'({length})' for length in shape) for shape in _shapes(layout, ())]
-    size: Callable[..., int] = _defined('size', '_sizes', [f'return {" + ".join(terms)}'], {})
+    size: Callable[..., int] = _defined('_sizes', f'return {" + ".join(_sizes(layout))}', {})
     return size
 
 
@@ -60,12 +64,15 @@ def view_of(layout: type[T]) -> Callable[..., T]:
     Kernels may call it; its arrays are views that must not outlive the vector (`views.part`).
     """
     names: dict[str, Any] = {'_part': part}  # no field's name starts with an underscore
-    hints = get_type_hints(layout, include_extras=True)
+    hints = _hints(layout)
     own = tuple(name for name, hint in hints.items() if hint is int)
     lines = ['_at = 0']
-    expression = _view(layout, own, lines, names, '')
-    arguments = '_vector, _sizes' if any('_sizes.' in line for line in lines) else '_vector'
-    view: Callable[..., T] = _defined('view', arguments, [*lines, f'return {expression}'], names)
+    result = _view(layout, own, lines, names, '')
+    arguments = ['_vector', *(name for name, hint in hints.items() if not _is_part(hint))]
+    if any('_sizes.' in line for line in lines):
+        arguments.insert(1, '_sizes')
+    body = '\n    '.join([*lines, f'return {result}'])
+    view: Callable[..., T] = _defined(', '.join(arguments), body, names)
     return inner(view)
 
 
@@ -75,7 +82,7 @@ def _view(
     """Append the reading of each field to `lines` and return the call that builds the tuple."""
     names[f'{prefix}{layout.__name__}'] = layout
     values = []
-    for name, hint in get_type_hints(layout, include_extras=True).items():
+    for name, hint in _hints(layout).items():
         local = f'{prefix}{name}'
         if hasattr(hint, '_fields'):
             values.append(f'{name}={_view(hint, own, lines, names, f"{local}_")}')
@@ -84,19 +91,27 @@ def _view(
         if hint in (int, float):
             lines += [f'{local} = {"int(_vector[_at])" if hint is int else "_vector[_at]"}']
             lines += ['_at += 1']
-            continue
-        shape = [_length(length, own) for length in hint.__metadata__]
-        lines += [f'{local} = _part(_vector, _at, ({", ".join(shape)},))']
-        lines += [f'_at += {"*".join(f"({length})" for length in shape)}']
+        elif _is_part(hint):
+            shape = [_length(length, own) for length in hint.__metadata__]
+            lines += [f'{local} = _part(_vector, _at, ({", ".join(shape)},))']
+            lines += [f'_at += {_product(shape)}']
     return f'{prefix}{layout.__name__}({", ".join(values)})'
 
 
-def _shapes(layout: type, own: tuple[str, ...]) -> Iterator[list[str]]:
-    for hint in get_type_hints(layout, include_extras=True).values():
+def _sizes(layout: type) -> Iterator[str]:
+    for hint in _hints(layout).values():
         if hasattr(hint, '_fields'):
-            yield from _shapes(hint, own)
-        else:
-            yield [_length(length, own) for length in getattr(hint, '__metadata__', ('1',))]
+            yield from _sizes(hint)
+        elif _is_part(hint):
+            yield _product([_length(length, ()) for length in getattr(hint, '__metadata__', '1')])
+
+
+def _hints(layout: type) -> dict[str, Any]:
+    return get_type_hints(layout, include_extras=True)
+
+
+def _is_part(hint: Any) -> bool:
+    return hint in (int, float) or hasattr(hint, '__metadata__') or hasattr(hint, '_fields')
 
 
 def _length(expression: object, own: tuple[str, ...]) -> str:
@@ -111,8 +126,12 @@ def _length(expression: object, own: tuple[str, ...]) -> str:
     return ast.unparse(FromSizes().visit(ast.parse(str(expression), mode='eval')))
 
 
-def _defined(name: str, arguments: str, lines: list[str], names: dict[str, Any]) -> Any:
+def _product(lengths: list[str]) -> str:
+    return ' * '.join(f'({length})' for length in lengths)
+
+
+def _defined(arguments: str, body: str, names: dict[str, Any]) -> Any:
     """Python function of generated source."""
-    source = f'def {name}({arguments}):\n' + ''.join(f'    {line}\n' for line in lines)
+    source = f'def generated({arguments}):\n    {body}\n'
     exec(source, names)  # noqa: S102 - generated above, of the package's own annotations
-    return names[name]
+    return names['generated']

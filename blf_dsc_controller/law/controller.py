@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import inner, kernel
+from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.compiled.views import part
 from blf_dsc_controller.law import funnel
 from blf_dsc_controller.law import step as law
@@ -69,6 +71,7 @@ def answer(
 
 @kernel
 def respond(
+    model: ArmModel,
     settings_vector: np.ndarray,
     reference_vector: np.ndarray,
     state_vector: np.ndarray,
@@ -78,8 +81,8 @@ def respond(
     measurement: np.ndarray,
     sample_vector: np.ndarray,
 ) -> None:
-    """`answer`, with settings, state, signals and sample as packed vectors."""
-    settings = settings_of(settings_vector)
+    """`answer` for an arm model, with settings, state, signals and sample as packed vectors."""
+    settings = settings_of(settings_vector, model)
     answer(
         settings,
         reference_vector,
@@ -102,11 +105,11 @@ class Controller:
         sample: views on what is told of it; `sample.torque` is the answer.
     """
 
-    def __init__(self, settings_vector: np.ndarray, reference_vector: np.ndarray) -> None:
-        """Allocate for packed settings (`settings.pack`) and reference; compile the kernels."""
-        self.settings_vector = settings_vector
+    def __init__(self, settings: Settings, reference_vector: np.ndarray) -> None:
+        """Allocate for settings and a packed reference; compile the kernels."""
+        self.settings_vector = pack(settings)
         self.reference_vector = reference_vector
-        self.settings = settings_of(settings_vector)
+        self.settings = settings_of(self.settings_vector, settings.model)
         self.state_vector = np.zeros(state_size(self.settings))
         self.signals_vector = np.zeros(signals_size(self.settings))
         self.state = state_of(self.state_vector, self.settings)
@@ -153,6 +156,7 @@ class Controller:
             measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
         """
         respond(
+            self.settings.model,
             self.settings_vector,
             self.reference_vector,
             self.state_vector,

@@ -84,7 +84,7 @@ class ExcitationProblem:
         settings = self._settings
         motion = sampled(pack(self.n, [sinusoids_term(**parameters)]), self._times)
         rows = np.zeros((self._times.size, settings.n, settings.m))
-        rows_along(self._vector, self._times, motion, rows)
+        rows_along(self._settings.model, self._vector, self._times, motion, rows)
         torque = rows[:, :, : settings.p] @ self._guess
         values = (motion[:, 0] - self._middle, motion[:, 1], motion[:, 2], torque)
         ratios = [

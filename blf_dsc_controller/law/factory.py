@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.arms import models
-from blf_dsc_controller.compiled.layout import pack
+from blf_dsc_controller.arms.model import ArmModel, arm_model
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
@@ -35,11 +34,9 @@ COLUMN_GAIN = 1.0
 """Entry of Gamma for the disturbance columns: they do not act on the torque."""
 
 
-def model_of(config: ControllerConfig) -> models.Model:
+def model_of(config: ControllerConfig) -> ArmModel:
     """Model named by `model`, with the geometry that the controller is told."""
-    if config.model == 'planar_chain':
-        return models.planar_arm(len(config.joints), config.arm.l1, config.arm.gravity)
-    return models.two_link_arm(config.arm.l1, config.arm.gravity)
+    return arm_model(config.model, len(config.joints), config.arm.l1, config.arm.gravity)
 
 
 def column_names(config: ControllerConfig) -> tuple[str, ...]:
@@ -67,16 +64,16 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     """Translate the configuration's words into the paper's symbols."""
     model = model_of(config)
     learning = config.learning
-    columns = len(column_names(config))
+    p, columns = len(model.parameter_names), len(column_names(config))
     truth = config.truth
     per_joint = zip(
         config.barrier.bound, config.barrier.weight, config.barrier.slope_limit, strict=True
     )
     settings = Settings(
+        model=model,
         n=model.n,
-        p=model.p,
-        m=model.p + columns,
-        model=model.code,
+        p=p,
+        m=p + columns,
         surface=SURFACES.index('filtered'),
         prediction=PREDICTIONS.index(learning.prediction),
         latch=LATCHES.index(learning.latch),
@@ -88,7 +85,6 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         viscous=int(learning.viscous),
         coulomb=int(learning.coulomb),
         tones=len(learning.frequencies),
-        geometry=len(model.constants),
         truth_known=int(bool(truth.parameters)),
         feed_forward=int(truth.feed_forward),
         time_constant=config.surface.time_constant,
@@ -120,9 +116,8 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         true_disturbance=np.array((truth.constant, truth.amplitude, truth.frequency, truth.phase)),
         Gamma=np.array(learning.adaptation_gain + (COLUMN_GAIN,) * columns),
         initial_estimate=np.array(learning.initial_estimate + (0.0,) * columns),
-        true_parameters=np.array(truth.parameters or (0.0,) * model.p),
+        true_parameters=np.array(truth.parameters or (0.0,) * p),
         frequencies=np.array(learning.frequencies),
-        constants=np.array(model.constants),
     )
     return settings._replace(**_of_law(config, settings))
 
@@ -161,7 +156,7 @@ def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
 
 def controller_of(config: ControllerConfig) -> Controller:
     """Controller of a configuration, compiled and at rest."""
-    return Controller(pack(settings_of_config(config)), reference_of(config))
+    return Controller(settings_of_config(config), reference_of(config))
 
 
 def begin(

@@ -3,7 +3,6 @@
 
 import numpy as np
 
-from blf_dsc_controller.arms import models
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.settings import LINEAR, Settings
@@ -31,9 +30,7 @@ def error_term(settings: Settings, signals: Signals) -> float:
 @inner
 def kinetic_term(settings: Settings, signals: Signals, q: np.ndarray) -> float:
     """xi2^T M xi2 / 2 [J], by M xi2 = Yp(q, xi2) P; overwrites Yp and Yr in `signals`."""
-    models.momentum_regressor(
-        settings.model, settings.constants, q, signals.xi2, signals.momentum, signals.rest
-    )
+    settings.model.momentum_regressor(q, signals.xi2, signals.momentum, signals.rest)
     total = 0.0
     for i in range(settings.n):
         for j in range(settings.p):

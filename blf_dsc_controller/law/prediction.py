@@ -20,7 +20,6 @@ from math import exp
 
 import numpy as np
 
-from blf_dsc_controller.arms import models
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law import surface
 from blf_dsc_controller.law.settings import FILTERED, LAMBDA, Settings
@@ -109,7 +108,7 @@ def accelerated_row(
         scale = heuristic_factor(settings, state, signals, dq)
     else:
         X = signals.momentum
-        models.regressor(settings.model, settings.constants, q, dq, dq, signals.acceleration, X)
+        settings.model.regressor(q, dq, dq, signals.acceleration, X)
     for i in range(settings.n):
         for j in range(settings.m):
             signals.row[i, j] = X[i, j] if j < settings.p else scale * signals.rest[i, j]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from typing import Annotated, NamedTuple
 
+from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.layout import Array, view_of
 
 # What these settings may be called; the vector holds the index.
@@ -28,10 +29,10 @@ class Settings(NamedTuple):
     The kernels' view of the flat vector that `pack` makes; the order of the fields is its layout.
     """
 
+    model: ArmModel
     n: int
     p: int
     m: int
-    model: int  # code of the model
     surface: int
     prediction: int
     latch: int
@@ -43,7 +44,6 @@ class Settings(NamedTuple):
     viscous: int  # 1: a column dq_i per joint
     coulomb: int  # 1: a column tanh(dq_i / coulomb_velocity) per joint
     tones: int  # sine and cosine columns per joint, for as many frequencies
-    geometry: int  # constants of the model
     truth_known: int  # 1: true_parameters and true_disturbance hold
     feed_forward: int  # 1: the true disturbance is compensated
     time_constant: float  # lambda of (13), s
@@ -77,7 +77,6 @@ class Settings(NamedTuple):
     initial_estimate: Annotated[Array, 'm']  # P^(0), zeros for the columns
     true_parameters: Annotated[Array, 'p']
     frequencies: Annotated[Array, 'tones']  # of the sine and cosine columns, rad/s
-    constants: Annotated[Array, 'geometry']  # what the model's regressors know of the geometry
 
 
 settings_of = view_of(Settings)

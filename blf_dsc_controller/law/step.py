@@ -10,7 +10,6 @@ from math import sin
 
 import numpy as np
 
-from blf_dsc_controller.arms import models
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.views import part
 from blf_dsc_controller.law import (
@@ -100,12 +99,12 @@ def regress(
     settings: Settings, state: State, signals: Signals, q: np.ndarray, dq: np.ndarray
 ) -> None:
     """H(q, dq, alpha2, alpha2') and, for the prediction that needs them, Yp and Yr."""
-    model, constants, H = settings.model, settings.constants, signals.H
+    model, H = settings.model, signals.H
     if settings.prediction != FILTERED:
-        models.regressor(model, constants, q, dq, state.alpha2, signals.dalpha2, H)
+        model.regressor(q, dq, state.alpha2, signals.dalpha2, H)
         return
     Yp, Yr = signals.momentum, signals.rest
-    models.regressors(model, constants, q, dq, state.alpha2, signals.dalpha2, H, Yp, Yr)
+    model.regressors(q, dq, state.alpha2, signals.dalpha2, H, Yp, Yr)
 
 
 @inner

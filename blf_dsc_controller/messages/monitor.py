@@ -11,7 +11,6 @@ from math import exp, nan
 
 import numpy as np
 
-from blf_dsc_controller.arms.models import momentum_regressor
 from blf_dsc_controller.law.sample import Sample
 from blf_dsc_controller.law.settings import LINEAR, NEWTON, Settings
 from blf_dsc_controller.messages import topics
@@ -34,7 +33,7 @@ def largest_inertia(settings: Settings) -> float:
     for angle in np.linspace(-np.pi, np.pi, _POSTURES):
         M = np.zeros((n, n))
         for i, unit in enumerate(np.eye(n)):
-            momentum_regressor(settings.model, settings.constants, np.full(n, angle), unit, Yp, Yr)
+            settings.model.momentum_regressor(np.full(n, angle), unit, Yp, Yr)
             M[:, i] = Yp @ settings.true_parameters
         largest = max(largest, float(np.linalg.eigvalsh(M)[-1]))
     return largest

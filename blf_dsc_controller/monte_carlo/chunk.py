@@ -65,6 +65,7 @@ def _measured(
         plant.settings,
         plant.state,
         plant.rng,
+        controller.settings.model,
         controller.settings_vector,
         controller.reference_vector,
         controller.state_vector,

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.views import borrowed, part
 from blf_dsc_controller.law.controller import decide
@@ -174,6 +175,7 @@ def run(
     plant_settings: np.ndarray,
     plant_state: np.ndarray,
     rng: np.random.Generator,
+    model: ArmModel,
     settings: np.ndarray,
     reference: np.ndarray,
     state: np.ndarray,
@@ -190,6 +192,7 @@ def run(
         plant_settings: of the plant.
         plant_state: of the plant, moved on.
         rng: of the plant's noise.
+        model: of the arm.
         settings: packed `Settings`.
         reference: packed reference.
         state: packed `State`, moved on.
@@ -205,7 +208,7 @@ def run(
     wanted_motion = borrowed(reference)
     wanted = wanted_of(borrowed(wanted_vector))
     figures = figures_of(borrowed(figures_vector), n)
-    law = settings_of(settings)
+    law = settings_of(settings, model)
     told = sample_of(borrowed(sample), law)
     law_state = state_of(state, law)
     law_signals = signals_of(signals, law)
@@ -234,7 +237,7 @@ def weigh_record(
     figures_vector: np.ndarray,
 ) -> None:
     """Fill the figures of a run of which every sample is there (`simulation.Record`)."""
-    law = settings_of(settings)
+    law = settings_of(settings, None)
     wanted = wanted_of(borrowed(wanted_vector))
     figures = figures_of(borrowed(figures_vector), law.n)
     begin(figures)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.compiled.views import borrowed
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -59,6 +60,7 @@ def loop(
     plant_settings: np.ndarray,
     plant_state: np.ndarray,
     rng: np.random.Generator,
+    model: ArmModel,
     settings: np.ndarray,
     reference: np.ndarray,
     state: np.ndarray,
@@ -70,7 +72,7 @@ def loop(
     is_last: bool,
 ) -> None:
     """Run as many samples as there are rows; the torque of the last row of all is not applied."""
-    law = settings_of(settings)
+    law = settings_of(settings, model)
     law_state = state_of(state, law)
     law_signals = signals_of(signals, law)
     arm, now = plants.plant_of(plant_settings, plant_state)
@@ -118,6 +120,7 @@ def simulate(
             plant.settings,
             plant.state,
             plant.rng,
+            controller.settings.model,
             controller.settings_vector,
             controller.reference_vector,
             controller.state_vector,

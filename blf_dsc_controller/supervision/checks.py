@@ -53,7 +53,7 @@ def look(
         SUSPECT if a number is not finite, a torque at its limit or an error too large; OUTSIDE, in
         addition or alone, if an error is not within its bound.
     """
-    settings = settings_of(settings_vector)
+    settings = settings_of(settings_vector, None)
     n = settings.n
     m = settings.m
     state = state_of(state_vector, settings)

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms import models
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.law.factory import model_of, settings_of_config
+from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.settings import FILTERED, LINEAR, NEWTON, Settings
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import reference_of
@@ -68,7 +67,6 @@ def concerns(config: ControllerConfig, q: Floats | None = None) -> list[str]:
 
 def rehearse(config: ControllerConfig, settings: Settings) -> Rehearsal:
     """Follow the reference in thought, over its slowest period."""
-    model = model_of(config)
     P = settings.initial_estimate[: settings.p]
     horizon = _horizon(config)
     H, Yp, Yr = np.zeros((3, settings.n, settings.p))
@@ -76,12 +74,12 @@ def rehearse(config: ControllerConfig, settings: Settings) -> Rehearsal:
     excitation = np.zeros((settings.p, settings.p))
     moments = np.linspace(0.0, horizon, _POINTS, endpoint=False)
     for q, dq, ddq in reference.sampled(reference_of(config), moments):
-        models.regressor(model.code, settings.constants, q, dq, dq, ddq, H)
+        settings.model.regressor(q, dq, dq, ddq, H)
         torque = np.maximum(torque, np.abs(H @ P))
         excitation += H.T @ H / _POINTS
         M = np.zeros((settings.n, settings.n))
         for i, unit in enumerate(np.eye(settings.n)):
-            models.momentum_regressor(model.code, settings.constants, q, unit, Yp, Yr)
+            settings.model.momentum_regressor(q, unit, Yp, Yr)
             M[:, i] = Yp @ P
         if np.linalg.eigvalsh(M)[0] > 0.0:
             roots = np.linalg.eigvals(np.linalg.solve(M, np.diag(settings.Kp)))

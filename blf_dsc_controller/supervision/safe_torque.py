@@ -6,7 +6,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms import models
 from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.law.settings import Settings
 
@@ -17,7 +16,7 @@ def gravity(settings: Settings, q: Vector, estimate: Vector) -> Vector:
     """Gravity torque (n,) [N m] of the learned model at q (n,) [rad]: H(q, 0, 0, 0) P^."""
     rest = np.zeros(settings.n)
     H = np.zeros((settings.n, settings.p))
-    models.regressor(settings.model, settings.constants, q, rest, rest, rest, H)
+    settings.model.regressor(q, rest, rest, rest, H)
     return H @ estimate[: settings.p]
 
 

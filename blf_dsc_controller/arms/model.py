@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The interface between the laws and an arm whose dynamics are linear in p parameters.
+
+An arm is a `NamedTuple` of what its regressors know of the geometry (numbers and arrays), with the
+properties and methods of `ArmModel`.  Kernels call the methods as Python does: `regressor` of the
+type that they are given is compiled into them, and of no other arm.  To add an arm, write its class
+in a file of its own and its name into `arm_model` and into the choices of the parameter `model`.
+"""
+
+from __future__ import annotations
+
+from inspect import signature
+from typing import Any, Protocol
+
+import numpy as np
+from numba.core.types.containers import BaseNamedTuple
+from numba.extending import overload_method
+
+from blf_dsc_controller.arms.planar_chain import PlanarChain
+from blf_dsc_controller.arms.two_link import TwoLink
+from blf_dsc_controller.compiled.jit import INLINED
+
+
+class ArmModel(Protocol):
+    """Regressors of an arm of n joints, and the names of the p parameters P they multiply."""
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the p entries of P, in order."""
+
+    @property
+    def parameter_units(self) -> tuple[str, ...]:
+        """Units of the entries of P."""
+
+    def regressor(
+        self, q: np.ndarray, dq: np.ndarray, v: np.ndarray, a: np.ndarray, H: np.ndarray
+    ) -> None:
+        """Fill H (n, p) so that H P = M(q) a + C(q, dq) v + G(q)   [N m], Property III."""
+
+    def momentum_regressor(
+        self, q: np.ndarray, dq: np.ndarray, Yp: np.ndarray, Yr: np.ndarray
+    ) -> None:
+        """Fill Yp, Yr (n, p) so that Yp P = M dq [N m s] and Yr P = G - C^T dq [N m].
+
+        Then d/dt(Yp P) + Yr P = tau - tau_dist: the dynamics without the acceleration.
+        """
+
+    def regressors(
+        self,
+        q: np.ndarray,
+        dq: np.ndarray,
+        v: np.ndarray,
+        a: np.ndarray,
+        H: np.ndarray,
+        Yp: np.ndarray,
+        Yr: np.ndarray,
+    ) -> None:
+        """`regressor` and `momentum_regressor` of one state."""
+
+
+def arm_model(name: str, n: int, l1: float, gravity: float) -> ArmModel:
+    """Model of this name for n joints, with known l1 [m] and gravity [m/s^2], all else unknown."""
+    r = gravity / l1
+    return PlanarChain(n, r) if name == 'planar_chain' else TwoLink(r)
+
+
+def _compile_method(name: str) -> None:
+    """Let kernels call this method of every named tuple that has it."""
+
+    def chosen(self: Any, *_arguments: Any) -> Any:
+        return getattr(self.instance_class, name, None)
+
+    chosen.__signature__ = signature(getattr(ArmModel, name))  # type: ignore[attr-defined]
+    overload_method(BaseNamedTuple, name, strict=False, jit_options=INLINED)(chosen)
+
+
+for _method in ('regressor', 'momentum_regressor', 'regressors'):
+    _compile_method(_method)
