@@ -11,8 +11,7 @@ from blf_dsc_controller.configuration.schema import counted, non_negative, param
 PerJoint: TypeAlias = Annotated[tuple[float, ...], 'joints']
 """An array with an entry for each joint."""
 
-_ROUNDING = 1e-12
-"""Relative; the product of a decimal fraction and 1e9 is off by a few 1e-16."""
+_ROUNDING = 1e-12  # relative; the product of a decimal fraction and 1e9 is off by a few 1e-16
 
 _AT_START = 'the process requests it once, before the first sample'
 
@@ -43,18 +42,22 @@ def autostart() -> Any:
     )
 
 
-def nanoseconds(sample_time: float) -> int:
-    """Return the sample time [s] in nanoseconds, the unit of the stamps."""
-    return round(sample_time * 1e9)
+class Sampled:
+    """A configuration with a sample time."""
 
+    sample_time: float
 
-def sample_time_problems(sample_time: float) -> list[str]:
-    """Require whole nanoseconds: otherwise stamps drift from the time in the law."""
-    whole = nanoseconds(sample_time)
-    if abs(sample_time * 1e9 - whole) <= _ROUNDING * whole:
-        return []
-    remedy = f'write {whole * 1e-9:.9f}'
-    return [f'sample_time: got {sample_time!r} s, not a whole number of nanoseconds: {remedy}']
+    @property
+    def sample_time_ns(self) -> int:
+        """The sample time in nanoseconds, the unit of the stamps."""
+        return round(self.sample_time * 1e9)
+
+    def sample_time_problems(self) -> list[str]:
+        """Require whole nanoseconds: otherwise stamps drift from the time in the law."""
+        if abs(self.sample_time * 1e9 - self.sample_time_ns) <= _ROUNDING * self.sample_time_ns:
+            return []
+        got = f'got {self.sample_time!r} s, not a whole number of nanoseconds'
+        return [f'sample_time: {got}: write {self.sample_time_ns * 1e-9:.9f}']
 
 
 def joint_problems(joints: tuple[str, ...], arm: str, needed: int | None) -> list[str]:

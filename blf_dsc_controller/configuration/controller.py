@@ -4,14 +4,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal
 
 from blf_dsc_controller.configuration.common import (
     PerJoint,
     Realtime,
+    Sampled,
     autostart,
     joint_problems,
-    nanoseconds,
-    sample_time_problems,
 )
 from blf_dsc_controller.configuration.gains import (
     Barrier,
@@ -26,7 +27,7 @@ from blf_dsc_controller.configuration.learning import Learning
 from blf_dsc_controller.configuration.reference import Approach, MotionLimits, Reference
 from blf_dsc_controller.configuration.schema import non_negative, parameter, positive
 
-_SIZES = 'it sizes the state of the law'
+_size = partial(parameter, read_only='it sizes the state of the law')
 _WINDOW = 'the data in the excitation window depend on it'
 _TOPICS = 'topics are created once, when the node starts'
 
@@ -58,22 +59,17 @@ class Safety:
     state_timeout: float = positive(
         0.04, 'largest delay of a joint state, on the steady clock and by its stamp', 's'
     )
-    watchdog: str = parameter(
+    watchdog: Literal['auto', 'on', 'off'] = parameter(
         'auto',
         'steady-clock watchdog for missing joint states; auto: on if their stamps are wall-clock '
         'time, which is not the case in lock-step',
-        choices=('auto', 'on', 'off'),
     )
     repeated_states: int = non_negative(
-        3,
-        'consecutive joint states with an unchanged stamp that are ignored',
-        'samples',
-        at_most=1_000_000,
+        3, 'consecutive states with an unchanged stamp to ignore', 'samples', at_most=1_000_000
     )
-    velocity: str = parameter(
+    velocity: Literal['measured', 'estimated'] = parameter(
         'measured',
         'velocity as measured, or estimated from position differences, starting at rest',
-        choices=('measured', 'estimated'),
         read_only='the filters hold data that depend on it',
     )
     velocity_limit: float = positive(
@@ -90,16 +86,12 @@ class Safety:
         0.4, 'largest fraction of missed states, averaged over overrun_window', at_most=1.0
     )
     overrun_window: float = positive(1.0, 'time over which missed states are averaged', 's')
-    torque: str = parameter(
-        'zero',
-        'safe torque: zero, damping -D dq, or the learned gravity with damping',
-        choices=('zero', 'damping', 'hold_gravity'),
+    torque: Literal['zero', 'damping', 'hold_gravity'] = parameter(
+        'zero', 'safe torque: zero, damping -D dq, or the learned gravity with damping'
     )
     damping: PerJoint = non_negative((2.0, 1.0), 'damping in the safe torque', 'N m s/rad', 'D')
     stop_ramp: float = non_negative(
-        0.0,
-        'ramp from the last torque of the law to the safe torque after a fault; 0: at once',
-        's',
+        0.0, 'ramp from the last torque to the safe torque after a fault; 0: at once', 's'
     )
     deactivation_ramp: float = non_negative(0.5, 'the same ramp when the node is deactivated', 's')
     keep_estimates: bool = parameter(
@@ -117,30 +109,27 @@ class Telemetry:
 
 
 @dataclass(frozen=True)
-class ControllerConfig:
+class ControllerConfig(Sampled):
     """Parameters of the node `blf_dsc_controller`; the defaults are the recommended set.
 
     Make one with `load` from a parameter file, or with `build` and `change` from values by dotted
     name: these validate. The constructor does not.
     """
 
-    joints: tuple[str, ...] = parameter(
-        ('joint1', 'joint2'), 'names of the joints, from the base', read_only=_SIZES
-    )
-    sample_time: float = parameter(
+    joints: tuple[str, ...] = _size(('joint1', 'joint2'), 'names of the joints, from the base')
+    sample_time: float = _size(
         0.001,
         'time between two joint states, for which the torque is held',
         's',
         'T',
         at_least=1e-5,
         at_most=1.0,
-        read_only=_SIZES,
     )
-    law: str = parameter('blf_dsc', 'control law', choices=LAWS, read_only=_SIZES)
-    model: str = parameter('two_link', 'model of the arm', choices=tuple(MODELS), read_only=_SIZES)
+    law: str = _size('blf_dsc', 'control law', choices=LAWS)
+    model: str = _size('two_link', 'model of the arm', choices=tuple(MODELS))
     wait_for_subscribers: int = non_negative(
         0,
-        'subscribers that each topic must have, beside the plant, before the first state is used',
+        'subscribers per topic, beside the plant, required before the first state is used',
         read_only=_TOPICS,
     )
     autostart: bool = autostart()
@@ -160,18 +149,13 @@ class ControllerConfig:
     telemetry: Telemetry = Telemetry()
     realtime: Realtime = field(default_factory=Realtime)
 
-    @property
-    def sample_time_ns(self) -> int:
-        """The sample time in nanoseconds."""
-        return nanoseconds(self.sample_time)
-
     def problems(self) -> list[str]:
         """Check parameters against each other, and joints and estimates against the model."""
         needed = MODELS[self.model]
         count = parameter_count(needed or len(self.joints))
         return [
             *joint_problems(self.joints, f'model {self.model}', needed),
-            *sample_time_problems(self.sample_time),
+            *self.sample_time_problems(),
             *self.reference.problems(),
             *self.limits.problems(self.joints),
             *self.barrier.problems(self.joints),

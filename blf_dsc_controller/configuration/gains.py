@@ -18,20 +18,14 @@ class Barrier:
 
     bound: PerJoint = positive((0.002, 0.002), 'bound on the tracking error', 'rad', 'k_c')
     initial_bound: PerJoint = non_negative(
-        (0.0, 0.0),
-        'initial bound of a funnel that narrows to `bound`; 0: the bound is constant',
-        'rad',
-        'k_0',
+        (0.0, 0.0), 'initial bound of a funnel that narrows to `bound`; 0: constant', 'rad', 'k_0'
     )
     funnel_rate: float = non_negative(0.0, 'rate at which the funnel narrows', '1/s', 'a')
     weight: PerJoint = positive(
         (1000.0, 1000.0), 'stiffness of the barrier at zero error; 1 in the paper', 'N m/rad', 'w'
     )
     slope_limit: PerJoint = positive(
-        (2e4, 2e4),
-        'stiffness above which the barrier continues as a straight line',
-        'N m/rad',
-        'S_lim',
+        (2e4, 2e4), 'stiffness at which the barrier continues linearly', 'N m/rad', 'S_lim'
     )
 
     @property

@@ -5,132 +5,100 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from functools import partial
+from typing import Annotated, Literal
 
 from blf_dsc_controller.configuration.schema import counted, non_negative, parameter, positive
 
-_SIZES = 'it sizes the memory of the learning'
-_WINDOW = 'the data in the excitation window depend on it'
-_FIRST = 'it has no effect later'
+_size = partial(parameter, read_only='it sizes the memory of the learning')
+_in_window = partial(parameter, read_only='the data in the excitation window depend on it')
+_at_start = partial(parameter, read_only='it has no effect later')
 
-FEWEST_SAMPLES = 10
-"""In an excitation window: fewer do not determine the parameters of an arm."""
-
-MOST_SAMPLES = 1_000_000
-"""In an excitation window: each takes a few hundred bytes, so this is some hundred megabytes."""
+_SAMPLES = (10, 1_000_000)  # of a window: fewer do not determine P, more take over 100 MB
 
 
 @dataclass(frozen=True)
 class Learning:
     """Composite learning of the parameters P and of the disturbance columns."""
 
-    initial_estimate: tuple[float, ...] = parameter(
+    initial_estimate: tuple[float, ...] = _at_start(
         (0.5, 0.16, 0.2),
         'initial estimate of the parameters (m1+m2)*l1^2, m2*l2^2, m2*l1*l2',
         'kg m^2',
         'P^(0)',
-        read_only=_FIRST,
     )
     adaptation_gain: Annotated[tuple[float, ...], 'learning.initial_estimate'] = non_negative(
         (0.5, 0.5, 0.5), 'diagonal of the adaptation gain', symbol='Gamma'
     )
     weight: float = non_negative(
-        100.0,
-        'weight of the prediction error against the tracking error; 0: no composite learning',
-        symbol='kappa',
+        100.0, 'weight of the prediction error; 0: no composite learning', symbol='kappa'
     )
-    update: str = parameter(
-        'newton',
-        'direction of the prediction-error step: regularised Newton, or the gradient (paper)',
-        choices=('newton', 'gradient'),
+    update: Literal['newton', 'gradient'] = parameter(
+        'newton', 'step along the prediction error: regularised Newton, or the gradient (paper)'
     )
-    prediction: str = parameter(
-        'filtered',
-        'prediction error: filtered regressor, Lambda of (24), or estimated acceleration',
-        choices=('filtered', 'acceleration', 'lambda'),
-        read_only=_WINDOW,
+    prediction: Literal['filtered', 'acceleration', 'lambda'] = _in_window(
+        'filtered', 'prediction error: filtered regressor, estimated acceleration, Lambda of (24)'
     )
-    latch: str = parameter(
-        'last',
-        'which excited window is latched: the last one (paper), or the best one',
-        choices=('last', 'max'),
+    latch: Literal['last', 'max'] = parameter(
+        'last', 'excited window that is latched: the last one (paper), or the best one'
     )
     regularization: float = positive(
         1e-5, 'regularisation of the excitation matrix in the Newton step', symbol='rho'
     )
     excitation_threshold: float = positive(
-        0.003,
-        'minimum eigenvalue of the excitation matrix from which the window counts as excited',
-        symbol='sigma',
+        0.003, 'minimum eigenvalue of the excitation matrix of an excited window', symbol='sigma'
     )
-    window: float = positive(
+    window: float = _size(
         2.0 * math.pi,
         'length of the excitation window; whole periods of the reference average disturbances out',
         's',
         'tau_d',
-        read_only=_SIZES,
+        above=0.0,
     )
-    settling_time: float = non_negative(
-        0.5,
-        'time for the filters to settle before the window is used',
-        's',
-        'T_a',
-        read_only=_FIRST,
+    settling_time: float = _at_start(
+        0.5, 'time for the filters to settle before the window is used', 's', 'T_a', at_least=0.0
     )
-    filter_pole: float = positive(
-        10.0, 'pole of the filters on regressor and torque', 'rad/s', read_only=_WINDOW
+    filter_pole: float = _in_window(
+        10.0, 'pole of the filters on regressor and torque', 'rad/s', above=0.0
     )
-    bias: bool = parameter(
-        True, 'also estimate a constant disturbance of each joint', read_only=_SIZES
+    bias: bool = _size(True, 'also estimate a constant disturbance of each joint')
+    viscous: bool = _size(False, 'also estimate the viscous friction of each joint')
+    coulomb: bool = _size(False, 'also estimate the Coulomb friction of each joint')
+    coulomb_velocity: float = _in_window(
+        0.01, 'velocity scale of the sign change of the Coulomb column', 'rad/s', above=0.0
     )
-    viscous: bool = parameter(
-        False, 'also estimate the viscous friction of each joint', read_only=_SIZES
-    )
-    coulomb: bool = parameter(
-        False, 'also estimate the Coulomb friction of each joint', read_only=_SIZES
-    )
-    coulomb_velocity: float = positive(
-        0.01, 'velocity scale of the sign change of the Coulomb column', 'rad/s', read_only=_WINDOW
-    )
-    frequencies: tuple[float, ...] = positive(
+    frequencies: tuple[float, ...] = _size(
         (),
         'also estimate a sinusoidal disturbance of each joint at each of these frequencies',
         'rad/s',
+        above=0.0,
         may_be_empty=True,
-        read_only=_SIZES,
     )
-    derivative_filter: float = positive(
+    derivative_filter: float = _in_window(
         100.0,
         'frequency of the filter (8), for the predictions lambda and acceleration',
         'rad/s',
         'omega',
-        read_only=_WINDOW,
+        above=0.0,
     )
     radius: float = positive(
         3.0, 'radius of the projection ball of the estimate', 'kg m^2', 'omega_a'
     )
-    interval: int = parameter(
-        10,
-        'samples between two eigenvalue checks of the excitation matrix',
-        'samples',
-        at_least=1,
-        read_only=_SIZES,
+    interval: int = _size(
+        10, 'samples between two eigenvalue checks of the excitation matrix', 'samples', at_least=1
     )
-    torque_source: str = parameter(
-        'command',
-        'torque used for learning: the limited command, or the effort of the joint states',
-        choices=('command', 'effort'),
-        read_only=_WINDOW,
+    torque_source: Literal['command', 'effort'] = _in_window(
+        'command', 'torque to learn from: the limited command, or the effort of the joint states'
     )
 
     def problems(self, sample_time: float, model: str, count: int) -> list[str]:
         """Check the size of the window, and the initial estimate against the model and the ball."""
         problems = []
-        samples = round(self.window / sample_time)
-        if not FEWEST_SAMPLES <= samples <= MOST_SAMPLES:
+        samples, (fewest, most) = round(self.window / sample_time), _SAMPLES
+        if not fewest <= samples <= most:
             problems.append(
                 f'learning.window: got {self.window:g} s, which is {samples} samples of '
-                f'{sample_time:g} s: between {FEWEST_SAMPLES} and {MOST_SAMPLES} are allowed'
+                f'{sample_time:g} s: between {fewest} and {most} are allowed'
             )
         if len(self.initial_estimate) != count:
             entries = counted(len(self.initial_estimate), 'entry', 'entries')

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from blf_dsc_controller.configuration.common import joint_problems
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -30,9 +30,7 @@ class RecorderConfig:
 
     output: str = _of_bag('bag', 'folder of the bag; it must not exist yet')
     topics: tuple[str, ...] = _of_bag((), 'topics to record; empty: all', may_be_empty=True)
-    compression: str = _of_bag(
-        'none', 'compression of the chunks of the bag', choices=('none', 'zstd')
-    )
+    compression: Literal['none', 'zstd'] = _of_bag('none', 'compression of the chunks of the bag')
     queue_depth: int = _of_bag(
         100_000, 'messages of a topic that can wait while the disk is busy', 'messages', at_least=1
     )
@@ -44,8 +42,7 @@ class RecorderConfig:
     )
     ring: float = _of_bag(
         0.0,
-        'keep only the last messages, of this duration, in memory and write them on the service '
-        'trigger; 0: write all',
+        'keep only this last time in memory, and write it on the service trigger; 0: write all',
         's',
         at_least=0.0,
     )

@@ -18,7 +18,7 @@ from blf_dsc_controller.configuration.nodes import (
     is_builtin,
     known_names,
 )
-from blf_dsc_controller.configuration.ros_yaml import Entry, Section, parse
+from blf_dsc_controller.configuration.ros_yaml import Section, parse
 from blf_dsc_controller.configuration.schema import build, flatten, parameters, unknown
 from blf_dsc_controller.configuration.share import share_folder
 from blf_dsc_controller.errors import ConfigurationError
@@ -137,30 +137,24 @@ def format_value(value: Value) -> str:
 def _load(
     sections: list[Section], node: str, cls: type[Config], overrides: Mapping[str, object]
 ) -> Config:
-    entries = _entries(sections, node, {one.name for one in parameters(cls)})
-    values = {name: entry.value for name, entry in entries.items()}
-    try:
-        return build(cls, {**values, **overrides})
-    except ConfigurationError as error:
-        lines = {name: entry.line for name, entry in entries.items() if name not in overrides}
-        raise ConfigurationError([_located(problem, lines) for problem in error.problems]) from None
-
-
-def _entries(sections: list[Section], node: str, known: set[str]) -> dict[str, Entry]:
-    """Return the entries for the node, without names of other nodes in wildcard sections."""
-    return {
+    """Build the configuration; names of other nodes in wildcard sections are left out."""
+    known = {one.name for one in parameters(cls)}
+    entries = {
         name: entry
         for section in sections
         if section.matches('/' + node.removeprefix('/'))
         for name, entry in section.entries.items()
         if name in known or not (section.is_wildcard or is_builtin(name))
     }
-
-
-def _located(problem: str, lines: Mapping[str, int]) -> str:
-    """Prefix a problem that begins with the name of a parameter in the file with its line."""
-    name = problem.split(':', 1)[0]
-    return f'line {lines[name]}: {problem}' if name in lines else problem
+    try:
+        return build(cls, {name: entry.value for name, entry in entries.items()} | dict(overrides))
+    except ConfigurationError as error:
+        problems = []
+        for problem in error.problems:
+            name = problem.split(':', 1)[0]
+            in_file = name in entries and name not in overrides
+            problems.append(f'line {entries[name].line}: {problem}' if in_file else problem)
+        raise ConfigurationError(problems) from None
 
 
 def _unknown_names(sections: list[Section]) -> Iterator[str]:

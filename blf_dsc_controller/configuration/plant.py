@@ -5,14 +5,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Literal
 
 from blf_dsc_controller.configuration.common import (
     PerJoint,
     Realtime,
+    Sampled,
     autostart,
     joint_problems,
-    nanoseconds,
-    sample_time_problems,
 )
 from blf_dsc_controller.configuration.schema import parameter, positive
 
@@ -64,19 +64,14 @@ class Sensor:
     """How the true state is measured."""
 
     position_noise: float = _fixed(
-        0.0, 'standard deviation of the white noise on each position', 'rad', at_least=0.0
+        0.0, 'standard deviation of the white noise on measured positions', 'rad', at_least=0.0
     )
     velocity_noise: float = _fixed(
-        0.0,
-        'standard deviation of the white noise on each measured velocity',
-        'rad/s',
-        at_least=0.0,
+        0.0, 'standard deviation of the white noise on measured velocities', 'rad/s', at_least=0.0
     )
     resolution: float = _fixed(0.0, 'resolution of the encoders; 0: ideal', 'rad', at_least=0.0)
-    velocity: str = _fixed(
-        'measured',
-        'velocity from its own sensor, or as the difference of two measured positions',
-        choices=('measured', 'differenced'),
+    velocity: Literal['measured', 'differenced'] = _fixed(
+        'measured', 'velocity from its own sensor, or the difference of two measured positions'
     )
 
 
@@ -91,15 +86,13 @@ class Actuator:
     command_timeout: float = positive(
         0.05, 'age above which a torque is not applied, in real time only', 's'
     )
-    without_command: str = parameter(
-        'zero',
-        'what the motors do without a command: no torque, or the brakes hold the joints',
-        choices=('zero', 'brake'),
+    without_command: Literal['zero', 'brake'] = parameter(
+        'zero', 'without a command: zero torque, or the brakes hold the joints'
     )
 
 
 @dataclass(frozen=True)
-class PlantConfig:
+class PlantConfig(Sampled):
     """Parameters of the node `sim_plant`.
 
     Make one with `load` from a parameter file, or with `build` and `change` from values by dotted
@@ -115,27 +108,22 @@ class PlantConfig:
         at_least=1e-5,
         at_most=1.0,
     )
-    mode: str = _fixed(
-        'realtime',
-        'realtime: one step each sample time of the wall clock; lockstep: one step for each torque',
-        choices=('realtime', 'lockstep'),
+    mode: Literal['realtime', 'lockstep'] = _fixed(
+        'realtime', 'a step each sample time of the wall clock, or a step for each torque received'
     )
     duration: float = _fixed(
-        0.0, 'simulated time after which the plant ends; 0: runs until stopped', 's', at_least=0.0
+        0.0, 'simulated time after which the plant stops; 0: no limit', 's', at_least=0.0
     )
     seed: int = _fixed(0, 'seed of the noise; equal seeds give equal runs', at_least=0)
     publish_clock: bool = _fixed(False, 'publish the simulated time on /clock')
     wait_for_subscribers: int = _fixed(
         0,
-        'subscribers that each topic must have, beside the controller, before the first state is '
-        'sent',
+        'subscribers per topic, beside the controller, required before the first state',
         at_least=0,
     )
     autostart: bool = autostart()
-    integrator: str = _fixed(
-        'dopri5',
-        'fixed-step method from one sample to the next: Dormand-Prince 5 or Runge-Kutta 4',
-        choices=('dopri5', 'rk4'),
+    integrator: Literal['dopri5', 'rk4'] = _fixed(
+        'dopri5', 'fixed-step method for one sample: Dormand-Prince 5 or Runge-Kutta 4'
     )
     arm: PlantArm = PlantArm()
     initial: Initial = Initial()
@@ -144,15 +132,10 @@ class PlantConfig:
     actuator: Actuator = Actuator()
     realtime: Realtime = field(default_factory=Realtime)
 
-    @property
-    def sample_time_ns(self) -> int:
-        """The sample time in nanoseconds."""
-        return nanoseconds(self.sample_time)
-
     def problems(self) -> list[str]:
         """Check the joints, the sample time, and the duration against it."""
         problems = joint_problems(self.joints, 'the simulated arm', 2)
-        problems += sample_time_problems(self.sample_time)
+        problems += self.sample_time_problems()
         if 0.0 < self.duration < self.sample_time:
             problems.append(
                 f'duration: got {self.duration:g} s, shorter than one sample of '

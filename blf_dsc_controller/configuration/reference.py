@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Literal
 
 from blf_dsc_controller.configuration.common import PerJoint
 from blf_dsc_controller.configuration.schema import parameter, positive
@@ -28,10 +28,9 @@ class Reference:
     `amplitude` and `points` hold one row per joint, row after row.
     """
 
-    type: str = _fixed(
+    type: Literal['sinusoids', 'waypoints', 'hold'] = _fixed(
         'sinusoids',
         "sinusoids (the paper's), waypoints (minimum jerk), or hold (the initial position)",
-        choices=('sinusoids', 'waypoints', 'hold'),
     )
     offset: PerJoint = _fixed((1.9935, 1.3961), 'centre of the motion', 'rad')
     amplitude: Annotated[tuple[float, ...], 'joints', 'reference.frequency'] = _fixed(

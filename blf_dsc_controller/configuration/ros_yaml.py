@@ -33,7 +33,6 @@ _HEXADECIMAL = re.compile(
 _SPECIAL = re.compile(r'[+-]?(?i:inf|infinity|nan)|[+-]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)')
 
 _PARAMETERS = 'ros__parameters'
-_UNTAGGED = '?'
 _PART = re.compile(r'\*|\*\*|[A-Za-z_][A-Za-z0-9_]*')
 
 
@@ -105,12 +104,7 @@ def parse_scalar(word: str) -> bool | int | float | str:
 class _Composer(yaml.BaseLoader):
     """Keeps each word as written, and rejects aliases, as rcl does."""
 
-    def resolve(self, kind: Any, value: Any, implicit: Any) -> str:
-        """Leave the types of untagged scalars to `parse_scalar`."""
-        if kind is yaml.ScalarNode:
-            return _UNTAGGED
-        tag: str = super().resolve(kind, value, implicit)  # type: ignore[no-untyped-call]
-        return tag
+    DEFAULT_SCALAR_TAG = '?'  # type: ignore[misc] # not that of an explicit !!str
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         """Compose a node, which must not be an alias."""

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 from blf_dsc_controller.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
 Config = TypeVar('Config')
 Value: TypeAlias = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
@@ -87,13 +87,7 @@ class Parameter:
         """The valid range or choices, such as `above 0 and at most 1`; empty: any value."""
         if self.choices:
             return 'one of ' + ', '.join(self.choices)
-        limits = {
-            'at least': self.at_least,
-            'above': self.above,
-            'at most': self.at_most,
-            'below': self.below,
-        }
-        return ' and '.join(f'{key} {x:g}' for key, x in limits.items() if x is not None)
+        return ' and '.join(f'{words} {limit:g}' for words, limit, _ in self._limits())
 
     def problems(self, given: object) -> list[str]:
         """Check a value; each problem names the parameter, what it got, and what is expected."""
@@ -126,13 +120,18 @@ class Parameter:
             yield f'got {_shown(entry)}{place}, but {expected}'
 
     def _allows(self, entry: Any) -> bool:
-        return (
-            (not self.choices or entry in self.choices)
-            and (self.at_least is None or entry >= self.at_least)
-            and (self.above is None or entry > self.above)
-            and (self.at_most is None or entry <= self.at_most)
-            and (self.below is None or entry < self.below)
-        )
+        within = all(compare(entry, limit) for _, limit, compare in self._limits())
+        return within and (not self.choices or entry in self.choices)
+
+    def _limits(self) -> Iterator[tuple[str, float, Callable[[Any, Any], bool]]]:
+        for words, limit, compare in (
+            ('at least', self.at_least, operator.ge),
+            ('above', self.above, operator.gt),
+            ('at most', self.at_most, operator.le),
+            ('below', self.below, operator.lt),
+        ):
+            if limit is not None:
+                yield words, limit, compare
 
 
 def parameter(
@@ -141,7 +140,7 @@ def parameter(
     """Declare a field of a configuration; the arguments are those of `Parameter`.
 
     The length of an array is annotated: `Annotated[tuple[float, ...], 'joints']` has one entry for
-    each entry of the parameter `joints`.
+    each entry of the parameter `joints`. A `Literal` annotation gives the choices.
     """
     declared = Parameter(default, description, unit, symbol, **options)
     return dataclasses.field(default=default, metadata={'parameter': declared})
@@ -210,13 +209,15 @@ def _parameters(cls: type[Any], prefix: str) -> list[Parameter]:
     annotated = typing.get_type_hints(cls, include_extras=True)
     found: list[Parameter] = []
     for field in dataclasses.fields(cls):
-        name, kind = prefix + field.name, types[field.name]
+        name, hint = prefix + field.name, types[field.name]
         if 'parameter' in field.metadata:
+            one: Parameter = field.metadata['parameter']
+            if typing.get_origin(hint) is typing.Literal:
+                one, hint = dataclasses.replace(one, choices=typing.get_args(hint)), str
             length = getattr(annotated[field.name], '__metadata__', ())
-            declared = field.metadata['parameter']
-            found.append(dataclasses.replace(declared, name=name, kind=_KINDS[kind], length=length))
+            found.append(dataclasses.replace(one, name=name, kind=_KINDS[hint], length=length))
         else:
-            found += _parameters(kind, f'{name}.')
+            found += _parameters(hint, f'{name}.')
     return found
 
 

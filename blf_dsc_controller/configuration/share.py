@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sysconfig
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,15 +40,9 @@ def share_folder() -> Path:
 def _candidates() -> Iterator[Path]:
     if (_CHECKOUT / 'setup.py').is_file():
         yield _CHECKOUT
-    yield from _ament_index()
-    for scheme in (sysconfig.get_default_scheme(), sysconfig.get_preferred_scheme('user')):
-        yield Path(sysconfig.get_path('data', scheme), 'share', PACKAGE)
-
-
-def _ament_index() -> Iterator[Path]:
-    try:
+    with suppress(ImportError, LookupError, OSError):  # no ROS, index, or package in it
         from ament_index_python.packages import get_package_share_directory
 
         yield Path(get_package_share_directory(PACKAGE))
-    except (ImportError, LookupError, OSError):  # no ROS; not in the index; no AMENT_PREFIX_PATH
-        return
+    for scheme in (sysconfig.get_default_scheme(), sysconfig.get_preferred_scheme('user')):
+        yield Path(sysconfig.get_path('data', scheme), 'share', PACKAGE)
