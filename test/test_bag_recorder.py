@@ -22,9 +22,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.analysis.subject import read_subjects
-from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.errors import BagExistsError
-from blf_dsc_controller.bags.losses import Losses
+from blf_dsc_controller.bags.context import Losses, read_context
+from blf_dsc_controller.bags.errors import BagError
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages.encoders import JointStateEncoder
 from blf_dsc_controller.messages.topics import FOREVER, JOINT_STATES, Quality
@@ -312,7 +311,7 @@ def test_losses_are_gaps_in_the_numbers():
 
 def test_an_existing_folder_is_refused(loop, tmp_path):
     (tmp_path / 'bag').mkdir()
-    with pytest.raises(BagExistsError, match='bag exists already'):
+    with pytest.raises(BagError, match='bag exists already'):
         loop()
 
 

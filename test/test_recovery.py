@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+from io import BytesIO
 from pathlib import Path
 
 import pytest
@@ -13,8 +14,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.errors import BagExistsError, UnreadableBagError
-from blf_dsc_controller.bags.mcap_records import CHUNK, HEAD, MAGIC, chunk_of, head
+from blf_dsc_controller.bags.errors import BagError
 from blf_dsc_controller.bags.recover import recover
 from blf_dsc_controller.bags.salvage import Salvage
 from blf_dsc_controller.bags.writer import BagWriter
@@ -47,14 +47,10 @@ def write(path, compression='none'):
 
 
 def chunks(data):
-    """Place, end and content of each chunk."""
-    found, at = [], len(MAGIC)
-    while at < len(data) - len(MAGIC):
-        opcode, end = head(data, at)
-        if opcode == CHUNK:
-            found.append((at, end, chunk_of(data[at + HEAD.size : end])))
-        at = end
-    return found
+    """Place, end and index entry of each chunk of a whole file."""
+    indexes = make_reader(BytesIO(data)).get_summary().chunk_indexes
+    starts = [one.chunk_start_offset for one in indexes]
+    return [(at, at + one.chunk_length, one) for at, one in zip(starts, indexes, strict=True)]
 
 
 def read(path):
@@ -130,11 +126,12 @@ def test_a_corrupted_chunk_is_skipped_and_told_with_its_times_and_messages(whole
     content[(at + end) // 2] ^= 0x40
     recovery = recover(damaged(tmp_path / 'bag', content), tmp_path / 'clean')
     (loss,) = recovery.losses
-    assert (loss.start, loss.end) == (chunk.start, chunk.end)
-    assert (chunk.start, chunk.end) == (START + 10 * MILLISECOND, START + 14 * MILLISECOND + 1)
+    start, stop = START + 10 * MILLISECOND, START + 14 * MILLISECOND + 1
+    assert (chunk.message_start_time, chunk.message_end_time) == (start, stop)
+    assert (loss.start, loss.end) == (start, stop)
     assert loss.messages == {JOINT_STATES.resolved: PER_CHUNK, COMMANDS.resolved: PER_CHUNK}
     assert recovery.missed == {JOINT_STATES.resolved: PER_CHUNK, COMMANDS.resolved: PER_CHUNK}
-    remaining = [one for one in read(whole.parent) if not chunk.start <= one[1] <= chunk.end]
+    remaining = [one for one in read(whole.parent) if not start <= one[1] <= stop]
     assert read(recovery.path) == remaining
     assert 'from 1734000000.010000000 s (2024-12-12 10:40:00 UTC)' in str(loss)
     assert 'messages lost: 5 of /joint_states' in str(loss)
@@ -170,7 +167,7 @@ def test_the_damaged_bag_is_not_touched(plain, tmp_path):
     recover(folder, tmp_path / 'clean')
     assert [one.name for one in folder.iterdir()] == ['bag_0.mcap']
     assert hashlib.sha256((folder / 'bag_0.mcap').read_bytes()).hexdigest() == digest
-    with pytest.raises(BagExistsError):
+    with pytest.raises(BagError):
         recover(folder, tmp_path / 'clean')
 
 
@@ -218,7 +215,7 @@ def test_a_bag_of_another_writer_is_recovered(tmp_path):
 
 
 def test_what_is_no_bag_is_one_message(tmp_path, capsys):
-    with pytest.raises(UnreadableBagError, match='there is no MCAP file'):
+    with pytest.raises(BagError, match='there is no MCAP file'):
         recover(tmp_path, tmp_path / 'clean')
     assert main(['recover', str(tmp_path / 'nowhere')]) == 1
     assert capsys.readouterr().err.startswith('blf_dsc recover: ')

@@ -1,120 +1,171 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The undecoded messages of a bag: one of our own, or any other that holds the same topics."""
+"""The undecoded messages of a bag, its topics and joints matched to ours by name."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from blf_dsc_controller.bags.errors import EmptyBagError, MissingTopicError
-from blf_dsc_controller.bags.name_map import NO_NAMES, NameMap
+from blf_dsc_controller.bags.errors import BagError
 from blf_dsc_controller.bags.sources import open_bag
-from blf_dsc_controller.bags.topic_lookup import find
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import (
-    ACCEPTED_TRAJECTORY,
-    BOUND,
+    CLOCK,
     COMMANDS,
+    DIAGNOSTICS,
     JOINT_STATE,
     JOINT_STATES,
-    LEARNING,
-    MONITOR,
     PARAMETER_EVENTS,
-    REFERENCE,
-    STATE,
-    TIMING,
-    TRACKING_ERROR,
-    TRUTH,
+    TOPICS,
     Topic,
 )
 
-_OF_INTEREST = (
-    JOINT_STATES,
-    COMMANDS,
-    REFERENCE,
-    TRACKING_ERROR,
-    LEARNING,
-    BOUND,
-    MONITOR,
-    PARAMETER_EVENTS,
-    STATE,
-    ACCEPTED_TRAJECTORY,
-    TRUTH,
-    TIMING,
-)
+_OF_INTEREST = (*(one for one in TOPICS if one not in (CLOCK, DIAGNOSTICS)), PARAMETER_EVENTS)
+
+
+@dataclass(frozen=True)
+class NameMap:
+    """Other names in a bag: of a topic by the last part of our name, of a joint by its name."""
+
+    topics: Mapping[str, str] = field(default_factory=dict)
+    joints: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def parse(cls, entries: Iterable[str]) -> NameMap:
+        """Read entries such as `commands=/arm/torque` and `joint1=shoulder`.
+
+        Raises:
+            BlfDscError: an entry has no two sides, or one side is there twice.
+        """
+        leaves = [topic.leaf for topic in TOPICS]
+        topics: dict[str, str] = {}
+        joints: dict[str, str] = {}
+        for entry in entries:
+            ours, _, theirs = (side.strip() for side in entry.partition('='))
+            if not ours or not theirs:
+                raise _bad_entry(entry, 'one side is missing')
+            side = topics if ours in leaves else joints
+            if ours in side or theirs in side.values():
+                raise _bad_entry(entry, 'a name was given before')
+            side[ours] = theirs
+        return cls({leaf: '/' + name.lstrip('/') for leaf, name in topics.items()}, joints)
+
+    def joints_of(self, joints: Sequence[str]) -> tuple[str, ...]:
+        """Names that these joints have in the bag.
+
+        Raises:
+            BlfDscError: a name is mapped that is neither a topic nor one of `joints`.
+        """
+        for joint, theirs in self.joints.items():
+            if joint not in joints:
+                reason = f'{joint} is neither a topic nor one of the joints {", ".join(joints)}'
+                raise _bad_entry(f'{joint}={theirs}', reason)
+        return tuple(self.joints.get(joint, joint) for joint in joints)
+
+
+NO_NAMES = NameMap()
 
 
 @dataclass
-class Recorded:
-    """All messages of one topic, undecoded."""
+class TopicMessages:
+    """All messages of one topic, undecoded, in the order of their reception."""
 
     name: str
     type: str = ''
     received: list[int] = field(default_factory=list)  # ns
     raw: list[bytes] = field(default_factory=list)
 
-    def sort(self) -> None:
-        """Put the messages into the order in which they were received."""
-        times = np.array(self.received, dtype=np.int64)
-        if (times[1:] < times[:-1]).any():
-            order = np.argsort(times, kind='stable').tolist()
-            self.received = [self.received[k] for k in order]
-            self.raw = [self.raw[k] for k in order]
-
 
 @dataclass(frozen=True)
 class Content:
-    """The topics of this package that a bag holds, and how many messages of every topic."""
+    """The messages of the package's topics in a bag, and the number of messages of every topic."""
 
-    topics: Mapping[Topic, Recorded]
+    topics: Mapping[Topic, TopicMessages]
     message_counts: Mapping[str, int]
 
 
 def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Content:
-    """Read the messages of every topic that this package knows.
+    """Read the messages of the package's topics.
 
     Args:
         path: folder of the bag, one of its storage files, or a ROS 1 `.bag`.
-        namespace: of the robot to look at, if the bag holds several.
-        names: of topics that are called otherwise in the bag.
+        namespace: of the robot, if the bag holds several.
+        names: of topics that have other names in the bag.
 
     Raises:
-        UnreadableBagError: there is no bag, or it is damaged.
-        MissingTopicError: it holds no joint states, or not a topic of `names`.
-        EmptyBagError: it holds no message of the joint states.
-        AmbiguousTopicError: it holds the topics of several robots.
+        BagError: there is no bag, it is damaged, it holds no joint states or not a topic of
+            `names`, or it holds the topics of several robots.
     """
     with open_bag(path) as bag:
         found = {topic: _find(topic, bag.held, namespace, names) for topic in _OF_INTEREST}
-        states = found[JOINT_STATES]
         if not bag.held:
-            raise EmptyBagError(path)
-        if states is None:
-            raise MissingTopicError(JOINT_STATES.name, JOINT_STATES.type, bag.held)
-        topics = {topic: Recorded(name) for topic, name in found.items() if name is not None}
+            raise BagError(f'{path} is empty: it holds no message')
+        if found[JOINT_STATES] is None:
+            raise _missing_topic(JOINT_STATES.name, JOINT_STATES.type, bag.held)
         types = dict(bag.held)
-        for topic, recorded in topics.items():
-            recorded.type = types[recorded.name] if topic is COMMANDS else topic.type
-        by_name = {one.name: one for one in topics.values()}
-        for name, received, raw in bag.messages(by_name):
-            recorded = by_name[name]
-            recorded.received.append(received)
-            recorded.raw.append(raw)
+        topics = {
+            topic: TopicMessages(name, types[name] if topic is COMMANDS else topic.type)
+            for topic, name in found.items()
+            if name is not None
+        }
+        lists = {one.name: (one.received.append, one.raw.append) for one in topics.values()}
+        for name, received, raw in bag.messages(lists):
+            append_received, append_raw = lists[name]
+            append_received(received)
+            append_raw(raw)
         counts = bag.counts
     if not topics[JOINT_STATES].raw:
-        raise EmptyBagError(path, states)
-    for recorded in topics.values():
-        recorded.sort()
+        raise BagError(f'{path} is empty: it holds no message of {found[JOINT_STATES]}')
+    for messages in topics.values():
+        times = np.array(messages.received, dtype=np.int64)
+        if (times[1:] < times[:-1]).any():
+            order = np.argsort(times, kind='stable').tolist()
+            messages.received = [messages.received[k] for k in order]
+            messages.raw = [messages.raw[k] for k in order]
     return Content({topic: one for topic, one in topics.items() if one.raw}, counts)
 
 
 def _find(topic: Topic, held: list[tuple[str, str]], namespace: str, names: NameMap) -> str | None:
+    """Name of a topic in a bag, None if it is not there.
+
+    Searched by type and by the full name, then by the name behind a namespace, then by the last
+    part of the name.
+    """
     name = names.topics.get(topic.leaf)
-    if name is None:
-        return find(topic, held, namespace)
-    types = (topic.type, JOINT_STATE) if topic is COMMANDS else (topic.type,)
-    if not any((name, type_) in held for type_ in types):
-        raise MissingTopicError(name, ' or '.join(types), held)
-    return name
+    if name is not None:
+        types = (topic.type, JOINT_STATE) if topic is COMMANDS else (topic.type,)
+        if not any((name, type_) in held for type_ in types):
+            raise _missing_topic(name, ' or '.join(types), held)
+        return name
+    prefix = f'/{namespace.strip("/")}/' if namespace.strip('/') else '/'
+    candidates = [name for name, type_ in held if type_ == topic.type and name.startswith(prefix)]
+    for ending in (topic.resolved, f'/{topic.leaf}'):
+        if prefix + ending[1:] in candidates:
+            return prefix + ending[1:]
+        fitting = sorted(name for name in candidates if name.endswith(ending))
+        if len(fitting) > 1:
+            raise BagError(
+                f'the bag has {len(fitting)} topics that could be {topic.relative!r}: '
+                f'{", ".join(fitting)}; name the namespace of the one robot to look at'
+            )
+        if fitting:
+            return fitting[0]
+    return None
+
+
+def _missing_topic(wanted: str, type_name: str, held: Iterable[tuple[str, str]]) -> BagError:
+    listing = ''.join(f'\n  {name} ({type_ or "of unknown type"})' for name, type_ in held)
+    named = 'called' if wanted.startswith('/') else 'whose name ends in'
+    return BagError(
+        f'the bag has no topic {named} {wanted!r} of type {type_name}; it holds:{listing}'
+    )
+
+
+def _bad_entry(entry: str, reason: str) -> BlfDscError:
+    return BlfDscError(
+        f'--map {entry}: {reason}; expected OURS=THEIRS with a topic, as in '
+        'joint_states=/arm/states, or a joint, as in joint1=shoulder'
+    )

@@ -1,55 +1,92 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a bag says of its run beside the messages: by which version, and under which configuration.
+"""What a bag records of its run beside the messages: version, configuration, lost messages.
 
-The configuration is a ROS 2 parameter file of every node that took part, as an MCAP attachment; the
-facts that one looks for first are also a metadata record, and custom data of metadata.yaml.
+The configuration is a ROS 2 parameter file of every node, stored as an MCAP attachment; the main
+facts are also a metadata record, and custom data of metadata.yaml.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mcap.reader import make_reader
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.errors import NoConfigurationError, OtherVersionError
-from blf_dsc_controller.bags.losses import NOTHING_MISSED
+from blf_dsc_controller.bags.errors import BagError
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import is_builtin
-from blf_dsc_controller.configuration.ros_yaml import Section, parse
+from blf_dsc_controller.configuration.ros_yaml import parse
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages.topics import TOPICS
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 RECORD = 'blf_dsc_controller'
 """Name of the metadata record."""
 
 ATTACHMENT = 'configuration.yaml'
-MEDIA_TYPE = 'application/yaml'
 VERSION = 'package_version'
 MESSAGES = 'messages '
-"""Start of the name of a fact that tells of a topic what was written and what was lost."""
+"""Start of the name of a fact on how many messages of a topic were written and lost."""
 
+_NOTHING_MISSED = '0 missed'
 _FACTS = {'law': 'law', 'model': 'model', 'seed': 'seed', 'mode': 'clock'}
 _KEPT = frozenset(topic.leaf for topic in TOPICS if topic.offered.depth > 1)
 _OF_CONTROLLER = frozenset(('law', 'model', 'barrier.bound', 'learning.window'))
 
 
+class Losses:
+    """Counts messages of one topic that were published but not recorded, by sequence number.
+
+    Each publisher has its own numbers, so that nothing is known of a topic that ever had several.
+
+    Args:
+        publishers: present number of publishers.
+
+    Attributes:
+        missed: messages between recorded ones that were not; None if unknown.
+        before: messages that a publisher had sent before its first recorded one.
+    """
+
+    def __init__(self, publishers: int) -> None:
+        self.missed: int | None = 0
+        self.before = 0
+        self._last = 0
+        self.publishers_seen(publishers)
+
+    def publishers_seen(self, publishers: int) -> None:
+        """Update the number of publishers."""
+        if publishers > 1:
+            self.missed, self.before = None, 0
+
+    def count(self, sequence: int) -> None:
+        """Count a message; a number that is not higher than the last means a new publisher."""
+        if self.missed is not None:
+            if self._last and sequence > self._last:
+                self.missed += sequence - self._last - 1
+            else:
+                self.before += max(sequence - 1, 0)
+        self._last = sequence
+
+    def text(self) -> str:
+        """Text to follow the number of recorded messages."""
+        if self.missed is None:
+            return ''
+        earlier = f', {self.before} sent before the recorder heard them' if self.before else ''
+        return f', {self.missed} missed{earlier}'
+
+
 @dataclass(frozen=True)
-class Recorded:
-    """A controller as the bag tells of it.
+class RecordedController:
+    """A controller as recorded in a bag.
 
     Attributes:
         node: its full name.
         config: its configuration.
-        known_at: when the recorder learned it [ns].
+        known_at: when the recorder received it [ns].
     """
 
     node: str
@@ -59,12 +96,12 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Context:
-    """What a bag tells; nothing, if it was recorded by something else.
+    """What a bag records of its run; empty, if another recorder made it.
 
     Attributes:
         path: of the bag.
-        configurations: when it was stored [ns] and the text of each parameter file, in turn; each
-            holds the nodes known by then.
+        configurations: time of storage [ns] and text of each parameter file, in turn; each holds
+            the nodes known by then.
         facts: by name, such as `package_version`, `law`, `model`, `seed`, `clock`.
     """
 
@@ -83,30 +120,29 @@ class Context:
         return self.configurations[-1][1] if self.configurations else ''
 
     def missed(self, topic: str) -> int:
-        """Messages of a topic that the recorder knows it missed."""
+        """Number of messages of a topic that the recorder knows it missed."""
         found = re.search(r'(\d+) missed', self.facts.get(f'{MESSAGES}{topic}', ''))
         return int(found[1]) if found else 0
 
     @property
     def losses(self) -> dict[str, str]:
-        """What the recorder did not get of each topic, in its words, where there is anything.
+        """Text of the recorder on what it missed, by topic.
 
-        Of a topic that keeps its last message alone, earlier ones are not counted as lost.
+        Topics that keep only their last message are left out.
         """
-        told = {
+        texts = {
             name.removeprefix(MESSAGES): text.partition(', ')[2]
             for name, text in self.facts.items()
             if name.startswith(MESSAGES) and name.rsplit('/', 1)[-1] in _KEPT
         }
-        return {topic: text for topic, text in told.items() if text not in ('', NOTHING_MISSED)}
+        return {topic: text for topic, text in texts.items() if text not in ('', _NOTHING_MISSED)}
 
-    def controller(self) -> Recorded:
-        """Tell which controller ran, and how it was configured.
+    def controller(self) -> RecordedController:
+        """Controller of the run and its configuration.
 
         Raises:
-            UnreadableBagError: there is no bag, or it is damaged.
-            NoConfigurationError: the bag does not tell.
-            OtherVersionError: it tells of a configuration that this version cannot run.
+            BagError: there is no bag, it is damaged, or it holds no configuration.
+            ConfigurationError: this version of the package cannot run the configuration.
         """
         damage = ''
         for stored, text in self.configurations:
@@ -117,24 +153,28 @@ class Context:
                 continue
             for section in sections:
                 if section.entries.keys() >= _OF_CONTROLLER:
-                    return Recorded(section.pattern, self._config(section), stored)
-        with open_bag(self.path):  # if it is no bag, that is what is to be told
-            raise NoConfigurationError(self.path, damage)
-
-    def _config(self, section: Section) -> ControllerConfig:
-        values = {
-            name: entry.value for name, entry in section.entries.items() if not is_builtin(name)
-        }
-        try:
-            return build(ControllerConfig, values, f'{self.path}, {ATTACHMENT}')
-        except ConfigurationError as error:
-            if self.version != __version__:
-                raise OtherVersionError(self.path, self.version, __version__, error) from error
-            raise
+                    values = {
+                        name: entry.value
+                        for name, entry in section.entries.items()
+                        if not is_builtin(name)
+                    }
+                    source = f'{self.path}, {ATTACHMENT}'
+                    if self.version != __version__:
+                        source += f' by version {self.version or "unknown"}, not {__version__}'
+                    config = build(ControllerConfig, values, source)
+                    return RecordedController(section.pattern, config, stored)
+        reason = (
+            f'{self.path} holds a configuration that cannot be read ({damage})'
+            if damage
+            else f'{self.path} does not hold the configuration of a controller: it was recorded by '
+            'something else, or without the controller'
+        )
+        with open_bag(self.path):  # raises if there is no bag
+            raise BagError(f'{reason}; name one, as in --config recommended')
 
 
 def facts_of(configuration: str) -> dict[str, str]:
-    """Facts to look for first, of a configuration and of this version."""
+    """Version of the package and the main facts of a configuration."""
     facts = {VERSION: __version__}
     try:
         sections = parse(configuration)
@@ -148,11 +188,7 @@ def facts_of(configuration: str) -> dict[str, str]:
 
 
 def read_context(path: Path) -> Context:
-    """Read what the first MCAP file of a bag tells; a bag without any tells nothing.
-
-    Args:
-        path: folder of the bag, or one of its storage files.
-    """
+    """Read the context from the first MCAP file of a bag (folder or file); empty without one."""
     files = sorted(path.glob('*.mcap')) if path.is_dir() else [path]
     if not files or files[0].suffix != '.mcap':
         return Context(path)
@@ -167,6 +203,6 @@ def read_context(path: Path) -> Context:
                 for one in reader.iter_attachments()
                 if one.name == ATTACHMENT
             )
-    except Exception:  # noqa: BLE001 - damage is told by who reads the messages
+    except Exception:  # noqa: BLE001 - reading the messages reports the damage
         return Context(path)
     return Context(path, texts, facts)

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One MCAP file, laid out as rosbag2's own storage does it."""
+"""One MCAP file, laid out as rosbag2's own storage does it, that can be ended on a full disk."""
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 from typing import IO, cast
 
@@ -15,7 +17,6 @@ from blf_dsc_controller.bags.metadata import (
     TopicInformation,
     quality_text,
 )
-from blf_dsc_controller.bags.reserved_file import ReservedFile
 
 COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
 CHANNEL_RECORD = 'blf_dsc_controller channel '
@@ -26,16 +27,20 @@ CHUNK_SIZE = 1 << 20
 _CHUNK_ENTRY = 100  # bytes that a chunk takes in the index at the end ...
 _CHANNEL_ENTRY = 16  # ... and for each channel
 
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_STEP = 1 << 20  # bytes
+_LARGEST_BUFFER = 1 << 20  # bytes
+
 
 class McapFile:
-    """Messages into chunks, an index of them all at the end.
+    """Messages in chunks, with an index of them all at the end.
 
     Args:
         path: of a file that does not exist yet.
         compression: of the chunks, `none` or `zstd`.
 
     Attributes:
-        information: what metadata.yaml says about this file.
+        information: the entry of this file in metadata.yaml.
     """
 
     def __init__(self, path: Path, compression: str) -> None:
@@ -66,10 +71,10 @@ class McapFile:
     def add_channel(
         self, topic: TopicInformation, definition: str, encoding: str = 'ros2msg'
     ) -> int:
-        """Announce a topic and return its number within the file.
+        """Add a topic and return its number within the file.
 
-        It stands in the chunk of its first message and in the index at the end; a third time, in a
-        record of its own, for a file that has lost both.
+        It is stored in the chunk of its first message, in the index at the end, and in a record of
+        its own, for a file that has lost both.
         """
         if topic.type not in self._schemas:
             self._schemas[topic.type] = self._writer.register_schema(
@@ -103,17 +108,98 @@ class McapFile:
 
     @property
     def is_full(self) -> bool:
-        """Whether its disk is full: it can still be closed in order, but should take no more."""
+        """Whether the disk is full: the file can still be closed, but should not grow."""
         return self._stream.is_full
 
     def flush(self) -> None:
-        """End the current chunk and hand all of it to the operating system."""
+        """End the current chunk and pass all of it to the operating system."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         self._stream.flush()
         self._index_size += _CHUNK_ENTRY + _CHANNEL_ENTRY * self._channels
-        self._stream.hold(self._index_size)
+        self._stream.reserve(self._index_size)
 
     def close(self) -> None:
         """Write the index and close the file."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
+
+
+class ReservedFile:
+    """A file, buffered until `flush`, that can still be ended when its disk is full.
+
+    A second file of zeros reserves room for what is not written yet: the current chunk, the index,
+    metadata.yaml. It is removed when the disk is full.
+
+    Args:
+        path: of a file that does not exist yet.
+
+    Attributes:
+        is_full: whether the disk has been found full; the file should be ended then.
+
+    Raises:
+        OSError: it cannot be made, or there is not even room for the reserve.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.is_full = False
+        self._file = path.open('xb', buffering=0)
+        self._buffer = bytearray()
+        self._written = 0
+        self._reserve = path.with_name(f'.{path.name}.reserve')
+        self._reserved = 0
+        self.reserve(0)
+        if self.is_full:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    def reserve(self, size: int) -> None:
+        """Reserve room for `size` bytes beyond what is flushed, in whole steps."""
+        if size + _STEP <= self._reserved or self.is_full:
+            return
+        reserved = (size // _STEP + 2) * _STEP
+        try:
+            with self._reserve.open('ab') as reserve:
+                os.posix_fallocate(reserve.fileno(), 0, reserved)
+        except OSError as error:
+            if error.errno not in _FULL:
+                raise
+            self.is_full = True
+        else:
+            self._reserved = reserved
+
+    def write(self, data: bytes) -> int:
+        """Take bytes; OSError if they cannot be written for another reason than a full disk."""
+        self._buffer += data
+        if len(self._buffer) >= _LARGEST_BUFFER:
+            self.flush()
+        return len(data)
+
+    def tell(self) -> int:
+        """Bytes taken so far."""
+        return self._written + len(self._buffer)
+
+    def flush(self) -> None:
+        """Pass all bytes to the operating system, at the cost of the reserve if need be."""
+        waiting = memoryview(self._buffer)
+        while waiting:
+            try:
+                count = self._file.write(waiting) or 0
+            except OSError as error:
+                if error.errno not in _FULL or not self._reserved:
+                    raise
+                self.is_full = True
+                self._remove_reserve()
+                continue
+            self._written += count
+            waiting = waiting[count:]
+        waiting.release()
+        self._buffer = bytearray()
+
+    def close(self) -> None:
+        """Flush and close the file; the reserve is free for metadata.yaml from here on."""
+        self._remove_reserve()
+        self.flush()
+        self._file.close()
+
+    def _remove_reserve(self) -> None:
+        self._reserved = 0
+        self._reserve.unlink(missing_ok=True)

@@ -3,16 +3,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import yaml
 
+from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.topics import FOREVER, Quality
 
 VERSION = 9
 ROS_DISTRO = 'jazzy'
-NANOSECONDS = 1_000_000_000
+
+_DURATIONS = ('deadline', 'lifespan', 'liveliness_lease_duration')
+_QUALITY = (
+    *('history', 'depth', 'reliability', 'durability', 'deadline', 'lifespan'),
+    *('liveliness', 'liveliness_lease_duration'),
+)
 
 
 @dataclass
@@ -25,19 +32,6 @@ class TopicInformation:
     type_hash: str
     message_count: int = 0
 
-    def as_tree(self) -> dict[str, Any]:
-        """Plain data as rosbag2 lays it out."""
-        return {
-            'topic_metadata': {
-                'name': self.name,
-                'type': self.type,
-                'serialization_format': 'cdr',
-                'offered_qos_profiles': [_quality_tree(quality) for quality in self.offered],
-                'type_description_hash': self.type_hash,
-            },
-            'message_count': self.message_count,
-        }
-
 
 @dataclass
 class FileInformation:
@@ -48,15 +42,6 @@ class FileInformation:
     ending_time: int = 0
     message_count: int = 0
 
-    def as_tree(self) -> dict[str, Any]:
-        """Plain data as rosbag2 lays it out."""
-        return {
-            'path': self.path,
-            'starting_time': {'nanoseconds_since_epoch': self.starting_time},
-            'duration': {'nanoseconds': _duration(self.starting_time, self.ending_time)},
-            'message_count': self.message_count,
-        }
-
 
 @dataclass
 class BagInformation:
@@ -66,81 +51,93 @@ class BagInformation:
     files: list[FileInformation] = field(default_factory=list)
     custom_data: dict[str, str] = field(default_factory=dict)
 
-    def as_tree(self) -> dict[str, Any]:
-        """Plain data as rosbag2 lays it out.
+    def record_text(self) -> str:
+        """Text for the record `rosbag2` inside an MCAP file."""
+        return _dump(self._tree())
 
-        The compression fields are those of rosbag2's own whole-file compression; chunks that MCAP
-        compresses itself leave them empty.
+    def file_text(self) -> str:
+        """Text of metadata.yaml."""
+        return _dump({'rosbag2_bagfile_information': self._tree()})
+
+    def _tree(self) -> dict[str, Any]:
+        """Plain data as rosbag2 arranges it.
+
+        The compression fields are those of rosbag2's own compression of whole files.
         """
-        start = min((file.starting_time for file in self.files), default=FOREVER)
-        end = max((file.ending_time for file in self.files), default=0)
+        topics = [
+            {
+                'topic_metadata': {
+                    'name': topic.name,
+                    'type': topic.type,
+                    'serialization_format': 'cdr',
+                    'offered_qos_profiles': _quality_trees(topic.offered),
+                    'type_description_hash': topic.type_hash,
+                },
+                'message_count': topic.message_count,
+            }
+            for topic in self.topics
+        ]
+        files = [
+            {'path': file.path, **_period([file]), 'message_count': file.message_count}
+            for file in self.files
+        ]
+        period = _period(self.files)
         return {
             'version': VERSION,
             'storage_identifier': 'mcap',
-            'duration': {'nanoseconds': _duration(start, end)},
-            'starting_time': {'nanoseconds_since_epoch': start},
+            'duration': period['duration'],
+            'starting_time': period['starting_time'],
             'message_count': sum(file.message_count for file in self.files),
-            'topics_with_message_count': [topic.as_tree() for topic in self.topics],
+            'topics_with_message_count': topics,
             'compression_format': '',
             'compression_mode': '',
             'relative_file_paths': [file.path for file in self.files],
-            'files': [file.as_tree() for file in self.files],
+            'files': files,
             'custom_data': self.custom_data or None,
             'ros_distro': ROS_DISTRO,
         }
 
-    def record_text(self) -> str:
-        """Text for the record `rosbag2` inside an MCAP file."""
-        return _dump(self.as_tree())
 
-    def file_text(self) -> str:
-        """Text of metadata.yaml."""
-        return _dump({'rosbag2_bagfile_information': self.as_tree()})
-
-
-def quality_text(offered: tuple[Quality, ...]) -> str:
+def quality_text(offered: Iterable[Quality]) -> str:
     """Text for the entry `offered_qos_profiles` of a channel."""
-    return _dump([_quality_tree(quality) for quality in offered])
+    return _dump(_quality_trees(offered))
 
 
-def qualities(text: str) -> tuple[Quality, ...]:
-    """Qualities of service that `quality_text` wrote; none, if the text is something else."""
+def parse_qualities(text: str) -> tuple[Quality, ...]:
+    """Qualities of service in such a text; none, if it is something else."""
     try:
-        return tuple(_quality(tree) for tree in yaml.safe_load(text) or ())
+        return tuple(
+            Quality(
+                **{name: tree[name] for name in _QUALITY if name not in _DURATIONS},
+                **{
+                    name: tree[name]['sec'] * NANOSECONDS + tree[name]['nsec']
+                    for name in _DURATIONS
+                },
+            )
+            for tree in yaml.safe_load(text) or ()
+        )
     except (yaml.YAMLError, KeyError, TypeError, AttributeError):
         return ()
 
 
-def _quality(tree: dict[str, Any]) -> Quality:
-    durations = {
-        name: tree[name]['sec'] * NANOSECONDS + tree[name]['nsec']
-        for name in ('deadline', 'lifespan', 'liveliness_lease_duration')
-    }
-    words = {name: tree[name] for name in ('reliability', 'durability', 'history', 'liveliness')}
-    return Quality(depth=tree['depth'], **words, **durations)
+def _quality_trees(offered: Iterable[Quality]) -> list[dict[str, Any]]:
+    trees = []
+    for quality in offered:
+        tree = {name: getattr(quality, name) for name in _QUALITY}
+        for name in _DURATIONS:
+            seconds, nanoseconds = divmod(tree[name], NANOSECONDS)
+            tree[name] = {'sec': seconds, 'nsec': nanoseconds}
+        trees.append({**tree, 'avoid_ros_namespace_conventions': False})
+    return trees
 
 
-def _quality_tree(quality: Quality) -> dict[str, Any]:
+def _period(files: Sequence[FileInformation]) -> dict[str, dict[str, int]]:
+    start = min((file.starting_time for file in files), default=FOREVER)
+    end = max((file.ending_time for file in files), default=0)
     return {
-        'history': quality.history,
-        'depth': quality.depth,
-        'reliability': quality.reliability,
-        'durability': quality.durability,
-        'deadline': _duration_tree(quality.deadline),
-        'lifespan': _duration_tree(quality.lifespan),
-        'liveliness': quality.liveliness,
-        'liveliness_lease_duration': _duration_tree(quality.liveliness_lease_duration),
-        'avoid_ros_namespace_conventions': False,
+        'starting_time': {'nanoseconds_since_epoch': start},
+        'duration': {'nanoseconds': max(end - start, 0)},
     }
-
-
-def _duration_tree(duration: int) -> dict[str, int]:
-    seconds, nanoseconds = divmod(duration, NANOSECONDS)
-    return {'sec': seconds, 'nsec': nanoseconds}
-
-
-def _duration(start: int, end: int) -> int:
-    return max(end - start, 0)
 
 
 def _dump(tree: object) -> str:

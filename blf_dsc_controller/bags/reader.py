@@ -4,20 +4,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.bags.batch import decode_arrays, decode_joint_states
-from blf_dsc_controller.bags.content import Content, Recorded, read_content
-from blf_dsc_controller.bags.errors import UnreadableMessageError
-from blf_dsc_controller.bags.rejected_columns import refused
-from blf_dsc_controller.messages.cdr import JointStateLayout
-from blf_dsc_controller.messages.errors import MessageError
+from blf_dsc_controller.bags.batch import decode_arrays, decode_joint_states, joint_names
+from blf_dsc_controller.bags.content import Content, TopicMessages, read_content
+from blf_dsc_controller.bags.sources import open_bag
+from blf_dsc_controller.messages.names import COMPUTE_TIME, REJECTED
 from blf_dsc_controller.messages.topics import (
     BOUND,
     COMMANDS,
+    DIAGNOSTICS,
     JOINT_STATES,
     LEARNING,
     MONITOR,
@@ -27,24 +26,24 @@ from blf_dsc_controller.messages.topics import (
     TRUTH,
     Topic,
 )
+from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Floats, Run, Series, Stamps
 
 
 def read_run(path: str | Path, namespace: str = '') -> Run:
     """Read a bag.
 
-    The k-th command answers the k-th joint state if there are as many; otherwise the torque is
+    The k-th command belongs to the k-th joint state if there are as many; otherwise the torque is
     that of the tracking error, or else the effort of the next joint state.
 
     Args:
         path: folder of the bag, or one of its storage files.
-        namespace: of the robot to look at, if the bag holds several.
+        namespace: of the robot, if the bag holds several.
 
     Raises:
-        UnreadableBagError: there is no bag, or it is damaged.
+        BagError: there is no bag, it is damaged, it holds no joint states, or the topics of several
+            robots.
         UnreadableMessageError: a message in it cannot be decoded.
-        MissingTopicError: it holds no joint states.
-        AmbiguousTopicError: it holds the topics of several robots.
     """
     content = read_content(Path(path), namespace)
     joints = _joints(content)
@@ -73,12 +72,11 @@ def read_run(path: str | Path, namespace: str = '') -> Run:
         timing=_vector(content, TIMING),
         monitor=_vector(content, MONITOR),
         message_counts=content.message_counts,
-        refused=refused(Path(path), learning, namespace),
+        refused=_rejected_columns(Path(path), learning, namespace),
     )
 
 
-@dataclass(frozen=True)
-class _Decoded:
+class _Decoded(NamedTuple):
     """All messages of one topic, ordered by stamp, one of each stamp."""
 
     names: tuple[str, ...]
@@ -96,28 +94,15 @@ class _Decoded:
 
 
 def _joints(content: Content) -> tuple[str, ...]:
-    """Joints that the controller controls, in its order; all that move if it is not there."""
-    for topic in (TRACKING_ERROR, REFERENCE, BOUND, JOINT_STATES):
-        if topic in content.topics:
-            return _names(content.topics[topic])
-    raise AssertionError
+    """Joints of the controller, in its order; all of the joint states if it is not in the bag."""
+    topics = (TRACKING_ERROR, REFERENCE, BOUND, JOINT_STATES)
+    return joint_names(next(content.topics[one] for one in topics if one in content.topics))
 
 
-def _names(recorded: Recorded) -> tuple[str, ...]:
-    try:
-        names = JointStateLayout.parse(recorded.raw[0]).names
-    except MessageError as error:
-        raise UnreadableMessageError(recorded.name, 0, error) from error
-    if not names:
-        unnamed = MessageError('it names no joint, so its values cannot be told apart')
-        raise UnreadableMessageError(recorded.name, 0, unnamed)
-    return names
-
-
-def _decode(recorded: Recorded, names: Sequence[str]) -> _Decoded:
-    stamp, values = decode_joint_states(recorded, names, ('position',))
+def _decode(messages: TopicMessages, names: Sequence[str]) -> _Decoded:
+    stamp, values = decode_joint_states(messages, names, ('position',))
     stamp, order = np.unique(stamp, return_index=True)
-    received = np.array(recorded.received, dtype=np.int64)[order]
+    received = np.array(messages.received, dtype=np.int64)[order]
     return _Decoded(tuple(names), stamp, received, values[order])
 
 
@@ -126,10 +111,8 @@ def _optional(content: Content, topic: Topic, joints: Sequence[str]) -> _Decoded
 
 
 def _vector(content: Content, topic: Topic) -> Series | None:
-    if topic not in content.topics:
-        return None
-    recorded = content.topics[topic]
-    return _decode(recorded, _names(recorded)).position
+    messages = content.topics.get(topic)
+    return None if messages is None else _decode(messages, joint_names(messages)).position
 
 
 def _torque(content: Content, states: _Decoded, errors: _Decoded | None) -> Floats:
@@ -141,3 +124,32 @@ def _torque(content: Content, states: _Decoded, errors: _Decoded | None) -> Floa
     if errors is not None:
         return errors.effort.exact(states.stamp)
     return np.vstack([states.effort.values[1:], np.full(len(states.names), np.nan)])
+
+
+def _rejected_columns(path: Path, learning: Series | None, namespace: str) -> dict[str, str]:
+    """Columns that are NaN at the end of the learning, with the reason given in /diagnostics."""
+    if learning is None:
+        return {}
+    last = dict(zip(learning.names, learning.values[-1], strict=True))
+    columns = [name for name, value in last.items() if name != COMPUTE_TIME and np.isnan(value)]
+    reasons = _reasons(path, namespace.strip('/')) if columns else {}
+    return {column: reasons.get(column, '') for column in columns}
+
+
+def _reasons(path: Path, namespace: str) -> dict[str, str]:
+    """Reasons by column, from the last message that holds any."""
+    with open_bag(path) as bag:
+        if (DIAGNOSTICS.resolved, DIAGNOSTICS.type) not in bag.held:
+            return {}
+        for _, _, raw in reversed(list(bag.messages({DIAGNOSTICS.resolved}))):
+            message: Any = typestore().deserialize_cdr(raw, DIAGNOSTICS.type)
+            found = {
+                pair.key.removeprefix(REJECTED): pair.value
+                for status in message.status
+                if status.name.startswith(namespace)
+                for pair in status.values
+                if pair.key.startswith(REJECTED)
+            }
+            if found:
+                return found
+    return {}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A black box: the last seconds of all topics in memory, written out when something happened."""
+"""A black box: the last seconds of all topics in memory, written out on demand."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.topics import Quality
-
-_NANOSECONDS = 1_000_000_000
 
 
 class _Message(NamedTuple):
@@ -31,7 +30,7 @@ class Ring:
     """
 
     def __init__(self, seconds: float, compression: str) -> None:
-        self._span = round(seconds * _NANOSECONDS)
+        self._span = round(seconds * NANOSECONDS)
         self._compression = compression
         self._topics: list[tuple[str, str, tuple[Quality, ...]]] = []
         self._messages: deque[_Message] = deque()
@@ -39,14 +38,14 @@ class Ring:
         self._configuration: tuple[str, int] | None = None
 
     def add_topic(self, name: str, type_name: str, offered: Sequence[Quality]) -> int:
-        """Announce a topic and return its handle."""
+        """Add a topic and return its handle."""
         self._topics.append((name, type_name, tuple(offered)))
         return len(self._topics)
 
     def write(
         self, handle: int, raw: bytes, log_time: int, publish_time: int, sequence: int
     ) -> None:
-        """Keep a message, and let go of those that are too old by now."""
+        """Keep a message, and drop those that are too old by now."""
         self._messages.append(_Message(log_time, handle, raw, publish_time, sequence))
         while self._messages[0].log_time < log_time - self._span:
             old = self._messages.popleft()
@@ -58,10 +57,10 @@ class Ring:
         self._configuration = configuration, known_at
 
     def dump(self, path: Path, facts: dict[str, str]) -> int:
-        """Write what is kept as a bag and return the number of messages; the ring goes on.
+        """Write the kept messages as a bag and return their number; the ring continues.
 
         Raises:
-            BagExistsError: `path` is there already.
+            BagError: `path` exists already.
             DiskFullError: there is no room for all of it.
         """
         kept = [*self._latched.values(), *self._messages]

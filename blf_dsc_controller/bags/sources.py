@@ -6,96 +6,74 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
 
 import yaml
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 
-from blf_dsc_controller.bags.errors import UnreadableBagError
-from blf_dsc_controller.bags.mcap_reader import McapMessages
+from blf_dsc_controller.bags.errors import BagError
+from blf_dsc_controller.bags.mcap_reader import read_messages
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.types import typestore
 
-_TOLD = {'__schemaless__': ''}
 _NEWEST = 9  # version of rosbag2's metadata.yaml that is known
 _STORAGES = ('mcap', 'sqlite3')
 
 
-class Source(Protocol):
-    """An open bag.
+class OpenBag:
+    """An open bag. rosbags' AnyReader would reject bags with one bad type definition.
 
     Attributes:
-        held: name and type of each topic; the type is empty where the bag does not tell it.
+        held: name and type of each topic; the type is empty where it is unknown.
         counts: number of messages of each topic.
     """
 
-    held: list[tuple[str, str]]
-    counts: dict[str, int]
-
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, time of reception [ns] and content in CDR of every message of these topics.
-
-        Those of one topic come nearly in the order of their reception.
-        """
-
-
-class _Bag2:
-    def __init__(self, reader: Reader2, files: list[Path]) -> None:
+    def __init__(self, reader: Reader1 | Reader2, files: list[Path]) -> None:
         self._reader = reader
         self._files = files
-        self.held = [(one.topic, _TOLD.get(one.msgtype, one.msgtype)) for one in reader.connections]
-        self.counts = {one.topic: one.msgcount for one in reader.connections}
-
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
-        if self._files:
-            for file in self._files:
-                yield from McapMessages(file, topics).read()
-            return
-        chosen = [one for one in self._reader.connections if one.topic in topics]
-        if chosen:  # none given would be all
-            for connection, received, raw in self._reader.messages(chosen):
-                yield connection.topic, received, bytes(raw)
-
-
-class _Bag1:
-    """The common types serialise alike in ROS 1 and 2 but for padding and `seq` of the header."""
-
-    def __init__(self, reader: Reader1) -> None:
-        self._reader = reader
-        self.held = sorted({(one.topic, one.msgtype) for one in reader.connections})
+        held = dict.fromkeys((one.topic, one.msgtype) for one in reader.connections)
+        self.held = [(name, kind.replace('__schemaless__', '')) for name, kind in held]
         self.counts = {name: reader.topics[name].msgcount for name, _ in self.held}
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+        """Topic, time of reception [ns] and content in CDR of every message of `topics`.
+
+        Those of one topic come nearly in the order of their reception.
+        """
+        if self._files:
+            for file in self._files:
+                yield from read_messages(file, topics)
+            return
+        # The common types serialise alike in ROS 1 and 2 but for padding and `seq` of the header.
+        is_ros1 = isinstance(self._reader, Reader1)
         chosen = [one for one in self._reader.connections if one.topic in topics]
-        if chosen:
-            for connection, received, raw in self._reader.messages(chosen):
-                message = typestore().ros1_to_cdr(raw, connection.msgtype)
-                yield connection.topic, received, bytes(message)
+        for connection, received, raw in self._reader.messages(chosen) if chosen else ():
+            cdr = typestore().ros1_to_cdr(raw, connection.msgtype) if is_ros1 else raw
+            yield connection.topic, received, bytes(cdr)
 
 
 @contextmanager
-def open_bag(path: Path) -> Iterator[Source]:
+def open_bag(path: Path) -> Iterator[OpenBag]:
     """Open a bag for reading: a folder, one of its storage files, or a ROS 1 `.bag`.
 
     Raises:
-        UnreadableBagError: there is no bag, or it is damaged; also while it is read.
+        BagError: there is no bag, or it is damaged; also while it is read.
     """
     try:
         if path.suffix == '.bag':
             with Reader1(path) as reader1:
-                yield _Bag1(reader1)
+                yield OpenBag(reader1, [])
         else:
             with Reader2(path) as reader2:
-                yield _Bag2(reader2, _mcap_files(path))
+                yield OpenBag(reader2, _mcap_files(path))
     except BlfDscError:
         raise
     except Exception as error:  # a damaged file makes the library raise nearly anything
-        raise UnreadableBagError(path, _reason(path, error)) from error
+        raise BagError(f'{path} cannot be read as a bag: {_reason(path, error)}') from error
 
 
 def _mcap_files(path: Path) -> list[Path]:
-    """Files of a bag if all are plain MCAP, in their order; none if they are not."""
+    """Files of a bag in their order, if all are plain MCAP; else none."""
     files = [path]
     if path.is_dir():
         tree = yaml.safe_load((path / 'metadata.yaml').read_text(encoding='utf-8'))
@@ -107,30 +85,27 @@ def _mcap_files(path: Path) -> list[Path]:
 def _reason(path: Path, error: Exception) -> str:
     if not path.exists():
         return 'there is no such folder'
-    remedy = f'to save what is whole: bag_recover {path}'
-    if not path.is_dir():
-        return f'{_said(error)}; {remedy}' if path.suffix == '.mcap' else _said(error)
-    has_mcap = any(path.glob('*.mcap'))
-    if not (path / 'metadata.yaml').exists():
-        if has_mcap:
+    text = str(error).rstrip('.') or type(error).__name__
+    metadata = path / 'metadata.yaml'
+    is_mcap = path.suffix == '.mcap'
+    if path.is_dir():
+        is_mcap = any(path.glob('*.mcap'))
+        if not metadata.exists():
+            if not is_mcap:
+                return 'the folder has no metadata.yaml: it is no bag'
             return (
                 'the folder has no metadata.yaml; was the recording ended before it was complete? '
                 f'Make a clean bag of it: bag_recover {path}'
             )
-        return 'the folder has no metadata.yaml: it is no bag'
-    reason = _other_format(path / 'metadata.yaml') or _said(error)
-    return f'{reason}; {remedy}' if has_mcap else reason
-
-
-def _said(error: Exception) -> str:
-    return str(error).rstrip('.') or type(error).__name__
+        text = _other_format(metadata) or text
+    return f'{text}; to save what is whole: bag_recover {path}' if is_mcap else text
 
 
 def _other_format(metadata: Path) -> str:
-    """What a metadata.yaml says that is not known here, empty if that is not what is wrong."""
+    """Why a metadata.yaml is not understood; empty if it is."""
     try:
-        told = yaml.safe_load(metadata.read_text(encoding='utf-8'))['rosbag2_bagfile_information']
-        version, storage = told['version'], told['storage_identifier']
+        tree = yaml.safe_load(metadata.read_text(encoding='utf-8'))['rosbag2_bagfile_information']
+        version, storage = tree['version'], tree['storage_identifier']
     except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError):
         return 'its metadata.yaml does not describe a bag'
     if isinstance(version, int) and version > _NEWEST:

@@ -10,8 +10,8 @@ from math import inf
 from pathlib import Path
 from types import TracebackType
 
-from blf_dsc_controller.bags.context import ATTACHMENT, MEDIA_TYPE, RECORD, facts_of
-from blf_dsc_controller.bags.errors import BagExistsError, DiskFullError
+from blf_dsc_controller.bags.context import ATTACHMENT, RECORD, facts_of
+from blf_dsc_controller.bags.errors import BagError, DiskFullError
 from blf_dsc_controller.bags.mcap_writer import McapFile
 from blf_dsc_controller.bags.metadata import BagInformation, TopicInformation
 from blf_dsc_controller.messages.topics import Quality
@@ -20,7 +20,7 @@ from blf_dsc_controller.messages.types import definition
 
 @dataclass(frozen=True)
 class Limits:
-    """When a new file of the bag is begun: at a size [bytes], or after a time [s]; inf: never."""
+    """When the next file of a bag is begun: at a size [bytes], or after a time [s]; inf: never."""
 
     size: float = inf
     duration: float = inf
@@ -29,19 +29,19 @@ class Limits:
 class BagWriter:
     """Writes serialised messages into a new bag.
 
-    All that is written leaves the process within `flush_interval` and the time to the next call
-    of `write` or `flush_if_due`; what has left it survives the process being killed.
+    Data leaves the process within `flush_interval` plus the time to the next call of `write` or
+    `flush_if_due`; then it survives the process being killed.
 
     Args:
         path: folder of the bag, which must not exist yet.
         compression: of the chunks, `none` or `zstd`.
-        flush_interval: longest time that data stays in the process [s]; None leaves it to the size
-            of a chunk, which is best where nothing is lost by starting over.
+        flush_interval: longest time that data stays in the process [s]; None: until a chunk is
+            full, for bags that can be made again.
         clock: monotonic time [s].
         limits: of one file.
 
     Raises:
-        BagExistsError: `path` is there already.
+        BagError: `path` exists already.
     """
 
     def __init__(
@@ -59,7 +59,12 @@ class BagWriter:
         self._bag = BagInformation()
         self._definitions: list[tuple[str, str]] = []
         self._configuration: tuple[str, int] | None = None
-        self._make_folder()
+        try:
+            self.path.mkdir(parents=True)
+        except FileExistsError:
+            raise BagError(
+                f'{path} exists already and is not overwritten: choose another folder or remove it'
+            ) from None
         self._file = self._new_file()
         self._flush_interval = inf if flush_interval is None else flush_interval
         self._clock = clock
@@ -76,19 +81,19 @@ class BagWriter:
         hash_: str = '',
         encoding: str = 'ros2msg',
     ) -> int:
-        """Announce a topic and return the handle to write to it.
+        """Add a topic and return the handle to write to it.
 
         Args:
             name: full name.
             type_name: such as `sensor_msgs/msg/JointState`.
             offered: quality of service of each publisher.
-            text: definition of the type and all nested ones, if not a common type of Jazzy; empty
-                if there is none to be had.
-            hash_: of the type, likewise.
+            text: definition of the type and all nested ones, empty if unknown; None for a common
+                type of Jazzy.
+            hash_: of the type.
             encoding: of the definition.
 
         Raises:
-            UnknownTypeError: no `text` is given and the type is none of the common ones.
+            UnknownTypeError: `text` is None and the type is none of the common ones.
         """
         if text is None:
             text, known_hash = definition(type_name)
@@ -113,7 +118,7 @@ class BagWriter:
             raw: the message in CDR.
             log_time: when it was received [ns].
             publish_time: when it was published [ns], `log_time` if not known.
-            sequence: number that the publisher gave it, 0 if not known.
+            sequence: number given by the publisher, 0 if not known.
 
         Raises:
             DiskFullError: there is no room left; the bag is complete and closed.
@@ -129,32 +134,24 @@ class BagWriter:
 
         Args:
             configuration: text of a parameter file of all nodes known so far.
-            known_at: when it was learned [ns], now if not given.
+            known_at: when it was received [ns], now if not given.
         """
         self._configuration = configuration, time.time_ns() if known_at is None else known_at
         self._bag.custom_data.update(facts_of(configuration))
         self._describe(self._file)
 
     def note(self, facts: dict[str, str]) -> None:
-        """Store facts of the run under names of their own."""
+        """Store facts of the run by name."""
         self._bag.custom_data.update(facts)
         self._file.note(RECORD, self._bag.custom_data)
 
     def flush_if_due(self) -> None:
-        """Flush if the flush interval has passed, for use in a pause of the messages.
-
-        Raises:
-            DiskFullError: as in `write`.
-        """
+        """Flush if the flush interval has passed; DiskFullError as in `write`."""
         if self._file.is_full or self._clock() - self._flushed >= self._flush_interval:
             self.flush()
 
     def flush(self) -> None:
-        """Hand everything written so far to the operating system.
-
-        Raises:
-            DiskFullError: as in `write`.
-        """
+        """Pass everything written so far to the operating system; DiskFullError as in `write`."""
         self._file.flush()
         self._flushed = self._clock()
         if self._file.is_full:
@@ -191,7 +188,7 @@ class BagWriter:
         self.close()
 
     def _new_file(self) -> McapFile:
-        """Begin the next file, with all that the one before it announced."""
+        """Begin the next file, with the topics of the one before it."""
         name = f'{self.path.name}_{len(self._bag.files)}.mcap'
         file = McapFile(self.path / name, self._compression)
         self._bag.files.append(file.information)
@@ -206,7 +203,7 @@ class BagWriter:
             file.note(RECORD, self._bag.custom_data)
         if self._configuration is not None:
             text, known_at = self._configuration
-            file.attach(ATTACHMENT, MEDIA_TYPE, text, known_at)
+            file.attach(ATTACHMENT, 'application/yaml', text, known_at)
 
     def _split(self) -> None:
         self._end(self._file)
@@ -217,9 +214,3 @@ class BagWriter:
         file.flush()
         file.describe(self._bag)
         file.close()
-
-    def _make_folder(self) -> None:
-        try:
-            self.path.mkdir(parents=True)
-        except FileExistsError:
-            raise BagExistsError(self.path) from None

@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from blf_dsc_controller.analysis import figures, subject, summary, table
 from blf_dsc_controller.analysis.report import write_report
 from blf_dsc_controller.bags import recover as recovering
-from blf_dsc_controller.bags.damage import clock
 from blf_dsc_controller.bags.export import export as export_run
 from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.bags.salvage import format_time
 
 
 def report(options: Namespace) -> None:
@@ -54,7 +54,7 @@ def _losses(recovery: recovering.Recovery) -> Iterator[str]:
     for loss in recovery.losses:
         yield f'LOST {loss}'
     for name, last in recovery.unfinished:
-        after = 'nothing in it could be read' if last is None else f'it ends at {clock(last)}'
+        after = 'nothing in it could be read' if last is None else f'it ends at {format_time(last)}'
         yield (
             f'{name}: the recording was not ended; {after}. What came later is not in the file: '
             'at most 0.1 s if the recorder was killed'

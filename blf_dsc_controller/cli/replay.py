@@ -9,8 +9,8 @@ from time import perf_counter
 
 import numpy as np
 
+from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.name_map import NameMap
 from blf_dsc_controller.cli.main import require_ros
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER

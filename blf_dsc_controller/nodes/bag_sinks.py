@@ -23,7 +23,7 @@ _MEGABYTE = 1_000_000
 
 
 class BagSink(BagWriter):
-    """Writes everything into one bag; BagExistsError if its folder is there already.
+    """Writes everything into one bag; BagError if its folder is there already.
 
     Attributes:
         notice: what to log at the start.

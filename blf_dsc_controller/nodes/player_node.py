@@ -17,7 +17,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from blf_dsc_controller.bags.errors import EmptyBagError
+from blf_dsc_controller.bags.errors import BagError
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.messages.encoders import encode_clock
 from blf_dsc_controller.messages.topics import CLOCK, HISTORY, STREAM
@@ -42,8 +42,7 @@ class PlayerNode(Node):
         options: of rclpy's Node.
 
     Raises:
-        UnreadableBagError: there is no bag, or it is damaged.
-        EmptyBagError: it holds nothing that can be played here.
+        BagError: there is no bag, it is damaged, or it holds nothing that can be played here.
     """
 
     def __init__(self, path: Path, rate: float, *, loop: bool, clock: bool, **options: Any) -> None:
@@ -54,7 +53,7 @@ class PlayerNode(Node):
             known = {name for name, output in outputs.items() if output is not None}
             messages = sorted(bag.messages(known), key=lambda message: message[1])
         if not messages:
-            raise EmptyBagError(path)
+            raise BagError(f'{path} is empty: it holds no message')
         self._messages = [(outputs[name], raw) for name, _, raw in messages]
         self._outputs = [output for output in outputs.values() if output is not None]
         self.timeline = Timeline([at for _, at, _ in messages], rate, loop=loop)
@@ -146,7 +145,7 @@ def play(
         remaps: such as `joint_states:=other`.
 
     Raises:
-        UnreadableBagError: there is no bag, or it is damaged.
+        BagError: there is no bag, or it is damaged.
     """
     words = [word for remap in remaps for word in ('--remap', remap)]
     rclpy.init(args=['bag_replay', '--ros-args', *words] if words else None)

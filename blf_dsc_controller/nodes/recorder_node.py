@@ -7,9 +7,8 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from blf_dsc_controller.bags.context import MESSAGES
-from blf_dsc_controller.bags.errors import DiskFullError, WriteError
-from blf_dsc_controller.bags.losses import Losses
+from blf_dsc_controller.bags.context import MESSAGES, Losses
+from blf_dsc_controller.bags.errors import BagError, DiskFullError
 from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.configuration.params_file import dumps
 from blf_dsc_controller.messages.errors import UnknownTypeError
@@ -36,7 +35,7 @@ class BagRecorderNode(PlainNode):
 
     Raises:
         ConfigurationError: a parameter is wrong.
-        BagExistsError: the folder of the bag is there already.
+        BagError: the folder of the bag is there already.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -150,9 +149,14 @@ class BagRecorderNode(PlainNode):
                 self._sink.flush()
             else:
                 self._sink.flush_if_due()
-        except (DiskFullError, OSError) as error:
-            self.failure = error if isinstance(error, DiskFullError) else WriteError(error)
+        except DiskFullError as error:
+            self.failure, self.finished = error, True
+        except OSError as error:
             self.finished = True
+            self.failure = BagError(
+                f'the bag cannot be written any further: {error}; what was written before is '
+                'saved by bag_recover'
+            )
 
     def _statistics(self) -> dict[str, str]:
         return {

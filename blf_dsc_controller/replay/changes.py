@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from blf_dsc_controller.bags.batch import decode_joint_states
-from blf_dsc_controller.bags.content import Content, Recorded
+from blf_dsc_controller.bags.content import Content, TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change, parameters
 from blf_dsc_controller.messages.topics import BOUND, FOREVER, PARAMETER_EVENTS, REFERENCE
@@ -96,7 +96,7 @@ def restarts(content: Content, config: ControllerConfig, start: int) -> Stamps:
 
 
 def _told_again(
-    bounds: Recorded, config: ControllerConfig, told: Stamps | None, starts: Sequence[int]
+    bounds: TopicMessages, config: ControllerConfig, told: Stamps | None, starts: Sequence[int]
 ) -> list[tuple[int, int]]:
     """Stamp [ns] of the bounds that were told for a change of parameters, and when they came [ns].
 
@@ -117,7 +117,7 @@ def _told_again(
     return [(int(stamp[k]), bounds.received[k]) for k in np.flatnonzero(told_again)]
 
 
-def _received_from(bounds: Recorded, end: int) -> int:
+def _received_from(bounds: TopicMessages, end: int) -> int:
     """When the first bound of a stamp from `end` on came [ns]."""
     stamp, _ = decode_joint_states(bounds, (), ())
     late = [at for at, one in zip(bounds.received, stamp.tolist(), strict=True) if one >= end]

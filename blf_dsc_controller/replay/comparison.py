@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.batch import decode_arrays, decode_joint_states
-from blf_dsc_controller.bags.content import Content, Recorded
+from blf_dsc_controller.bags.content import Content, TopicMessages
 from blf_dsc_controller.messages.cdr import JointStateLayout
 from blf_dsc_controller.messages.encoders import JOINT_STATE_FIELDS
 from blf_dsc_controller.messages.topics import COMMANDS, LEARNING, MONITOR, Topic
@@ -125,7 +125,7 @@ def first(comparisons: Sequence[Comparison]) -> Difference | None:
 
 
 def _compare_commands(
-    recorded: Recorded, commands: Commands, fields: Collection[str], *, is_gappy: bool
+    recorded: TopicMessages, commands: Commands, fields: Collection[str], *, is_gappy: bool
 ) -> Comparison:
     """Commands have no stamp: the k-th is the k-th."""
     count, sure = len(recorded.raw), commands.sure
@@ -167,7 +167,7 @@ def _left_out(values: Floats, commands: Commands) -> str:
 
 
 def _compare_stamped(
-    recorded: Recorded, states: States, columns: Columns, *, named: bool
+    recorded: TopicMessages, states: States, columns: Columns, *, named: bool
 ) -> Comparison:
     names = JointStateLayout.parse(recorded.raw[0]).names
     stamp, values = decode_joint_states(recorded, names, ())

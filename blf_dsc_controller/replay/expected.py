@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from blf_dsc_controller.bags.batch import decode_joint_states
-from blf_dsc_controller.bags.content import Recorded
+from blf_dsc_controller.bags.content import TopicMessages
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.messages.cdr import JointStateLayout
 from blf_dsc_controller.messages.monitor import Monitor
@@ -81,7 +81,7 @@ def _table(monitored: Mapping[int, bytes], states: States) -> Columns:
         return {}
     messages = list(monitored.values())
     names = JointStateLayout.parse(messages[0]).names
-    _, values = decode_joint_states(Recorded(MONITOR.resolved, raw=messages), names, ())
+    _, values = decode_joint_states(TopicMessages(MONITOR.resolved, raw=messages), names, ())
     table = np.full((states.stamp.size, len(names)), np.nan)
     table[list(monitored)] = values[:, 0]
     return dict(zip(names, table.T, strict=True))

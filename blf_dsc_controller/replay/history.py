@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from blf_dsc_controller.bags.content import Content, Recorded
+from blf_dsc_controller.bags.content import Content, TopicMessages
 from blf_dsc_controller.messages.names import (
     LAST_STATE,
     OPERATION,
@@ -157,7 +157,7 @@ def retunings(changes: Iterable[Change]) -> Iterator[Order]:
         yield Order(one.stamp, one.told, PARAMETERS, partial(_retune, one))
 
 
-def _states(recorded: Recorded | None) -> Iterator[tuple[int, Mapping[str, str]]]:
+def _states(recorded: TopicMessages | None) -> Iterator[tuple[int, Mapping[str, str]]]:
     if recorded is None:
         return
     for told, raw in zip(recorded.received, recorded.raw, strict=True):

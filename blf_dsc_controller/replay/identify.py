@@ -14,8 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.bags.name_map import NO_NAMES, NameMap
+from blf_dsc_controller.bags.content import NO_NAMES, NameMap, read_content
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import begin, controller_of, estimate_names
 from blf_dsc_controller.replay.errors import ShortBagError

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.bags.name_map import NO_NAMES, NameMap
+from blf_dsc_controller.bags.content import NO_NAMES, NameMap, read_content
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.replay.law import Replayed, run_law
 from blf_dsc_controller.replay.states import States, answered_states

@@ -11,8 +11,7 @@ import numpy as np
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.content import Content, read_content
-from blf_dsc_controller.bags.context import Context, read_context
-from blf_dsc_controller.bags.context import Recorded as RecordedController
+from blf_dsc_controller.bags.context import Context, RecordedController, read_context
 from blf_dsc_controller.law.factory import required_fields
 from blf_dsc_controller.messages.topics import (
     ACCEPTED_TRAJECTORY,
@@ -83,7 +82,7 @@ def replay(path: Path, namespace: str = '') -> Outcome:
         namespace: of the robot to look at, if the bag holds several.
 
     Raises:
-        NoConfigurationError: the bag does not tell how the controller was configured.
+        BagError: the bag does not tell how the controller was configured.
         NothingToCompareError: it holds nothing that the controller said.
         LateRecordingError: it does not hold the first state that the controller answered.
         BlfDscError: the bag, or a message in it, cannot be read.

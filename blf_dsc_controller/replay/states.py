@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from blf_dsc_controller.bags.batch import decode_joint_states
-from blf_dsc_controller.bags.content import Content, Recorded
+from blf_dsc_controller.bags.content import Content, TopicMessages
 from blf_dsc_controller.bags.errors import UnreadableMessageError
 from blf_dsc_controller.messages.decoders import JointStateDecoder
 from blf_dsc_controller.messages.errors import MessageError
@@ -125,7 +125,9 @@ def arrivals(
     return Arrivals(stamp.tolist(), values.reshape(count, -1), {}, taken.received)
 
 
-def _one_by_one(recorded: Recorded, joints: Sequence[str], required: Sequence[str]) -> Arrivals:
+def _one_by_one(
+    recorded: TopicMessages, joints: Sequence[str], required: Sequence[str]
+) -> Arrivals:
     decoder = JointStateDecoder(joints, required)
     stamp = [0] * len(recorded.raw)
     measurement = np.zeros((len(recorded.raw), 3 * len(joints)))

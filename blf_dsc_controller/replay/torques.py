@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from blf_dsc_controller.bags.batch import array_size, decode_arrays, decode_joint_states
-from blf_dsc_controller.bags.content import Content, Recorded
+from blf_dsc_controller.bags.content import Content, TopicMessages
 from blf_dsc_controller.messages.cdr import JointStateLayout
 from blf_dsc_controller.messages.decoders import columns_of
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE, JOINT_STATES, TRACKING_ERROR
@@ -51,7 +51,7 @@ def applied_torque(
 
 
 def _commanded(
-    content: Content, recorded: Recorded, states: States, joints: Sequence[str]
+    content: Content, recorded: TopicMessages, states: States, joints: Sequence[str]
 ) -> Floats:
     """Command of each state: the k-th if there are as many, else the last that had come."""
     torque = _values(content, recorded, joints)
@@ -70,7 +70,7 @@ def _commanded(
     return held
 
 
-def _values(content: Content, recorded: Recorded, joints: Sequence[str]) -> Floats:
+def _values(content: Content, recorded: TopicMessages, joints: Sequence[str]) -> Floats:
     """Commands (m, n): by name, or in the order of the joints, or in that of the joint states."""
     if recorded.type == JOINT_STATE:
         return decode_joint_states(recorded, joints, ('effort',))[1][:, 2]

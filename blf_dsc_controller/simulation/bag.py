@@ -46,7 +46,7 @@ def write_bag(
         plant: configuration of the arm, to be stored beside that of the controller.
 
     Raises:
-        BagExistsError: `path` is there already.
+        BagError: `path` is there already.
     """
     with BagWriter(path, compression=compression, flush_interval=None) as bag:
         nodes: dict[str, object] = {topics.CONTROLLER: config}
