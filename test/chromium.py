@@ -24,7 +24,7 @@ FLAGS = (
     '--window-size=1400,1000',
 )
 NAMES = ('chromium', 'chromium-browser', 'google-chrome')
-PATIENCE = 120.0  # s, until a test gives up on what should take seconds
+PATIENCE = 300.0  # s, until a test gives up on what should take seconds
 
 
 def find():

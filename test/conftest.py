@@ -11,7 +11,7 @@ import shutil
 import tempfile
 
 import hypothesis
-from own_domain import MINE
+from own_domain import own_domain
 
 # How long an example takes says something of the machine, not of the package.
 hypothesis.settings.register_profile('patient', deadline=None)
@@ -19,7 +19,7 @@ hypothesis.settings.load_profile('patient')
 
 _LOG_FOLDER = tempfile.mkdtemp(prefix='blf_dsc_controller_test_log_')
 
-os.environ['ROS_DOMAIN_ID'] = str(MINE[0])
+os.environ['ROS_DOMAIN_ID'] = str(own_domain())
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_LOG_DIR'] = _LOG_FOLDER
 

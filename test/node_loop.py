@@ -23,7 +23,7 @@ from blf_dsc_controller.messages.encoders import JointStateEncoder
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.simulation.loop import simulate
 
-PATIENCE = 60.0  # s, until a test gives up on what should take a moment
+PATIENCE = 300.0  # s, until a test gives up on what should take a moment
 JOINTS = ('joint1', 'joint2')
 START = (2.293, 1.696)  # rad, inside the bound at the reference's start
 
@@ -39,10 +39,10 @@ class NodeLoop:
         self.tester = Node('tester', context=self.context, start_parameter_services=False)
         self.executor.add_node(self.tester)
 
-    def add(self, make_node, values=None):
+    def add(self, make_node, values=None, **clocks):
         """Start a node with these parameters by their dotted names."""
         overrides = [Parameter(name, value=value) for name, value in (values or {}).items()]
-        node = make_node(context=self.context, parameter_overrides=overrides)
+        node = make_node(context=self.context, parameter_overrides=overrides, **clocks)
         self.nodes.append(node)
         self.executor.add_node(node)
         return node

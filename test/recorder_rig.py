@@ -20,7 +20,7 @@ from sensor_msgs.msg import JointState
 
 from blf_dsc_controller.messages.encoders import JointStateEncoder
 
-PATIENCE = 30.0  # s, until a test gives up on what should take a moment
+PATIENCE = 300.0  # s, until a test gives up on what should take a moment
 RECORDER = (sys.executable, '-m', 'blf_dsc_controller.nodes.recorder_node', '--ros-args')
 ENCODER = JointStateEncoder(['joint1', 'joint2'])
 # Kept for the recorder, which may match a moment after the publisher has.

@@ -21,7 +21,7 @@ from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from sim_plant.node import PlantNode
 
-PATIENCE = 30.0  # s until a test that waits in vain is given up
+PATIENCE = 300.0  # s until a test that waits in vain is given up
 
 
 class RosRig:
@@ -60,7 +60,7 @@ class RosRig:
         self.spin(0.05)  # what was on its way to the node runs out before its handles are gone
         node.destroy_node()
 
-    def add(self, make, namespace='', **given):
+    def add(self, make, namespace='', clock=time.monotonic_ns, **given):
         """Start a node; `__` in a parameter's name stands for the dot."""
         overrides = [Parameter(k.replace('__', '.'), value=v) for k, v in given.items()]
         node = make(
@@ -68,13 +68,14 @@ class RosRig:
             namespace=namespace,
             parameter_overrides=overrides,
             cli_args=[],
+            **({'steady': clock} if make in (PlantNode, ControllerNode) else {}),
         )
         return self._keep(node)
 
-    def loop(self, plant=None, controller=None, namespace=''):
+    def loop(self, plant=None, controller=None, namespace='', clock=time.monotonic_ns):
         """Start plant and controller in lock-step; return both."""
-        arm = self.add(PlantNode, namespace, mode='lockstep', **(plant or {}))
-        law = self.add(ControllerNode, namespace, **(controller or {}))
+        arm = self.add(PlantNode, namespace, clock, mode='lockstep', **(plant or {}))
+        law = self.add(ControllerNode, namespace, clock, **(controller or {}))
         return arm, law
 
     def until(self, condition):

@@ -23,7 +23,7 @@ from sensor_msgs.msg import JointState
 
 from blf_dsc_controller.messages.encoders import JointStateEncoder
 
-PATIENCE = 30.0  # s, until a test gives up on what should take a moment
+PATIENCE = 300.0  # s, until a test gives up on what should take a moment
 RECORDER = (sys.executable, '-m', 'blf_dsc_controller.nodes.recorder_node')
 TOPICS = ('a', 'b', 'c', 'd', 'e')
 

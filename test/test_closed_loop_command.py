@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from command import PATIENCE, closed_loop
+from command import PATIENCE, PATIENT, closed_loop
 from node_loop import simulated_torques
 
 from blf_dsc_controller.bags.reader import read_run
@@ -144,7 +144,8 @@ def test_in_a_log_progress_is_a_few_lines(out):
 
 def test_real_time_reports_what_it_held(tmp_path):
     config = tmp_path / 'fifo.yaml'
-    config.write_text('/**:\n  ros__parameters:\n    realtime: {priority: 10, lock_memory: true}\n')
+    fifo = '/**:\n  ros__parameters:\n    realtime: {priority: 10, lock_memory: true}\n'
+    config.write_text(fifo + PATIENT)
     out = tmp_path / 'out'
     run = closed_loop('--mode', 'realtime', '--duration', 1, '--config', config, '--out', out)
     assert run.returncode == 0, run.stderr

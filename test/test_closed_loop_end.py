@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from command import Running, closed_loop, wait_for
+from command import PATIENT, Running, closed_loop, wait_for
 from small_disk import small_disk
 
 from blf_dsc_controller.bags.reader import read_run
@@ -73,7 +73,9 @@ def at_the_end(complaints):
 @pytest.mark.parametrize(('mode', 'duration'), [('lockstep', 20), ('realtime', 5)])
 def test_a_full_disk_ends_the_recording_and_not_the_loop(tmp_path, mode, duration):
     # Full after 2 s: each takes over 1 MB, and half of the 4 MB are kept for the end of the bag.
-    run = ('--mode', mode, '--duration', duration, '--out')
+    config = tmp_path / 'patient.yaml'
+    config.write_text(PATIENT)
+    run = ('--config', config, '--mode', mode, '--duration', duration, '--out')
     with small_disk(tmp_path / 'disk', 4) as disk:
         recorded = closed_loop(*run, disk / 'out')
         assert recorded.returncode == 1

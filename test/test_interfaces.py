@@ -75,6 +75,8 @@ def test_qualities_of_service_are_overridden_in_the_standard_way(ros):
     ros.add(
         ControllerNode, **{'qos_overrides./joint_states.subscription.reliability': 'best_effort'}
     )
+    ros.until(lambda: ros.tester.count_publishers('/joint_states'))
+    ros.until(lambda: ros.tester.count_subscribers('/joint_states'))
     (publisher,) = ros.tester.get_publishers_info_by_topic('/joint_states')
     (subscriber,) = ros.tester.get_subscriptions_info_by_topic('/joint_states')
     for end in (publisher, subscriber):
@@ -99,9 +101,18 @@ def test_markers_show_reference_bound_and_torque(ros):
     arm, law = ros.loop()
     ros.run(arm, 300)
     assert deactivate(ros, arm)  # time stands still
-    ros.spin(0.1)
-    heard.clear()
-    ros.until(lambda: heard and len(heard[-1].markers) == 4)
+    ros.until(lambda: law.guard.last_seen == arm.stamp)
+    q = law.guard.controller.signals.qr
+    tip_x = np.cos(q[0]) + 0.8 * np.cos(q.sum())
+
+    def drawn():
+        """Whether the last markers are of the last state."""
+        found = {one.ns: one for one in heard[-1].markers} if heard else {}
+        return len(found) == 3 and abs(found['reference'].points[-1].x - tip_x) < 1e-12
+
+    ros.until(drawn)
+    count = len(heard)
+    ros.until(lambda: len(heard) > count + 1)
     by_kind = {marker.ns: marker for marker in heard[-1].markers}
     # The arm leans back: both joints pull it forward with a negative torque, about -y, hence to +y.
     arrows = [marker.points[1].y for marker in heard[-1].markers if marker.ns == 'torque']

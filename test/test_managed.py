@@ -8,12 +8,15 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
+from fake_clock import FakeClock
 from ros_rig import RosRig, activate, cleanup, configure, deactivate, shutdown, torques, values
 
 import sim_plant.node
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from sim_plant.node import PlantNode
+
+SECOND = 1_000_000_000  # ns
 
 
 @pytest.fixture
@@ -132,14 +135,19 @@ def test_resets_in_any_order_leave_a_loop_that_runs(ros, order):
 
 def test_a_reset_of_both_is_the_same_run_again(ros):
     heard = ros.listen(topics.COMMANDS)
-    arm, _ = ros.loop({'sensor__position_noise': 1e-5, 'seed': 3})
+    clock = FakeClock()
+    arm, _ = ros.loop({'sensor__position_noise': 1e-5, 'seed': 3}, clock=clock)
+    ros.until(lambda: clock.advance(0.01) or arm._offered)
     ros.run(arm, 100)
-    ros.until(lambda: len(heard) >= 100)
-    first = torques(heard)[:100]
+    begin = arm.stamp - arm.plant.elapsed_ns
     ros.reset(arm)
-    ros.spin(0.1)  # the last torques of the first run arrive, and the plant lets its peers settle
+    # The clock stands still, and the plant with it, until all torques of the first run have come.
+    samples = (arm.stamp - SECOND - begin) // (SECOND // 1000) + 1
+    ros.until(lambda: len(heard) == samples)
     assert arm.plant.sample == 0
+    first = torques(heard)[:100]
     heard.clear()
+    ros.until(lambda: clock.advance(0.01) or arm._offered)
     ros.until(lambda: len(heard) >= 100)
     np.testing.assert_array_equal(torques(heard)[:100], first)
 
@@ -169,7 +177,7 @@ def test_a_controller_killed_and_started_again_takes_the_arm_where_it_is(ros, mo
     arm, law = ros.loop()
     ros.run(arm, 50)
     ros.kill(law)
-    ros.spin(0.3)
+    ros.until(lambda: arm.stamp == law.guard.last_seen + SECOND // 1000)
     sample = arm.plant.sample
     ros.spin(0.3)
     assert arm.plant.sample == sample  # without torques, time stands still
@@ -179,23 +187,27 @@ def test_a_controller_killed_and_started_again_takes_the_arm_where_it_is(ros, mo
 
 @pytest.mark.parametrize('brake', ['zero', 'brake'])
 def test_in_real_time_a_torque_that_is_too_old_is_not_applied(ros, brake):
-    told = ros.listen(topics.DIAGNOSTICS)
-    arm = ros.add(PlantNode, actuator__without_command=brake)
-    law = ros.add(ControllerNode)
-    ros.run(arm, 20)
+    told, states = ros.listen(topics.DIAGNOSTICS), ros.listen(topics.JOINT_STATES)
+    clock = FakeClock()
+    arm = ros.add(PlantNode, clock=clock, actuator__without_command=brake)
+    law = ros.add(ControllerNode, clock=clock)
+    ros.until(lambda: clock.advance(0.01) or states)
+    ros.until(arm.input.torque.any)
+    for sample in range(1, 21):
+        clock.advance(0.001)
+        ros.until(lambda k=sample: arm.plant.sample == k and arm._has_torque)
     assert arm.plant.measure()[4:].any()
     ros.kill(law)
-    ros.until(lambda: arm.input.stale_steps > 5)
+    ros.until(lambda: clock.advance(0.001) or arm.input.stale_steps > 5)
     measured = arm.plant.measure()
     assert not measured[4:].any()
     assert measured[2:4].any() == (brake == 'zero')
     ros.until(lambda: any(said(told, 'sim_plant/torque').values()))
     assert 'too old' in said(told, 'sim_plant/torque')['message']
     # A controller that comes back and starts with the arm gets it going again.
-    again = ros.add(ControllerNode)
-    again.finished = False
+    again = ros.add(ControllerNode, clock=clock)
     ros.reset(arm)
-    ros.until(lambda: in_command(again))
+    ros.until(lambda: clock.advance(0.01) or in_command(again))
 
 
 def said(told, name):

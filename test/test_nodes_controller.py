@@ -8,6 +8,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
+from fake_clock import FakeClock
 from node_loop import JOINTS, START, Arm, NodeLoop, torques
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
@@ -79,14 +80,17 @@ def test_a_state_without_one_of_the_joints_stops_the_arm_and_names_it(loop):
 
 
 def test_an_arm_that_falls_silent_gets_the_safe_torque_again_and_again(loop):
-    node = loop.add(ControllerNode, {'safety.watchdog': 'on'})
+    clock = FakeClock()
+    node = loop.add(ControllerNode, {'safety.watchdog': 'on'}, steady=clock)
     arm = Arm(loop)
     said = loop.listen(topics.COMMANDS)
     assert arm.ask(0, START).any()
-    loop.spin_until(lambda: node.stopped)  # with a clock as its only reason
+    assert not node.stopped
+    clock.advance(0.1)
+    loop.spin_until(lambda: node.stopped)  # with the clock as its only reason
     assert 'no joint state has come for' in node.stopped
     before = len(said)
-    loop.spin_until(lambda: len(said) >= before + 20)
+    loop.spin_until(lambda: clock.advance(0.01) or len(said) >= before + 20)
     np.testing.assert_array_equal(torques(said)[-1], NOTHING)
 
 

@@ -129,12 +129,12 @@ def test_the_service_that_tools_call_works_the_same(context, tuned):
     )
     for node in (tuned.node, asker):
         executor.add_node(node)
-    assert client.wait_for_service(timeout_sec=10.0)
+    assert client.wait_for_service(timeout_sec=300.0)
 
     def answer(value):
         message = Parameter('feedback.gain', value=value).to_parameter_msg()
         future = client.call_async(SetParametersAtomically.Request(parameters=[message]))
-        executor.spin_until_future_complete(future, timeout_sec=10.0)
+        executor.spin_until_future_complete(future, timeout_sec=300.0)
         return future.result().result
 
     assert answer([65.0, 25.0]).successful

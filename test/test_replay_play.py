@@ -14,7 +14,7 @@ from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.replay.timeline import Timeline
 
 TIMES = [100, 110, 120, 200]
-PATIENCE = 30.0  # s, until a test gives up on what should take a moment
+PATIENCE = 300.0  # s, until a test gives up on what should take a moment
 
 
 def test_messages_are_due_as_their_times_say():

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from struct import Struct
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import recorded_run
+from fake_clock import FakeClock
 from rclpy.parameter import Parameter
 from ros_rig import RosRig, activate, configure, deactivate
 from sent_trajectory import JOINTS, SECOND, send, trajectory
@@ -28,6 +30,7 @@ from blf_dsc_controller.messages.topics import (
 )
 from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
+from blf_dsc_controller.nodes.process import drain
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.replay.recorded import replay
 
@@ -42,13 +45,13 @@ DAMPED = {'safety__torque': 'hold_gravity', 'safety__damping': [2.0, 1.0]}  # ne
 class Recording:
     """A loop in lock-step and its recorder, all in this process."""
 
-    def __init__(self, path, **controller):
+    def __init__(self, path, clock=time.monotonic_ns, **controller):
         self.ros = RosRig()
         self.path = path
         self.recorder = self.ros.add(BagRecorderNode, output=str(path))
         complete = {'wait_for_subscribers': 1}
         waiting = complete | {'autostart': False}
-        self.arm, self.law = self.ros.loop(waiting, complete | controller)
+        self.arm, self.law = self.ros.loop(waiting, complete | controller, clock=clock)
         configure(self.ros, self.arm)
         # What is changed from here on is not in the configuration that the bag begins with.
         name = self.law.get_fully_qualified_name()
@@ -65,7 +68,9 @@ class Recording:
     def end(self):
         """Hold the time, let the recorder have everything, and complete the bag."""
         deactivate(self.ros, self.arm)
-        self.ros.spin(0.3)
+        self.ros.until(lambda: self.law.guard.last_seen == self.arm.stamp)
+        for node in (self.arm, self.law):
+            drain(node.publishers)
         self.recorder.close()
         self.ros.close()
         return self.path
@@ -278,12 +283,16 @@ def test_a_stop_that_only_one_of_the_two_makes_is_a_difference(
 
 
 def test_a_stop_for_silence_leaves_its_torques_out_and_the_law_is_followed_again(tmp_path):
-    run = Recording(tmp_path / 'bag', safety__watchdog='on', safety__state_timeout=0.2, **DAMPED)
+    clock = FakeClock()
+    run = Recording(tmp_path / 'bag', clock, safety__watchdog='on', **DAMPED)
+    run.ros.until(lambda: clock.advance(0.01) or run.arm._offered)
     run.run(50)
     deactivate(run.ros, run.arm)
+    clock.advance(0.1)
     run.ros.until(lambda: run.law.stopped)
     silent = run.law.guard.last_stamp
     activate(run.ros, run.arm)
+    run.ros.until(lambda: clock.advance(0.01) or run.arm._offered)
     run.run(20)
     deactivate(run.ros, run.law)
     activate(run.ros, run.law)  # after a stop with the estimates alone

@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from math import inf
 from pathlib import Path
@@ -28,6 +28,7 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.names import RATIO
+from blf_dsc_controller.messages.telemetry import DECIMATION
 from blf_dsc_controller.nodes.endpoints import qos_profile
 
 # In the order in which they start. They end in reverse: the recorder last, to get every message.
@@ -38,8 +39,8 @@ _MODULES = {
 }
 _DOMAINS = range(1, 101)  # 0 is the default; above 101 are the ports that the system hands out
 _FIRST_SIGN = 5.0  # s, at most, until a running loop is seen to run, also on a busy machine
-_LAST = 0.05  # s without a message after which the last one has come
-_LINGER = 0.5  # s for all of them: a loop that is being interrupted still runs
+_LAST = 1.0  # s without a message after which no more is expected, also on a busy machine
+_LINGER = 0.5  # s for the messages of a loop that is being interrupted and still runs
 _ENDING = 20.0  # s that a node may take to end before it is killed
 _TAIL = 12  # lines of a failed node's log that are shown
 _ROOM = 1_000_000  # bytes that a log needs at least
@@ -140,9 +141,13 @@ class NodeProcess:
 class Monitor:
     """Shows the progress of the loop that runs in this process's ROS domain."""
 
-    def __init__(self, config: PlantConfig) -> None:
+    def __init__(self, config: PlantConfig, interrupts: Sequence[int]) -> None:
+        self._interrupts = interrupts
         self.progress = Progress(config)
-        self._start = -1.0
+        self._start, self._elapsed = -1.0, 0.0
+        self._end = (
+            config.duration - DECIMATION * config.sample_time / 2 if config.duration else inf
+        )
         self._latest: JointState | None = None
         self._context = rclpy.Context()
         rclpy.init(context=self._context, signal_handler_options=rclpy.SignalHandlerOptions.NO)
@@ -169,7 +174,8 @@ class Monitor:
             self._start = stamp
         values = dict(zip(message.name, message.position, strict=True))
         ratio = max(value for name, value in values.items() if name.startswith(RATIO))
-        self.progress.show(stamp - self._start, ratio, [values[name] for name in PARAMETER_NAMES])
+        self._elapsed = stamp - self._start
+        self.progress.show(self._elapsed, ratio, [values[name] for name in PARAMETER_NAMES])
         return True
 
     def __enter__(self) -> Monitor:
@@ -181,13 +187,20 @@ class Monitor:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        end = time.monotonic() + _LINGER
-        while kind is None and time.monotonic() < end and self.wait(_LAST):
-            pass
+        if kind is None:
+            self._receive_last()
         self.progress.close()
         self._executor.remove_node(self._node)
         self._node.destroy_node()
         rclpy.try_shutdown(context=self._context)
+
+    def _receive_last(self) -> None:
+        """Show what is still on its way, up to the message of the last sample."""
+        wait = _LINGER if self._interrupts else _LAST
+        deadline = time.monotonic() + wait
+        while self._elapsed < self._end and time.monotonic() < deadline:
+            if self.wait(0.05) and not self._interrupts:
+                deadline = time.monotonic() + wait
 
     def _receive(self, message: JointState) -> None:
         self._latest = message
@@ -228,7 +241,7 @@ def _monitor(plant: PlantConfig, nodes: list[NodeProcess], interrupts: list[int]
     """
     recorder, *loop = nodes
     ended, warned = inf, False
-    with Monitor(plant) as monitor:
+    with Monitor(plant, interrupts) as monitor:
         while loop[-1].is_running and not interrupts:
             for node in loop:
                 node.check()
