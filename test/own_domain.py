@@ -43,5 +43,5 @@ def own_domain() -> int:
             return claimed
     if not _MINE:  # on a very crowded machine one is shared
         _MINE.append(1 + os.getpid() % _DOMAINS)
-    _MINE.append(_MINE.pop(0))
+    _MINE.append(_MINE.pop(min(1, len(_MINE) - 1)))  # the first is that of the environment
     return _MINE[-1]
