@@ -14,7 +14,7 @@ from timing import Ratio, interleaved, ratio
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.replay.recorded import replay
+from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -34,9 +34,9 @@ def measure() -> Iterator[Ratio]:
         messages = _iterated(bag)
 
         def replayed() -> int:
-            outcome = replay(bag)
-            if outcome.difference is not None:
-                raise ValueError(f'{bag}: {outcome.difference}')
+            found = verify(bag)
+            if found.difference is not None:
+                raise ValueError(f'{bag}: {found.difference}')
             return messages
 
         contestants = {

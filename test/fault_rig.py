@@ -83,9 +83,9 @@ class Rig:
         try:
             stamp = self._decoder.decode(raw)
         except MessageError as error:
-            torque = self.guard.unusable(error)
+            torque = self.guard.reject(error)
         else:
-            torque = self.guard.answer(stamp, self._decoder.values)
+            torque = self.guard.update(stamp, self._decoder.values)
         self._command(torque)
         return torque
 

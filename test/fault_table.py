@@ -50,9 +50,9 @@ class Outcome(NamedTuple):
     rejected: int  # commands that the plant passed over
 
 
-def run(fault: Fault) -> Outcome:
+def run(fault: Fault, rig: Rig | None = None) -> Outcome:
     """Run a loop into a fault, watch it, and mend it."""
-    rig = Rig(fault.given, live=fault.live)
+    rig = rig or Rig(fault.given, live=fault.live)
     rig.step(LEAD)
     assert rig.supervisor.phase is Phase.TRACKING, rig.supervisor.text
     start, noticed = len(rig.commands), -1
@@ -277,7 +277,7 @@ def storm(rig: Rig) -> None:
         values += [start.barrier.weight, start.disturbance.gain]
         given = {n: tuple(v * s) for n, v, s in zip(names, values, scale, strict=True)}
         candidate = change(rig.guard.config, given)
-        if not rig.guard.objections(candidate):
+        if not rig.guard.problems(candidate):
             rig.guard.retune(candidate)
         return [state.raw()]
 
@@ -291,9 +291,9 @@ def refused(**changes) -> Callable[[Rig], None]:
     given = {name.replace('__', '.'): value for name, value in changes.items()}
 
     def inject(rig):
-        objections = rig.guard.objections(change(rig.guard.config, given))
-        assert objections
-        assert all(one.startswith(tuple(given)) for one in objections)
+        problems = rig.guard.problems(change(rig.guard.config, given))
+        assert problems
+        assert all(one.startswith(tuple(given)) for one in problems)
 
     return inject
 
@@ -468,7 +468,7 @@ FAULTS = (
     Fault(
         'controller killed, started far away',
         restarted_controller,
-        R.START_REFUSED,
+        R.START_REJECTED,
         given={'approach.enabled': False},
     ),
     Fault('controller killed, led back by an approach', restarted_controller, R.NONE),

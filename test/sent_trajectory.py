@@ -57,8 +57,8 @@ def send(ros, law, sent):
     name = '/' + topics.JOINT_TRAJECTORY.relative
     publisher = ros.tester.create_publisher(JointTrajectory, name, 10)
     ros.until(lambda: publisher.get_subscription_count() > 0)
-    before = inputs(law).taken + inputs(law).refused
+    before = inputs(law).accepted + inputs(law).rejected
     publisher.publish(sent)
-    ros.until(lambda: inputs(law).taken + inputs(law).refused > before)
+    ros.until(lambda: inputs(law).accepted + inputs(law).rejected > before)
     ros.tester.destroy_publisher(publisher)
     return inputs(law).reason

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from closed_loop_case import controller, plant, recommended
 
-from blf_dsc_controller.supervision.checks import OUTSIDE, SUSPECT, look, state_is_sound
+from blf_dsc_controller.supervision.checks import OUTSIDE, SUSPECT, check_sample, is_valid_state
 
 DT = 1e-3
 
@@ -25,7 +25,7 @@ def law():
 def verdict(law, ratio=None, kept=None, error_ratio=1.0):
     vectors = law.settings_vector, law.state_vector, law.signals_vector, law.sample_vector
     ratio = np.zeros(2) if ratio is None else ratio
-    return look(*vectors, error_ratio, ratio, np.zeros(7) if kept is None else kept)
+    return check_sample(*vectors, error_ratio, ratio, np.zeros(7) if kept is None else kept)
 
 
 def test_a_sound_answer_is_kept(law):
@@ -70,8 +70,8 @@ def test_a_refused_column_is_told_as_unknown_and_is_no_fault(law):
 @pytest.mark.parametrize('value', [nan, inf, 50.1])
 def test_a_state_is_sound_if_finite_and_slow(value):
     still = np.zeros(2)
-    assert state_is_sound(still, still, 50.0)
-    assert not state_is_sound(still, np.array([0.0, -value]), 50.0)
-    assert state_is_sound(still, np.array([50.0, 0.0]), 50.0)
+    assert is_valid_state(still, still, 50.0)
+    assert not is_valid_state(still, np.array([0.0, -value]), 50.0)
+    assert is_valid_state(still, np.array([50.0, 0.0]), 50.0)
     if value != 50.1:
-        assert not state_is_sound(np.array([value, 0.0]), still, 50.0)
+        assert not is_valid_state(np.array([value, 0.0]), still, 50.0)

@@ -10,19 +10,19 @@ from paper_case import EXACT, NO_DISTURBANCE, P, configured, run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.params_file import load_loop, locate
 from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.supervision.config_warnings import concerns, rehearse
+from blf_dsc_controller.supervision.config_warnings import config_warnings, reference_load
 
 BOUND = 0.002  # rad
 
 
 def told(changes, preset='recommended', q=None):
-    return concerns(configured(preset, 1.0, changes).controller, q)
+    return config_warnings(configured(preset, 1.0, changes).controller, q)
 
 
 @pytest.mark.parametrize('preset', ['recommended', 'paper', 'noisy', 'two_tone', 'model_based'])
 def test_presets_are_not_warned_of(preset):
     config = load_loop(locate(preset))
-    assert concerns(config.controller, np.array(config.plant.initial.position)) == []
+    assert config_warnings(config.controller, np.array(config.plant.initial.position)) == []
 
 
 @pytest.mark.parametrize(
@@ -47,14 +47,14 @@ def test_presets_are_not_warned_of(preset):
     ],
 )
 def test_what_cannot_work_is_named(parameter, changes):
-    (concern,) = told(changes)
-    assert concern.startswith(parameter)
+    (warning,) = told(changes)
+    assert warning.startswith(parameter)
 
 
 def test_a_start_close_to_the_bound_is_named_with_its_joint():
     qr = np.array([2.2935, 1.6961])
-    (concern,) = told({}, q=qr - np.array([0.0, 0.9 * BOUND]))
-    assert concern.startswith('barrier.bound: joint2 starts -0.0018 rad')
+    (warning,) = told({}, q=qr - np.array([0.0, 0.9 * BOUND]))
+    assert warning.startswith('barrier.bound: joint2 starts -0.0018 rad')
     assert told({}, q=qr - np.array([0.0, 0.5 * BOUND])) == []
 
 
@@ -63,14 +63,14 @@ def test_laws_are_not_warned_of_gains_they_do_not_have():
     assert told(changes) == []
 
 
-def test_rehearsal_needs_the_torque_that_the_run_needs():
+def test_load_needs_the_torque_that_the_run_needs():
     """With the true parameters and no disturbance, within the filter's lag of the run's largest."""
     silent = {'truth.constant': [0.0, 0.0], 'truth.amplitude': [0.0, 0.0]}
     loop = configured('model_based', 7.0, silent, NO_DISTURBANCE)
     config, torque = loop.controller, np.abs(run(loop).torque[1000:])
-    rehearsal = rehearse(config, settings_of_config(config))
-    np.testing.assert_allclose(rehearsal.torque, torque.max(axis=0), rtol=2e-3)
-    assert np.linalg.eigvalsh(rehearsal.excitation)[0] == pytest.approx(0.269, abs=5e-4)
+    load = reference_load(config, settings_of_config(config))
+    np.testing.assert_allclose(load.torque, torque.max(axis=0), rtol=2e-3)
+    assert np.linalg.eigvalsh(load.excitation)[0] == pytest.approx(0.269, abs=5e-4)
 
 
 def test_too_high_a_feedback_chatters_from_twice_the_inertia_s_rate_on():
@@ -80,7 +80,9 @@ def test_too_high_a_feedback_chatters_from_twice_the_inertia_s_rate_on():
         changes = {'sample_time': 0.002, 'feedback.gain': [60.0, gain]}
         config = configured('recommended', 4.0, EXACT | changes, {'sample_time': 0.002})
         settings = settings_of_config(config.controller)
-        true = rehearse(config.controller, settings._replace(initial_estimate=np.array([*P, 0, 0])))
+        true = reference_load(
+            config.controller, settings._replace(initial_estimate=np.array([*P, 0, 0]))
+        )
         torque = run(config).torque
         calm[true.rate * 0.002] = np.abs(np.diff(torque[-1000:], axis=0)).max() < 0.1
     assert all(is_calm == (product < 2.0) for product, is_calm in calm.items()), calm

@@ -52,33 +52,33 @@ def test_a_ramp_is_straight_and_ends_at_a_goal_that_moves():
     ramp = Ramp(1)
     ramp.begin(np.array([4.0]), 0.004)
     goals = (0.0, 0.0, 8.0, 8.0, 7.0)
-    got = [ramp.towards(np.array([goal]), 0.001)[0] for goal in goals]
+    got = [ramp.advance(np.array([goal]), 0.001)[0] for goal in goals]
     np.testing.assert_allclose(got, [3.0, 2.0, 7.0, 8.0, 7.0])
     ramp.begin(np.array([4.0]), 0.0)
-    assert ramp.towards(np.array([1.0]), 0.001) == 1.0
+    assert ramp.advance(np.array([1.0]), 0.001) == 1.0
 
 
 def test_missed_states_are_averaged():
     """Every second state missed is a fraction of a half, after a few windows."""
     overruns = Overruns()
     for _ in range(1000):
-        overruns.take(2, 100.0)
+        overruns.count_sample(2, 100.0)
     assert overruns.count == 1000
     assert overruns.fraction == pytest.approx(0.5, abs=0.01)
     for _ in range(1000):
-        overruns.take(1, 100.0)
+        overruns.count_sample(1, 100.0)
     assert overruns.fraction < 1e-4
 
 
 def test_silence_is_told_by_a_watch_that_was_awake():
     silence = Silence()
-    assert silence.look(0, 0.04) == 0.0  # nothing has come yet: nobody is missed
-    silence.state(10 * MILLISECOND)
-    assert silence.look(41 * MILLISECOND, 0.04) == 0.0
-    assert silence.next_look == pytest.approx(0.01)  # 1 ms after it could be silent
-    assert silence.look(51 * MILLISECOND, 0.04) == pytest.approx(0.041)
-    assert silence.look(200 * MILLISECOND, 0.04) == 0.0  # it has slept itself
-    assert silence.look(208 * MILLISECOND, 0.04) == pytest.approx(0.198)
+    assert silence.check(0, 0.04) == 0.0  # nothing has come yet: nobody is missed
+    silence.restart(10 * MILLISECOND)
+    assert silence.check(41 * MILLISECOND, 0.04) == 0.0
+    assert silence.next_check == pytest.approx(0.01)  # 1 ms after it could be silent
+    assert silence.check(51 * MILLISECOND, 0.04) == pytest.approx(0.041)
+    assert silence.check(200 * MILLISECOND, 0.04) == 0.0  # it has slept itself
+    assert silence.check(208 * MILLISECOND, 0.04) == pytest.approx(0.198)
 
 
 @pytest.mark.parametrize(('watchdog', 'live'), [('auto', True), ('on', False)])
@@ -211,7 +211,7 @@ def test_a_column_that_learning_refuses_is_no_fault():
 def test_an_error_nobody_foresaw_stops_too():
     rig = Rig()
     rig.step(20)
-    torque = rig.guard.fail(ZeroDivisionError('x'))
+    torque = rig.guard.fail('ZeroDivisionError: x')
     assert rig.supervisor.reason is Reason.FAILED
     assert rig.supervisor.text == 'ZeroDivisionError: x'
     assert torque.tolist() == [0.0, 0.0]
@@ -232,12 +232,12 @@ def jump(given, *, bumpless, samples=1):
     rig.step(60)
     candidate = change(rig.guard.config, given)
     if bumpless:
-        assert rig.guard.objections(candidate) == []
+        assert rig.guard.problems(candidate) == []
         rig.guard.retune(candidate)
     else:
-        from blf_dsc_controller.supervision import retuning as tuning
+        from blf_dsc_controller.supervision import retuning
 
-        tuning.take(rig.guard.controller, candidate)
+        retuning.apply(rig.guard.controller, candidate)
     rig.step(samples)
     return np.abs(np.array(rig.commands[-samples:]) - rig.commands[-samples - 1]).max()
 
@@ -269,10 +269,10 @@ def test_nor_does_the_bump_come_later(given):
 def test_what_a_running_law_cannot_take_is_refused_with_the_reason(given, said):
     rig = Rig()
     rig.step(200)
-    (objection,) = rig.guard.objections(change(rig.guard.config, given))
-    assert objection.startswith(said)
+    (problem,) = rig.guard.problems(change(rig.guard.config, given))
+    assert problem.startswith(said)
     rig.guard.deactivate()
-    assert rig.guard.objections(change(rig.guard.config, given)) == []
+    assert rig.guard.problems(change(rig.guard.config, given)) == []
 
 
 def test_an_update_that_would_diverge_is_refused():
@@ -286,7 +286,7 @@ def test_an_update_that_would_diverge_is_refused():
     )
     rig.step(400)
     assert rig.guard.controller.state.latched[0] == 1.0
-    (objection,) = rig.guard.objections(change(rig.guard.config, {'learning.update': 'gradient'}))
-    assert objection.startswith('learning.weight: with the update gradient')
+    (problem,) = rig.guard.problems(change(rig.guard.config, {'learning.update': 'gradient'}))
+    assert problem.startswith('learning.weight: with the update gradient')
     gentle = {'learning.update': 'gradient', 'learning.weight': 2.0}
-    assert rig.guard.objections(change(rig.guard.config, gentle)) == []
+    assert rig.guard.problems(change(rig.guard.config, gentle)) == []

@@ -101,7 +101,7 @@ def test_markers_show_reference_bound_and_torque(ros):
     arm, law = ros.loop()
     ros.run(arm, 300)
     assert deactivate(ros, arm)  # time stands still
-    ros.until(lambda: law.guard.last_seen == arm.stamp)
+    ros.until(lambda: law.guard.journal.stamp == arm.stamp)
     q = law.guard.controller.signals.qr
     tip_x = np.cos(q[0]) + 0.8 * np.cos(q.sum())
 

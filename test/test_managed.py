@@ -177,7 +177,7 @@ def test_a_controller_killed_and_started_again_takes_the_arm_where_it_is(ros, mo
     arm, law = ros.loop()
     ros.run(arm, 50)
     ros.kill(law)
-    ros.until(lambda: arm.stamp == law.guard.last_seen + SECOND // 1000)
+    ros.until(lambda: arm.stamp == law.guard.journal.stamp + SECOND // 1000)
     sample = arm.plant.sample
     ros.spin(0.3)
     assert arm.plant.sample == sample  # without torques, time stands still
@@ -228,7 +228,7 @@ def test_the_state_is_latched_and_names_the_reason(ros):
     arm._start_stamp -= 10**9
     ros.until(lambda: len(late) > 1)
     assert late[-1].level == b'\2'
-    assert late[-1].message.startswith('stopped: a joint state is stamped 0.999 s before')
+    assert late[-1].message.startswith('stopped: the stamp of a joint state is 0.999 s before')
     assert values(late[-1]) | {'phase': 'safe stop', 'reason': 'stamp backward'} == values(late[-1])
     assert late[-1].name == 'blf_dsc_controller/state'
     assert late[-1].hardware_id == 'joint1 joint2'

@@ -58,7 +58,7 @@ def test_an_approach_that_cannot_be_made_is_refused_and_told(ros):
     )
     ros.until(lambda: phase(law) is Phase.SAFE_STOP)
     assert "the velocity of joint 'joint1' would be" in law.stopped
-    assert law.guard.supervisor.reason.value == 'start refused'
+    assert law.guard.supervisor.reason.value == 'start rejected'
 
 
 @pytest.fixture
@@ -81,8 +81,8 @@ def test_a_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ro
     last = [1e-9 * (law.guard.last_stamp - begin)]
     ros.run(arm, 3500)
 
-    assert inputs(law).taken == 3
-    assert inputs(law).refused == 0
+    assert inputs(law).accepted == 3
+    assert inputs(law).rejected == 0
     # On the last of the three, then held at its end.
     now = law.controller.reference_at(last[0] + 3.4)
     np.testing.assert_allclose(now, [two_tones(3.95, np.array(shifts[2]))[0], [0, 0], [0, 0]])
@@ -103,8 +103,8 @@ def test_a_trajectory_that_is_refused_changes_nothing(ros, sender):
     ros.run(arm, 20)
     before = law.controller.reference_vector.copy()
     sender(law, trajectory(JOINTS, np.zeros(2), duration=0.1, names=('joint1', 'elbow')))
-    assert inputs(law).refused == 1
-    for part in ("no joint 'elbow'", "nothing of joint 'joint2'"):
+    assert inputs(law).rejected == 1
+    for part in ("no joint 'elbow'", "joint 'joint2' is missing"):
         assert part in inputs(law).reason
     np.testing.assert_array_equal(law.controller.reference_vector, before)
     ros.run(arm, 20)

@@ -137,6 +137,6 @@ def test_a_new_bound_is_judged_by_how_wide_it_is_now():
     guard = (rig := Rig(funnel)).guard
     rig.step(60)
     narrow = {'barrier.bound': [0.1 * np.abs(guard.controller.sample.xi1).max()] * 2}
-    assert guard.objections(change(guard.config, narrow)) == []
+    assert guard.problems(change(guard.config, narrow)) == []
     still = {'barrier.initial_bound': [0.0, 0.0], 'barrier.funnel_rate': 0.0}
-    assert guard.objections(change(guard.config, narrow | still))
+    assert guard.problems(change(guard.config, narrow | still))

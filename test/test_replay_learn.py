@@ -11,8 +11,8 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import JOINT_STATES
-from blf_dsc_controller.replay.errors import ShortBagError
 from blf_dsc_controller.replay.identify import identify
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
@@ -66,7 +66,7 @@ def test_joint_states_with_their_effort_are_enough(bag, tmp_path):
 
 def test_a_bag_too_short_is_told(tmp_path):
     path = recorded_run.record(tmp_path / 'bag', 0.3)
-    with pytest.raises(ShortBagError, match=r'holds 0\.3 s, .* window of 6\.28 s'):
+    with pytest.raises(BlfDscError, match=r'holds 0\.3 s, .* window of 6\.28 s'):
         identify(path, ControllerConfig())
 
 

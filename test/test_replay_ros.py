@@ -17,22 +17,21 @@ from rclpy.parameter import Parameter
 from ros_rig import RosRig, activate, configure, deactivate
 from sent_trajectory import JOINTS, SECOND, send, trajectory
 
-from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller import __version__
 from blf_dsc_controller.messages.cdr import STAMP_OFFSET
 from blf_dsc_controller.messages.encoders import JointStateEncoder
+from blf_dsc_controller.messages.journal import EventType, decode
 from blf_dsc_controller.messages.topics import (
-    ACCEPTED_TRAJECTORY,
     COMMANDS,
     JOINT_STATES,
-    JOINT_TRAJECTORY,
+    JOURNAL,
     REFERENCE,
     TRACKING_ERROR,
 )
-from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.nodes.process import drain
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
-from blf_dsc_controller.replay.recorded import replay
+from blf_dsc_controller.replay.verify import verify
 
 MILLISECOND = 1_000_000  # ns
 BRISK = {
@@ -68,7 +67,7 @@ class Recording:
     def end(self):
         """Hold the time, let the recorder have everything, and complete the bag."""
         deactivate(self.ros, self.arm)
-        self.ros.until(lambda: self.law.guard.last_seen == self.arm.stamp)
+        self.ros.until(lambda: self.law.guard.journal.stamp == self.arm.stamp)
         for node in (self.arm, self.law):
             drain(node.publishers)
         self.recorder.close()
@@ -127,12 +126,12 @@ def stopped(tmp_path_factory):
 
 @pytest.fixture
 def rewritten(tmp_path):
-    """Writes a bag again, with other messages or another configuration."""
+    """Writes a bag again with other messages."""
 
-    def write(bag, change=lambda entry: entry, configure=lambda text: text):
+    def write(bag, change):
         entries = [change(list(entry)) for entry in recorded_run.messages(bag)]
-        configuration = configure(read_context(bag).configuration)
-        return recorded_run.write(tmp_path / 'changed', entries, configuration)
+        facts = {'clock': 'lockstep', 'package_version': __version__}
+        return recorded_run.write(tmp_path / 'changed', entries, **facts)
 
     return write
 
@@ -151,98 +150,90 @@ def flipped(topic, number):
     return change
 
 
-def accepted(entry):
-    store = typestore()
-    return store.deserialize_cdr(entry[3], ACCEPTED_TRAJECTORY.type)
+def altered(event_type, change):
+    """Change the first event of a type."""
+    done = []
+
+    def alter(entry):
+        if entry[0] == JOURNAL.resolved and not done:
+            event = decode(entry[3])
+            if event.type is event_type:
+                done.append(event)
+                entry[3] = change(event).encode()
+        return entry
+
+    return alter
 
 
-def compared(outcome):
-    return {one.topic.rsplit('/', 1)[-1]: one.values for one in outcome.comparisons}
+def trajectories(bag):
+    """Events of the trajectories in a bag."""
+    entries = recorded_run.messages(bag)
+    events = [decode(entry[3]) for entry in entries if entry[0] == JOURNAL.resolved]
+    return [event for event in events if event.type is EventType.TRAJECTORY]
+
+
+def compared(result):
+    return {one.topic.rsplit('/', 1)[-1]: one.values for one in result.comparisons}
 
 
 def test_trajectories_and_a_gain_replay_where_they_took_effect(moved):
-    outcome = replay(moved)
-    assert outcome.difference is None
-    assert outcome.remarks == ()
-    assert outcome.changes == 1
-    assert outcome.done == ('2 trajectories replayed where they took effect',)
-    samples = outcome.states.stamp.size
+    result = verify(moved)
+    assert result.difference is None
+    assert result.remarks == ()
+    assert result.count(EventType.PARAMETERS) == 1
+    assert result.count(EventType.TRAJECTORY) == 2
+    samples = result.states.stamp.size
     assert samples >= 1300
-    assert compared(outcome)['commands'] == 2 * samples
-    assert compared(outcome)['reference'] == 4 * samples
+    assert compared(result)['commands'] == 2 * samples
+    assert compared(result)['reference'] == 4 * samples
 
 
-def test_what_is_told_of_a_trajectory_is_what_was_sent_and_when_it_was_taken(moved):
-    told = [
-        accepted(entry)
-        for entry in recorded_run.messages(moved)
-        if entry[0] == ACCEPTED_TRAJECTORY.resolved
-    ]
-    assert [tuple(one.joint_names) for one in told] == [JOINTS, JOINTS[::-1]]
-    assert told[0].header.frame_id == ''
-    assert told[1].header.frame_id == (moved.parent / 'begin').read_text()
+def test_the_journal_holds_each_trajectory_as_it_was_sent(moved):
+    first, second = [event.content for event in trajectories(moved)]
+    assert (tuple(first['joints']), tuple(second['joints'])) == (JOINTS, JOINTS[::-1])
+    assert first['begin'] is None
+    start = min(stamps(moved, TRACKING_ERROR))
+    begin = int((moved.parent / 'begin').read_text())
+    assert second['begin'] == (begin - start) * 1e-9
     sent = trajectory(JOINTS, np.zeros(2), duration=1.0)
-    for one, other in zip(told[0].points, sent.points, strict=True):
-        np.testing.assert_array_equal(one.positions, other.positions)
-        np.testing.assert_array_equal(one.accelerations, other.accelerations)
-        assert one.time_from_start.nanosec == other.time_from_start.nanosec
+    for one, other in zip(first['points'], sent.points, strict=True):
+        np.testing.assert_array_equal(one['positions'], other.positions)
+        np.testing.assert_array_equal(one['accelerations'], other.accelerations)
 
 
 def test_a_trajectory_taken_a_sample_later_is_another_run(moved, rewritten):
-    stamps = []
+    def later(event):
+        return event._replace(stamp=event.stamp + MILLISECOND, messages=event.messages + 1)
 
-    def later(entry):
-        if entry[0] == ACCEPTED_TRAJECTORY.resolved and not stamps:
-            message = accepted(entry)
-            stamps.append(message.header.stamp.sec * SECOND + message.header.stamp.nanosec)
-            message.header.stamp.nanosec += MILLISECOND
-            raw = typestore().serialize_cdr(message, ACCEPTED_TRAJECTORY.type)
-            entry[3] = bytes(raw)
-        return entry
-
-    difference = replay(rewritten(moved, later)).difference
-    assert difference.stamp == stamps[0] + MILLISECOND
+    bag = rewritten(moved, altered(EventType.TRAJECTORY, later))
+    assert verify(bag).difference.stamp == trajectories(moved)[0].stamp + MILLISECOND
 
 
 def test_a_trajectory_with_another_value_is_another_run(moved, rewritten):
-    def changed(entry):
-        if entry[0] == ACCEPTED_TRAJECTORY.resolved:
-            message = accepted(entry)
-            message.points[0].positions = np.add(message.points[0].positions, [0.0, 1e-9])
-            entry[3] = bytes(typestore().serialize_cdr(message, ACCEPTED_TRAJECTORY.type))
-        return entry
+    def changed(event):
+        event.content['points'][0]['positions'][1] += 1e-9
+        return event
 
-    outcome = replay(rewritten(moved, changed))
-    (reference,) = [one for one in outcome.comparisons if one.topic == REFERENCE.resolved]
-    assert reference.difference.stamp == outcome.difference.stamp
+    result = verify(rewritten(moved, altered(EventType.TRAJECTORY, changed)))
+    (reference,) = [one for one in result.comparisons if one.topic == REFERENCE.resolved]
+    assert reference.difference.stamp == result.difference.stamp
     assert reference.difference.field in ('position of joint2', 'velocity of joint2')
 
 
-def test_a_bag_that_does_not_tell_what_was_taken_says_so(moved, rewritten):
-    def sent(entry):
-        is_told = entry[0] == ACCEPTED_TRAJECTORY.resolved
-        return [JOINT_TRAJECTORY.resolved, *entry[1:]] if is_told else entry
-
-    outcome = replay(rewritten(moved, sent))
-    assert outcome.difference is not None
-    assert 'the bag does not tell when it took them' in outcome.remarks[0]
-
-
 def test_stops_ramps_and_starts_replay_with_every_torque(stopped):
-    outcome = replay(stopped)
-    assert outcome.difference is None
-    assert outcome.remarks == ()
-    assert outcome.changes == 1
-    operations, safe = outcome.done
-    assert operations == (
-        'replayed in turn: activate, deactivate, activate, safe stop (stamp jump), deactivate, '
+    result = verify(stopped)
+    assert result.difference is None
+    assert result.remarks == ()
+    assert result.count(EventType.PARAMETERS) == 1
+    assert ', '.join(result.turns) == (
+        'activate, deactivate, activate, safe stop (stamp jump), deactivate, '
         'activate, reset, safe stop (joint missing)'
     )
     torques = sum(entry[0] == COMMANDS.resolved for entry in recorded_run.messages(stopped))
-    assert compared(outcome)['commands'] == 2 * torques
-    count = torques - outcome.states.stamp.size
+    assert compared(result)['commands'] == 2 * torques
+    count = torques - result.states.stamp.size
     assert count >= 600 + 3 * 50
-    assert safe == f'{count} of the commands compared are safe torques, or on the ramp to one'
+    assert result.safe_torques == count
 
 
 def stamps(bag, topic):
@@ -256,7 +247,7 @@ def test_one_flipped_bit_of_a_safe_torque_is_found(stopped, rewritten, part):
     states = stamps(stopped, JOINT_STATES)
     safe = np.flatnonzero(~np.isin(states, stamps(stopped, TRACKING_ERROR)))
     number = safe[int(part * safe.size)]  # in lock-step the k-th command answers the k-th state
-    difference = replay(rewritten(stopped, flipped(COMMANDS, number))).difference
+    difference = verify(rewritten(stopped, flipped(COMMANDS, number))).difference
     assert difference.topic == COMMANDS.resolved
     assert difference.stamp == states[number]
     assert difference.field == 'effort of joint2'
@@ -265,24 +256,24 @@ def test_one_flipped_bit_of_a_safe_torque_is_found(stopped, rewritten, part):
 
 
 @pytest.mark.parametrize(
-    ('before', 'after', 'departure'),
+    ('name', 'value', 'departure'),
     [
-        ('state_timeout: 0.04', 'state_timeout: 1.0', 'stop: stamp jump'),
-        ('error_ratio: 1.0', 'error_ratio: 0.001', r"answered (joint 'joint1' is"),
+        ('safety.state_timeout', 1.0, 'stop: stamp jump'),
+        ('safety.error_ratio', 0.001, r"answered (joint 'joint1' is"),
     ],
 )
 def test_a_stop_that_only_one_of_the_two_makes_is_a_difference(
-    stopped, rewritten, before, after, departure
+    stopped, rewritten, name, value, departure
 ):
-    def configure(text):
-        assert before in text
-        return text.replace(before, after)
+    def configured(event):
+        event.content['parameters'][name] = value
+        return event
 
-    outcome = replay(rewritten(stopped, configure=configure))
-    assert outcome.difference.field.startswith(departure)
+    bag = rewritten(stopped, altered(EventType.CONFIGURE, configured))
+    assert verify(bag).difference.field.startswith(departure)
 
 
-def test_a_stop_for_silence_leaves_its_torques_out_and_the_law_is_followed_again(tmp_path):
+def test_a_stop_for_silence_replays_with_its_torques(tmp_path):
     clock = FakeClock()
     run = Recording(tmp_path / 'bag', clock, safety__watchdog='on', **DAMPED)
     run.ros.until(lambda: clock.advance(0.01) or run.arm._offered)
@@ -297,13 +288,12 @@ def test_a_stop_for_silence_leaves_its_torques_out_and_the_law_is_followed_again
     deactivate(run.ros, run.law)
     activate(run.ros, run.law)  # after a stop with the estimates alone
     run.run(50)
-    outcome = replay(run.end())
-    assert outcome.difference is None
-    turns = 'replayed in turn: activate, safe stop (state timeout), deactivate, activate'
-    assert outcome.done[0].startswith(turns)
-    (commands,) = [one for one in outcome.comparisons if one.topic == COMMANDS.resolved]
-    assert 'state timeout' in commands.left_out
-    before = np.count_nonzero(outcome.states.stamp <= silent)
-    assert commands.values == 2 * before
-    assert outcome.states.stamp.size >= before + 30
-    assert compared(outcome)['tracking_error'] == 6 * outcome.states.stamp.size
+    bag = run.end()
+    result = verify(bag)
+    assert result.difference is None
+    assert result.turns == ['activate', 'safe stop (state timeout)', 'deactivate', 'activate']
+    before = np.count_nonzero(result.states.stamp <= silent)
+    assert result.states.stamp.size >= before + 30
+    torques = sum(entry[0] == COMMANDS.resolved for entry in recorded_run.messages(bag))
+    assert compared(result)['commands'] == 2 * torques
+    assert compared(result)['tracking_error'] == 6 * result.states.stamp.size

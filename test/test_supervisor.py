@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.supervision.reasons import Phase
-from blf_dsc_controller.supervision.supervisor import Supervisor, Trust
+from blf_dsc_controller.supervision.supervisor import Supervisor, Verdict
 
 STILL = np.zeros(2)
 SAFETY = Safety()
@@ -34,9 +34,9 @@ def test_the_quick_look_at_a_stamp_is_the_careful_one(steps):
     stamp = 1_000_000_000
     for step in steps:
         stamp += step
-        verdicts = [one.inspect(SAFETY, stamp, STILL, STILL) for one in (quick, careful)]
+        verdicts = [one.check_state(SAFETY, stamp, STILL, STILL) for one in (quick, careful)]
         assert verdicts[0] is verdicts[1]
-        for of in ('reason', 'text', 'repeated', 'stops', 'turns'):
+        for of in ('reason', 'text', 'repeated', 'stops', 'revision'):
             assert getattr(quick, of) == getattr(careful, of)
         assert vars(quick.overruns) == vars(careful.overruns)
 
@@ -45,6 +45,6 @@ def test_a_velocity_is_looked_at_on_the_quick_way_too():
     supervisor = Supervisor(['joint1', 'joint2'], 1e-3)
     supervisor.enter(Phase.STARTING)
     supervisor.enter(Phase.TRACKING)
-    assert supervisor.inspect(SAFETY, 1_000_000_000, STILL, STILL) is Trust.USE
+    assert supervisor.check_state(SAFETY, 1_000_000_000, STILL, STILL) is Verdict.USE
     too_fast = np.array([0.0, 2.0 * SAFETY.velocity_limit])
-    assert supervisor.inspect(SAFETY, 1_001_000_000, STILL, too_fast) is Trust.STOP
+    assert supervisor.check_state(SAFETY, 1_001_000_000, STILL, too_fast) is Verdict.STOP

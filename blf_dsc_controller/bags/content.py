@@ -18,12 +18,11 @@ from blf_dsc_controller.messages.topics import (
     DIAGNOSTICS,
     JOINT_STATE,
     JOINT_STATES,
-    PARAMETER_EVENTS,
     TOPICS,
     Topic,
 )
 
-_OF_INTEREST = (*(one for one in TOPICS if one not in (CLOCK, DIAGNOSTICS)), PARAMETER_EVENTS)
+_OF_INTEREST = tuple(one for one in TOPICS if one not in (CLOCK, DIAGNOSTICS))
 
 
 @dataclass(frozen=True)

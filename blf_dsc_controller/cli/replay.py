@@ -15,12 +15,12 @@ from blf_dsc_controller.cli.main import require_ros
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.params_file import load, locate
+from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.messages.topics import COMMANDS
 from blf_dsc_controller.replay.identify import identify
-from blf_dsc_controller.replay.open_loop import Answer, answer
-from blf_dsc_controller.replay.recorded import Outcome
-from blf_dsc_controller.replay.recorded import replay as verify
 from blf_dsc_controller.replay.states import States
+from blf_dsc_controller.replay.verify import Verification, verify
+from blf_dsc_controller.replay.what_if import WhatIf, what_if
 
 DIFFERENT = 3
 """Exit code where the replay differs from the bag."""
@@ -34,14 +34,14 @@ def replay(options: Namespace) -> int:
         return _identify(options)
     begin = perf_counter()
     if options.config is None:
-        outcome = verify(options.bag, options.namespace)
-        _print_speed(outcome.states, perf_counter() - begin)
-        print('\n'.join(_verification(outcome)))
-        return 0 if outcome.difference is None else DIFFERENT
+        result = verify(options.bag, options.namespace)
+        _print_speed(result.states, perf_counter() - begin)
+        print('\n'.join(_verification(result)))
+        return 0 if result.difference is None else DIFFERENT
     config = load(locate(options.config), CONTROLLER, ControllerConfig)
-    found = answer(options.bag, config, options.namespace, NameMap.parse(options.map))
+    found = what_if(options.bag, config, options.namespace, NameMap.parse(options.map))
     _print_speed(found.states, perf_counter() - begin)
-    print('\n'.join(_open_loop(found)))
+    print('\n'.join(_open_loop(found, config)))
     return 0
 
 
@@ -90,30 +90,35 @@ def _print_speed(states: States, took: float) -> None:
     )
 
 
-def _verification(outcome: Outcome) -> Iterator[str]:
-    for one in outcome.comparisons:
+def _verification(result: Verification) -> Iterator[str]:
+    for one in result.comparisons:
         verdict = 'bit-equal' if one.difference is None else 'DIFFERENT'
         left_out = f' (not compared: {one.left_out})' if one.left_out else ''
         yield f'{one.topic}: {one.values} values {verdict}{left_out}'
-    if outcome.changes:
-        yield f'{outcome.changes} changes of parameters replayed where they took effect'
-    yield from outcome.done
-    if outcome.states.passed_over:
-        yield f'{outcome.states.passed_over} states skipped: the controller did not answer them'
-    yield from (f'note: {remark}' for remark in outcome.remarks)
-    if outcome.difference is not None:
-        yield f'DIFFERENT, first at {outcome.difference}'
+    changes, trajectories = map(result.count, (EventType.PARAMETERS, EventType.TRAJECTORY))
+    if changes:
+        yield f'{changes} changes of parameters replayed where they took effect'
+    if trajectories:
+        yield f'{trajectories} trajectories replayed where they took effect'
+    if len(result.turns) > 1:
+        yield f'replayed in turn: {", ".join(result.turns)}'
+    if result.safe_torques:
+        yield f'{result.safe_torques} of the commands are safe torques, or on the ramp to one'
+    if result.states.passed_over:
+        yield f'{result.states.passed_over} states skipped: the controller did not use them'
+    yield from (f'note: {remark}' for remark in result.remarks)
+    if result.difference is not None:
+        yield f'DIFFERENT, first at {result.difference}'
         return
-    commands = [one for one in outcome.comparisons if one.topic.endswith(COMMANDS.leaf)]
+    commands = [one for one in result.comparisons if one.topic.endswith(COMMANDS.leaf)]
     is_whole = not any(one.left_out for one in commands)
     compared = 'all outputs' if is_whole else 'what could be compared, which is not all'
     yield f'bit-equal: {compared}'
 
 
-def _open_loop(found: Answer) -> Iterator[str]:
+def _open_loop(found: WhatIf, config: ControllerConfig) -> Iterator[str]:
     yield 'OPEN LOOP: the arm moved under the recorded torques and does not feel these'
     yield f'recorded torque: {found.source}'
-    config = found.replayed.config
     for i, joint in enumerate(config.joints):
         known = found.difference[np.isfinite(found.difference[:, i]), i]
         difference = (
@@ -122,7 +127,7 @@ def _open_loop(found: Answer) -> Iterator[str]:
             if known.size
             else 'cannot be compared: no torque was recorded'
         )
-        at_limit = np.mean(np.abs(found.replayed.told.torque[:, i]) >= config.torque.limit[i])
+        at_limit = np.mean(np.abs(found.samples.torque[:, i]) >= config.torque.limit[i])
         yield (
             f'{joint}: torque {difference}; at its limit {100 * at_limit:.3g} % of the time; '
             f'max |xi1| / bound {found.error_ratio[i]:.3g}'

@@ -30,7 +30,7 @@ from blf_dsc_controller.law.rejected_columns import refusals
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import Record, loop, simulate
-from blf_dsc_controller.supervision.config_warnings import concerns
+from blf_dsc_controller.supervision.config_warnings import config_warnings
 from sim_plant import plant as plant_kernels
 
 _FOLDER = 'closed_loop'
@@ -41,7 +41,9 @@ def run(options: Namespace) -> int:
     """Run the closed loop into a new folder."""
     config = _configuration(options)
     order = [config.plant.joints.index(joint) for joint in config.controller.joints]
-    for warning in concerns(config.controller, np.array(config.plant.initial.position)[order]):
+    for warning in config_warnings(
+        config.controller, np.array(config.plant.initial.position)[order]
+    ):
         print(f'warning: {warning}', file=sys.stderr)
     if not options.offline:
         require_ros()

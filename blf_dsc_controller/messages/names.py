@@ -25,6 +25,3 @@ REJECTED = 'rejected '  # followed by the column that is not estimated
 PHASE = 'phase'
 REASON = 'reason'
 STOPS = 'stops'  # since the node was configured
-OPERATIONS = 'operations'  # activations, deactivations and resets since the node was configured
-OPERATION = 'last operation'
-LAST_STATE = 'last state'  # stamp of the last joint state before the operation [ns]

@@ -87,10 +87,6 @@ CLOCK = Topic(PLANT, '/clock', 'rosgraph_msgs/msg/Clock', STREAM, LATEST)
 DIAGNOSTICS = Topic(
     CONTROLLER, '/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', DIAGNOSTIC, DIAGNOSTIC
 )
-PARAMETER_EVENTS = Topic(
-    CONTROLLER, '/parameter_events', 'rcl_interfaces/msg/ParameterEvent', STREAM, STREAM
-)
-"""Published by every ROS node."""
 ROBOT_DESCRIPTION = Topic(PLANT, 'robot_description', 'std_msgs/msg/String', LATCHED, LATCHED)
 """The URDF; not in TOPICS, since the offline writer does not write it."""
 JOINT_TRAJECTORY = Topic(
@@ -101,14 +97,8 @@ JOINT_TRAJECTORY = Topic(
     DIAGNOSTIC,
 )
 """Published by other nodes for the controller."""
-ACCEPTED_TRAJECTORY = Topic(
-    CONTROLLER,
-    '~/accepted_trajectory',
-    'trajectory_msgs/msg/JointTrajectory',
-    Quality(depth=100, durability='transient_local'),
-    LATCHED,
-)
-"""The trajectories that took effect, and when: see messages.trajectory."""
+JOURNAL = Topic(CONTROLLER, '~/journal', 'std_msgs/msg/String', HISTORY, HISTORY)
+"""Every event of the controller, also for late recorders: see messages.journal."""
 
 TOPICS = (
     JOINT_STATES,
@@ -118,7 +108,7 @@ TOPICS = (
     LEARNING,
     BOUND,
     STATE,
-    ACCEPTED_TRAJECTORY,
+    JOURNAL,
     MONITOR,
     TRUTH,
     TIMING,

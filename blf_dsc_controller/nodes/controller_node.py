@@ -31,7 +31,7 @@ from blf_dsc_controller.nodes.endpoints import (
 )
 from blf_dsc_controller.nodes.lifecycle import ManagedNode
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
-from blf_dsc_controller.supervision.config_warnings import concerns
+from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.reasons import Phase
 
@@ -111,15 +111,13 @@ class ControllerNode(ManagedNode):
         """Compile the law; create the topics of the loop the first time."""
         process.log_compilation(self.get_logger(), respond)
         self.guard = Guard(self.config, *self._clocks)
-        for warning in concerns(self.config):
+        for warning in config_warnings(self.config):
             self.get_logger().warning(warning)
         if not self._outputs:
             outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
             self._outputs = {topic: create_publisher(self, topic) for topic in outputs}
             create_subscription(self, topics.JOINT_STATES, self._on_joint_state)
-            self._status.trajectories = TrajectoryInput(
-                self, lambda: self.guard, telemetry=self.config.telemetry.enabled
-            )
+            self._status.trajectories = TrajectoryInput(self, lambda: self.guard)
             process.request_realtime(self.config.realtime, self.get_logger())
         self._report()
 
@@ -145,13 +143,16 @@ class ControllerNode(ManagedNode):
     def close(self) -> None:
         """Command zero torque and wait until every subscriber has the last messages."""
         self._command_zero()
-        process.drain(self._outputs.values())
+        process.drain([*self._outputs.values(), self._status.journal])
 
     def _command_zero(self) -> None:
-        """Command zero torque, as drivers hold the last command; unless the arm has gone."""
+        """Command zero torque, as drivers hold the last command, and release the guard."""
         states = self.resolve_topic_name(topics.JOINT_STATES.relative)
         if self.guard is not None and self.guard.commanding and self.count_publishers(states):
             self._command(np.zeros(len(self.config.joints)))
+        if self.guard is not None:
+            self.guard.release()
+            self._status.publish_events(self.guard)
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = self.guard is not None and self.state_label == 'active'
@@ -179,10 +180,10 @@ class ControllerNode(ManagedNode):
             torque, stamp = self._torque_for(guard, raw)
         except Exception as error:  # noqa: BLE001 - whatever it is, the arm needs a torque
             self.get_logger().fatal(f'{type(error).__name__}: {error}')
-            torque, stamp = guard.fail(error), 0
+            torque, stamp = guard.fail(f'{type(error).__name__}: {error}'), 0
         if torque is not None:
             self._command(torque)
-        if guard.answered:
+        if guard.has_sample:
             self._publish_telemetry(guard, stamp)
         self._report_if_changed(guard)
 
@@ -191,11 +192,11 @@ class ControllerNode(ManagedNode):
             stamp = self._decoder.decode(raw)
         except MessageError as error:
             foreign = guard.foreign
-            torque = guard.unusable(error)
+            torque = guard.reject(error)
             if guard.foreign != foreign:
                 self.get_logger().warning(f'passed over: {error}', throttle_duration_sec=10.0)
             return torque, 0
-        return guard.answer(stamp, self._decoder.values), stamp
+        return guard.update(stamp, self._decoder.values), stamp
 
     def _publish_telemetry(self, guard: Guard, stamp: int) -> None:
         if guard.controller.state.judged[0] != self._columns_checked:
@@ -260,7 +261,7 @@ class ControllerNode(ManagedNode):
     # Changes of the configuration, and reports.
 
     def _problems(self, config: ControllerConfig) -> list[str]:
-        return self.guard.objections(config) if self.guard else []
+        return self.guard.problems(config) if self.guard else []
 
     def _retune(self, config: ControllerConfig) -> None:
         self.config = config
@@ -269,17 +270,17 @@ class ControllerNode(ManagedNode):
             stamp = self.guard.last_stamp
             if stamp >= 0 and config.telemetry.enabled:
                 t = (stamp - self.guard.start_stamp) * 1e-9
-                self._publish_bound(self.guard.last_seen, self.guard.controller.bound_at(t))
+                self._publish_bound(self.guard.journal.stamp, self.guard.controller.bound_at(t))
 
     def _report_if_changed(self, guard: Guard) -> None:
-        if not self._status.is_news(guard):
+        if not self._status.has_news(guard):
             return
         supervisor = guard.supervisor
         if supervisor.phase is Phase.SAFE_STOP:
             self.get_logger().fatal(f'{self.config.safety.torque} torque: {supervisor.text}')
         self._started = self._started or supervisor.running
-        if guard.refusal is not None and self.config.autostart and not self._started:
-            self.failure, self.finished = guard.refusal, True
+        if guard.start_error is not None and self.config.autostart and not self._started:
+            self.failure, self.finished = guard.start_error, True
         self._report()
 
     def _report(self) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the controller says of its state: `~/state`, latched, and its part of `/diagnostics`."""
+"""The state of the controller on `~/state`, `~/journal` and `/diagnostics`."""
 
 from __future__ import annotations
 
@@ -11,16 +11,9 @@ from rclpy.node import Node
 
 from blf_dsc_controller.law.rejected_columns import Refusal
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.names import (
-    LAST_STATE,
-    OPERATION,
-    OPERATIONS,
-    PHASE,
-    REASON,
-    REJECTED,
-    STOPS,
-)
+from blf_dsc_controller.messages.names import PHASE, REASON, REJECTED, STOPS
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher
+from blf_dsc_controller.nodes.endpoints import create_publisher
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.reasons import Phase, Reason
@@ -32,7 +25,7 @@ _LEVELS = {
     Phase.TRACKING: OK,
     Phase.SAFE_STOP: ERROR,
 }
-_WORDS = {
+_MESSAGES = {
     Phase.INACTIVE: 'not in command',
     Phase.STARTING: 'waiting for a joint state to start from',
     Phase.APPROACHING: 'approaching the reference',
@@ -43,43 +36,48 @@ _WORDS = {
 class ControllerStatus:
     """Publishes the state of the controller.
 
-    Args:
-        node: that tells.
-        joints: names of the joints.
-
     Attributes:
+        journal: publisher of `~/journal`.
         refusals: disturbance columns that are not estimated, and why.
-        trajectories: what came of the trajectories that were sent.
+        trajectories: accepted and rejected trajectories.
     """
 
     def __init__(self, node: Node, joints: Sequence[str]) -> None:
+        """Create the publishers of a node that controls `joints`."""
+        self.journal = create_publisher(node, topics.JOURNAL)
         self.refusals: tuple[Refusal, ...] = ()
         self.trajectories: TrajectoryInput | None = None
         self._joints = tuple(joints)
         self._diagnostics = DiagnosticsPublisher(node, joints, topics.STATE)
-        self._told = -1
-        self._announced: tuple[str, str, int, int] | None = None
+        self._revision = -1
+        self._published: tuple[str, str, int] | None = None
 
-    def is_news(self, guard: Guard) -> bool:
-        """Whether the state has changed since it was told."""
-        return guard.supervisor.turns != self._told
+    def has_news(self, guard: Guard) -> bool:
+        """Whether there are events or a state to publish."""
+        return bool(guard.journal.pending) or guard.supervisor.revision != self._revision
 
     def report(self, life: str, guard: Guard | None) -> None:
-        """Publish diagnostics and, where it has changed, the state.
+        """Publish diagnostics, new events and, if it has changed, the state.
 
         Args:
             life: lifecycle state of the node.
             guard: None while the node is not configured.
         """
+        if guard is not None:
+            self.publish_events(guard)
         state = self._state(life, guard)
         parts = [state] if guard is None else [state, self._loop(guard), self._learning(guard)]
         self._diagnostics.publish(parts)
-        counts = (guard.supervisor.stops, guard.operations) if guard else (0, 0)
-        essence = (state.message, life, *counts)
-        if essence != self._announced:
+        stops = guard.supervisor.stops if guard else 0
+        if (state.message, life, stops) != self._published:
             self._diagnostics.publish_state(state)
-            self._announced = essence
-        self._told = guard.supervisor.turns if guard else -1
+            self._published = (state.message, life, stops)
+        self._revision = guard.supervisor.revision if guard else -1
+
+    def publish_events(self, guard: Guard) -> None:
+        """Publish the new events."""
+        while guard.journal.pending:
+            self.journal.publish(guard.journal.pending.popleft().encode())
 
     def _state(self, life: str, guard: Guard | None) -> DiagnosticStatus:
         phase = guard.supervisor.phase if guard else Phase.INACTIVE
@@ -87,39 +85,38 @@ class ControllerStatus:
         if guard is not None and phase is Phase.SAFE_STOP:
             message = f'stopped: {guard.supervisor.text}'
         else:
-            message = _WORDS[phase] if guard else 'not configured'
+            message = _MESSAGES[phase] if guard else 'not configured'
         values: dict[str, Any] = {PHASE: phase.value, REASON: reason.value, 'lifecycle': life}
         if guard is not None:
             values[STOPS] = guard.supervisor.stops
             values['safe torque'] = guard.config.safety.torque
-            values[OPERATIONS] = guard.operations
-            values[OPERATION] = guard.operation.value
-            values[LAST_STATE] = guard.last_seen
         return self._diagnostics.status('state', _LEVELS[phase], message, values)
 
     def _loop(self, guard: Guard) -> DiagnosticStatus:
         supervisor = guard.supervisor
         values = {
             'samples': guard.controller.samples,
-            'repeated or late states passed over': supervisor.repeated,
+            'repeated states ignored': supervisor.repeated,
             'samples outside the bound': guard.outside,
             'largest error against the bound': f'{guard.ratio.max():.3g}',
             'states missed': supervisor.overruns.count,
             'samples with a torque at its limit': supervisor.saturation.count,
             'messages for other joints': guard.foreign,
-            'watch on the steady clock': 'on' if guard.watching else 'off',
+            'watchdog on the steady clock': 'on' if guard.watching else 'off',
             **self._cuts(guard),
-            **(self.trajectories.told if self.trajectories else {}),
+            **(self.trajectories.values if self.trajectories else {}),
         }
         if guard.outside:
             return self._diagnostics.status('loop', WARN, 'the error has left its bound', values)
         if supervisor.saturation.lasted > 0.0:
             message = 'torque at its limit: adaptation by the tracking error is frozen'
             return self._diagnostics.status('loop', WARN, message, values)
-        if guard.answered and guard.controller.sample.cuts.any():
+        if guard.has_sample and guard.controller.sample.cuts.any():
             message = 'torque changes at its limit: adaptation by the tracking error is frozen'
             return self._diagnostics.status('loop', WARN, message, values)
-        return self._diagnostics.status('loop', OK, _WORDS.get(supervisor.phase, 'stopped'), values)
+        return self._diagnostics.status(
+            'loop', OK, _MESSAGES.get(supervisor.phase, 'stopped'), values
+        )
 
     def _cuts(self, guard: Guard) -> dict[str, int]:
         """Samples in which the law's torque was cut, joint by joint."""

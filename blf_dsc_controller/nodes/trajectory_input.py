@@ -1,81 +1,90 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`~/joint_trajectory`: another reference while the controller runs, or the reason why not.
-
-What is followed is told on `~/accepted_trajectory`, with the sample after which it was taken.
-"""
+"""`~/joint_trajectory`: another reference while the controller runs, or the reason why not."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
-from builtin_interfaces.msg import Time
 from rclpy.node import Node
-from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
 from blf_dsc_controller.messages.cdr import NANOSECONDS
-from blf_dsc_controller.messages.topics import ACCEPTED_TRAJECTORY, JOINT_TRAJECTORY
-from blf_dsc_controller.messages.trajectory import request_of, told_begin
-from blf_dsc_controller.nodes.endpoints import create_publisher, qos_profile
-from blf_dsc_controller.reference.trajectory import TrajectoryError
+from blf_dsc_controller.messages.topics import JOINT_TRAJECTORY
+from blf_dsc_controller.nodes.endpoints import qos_profile
+from blf_dsc_controller.reference.trajectory import (
+    Trajectory,
+    TrajectoryError,
+    TrajectoryPoint,
+)
 from blf_dsc_controller.supervision.guard import Guard
+
+_NANO = 1e-9
 
 
 class TrajectoryInput:
-    """Hands trajectories to the guard, between two samples, and says what came of them.
-
-    Args:
-        node: that listens.
-        guard: gives the guard; None while there is none.
-        telemetry: whether to tell what is followed.
+    """Hands trajectories to the guard, between two samples.
 
     Attributes:
-        taken: trajectories that are or were followed.
-        refused: trajectories that are not.
-        reason: why the last of those was refused.
+        accepted: number of trajectories that are or were followed.
+        rejected: number of those that are not.
+        reason: of the last rejection.
     """
 
-    def __init__(self, node: Node, guard: Callable[[], Guard | None], *, telemetry: bool) -> None:
-        self.taken = 0
-        self.refused = 0
+    def __init__(self, node: Node, guard: Callable[[], Guard | None]) -> None:
+        """Subscribe; `guard` returns None while the node is not configured."""
+        self.accepted = 0
+        self.rejected = 0
         self.reason = ''
         self._log = node.get_logger()
         self._guard = guard
-        self._accepted = create_publisher(node, ACCEPTED_TRAJECTORY) if telemetry else None
         name, quality = JOINT_TRAJECTORY.name, qos_profile(JOINT_TRAJECTORY.requested)
-        node.create_subscription(JointTrajectory, name, self._take, quality)
+        node.create_subscription(JointTrajectory, name, self._on_trajectory, quality)
 
     @property
-    def told(self) -> dict[str, str]:
+    def values(self) -> dict[str, str]:
         """Values for the diagnostics."""
         return {
-            'trajectories followed': f'{self.taken}',
-            'trajectories refused': f'{self.refused}',
-            'last refusal': self.reason or 'none',
+            'trajectories followed': f'{self.accepted}',
+            'trajectories rejected': f'{self.rejected}',
+            'last rejection': self.reason or 'none',
         }
 
-    def _take(self, message: JointTrajectory) -> None:
-        try:
-            self._follow(self._guard(), message)
-        except TrajectoryError as error:
-            self.refused += 1
-            self.reason = str(error)
-            self._log.warning(self.reason)
-
-    def _follow(self, guard: Guard | None, message: JointTrajectory) -> None:
+    def _on_trajectory(self, message: JointTrajectory) -> None:
+        guard = self._guard()
         if guard is None:
-            raise TrajectoryError(['the controller is not configured'])
-        guard.follow(request_of(message, guard.start_stamp))
-        self._tell(message, guard.last_seen)
-        self.taken += 1
+            self._reject('trajectory rejected: the controller is not configured')
+            return
+        try:
+            guard.follow(_trajectory(message, guard.start_stamp))
+        except TrajectoryError as error:
+            self._reject(str(error))
+            return
+        self.accepted += 1
         self._log.info(f'following a trajectory of {len(message.points)} points')
 
-    def _tell(self, message: JointTrajectory, stamp: int) -> None:
-        if self._accepted is None:
-            return
-        seconds, nanoseconds = divmod(stamp, NANOSECONDS)
-        header = Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=told_begin(message))
-        told = JointTrajectory(
-            header=header, joint_names=message.joint_names, points=message.points
+    def _reject(self, reason: str) -> None:
+        self.rejected += 1
+        self.reason = reason
+        self._log.warning(reason)
+
+
+def _trajectory(message: JointTrajectory, start_stamp: int) -> Trajectory:
+    """Trajectory of a message, in times since the controller's start; stamp 0 begins at once."""
+    points = tuple(
+        TrajectoryPoint(
+            _nanoseconds(point.time_from_start) * _NANO,
+            tuple(point.positions),
+            tuple(point.velocities),
+            tuple(point.accelerations),
+            tuple(point.effort),
         )
-        self._accepted.publish(told)
+        for point in message.points
+    )
+    stamp = _nanoseconds(message.header.stamp)
+    begin = (stamp - start_stamp) * _NANO if stamp else None
+    return Trajectory(tuple(message.joint_names), points, begin)
+
+
+def _nanoseconds(time: Any) -> int:
+    return int(time.sec) * NANOSECONDS + int(time.nanosec)

@@ -20,7 +20,7 @@ from blf_dsc_controller.paper.robustness_figure import draw_robustness
 from blf_dsc_controller.paper.runs import Outcome, run_all
 from blf_dsc_controller.paper.sweeps import SWEEPS
 from blf_dsc_controller.paper.tables import HEADER, kept_bounds, side_by_side, write_tables
-from blf_dsc_controller.supervision.config_warnings import concerns
+from blf_dsc_controller.supervision.config_warnings import config_warnings
 
 TITLE = 'The paper, side by side'
 
@@ -147,9 +147,9 @@ def content(
 def warnings() -> list[str]:
     """What the feasibility checks say of the side-by-side cases."""
     found = [
-        f'{case.label}: {concern}'
+        f'{case.label}: {warning}'
         for case in SIDE_BY_SIDE
-        for concern in concerns(case.loop().controller)
+        for warning in config_warnings(case.loop().controller)
     ]
     return found or ['None of these configurations is warned of.']
 

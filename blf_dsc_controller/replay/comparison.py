@@ -1,28 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded against replayed, bit for bit."""
+"""Recorded against replayed messages of the controller, bit for bit."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.batch import decode_arrays, decode_joint_states
 from blf_dsc_controller.bags.content import Content, TopicMessages
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.factory import estimate_names
+from blf_dsc_controller.law.sample import Sample
 from blf_dsc_controller.messages.cdr import JointStateLayout
 from blf_dsc_controller.messages.encoders import JOINT_STATE_FIELDS
-from blf_dsc_controller.messages.topics import COMMANDS, LEARNING, MONITOR, Topic
-from blf_dsc_controller.replay.expected import Columns
+from blf_dsc_controller.messages.names import LAMBDA_MIN, LATCHED
+from blf_dsc_controller.messages.telemetry import disturbance_names
+from blf_dsc_controller.messages.topics import (
+    COMMANDS,
+    LEARNING,
+    MONITOR,
+    REFERENCE,
+    TRACKING_ERROR,
+    Topic,
+)
 from blf_dsc_controller.replay.states import States
 from blf_dsc_controller.run import Floats, Stamps
 
-_NAMED = (LEARNING, MONITOR)
+Columns = Mapping[str, Floats]
+"""Values (N,) by the field that holds them, such as `velocity of joint1` or `lambda_min`."""
 
 
-@dataclass(frozen=True)
-class Difference:
+class Difference(NamedTuple):
     """The first number of a topic that is not the same."""
 
     topic: str
@@ -39,83 +50,100 @@ class Difference:
         )
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """One topic.
+class Comparison(NamedTuple):
+    """One topic."""
 
-    Attributes:
-        topic: its name in the bag.
-        values: numbers compared.
-        difference: the first, None if all are equal.
-        left_out: what was not compared, and why not; empty if nothing.
-    """
-
-    topic: str
-    values: int
+    topic: str  # name in the bag
+    values: int  # numbers compared
     difference: Difference | None
-    left_out: str = ''
+    left_out: str = ''  # what was not compared, and why not
 
 
-@dataclass(frozen=True)
-class Commands:
-    """Torques in the order in which they were commanded.
+class Commands(NamedTuple):
+    """M replayed torques in the order in which they were commanded."""
 
-    Attributes:
-        stamp: of the state that each answers (M,) [ns].
-        torque: (M, n) [N m].
-        of_law: which of them are the law's (M,). Those answer the states that the controller tells
-            of; it tells of none while the law is not in command.
-        known: how many there are before something that does not show in the states.
-        doubt: what that is, in words; empty if there is no such thing.
-        in_step: whether the plant waited for each command, so that every state was answered.
+    stamp: Stamps  # (M,) ns, of the last joint state before each
+    torque: Floats  # (M, n) N m
+    of_law: NDArray[np.bool_]  # (M,) torques of the law; the others are safe torques
+    exact: NDArray[np.bool_]  # (M,) whether the same states led to it as in the recorded run
+    number: NDArray[np.intp]  # (M,) of the recorded command
+
+
+def expected(
+    config: ControllerConfig, samples: Sample, monitored: Mapping[int, bytes]
+) -> dict[Topic, Columns]:
+    """Columns of every topic with a stamp over the replayed samples.
+
+    Args:
+        config: of the controller.
+        samples: columns of N telemetry samples.
+        monitored: messages of the monitor, by the number of their sample.
     """
+    joints = config.joints
+    errors = {'position': samples.xi1, 'velocity': samples.xi2, 'effort': samples.torque}
+    return {
+        TRACKING_ERROR: _of_joints(joints, errors),
+        REFERENCE: _of_joints(joints, {'position': samples.qr, 'velocity': samples.dqr}),
+        LEARNING: {
+            **dict(zip(estimate_names(config), samples.estimate.T, strict=True)),
+            **dict(zip(disturbance_names(joints), samples.disturbance.T, strict=True)),
+            LAMBDA_MIN: samples.lambda_min[:, 0],
+            LATCHED: samples.latched[:, 0],
+        },
+        MONITOR: _of_monitor(monitored, len(samples.xi1)),
+    }
 
-    stamp: Stamps
-    torque: Floats
-    of_law: NDArray[np.bool_]
-    known: int
-    doubt: str = ''
-    in_step: bool = True
 
-    @property
-    def sure(self) -> int:
-        """How many there are before the first that is not the law's."""
-        return int(np.argmin(np.append(self.of_law, values=False)))
+def _of_joints(joints: Sequence[str], fields: Mapping[str, Floats]) -> dict[str, Floats]:
+    return {
+        f'{field} of {joint}': column
+        for field, values in fields.items()
+        for joint, column in zip(joints, values.T, strict=True)
+    }
+
+
+def _of_monitor(monitored: Mapping[int, bytes], count: int) -> Columns:
+    """Columns of the monitor; NaN between its messages."""
+    if not monitored:
+        return {}
+    messages = list(monitored.values())
+    names = JointStateLayout.parse(messages[0]).names
+    _, values = decode_joint_states(TopicMessages(MONITOR.resolved, raw=messages), names, ())
+    table = np.full((count, len(names)), np.nan)
+    table[list(monitored)] = values[:, 0]
+    return dict(zip(names, table.T, strict=True))
 
 
 def compare(
     content: Content,
     states: States,
-    expectation: dict[Topic, Columns],
+    columns: Mapping[Topic, Columns],
+    commands: Commands,
+    joints: Sequence[str],
     gappy: Collection[str] = (),
-    commands: Commands | None = None,
 ) -> Iterator[Comparison]:
     """Compare each topic of the controller that the bag holds.
 
     Args:
         content: of the bag.
-        states: that were replayed.
-        expectation: what the topics must hold.
+        states: that the law used.
+        columns: replayed values of the topics with a stamp.
+        commands: all replayed torques.
+        joints: names of the joints.
         gappy: topics of which the recorder missed messages.
-        commands: all torques; None if there are no others than the law's.
 
     Raises:
         UnreadableMessageError: a message cannot be decoded.
     """
-    for topic, columns in expectation.items():
+    recorded = content.topics.get(COMMANDS)
+    if recorded is not None:
+        efforts = [f'effort of {joint}' for joint in joints]
+        yield _compare_commands(recorded, commands, efforts, is_gappy=recorded.name in gappy)
+    for topic, fields in columns.items():
         recorded = content.topics.get(topic)
-        if recorded is None:
-            continue
-        if topic is COMMANDS:
-            torque = np.stack(list(columns.values()), axis=1)
-            law_alone = Commands(
-                states.stamp, torque, np.ones(len(torque), dtype=np.bool_), len(torque)
-            )
-            all_of_them = commands or law_alone
-            is_gappy = recorded.name in gappy
-            yield _compare_commands(recorded, all_of_them, columns, is_gappy=is_gappy)
-        else:
-            yield _compare_stamped(recorded, states, columns, named=topic in _NAMED)
+        if recorded is not None:
+            is_named = topic in (LEARNING, MONITOR)
+            yield _compare_stamped(recorded, states, fields, is_named=is_named)
 
 
 def first(comparisons: Sequence[Comparison]) -> Difference | None:
@@ -125,79 +153,65 @@ def first(comparisons: Sequence[Comparison]) -> Difference | None:
 
 
 def _compare_commands(
-    recorded: TopicMessages, commands: Commands, fields: Collection[str], *, is_gappy: bool
+    recorded: TopicMessages, commands: Commands, fields: Sequence[str], *, is_gappy: bool
 ) -> Comparison:
-    """Commands have no stamp: the k-th is the k-th."""
-    count, sure = len(recorded.raw), commands.sure
-    if count < sure or is_gappy:
-        reason = f'{count} commands for {sure} answered states, and they have no stamp'
+    """Compare commands by their number in the run: they have no stamp."""
+    count = len(recorded.raw)
+    due = int(np.argmin(np.append(commands.of_law, values=False)))
+    if count < due or is_gappy:
+        reason = f'{count} commands for {due} states that the law used, and they have no stamp'
         return Comparison(recorded.name, 0, None, reason)
     values = decode_arrays(recorded, len(fields))
     if values is None:
         return Comparison(recorded.name, 0, None, f'they are not {len(fields)} values each')
-    compared = min(count, commands.known)
-    left_out = _left_out(values, commands)
-    if not commands.in_step:
-        alike = _alike(values[sure:compared], commands.torque[sure:compared]).all(axis=1)
-        if not alike.all():
-            compared = sure + int(np.argmin(alike))
-            left_out = (
-                f'{count - compared} torques from one on that does not match after a stop or '
-                'deactivation: in real time a state may have been missed there, or the watch on '
-                'the steady clock have spoken'
-            )
-    columns = dict(zip(fields, commands.torque[:compared].T, strict=True))
-    moments = States(commands.stamp[:compared], commands.torque[:compared])
-    return _compare(
-        recorded.name, moments, np.arange(compared), columns, values[:compared], left_out
-    )
-
-
-def _left_out(values: Floats, commands: Commands) -> str:
-    """What of the commands cannot be compared, and why not, in words.
-
-    The last command of a node that ends in order is zero, and answers no state.
-    """
-    rest = values[commands.known :]
-    if commands.doubt:
-        return f'{len(rest)} torques, because {commands.doubt}' if len(rest) else ''
+    number = commands.number
+    # After a dropped state there may be more replayed torques than commands before the next event.
+    later = np.append(np.minimum.accumulate(number[::-1])[::-1][1:], count)
+    rows = np.flatnonzero((number < later) & (number < count))
+    alike = np.all(_alike(values[number[rows]], commands.torque[rows]), axis=1)
+    rows = rows[alike | ~_is_doubtful(alike, commands.exact[rows])]
+    left_out = ''
+    rest = np.delete(values, number[rows], axis=0)
+    # The last command of a node that ends in order is zero, and has no state.
     if len(rest) > 1 or rest.any():
-        return f'{len(rest)} torques more than are due to the states'
-    return ''
+        left_out = (
+            f'{len(rest)} torques that the bag does not determine: out of command, by states that '
+            'the middleware dropped, or by the watchdog at the end'
+        )
+    columns = dict(zip(fields, commands.torque[rows].T, strict=True))
+    stamps = States(commands.stamp[rows], commands.torque[rows])
+    place = np.arange(rows.size)
+    return _compare(recorded.name, stamps, place, columns, values[number[rows]], left_out)
+
+
+def _is_doubtful(alike: NDArray[np.bool_], exact: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Rows of an inexact part from its first mismatch on."""
+    k = np.arange(alike.size)
+    last_mismatch = np.maximum.accumulate(np.where(exact | alike, -1, k))
+    return np.asarray(last_mismatch > np.maximum.accumulate(np.where(exact, k, -1)))
 
 
 def _compare_stamped(
-    recorded: TopicMessages, states: States, columns: Columns, *, named: bool
+    recorded: TopicMessages, states: States, columns: Columns, *, is_named: bool
 ) -> Comparison:
     names = JointStateLayout.parse(recorded.raw[0]).names
     stamp, values = decode_joint_states(recorded, names, ())
-    rows, known = _rows(stamp, states)
-    fields = dict(zip(names, values[:, 0].T, strict=True)) if named else _fields(names, values)
+    rows = np.searchsorted(states.stamp, stamp)
+    known = np.isin(stamp, states.stamp)
+    if is_named:
+        fields = dict(zip(names, values[:, 0].T, strict=True))
+    else:
+        fields = {
+            f'{field} of {joint}': values[:, f, j]
+            for f, field in enumerate(JOINT_STATE_FIELDS)
+            for j, joint in enumerate(names)
+            if not np.isnan(values[:, f, j]).all()
+        }
     shared = {field: column for field, column in columns.items() if field in fields}
     absent = [field for field in (*columns, *fields) if (field in columns) != (field in fields)]
-    left_out = ', '.join(absent)
-    told = [fields[field][known] for field in shared]
-    table = np.stack(told, axis=1) if told else np.empty((rows.size, 0))
-    return _compare(recorded.name, states, rows, shared, table, left_out)
-
-
-def _rows(stamp: Stamps, states: States) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Sample that each message is of, and which messages are of one."""
-    if not states.stamp.size:
-        return np.empty(0, dtype=np.intp), np.zeros(stamp.size, dtype=np.bool_)
-    rows = np.minimum(np.searchsorted(states.stamp, stamp), states.stamp.size - 1)
-    known = states.stamp[rows] == stamp
-    return rows[known], known
-
-
-def _fields(names: Sequence[str], values: Floats) -> dict[str, Floats]:
-    """Columns of the fields that are not empty."""
-    return {
-        f'{field} of {joint}': values[:, f, j]
-        for f, field in enumerate(JOINT_STATE_FIELDS)
-        for j, joint in enumerate(names)
-        if not np.isnan(values[:, f, j]).all()
-    }
+    rows = rows[known]
+    table = np.array([fields[field][known] for field in shared]).reshape(len(shared), rows.size).T
+    return _compare(recorded.name, states, rows, shared, table, ', '.join(absent))
 
 
 def _compare(
@@ -209,9 +223,7 @@ def _compare(
     left_out: str = '',
 ) -> Comparison:
     replayed = (
-        np.stack([column[rows] for column in columns.values()], axis=1)
-        if columns
-        else (np.empty(recorded.shape))
+        np.array([column[rows] for column in columns.values()]).reshape(len(columns), rows.size).T
     )
     unlike = ~_alike(recorded, replayed)
     difference = None
@@ -229,6 +241,7 @@ def _compare(
 
 
 def _alike(recorded: Floats, replayed: Floats) -> NDArray[np.bool_]:
-    """Where the bits are the same, or both no number."""
-    equal = np.ascontiguousarray(recorded).view(np.int64) == replayed.view(np.int64)
+    """Where the bits are the same, or both are NaN."""
+    bits = np.ascontiguousarray(recorded).view(np.int64)
+    equal = bits == np.ascontiguousarray(replayed).view(np.int64)
     return np.asarray(equal | (np.isnan(recorded) & np.isnan(replayed)))

@@ -1,69 +1,73 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller with its guard on the joint states of a bag: starts, stops, ramps and all.
+"""The guarded controller on recorded joint states, with every event of its journal.
 
-This is the very guard that the node runs, given the states that the node was given.  While the law
-is in command these are the ones that the controller tells of, for in real time it passes over what
-it has no time for.  While it is not, it tells of none; they are then all taken to have come, which
-is so in lock-step, and elsewhere if the commands match.  The clocks stand still: what the watch on
-the steady clock does is not replayed.
+The journal tells how many joint-state messages were processed before an event, and the stamp of the
+last. Where the bag holds as many in between, each is processed again. Where it holds more, the
+middleware has dropped some (in real time): the telemetry tells which ones the law used; out of
+command all are used, and the torques are compared as far as they match.
 """
 
 from __future__ import annotations
 
-from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeGuard
 
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.law.factory import estimate_names
+from blf_dsc_controller.law.sample import Sample, sample_of
+from blf_dsc_controller.law.settings import Settings
+from blf_dsc_controller.messages.journal import Event, EventType
+from blf_dsc_controller.messages.monitor import Monitor
+from blf_dsc_controller.messages.telemetry import DECIMATION
 from blf_dsc_controller.messages.topics import FOREVER, TRACKING_ERROR
-from blf_dsc_controller.reference.trajectory import TrajectoryError
-from blf_dsc_controller.replay.comparison import Commands, Difference
-from blf_dsc_controller.replay.history import (
-    OUT_OF_ORDER,
-    SILENT,
-    UNREADABLE,
-    Event,
-    History,
-    Order,
-    Stop,
+from blf_dsc_controller.reference.trajectory import (
+    Trajectory,
+    TrajectoryError,
+    TrajectoryPoint,
 )
-from blf_dsc_controller.replay.law import Replayed
-from blf_dsc_controller.replay.log import Log
+from blf_dsc_controller.replay.comparison import Commands, Difference
 from blf_dsc_controller.replay.states import Arrivals, States
-from blf_dsc_controller.run import Stamps
+from blf_dsc_controller.run import Floats, Stamps
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.reasons import Phase
+from blf_dsc_controller.supervision.reasons import Phase, Reason
+
+_UNREADABLE = frozenset(
+    (Reason.BAD_MESSAGE, Reason.JOINT_MISSING, Reason.JOINT_DUPLICATED, Reason.FIELD_MISSING)
+)
 
 
 @dataclass(frozen=True)
 class Rerun:
-    """What the controller did.
+    """What the replayed controller did.
 
     Attributes:
-        states: that the law answered.
-        replayed: what it told of them.
+        states: that the law used.
+        samples: columns of the law's telemetry samples, each (N, its length).
         monitored: messages of the monitor, by the number of their state.
         commands: every torque.
-        done: what was done to it, and its stops, as far as the replay came.
-        departure: where it did otherwise than the bag tells, so that the replay ends; or None.
-        end: why else the replay ended before the bag did, in words; empty if it did not.
+        events: that were replayed.
+        departure: where it did something else than the journal says; the replay ends there.
+        end: why else the replay ended before the bag; empty if it did not.
     """
 
     states: States
-    replayed: Replayed
+    samples: Sample
     monitored: dict[int, bytes]
     commands: Commands
-    done: tuple[Event, ...]
+    events: tuple[Event, ...]
     departure: Difference | None
     end: str
 
 
 def rerun(
     config: ControllerConfig,
+    events: Sequence[Event],
     came: Arrivals,
-    told: Stamps | None,
-    history: History,
+    sampled: Stamps | None,
     *,
     in_step: bool,
 ) -> Rerun:
@@ -71,188 +75,257 @@ def rerun(
 
     Args:
         config: in force at first.
+        events: of the journal after the configuration, in turn.
         came: joint states.
-        told: stamps of those that the law answered [ns], in order; None if the bag does not tell.
-        history: what was done to the controller, and its stops.
-        in_step: whether the plant waited for each command.
+        sampled: stamps of those that the law used [ns], increasing; None without telemetry.
+        in_step: whether the plant waited for each command, so that none was dropped at the end.
     """
-    return _Run(config, came, told, history, in_step=in_step).go()
+    return _Rerun(config, came, sampled).run(events, in_step=in_step)
 
 
-class _Run:
-    def __init__(
-        self,
-        config: ControllerConfig,
-        came: Arrivals,
-        told: Stamps | None,
-        history: History,
-        *,
-        in_step: bool,
-    ) -> None:
-        self._in_step = in_step
+def columns_of(rows: Floats, settings: Settings) -> Sample:
+    """Columns by name of packed samples (N, s): their places are found on a row of indices."""
+    places = sample_of(np.arange(rows.shape[1], dtype=np.float64), settings)
+    return Sample(*(rows[:, part.astype(np.intp)] for part in places))
+
+
+class _Rerun:
+    def __init__(self, config: ControllerConfig, came: Arrivals, sampled: Stamps | None) -> None:
         self._config = config
-        self._came = came
-        self._told = None if told is None else frozenset(told.tolist())
-        self._queue = deque(history.events)
         self._guard = Guard(config, _no_time, _no_time)
-        self._log = Log(config, self._guard, len(came.stamp))
-        self._known: int | None = None
-        self._doubt = ''
-        self._done: list[Event] = []
+        self._guard.journal.pending.clear()
+        self._came = came
+        self._sampled = None if sampled is None else frozenset(sampled.tolist())
+        lost = np.setdiff1d([] if sampled is None else sampled, came.stamp)
+        self._lost = int(lost[0]) if lost.size else FOREVER
+        self._position = -1  # number of the last joint state before now
+        self._messages = 0  # that were processed by then, according to the journal
+        self._last = -1  # stamp of the last state that the law used [ns]
         self._passed_over = 0
-        self._first = next((one for k, one in enumerate(came.stamp) if k not in came.errors), 0)
-        absent = np.setdiff1d([] if told is None else told, came.stamp)
-        self._lost = int(absent[0]) if absent.size else None
-        self._lost_from = FOREVER if self._lost is None else self._lost
+        self._numbers: list[int] = []  # of the joint states that the law used
+        self._rows: list[Floats] = []
+        self._monitor: Monitor | None = None
+        self._monitored: dict[int, bytes] = {}
+        self._torques: list[tuple[int, Floats, bool, bool]] = []  # stamp, torque, of law, exact
+        self._offsets: list[tuple[int, int]] = [(0, 0)]  # from a torque on: its number in the bag
+        self._failed = False
         self._departure: Difference | None = None
-        self._end = history.end
-
-    def go(self) -> Rerun:
-        end = self._end
         self._end = ''
-        while self._queue and self._is_before(self._queue[0]):
-            self._take(self._queue.popleft())
-        for k, stamp in enumerate(self._came.stamp):
-            self._pass_on(k, stamp)
-            if self._queue:
-                self._catch_up(k, stamp)
-            if self._end or self._departure:
+
+    def run(self, events: Sequence[Event], *, in_step: bool) -> Rerun:
+        done: list[Event] = []
+        for event in events:
+            if event.number != len(done) + 1:
+                self._end = 'an event of the journal is not in the bag'
+                break
+            self._feed(event, *self._locate(event))
+            if self._is_over:
+                break
+            self._repeat(event)
+            done.append(event)
+            if self._is_over or event.type is EventType.RELEASE:
                 break
         else:
-            self._end = end
-            self._look_for_what_is_missing()
-        return self._result()
+            self._feed(None, len(self._came.stamp) - 1, is_exact=in_step)
+        return self._result(tuple(done))
 
-    # One joint state.
+    @property
+    def _is_over(self) -> bool:
+        return bool(self._end or self._departure)
 
-    def _pass_on(self, k: int, stamp: int) -> None:
-        guard = self._guard
-        if k in self._came.errors:
-            if self._is_out_of_command() or self._is_stop_by_message():
-                self._log.commanded(guard.last_seen, guard.unusable(self._came.errors[k]))
-            return
-        if self._is_out_of_command():
-            self._log.commanded(stamp, guard.answer(stamp, self._came.measurement[k]))
-        elif self._told is None or (stamp in self._told and stamp != self._log.last):
-            self._answer(k, stamp)
-        elif self._is_stop_by(stamp):
-            self._log.commanded(stamp, guard.answer(stamp, self._came.measurement[k]))
-        else:
-            self._passed_over += 1
+    @property
+    def _in_command(self) -> bool:
+        return self._guard.supervisor.phase not in (Phase.SAFE_STOP, Phase.INACTIVE)
 
-    def _answer(self, k: int, stamp: int) -> None:
-        if (
-            self._told is not None
-            and (self._queue or not self._log.last < stamp <= self._lost_from)
-            and self._is_obstructed(stamp)
-        ):
-            return
-        guard = self._guard
-        torque = guard.answer(stamp, self._came.measurement[k])
-        if torque is not None and guard.answered:
-            self._log.answered(k, stamp, torque)
-            return
-        self._log.commanded(stamp, torque)
-        # A state that led to a stop may come once more, after a reset, and be answered then.
-        if self._told is not None and not self._is_stop_by(stamp):
-            self._departure = self._difference(f'answered ({guard.supervisor.text})', stamp)
+    # Between two events.
 
-    def _is_obstructed(self, stamp: int) -> bool:
-        """Whether something is in the way of the law's answer that the bag tells of."""
-        head = self._queue[0] if self._queue else None
-        if stamp <= self._log.last:
-            self._end = f'the stamps begin again with {stamp} ns'
-        elif stamp > self._lost_from:
-            self._end = f'the state of stamp {self._lost} ns was answered but is not in the bag'
-        elif isinstance(head, Stop) and head.reason in OUT_OF_ORDER:
-            return False
-        elif head is not None and head.after < stamp:
-            if isinstance(head, Stop) and head.after in self._came.stamp:
-                self._departure = self._difference(f'stop: {head.reason.value}', head.after)
+    def _locate(self, event: Event) -> tuple[int, bool]:
+        """Number of the last joint state before an event, and whether none before was dropped."""
+        came, processed = self._came, event.messages - self._messages
+        self._messages = event.messages
+        end = self._position + processed
+        if processed == 0 or (end < len(came.stamp) and self._seen(end) == event.stamp):
+            return end, True
+        is_unreadable = _reason(event) in _UNREADABLE
+        for k in range(self._position + 1, len(came.stamp)):
+            is_it = (k in came.errors) == is_unreadable and self._seen(k) == event.stamp
+            if is_it and (k >= end or not self._is_again(k + 1, event.stamp)):
+                return k, False
+        if self._numbers:
+            self._end = f'the state of stamp {event.stamp} ns came but is not in the bag'
+        return self._position, False
+
+    def _seen(self, k: int) -> int:
+        """Stamp of the last readable state up to number k."""
+        while k in self._came.errors:
+            k -= 1
+        return self._came.stamp[k] if k >= 0 else -1
+
+    def _is_again(self, k: int, stamp: int) -> bool:
+        return k < len(self._came.stamp) and self._came.stamp[k] == stamp
+
+    def _feed(self, event: Event | None, end: int, is_exact: bool) -> None:  # noqa: FBT001
+        """Process the joint states up to number `end`, before an event."""
+        for k in range(self._position + 1, end + 1):
+            if self._is_over:
+                return
+            if event is not None and k == end and _reason(event) is Reason.FAILED:
+                continue  # nothing tells how far the law came with this one
+            if self._is_processed(k, event, end, is_exact=is_exact):
+                self._process(k, event, is_exact=is_exact)
             else:
-                self._end = f'the state of stamp {head.after} ns came but is not in the bag'
-        else:
+                self._passed_over += 1
+        self._position = end
+
+    def _is_processed(self, k: int, event: Event | None, end: int, *, is_exact: bool) -> bool:
+        stamp, phase = self._came.stamp[k], self._guard.supervisor.phase
+        if not self._in_command:
+            return True
+        if event is not None and (is_exact or k == end or stamp == event.stamp):
+            return True
+        if k in self._came.errors or stamp == self._last or phase is Phase.STARTING:
             return False
-        return True
+        return self._sampled is None or stamp in self._sampled
 
-    # What was done.
-
-    def _is_out_of_command(self) -> bool:
-        phase = self._guard.supervisor.phase
-        return phase is Phase.SAFE_STOP or phase is Phase.INACTIVE
-
-    def _is_stop_by(self, stamp: int) -> bool:
-        head = self._queue[0] if self._queue else None
-        return isinstance(head, Stop) and head.after == stamp
-
-    def _is_stop_by_message(self) -> bool:
-        head = self._queue[0] if self._queue else None
-        if not isinstance(head, Stop) or head.reason not in UNREADABLE:
-            return False
-        return head.after == self._guard.last_seen
-
-    def _catch_up(self, k: int, stamp: int) -> None:
-        """Take what follows this state."""
+    def _process(self, k: int, event: Event | None, *, is_exact: bool) -> None:
+        guard, stamp = self._guard, self._came.stamp[k]
         if k in self._came.errors:
-            stamp = self._guard.last_seen
-        while self._queue and self._queue[0].after == stamp and self._departure is None:
-            head = self._queue[0]
-            if k + 1 in self._came.errors and self._came.received[k + 1] < head.told:
-                return  # that message has no stamp to tell whether it came before, but came first
-            if isinstance(head, Stop) and head.reason not in SILENT:
-                if self._guard.supervisor.phase is not Phase.SAFE_STOP:
-                    return  # the next message of this stamp may be what leads to it
-                if self._guard.supervisor.reason is not head.reason:
-                    self._departure = self._difference(f'stop: {head.reason.value}', stamp)
-            self._take(self._queue.popleft())
+            torque = guard.reject(self._came.errors[k])
+            self._command(guard.journal.stamp, torque, is_exact=is_exact)
+        elif self._in_command and stamp > self._lost:
+            self._end = f'the state of stamp {self._lost} ns was used but is not in the bag'
+        else:
+            is_due = self._in_command and stamp > self._last
+            is_due = is_due and self._sampled is not None and stamp in self._sampled
+            torque = guard.update(stamp, self._came.measurement[k])
+            if guard.has_sample and stamp <= self._last:
+                self._end = f'the stamps begin again with {stamp} ns'
+                return
+            if guard.has_sample:
+                self._sample(k, stamp)
+            self._command(stamp, torque, is_exact=is_exact)
+            if is_due and not guard.has_sample and not _is_stop(event, stamp):
+                self._depart(f'answered ({guard.supervisor.text})', stamp)
+        if guard.journal.pending and not _is_same(guard.journal.pending[0], event):
+            self._depart_by(guard.journal.pending[0], event)
 
-    def _take(self, event: Event) -> None:
+    def _sample(self, k: int, stamp: int) -> None:
         guard = self._guard
-        self._done.append(event)
-        if isinstance(event, Order):
-            try:
-                event.act(guard)
-            except TrajectoryError as error:
-                self._departure = self._difference(f'trajectory accepted ({error})', event.after)
-        elif event.reason in SILENT:
-            guard.supervisor.stop(event.reason, 'as recorded')
-            self._known = self._log.torques if self._known is None else self._known
-            self._doubt = f'the stop is due to no state: {event.reason.value}'
+        controller, row = guard.controller, len(self._rows)
+        self._last = stamp
+        self._numbers.append(k)
+        self._rows.append(controller.sample_vector.copy())
+        samples = controller.samples
+        if samples == 1 or self._monitor is None:
+            names = estimate_names(self._config)
+            self._monitor = Monitor(self._config.joints, names, controller.settings)
+        if (samples - 1) % DECIMATION == 0:
+            sample = controller.sample
+            message = self._monitor.message(stamp, sample, guard.ratio, sample.bound)
+            self._monitored[row] = message[1]
 
-    def _is_before(self, event: Event) -> bool:
-        return isinstance(event, Order) and event.after < self._first
+    def _command(self, stamp: int, torque: Floats | None, *, is_exact: bool) -> None:
+        if torque is not None:
+            of_law = self._guard.has_sample
+            is_exact = of_law or (is_exact and not self._failed)
+            self._torques.append((stamp, torque.copy(), of_law, is_exact))
 
-    def _look_for_what_is_missing(self) -> None:
-        """Find what the bag tells of and the replay did not come to."""
-        head = self._queue[0] if self._queue else None
-        answered = {self._came.stamp[k] for k in self._log.numbers}
-        missing = (one for one in self._came.stamp if one in (self._told or ()))
-        first = next((one for one in missing if one not in answered), None)
-        if isinstance(head, Stop) and head.after in self._came.stamp:
-            self._departure = self._difference(f'stop: {head.reason.value}', head.after)
-        elif first is not None:
-            self._departure = self._difference('answered', first)
+    # Events.
 
-    def _difference(self, what: str, stamp: int) -> Difference:
-        time = (stamp - self._first) * 1e-9
-        return Difference(TRACKING_ERROR.resolved, what, stamp, time, 1.0, 0.0)
+    def _repeat(self, event: Event) -> None:
+        """Do what the journal says, or see that it has happened."""
+        pending = self._guard.journal.pending
+        is_own = event.type is EventType.START or (
+            event.type is EventType.STOP
+            and _reason(event) not in (Reason.STATE_TIMEOUT, Reason.FAILED)
+        )
+        if not is_own and pending:
+            self._depart_by(pending[0], event)
+            return
+        try:
+            self._act(event)
+        except TrajectoryError as error:
+            self._depart(f'trajectory accepted ({error})', event.stamp)
+            return
+        if not pending or not _is_same(pending[0], event):
+            what = _reason(event).value if event.type is EventType.STOP else ''
+            self._depart(f'{event.type}: {what}' if what else event.type, event.stamp)
+            return
+        own = pending.popleft()
+        self._offsets.append((own.commands, event.commands))
 
-    def _result(self) -> Rerun:
-        log = self._log
-        stamps = np.array(self._came.stamp, dtype=np.int64)[log.numbers]
-        measurement = self._came.measurement[log.numbers]
-        moments, torque, of_law = log.commands()
-        known = len(moments) if self._known is None else self._known
-        doubt = self._doubt or self._end or ('the replay ends there' if self._departure else '')
+    def _act(self, event: Event) -> None:
+        guard, content = self._guard, event.content
+        if event.type in (EventType.ACTIVATE, EventType.RESET):
+            self._failed = False
+            (guard.activate if event.type is EventType.ACTIVATE else guard.reset)()
+        elif event.type is EventType.DEACTIVATE:
+            guard.deactivate()
+        elif event.type is EventType.RELEASE:
+            guard.release()
+        elif event.type is EventType.TRAJECTORY:
+            points = tuple(TrajectoryPoint(**point) for point in content['points'])
+            guard.follow(Trajectory(tuple(content['joints']), points, content['begin']))
+        elif event.type is EventType.PARAMETERS:
+            guard.retune(change(guard.config, content['parameters']))
+        elif event.type is EventType.SILENCE:
+            while guard.watchdog_torques < content['torques']:
+                self._command(event.stamp, guard.time_out(''), is_exact=True)
+            guard.end_silence()
+        elif _reason(event) is Reason.STATE_TIMEOUT:
+            self._command(event.stamp, guard.time_out(content['text']), is_exact=True)
+        elif _reason(event) is Reason.FAILED:
+            self._failed = True
+            guard.journal.stamp = event.stamp
+            self._command(event.stamp, guard.fail(content['text']), is_exact=True)
+
+    def _depart_by(self, own: Event, event: Event | None) -> None:
+        """The replayed controller started or stopped where the recorded one did not, or not so."""
+        text = own.content['text'] if own.type is EventType.STOP else own.type
+        what = f'stop: {_reason(event).value}' if _is_stop(event, own.stamp) else 'answered'
+        self._depart(f'{what} ({text})', own.stamp)
+
+    def _depart(self, what: str, stamp: int) -> None:
+        begin = self._came.stamp[self._numbers[0]] if self._numbers else stamp
+        if self._departure is None:
+            time = (stamp - begin) * 1e-9
+            self._departure = Difference(TRACKING_ERROR.resolved, what, stamp, time, 1.0, 0.0)
+
+    def _result(self, done: tuple[Event, ...]) -> Rerun:
+        settings = self._guard.controller.settings
+        stamps = np.array(self._came.stamp, dtype=np.int64)[self._numbers]
+        measurement = self._came.measurement[self._numbers]
+        rows = np.array(self._rows).reshape(-1, self._guard.controller.sample_vector.size)
+        number = np.arange(len(self._torques))
+        for own, recorded in self._offsets:
+            number[own:] = np.arange(recorded, recorded + len(number) - own)
+        columns = zip(*self._torques, strict=True) if self._torques else ((), (), (), ())
+        stamp, torque, of_law, exact = (np.array(column) for column in columns)
         return Rerun(
-            States(stamps, measurement, self._passed_over, self._lost),
-            log.replayed(),
-            log.monitored,
-            Commands(moments, torque, of_law, known, doubt, self._in_step),
-            tuple(self._done),
+            States(stamps, measurement, self._passed_over),
+            columns_of(rows, settings),
+            self._monitored,
+            Commands(stamp, torque.reshape(-1, settings.n), of_law, exact, number),
+            done,
             self._departure,
             self._end,
         )
+
+
+def _reason(event: Event) -> Reason:
+    return Reason(event.content['reason']) if event.type is EventType.STOP else Reason.NONE
+
+
+def _is_same(own: Event, event: Event | None) -> bool:
+    return event is not None and (own.type, own.stamp, _reason(own)) == (
+        event.type,
+        event.stamp,
+        _reason(event),
+    )
+
+
+def _is_stop(event: Event | None, stamp: int) -> TypeGuard[Event]:
+    return event is not None and event.type is EventType.STOP and event.stamp == stamp
 
 
 def _no_time() -> int:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The joint states of a bag that the controller answered, as it took them."""
+"""The joint states of a bag: those with telemetry of the law, or every message."""
 
 from __future__ import annotations
 
@@ -10,37 +10,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from blf_dsc_controller.bags.batch import decode_joint_states
-from blf_dsc_controller.bags.content import Content, TopicMessages
+from blf_dsc_controller.bags.content import Content
 from blf_dsc_controller.bags.errors import UnreadableMessageError
 from blf_dsc_controller.messages.decoders import JointStateDecoder
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.topics import JOINT_STATES, LEARNING, REFERENCE, TRACKING_ERROR
 from blf_dsc_controller.run import Floats, Stamps
 
-_TOLD_OF_EACH = (TRACKING_ERROR, REFERENCE, LEARNING)
-
 
 @dataclass(frozen=True)
 class States:
-    """N answered states of n joints.
+    """N joint states of n joints that the law uses.
 
     Attributes:
         stamp: (N,) [ns], increasing.
         measurement: [q (n,) rad, dq (n,) rad/s, torque of the last interval (n,) N m] (N, 3 n).
-        passed_over: states that were not answered: repeated, or overtaken by the next.
-        lost: stamp [ns] of the first state that was answered but is not in the bag; the law's
-            state cannot be told from there on, and the states end before it.
+        passed_over: number of states that the law did not use.
     """
 
     stamp: Stamps
     measurement: Floats
     passed_over: int = 0
-    lost: int | None = None
-
-    def until(self, stamp: int) -> States:
-        """The states before a stamp [ns]."""
-        kept = self.stamp < stamp
-        return replace(self, stamp=self.stamp[kept], measurement=self.measurement[kept])
 
     @property
     def time(self) -> Floats:
@@ -53,84 +43,71 @@ class States:
         return float(self.time[-1]) if self.stamp.size else 0.0
 
 
-def answered_states(
-    content: Content, joints: Sequence[str], required: Sequence[str] = ('position', 'velocity')
-) -> States:
-    """Take the answered states from a bag; all of them, if its telemetry does not tell which.
+def law_states(content: Content, joints: Sequence[str]) -> States:
+    """Return the states with telemetry of the law; all of them if the bag has no telemetry.
 
     Args:
         content: of the bag.
         joints: the n names that they have in the bag.
-        required: fields that the controller asks for.
 
     Raises:
         UnreadableMessageError: a state cannot be decoded, or a joint is not in it.
     """
-    stamp, values = decode_joint_states(content.topics[JOINT_STATES], joints, required)
-    increasing = stamp > np.maximum.accumulate(np.concatenate([[-1], stamp[:-1]]))
-    told = told_stamps(content)
-    kept = increasing if told is None else increasing & np.isin(stamp, told)
-    lost = None
-    if told is not None:
-        absent = np.setdiff1d(told, stamp)
-        lost = int(absent[0]) if absent.size else None
-    if lost is not None:
-        kept &= stamp < lost
-    passed_over = int(np.count_nonzero(~kept)) if lost is None else 0
-    return States(stamp[kept], values[kept].reshape(-1, 3 * len(joints)), passed_over, lost)
+    stamp, values = decode_joint_states(content.topics[JOINT_STATES], joints)
+    kept = stamp > np.maximum.accumulate(np.concatenate([[-1], stamp[:-1]]))
+    sampled = sampled_stamps(content)
+    if sampled is not None:
+        kept &= np.isin(stamp, sampled)
+        kept &= stamp < np.append(np.setdiff1d(sampled, stamp), np.iinfo(np.int64).max)[0]
+    measurement = values[kept].reshape(-1, 3 * len(joints))
+    return States(stamp[kept], measurement, int(np.count_nonzero(~kept)))
 
 
-def told_stamps(content: Content) -> Stamps | None:
-    """Stamps of the states that the controller tells of; one topic may have what another lost."""
-    told = [
+def sampled_stamps(content: Content) -> Stamps | None:
+    """Stamps of the states with telemetry of the law; one topic may have what another lost."""
+    stamps = [
         decode_joint_states(content.topics[topic], (), ())[0]
-        for topic in _TOLD_OF_EACH
+        for topic in (TRACKING_ERROR, REFERENCE, LEARNING)
         if topic in content.topics
     ]
-    return np.unique(np.concatenate(told)) if told else None
+    return np.unique(np.concatenate(stamps)) if stamps else None
 
 
 @dataclass(frozen=True)
 class Arrivals:
-    """Every joint state of a bag as it came, also those that nobody can use.
+    """Every joint-state message of a bag, readable or not.
 
     Attributes:
-        stamp: of each [ns]; 0 where the message cannot be read.
+        stamp: of each [ns]; 0 for an unreadable message.
         measurement: (N, 3 n) as in `States`.
-        errors: why a message cannot be read, by its number.
-        received: when the recorder got each [ns].
+        errors: why a message is unreadable, by its number.
     """
 
     stamp: list[int]
     measurement: Floats
     errors: Mapping[int, MessageError]
-    received: list[int]
 
 
 def arrivals(
     content: Content, joints: Sequence[str], required: Sequence[str], until: int
 ) -> Arrivals:
-    """Take the joint states that the recorder received before `until` [ns].
+    """Decode every joint state that was received before `until` [ns].
 
     Raises:
         UnreadableMessageError: not one of them can be read.
     """
     recorded = content.topics[JOINT_STATES]
     count = bisect_left(recorded.received, until)
-    taken = replace(recorded, received=recorded.received[:count], raw=recorded.raw[:count])
+    recorded = replace(recorded, received=recorded.received[:count], raw=recorded.raw[:count])
     try:
-        stamp, values = decode_joint_states(taken, joints, required)
+        stamps, values = decode_joint_states(recorded, joints, required)
     except UnreadableMessageError:
-        return _one_by_one(taken, joints, required)
-    return Arrivals(stamp.tolist(), values.reshape(count, -1), {}, taken.received)
-
-
-def _one_by_one(
-    recorded: TopicMessages, joints: Sequence[str], required: Sequence[str]
-) -> Arrivals:
+        pass
+    else:
+        return Arrivals(stamps.tolist(), values.reshape(count, -1), {})
     decoder = JointStateDecoder(joints, required)
-    stamp = [0] * len(recorded.raw)
-    measurement = np.zeros((len(recorded.raw), 3 * len(joints)))
+    stamp = [0] * count
+    measurement = np.zeros((count, 3 * len(joints)))
     errors: dict[int, MessageError] = {}
     for k, raw in enumerate(recorded.raw):
         try:
@@ -138,6 +115,6 @@ def _one_by_one(
             measurement[k] = decoder.values
         except MessageError as error:
             errors[k] = error
-    if len(errors) == len(recorded.raw):
+    if len(errors) == count:
         raise UnreadableMessageError(recorded.name, 0, errors[0])
-    return Arrivals(stamp, measurement, errors, recorded.received)
+    return Arrivals(stamp, measurement, errors)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When to play which message: speed, pause, single steps and loops, without ROS or a clock.
+"""Which message to play when: rate, pause, single steps and loops.
 
-All times are integers [ns]; those of the bag and those of the caller's steady clock.
+All times are integers [ns], of the bag or of the caller's steady clock.
 """
 
 from __future__ import annotations
@@ -10,19 +10,15 @@ from collections.abc import Sequence
 
 
 class Timeline:
-    """Position in a bag as time goes by.
-
-    Args:
-        times: of the messages, in their order [ns].
-        rate: bag time per time; 0: as fast as possible.
-        loop: whether to begin again at the end.
+    """Position in a bag over time.
 
     Attributes:
-        paused: whether only `step` moves on.
-        next: number of the message that is due next.
+        paused: whether only `step` advances.
+        next: number of the next message.
     """
 
     def __init__(self, times: Sequence[int], rate: float, *, loop: bool = False) -> None:
+        """Start at the first of the messages' `times` [ns]; rate 0 is as fast as possible."""
         self._times = times
         self._rate = rate
         self._loop = loop
@@ -33,7 +29,7 @@ class Timeline:
 
     @property
     def is_over(self) -> bool:
-        """Whether there is nothing left to play."""
+        """Whether no message is left."""
         return self.next >= len(self._times) and not (self._loop and self._times)
 
     def position(self, now: int) -> int:
@@ -45,15 +41,15 @@ class Timeline:
         return self._bag + round((now - self._now) * self._rate)
 
     def pause(self, now: int) -> None:
-        """Stay where it is."""
+        """Hold the position."""
         self._bag, self.paused = self.position(now), True
 
     def resume(self, now: int) -> None:
-        """Go on from where it is."""
+        """Continue from the position."""
         self._bag, self._now, self.paused = self.position(now), now, False
 
     def step(self) -> int | None:
-        """Number of the next message, which is then played; None unless paused, or at the end."""
+        """Advance by a message and return its number; None unless paused, or at the end."""
         if not self.paused or self.is_over:
             return None
         self._wrap()
@@ -63,7 +59,7 @@ class Timeline:
         return number
 
     def due(self, now: int, most: int) -> range:
-        """Numbers of the messages to play by now, at most so many at once."""
+        """Advance to now and return the numbers of the messages to play, at most `most`."""
         if self._now is None:
             self._now = now
         if self.paused or self.is_over:

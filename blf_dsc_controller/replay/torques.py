@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The torques that acted on the arm, wherever a bag tells them."""
+"""The applied torques, from whichever topic of a bag holds them."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 
 from blf_dsc_controller.bags.batch import array_size, decode_arrays, decode_joint_states
 from blf_dsc_controller.bags.content import Content, TopicMessages
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.cdr import JointStateLayout
 from blf_dsc_controller.messages.decoders import columns_of
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE, JOINT_STATES, TRACKING_ERROR
-from blf_dsc_controller.replay.errors import NoCommandOrderError, NoTorqueError
 from blf_dsc_controller.replay.states import States
 from blf_dsc_controller.run import Floats, Series, Stamps
 
@@ -21,19 +21,13 @@ from blf_dsc_controller.run import Floats, Series, Stamps
 def applied_torque(
     path: Path, content: Content, states: States, joints: Sequence[str]
 ) -> tuple[Floats, str]:
-    """Torque from each state to the next (N, n) [N m], and in words where it comes from.
+    """Torque from each of the n joints' states to the next (N, n) [N m], and its topic.
 
-    The limited torque that the controller told, or else the commands, or else the effort of the
-    next state.
-
-    Args:
-        path: of the bag, for messages.
-        content: of the bag.
-        states: answered states of the n joints.
-        joints: their names in the bag.
+    In this order: the saturated torque of the controller's telemetry, the commands, the effort of
+    the next state.
 
     Raises:
-        NoTorqueError: the bag does not tell.
+        BlfDscError: the bag holds none of them.
     """
     if TRACKING_ERROR in content.topics:
         recorded = content.topics[TRACKING_ERROR]
@@ -45,7 +39,11 @@ def applied_torque(
         return _commanded(content, recorded, states, joints), recorded.name
     effort = states.measurement[:, 2 * len(joints) :]
     if np.isnan(effort).all():
-        raise NoTorqueError(path)
+        reason = (
+            f'{path} does not hold the torques: there is no topic of commands (name it: --map '
+            'commands=/its/name) and the effort of the joint states is empty'
+        )
+        raise BlfDscError(reason)
     last = np.full((1, len(joints)), np.nan)
     return np.vstack([effort[1:], last]), f'effort of {content.topics[JOINT_STATES].name}'
 
@@ -53,7 +51,7 @@ def applied_torque(
 def _commanded(
     content: Content, recorded: TopicMessages, states: States, joints: Sequence[str]
 ) -> Floats:
-    """Command of each state: the k-th if there are as many, else the last that had come."""
+    """Command after each state: the k-th, or the last before the next state if counts differ."""
     torque = _values(content, recorded, joints)
     if len(recorded.raw) == states.stamp.size:
         return torque
@@ -62,7 +60,6 @@ def _commanded(
     came = np.array(recorded.received, dtype=np.int64)
     of_state = dict(zip(stamp.tolist(), received.tolist(), strict=True))
     moments: Stamps = np.array([of_state[one] for one in states.stamp.tolist()], dtype=np.int64)
-    # What acts until the next state is what comes before it.
     until = np.append(moments[1:], np.iinfo(np.int64).max)
     index = np.searchsorted(came, until) - 1
     held = torque[np.maximum(index, 0)]
@@ -78,5 +75,9 @@ def _values(content: Content, recorded: TopicMessages, joints: Sequence[str]) ->
     values = decode_arrays(recorded, size)
     names = JointStateLayout.parse(content.topics[JOINT_STATES].raw[0]).names
     if values is None or size not in (len(joints), len(names)):
-        raise NoCommandOrderError(recorded.name, size, len(joints), names)
+        reason = (
+            f'{recorded.name} has {size} values, but there are {len(joints)} joints, and '
+            f'{len(names)} in the joint states ({", ".join(names)}): their order is not known'
+        )
+        raise BlfDscError(reason)
     return values if size == len(joints) else values[:, columns_of(joints, names)]

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +12,11 @@ from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.params_file import dumps
 from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.factory import estimate_names, model_of
 from blf_dsc_controller.law.rejected_columns import refusals
 from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.journal import Event, EventType, Journal
 from blf_dsc_controller.messages.monitor import Monitor
 from blf_dsc_controller.messages.telemetry import (
     DECIMATION,
@@ -72,6 +74,8 @@ def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, M
     controller = ControllerTelemetry(config.joints, estimate_names(config))
     monitor = Monitor(config.joints, estimate_names(config), record.controller.settings)
     limit = np.array(config.torque.limit)
+    for event in _events(config):
+        yield START, (topics.JOURNAL, event.encode())
     ratio = np.zeros(record.joints)
     bound = np.zeros(record.joints)
     for row, elapsed in enumerate(record.stamps.tolist()):
@@ -88,3 +92,13 @@ def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, M
         if row % DECIMATION == 0:
             yield stamp, plant.truth(stamp, record.truths[row])
             yield stamp, monitor.message(stamp, told, ratio, bound)
+
+
+def _events(config: ControllerConfig) -> Iterable[Event]:
+    """The run from the first state on, without any other event."""
+    journal = Journal()
+    journal.note(EventType.CONFIGURE, parameters=flatten(config))
+    journal.note(EventType.ACTIVATE)
+    journal.stamp, journal.messages = START, 1
+    journal.note(EventType.START, resumed=False)
+    return journal.pending

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is worth a warning before the start: gains, limits and windows that cannot do their work.
+"""Warnings before the start: gains, limits and windows that are valid but cannot work well.
 
-None of it is forbidden: the figures rest on the first estimate of the parameters, which is a guess.
-doc/tuning.md says where each of them comes from.
+They rest on the initial estimate of the parameters, which is a guess. doc/tuning.md derives them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,64 +15,58 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.settings import FILTERED, LINEAR, NEWTON, Settings
-from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import reference_of
+from blf_dsc_controller.reference.terms import sampled
 
 Floats = NDArray[np.float64]
 
-_POINTS = 400  # of the reference that is looked at
+_POINTS = 400  # on the reference
 _LONGEST = 120.0  # s of it
-_MARGIN = 1.25  # of torque, beside what the reference needs
+_MARGIN = 1.25  # of torque beyond what the reference needs
 _PERIODS = 0.02  # by which a window may miss a whole number of periods
 _CLOSE = 0.8  # of the bound
 _SETTLED = 10.0  # time constants of the filter (8) ...
-_FILTERED = 4.0  # ... and of the regressor's, through which both sides of the identity pass
+_FILTERED = 4.0  # ... and of the regressor's, which both sides of the identity pass
 
 
-@dataclass(frozen=True)
-class Rehearsal:
-    """The reference, followed exactly with the first estimate.
+class ReferenceLoad(NamedTuple):
+    """What the reference demands, followed exactly with the initial estimate."""
 
-    Attributes:
-        torque: largest torque it needs (n,) [N m].
-        rate: largest eigenvalue of M^-1 K_p [1/s].
-        excitation: mean of H^T H (p, p).
-    """
-
-    torque: Floats
-    rate: float
-    excitation: Floats
+    torque: Floats  # largest magnitude (n,), N m
+    rate: float  # largest eigenvalue of M^-1 K_p, 1/s
+    excitation: Floats  # mean of H^T H (p, p)
 
 
-def concerns(config: ControllerConfig, q: Floats | None = None) -> list[str]:
-    """Warnings in words, each with the parameter to look at first; empty where all is well.
+def config_warnings(config: ControllerConfig, q: Floats | None = None) -> list[str]:
+    """Warnings, a sentence each that begins with the parameter to change first.
 
-    Args:
-        config: of the controller.
-        q: measured positions at the start (n,) [rad], if they are known.
+    `q` (n,) [rad] are the measured positions at the start, if known.
     """
     settings = settings_of_config(config)
-    rehearsal = rehearse(config, settings)
+    load = reference_load(config, settings)
     found = list(_of_start(config, q))
-    found += _of_torque(config, rehearsal)
-    found += _of_feedback(config, settings, rehearsal)
+    found += _of_torque(config, load)
+    found += _of_feedback(config, settings, load)
     if settings.surface != LINEAR:
         found += _of_surface(config, settings)
     if settings.surface != LINEAR and settings.kappa > 0.0 and settings.Gamma.any():
-        found += _of_update(config, settings, rehearsal)
-        found += _of_window(config, settings, rehearsal)
+        found += _of_update(config, settings, load)
+        found += _of_window(config, settings, load)
     return found
 
 
-def rehearse(config: ControllerConfig, settings: Settings) -> Rehearsal:
-    """Follow the reference in thought, over its slowest period."""
+def reference_load(config: ControllerConfig, settings: Settings) -> ReferenceLoad:
+    """Evaluate the dynamics along the reference, over its slowest period."""
     P = settings.initial_estimate[: settings.p]
-    horizon = _horizon(config)
+    frequencies = [w for w in config.reference.frequency if w > 0.0]
+    horizon = min(float(2.0 * np.pi / min(frequencies, default=1.0)), _LONGEST)
+    if config.reference.type == 'waypoints':
+        horizon = max(config.reference.times)
     H, Yp, Yr = np.zeros((3, settings.n, settings.p))
     torque, rate = np.zeros(settings.n), 0.0
     excitation = np.zeros((settings.p, settings.p))
     moments = np.linspace(0.0, horizon, _POINTS, endpoint=False)
-    for q, dq, ddq in reference.sampled(reference_of(config), moments):
+    for q, dq, ddq in sampled(reference_of(config), moments):
         settings.model.regressor(q, dq, dq, ddq, H)
         torque = np.maximum(torque, np.abs(H @ P))
         excitation += H.T @ H / _POINTS
@@ -84,21 +77,13 @@ def rehearse(config: ControllerConfig, settings: Settings) -> Rehearsal:
         if np.linalg.eigvalsh(M)[0] > 0.0:
             roots = np.linalg.eigvals(np.linalg.solve(M, np.diag(settings.Kp)))
             rate = max(rate, float(np.abs(roots).max()))
-    return Rehearsal(torque, rate, excitation)
-
-
-def _horizon(config: ControllerConfig) -> float:
-    told = config.reference
-    if told.type == 'waypoints':
-        return max(told.times)
-    slowest = min((w for w in told.frequency if w > 0.0), default=1.0)
-    return min(float(2.0 * np.pi / slowest), _LONGEST)
+    return ReferenceLoad(torque, rate, excitation)
 
 
 def _of_start(config: ControllerConfig, q: Floats | None) -> Iterator[str]:
     if q is None or config.reference.type == 'hold':
         return
-    ((qr, _, _),) = reference.sampled(reference_of(config), np.zeros(1))
+    ((qr, _, _),) = sampled(reference_of(config), np.zeros(1))
     for joint, error, bound in zip(config.joints, q - qr, config.barrier.widest, strict=True):
         if _CLOSE * bound <= abs(error) < bound:
             yield (
@@ -107,10 +92,8 @@ def _of_start(config: ControllerConfig, q: Floats | None) -> Iterator[str]:
             )
 
 
-def _of_torque(config: ControllerConfig, rehearsal: Rehearsal) -> Iterator[str]:
-    for joint, need, limit in zip(
-        config.joints, rehearsal.torque, config.torque.limit, strict=True
-    ):
+def _of_torque(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
+    for joint, need, limit in zip(config.joints, load.torque, config.torque.limit, strict=True):
         if limit < _MARGIN * need:
             yield (
                 f'torque.limit: {joint} is given {limit:g} N m, but by learning.initial_estimate '
@@ -120,20 +103,20 @@ def _of_torque(config: ControllerConfig, rehearsal: Rehearsal) -> Iterator[str]:
 
 
 def _of_feedback(
-    config: ControllerConfig, settings: Settings, rehearsal: Rehearsal
+    config: ControllerConfig, settings: Settings, load: ReferenceLoad
 ) -> Iterator[str]:
-    product = rehearsal.rate * config.sample_time
+    product = load.rate * config.sample_time
     if product > 1.0:
         yield (
-            f'feedback.gain: K_p over the inertia is {rehearsal.rate:.3g} 1/s by '
+            f'feedback.gain: K_p over the inertia is {load.rate:.3g} 1/s by '
             f'learning.initial_estimate, {product:.2g} of a sample time of '
             f'{config.sample_time:g} s: from 1 on the sampled loop has little left for a delay, '
             f'and from 2 on it chatters between the limits: lower the gain or the sample time'
         )
-    share = float(np.max(settings.gamma * config.sample_time / np.maximum(settings.Kp, 1e-12)))
-    if share > 0.5:
+    fraction = float(np.max(settings.gamma * config.sample_time / np.maximum(settings.Kp, 1e-12)))
+    if fraction > 0.5:
         yield (
-            f'disturbance.gain: the disturbance estimate takes up {share:.2g} of the velocity '
+            f'disturbance.gain: the disturbance estimate takes up {fraction:.2g} of the velocity '
             f'feedback in each sample, more than half: it will oscillate against feedback.gain'
         )
 
@@ -163,13 +146,13 @@ def _of_surface(config: ControllerConfig, settings: Settings) -> Iterator[str]:
             )
 
 
-def _of_update(config: ControllerConfig, settings: Settings, rehearsal: Rehearsal) -> Iterator[str]:
+def _of_update(config: ControllerConfig, settings: Settings, load: ReferenceLoad) -> Iterator[str]:
     T = config.sample_time
     Gamma = float(settings.Gamma[: settings.p].max())
     if settings.update == NEWTON:
         step, what = settings.kappa * Gamma * T, 'kappa Gamma T'
     else:
-        largest = float(np.linalg.eigvalsh(rehearsal.excitation)[-1])
+        largest = float(np.linalg.eigvalsh(load.excitation)[-1])
         step, what = settings.kappa * Gamma * T * largest, 'kappa Gamma lambda_max(Phi) T'
     if step > 1.0:
         yield (
@@ -183,9 +166,9 @@ def _of_update(config: ControllerConfig, settings: Settings, rehearsal: Rehearsa
         )
 
 
-def _of_window(config: ControllerConfig, settings: Settings, rehearsal: Rehearsal) -> Iterator[str]:
+def _of_window(config: ControllerConfig, settings: Settings, load: ReferenceLoad) -> Iterator[str]:
     learning = config.learning
-    least = float(np.linalg.eigvalsh(rehearsal.excitation)[0])
+    least = float(np.linalg.eigvalsh(load.excitation)[0])
     if least < settings.sigma:
         yield (
             f'learning.excitation_threshold: the reference excites the parameters by '

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The words for what the controller is doing, what was done to it, and why it stopped."""
+"""Phases of the controller and reasons of its safe stops, with their published names."""
 
 from __future__ import annotations
 
@@ -7,26 +7,17 @@ from enum import Enum
 
 
 class Phase(Enum):
-    """What the controller is doing; the value is what `~/state` says."""
+    """What the controller is doing."""
 
-    INACTIVE = 'inactive'  # not in command: ramped, or ramping, to the safe torque
-    STARTING = 'starting'  # waiting for the first state to start from
+    INACTIVE = 'inactive'  # not in command: the safe torque, or on the ramp to it
+    STARTING = 'starting'  # waiting for the first joint state
     APPROACHING = 'approaching'  # on the way to the reference
     TRACKING = 'tracking'
-    SAFE_STOP = 'safe stop'  # the safe torque until reset or activated again
-
-
-class Operation(Enum):
-    """What an operator did last; the value is what `~/state` says."""
-
-    NONE = 'none'
-    ACTIVATE = 'activate'
-    DEACTIVATE = 'deactivate'
-    RESET = 'reset'
+    SAFE_STOP = 'safe stop'  # the safe torque until the next reset or activation
 
 
 class Reason(Enum):
-    """Why the controller stopped; the value is what `~/state` says."""
+    """Why the controller stopped."""
 
     NONE = 'none'
     STATE_TIMEOUT = 'state timeout'
@@ -40,7 +31,7 @@ class Reason(Enum):
     FIELD_MISSING = 'field missing'
     NOT_FINITE = 'measurement not finite'
     VELOCITY = 'velocity not plausible'
-    START_REFUSED = 'start refused'
+    START_REJECTED = 'start rejected'
     OUTSIDE_BOUND = 'error past the bound'
     SATURATED = 'torque saturated'
     OVERRUN = 'loop overrun'

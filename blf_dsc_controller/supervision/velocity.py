@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Velocity of the joints where it is not measured: the difference of two positions."""
+"""Joint velocities from positions, for arms that do not measure them."""
 
 from __future__ import annotations
 
@@ -10,12 +10,7 @@ Vector = NDArray[np.float64]
 
 
 class Velocity:
-    """Fills in velocities, if so configured.
-
-    Args:
-        source: `measured` leaves the velocities as they come; `estimated` replaces them.
-        n: joints.
-    """
+    """Replaces velocities by difference quotients if the source is `estimated`, not `measured`."""
 
     def __init__(self, source: str, n: int) -> None:
         self._estimated = source == 'estimated'
@@ -23,12 +18,12 @@ class Velocity:
         self._q = np.zeros(n)
         self._dq = np.zeros(n)
 
-    def forget(self) -> None:
-        """The next state is the first: the arm is taken to be at rest there."""
+    def reset(self) -> None:
+        """Forget the last state: the arm is taken to be at rest in the next one."""
         self._stamp = -1
 
     def replace(self, stamp: int, q: Vector, dq: Vector) -> None:
-        """Overwrite dq (n,) [rad/s] by the difference of q (n,) [rad] and the last positions."""
+        """Overwrite dq (n,) [rad/s] by the difference quotient of q (n,) [rad]; stamp in ns."""
         if not self._estimated:
             return
         if self._stamp < 0:

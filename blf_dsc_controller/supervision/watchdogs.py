@@ -1,41 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is summed up over many samples: saturation, missed states, silence."""
+"""Watchdogs over many samples: saturation, missed states, silence."""
 
 from __future__ import annotations
 
-LOOK = 0.008
-"""Time [s] from one look at the steady clock to the next while it is silent."""
+PERIOD = 0.008
+"""Time [s] between two checks of the steady clock during a silence."""
 
-_MARGIN = 0.001  # s, after which what was due has come or is late
+_MARGIN = 0.001  # s past the limit, for a state that is on its way
 _NANO = 1e-9
 
 
 class Saturation:
-    """Time for which some torque has been at its limit without a break.
+    """Samples with a torque at its limit.
 
     Attributes:
-        lasted: that time [s].
-        count: samples at the limit since the start.
+        lasted: time without a break [s].
+        count: samples since the start.
     """
 
     def __init__(self) -> None:
         self.lasted = 0.0
         self.count = 0
 
-    def take(self, dt: float, *, saturated: bool) -> None:
-        """Take note of one sample of `dt` [s]."""
+    def count_sample(self, dt: float, *, saturated: bool) -> None:
+        """Count one sample of `dt` [s]."""
         self.lasted = self.lasted + dt if saturated else 0.0
         self.count += saturated
 
 
 class Overruns:
-    """Part of the states that were missed, averaged exponentially.
+    """Joint states that the stamps jump over, averaged exponentially.
 
-    Missed are the states that the stamps jump over: the loop, the network or the arm's driver was
-    too slow.  It is counted in the plant's time, so that a slow computer in lock-step misses none.
+    Counted in the plant's time: a slow computer in lock-step misses none.
 
     Attributes:
-        fraction: missed part, from 0 to 1.
+        fraction: of the states that were missed, from 0 to 1.
         count: states missed since the start.
     """
 
@@ -43,8 +42,8 @@ class Overruns:
         self.fraction = 0.0
         self.count = 0
 
-    def take(self, samples: int, memory: float) -> None:
-        """Take note of a state that is `samples` after the last; `memory` is in samples."""
+    def count_sample(self, samples: int, memory: float) -> None:
+        """Count a state that is `samples` after the last; `memory` is in samples."""
         keep = 1.0 - min(1.0, 1.0 / memory)
         self.fraction *= keep
         if samples > 1:
@@ -54,37 +53,33 @@ class Overruns:
 
 
 class Silence:
-    """Watches the steady clock between two states.
+    """Time on the steady clock since the last joint state.
 
-    A watch that was itself late proves nothing, because the states may wait in the queue behind
-    it: then the verdict is left to the next look.
+    A check that is itself late proves nothing, since states may wait in the queue behind it; the
+    next one decides.
 
     Attributes:
-        next_look: time [s] from the last look to the next: as soon as it could have become silent.
+        next_check: time [s] from the last check to the next.
     """
 
     def __init__(self) -> None:
-        self.next_look = LOOK
+        self.next_check = PERIOD
         self._last_state = -1
-        self._last_look = -1
+        self._last_check = -1
 
-    def state(self, now: int) -> None:
-        """Take note of a state at `now` [ns, steady clock]."""
+    def restart(self, now: int = -1) -> None:
+        """Count from a state at `now` [ns]; without one, from the next state on."""
         self._last_state = now
 
-    def forget(self) -> None:
-        """Wait for a state without counting the time."""
-        self._last_state = -1
-
-    def look(self, now: int, limit: float) -> float:
-        """Return for how long it has been silent past `limit` [s]; 0 if it has not.
+    def check(self, now: int, limit: float) -> float:
+        """Return the length of a silence [s] past `limit` [s], else 0.
 
         Args:
-            now: steady clock [ns], `next_look` after the last look.
+            now: steady clock [ns], `next_check` after the last check.
             limit: longest time between two states [s].
         """
-        is_late = (now - self._last_look) * _NANO > self.next_look + LOOK
-        self._last_look = now
+        is_late = (now - self._last_check) * _NANO > self.next_check + PERIOD
+        self._last_check = now
         silent = (now - self._last_state) * _NANO if self._last_state >= 0 else 0.0
-        self.next_look = limit - silent + _MARGIN if silent <= limit else LOOK
+        self.next_check = limit - silent + _MARGIN if silent <= limit else PERIOD
         return silent if silent > limit and not is_late else 0.0

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`~/journal`: every event of the controller as JSON in a std_msgs/String, one message each.
+
+With the journal and the joint states, a replay repeats a run exactly: an event takes effect after
+so many joint-state messages, the last of which has a known stamp.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages.topics import JOURNAL
+from blf_dsc_controller.messages.types import typestore
+
+
+class EventType(StrEnum):
+    """What happened, with the content of its event."""
+
+    CONFIGURE = 'configure'  # parameters: all of them by name
+    ACTIVATE = 'activate'
+    START = 'start'  # the law takes the first joint state; resumed: along the running reference
+    TRAJECTORY = 'trajectory'  # joints, points, begin: the accepted `Request`
+    PARAMETERS = 'parameters'  # parameters: the changed ones by name
+    STOP = 'stop'  # reason, text
+    SILENCE = 'silence'  # torques: commanded by the watchdog before the next message
+    DEACTIVATE = 'deactivate'
+    RESET = 'reset'
+    RELEASE = 'release'
+
+
+class Event(NamedTuple):
+    """One event."""
+
+    number: int  # since the controller was configured
+    type: EventType
+    stamp: int  # of the last joint state before it [ns]; -1 before the first
+    messages: int  # joint-state messages processed by then, readable or not
+    commands: int  # torques commanded by then
+    content: dict[str, Any]
+
+    def encode(self) -> bytes:
+        """Return the serialised std_msgs/String."""
+        text = json.dumps(self._asdict())
+        message = typestore().types[JOURNAL.type](data=text)
+        return bytes(typestore().serialize_cdr(message, JOURNAL.type))
+
+
+def decode(raw: bytes) -> Event:
+    """Return the event of a serialised message.
+
+    Raises:
+        BlfDscError: it holds no event.
+    """
+    try:
+        message: Any = typestore().deserialize_cdr(raw, JOURNAL.type)
+        event = Event(**json.loads(message.data))
+        return event._replace(type=EventType(event.type))
+    except Exception as error:
+        reason = f'a message of {JOURNAL.resolved} holds no event: {error}'
+        raise BlfDscError(reason) from error
+
+
+class Journal:
+    """Notes the events of a controller until they are published.
+
+    Attributes:
+        stamp, messages, commands: as in `Event`, up to now.
+        pending: events that have not been published yet.
+    """
+
+    def __init__(self) -> None:
+        self.stamp = -1
+        self.messages = 0
+        self.commands = 0
+        self.pending: deque[Event] = deque()
+        self._number = 0
+
+    def note(self, event: EventType, **content: Any) -> None:
+        """Add an event that happens now."""
+        one = Event(self._number, event, self.stamp, self.messages, self.commands, content)
+        self._number += 1
+        self.pending.append(one)
