@@ -159,7 +159,7 @@ def test_an_unexpected_error_is_replayed_as_a_stop(tmp_path):
     rig.guard.journal.messages += 1  # as far as the message came
     rig.guard.journal.stamp = stamp
     rig._command(rig.guard.fail('ZeroDivisionError: x'))
-    rig.plant.step(rig.reception.torque)
+    rig.plant.step(rig.input.torque)
     rig.step(30)
     rig.guard.reset()
     rig.step(30)
