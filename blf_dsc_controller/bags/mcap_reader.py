@@ -49,7 +49,7 @@ class MalformedRecordError(ValueError):
 
 
 class _Stream(ReadDataStream):
-    """Does not return less than it was asked for."""
+    """Raises where the end comes before `length` bytes."""
 
     def read(self, length: int) -> bytes:
         data = super().read(length)

@@ -17,6 +17,7 @@ from blf_dsc_controller.bags.metadata import (
     TopicInformation,
     quality_text,
 )
+from blf_dsc_controller.messages.types import Definition
 
 COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
 CHANNEL_RECORD = 'blf_dsc_controller channel '
@@ -68,9 +69,7 @@ class McapFile:
         """Store a text of this time [ns] as an attachment."""
         self._writer.add_attachment(log_time, log_time, name, media_type, text.encode())
 
-    def add_channel(
-        self, topic: TopicInformation, definition: str, encoding: str = 'ros2msg'
-    ) -> int:
+    def add_channel(self, topic: TopicInformation, definition: Definition) -> int:
         """Add a topic and return its number within the file.
 
         It is stored in the chunk of its first message, in the index at the end, and in a record of
@@ -78,7 +77,7 @@ class McapFile:
         """
         if topic.type not in self._schemas:
             self._schemas[topic.type] = self._writer.register_schema(
-                topic.type, encoding, definition.encode()
+                topic.type, definition.encoding, definition.text.encode()
             )
         metadata = {
             'offered_qos_profiles': quality_text(topic.offered),

@@ -19,7 +19,7 @@ from blf_dsc_controller.bags.metadata import parse_qualities
 from blf_dsc_controller.bags.salvage import Loss, Salvage
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.messages.errors import UnknownTypeError
-from blf_dsc_controller.messages.types import definition
+from blf_dsc_controller.messages.types import Definition, definition
 
 
 @dataclass
@@ -126,17 +126,16 @@ class _Transfer:
         if not type_name:
             return None
         try:
-            text, type_hash = definition(type_name)
+            known = definition(type_name)
         except UnknownTypeError:
-            text, type_hash = '', ''
-        encoding = 'ros2msg'
+            known = Definition('', '')
         if schema is not None and schema.data:
-            text, encoding = schema.data.decode(errors='replace'), schema.encoding
+            text = schema.data.decode(errors='replace')
+            known = known._replace(text=text, encoding=schema.encoding)
+        if channel.metadata.get('topic_type_hash'):
+            known = known._replace(hash=channel.metadata['topic_type_hash'])
         offered = parse_qualities(channel.metadata.get('offered_qos_profiles', ''))
-        type_hash = channel.metadata.get('topic_type_hash') or type_hash
-        handle = self._bag.add_topic(
-            channel.topic, type_name, offered, text=text, hash_=type_hash, encoding=encoding
-        )
+        handle = self._bag.add_topic(channel.topic, type_name, offered, known)
         self._handles[channel.topic] = handle
         self.missing[channel.topic] = Losses(len(offered))
         return handle

@@ -199,7 +199,7 @@ def format_time(stamp: int) -> str:
 def _check_record(data: Data, at: int) -> tuple[int, int]:
     """Opcode and end of a record whose content fits its length, or MalformedRecordError.
 
-    Where the content does not tell its length, another record must follow.
+    Where the content does not determine its length, another record must follow.
     """
     opcode, end = record_head(data, at)
     content_at = at + HEAD.size

@@ -8,18 +8,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from types import TracebackType
 
 from blf_dsc_controller.bags.context import ATTACHMENT, RECORD, facts_of
 from blf_dsc_controller.bags.errors import BagError, DiskFullError
 from blf_dsc_controller.bags.mcap_writer import McapFile
 from blf_dsc_controller.bags.metadata import BagInformation, TopicInformation
 from blf_dsc_controller.messages.topics import Quality
-from blf_dsc_controller.messages.types import definition
+from blf_dsc_controller.messages.types import Definition, definition
 
 
 @dataclass(frozen=True)
-class Limits:
+class SplitLimits:
     """When the next file of a bag is begun: at a size [bytes], or after a time [s]; inf: never."""
 
     size: float = inf
@@ -51,13 +50,13 @@ class BagWriter:
         compression: str = 'none',
         flush_interval: float | None = 0.1,
         clock: Callable[[], float] = time.monotonic,
-        limits: Limits = Limits(),
+        limits: SplitLimits = SplitLimits(),
     ) -> None:
         self.path = Path(path)
         self._compression = compression
         self._limits = limits
         self._bag = BagInformation()
-        self._definitions: list[tuple[str, str]] = []
+        self._definitions: list[Definition] = []
         self._configuration: tuple[str, int] | None = None
         try:
             self.path.mkdir(parents=True)
@@ -76,10 +75,7 @@ class BagWriter:
         name: str,
         type_name: str,
         offered: Sequence[Quality],
-        *,
-        text: str | None = None,
-        hash_: str = '',
-        encoding: str = 'ros2msg',
+        known: Definition | None = None,
     ) -> int:
         """Add a topic and return the handle to write to it.
 
@@ -87,21 +83,16 @@ class BagWriter:
             name: full name.
             type_name: such as `sensor_msgs/msg/JointState`.
             offered: quality of service of each publisher.
-            text: definition of the type and all nested ones, empty if unknown; None for a common
-                type of Jazzy.
-            hash_: of the type.
-            encoding: of the definition.
+            known: definition of the type; may be left out for a common type of Jazzy.
 
         Raises:
-            UnknownTypeError: `text` is None and the type is none of the common ones.
+            UnknownTypeError: the definition is left out and the type is none of the common ones.
         """
-        if text is None:
-            text, known_hash = definition(type_name)
-            hash_ = hash_ or known_hash
-        topic = TopicInformation(name, type_name, tuple(offered), hash_)
-        self._definitions.append((text, encoding))
+        found = definition(type_name) if known is None else known
+        topic = TopicInformation(name, type_name, tuple(offered), found.hash)
+        self._definitions.append(found)
         self._bag.topics.append(topic)
-        return self._file.add_channel(topic, *self._definitions[-1])
+        return self._file.add_channel(topic, found)
 
     def write(
         self,
@@ -161,7 +152,9 @@ class BagWriter:
             self._file.size >= self._limits.size
             or self._flushed - self._began >= self._limits.duration
         ):
-            self._split()
+            self._end(self._file)
+            self._file = self._new_file()
+            self._began = self._flushed
 
     def close(self) -> None:
         """Complete the bag; a second call does nothing."""
@@ -179,12 +172,7 @@ class BagWriter:
     def __enter__(self) -> BagWriter:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _new_file(self) -> McapFile:
@@ -193,8 +181,8 @@ class BagWriter:
         file = McapFile(self.path / name, self._compression)
         self._bag.files.append(file.information)
         file.describe(self._bag)
-        for topic, (text, encoding) in zip(self._bag.topics, self._definitions, strict=True):
-            file.add_channel(topic, text, encoding)
+        for topic, found in zip(self._bag.topics, self._definitions, strict=True):
+            file.add_channel(topic, found)
         self._describe(file)
         return file
 
@@ -204,11 +192,6 @@ class BagWriter:
         if self._configuration is not None:
             text, known_at = self._configuration
             file.attach(ATTACHMENT, 'application/yaml', text, known_at)
-
-    def _split(self) -> None:
-        self._end(self._file)
-        self._file = self._new_file()
-        self._began = self._flushed
 
     def _end(self, file: McapFile) -> None:
         file.flush()

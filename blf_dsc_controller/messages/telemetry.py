@@ -73,7 +73,7 @@ class ControllerTelemetry:
         return topics.BOUND, message
 
     def sample(self, stamp: int, sample: Sample, compute_time: float) -> Iterator[Message]:
-        """Messages of the telemetry sample of a state's stamp [ns]; time of the update [s]."""
+        """Messages of the sample of a joint state: its stamp [ns], telemetry, update time [s]."""
         yield topics.REFERENCE, self._reference.encode(stamp, sample.qr, sample.dqr)
         yield (
             topics.TRACKING_ERROR,
@@ -117,7 +117,7 @@ class PlantTelemetry:
         return topics.TRUTH, self._truth.encode(stamp, truth)
 
     def timing(self, stamp: int, latency: float, lateness: float, late_steps: int) -> Message:
-        """How well real time was kept in the step that led to this sample [s, s, count]."""
+        """Real-time performance of the step up to this sample [s, s, count]."""
         return topics.TIMING, self._timing.encode(stamp, (latency, lateness, late_steps))
 
     def clock(self, stamp: int) -> Message:

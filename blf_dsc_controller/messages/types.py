@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
@@ -17,13 +18,17 @@ def typestore() -> Typestore:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
-def definition(type_name: str) -> tuple[str, str]:
-    """Text of a message type with those of all nested types, and its hash (RIHS01_...).
+class Definition(NamedTuple):
+    """Definition of a message type, empty where it is unknown."""
 
-    Raises:
-        UnknownTypeError: the type is not in the store.
-    """
+    text: str  # with those of all nested types
+    hash: str  # RIHS01_...
+    encoding: str = 'ros2msg'
+
+
+def definition(type_name: str) -> Definition:
+    """Definition of a message type; UnknownTypeError if it is not in the store."""
     if type_name not in typestore().fielddefs:
         raise UnknownTypeError(type_name)
     text, _md5 = typestore().generate_msgdef(type_name, ros_version=2)
-    return text, typestore().hash_rihs01(type_name)
+    return Definition(text, typestore().hash_rihs01(type_name))

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from blf_dsc_controller.bags.ring import Ring
-from blf_dsc_controller.bags.writer import BagWriter, Limits
+from blf_dsc_controller.bags.writer import BagWriter, SplitLimits
 from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import Quality
@@ -34,7 +34,7 @@ class BagSink(BagWriter):
             config.output,
             compression=config.compression,
             flush_interval=_FLUSH_INTERVAL,
-            limits=Limits(config.split_size * _MEGABYTE or inf, config.split_duration or inf),
+            limits=SplitLimits(config.split_size * _MEGABYTE or inf, config.split_duration or inf),
         )
         self.notice = f'recording into {self.path}'
 

@@ -91,18 +91,18 @@ def test_message_tells_distance_and_the_terms_where_the_truth_is_known(known):
     arguments = (10**9, law.sample, np.array([0.3, 0.2]), np.array([0.002, 0.004]))
     if not known:
         assert b'V barrier' not in monitor.message(*arguments)[1]
-    told = decoded(monitor, [*names, *terms] if known else names, *arguments)
+    values = decoded(monitor, [*names, *terms] if known else names, *arguments)
 
-    assert told['max_error_ratio joint1'] == 0.3
-    assert told['distance_to_bound joint1'] == pytest.approx(0.002 - abs(law.sample.xi1[0]))
-    assert told['distance_to_bound joint2'] == pytest.approx(0.004 - abs(law.sample.xi1[1]))
+    assert values['max_error_ratio joint1'] == 0.3
+    assert values['distance_to_bound joint1'] == pytest.approx(0.002 - abs(law.sample.xi1[0]))
+    assert values['distance_to_bound joint2'] == pytest.approx(0.004 - abs(law.sample.xi1[1]))
     if known:
-        assert [told[name] for name in terms[:4]] == law.sample.lyapunov.tolist()
+        assert [values[name] for name in terms[:4]] == law.sample.lyapunov.tolist()
 
 
 @pytest.fixture(scope='module')
-def refusing_run(tmp_path_factory):
-    """Run from a bag, 8 s, with a cosine column that the reference cannot tell, truth known."""
+def rejecting_run(tmp_path_factory):
+    """Run from a bag, 8 s, with a cosine column that the reference does not excite, truth known."""
     learning = {'learning.frequencies': [1.0], 'learning.bias': False}
     config = configured('recommended', 8.0, LEAKY | learning)
     path = tmp_path_factory.mktemp('refusing') / 'bag'
@@ -110,16 +110,16 @@ def refusing_run(tmp_path_factory):
     return read_run(path)
 
 
-def test_refused_columns_reach_the_summary_with_their_reason(refusing_run):
-    learning = summarize(refusing_run)['learning']
+def test_rejected_columns_reach_the_summary_with_their_reason(rejecting_run):
+    learning = summarize(rejecting_run)['learning']
     ((refused, reason),) = learning['refused_columns'].items()
     assert refused.startswith('cos 1 rad/s ')
     assert reason.startswith(f'{refused} is not estimated: on this window it cannot be told from ')
-    assert f'refused     {reason}' in format_table(summarize(refusing_run))
+    assert f'refused     {reason}' in format_table(summarize(rejecting_run))
     assert learning['final_relative_error'] < 0.5
 
 
-def test_a_run_that_refuses_nothing_says_so(tmp_path):
+def test_a_run_without_rejected_columns(tmp_path):
     config = configured('recommended', 8.0)
     write_bag(tmp_path / 'bag', simulate(*config[1::-1]), config.controller, 'none')
     run = read_run(tmp_path / 'bag')
@@ -127,9 +127,9 @@ def test_a_run_that_refuses_nothing_says_so(tmp_path):
     assert 'V barrier' not in run.monitor.names
 
 
-def test_monitors_are_drawn_from_the_bag(refusing_run, tmp_path):
+def test_monitors_are_drawn_from_the_bag(rejecting_run, tmp_path):
     path = tmp_path / 'monitors.png'
-    assert draw_monitors(refusing_run, path)
+    assert draw_monitors(rejecting_run, path)
     image = matplotlib.image.imread(path)
     assert image.shape[1] > 1200
     dark = (image[..., :3].max(axis=2) < 0.3).sum()

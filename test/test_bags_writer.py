@@ -17,12 +17,13 @@ from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.messages.errors import UnknownTypeError
 from blf_dsc_controller.messages.topics import BOUND, COMMANDS, JOINT_STATES, Quality
+from blf_dsc_controller.messages.types import Definition
 
 START = 1_734_000_000_000_000_000
 MILLISECOND = 1_000_000
 
 # Reads a bag with nothing but public libraries and prints what is in it.
-STRANGER = """
+READER = """
 import json, sys
 from pathlib import Path
 from mcap.reader import make_reader
@@ -70,9 +71,9 @@ def write_some(path, count=50, **options):
             bag.write(second, torques.encode([k, k]), stamp + 1)
 
 
-def seen_by_a_stranger(path):
+def read_by_others(path):
     run = subprocess.run(
-        [sys.executable, '-c', STRANGER, str(path)], capture_output=True, text=True, check=False
+        [sys.executable, '-c', READER, str(path)], capture_output=True, text=True, check=False
     )
     assert run.returncode == 0, run.stderr
     return json.loads(run.stdout)
@@ -81,7 +82,7 @@ def seen_by_a_stranger(path):
 @pytest.mark.parametrize('compression', ['none', 'zstd'])
 def test_other_libraries_read_all_of_it(tmp_path, compression):
     write_some(tmp_path / 'bag', count=300, compression=compression)
-    found = seen_by_a_stranger(tmp_path / 'bag')
+    found = read_by_others(tmp_path / 'bag')
 
     stamps = [START + k * MILLISECOND for k in range(300)]
     in_turn = [
@@ -192,7 +193,7 @@ def test_metadata_is_that_of_rosbag2(tmp_path):
     assert topic['message_count'] == 0
 
 
-def test_an_existing_folder_is_refused_and_left_alone(tmp_path):
+def test_an_existing_folder_is_rejected_and_left_alone(tmp_path):
     (tmp_path / 'bag').mkdir()
     (tmp_path / 'bag' / 'precious').write_text('kept')
     with pytest.raises(BagError, match=r'bag exists already.*choose another folder'):
@@ -206,14 +207,14 @@ def test_an_unknown_type_is_named_and_the_bag_goes_on(tmp_path):
             bag.add_topic('/nothing', 'nowhere_msgs/msg/Nothing', [])
         known = bag.add_topic('/command', COMMANDS.type, [COMMANDS.offered])
         bag.write(known, Float64MultiArrayEncoder(1).encode([1]), START)
-    assert seen_by_a_stranger(tmp_path / 'bag')['counts'] == {'/command': 1}
+    assert read_by_others(tmp_path / 'bag')['counts'] == {'/command': 1}
 
 
 def test_a_given_definition_and_hash_are_stored(tmp_path):
     with BagWriter(tmp_path / 'bag') as bag:
-        handle = bag.add_topic('/x', 'my_msgs/msg/X', [], text='int32 a\n', hash_='RIHS01_5')
+        handle = bag.add_topic('/x', 'my_msgs/msg/X', [], Definition('int32 a\n', 'RIHS01_5'))
         bag.write(handle, b'\0\1\0\0\7\0\0\0', START)
-    found = seen_by_a_stranger(tmp_path / 'bag')
+    found = read_by_others(tmp_path / 'bag')
     assert found['texts'] == {'my_msgs/msg/X': 'int32 a\n'}
     assert found['hashes'] == {'/x': 'RIHS01_5'}
 
@@ -270,7 +271,7 @@ def test_what_was_flushed_survives_a_kill(tmp_path, compression):
 
 def test_an_empty_bag_is_a_bag(tmp_path):
     BagWriter(tmp_path / 'bag').close()
-    assert seen_by_a_stranger(tmp_path / 'bag')['counts'] == {}
+    assert read_by_others(tmp_path / 'bag')['counts'] == {}
     information = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
     information = information['rosbag2_bagfile_information']
     assert information['duration'] == {'nanoseconds': 0}  # rosbag2 reads it as unsigned
@@ -292,4 +293,4 @@ def test_closing_twice_is_harmless(tmp_path):
     bag = BagWriter(tmp_path / 'bag')
     bag.close()
     bag.close()
-    assert seen_by_a_stranger(tmp_path / 'bag')['mcap'] == []
+    assert read_by_others(tmp_path / 'bag')['mcap'] == []

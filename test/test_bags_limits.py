@@ -14,7 +14,7 @@ from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.errors import DiskFullError
 from blf_dsc_controller.bags.recover import recover
 from blf_dsc_controller.bags.ring import Ring
-from blf_dsc_controller.bags.writer import BagWriter, Limits
+from blf_dsc_controller.bags.writer import BagWriter, SplitLimits
 from blf_dsc_controller.messages.encoders import JointStateEncoder
 from blf_dsc_controller.messages.topics import BOUND, JOINT_STATES, STREAM
 
@@ -72,7 +72,7 @@ def test_room_for_the_index_grows_with_it(tmp_path):
         assert len(summary.chunk_indexes) == bag.message_counts['/a'] > 20_000
 
 
-def test_no_room_at_all_is_told_at_the_start(tmp_path):
+def test_no_room_at_all_is_an_error_at_the_start(tmp_path):
     with small_disk(tmp_path / 'disk', 1) as disk, pytest.raises(OSError, match='No space left'):
         BagWriter(disk / 'bag')
 
@@ -90,8 +90,8 @@ def test_the_reserve_is_gone_when_the_bag_is_closed(tmp_path):
 @pytest.mark.parametrize(
     ('limits', 'count'),
     [
-        (Limits(size=20_000), 3),  # 200 messages, each with its chunk and index some 290 bytes
-        (Limits(duration=0.5), 4),  # of 2 s
+        (SplitLimits(size=20_000), 3),  # 200 messages, each with its chunk and index some 290 bytes
+        (SplitLimits(duration=0.5), 4),  # of 2 s
     ],
 )
 def test_a_bag_is_split_and_reads_as_one(tmp_path, limits, count):
@@ -111,7 +111,7 @@ def test_a_bag_is_split_and_reads_as_one(tmp_path, limits, count):
     assert [raw for *_, raw in read(tmp_path / 'bag')] == [message(k) for k in range(200)]
     for file in files:
         assert file.stat().st_size < 30_000
-        context = read_context(file)  # each file tells of the run by itself
+        context = read_context(file)  # each file describes the run
         assert context.configurations == ((5, CONFIGURATION),)
         assert context.facts['law'] == 'blf_dsc'
         with file.open('rb') as stream:

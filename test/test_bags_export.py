@@ -56,6 +56,6 @@ def test_every_number_reads_back_equal_in_its_row(tmp_path, made, bag, ending):
     assert set(found['bound shoulder']) == {0.002}
 
 
-def test_another_ending_is_refused(tmp_path, bag, capsys):
+def test_another_ending_is_rejected(tmp_path, bag, capsys):
     assert main(['export', str(bag), '--out', str(tmp_path / 'table.xlsx')]) == 1
     assert 'neither .csv nor .parquet' in capsys.readouterr().err

@@ -84,7 +84,7 @@ def test_decoder_follows_a_change_of_layout():
     assert np.isnan(decoder.effort).all()
 
 
-def test_arrays_of_equal_total_length_are_told_apart():
+def test_arrays_of_equal_total_length_are_distinguished():
     decoder = JointStateDecoder(['a', 'b'], required=())
     decoder.decode(raw_joint_state('ab', [1, 2], [3, 4], []))
     decoder.decode(raw_joint_state('ab', [1, 2], [], [5, 6]))
@@ -116,7 +116,7 @@ def test_missing_joint_is_named():
     assert caught.value.joint == 'elbow'
 
 
-def test_duplicated_joint_is_named_only_when_asked_for():
+def test_duplicated_joint_is_named_only_when_it_is_wanted():
     raw = raw_joint_state('aab', [1, 2, 3], [4, 5, 6], [])
     with pytest.raises(DuplicatedJointError, match="'a' appears 2 times"):
         JointStateDecoder(['a']).decode(raw)
@@ -126,7 +126,7 @@ def test_duplicated_joint_is_named_only_when_asked_for():
 
 
 @pytest.mark.parametrize('velocity', [[], [1.0], [1.0, 2.0, 3.0]])
-def test_velocity_of_another_length_is_refused(velocity):
+def test_velocity_of_another_length_is_rejected(velocity):
     decoder = JointStateDecoder('ab')
     decoder.decode(raw_joint_state('ab', [1, 2], [3, 4], []))
     with pytest.raises(ShortArrayError, match=f'`velocity`.* {len(velocity)} values for 2 names'):
@@ -134,7 +134,7 @@ def test_velocity_of_another_length_is_refused(velocity):
 
 
 @pytest.mark.parametrize('warm', [False, True])
-def test_every_truncation_is_refused(warm):
+def test_every_truncation_is_rejected(warm):
     raw = raw_joint_state('ab', [1, 2], [3, 4], [5, 6])
     decoder = JointStateDecoder('ab')
     for length in range(len(raw)):
@@ -144,7 +144,7 @@ def test_every_truncation_is_refused(warm):
             decoder.decode(raw[:length])
 
 
-def test_other_encodings_are_refused():
+def test_other_encodings_are_rejected():
     good = raw_joint_state('a', [1], [2], [])
     decoder = JointStateDecoder('a')
     for _ in range(2):
@@ -163,7 +163,7 @@ def test_a_bad_message_does_not_disturb_the_next():
     assert decoder.decode(good) == STAMP
 
 
-def test_encoder_refuses_arrays_of_another_length():
+def test_encoder_rejects_arrays_of_another_length():
     encoder = JointStateEncoder(['a', 'b'], ('position',))
     with pytest.raises(ValueError, match='shape'):
         encoder.encode(0, [1, 2, 3])
@@ -198,14 +198,14 @@ def test_multi_array_with_dimensions(little_endian):
     assert decoder.data.tolist() == [1, 2, 3]
 
 
-def test_multi_array_of_another_size_is_told_by_its_length():
+def test_multi_array_of_another_size_returns_its_length():
     decoder = Float64MultiArrayDecoder(2)
     decoder.decode(Float64MultiArrayEncoder(2).encode([1, 2]))
     assert decoder.decode(Float64MultiArrayEncoder(3).encode([4, 5, 6])) == 3
     assert decoder.data.tolist() == [1, 2]
 
 
-def test_truncated_multi_array_is_refused():
+def test_truncated_multi_array_is_rejected():
     raw = Float64MultiArrayEncoder(2).encode([1, 2])
     for length in range(len(raw)):
         with pytest.raises(MessageError, match='is cut off'):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag comes back as the arrays it was made of, whatever its topics were called."""
+"""A bag comes back as the arrays it was made of, under any topic names."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_one_of_several_robots_is_read_by_its_namespace(tmp_path, messages):
     assert read_run(tmp_path / 'bag', '/right').stamp.size < SAMPLES
 
 
-def test_without_joint_states_the_bag_is_refused_with_what_it_holds(tmp_path, messages):
+def test_without_joint_states_the_bag_is_rejected_with_a_list_of_its_topics(tmp_path, messages):
     path = synthetic_bag.write(tmp_path / 'bag', without(messages, JOINT_STATES))
     with pytest.raises(BagError) as caught:
         read_run(path)
@@ -168,7 +168,7 @@ def test_bags_of_another_writer_are_read(tmp_path, made, messages, storage):
     np.testing.assert_array_equal(run.torque, made.torque)
 
 
-def test_no_bag_is_told_apart_from_a_broken_one(tmp_path, messages):
+def test_no_bag_and_a_broken_one_are_distinguished(tmp_path, messages):
     with pytest.raises(BagError, match='there is no such folder'):
         read_run(tmp_path / 'nowhere')
     path = synthetic_bag.write(tmp_path / 'bag', messages)
@@ -180,7 +180,7 @@ def test_no_bag_is_told_apart_from_a_broken_one(tmp_path, messages):
         read_run(path)
 
 
-def test_a_message_that_cannot_be_decoded_is_told_by_topic_and_number(tmp_path, messages):
+def test_a_message_that_cannot_be_decoded_is_named_by_topic_and_number(tmp_path, messages):
     bad = [*messages[:100], (LEARNING, messages[100][1], b'\0\1\0\0'), *messages[100:]]
     path = synthetic_bag.write(tmp_path / 'bag', bad)
     with Reader(path) as reader:

@@ -103,7 +103,7 @@ def test_every_truncation_gives_every_whole_chunk(plain, tmp_path):
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
-def test_no_damage_whatever_is_too_much(whole, tmp_path_factory, data):
+def test_any_damage_is_survived(whole, tmp_path_factory, data):
     # Flip some bytes anywhere: what is recovered was written, and no other chunk is lost.
     original = whole.read_bytes()
     places = data.draw(st.lists(st.integers(0, len(original) - 1), min_size=1, max_size=4))
@@ -120,7 +120,7 @@ def test_no_damage_whatever_is_too_much(whole, tmp_path_factory, data):
     assert sum(recovery.messages.values()) >= 2 * PER_CHUNK * (CHUNKS - hit - outside)
 
 
-def test_a_corrupted_chunk_is_skipped_and_told_with_its_times_and_messages(whole, tmp_path):
+def test_a_corrupted_chunk_is_skipped_and_reported_with_its_times_and_messages(whole, tmp_path):
     content = bytearray(whole.read_bytes())
     at, end, chunk = chunks(content)[2]
     content[(at + end) // 2] ^= 0x40
@@ -137,8 +137,8 @@ def test_a_corrupted_chunk_is_skipped_and_told_with_its_times_and_messages(whole
     assert 'messages lost: 5 of /joint_states' in str(loss)
 
 
-def test_the_first_chunk_takes_the_topics_with_it_but_they_are_told_elsewhere(plain, tmp_path):
-    # Of a recording that was killed, too: there is no index at the end to tell.
+def test_the_topics_are_known_without_the_first_chunk(plain, tmp_path):
+    # Of a recording that was killed, too: there is no index at the end.
     content = bytearray(plain.read_bytes())
     (first, *_, last) = chunks(content)
     content[(first[0] + first[1]) // 2] ^= 1
@@ -179,7 +179,7 @@ def test_a_whole_bag_has_lost_nothing(whole, tmp_path, capsys):
     assert 'nothing was lost' in capsys.readouterr().out
 
 
-def test_what_the_recorder_did_not_get_is_told_of_the_clean_bag_too(tmp_path, capsys):
+def test_lost_messages_are_recorded_in_the_clean_bag_too(tmp_path, capsys):
     with BagWriter(tmp_path / 'bag') as bag:
         handle = bag.add_topic(JOINT_STATES.resolved, JOINT_STATES.type, [JOINT_STATES.offered])
         for number in (6, 7, 9):

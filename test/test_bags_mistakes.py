@@ -64,15 +64,15 @@ def readers(tmp_path):
 
 @pytest.fixture
 def all_say(readers, capsys):
-    """Asserts that every command ends with these words in its one complaint."""
+    """Asserts that every command ends with these words in its one error."""
 
     def assert_it(bag, *words):
         for name, command in readers.items():
             assert command(bag) == 1, name
-            out, complaint = capsys.readouterr()
-            assert complaint.startswith(f'blf_dsc {name.split()[0]}: '), name
+            out, error = capsys.readouterr()
+            assert error.startswith(f'blf_dsc {name.split()[0]}: '), name
             for word in words:
-                assert word in complaint, name
+                assert word in error, name
             assert out == ''
 
     return assert_it
@@ -88,8 +88,8 @@ def write_mcap(folder, entries, schema, configuration=''):
         channels = {}
         for topic, type_name, at, raw in entries:
             if topic not in channels:
-                told = schema(type_name)
-                number = 0 if told is None else writer.register_schema(type_name, *told)
+                found = schema(type_name)
+                number = 0 if found is None else writer.register_schema(type_name, *found)
                 channels[topic] = writer.register_channel(topic, 'cdr', number)
             writer.add_message(channels[topic], at, raw, at)
         writer.finish()
@@ -107,15 +107,15 @@ def test_a_topic_of_a_wrong_type(entries, rewritten, all_say):
     all_say(rewritten(states), 'of type sensor_msgs/msg/JointState', '(std_msgs/msg/String)')
 
 
-@pytest.mark.parametrize('told', [('', b''), ('ros2msg', b'{{ no definition'), None])
+@pytest.mark.parametrize('schema', [('', b''), ('ros2msg', b'{{ no definition'), None])
 def test_a_missing_definition_of_another_topic_costs_no_other_message(
-    entries, readers, tmp_path, capsys, told
+    entries, readers, tmp_path, capsys, schema
 ):
     file = write_mcap(
         tmp_path / 'bag',
         [ODD_MESSAGE, *entries],
         lambda type_name: (
-            told if type_name == ODD else ('ros2msg', definition(type_name)[0].encode())
+            schema if type_name == ODD else ('ros2msg', definition(type_name)[0].encode())
         ),
     )
     for name in ('replay --config', 'report', 'export', 'plot'):
@@ -125,7 +125,7 @@ def test_a_missing_definition_of_another_topic_costs_no_other_message(
     with Reader(tmp_path / 'clean') as reader:
         found = {one.topic: one.msgcount for one in reader.connections}
     assert found['/joint_states'] == 301
-    if told is None:  # not even its name is there
+    if schema is None:  # not even its name is there
         assert 'LOST 1 messages of topics whose name or type is unknown' in said
     else:
         assert found['/odd'] == 1
