@@ -20,11 +20,16 @@ from timing import Ratio, interleaved, ratio
 from blf_dsc_controller.configuration.params_file import locate
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.monte_carlo import executors as engines
-from blf_dsc_controller.monte_carlo.chunk import run_chunk, warm_up
-from blf_dsc_controller.monte_carlo.computation import compute
+from blf_dsc_controller.monte_carlo.executors import compute
+from blf_dsc_controller.monte_carlo.runs import run_chunk, warm_up
 from blf_dsc_controller.monte_carlo.store import Span
-from blf_dsc_controller.monte_carlo.study import Study, draw, origin_of, plant_of_draw
-from blf_dsc_controller.monte_carlo.study_file import load_study
+from blf_dsc_controller.monte_carlo.study import (
+    Study,
+    draw,
+    load_study,
+    origin_of,
+    plant_of_draw,
+)
 
 _DURATION = 10.0  # s
 _RUNS = 50  # of each round beside C
@@ -95,7 +100,7 @@ def _pool(study: Study, stack: ExitStack, workers: int) -> Callable[[], int]:
     """Work of the engine with so many workers, which are there and have run something."""
     engine = engines.processes(workers)
     executor: Executor = stack.enter_context(engine.open())
-    engine = replace(engine, open=lambda: nullcontext(executor))
+    engine = engine._replace(open=lambda: nullcontext(executor))
     spans = [Span(k * _CHUNK, _CHUNK) for k in range(_CHUNKS)]
 
     def work() -> int:

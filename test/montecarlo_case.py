@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from blf_dsc_controller.monte_carlo.chunk import run_chunk
-from blf_dsc_controller.monte_carlo.study_file import load_study
+from blf_dsc_controller.monte_carlo.runs import run_chunk
+from blf_dsc_controller.monte_carlo.study import load_study
 
 RUNS = 24
 

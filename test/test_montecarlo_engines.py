@@ -7,16 +7,15 @@ import os
 import signal
 from concurrent.futures import BrokenExecutor, Executor
 from contextlib import contextmanager, nullcontext
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from montecarlo_case import RUNS, same, study, whole
 
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.monte_carlo import executors as engines
-from blf_dsc_controller.monte_carlo.chunk import warm_up
-from blf_dsc_controller.monte_carlo.computation import PATIENCE, chunk_size, compute
-from blf_dsc_controller.monte_carlo.errors import WorkersLostError
+from blf_dsc_controller.monte_carlo.executors import RETRIES, chunk_size, compute
+from blf_dsc_controller.monte_carlo.runs import warm_up
 from blf_dsc_controller.monte_carlo.store import Span
 
 
@@ -43,9 +42,9 @@ def joined(parts):
     return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
 
 
-def computed(a_study, engine, size, tell=pytest.fail):
+def computed(a_study, engine, size, warn=pytest.fail):
     parts = {}
-    compute(a_study, spans(size), engine, parts.__setitem__, tell)
+    compute(a_study, spans(size), engine, parts.__setitem__, warn)
     return joined(parts)
 
 
@@ -90,7 +89,7 @@ def killing(engine, kills):
             hit.append(pools[-1])
             os.kill(next(iter(pools[-1]._processes)), signal.SIGKILL)
 
-    return replace(engine, open=start), kill
+    return engine._replace(open=start), kill
 
 
 def test_killed_worker_loses_nothing(a_study, undisturbed):
@@ -118,9 +117,9 @@ class Broken(Executor):
 def test_workers_that_are_always_lost_are_given_up(a_study):
     told = []
     engine = engines.Engine(lambda: nullcontext(Broken()), 2)
-    with pytest.raises(WorkersLostError, match=r'out of memory.* 24 chunks are left'):
+    with pytest.raises(BlfDscError, match=r'out of memory.* 24 chunks are left'):
         compute(a_study, spans(1), engine, pytest.fail, told.append)
-    assert len(told) == PATIENCE
+    assert len(told) == RETRIES
 
 
 def test_error_of_a_run_is_no_lost_worker(a_study):

@@ -8,8 +8,8 @@ import pytest
 from montecarlo_case import LOOP, STUDY, study, whole
 
 from blf_dsc_controller.law.sample import sample_of
-from blf_dsc_controller.monte_carlo.chunk import run_chunk
-from blf_dsc_controller.monte_carlo.reproduction import plant_of_run
+from blf_dsc_controller.monte_carlo.report import plant_of_run
+from blf_dsc_controller.monte_carlo.runs import run_chunk
 from blf_dsc_controller.simulation.loop import simulate
 
 LIMITS = 'blf_dsc_controller:\n  ros__parameters:\n'
@@ -44,7 +44,7 @@ def plainly(a_study, run):
     told = {
         'first_violation_s': t[outside[0]] if outside.size else np.nan,
         'latch_time_s': t[latched[0]] if latched.size else np.nan,
-        'saturated_share': (torque >= limit).any(axis=1).mean(),
+        'saturated_fraction': (torque >= limit).any(axis=1).mean(),
         'parameter_error.0.1_s': distance[100],
         'parameter_error.0.25_s': distance[250],
         'parameter_error.end': distance[300],
@@ -72,7 +72,7 @@ def test_study_of_these_tests_has_all_kinds_of_figures(tmp_path):
     assert (strong['outcome'] == 'kept').sum() > 12
     assert (weak['outcome'] == 'violated').sum() > 12
     assert np.isfinite(strong['latch_time_s']).all()
-    assert (weak['saturated_share'] > 0.1).any()
+    assert (weak['saturated_fraction'] > 0.1).any()
     assert (strong['first_violation_s'] >= 0).sum() == (strong['outcome'] != 'kept').sum()
 
 
@@ -87,7 +87,7 @@ def test_start_that_the_controller_refuses_is_told_apart(tmp_path):
     """With noise of ten times the bound nearly every start is measured outside."""
     text = STUDY.replace('loguniform(1.0e-6, 2.0e-5)', 'choice(0.02)')
     results = whole(study(tmp_path, LOOP + text))
-    refused = results['outcome'] == 'refused'
+    refused = results['outcome'] == 'rejected'
     assert refused.sum() > 12
     assert (results['first_violation_s'][refused] == 0.0).all()
     worst = np.maximum(results['max_error_ratio.joint1'], results['max_error_ratio.joint2'])

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 import shlex
@@ -11,18 +12,14 @@ import matplotlib.image
 import numpy as np
 import pyarrow.parquet
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from montecarlo_case import RUNS, study, whole
-from scipy.stats import binomtest
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.params_file import load_loop
-from blf_dsc_controller.monte_carlo.errors import NotReproducedError
-from blf_dsc_controller.monte_carlo.report import write_report
-from blf_dsc_controller.monte_carlo.reproduction import plant_of_run, reproduce
-from blf_dsc_controller.monte_carlo.statistics import influence, judge, wilson, worst_first
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.monte_carlo.report import plant_of_run, reproduce, write_report
+from blf_dsc_controller.monte_carlo.statistics import influence, summarize, worst_first
 from blf_dsc_controller.monte_carlo.store import Span, Store
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -33,13 +30,6 @@ def store(tmp_path_factory):
     made = Store.create_or_open(folder / 'my study', study(folder))
     made.keep(Span(0, RUNS), whole(made.study))
     return made
-
-
-@given(trials=st.integers(1, 10_000), data=st.data())
-def test_interval_is_wilsons(trials, data):
-    hits = data.draw(st.integers(0, trials))
-    expected = binomtest(hits, trials).proportion_ci(0.95, method='wilson')
-    assert wilson(hits, trials) == pytest.approx((expected.low, expected.high), abs=1e-12)
 
 
 def test_worst_runs_come_first_and_lost_numbers_before_all(store):
@@ -53,17 +43,20 @@ def test_worst_runs_come_first_and_lost_numbers_before_all(store):
     results['outcome'] = outcome
     # The worse of both joints: ends before the middle, equal ones in their order.
     assert worst_first(store.study, results)[:5].tolist() == [5, 0, 23, 1, 22]
-    summary = judge(store.study, results)
+    summary = summarize(store.study, results)
     assert [one['run'] for one in summary['worst'][:3]] == [5, 0, 23]
-    assert summary['outcomes'] == {'kept': 23, 'violated': 0, 'diverged': 1, 'refused': 0}
-    assert summary['kept']['share'] == 23 / 24
+    assert summary['outcomes'] == {'kept': 23, 'violated': 0, 'diverged': 1, 'rejected': 0}
+    assert summary['kept']['fraction'] == 23 / 24
+    # (23 + z^2 / 2 -+ z sqrt(23 / 24 + z^2 / 4)) / (24 + z^2), z = 1.959964, Wilson (1927)
+    assert summary['kept']['low'] == pytest.approx(0.797582, abs=1e-6)
+    assert summary['kept']['high'] == pytest.approx(0.992607, abs=1e-6)
 
 
 def test_influence_also_sees_that_both_ends_are_bad(store):
     """A start near either side of the bound: no correlation at all, yet it explains everything."""
     rng = np.random.default_rng(3)
     runs = 2000
-    results = {one.column: rng.random(runs) for one in store.study.spreads}
+    results = {one.column: rng.random(runs) for one in store.study.variations}
     start = rng.uniform(-1.0, 1.0, runs)
     results['plant.initial.error.joint1'] = start
     results['outcome'] = np.full(runs, 'kept')
@@ -79,7 +72,7 @@ def test_influence_also_sees_that_both_ends_are_bad(store):
 def test_report_is_written(store):
     summary, written = write_report(store)
     assert [path.name for path in written] == [
-        'report.md',
+        'report.html',
         'distributions.png',
         'influence.png',
         'summary.json',
@@ -87,23 +80,22 @@ def test_report_is_written(store):
     assert json.loads((store.folder / 'summary.json').read_text()) == summary
     results = store.results()
     kept = int((results['outcome'] == 'kept').sum())
-    text = (store.folder / 'report.md').read_text()
+    text = (store.folder / 'report.html').read_text()
     assert f'({kept} of 24; 95 % confidence:' in text
+    assert text.count('src="data:image/png;base64,') == 2
     for picture in ('distributions.png', 'influence.png'):
-        assert f']({picture})' in text
         assert matplotlib.image.imread(store.folder / picture).shape[1] > 1200
 
 
 def test_worst_ten_are_reproduced_by_the_commands_of_the_report(store, tmp_path, monkeypatch):
     write_report(store)
-    commands = re.findall(
-        r'`(monte_carlo --reproduce .*?)`', (store.folder / 'report.md').read_text()
-    )
+    page = html.unescape((store.folder / 'report.html').read_text())
+    commands = re.findall(r'>blf_dsc (monte-carlo --reproduce .*?)<', page)
     assert len(commands) == 10
     monkeypatch.chdir(tmp_path)
-    arguments = shlex.split(commands[0])[1:]
-    assert main(['monte-carlo', *arguments]) == 0
-    run, out = int(arguments[2]), tmp_path / arguments[4]
+    arguments = shlex.split(commands[0])
+    assert main(arguments) == 0
+    run, out = int(arguments[3]), tmp_path / arguments[5]
     written = {path.name for path in out.iterdir()}
     assert {'bag', 'config.yaml', 'summary.json', 'tracking.png', 'parameters.png'} <= written
     row = store.results()
@@ -118,7 +110,7 @@ def test_worst_ten_are_reproduced_by_the_commands_of_the_report(store, tmp_path,
     again = simulate(loop.controller, loop.plant)
     np.testing.assert_array_equal(again.measurements[:, :2], bag.position)
     # It does not overwrite.
-    assert main(['monte-carlo', *arguments]) == 1
+    assert main(arguments) == 1
 
 
 def test_run_that_is_not_what_it_was_is_told(store, tmp_path):
@@ -128,7 +120,7 @@ def test_run_that_is_not_what_it_was_is_told(store, tmp_path):
     results['max_error_ratio.joint2'] = np.nextafter(results['max_error_ratio.joint2'], 2.0)
     other.keep(Span(0, RUNS), results)
     (tmp_path / 'run').mkdir()
-    with pytest.raises(NotReproducedError, match=r'run 4 is not .*\n.*max_error_ratio.joint2'):
+    with pytest.raises(BlfDscError, match=r'run 4 is not .*\n.*max_error_ratio.joint2'):
         reproduce(other, 4, tmp_path / 'run')
 
 

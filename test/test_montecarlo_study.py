@@ -15,14 +15,19 @@ from blf_dsc_controller.configuration.schema import Kind
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.monte_carlo.distribution import TAIL, parse
-from blf_dsc_controller.monte_carlo.study import draw, origin_of, plant_of_draw
-from blf_dsc_controller.monte_carlo.study_file import load_study, write_study
+from blf_dsc_controller.monte_carlo.study import (
+    draw,
+    load_study,
+    origin_of,
+    plant_of_draw,
+    write_study,
+)
 
 SHARES = st.floats(0.0, 1.0, exclude_max=True)
 
 
 def drawn_values(a_study, run):
-    return dict(zip((s.column for s in a_study.spreads), draw(a_study, run).values, strict=True))
+    return dict(zip((s.column for s in a_study.variations), draw(a_study, run).values, strict=True))
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,7 @@ def _configuration(options: Namespace) -> LoopConfig:
 
 
 def _run_offline(config: LoopConfig, bag: Path) -> None:
-    _announce_compilation(loop)
+    announce_compilation(loop)
     progress = Progress(config.plant)
 
     def show(record: Record, rows: int) -> None:
@@ -144,11 +144,12 @@ def _run_over_ros(config: LoopConfig, out: Path, domain: int | None) -> bool:
     """Run the three nodes; False if a signal ended the run."""
     from blf_dsc_controller.cli.session import run_session
 
-    _announce_compilation(respond, *plant_kernels.KERNELS)
+    announce_compilation(respond, *plant_kernels.KERNELS)
     return run_session(config.plant, out, domain)
 
 
-def _announce_compilation(*kernels: Any) -> None:
+def announce_compilation(*kernels: Any) -> None:
+    """Print a notice if the kernels must be compiled first, a wait that would look like a hang."""
     if not is_compiled(*kernels):
         print(COMPILATION_NOTICE, file=sys.stderr, flush=True)
 

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the chunks are computed: any `concurrent.futures.Executor` will do.
+"""The runs of a study, computed by any `concurrent.futures.Executor`.
 
     processes   processes of this machine (default)
-    threads     threads of this process: the kernels do without the interpreter's lock
-    dask        a dask.distributed cluster: one that runs already, by its address, or a local one
+    threads     threads of this process: the kernels release the interpreter's lock
+    dask        a dask.distributed cluster: a running one, by its address, or a local one
     mpi         the ranks of an MPI job (mpi4py.futures)
 
-The results are the same with each of them.
+The results are the same with each of them.  Chunks of runs are handed out one after the other, a
+few ahead of the workers, so the memory needed does not grow with the number of runs.
 """
 
 from __future__ import annotations
@@ -15,30 +16,40 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
 from multiprocessing import connection
+from typing import Any, NamedTuple
 
-from blf_dsc_controller.errors import MissingExtraError
+from blf_dsc_controller.errors import BlfDscError, MissingExtraError
+from blf_dsc_controller.monte_carlo.runs import Columns, run_chunk
+from blf_dsc_controller.monte_carlo.store import Span
+from blf_dsc_controller.monte_carlo.study import Study
 
-_PRELOADED = 'blf_dsc_controller.monte_carlo.chunk'
+RETRIES = 3
+"""Times in a row that all workers may be lost before any has finished a chunk."""
+
+_AHEAD = 3  # chunks handed out for each worker
+_CHUNKS_EACH = 20
+_MOST_PARTS = 1000
+_LARGEST = (100, 1000)  # runs in a chunk: in a study of up to 100 000, and in any
 
 
-@dataclass(frozen=True)
-class Engine:
-    """How to come by workers.
-
-    Attributes:
-        open: starts them; a new executor each time, ended on leaving.
-        workers: how many there are.
-        lost: what is raised when workers are lost with all that they were doing.
-    """
+class Engine(NamedTuple):
+    """Workers: `open` starts them, each time as a new executor; BrokenExecutor: they were lost."""
 
     open: Callable[[], AbstractContextManager[Executor]]
     workers: int
-    lost: tuple[type[Exception], ...] = (BrokenExecutor,)
 
 
 def cores() -> int:
@@ -48,81 +59,122 @@ def cores() -> int:
 
 def processes(workers: int) -> Engine:
     """Processes of this machine, each of which ends with this one."""
-
-    @contextmanager
-    def start() -> Iterator[Executor]:
-        method = 'forkserver'
-        if method not in multiprocessing.get_all_start_methods():
-            method = 'spawn'
-        context = multiprocessing.get_context(method)
-        if method == 'forkserver':
-            context.set_forkserver_preload([_PRELOADED])  # imported once, for all workers
-        with ProcessPoolExecutor(workers, context, _end_with_parent) as executor:
-            yield executor
-
-    return Engine(start, workers)
+    method = 'forkserver'
+    if method not in multiprocessing.get_all_start_methods():
+        method = 'spawn'
+    context = multiprocessing.get_context(method)
+    if method == 'forkserver':
+        context.set_forkserver_preload([run_chunk.__module__])  # imported once, for all workers
+    return Engine(lambda: ProcessPoolExecutor(workers, context, _end_with_parent), workers)
 
 
 def threads(workers: int) -> Engine:
     """Threads of this process."""
-
-    @contextmanager
-    def start() -> Iterator[Executor]:
-        with ThreadPoolExecutor(workers) as executor:
-            yield executor
-
-    return Engine(start, workers)
+    return Engine(lambda: ThreadPoolExecutor(workers), workers)
 
 
 def dask(workers: int, address: str = '') -> Engine:
-    """Make a dask.distributed cluster of this machine, or use the one whose scheduler is there.
+    """Make a dask.distributed cluster of this machine, or use the one of this scheduler.
 
-    Dask itself computes anew what a lost worker was doing; only if that goes wrong again and again
-    is it for us to begin anew.
+    Dask itself repeats what a lost worker was doing, unless that fails again and again.
     """
     try:
         import distributed
     except ImportError:
         raise MissingExtraError('dask.distributed', 'dask', 'the engine dask') from None
 
+    def client() -> Any:
+        if address:
+            return distributed.Client(address)
+        return distributed.Client(n_workers=workers, threads_per_worker=1, dashboard_address=None)
+
     @contextmanager
     def start() -> Iterator[Executor]:
-        if address:
-            with distributed.Client(address) as client:
-                yield client.get_executor(pure=False)
-            return
-        with (
-            distributed.LocalCluster(
-                n_workers=workers, threads_per_worker=1, dashboard_address=None
-            ) as cluster,
-            distributed.Client(cluster) as client,
-        ):
-            yield client.get_executor(pure=False)
+        with client() as connected:
+            try:
+                yield connected.get_executor(pure=False)
+            except distributed.KilledWorker as error:
+                raise BrokenExecutor(str(error)) from error
 
     if address:
-        with distributed.Client(address) as client:
-            workers = max(1, sum(client.nthreads().values()))
-    return Engine(start, workers, (BrokenExecutor, distributed.KilledWorker))
+        with client() as connected:
+            workers = max(1, sum(connected.nthreads().values()))
+    return Engine(start, workers)
 
 
 def mpi(workers: int) -> Engine:
     """Use the ranks of an MPI job, `mpiexec -n 9 python -m mpi4py.futures -m ...`: all but one.
 
-    Started as a single rank, it asks MPI for as many more as there are to be workers.
+    Started as a single rank, it requests as many more as there are to be workers.
     """
     try:
         from mpi4py import MPI
         from mpi4py.futures import MPIPoolExecutor
     except ImportError:
         raise MissingExtraError('mpi4py', 'mpi', 'the engine mpi') from None
-
-    @contextmanager
-    def start() -> Iterator[Executor]:
-        with MPIPoolExecutor(workers) as executor:
-            yield executor
-
     workers = MPI.COMM_WORLD.Get_size() - 1 or workers
-    return Engine(start, workers)
+    return Engine(lambda: MPIPoolExecutor(workers), workers)
+
+
+def chunk_size(runs: int, workers: int) -> int:
+    """Runs in a chunk: few files, yet enough chunks for the workers to end together."""
+    usual, ever = _LARGEST
+    largest = min(ever, max(usual, runs // _MOST_PARTS))
+    return max(1, min(largest, runs // (_CHUNKS_EACH * workers)))
+
+
+def compute(
+    study: Study,
+    spans: Iterable[Span],
+    engine: Engine,
+    keep: Callable[[Span, Columns], None],
+    warn: Callable[[str], None],
+) -> None:
+    """Compute all `spans` and give each with its results to `keep`, as they are done.
+
+    The chunk of a lost worker is repeated, after a warning; BlfDscError if workers are lost again
+    and again.
+    """
+    waiting = deque(spans)
+    in_a_row = 0
+    while waiting:
+        before = len(waiting)
+        try:
+            with engine.open() as executor:
+                _hand_out(study, waiting, executor, engine.workers * _AHEAD, keep)
+        except BrokenExecutor as error:
+            in_a_row = in_a_row + 1 if len(waiting) == before else 1
+            if in_a_row > RETRIES:
+                raise BlfDscError(
+                    f'{in_a_row} times in a row all workers were lost before any finished a chunk '
+                    f'({error}); {len(waiting)} chunks are left. Is there enough memory? Start the '
+                    'same command again to resume: what is done is kept'
+                ) from error
+            warn(f'a worker was lost: {len(waiting)} chunks are left, and go to new workers')
+
+
+def _hand_out(
+    study: Study,
+    waiting: deque[Span],
+    executor: Executor,
+    most: int,
+    keep: Callable[[Span, Columns], None],
+) -> None:
+    """Empty `waiting`; what was not kept is put back if anything goes wrong."""
+    handed: dict[Future[Columns], Span] = {}
+    try:
+        while waiting or handed:
+            while waiting and len(handed) < most:
+                span = waiting[0]
+                handed[executor.submit(run_chunk, study, *span)] = span
+                waiting.popleft()
+            for future in wait(handed, return_when=FIRST_COMPLETED).done:
+                keep(handed[future], future.result())
+                del handed[future]
+    finally:
+        for future in handed:
+            future.cancel()
+        waiting.extendleft(sorted(handed.values(), reverse=True))
 
 
 def _end_with_parent() -> None:

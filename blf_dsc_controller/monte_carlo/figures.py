@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures of a study: how its runs spread, and what the worst of them have in common."""
+"""Figures of a study: how its runs spread, and what the worst of them have in common."""
 
 from __future__ import annotations
 
@@ -10,69 +10,76 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 
 from blf_dsc_controller.analysis.style import ALARM, BLUE, COLOURS, INK, MUTED, Picture, head
-from blf_dsc_controller.monte_carlo.chunk import Columns
-from blf_dsc_controller.monte_carlo.measure import KEPT, error_columns
+from blf_dsc_controller.monte_carlo.runs import KEPT, Columns, error_columns
 from blf_dsc_controller.monte_carlo.statistics import influence, worst_ratio
 from blf_dsc_controller.monte_carlo.study import Study
 from blf_dsc_controller.run import Floats
 
 _PANEL = (6.2, 3.4)  # inches
 _MOST_BINS = 60
-_MILLI = 1e3
 _PANELS_OF_INFLUENCE = 6
 _MOST_DOTS = 20_000
 _FEW_DOTS = 1000
 _LEAST_ERROR = 1e-6
+_FAR = 1.25  # |xi1| / k_c of the last bar, which holds all above
 _FARTHEST = 2.0  # |xi1| / k_c that is drawn; what is beyond is put there
 _FEW_DECADES = 50.0
+_RATIO = r'max $|\xi_1| \; / \; k_c$'
+_PERCENT = FuncFormatter(lambda value, _: f'{100 * value:g} %')
 
 
 def draw_study(study: Study, results: Columns, folder: Path) -> list[Path]:
     """Draw distributions.png, and influence.png if anything varies, and return their paths."""
-    drawn = [folder / 'distributions.png', folder / 'influence.png']
-    _draw_distributions(study, results, drawn[0])
-    if not influence(study, results):
-        return drawn[:1]
-    _draw_influence(study, results, drawn[1])
-    return drawn
+    paths = [folder / 'distributions.png']
+    _draw_distributions(study, results, paths[0])
+    strongest = influence(study, results)
+    if strongest:
+        paths.append(folder / 'influence.png')
+        _draw_influence(study, results, strongest, paths[1])
+    return paths
 
 
 def _draw_distributions(study: Study, results: Columns, path: Path) -> None:
-    picture = Picture(2, 2, _title(results), _PANEL, share_time=False)
+    runs, kept = results['outcome'].size, int((results['outcome'] == KEPT).sum())
+    title = f'{runs} runs: {100 * kept / runs:.4g} % kept the bound'
+    picture = Picture(2, 2, title, _PANEL, share_time=False)
     (ratio, tail), (rms, error) = picture.axes
-    _ratio(ratio, study, results)
-    _tail(tail, study, results)
-    _rms(rms, study, results)
-    _error(error, study, results)
-    picture.save(path)
+    joints = study.plant.joints
 
+    ratios = {joint: results[f'max_error_ratio.{joint}'] for joint in joints}
+    _histogram(ratio, {joint: np.minimum(values, _FAR) for joint, values in ratios.items()})
+    ratio.axvline(1.0, color=ALARM, lw=1.4, label='bound')
+    ratio.set_xlabel(_RATIO)
+    head(ratio, 'largest error')
 
-def _title(results: Columns) -> str:
-    runs = results['outcome'].size
-    kept = int((results['outcome'] == KEPT).sum())
-    return f'{runs} runs: {100 * kept / runs:.4g} % kept the bound'
-
-
-def _ratio(axes: Axes, study: Study, results: Columns) -> None:
-    columns = {joint: results[f'max_error_ratio.{joint}'] for joint in study.plant.joints}
-    # Far outside, how far does not matter any more; the last bar holds all of it.
-    _histogram(axes, {joint: np.minimum(values, 1.25) for joint, values in columns.items()})
-    axes.axvline(1.0, color=ALARM, lw=1.4, label='bound')
-    axes.set_xlabel(r'max $|\xi_1| \; / \; k_c$')
-    head(axes, 'largest error')
-
-
-def _tail(axes: Axes, study: Study, results: Columns) -> None:
     worst = np.sort(worst_ratio(study, results))
-    share = 1.0 - np.arange(worst.size) / worst.size
+    fraction = 1.0 - np.arange(worst.size) / worst.size
     finite = np.isfinite(worst)
-    axes.loglog(worst[finite], share[finite], color=BLUE, drawstyle='steps-pre')
-    axes.axvline(1.0, color=ALARM, lw=1.4, label='bound')
-    axes.set_ylabel('share of runs above')
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{100 * value:g} %'))
-    _plain(axes)
-    axes.set_xlabel(r'max $|\xi_1| \; / \; k_c$, the worse joint')
-    head(axes, 'tail of the largest error')
+    tail.loglog(worst[finite], fraction[finite], color=BLUE, drawstyle='steps-pre')
+    tail.axvline(1.0, color=ALARM, lw=1.4, label='bound')
+    tail.set_ylabel('fraction of runs above')
+    tail.yaxis.set_major_formatter(_PERCENT)
+    _plain(tail)
+    tail.set_xlabel(f'{_RATIO}, the worse joint')
+    head(tail, 'tail of the largest error')
+
+    _histogram(
+        rms, {joint: 1e3 * results[f'rms_error_rad.{joint}'] for joint in joints}, logarithmic=True
+    )
+    _plain(rms)
+    rms.set_xlabel(r'rms $\xi_1$ [mrad]')
+    head(rms, f'error from {study.settings.settled_after:g} s on')
+
+    labels = [*(f'{moment:g} s' for moment in study.settings.moments), 'end']
+    errors = {
+        label: np.maximum(results[name], _LEAST_ERROR)
+        for label, name in zip(labels, error_columns(study), strict=True)
+    }
+    _histogram(error, errors, logarithmic=True)
+    error.xaxis.set_major_formatter(_PERCENT)
+    error.set_xlabel(r'$\|\hat P - P\| \;/\; \|P\|$')
+    head(error, 'relative parameter error')
+    picture.save(path)
 
 
 def _plain(axes: Axes) -> None:
@@ -85,30 +92,8 @@ def _plain(axes: Axes) -> None:
     )
 
 
-def _rms(axes: Axes, study: Study, results: Columns) -> None:
-    columns = {joint: results[f'rms_error_rad.{joint}'] for joint in study.plant.joints}
-    columns = {joint: _MILLI * values for joint, values in columns.items()}
-    _histogram(axes, columns, logarithmic=True)
-    _plain(axes)
-    axes.set_xlabel(r'rms $\xi_1$ [mrad]')
-    head(axes, f'error from {study.settings.settled_after:g} s on')
-
-
-def _error(axes: Axes, study: Study, results: Columns) -> None:
-    names = list(error_columns(study))
-    labels = [*(f'{moment:g} s' for moment in study.settings.moments), 'end']
-    columns = {
-        label: np.maximum(results[name], _LEAST_ERROR)
-        for label, name in zip(labels, names, strict=True)
-    }
-    _histogram(axes, columns, logarithmic=True)
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{100 * value:g} %'))
-    axes.set_xlabel(r'$\|\hat P - P\| \;/\; \|P\|$')
-    head(axes, 'relative parameter error')
-
-
 def _histogram(axes: Axes, columns: dict[str, Floats], *, logarithmic: bool = False) -> None:
-    """Outlines over common bins, so that several distributions can be told apart."""
+    """Outlines of several distributions over common bins."""
     known = {label: values[np.isfinite(values)] for label, values in columns.items()}
     everything = np.concatenate(list(known.values()))
     if everything.size == 0:
@@ -124,26 +109,28 @@ def _histogram(axes: Axes, columns: dict[str, Floats], *, logarithmic: bool = Fa
         weights = np.full(values.size, 1.0 / max(1, values.size))
         axes.hist(values, bins, weights=weights, histtype='stepfilled', color=colour, alpha=0.22)
         axes.hist(values, bins, weights=weights, histtype='step', color=colour, lw=1.4, label=label)
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{100 * value:g} %'))
-    axes.set_ylabel('share of runs')
+    axes.yaxis.set_major_formatter(_PERCENT)
+    axes.set_ylabel('fraction of runs')
 
 
-def _draw_influence(study: Study, results: Columns, path: Path) -> None:
-    strongest = list(influence(study, results).items())[:_PANELS_OF_INFLUENCE]
+def _draw_influence(
+    study: Study, results: Columns, influences: dict[str, float], path: Path
+) -> None:
+    strongest = list(influences.items())[:_PANELS_OF_INFLUENCE]
     columns = min(3, len(strongest))
     rows = -(-len(strongest) // columns)
     title = 'What the largest error depends on most'
     picture = Picture(rows, columns, title, (4.4, 3.2), share_time=False)
     worst = worst_ratio(study, results)
+    ratios = np.minimum(worst, _FARTHEST)
     kept = np.flatnonzero(results['outcome'] == KEPT)
     kept = kept[:: -(-kept.size // _MOST_DOTS) or 1]
-    lost = np.flatnonzero(results['outcome'] != KEPT)
-    size, opacity = (5.0, 0.5) if kept.size < _FEW_DOTS else (2.5, 0.25)
+    lost = results['outcome'] != KEPT
     beyond = worst > _FARTHEST
-    distributions = {one.column: one.distribution for one in study.spreads}
-    for axes, (name, share) in zip(picture.axes.flat, strongest, strict=False):
+    size, opacity = (5.0, 0.5) if kept.size < _FEW_DOTS else (2.5, 0.25)
+    distributions = {one.column: one.distribution for one in study.variations}
+    for axes, (name, fraction) in zip(picture.axes.flat, strongest, strict=False):
         values = results[f'plant.{name}']
-        ratios = np.minimum(worst, _FARTHEST)
         axes.plot(values[kept], ratios[kept], '.', ms=size, color=BLUE, alpha=opacity, mew=0)
         axes.plot(values[lost], ratios[lost], '.', ms=6, color=ALARM, mew=0)
         axes.plot(values[beyond], ratios[beyond], '^', ms=7, color=ALARM, mew=0)
@@ -151,8 +138,8 @@ def _draw_influence(study: Study, results: Columns, path: Path) -> None:
             axes.set_xscale('log')
         axes.axhline(1.0, color=INK, lw=1.0, ls='--')
         axes.set_xlabel(name, color=MUTED)
-        axes.set_ylabel(r'max $|\xi_1| \; / \; k_c$')
-        head(axes, f'explains {100 * share:.0f} %')
+        axes.set_ylabel(_RATIO)
+        head(axes, f'explains {100 * fraction:.0f} %')
     for axes in picture.axes.flat[len(strongest) :]:
         axes.set_visible(False)
     picture.save(path)

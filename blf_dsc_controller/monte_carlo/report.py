@@ -1,27 +1,171 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All that is told of a study: report.md, its pictures, and summary.json, in its own folder."""
+"""The report of a study in its own folder, and one of its runs again with every sample recorded."""
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
+from blf_dsc_controller.analysis.figures import draw as draw_run
+from blf_dsc_controller.analysis.page import Cell, Figure, Page, Paragraph, Section, Table
+from blf_dsc_controller.analysis.summary import summarize as summarize_run
 from blf_dsc_controller.analysis.summary import write_summary
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
+from blf_dsc_controller.configuration.params_file import dump
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.monte_carlo.figures import draw_study
-from blf_dsc_controller.monte_carlo.page import page
-from blf_dsc_controller.monte_carlo.statistics import Summary, judge
-from blf_dsc_controller.monte_carlo.store import Store
+from blf_dsc_controller.monte_carlo.runs import OUTCOMES, measure_record
+from blf_dsc_controller.monte_carlo.statistics import Summary, summarize
+from blf_dsc_controller.monte_carlo.store import Store, differences
+from blf_dsc_controller.monte_carlo.study import Study, draw, origin_of, plant_of_draw
+from blf_dsc_controller.simulation.bag import write_bag
+from blf_dsc_controller.simulation.loop import simulate
+
+_QUANTILES = ('min', 'median', 'p95', 'p99', 'max')
 
 
 def write_report(store: Store) -> tuple[Summary, list[Path]]:
-    """Judge and draw what there is; it may be done again at any time.
+    """Write report.html with its figures, and summary.json, of the runs that are done.
 
-    Returns the summary, and what was written. Raises NoResultsError where there is nothing yet.
+    Returns the summary and the paths; raises BlfDscError where there are no results yet.
     """
     results = store.results()
-    summary = judge(store.study, results)
-    pictures = draw_study(store.study, results, store.folder)
-    written = [store.folder / 'report.md', *pictures, store.folder / 'summary.json']
+    summary = summarize(store.study, results)
+    figures = draw_study(store.study, results, store.folder)
+    path = store.folder / 'report.html'
+    _page(store.study, summary, store.folder, figures).write(path)
     write_summary(summary, store.folder / 'summary.json')
-    text = page(store.study, summary, store.folder, pictures)
-    (store.folder / 'report.md').write_text(text, encoding='utf-8')
-    return summary, written
+    return summary, [path, *figures, store.folder / 'summary.json']
+
+
+def headline(summary: Summary) -> str:
+    """Result in one sentence."""
+    kept = summary['kept']
+    return (
+        f'{_percent(kept["fraction"])} of the runs kept the bound '
+        f'({summary["outcomes"]["kept"]} of {summary["runs"]}; {100 * kept["confidence"]:g} % '
+        f'confidence: {_percent(kept["low"])} to {_percent(kept["high"])})'
+    )
+
+
+def reproduce_command(folder: Path, run: int) -> str:
+    """Command that computes a run again and records it."""
+    out = shlex.quote(f'{folder.name}-run-{run}')
+    return f'blf_dsc monte-carlo --reproduce {shlex.quote(str(folder))} {run} --out {out}'
+
+
+def plant_of_run(study: Study, run: int) -> PlantConfig:
+    """Configuration of the plant of a run."""
+    return plant_of_draw(study, draw(study, run), origin_of(controller_of(study.controller)))
+
+
+def reproduce(store: Store, run: int, out: Path) -> Summary:
+    """Compute a run of the study again into the folder `out`: config.yaml, bag, figures, summary.
+
+    Raises BlfDscError if the run has no results, or if they are not reproduced bit for bit;
+    OutsideBarrierError if the controller rejects its start.
+    """
+    results = store.results()
+    if run not in results['run']:
+        raise BlfDscError(f'{store.folder} has no run {run}: it has {results["run"].size} runs')
+    study = store.study
+    plant = plant_of_run(study, run)
+    dump(out / 'config.yaml', {PLANT: plant, CONTROLLER: study.controller})
+    record = simulate(study.controller, plant)
+    write_bag(out / 'bag', record, study.controller, 'none')
+    recorded = read_run(out / 'bag')
+    summary = summarize_run(recorded)
+    write_summary(summary, out / 'summary.json')
+    draw_run(recorded, out)
+    here = measure_record(study, plant, record)
+    row = int((results['run'] == run).argmax())
+    different = differences({name: results[name][row] for name in here}, here)
+    if different:
+        raise BlfDscError(
+            f'run {run} is not what it was: was it computed on another kind of machine, or by '
+            f'another version?{different}'
+        )
+    return summary
+
+
+def _page(study: Study, summary: Summary, folder: Path, figures: list[Path]) -> Page:
+    introduction = [Paragraph(f'{headline(summary)}.', 'lead')]
+    if summary['runs'] < summary['planned']:
+        text = f'The study is not complete: {summary["planned"]} runs are planned.'
+        introduction.append(Paragraph(text))
+    outcomes = [(name, str(count), OUTCOMES[name]) for name, count in summary['outcomes'].items()]
+    method = (
+        f'The interval is that of Wilson. Seed {summary["seed"]}; everything else is in study.yaml '
+        'and versions.json, the results in runs/*.parquet.'
+    )
+    quantiles: list[tuple[str | Cell, ...]] = [
+        (Cell(name, 'code'), *(_number(values[one]) for one in _QUANTILES))
+        for name, values in summary['figures'].items()
+        if values is not None
+    ]
+    varied = [
+        (
+            Cell(one.column.removeprefix('plant.'), 'code'),
+            Cell(str(one.distribution), 'code'),
+            _explained(summary['influence'].get(one.column.removeprefix('plant.'))),
+        )
+        for one in study.variations
+    ]
+    return Page(
+        f'Monte Carlo study: {summary["runs"]} runs of {summary["duration_s"]:g} s',
+        [*introduction, Table(('outcome', 'runs', 'meaning'), outcomes), Paragraph(method)],
+        [
+            Section(
+                'Distributions',
+                [
+                    *(Figure(path, path.stem) for path in figures),
+                    Table(('', *_QUANTILES), quantiles, numeric=True),
+                ],
+            ),
+            Section(
+                'The worst runs',
+                [
+                    Table(
+                        ('run', 'outcome', 'max |ξ1|/k_c', 'first outside', 'again, with a bag'),
+                        [_worst_row(one, folder) for one in summary['worst']],
+                    )
+                ],
+            ),
+            Section(
+                'What varied',
+                [
+                    Paragraph(
+                        'Variance of the largest error that each number explains by itself: '
+                        'correlation ratio of the ranks over ten groups.'
+                    ),
+                    Table(('parameter', 'distribution', 'explains'), varied),
+                ],
+            ),
+        ],
+    )
+
+
+def _worst_row(one: Summary, folder: Path) -> tuple[str | Cell, ...]:
+    first = one['first_violation_s']
+    return (
+        str(one['run']),
+        one['outcome'],
+        ', '.join(_number(ratio) for ratio in one['max_error_ratio'].values()),
+        '-' if first is None else f'{first:.3f} s',
+        Cell(reproduce_command(folder, one['run']), 'code'),
+    )
+
+
+def _explained(fraction: float | None) -> str:
+    return '-' if fraction is None else f'{100 * fraction:.0f} %'
+
+
+def _number(value: float | None) -> str:
+    return '-' if value is None else f'{value:.4g}'
+
+
+def _percent(fraction: float) -> str:
+    return f'{100 * fraction:.4g} %'

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The folder of a study: what it is, and a file of results for each chunk of runs that is done.
 
-    study.yaml       the whole configuration, a file that `monte_carlo --config` takes
+    study.yaml       the whole configuration, a file that `blf_dsc monte-carlo --config` takes
     versions.json    what computed it
     runs/            Parquet files, named after the first and the last run in them
 
-A file of results appears whole or not at all, so a study that was killed goes on with the runs
+A file of results appears whole or not at all, so a study that was killed resumes with the runs
 that have none.
 """
 
@@ -20,22 +20,15 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import blf_dsc_controller
 from blf_dsc_controller.compiled.jit import cache_folder
-from blf_dsc_controller.monte_carlo.chunk import Columns
-from blf_dsc_controller.monte_carlo.errors import (
-    NoResultsError,
-    NotAStudyError,
-    OtherStudyError,
-    StudyInUseError,
-)
-from blf_dsc_controller.monte_carlo.study import Study
-from blf_dsc_controller.monte_carlo.study_file import load_study, write_study
-from blf_dsc_controller.monte_carlo.table import read_tables, write_table
+from blf_dsc_controller.errors import BlfDscError, MissingExtraError
+from blf_dsc_controller.monte_carlo.runs import Columns
+from blf_dsc_controller.monte_carlo.study import Study, load_study, write_study
 
 _STUDY = 'study.yaml'
 _VERSIONS = 'versions.json'
@@ -50,6 +43,16 @@ class Span(NamedTuple):
     runs: int
 
 
+def require_pyarrow() -> Any:
+    """Return pyarrow with its Parquet files; MissingExtraError where it is not installed."""
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet
+    except ImportError:
+        raise MissingExtraError('pyarrow', 'monte-carlo', 'keeping the results') from None
+    return pa
+
+
 def versions() -> dict[str, str]:
     """What the numbers depend on beside the configuration."""
     return {
@@ -59,62 +62,84 @@ def versions() -> dict[str, str]:
     }
 
 
-class Store:
-    """The folder of a study that is there.
+def differences(there: Mapping[str, object], here: Mapping[str, object]) -> str:
+    """Lines for a message, one for each value that differs; empty if none does."""
+    names = [*there, *(name for name in here if name not in there)]
+    pairs = ((name, there.get(name, 'nothing'), here.get(name, 'nothing')) for name in names)
+    return ''.join(
+        f'\n  - {name}: there {old}, here {new}'
+        for name, old, new in pairs
+        if old != new and (old == old or new == new)  # noqa: PLR0124 - NaN is as good as NaN
+    )
 
-    Attributes:
-        folder: of the study.
-        study: that its results belong to.
+
+class Store:
+    """The folder of a study; BlfDscError where there is none.
+
+    Attributes: `folder` of the study, and the `study` that its results belong to.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Open a study; NotAStudyError where there is none."""
         self.folder = folder
-        if not (folder / _STUDY).is_file():
-            raise NotAStudyError(folder)
+        try:
+            self._versions = json.loads((folder / _VERSIONS).read_text(encoding='utf-8'))
+            if not (folder / _STUDY).is_file():
+                raise FileNotFoundError
+        except (OSError, ValueError):
+            raise BlfDscError(
+                f'{folder} exists already, holds no study and is not written into: '
+                'choose another folder'
+                if os.path.lexists(folder)
+                else f'{folder} does not exist: it should be the folder of a study'
+            ) from None
         self.study = load_study(folder / _STUDY)
 
     @classmethod
     def create_or_open(cls, folder: Path, study: Study) -> Store:
-        """Make the folder of a study, or open it where it is there, to go on.
+        """Make the folder of a study, or open it to resume.
 
-        Raises:
-            NotAStudyError: there is something else of that name.
-            OtherStudyError: there is another study, or the same by another version.
+        Raises BlfDscError if it holds another study, the same by another version, or none.
         """
         if not os.path.lexists(folder):
             _create(folder, study)
-        if not (folder / _STUDY).is_file():
-            raise NotAStudyError(folder)
-        differences = _differences(version_of(folder), versions())
-        if differences:
-            raise OtherStudyError(folder, differences)
         store = cls(folder)
-        differences = _differences(store.study.flat(), study.flat())
-        if differences:
-            raise OtherStudyError(folder, differences)
+        different = differences(store._versions, versions())
+        different = different or differences(store.study.flat(), study.flat())
+        if different:
+            raise BlfDscError(
+                f'{folder} holds another study, which is neither resumed nor overwritten: '
+                f'choose another folder, or make them equal:{different}'
+            )
         return store
 
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Keep other processes from writing into the folder; a lock ends with its process.
 
-        Raises StudyInUseError where another process has it. What an earlier one has left
-        unfinished is removed.
+        Removes what an earlier process left unfinished. Raises BlfDscError if another holds it.
         """
         with (self.folder / _STUDY).open(encoding='utf-8') as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise StudyInUseError(self.folder) from None
+                raise BlfDscError(
+                    f'another monte-carlo is running in {self.folder}: wait for it, or end it'
+                ) from None
             for unfinished in (self.folder / _RUNS).glob('.runs-*'):
                 unfinished.unlink()
             yield
 
     def keep(self, span: Span, columns: Columns) -> None:
-        """Write the results of some runs."""
+        """Write the results of some runs: the whole file or none, even if the process is killed."""
+        pa = require_pyarrow()
         last = span.first + span.runs - 1
-        write_table(columns, self.folder / _RUNS / f'runs-{span.first:09d}-{last:09d}.parquet')
+        path = self.folder / _RUNS / f'runs-{span.first:09d}-{last:09d}.parquet'
+        unfinished = path.with_name(f'.{path.name}.{os.getpid()}')
+        with unfinished.open('wb') as file:
+            pa.parquet.write_table(pa.table(columns), file)
+            file.flush()
+            os.fsync(file.fileno())
+        unfinished.replace(path)
 
     def done(self) -> list[Span]:
         """Runs that have results, in their order."""
@@ -132,22 +157,32 @@ class Store:
         ]
 
     def results(self) -> Columns:
-        """Read all there is, a row for each run, in their order."""
+        """Read all results, a row for each run, in their order.
+
+        Raises BlfDscError if there are none yet, and for a damaged file.
+        """
+        pa = require_pyarrow()
         paths = sorted(
             path for path in (self.folder / _RUNS).iterdir() if _PART.fullmatch(path.name)
         )
         if not paths:
-            raise NoResultsError(self.folder, 'results yet')
-        return read_tables(paths)
-
-
-def version_of(folder: Path) -> dict[str, str]:
-    """What a study was begun with."""
-    try:
-        told: dict[str, str] = json.loads((folder / _VERSIONS).read_text(encoding='utf-8'))
-    except (OSError, ValueError):
-        raise NotAStudyError(folder) from None
-    return told
+            raise BlfDscError(f'{self.folder} has no results yet')
+        tables = []
+        for path in paths:
+            problem = ''
+            try:
+                tables.append(pa.parquet.read_table(path))
+                if tables[-1].column_names != tables[0].column_names:
+                    problem = f'its columns are not those of {paths[0].name}'
+            except (OSError, pa.ArrowException) as error:
+                problem = str(error)
+            if problem:
+                raise BlfDscError(
+                    f'{path} cannot be read ({problem}): remove it and start the study again, '
+                    'which computes these runs anew'
+                )
+        whole = pa.concat_tables(tables).sort_by('run')
+        return {name: np.asarray(whole[name].to_numpy()) for name in whole.column_names}
 
 
 def _create(folder: Path, study: Study) -> None:
@@ -156,17 +191,6 @@ def _create(folder: Path, study: Study) -> None:
     shutil.rmtree(unfinished, ignore_errors=True)
     (unfinished / _RUNS).mkdir(parents=True)
     write_study(study, unfinished / _STUDY)
-    told = json.dumps(versions(), indent=2) + '\n'
-    (unfinished / _VERSIONS).write_text(told, encoding='utf-8')
+    text = json.dumps(versions(), indent=2) + '\n'
+    (unfinished / _VERSIONS).write_text(text, encoding='utf-8')
     unfinished.rename(folder)
-
-
-def _differences(
-    there: Mapping[str, object], here: Mapping[str, object]
-) -> dict[str, tuple[object, object]]:
-    names = [*there, *(name for name in here if name not in there)]
-    return {
-        name: (there.get(name, 'nothing'), here.get(name, 'nothing'))
-        for name in names
-        if there.get(name) != here.get(name)
-    }

@@ -1,26 +1,84 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A study: a closed loop, what of it varies, and the run that each index stands for."""
+"""A study: a closed loop, what of it varies, and the run that each index stands for.
+
+Its file is a parameter file of the loop with one section more:
+
+    monte_carlo:
+      ros__parameters:
+        runs: 10000
+        vary:
+          arm.m2: uniform(0.4, 0.6)
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
+from blf_dsc_controller.configuration.params_file import dump, format_value, load_loop, read
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.configuration.schema import build, flatten, parameter
+from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.monte_carlo.configuration import MonteCarloConfig
 from blf_dsc_controller.monte_carlo.distribution import Value
-from blf_dsc_controller.monte_carlo.variations import Spread, slots
+from blf_dsc_controller.monte_carlo.variations import Variation, read_variations, slots
 
-NODE = 'monte_carlo'
-"""Name of the section that tells what varies."""
+_NODE = 'monte_carlo'
+_VARY = 'vary.'
+_ONE_STUDY = 'a study is one configuration from its first run to its last'
+
+
+@dataclass(frozen=True)
+class MonteCarloConfig:
+    """Section `monte_carlo` of a study file: how many runs, and what is measured of each."""
+
+    runs: int = parameter(
+        1000, 'closed loops to run', at_least=1, at_most=100_000_000, read_only=_ONE_STUDY
+    )
+    seed: int = parameter(
+        0,
+        'run i is determined by this seed and i alone',
+        at_least=0,
+        read_only=_ONE_STUDY,
+    )
+    settled_after: float = parameter(
+        0.0,
+        'time from which on the rms error is taken: leave the learning its window',
+        unit='s',
+        at_least=0.0,
+        read_only=_ONE_STUDY,
+    )
+    moments: tuple[float, ...] = parameter(
+        (),
+        'times at which the parameter error is kept, beside the end',
+        unit='s',
+        at_least=0.0,
+        may_be_empty=True,
+        read_only=_ONE_STUDY,
+    )
+
+    def duration_problems(self, duration: float) -> list[str]:
+        """Problems with what is measured after the end of a run of this duration [s]."""
+        if duration == 0.0:
+            return ['sim_plant.duration: got 0 s, but every run must end: give its time']
+        problems = [
+            f'moments: got {moment:g} s at entry {entry}, but a run ends at {duration:g} s'
+            for entry, moment in enumerate(self.moments, 1)
+            if moment > duration
+        ]
+        if self.settled_after >= duration:
+            problems.append(
+                f'settled_after: got {self.settled_after:g} s, but a run ends at {duration:g} s'
+            )
+        repeated = sorted({moment for moment in self.moments if self.moments.count(moment) > 1})
+        return problems + [f'moments: {moment:g} s is there more than once' for moment in repeated]
 
 
 @dataclass(frozen=True)
@@ -30,64 +88,119 @@ class Study:
     controller: ControllerConfig
     plant: PlantConfig
     settings: MonteCarloConfig
-    spreads: tuple[Spread, ...]
+    variations: tuple[Variation, ...]
+
+    def by_node(self) -> dict[str, Any]:
+        """Configurations by the names of their nodes."""
+        return {PLANT: self.plant, CONTROLLER: self.controller, _NODE: self.settings}
 
     def flat(self) -> dict[str, object]:
         """Every value by its node and name, with the distributions as they are written."""
-        nodes = {PLANT: self.plant, CONTROLLER: self.controller, NODE: self.settings}
-        told: dict[str, object] = {
+        values: dict[str, object] = {
             f'{node}.{name}': value
-            for node, config in nodes.items()
+            for node, config in self.by_node().items()
             for name, value in flatten(config).items()
         }
-        return told | {f'{NODE}.vary.{name}': text for name, text in self.varied().items()}
+        return values | {f'{_NODE}.{_VARY}{name}': text for name, text in self.varied().items()}
 
     def varied(self) -> dict[str, str | tuple[str, ...]]:
         """Distributions as they are written: a list for a parameter of each joint."""
-        written: dict[str, str | tuple[str, ...]] = {}
-        for one in self.spreads:
+        texts: dict[str, str | tuple[str, ...]] = {}
+        for one in self.variations:
             text = str(one.distribution)
-            if one.entry < 0:
-                written[one.name] = text
-            else:
-                written[one.name] = (*written.get(one.name, ()), text)
-        return written
+            texts[one.name] = text if one.entry < 0 else (*texts.get(one.name, ()), text)
+        return texts
+
+
+def load_study(path: str | Path, overrides: Mapping[str, object] | None = None) -> Study:
+    """Read a study; `overrides` of the section `monte_carlo` take precedence over the file.
+
+    Raises ConfigurationError with all problems of all sections, and their lines.
+    """
+    problems: list[str] = []
+    loop: LoopConfig | None = None
+    settings: MonteCarloConfig | None = None
+    try:
+        loop = load_loop(path)
+    except ConfigurationError as error:
+        problems += error.problems
+    given, lines = _read_section(path)
+    varied = {name.removeprefix(_VARY): given[name] for name in given if name.startswith(_VARY)}
+    others = {name: given[name] for name in given if not name.startswith(_VARY)}
+    own: list[str] = []
+    try:
+        settings = build(MonteCarloConfig, {**others, **(overrides or {})})
+    except ConfigurationError as error:
+        own += error.problems
+    variations, found = read_variations(varied, loop.plant.joints if loop else ('joint1', 'joint2'))
+    own += [f'{_VARY}{problem}' for problem in found]
+    if loop and settings:
+        own += settings.duration_problems(loop.plant.duration)
+    for problem in own:
+        name = problem.split(':', 1)[0]
+        where = f'line {lines[name]}: ' if name in lines else ''
+        problems.append(f'{_NODE}: {where}{problem}')
+    if loop and loop.plant.joints != loop.controller.joints:
+        problems.append(f'joints: {PLANT} and {CONTROLLER} have them in different orders')
+    if problems or loop is None or settings is None:
+        raise ConfigurationError(problems, str(path))
+    return Study(loop.controller, loop.plant, settings, variations)
+
+
+def write_study(study: Study, path: Path) -> None:
+    """Write a study so that `load_study` gives the same one."""
+    dump(path, study.by_node())
+    with path.open('a', encoding='utf-8') as file:
+        file.writelines(
+            f'    {_VARY}{name}: {format_value(text)}\n' for name, text in study.varied().items()
+        )
+
+
+def _read_section(path: str | Path) -> tuple[dict[str, Any], dict[str, int]]:
+    """Values and lines of the section `monte_carlo`, by name."""
+    entries = {
+        name: entry
+        for section in read(path)
+        if section.matches(f'/{_NODE}') and not section.is_wildcard
+        for name, entry in section.entries.items()
+    }
+    if not entries:
+        problem = (
+            f'there is no section {_NODE}, which says how many runs there are and what varies: '
+            'see the preset monte_carlo'
+        )
+        raise ConfigurationError([problem], str(path))
+    lines = {name: entry.line for name, entry in entries.items()}
+    return {name: entry.value for name, entry in entries.items()}, lines
 
 
 class Origin(NamedTuple):
-    """Where the reference and the bound begin, which a start is told relative to."""
+    """Where the reference and the bound begin, to which a start is relative."""
 
     qr: np.ndarray  # (n,) rad
     dqr: np.ndarray  # (n,) rad/s
     bound: np.ndarray  # (n,) rad
 
 
-@dataclass(frozen=True)
-class Draw:
-    """What run `index` has for its own.
+class Draw(NamedTuple):
+    """The random numbers of one run."""
 
-    Attributes:
-        index: of the run.
-        seed: of the sensor noise.
-        values: of the spreads, in their order.
-    """
-
-    index: int
-    seed: int
-    values: tuple[Value, ...]
+    run: int
+    seed: int  # of the sensor noise
+    values: tuple[Value, ...]  # of the variations, in their order
 
 
 def draw(study: Study, index: int) -> Draw:
-    """Draw run `index`: nothing but the seed of the study and the index goes into it.
+    """Draw run `index`, from nothing but the seed of the study and the index.
 
-    Each spread has a random number of its own, which it keeps whatever else varies: two studies of
-    one seed that differ in one distribution meet the same arms.
+    Each variation has a random number of its own, which it keeps whatever else varies: two studies
+    of one seed that differ in one distribution have the same arms.
     """
     sequence = np.random.SeedSequence(study.settings.seed, spawn_key=(index,))
     rng = np.random.Generator(np.random.PCG64(sequence))
     seed = int(rng.integers(2**62))
     numbers = rng.random(slots(len(study.plant.joints))).tolist()
-    values = tuple(one.distribution.at(numbers[one.slot]) for one in study.spreads)
+    values = tuple(one.distribution.at(numbers[one.slot]) for one in study.variations)
     return Draw(index, seed, values)
 
 
@@ -98,15 +211,9 @@ def origin_of(controller: Controller) -> Origin:
 
 
 def plant_of_draw(study: Study, drawn: Draw, origin: Origin) -> PlantConfig:
-    """Configuration of the plant of a run.
-
-    Args:
-        study: that it is a run of.
-        drawn: the run.
-        origin: of the controller of the study.
-    """
+    """Configuration of the plant of a run; `origin` is that of the study's controller."""
     changes: dict[str, dict[str, Any]] = {}
-    for one, value in zip(study.spreads, drawn.values, strict=True):
+    for one, value in zip(study.variations, drawn.values, strict=True):
         group, _, field = one.name.partition('.')
         section = changes.setdefault(group, {})
         if one.entry < 0:
@@ -116,19 +223,14 @@ def plant_of_draw(study: Study, drawn: Draw, origin: Origin) -> PlantConfig:
             entries = list(before or [0.0] * len(study.plant.joints))
             entries[one.entry] = value
             section[field] = tuple(entries)
-    changes['initial'] = _start(changes.get('initial', {}), origin)
-    groups = {
-        group: dataclasses.replace(getattr(study.plant, group), **section)
-        for group, section in changes.items()
-    }
-    return dataclasses.replace(study.plant, seed=drawn.seed, **groups)
-
-
-def _start(relative: Mapping[str, tuple[float, ...]], origin: Origin) -> dict[str, Any]:
-    """Position and velocity of a start that is told relative to the reference."""
+    relative = changes.pop('initial', {})
     start: dict[str, Any] = {}
     if 'error' in relative:
         start['position'] = tuple((origin.qr + origin.bound * relative['error']).tolist())
     if 'velocity_error' in relative:
         start['velocity'] = tuple((origin.dqr + relative['velocity_error']).tolist())
-    return start
+    groups = {
+        group: dataclasses.replace(getattr(study.plant, group), **section)
+        for group, section in (changes | {'initial': start}).items()
+    }
+    return dataclasses.replace(study.plant, seed=drawn.seed, **groups)
