@@ -25,7 +25,7 @@ def context():
 
 
 def with_ros(context, path, name):
-    """What the node is told by rcl, or None where rcl refuses the file."""
+    """Parameters that rcl reads for the node, or None if it rejects the file."""
     space, _, base = name.rpartition('/')
     try:
         node = Node(
@@ -38,9 +38,9 @@ def with_ros(context, path, name):
         )
     except RuntimeError:
         return None
-    told = {key: parameter.value for key, parameter in node._parameter_overrides.items()}
+    values = {key: parameter.value for key, parameter in node._parameter_overrides.items()}
     node.destroy_node()
-    return told
+    return values
 
 
 def without_ros(path, name):
@@ -64,9 +64,9 @@ def test_the_same_sections_count(context, tmp_path, name):
             for index, pattern in enumerate(PATTERNS)
         )
     )
-    told = without_ros(path, name)
-    assert told
-    assert told == with_ros(context, path, name)
+    values = without_ros(path, name)
+    assert values
+    assert values == with_ros(context, path, name)
 
 
 WORDS = """
@@ -105,7 +105,7 @@ def test_the_same_words_mean_the_same(context, tmp_path):
         'n: [\n',
     ],
 )
-def test_what_ros_refuses_is_refused(context, tmp_path, text):
+def test_files_that_ros_rejects_are_rejected(context, tmp_path, text):
     path = tmp_path / 'a.yaml'
     path.write_text(text)
     assert with_ros(context, path, '/n') is None
@@ -125,8 +125,10 @@ def test_ros_reads_a_written_configuration_exactly(context, tmp_path):
     path = tmp_path / 'run.yaml'
     config = ControllerConfig()
     dump(path, {'blf_dsc_controller': config})
-    told = with_ros(context, path, '/blf_dsc_controller')
+    values = with_ros(context, path, '/blf_dsc_controller')
     # ROS has no type for an empty list, and gives no value.
-    told = {name: [] if value is None else value for name, value in told.items()}
-    held = {key: tuple(value) if isinstance(value, list) else value for key, value in told.items()}
+    values = {name: [] if value is None else value for name, value in values.items()}
+    held = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in values.items()
+    }
     assert held == flatten(config)

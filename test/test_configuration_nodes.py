@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The configurations of the package: presets, agreement with the law, and what is refused."""
+"""The configurations of the package: presets, agreement with the law, and what is rejected."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from blf_dsc_controller.law import settings
 DEFAULTS = LoopConfig(PlantConfig(), ControllerConfig(), RecorderConfig())
 
 
-def complaints(cls, given):
+def problems_of(cls, given):
     with pytest.raises(ConfigurationError) as caught:
         build(cls, given)
     return caught.value.problems
@@ -62,7 +62,7 @@ def test_models_and_choices_are_those_of_the_law():
         assert parameter_count(n) == len(model.parameter_names)
     choices = {one.name: one.choices for one in parameters(ControllerConfig)}
     for law in choices['law']:
-        given = {'law': law, 'truth.parameters': [1.0, 0.32, 0.4]}  # model_based asks for them
+        given = {'law': law, 'truth.parameters': [1.0, 0.32, 0.4]}  # required by model_based
         assembly.settings_of_config(build(ControllerConfig, given))
     assert sorted(choices['learning.update']) == sorted(settings.UPDATES)
     assert sorted(choices['learning.torque_source']) == sorted(settings.TORQUE_SOURCES)
@@ -80,27 +80,27 @@ def test_a_whole_number_of_nanoseconds():
     assert build(PlantConfig, {'sample_time': 0.0003}).sample_time_ns == 300_000
     assert build(ControllerConfig, {'sample_time': 0.01}).sample_time_ns == 10_000_000
     for cls in (PlantConfig, ControllerConfig):
-        (complaint,) = complaints(cls, {'sample_time': 1 / 3000})
-        assert complaint.endswith('not a whole number of nanoseconds: write 0.000333333')
+        (problem,) = problems_of(cls, {'sample_time': 1 / 3000})
+        assert problem.endswith('not a whole number of nanoseconds: write 0.000333333')
 
 
 @pytest.mark.parametrize('cls', [PlantConfig, ControllerConfig])
 def test_joints_have_names_of_their_own_and_the_arm_has_two(cls):
-    assert complaints(cls, {'joints': ['elbow', 'elbow']}) == [
+    assert problems_of(cls, {'joints': ['elbow', 'elbow']}) == [
         "joints: the name 'elbow' is repeated"
     ]
-    assert complaints(cls, {'joints': ['elbow', '']}) == ['joints: a name is empty']
+    assert problems_of(cls, {'joints': ['elbow', '']}) == ['joints: a name is empty']
     one = {
         one.name: one.default[:1]
         for one in parameters(cls)
         if 'joints' in one.length or one.name == 'joints'
     }
-    (complaint,) = complaints(cls, one)
-    assert complaint.startswith('joints: got 1 name, but')
+    (problem,) = problems_of(cls, one)
+    assert problem.startswith('joints: got 1 name, but')
 
 
 @pytest.mark.parametrize(
-    ('given', 'said'),
+    ('given', 'message'),
     [
         ({'barrier.bound': [0.002, 0.0]}, 'barrier.bound: got 0.0 at entry 2'),
         ({'barrier.bound': [0.002]}, 'barrier.bound: got 1 entry, but 2 are needed (2 of joints)'),
@@ -139,9 +139,9 @@ def test_joints_have_names_of_their_own_and_the_arm_has_two(cls):
         ),
     ],
 )
-def test_a_controller_that_cannot_run_is_refused(given, said):
-    (complaint,) = complaints(ControllerConfig, given)
-    assert complaint.startswith(said)
+def test_a_controller_that_cannot_run_is_rejected(given, message):
+    (problem,) = problems_of(ControllerConfig, given)
+    assert problem.startswith(message)
 
 
 def test_the_shortest_window_and_a_two_tone_reference_are_accepted():
@@ -154,13 +154,13 @@ def test_the_shortest_window_and_a_two_tone_reference_are_accepted():
     assert build(ControllerConfig, two_tones).reference.amplitude == (0.3, 0.1, 0.2, 0.4)
 
 
-def test_a_plant_that_ends_within_its_first_sample_is_refused():
-    (complaint,) = complaints(PlantConfig, {'duration': 0.0005})
-    assert complaint.startswith('duration: got 0.0005 s, shorter than one sample of 0.001 s')
+def test_a_plant_that_ends_within_its_first_sample_is_rejected():
+    (problem,) = problems_of(PlantConfig, {'duration': 0.0005})
+    assert problem.startswith('duration: got 0.0005 s, shorter than one sample of 0.001 s')
 
 
-def test_a_recorder_without_a_folder_is_refused():
-    assert complaints(RecorderConfig, {'output': ' '}) == [
+def test_a_recorder_without_a_folder_is_rejected():
+    assert problems_of(RecorderConfig, {'output': ' '}) == [
         'output: got no folder name to write the bag into'
     ]
 
@@ -168,13 +168,13 @@ def test_a_recorder_without_a_folder_is_refused():
 def test_plant_and_controller_must_agree():
     assert DEFAULTS.problems() == []
     faster = DEFAULTS._replace(plant=change(DEFAULTS.plant, {'sample_time': 0.0005}))
-    (complaint,) = faster.problems()
-    assert complaint.startswith('sample_time: sim_plant has 0.0005 s, but blf_dsc_controller has')
+    (problem,) = faster.problems()
+    assert problem.startswith('sample_time: sim_plant has 0.0005 s, but blf_dsc_controller has')
     swapped = DEFAULTS._replace(plant=change(DEFAULTS.plant, {'joints': ['joint2', 'joint1']}))
     assert swapped.problems() == []
     other = DEFAULTS._replace(plant=change(DEFAULTS.plant, {'joints': ['joint1', 'elbow']}))
-    (complaint,) = other.problems()
-    assert complaint.startswith('joints: sim_plant has joint1, elbow, but blf_dsc_controller has')
+    (problem,) = other.problems()
+    assert problem.startswith('joints: sim_plant has joint1, elbow, but blf_dsc_controller has')
 
 
 def test_known_names_are_those_of_all_nodes():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameter files without ROS: which section counts for which node, and what is refused where."""
+"""Parameter files without ROS: matching of sections, and rejected lines."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def seed_of(path, node='sim_plant'):
     return load(path, node, PlantConfig).seed
 
 
-def complaints(path, node='sim_plant', cls=PlantConfig):
+def problems_of(path, node='sim_plant', cls=PlantConfig):
     with pytest.raises(ConfigurationError) as caught:
         load(path, node, cls)
     assert str(path) in str(caught.value)
@@ -96,9 +96,9 @@ def test_a_power_of_ten_needs_no_point(file):
     assert load(path, 'sim_plant', PlantConfig).sensor.position_noise == 1e-5
 
 
-def test_an_integer_for_a_double_is_refused_with_its_line(file):
+def test_an_integer_for_a_double_is_rejected_with_its_line(file):
     path = file('sim_plant:\n  ros__parameters:\n    seed: 3\n    arm:\n      l1: 1\n')
-    assert complaints(path) == [
+    assert problems_of(path) == [
         'line 5: arm.l1: got 1, but a double is expected: write 1.0 instead of 1'
     ]
 
@@ -112,9 +112,9 @@ def test_overrides_count_more_than_the_file(file):
     assert caught.value.problems == ['duration: got -2.0, but it must be at least 0 s']
 
 
-def test_an_unknown_name_in_the_section_of_the_node_is_refused(file):
+def test_an_unknown_name_in_the_section_of_the_node_is_rejected(file):
     path = file(section('sim_plant', 'barrier.bound: [1.0, 1.0], sed: 1'))
-    assert complaints(path) == [
+    assert problems_of(path) == [
         'line 2: barrier.bound: unknown parameter',
         'line 2: sed: unknown parameter, did you mean seed?',
     ]
@@ -125,19 +125,19 @@ def test_a_shared_section_may_name_what_only_another_node_has(file):
     assert seed_of(path) == 4
     assert load(path, 'blf_dsc_controller', ControllerConfig).barrier.bound == (1.0, 1.0)
     path = file(section('/**', 'barrier.bond: [1.0, 1.0], seed: 4'))
-    assert complaints(path) == [
+    assert problems_of(path) == [
         'line 2: barrier.bond: unknown parameter, did you mean barrier.bound?'
     ]
 
 
-def test_the_parameters_of_ros_itself_are_nobodys_mistake(file):
+def test_the_parameters_of_ros_itself_are_accepted(file):
     content = 'use_sim_time: true, qos_overrides: {/clock: {subscription: {depth: 1}}}, seed: 2'
     assert seed_of(file(section('sim_plant', content))) == 2
     assert seed_of(file(section('/**', content))) == 2
 
 
 @pytest.mark.parametrize(
-    ('text', 'said'),
+    ('text', 'message'),
     [
         ('', 'line 1: the file is empty'),
         ('# a comment\n', 'line 1: the file is empty'),
@@ -164,12 +164,12 @@ def test_the_parameters_of_ros_itself_are_nobodys_mistake(file):
         ('n:\n  ros__parameters: {a: 1}\n---\nm: {}\n', 'line 3: not valid YAML'),
     ],
 )
-def test_a_broken_file_is_refused_with_its_line(file, text, said):
-    (complaint,) = complaints(file(text))
-    assert complaint.startswith(said)
+def test_a_broken_file_is_rejected_with_its_line(file, text, message):
+    (problem,) = problems_of(file(text))
+    assert problem.startswith(message)
 
 
-def test_a_file_of_bytes_is_refused(tmp_path):
+def test_a_file_of_bytes_is_rejected(tmp_path):
     path = tmp_path / 'arm.yaml'
     path.write_bytes(b'\xff\xfe\x00')
     with pytest.raises(ConfigurationError, match=r'arm\.yaml'):
@@ -206,7 +206,7 @@ def test_a_loop_collects_the_problems_of_all_nodes(file):
     )
     with pytest.raises(ConfigurationError) as caught:
         load_loop(path)
-    assert [complaint.split(', but')[0] for complaint in caught.value.problems] == [
+    assert [problem.split(', but')[0] for problem in caught.value.problems] == [
         'sim_plant: line 2: sample_time: got 1',
         'sim_plant: line 4: seed: got -1',
         'blf_dsc_controller: line 2: sample_time: got 1',
@@ -214,7 +214,7 @@ def test_a_loop_collects_the_problems_of_all_nodes(file):
     ]
 
 
-def test_a_loop_refuses_nodes_that_do_not_agree_and_takes_overrides(file):
+def test_a_loop_rejects_nodes_that_do_not_agree_and_takes_overrides(file):
     path = file(section('sim_plant', 'sample_time: 0.002'))
     with pytest.raises(ConfigurationError, match=r'sim_plant has 0\.002 s, but'):
         load_loop(path)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Dataclasses as parameters: what is found, accepted, and refused in which words."""
+"""Dataclasses as parameters: what is found, accepted, and rejected with which messages."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Machine:
         return ['mode: fast needs armed'] if self.mode == 'fast' and not self.armed else []
 
 
-def complaints(given: dict[str, object]) -> list[str]:
+def problems_of(given: dict[str, object]) -> list[str]:
     with pytest.raises(ConfigurationError) as caught:
         build(Machine, given, 'machine.yaml')
     assert 'machine.yaml' in str(caught.value)
@@ -86,20 +86,20 @@ def test_an_array_is_held_as_a_tuple(entries):
     assert build(Machine, {'motor.gain': entries}).motor.gain == (3.0, 4.0)
 
 
-def test_an_unknown_name_is_answered_with_the_closest():
-    assert complaints({'motor.gian': [1.0, 1.0]}) == [
+def test_an_unknown_name_suggests_the_closest():
+    assert problems_of({'motor.gian': [1.0, 1.0]}) == [
         'motor.gian: unknown parameter, did you mean motor.gain?'
     ]
-    assert complaints({'drive.belt.table': 1}) == [
+    assert problems_of({'drive.belt.table': 1}) == [
         'drive.belt.table: unknown parameter, did you mean motor.table?'
     ]
-    assert complaints({'zzz': 1}) == ['zzz: unknown parameter']
+    assert problems_of({'zzz': 1}) == ['zzz: unknown parameter']
 
 
 @pytest.mark.parametrize(
-    ('given', 'said'),
+    ('given', 'message'),
     [
-        # ROS takes no integer for a double, so neither does a run without ROS.
+        # ROS accepts no integer for a double, so neither does a run without ROS.
         ({'speed': 1}, 'speed: got 1, but a double is expected: write 1.0 instead of 1'),
         (
             {'motor.gain': [1, 2]},
@@ -123,13 +123,13 @@ def test_an_unknown_name_is_answered_with_the_closest():
         ({'axes': ['x', 1]}, "axes: got ['x', 1], but a string array is expected: write '1' in"),
     ],
 )
-def test_a_wrong_type_says_what_was_given_and_how_to_write_it(given, said):
-    (complaint,) = complaints(given)
-    assert complaint.startswith(said)
+def test_a_wrong_type_names_the_value_and_the_remedy(given, message):
+    (problem,) = problems_of(given)
+    assert problem.startswith(message)
 
 
 @pytest.mark.parametrize(
-    ('given', 'said'),
+    ('given', 'message'),
     [
         ({'speed': 0.0}, 'speed: got 0.0, but it must be above 0 and below 10 m/s'),
         ({'speed': 10.0}, 'speed: got 10.0, but it must be above 0 and below 10 m/s'),
@@ -149,8 +149,8 @@ def test_a_wrong_type_says_what_was_given_and_how_to_write_it(given, said):
         ({'axes': []}, 'axes: got an empty list, but at least one entry is needed'),
     ],
 )
-def test_a_value_out_of_range_says_what_is_allowed(given, said):
-    assert complaints(given) == [said]
+def test_a_value_out_of_range_names_the_range(given, message):
+    assert problems_of(given) == [message]
 
 
 def test_the_edges_of_inclusive_ranges_are_inside():
@@ -160,7 +160,7 @@ def test_the_edges_of_inclusive_ranges_are_inside():
 
 
 def test_lengths_follow_other_parameters():
-    assert complaints({'motor.gain': [1.0]}) == [
+    assert problems_of({'motor.gain': [1.0]}) == [
         'motor.gain: got 1 entry, but 2 are needed (2 of axes)',
         'motor.table: got 4 entries, but 2 are needed (2 of axes times 1 of motor.gain)',
     ]
@@ -168,9 +168,9 @@ def test_lengths_follow_other_parameters():
     assert build(Machine, triple).motor.table == (1.0,) * 9
 
 
-def test_every_problem_is_told_at_once():
-    said = complaints({'bogus': 1, 'speed': -1.0, 'steps': 'a', 'motor.table': [1.0, 'b', 2.0]})
-    assert [complaint.split(':')[0] for complaint in said] == [
+def test_all_problems_are_reported_at_once():
+    message = problems_of({'bogus': 1, 'speed': -1.0, 'steps': 'a', 'motor.table': [1.0, 'b', 2.0]})
+    assert [problem.split(':')[0] for problem in message] == [
         'bogus',
         'speed',
         'steps',
@@ -178,14 +178,14 @@ def test_every_problem_is_told_at_once():
     ]
 
 
-def test_what_several_parameters_must_agree_on_is_judged_with_unknown_names():
-    assert complaints({'mode': 'fast', 'bogus': 1}) == [
+def test_problems_between_parameters_are_reported_beside_unknown_names():
+    assert problems_of({'mode': 'fast', 'bogus': 1}) == [
         'bogus: unknown parameter',
         'mode: fast needs armed',
     ]
 
 
-def test_a_change_keeps_the_rest_and_is_judged_as_a_whole():
+def test_a_change_keeps_the_rest_and_is_validated_as_a_whole():
     machine = build(Machine, {'speed': 2.0, 'armed': True, 'mode': 'fast'})
     assert flatten(change(machine, {'steps': 5})) == {**flatten(machine), 'steps': 5}
     with pytest.raises(ConfigurationError, match='fast needs armed'):

@@ -19,16 +19,16 @@ from blf_dsc_controller.nodes.parameters import declare, on_change, read
 
 
 class Tuned:
-    """A node that takes changes, and what it took."""
+    """A node that accepts changes, and the configurations it applied."""
 
     def __init__(self, context):
         self.node = Node('blf_dsc_controller', context=context, enable_rosout=False)
-        self.taken = []
-        self.objections = []
+        self.applied = []
+        self.problems = []
         declare(self.node, ControllerConfig)
-        on_change(self.node, ControllerConfig, self.taken.append, lambda _: self.objections)
+        on_change(self.node, ControllerConfig, self.applied.append, lambda _: self.problems)
 
-    def ask(self, **given):
+    def request(self, **given):
         """Send one atomic request; `__` stands for the dot."""
         values = {name.replace('__', '.'): value for name, value in given.items()}
         return self.node.set_parameters_atomically(
@@ -57,21 +57,21 @@ def tuned(context):
 
 
 def test_a_good_change_is_handed_over_once_as_a_whole_configuration(tuned):
-    assert tuned.ask(feedback__gain=[70.0, 30.0], learning__weight=2.0).successful
+    assert tuned.request(feedback__gain=[70.0, 30.0], learning__weight=2.0).successful
     wanted = change(ControllerConfig(), {'feedback.gain': (70.0, 30.0), 'learning.weight': 2.0})
-    assert tuned.taken == [wanted]
+    assert tuned.applied == [wanted]
     assert tuned.config == wanted
 
 
 def test_changes_add_up(tuned):
-    tuned.ask(learning__weight=2.0)
-    tuned.ask(disturbance__leakage=0.5)
-    assert [one.learning.weight for one in tuned.taken] == [2.0, 2.0]
-    assert [one.disturbance.leakage for one in tuned.taken] == [0.0, 0.5]
+    tuned.request(learning__weight=2.0)
+    tuned.request(disturbance__leakage=0.5)
+    assert [one.learning.weight for one in tuned.applied] == [2.0, 2.0]
+    assert [one.disturbance.leakage for one in tuned.applied] == [0.0, 0.5]
 
 
 @pytest.mark.parametrize(
-    ('given', 'said'),
+    ('given', 'message'),
     [
         ({'feedback__gain': [1.0]}, 'feedback.gain: got 1 entry, but 2 are needed (2 of joints)'),
         ({'feedback__gain': [1.0, -1.0]}, 'feedback.gain: got -1.0 at entry 2 of [1.0, -1.0]'),
@@ -81,7 +81,7 @@ def test_changes_add_up(tuned):
         ({'surface__mu': [float('nan'), 1.0]}, 'surface.mu: got nan at entry 1'),
         ({'learning__radius': 0.1}, 'learning.radius: got 0.1 kg m^2, but learning.initial_est'),
         ({'barrier__weight': [3e4, 1.0]}, 'barrier.slope_limit: got 20000 N m/rad for joint1, but'),
-        # These ROS refuses by itself, from the description of the parameter.
+        # ROS itself rejects these, by the descriptor of the parameter.
         ({'learning__weight': -1.0}, 'Parameter learning.weight out of range'),
         ({'learning__weight': float('inf')}, 'Parameter learning.weight out of range'),
         ({'learning__weight': 1}, 'Wrong parameter type, expected'),
@@ -89,57 +89,57 @@ def test_changes_add_up(tuned):
         ({'sample_time': 0.002}, 'Trying to set a read-only parameter: sample_time'),
     ],
 )
-def test_a_bad_change_is_refused_with_the_reason_and_nothing_of_it_is_taken(tuned, given, said):
-    answer = tuned.ask(disturbance__gain=[3.0, 3.0], **given)
-    assert not answer.successful
-    assert answer.reason.startswith(said)
-    assert tuned.taken == []
+def test_a_bad_change_is_rejected_with_the_reason_and_none_of_it_applied(tuned, given, message):
+    result = tuned.request(disturbance__gain=[3.0, 3.0], **given)
+    assert not result.successful
+    assert result.reason.startswith(message)
+    assert tuned.applied == []
     assert tuned.config == ControllerConfig()
 
 
 def test_two_changes_that_are_right_only_together_are_taken_together(tuned):
-    assert not tuned.ask(barrier__weight=[3e4, 3e4]).successful
-    assert tuned.ask(barrier__weight=[3e4, 3e4], barrier__slope_limit=[5e4, 5e4]).successful
-    assert tuned.taken[-1].barrier.weight == (3e4, 3e4)
-    # From here on the limit is judged against the weight in force, not against the first one.
-    assert not tuned.ask(barrier__slope_limit=[2.5e4, 2.5e4]).successful
+    assert not tuned.request(barrier__weight=[3e4, 3e4]).successful
+    assert tuned.request(barrier__weight=[3e4, 3e4], barrier__slope_limit=[5e4, 5e4]).successful
+    assert tuned.applied[-1].barrier.weight == (3e4, 3e4)
+    # Now the limit is validated against the current weight, not against the first one.
+    assert not tuned.request(barrier__slope_limit=[2.5e4, 2.5e4]).successful
 
 
-def test_a_node_can_object_to_what_it_cannot_take_now(tuned):
-    tuned.objections = ['barrier.bound: joint1 is 0.0015 rad off now']
-    answer = tuned.ask(barrier__bound=[0.001, 0.001])
-    assert (answer.successful, answer.reason) == (False, tuned.objections[0])
-    assert tuned.taken == []
-    tuned.objections = []
-    assert tuned.ask(barrier__bound=[0.001, 0.001]).successful
+def test_a_node_can_reject_a_valid_configuration(tuned):
+    tuned.problems = ['barrier.bound: joint1 is 0.0015 rad off now']
+    result = tuned.request(barrier__bound=[0.001, 0.001])
+    assert (result.successful, result.reason) == (False, tuned.problems[0])
+    assert tuned.applied == []
+    tuned.problems = []
+    assert tuned.request(barrier__bound=[0.001, 0.001]).successful
 
 
 def test_parameters_of_others_on_the_node_are_left_alone(tuned):
-    tuned.objections = ['never']
+    tuned.problems = ['never']
     tuned.node.declare_parameter('lamp.on', value=False)
-    assert tuned.ask(lamp__on=True).successful
-    assert tuned.taken == []
+    assert tuned.request(lamp__on=True).successful
+    assert tuned.applied == []
 
 
 def test_the_service_that_tools_call_works_the_same(context, tuned):
     executor = SingleThreadedExecutor(context=context)
-    asker = Node('asker', context=context, enable_rosout=False)
-    client = asker.create_client(
+    client_node = Node('client_node', context=context, enable_rosout=False)
+    client = client_node.create_client(
         SetParametersAtomically, '/blf_dsc_controller/set_parameters_atomically'
     )
-    for node in (tuned.node, asker):
+    for node in (tuned.node, client_node):
         executor.add_node(node)
     assert client.wait_for_service(timeout_sec=300.0)
 
-    def answer(value):
+    def result(value):
         message = Parameter('feedback.gain', value=value).to_parameter_msg()
         future = client.call_async(SetParametersAtomically.Request(parameters=[message]))
         executor.spin_until_future_complete(future, timeout_sec=300.0)
         return future.result().result
 
-    assert answer([65.0, 25.0]).successful
-    refusal = answer([65.0, -25.0])
-    assert refusal.reason.startswith('feedback.gain: got -25.0 at entry 2 of [65.0, -25.0]')
-    assert [one.feedback.gain for one in tuned.taken] == [(65.0, 25.0)]
+    assert result([65.0, 25.0]).successful
+    rejection = result([65.0, -25.0])
+    assert rejection.reason.startswith('feedback.gain: got -25.0 at entry 2 of [65.0, -25.0]')
+    assert [one.feedback.gain for one in tuned.applied] == [(65.0, 25.0)]
     executor.shutdown()
-    asker.destroy_node()
+    client_node.destroy_node()

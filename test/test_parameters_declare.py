@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A configuration as the parameters of a real node: declared, described, read, refused."""
+"""A configuration as the parameters of a real node: declared, described, read, rejected."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def start(tmp_path):
         if text:
             path = tmp_path / 'arm.yaml'
             path.write_text(text)
-        told = [Parameter(key, value=value) for key, value in (overrides or {}).items()]
+        values = [Parameter(key, value=value) for key, value in (overrides or {}).items()]
         started = Node(
             name,
             context=context,
             cli_args=['--ros-args', '--params-file', str(path)] if path else None,
-            parameter_overrides=told,
+            parameter_overrides=values,
             enable_rosout=False,
         )
         nodes.append(started)
@@ -48,7 +48,7 @@ def start(tmp_path):
     context.shutdown()
 
 
-def refused(node, cls):
+def problems_of(node, cls):
     with pytest.raises(ConfigurationError) as caught:
         declare(node, cls)
     assert f'/{node.get_name()}' in str(caught.value)
@@ -56,7 +56,7 @@ def refused(node, cls):
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_a_node_told_nothing_has_the_defaults(start, name):
+def test_a_node_without_parameters_has_the_defaults(start, name):
     node, cls = start(name), NODES[name]
     assert declare(node, cls) == cls()
     assert read(node, cls) == cls()
@@ -90,7 +90,7 @@ def test_a_parameter_describes_itself(start):
     assert node.describe_parameter('surface.time_constant').floating_point_range[0].from_value == 0
 
 
-def test_an_empty_list_is_taken_as_empty(start):
+def test_an_empty_list_stays_empty(start):
     text = 'bag_recorder:\n  ros__parameters: {topics: [], output: here}\n'
     node = start('bag_recorder', text)
     assert declare(node, RecorderConfig) == RecorderConfig(output='here')
@@ -99,10 +99,10 @@ def test_an_empty_list_is_taken_as_empty(start):
     assert declare(node, RecorderConfig).topics == ('/clock',)
 
 
-def test_everything_wrong_is_told_at_once_and_nothing_is_declared(start):
+def test_all_problems_are_reported_at_once_and_nothing_is_declared(start):
     content = 'arm: {l1: 1}, seed: -1, integrator: euler, sensr.resolution: 1.0, initial: {v: x}'
     node = start(text=f'sim_plant:\n  ros__parameters: {{{content}}}\n')
-    assert refused(node, PlantConfig) == [
+    assert problems_of(node, PlantConfig) == [
         'sensr.resolution: unknown parameter, did you mean sensor.resolution?',
         'initial.v: unknown parameter, did you mean initial.velocity?',
         'seed: got -1, but it must be at least 0',
@@ -113,7 +113,7 @@ def test_everything_wrong_is_told_at_once_and_nothing_is_declared(start):
 
 
 @pytest.mark.parametrize(
-    ('overrides', 'said'),
+    ('overrides', 'message'),
     [
         ({'initial.position': [1.0]}, 'initial.position: got 1 entry, but 2 are needed'),
         ({'initial.position': [1, 2]}, 'initial.position: got [1, 2], but a double array is'),
@@ -123,12 +123,12 @@ def test_everything_wrong_is_told_at_once_and_nothing_is_declared(start):
         ({'mode': True}, 'mode: got true, but a string is expected'),
     ],
 )
-def test_a_plant_that_cannot_run_is_refused(start, overrides, said):
-    (complaint,) = refused(start(overrides=overrides), PlantConfig)
-    assert complaint.startswith(said)
+def test_a_plant_that_cannot_run_is_rejected(start, overrides, message):
+    (problem,) = problems_of(start(overrides=overrides), PlantConfig)
+    assert problem.startswith(message)
 
 
-def test_what_other_nodes_or_ros_itself_are_told_is_nobodys_mistake(start):
+def test_parameters_of_other_nodes_and_of_ros_itself_are_ignored(start):
     overrides = {
         'barrier.bound': [1.0, 1.0],
         'use_sim_time': True,

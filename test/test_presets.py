@@ -28,14 +28,14 @@ def offline(preset, out, duration):
 @pytest.mark.parametrize('preset', PRESETS)
 def test_preset_runs_by_name_and_is_kept_as_it_ran(preset, tmp_path, capsys):
     assert offline(preset, tmp_path / 'out', 0.5) == 0
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     summary = json.loads((tmp_path / 'out' / 'summary.json').read_text(encoding='utf-8'))
     assert summary['samples'] == round(0.5 / load_loop(locate(preset)).plant.sample_time) + 1
     kept = load_loop(tmp_path / 'out' / 'config.yaml').controller
     assert kept.law == LAW.get(preset, 'blf_dsc')
     if preset != 'comparison_detuned':
         assert summary['tracking']['held']
-        assert 'held by every joint' in told
+        assert 'held by every joint' in printed
 
 
 def test_detuned_comparison_leaves_the_bound(tmp_path):
@@ -52,15 +52,15 @@ def test_offline_run_warns_of_a_refused_column_and_what_it_is_like(tmp_path, cap
         encoding='utf-8',
     )
     assert offline(str(path), tmp_path / 'out', 7.5) == 0
-    told = capsys.readouterr().out
-    assert 'warning: cos 1 rad/s joint1 is not estimated' in told
-    assert 'cannot be told from m2*l2^2 + cos 1 rad/s joint2' in told
-    assert 'refused     cos 1 rad/s joint1' in told
+    printed = capsys.readouterr().out
+    assert 'warning: cos 1 rad/s joint1 is not estimated' in printed
+    assert 'cannot be told from m2*l2^2 + cos 1 rad/s joint2' in printed
+    assert 'refused     cos 1 rad/s joint1' in printed
 
 
 @pytest.mark.skipif(importlib.util.find_spec('rclpy') is None, reason='needs ROS 2')
 def test_a_variant_over_ros_is_its_offline_run_bit_for_bit(tmp_path):
-    """Lambda prediction, gradient, all columns off, the truth told: not the defaults' path."""
+    """Lambda prediction, gradient, all columns off, the truth given: not the defaults' path."""
     assert offline('paper', tmp_path / 'offline', 1.0) == 0
     over_ros = ['--config', 'paper', '--mode', 'lockstep', '--duration', '1.0']
     assert main(['run', *over_ros, '--out', str(tmp_path / 'ros')]) == 0

@@ -93,7 +93,7 @@ def test_the_name_of_a_preset_means_the_installed_one(tmp_path, name):
     assert (found == folder / 'config' / 'recommended.yaml') == (name == 'recommended')
 
 
-def test_unknown_preset_is_answered_with_those_there_are(tmp_path):
+def test_unknown_preset_lists_the_presets(tmp_path):
     folder = installed(data_folder(tmp_path, sysconfig.get_default_scheme()))
     (folder / 'config' / 'paper.yaml').touch()
     with pytest.raises(BlfDscError, match=r'papre does not exist: .* preset: paper, recommended'):
