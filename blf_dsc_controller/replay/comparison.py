@@ -68,6 +68,12 @@ class Commands(NamedTuple):
     exact: NDArray[np.bool_]  # (M,) whether the same states led to it as in the recorded run
     number: NDArray[np.intp]  # (M,) of the recorded command
 
+    def first(self, count: int) -> Commands:
+        """The first `count` of them."""
+        stamp, torque, of_law, exact, number = self
+        end = slice(count)
+        return Commands(stamp[end], torque[end], of_law[end], exact[end], number[end])
+
 
 def expected(
     config: ControllerConfig, samples: Sample, monitored: Mapping[int, bytes]

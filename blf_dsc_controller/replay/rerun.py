@@ -80,7 +80,8 @@ def rerun(
         sampled: stamps of those that the law used [ns], increasing; None without telemetry.
         in_step: whether the plant waited for each command, so that none was dropped at the end.
     """
-    return _Rerun(config, came, sampled).run(events, in_step=in_step)
+    silence = sum(1 + event.content.get('torques', 0) for event in events)
+    return _Rerun(config, came, sampled, len(came.stamp) + silence).run(events, in_step=in_step)
 
 
 def columns_of(rows: Floats, settings: Settings) -> Sample:
@@ -90,7 +91,9 @@ def columns_of(rows: Floats, settings: Settings) -> Sample:
 
 
 class _Rerun:
-    def __init__(self, config: ControllerConfig, came: Arrivals, sampled: Stamps | None) -> None:
+    def __init__(
+        self, config: ControllerConfig, came: Arrivals, sampled: Stamps | None, most: int
+    ) -> None:
         self._config = config
         self._guard = Guard(config, _no_time, _no_time)
         self._guard.journal.pending.clear()
@@ -103,10 +106,17 @@ class _Rerun:
         self._last = -1  # stamp of the last state that the law used [ns]
         self._passed_over = 0
         self._numbers: list[int] = []  # of the joint states that the law used
-        self._rows: list[Floats] = []
+        self._rows = np.empty((len(came.stamp), self._guard.controller.sample_vector.size))
         self._monitor: Monitor | None = None
         self._monitored: dict[int, bytes] = {}
-        self._torques: list[tuple[int, Floats, bool, bool]] = []  # stamp, torque, of law, exact
+        self._commands = Commands(
+            np.zeros(most, dtype=np.int64),
+            np.zeros((most, len(config.joints))),
+            np.zeros(most, dtype=np.bool_),
+            np.zeros(most, dtype=np.bool_),
+            np.arange(most),
+        )
+        self._count = 0  # of the torques commanded
         self._offsets: list[tuple[int, int]] = [(0, 0)]  # from a torque on: its number in the bag
         self._failed = False
         self._departure: Difference | None = None
@@ -211,10 +221,10 @@ class _Rerun:
 
     def _sample(self, k: int, stamp: int) -> None:
         guard = self._guard
-        controller, row = guard.controller, len(self._rows)
+        controller, row = guard.controller, len(self._numbers)
         self._last = stamp
         self._numbers.append(k)
-        self._rows.append(controller.sample_vector.copy())
+        self._rows[row] = controller.sample_vector
         samples = controller.samples
         if samples == 1 or self._monitor is None:
             names = estimate_names(self._config)
@@ -226,9 +236,10 @@ class _Rerun:
 
     def _command(self, stamp: int, torque: Floats | None, *, is_exact: bool) -> None:
         if torque is not None:
-            of_law = self._guard.has_sample
-            is_exact = of_law or (is_exact and not self._failed)
-            self._torques.append((stamp, torque.copy(), of_law, is_exact))
+            k, of_law, commands = self._count, self._guard.has_sample, self._commands
+            commands.stamp[k], commands.torque[k], commands.of_law[k] = stamp, torque, of_law
+            commands.exact[k] = of_law or (is_exact and not self._failed)
+            self._count += 1
 
     # Events.
 
@@ -295,17 +306,14 @@ class _Rerun:
         settings = self._guard.controller.settings
         stamps = np.array(self._came.stamp, dtype=np.int64)[self._numbers]
         measurement = self._came.measurement[self._numbers]
-        rows = np.array(self._rows).reshape(-1, self._guard.controller.sample_vector.size)
-        number = np.arange(len(self._torques))
+        number = self._commands.number
         for own, recorded in self._offsets:
             number[own:] = np.arange(recorded, recorded + len(number) - own)
-        columns = zip(*self._torques, strict=True) if self._torques else ((), (), (), ())
-        stamp, torque, of_law, exact = (np.array(column) for column in columns)
         return Rerun(
             States(stamps, measurement, self._passed_over),
-            columns_of(rows, settings),
+            columns_of(self._rows[: len(self._numbers)], settings),
             self._monitored,
-            Commands(stamp, torque.reshape(-1, settings.n), of_law, exact, number),
+            self._commands.first(self._count),
             done,
             self._departure,
             self._end,

@@ -57,7 +57,7 @@ class Guard:
         controller: the law.
         supervisor: phase, and the reason of a stop.
         journal: events, and what has been processed so far.
-        has_sample: whether the last message was answered by the law, with new telemetry.
+        has_sample: whether the law used the last message, so that there is new telemetry.
         start_error: why the law could not start; None if it could.
         foreign: messages ignored because they name none of the joints.
         ratio: largest |xi1| / k_c of each joint since the start (n,).
@@ -224,7 +224,7 @@ class Guard:
             stamp: of the state [ns].
             measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
         """
-        self._count_message()
+        self._begin_message()
         self.journal.stamp = stamp
         self._silence.restart(self._steady())
         n = self.ratio.size
@@ -244,7 +244,7 @@ class Guard:
 
     def reject(self, error: MessageError) -> Vector | None:
         """Return the torque for an unreadable message, None if it is for another arm."""
-        self._count_message()
+        self._begin_message()
         names = error.names if isinstance(error, MissingJointError) else ()
         if names and not set(self.config.joints) & set(names):  # drivers may share joint_states
             self.foreign += 1
@@ -268,6 +268,7 @@ class Guard:
 
     def time_out(self, text: str) -> Vector | None:
         """Return the torque of one watchdog period without a joint state."""
+        self.has_sample = False
         self._dq[:] = 0.0
         self.supervisor.stop(Reason.STATE_TIMEOUT, text)
         self.watchdog_torques += 1
@@ -289,8 +290,9 @@ class Guard:
         """Note the end of the controller."""
         self._note(EventType.RELEASE)
 
-    def _count_message(self) -> None:
-        self.end_silence()
+    def _begin_message(self) -> None:
+        if self.watchdog_torques:
+            self.end_silence()
         self.has_sample = False
         self.journal.messages += 1
 
