@@ -4,33 +4,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, TypeAlias
 
-from blf_dsc_controller.configuration.schema import counted, non_negative, parameter
+from blf_dsc_controller.configuration.schema import counted, parameter
 
 PerJoint: TypeAlias = Annotated[tuple[float, ...], 'joints']
 """An array with an entry for each joint."""
 
 _ROUNDING = 1e-12  # relative; the product of a decimal fraction and 1e9 is off by a few 1e-16
 
-_AT_START = 'the process requests it once, before the first sample'
+_at_start = partial(parameter, read_only='the process requests it once, before the first sample')
 
 
 @dataclass(frozen=True)
 class Realtime:
     """What the process requests from the operating system."""
 
-    priority: int = non_negative(
-        0,
-        'SCHED_FIFO priority to request; 0: leave the scheduling as it is',
-        at_most=99,
-        read_only=_AT_START,
+    priority: int = _at_start(
+        0, 'SCHED_FIFO priority to request; 0: leave scheduling as it is', at_least=0, at_most=99
     )
-    lock_memory: bool = parameter(
-        False,
-        'lock the memory of the process, so that it is never swapped out',
-        read_only=_AT_START,
-    )
+    lock_memory: bool = _at_start(False, 'lock the memory of the process, to prevent swapping')
 
 
 def autostart() -> Any:

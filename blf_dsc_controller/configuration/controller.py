@@ -60,9 +60,7 @@ class Safety:
         0.04, 'largest delay of a joint state, on the steady clock and by its stamp', 's'
     )
     watchdog: Literal['auto', 'on', 'off'] = parameter(
-        'auto',
-        'steady-clock watchdog for missing joint states; auto: on if their stamps are wall-clock '
-        'time, which is not the case in lock-step',
+        'auto', 'steady-clock watchdog for missing states; auto: only if stamps are wall-clock time'
     )
     repeated_states: int = non_negative(
         3, 'consecutive states with an unchanged stamp to ignore', 'samples', at_most=1_000_000

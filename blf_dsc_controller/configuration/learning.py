@@ -22,10 +22,7 @@ class Learning:
     """Composite learning of the parameters P and of the disturbance columns."""
 
     initial_estimate: tuple[float, ...] = _at_start(
-        (0.5, 0.16, 0.2),
-        'initial estimate of the parameters (m1+m2)*l1^2, m2*l2^2, m2*l1*l2',
-        'kg m^2',
-        'P^(0)',
+        (0.5, 0.16, 0.2), 'initial estimate of (m1+m2)*l1^2, m2*l2^2, m2*l1*l2', 'kg m^2', 'P^(0)'
     )
     adaptation_gain: Annotated[tuple[float, ...], 'learning.initial_estimate'] = non_negative(
         (0.5, 0.5, 0.5), 'diagonal of the adaptation gain', symbol='Gamma'
@@ -75,11 +72,7 @@ class Learning:
         may_be_empty=True,
     )
     derivative_filter: float = _in_window(
-        100.0,
-        'frequency of the filter (8), for the predictions lambda and acceleration',
-        'rad/s',
-        'omega',
-        above=0.0,
+        100.0, 'frequency of filter (8) for lambda and acceleration', 'rad/s', 'omega', above=0.0
     )
     radius: float = positive(
         3.0, 'radius of the projection ball of the estimate', 'kg m^2', 'omega_a'

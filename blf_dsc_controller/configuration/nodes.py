@@ -41,10 +41,7 @@ class RecorderConfig:
         0.0, 'duration at which the bag continues in a new file; 0: never', 's', at_least=0.0
     )
     ring: float = _of_bag(
-        0.0,
-        'keep only this last time in memory, and write it on the service trigger; 0: write all',
-        's',
-        at_least=0.0,
+        0.0, 'keep only this last time, and write it on ~/trigger; 0: write all', 's', at_least=0.0
     )
 
     def problems(self) -> list[str]:
