@@ -263,7 +263,7 @@ def test_the_journal_holds_the_configuration(entries, tmp_path):
     path = recorded_run.write(tmp_path / 'bag', entries)
     assert verify(path).difference is None
     with pytest.raises(BagError, match='--config recommended'):
-        read_context(path).controller()
+        read_context(path).controller_config()
 
 
 @pytest.mark.parametrize('topics', [[JOINT_STATES], [JOURNAL, JOINT_STATES]])

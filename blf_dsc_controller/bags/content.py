@@ -15,14 +15,13 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import (
     CLOCK,
     COMMANDS,
-    DIAGNOSTICS,
     JOINT_STATE,
     JOINT_STATES,
     TOPICS,
     Topic,
 )
 
-_OF_INTEREST = tuple(one for one in TOPICS if one not in (CLOCK, DIAGNOSTICS))
+_OF_INTEREST = tuple(one for one in TOPICS if one is not CLOCK)
 
 
 @dataclass(frozen=True)
@@ -130,8 +129,8 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
 def _find(topic: Topic, held: list[tuple[str, str]], namespace: str, names: NameMap) -> str | None:
     """Name of a topic in a bag, None if it is not there.
 
-    Searched by type and by the full name, then by the name behind a namespace, then by the last
-    part of the name.
+    Searched by type and by the full name, then, unless that is absolute, by the name behind a
+    namespace, then by the last part of the name.
     """
     name = names.topics.get(topic.leaf)
     if name is not None:
@@ -139,6 +138,8 @@ def _find(topic: Topic, held: list[tuple[str, str]], namespace: str, names: Name
         if not any((name, type_) in held for type_ in types):
             raise _missing_topic(name, ' or '.join(types), held)
         return name
+    if topic.name.startswith('/'):
+        return topic.name if (topic.name, topic.type) in held else None
     prefix = f'/{namespace.strip("/")}/' if namespace.strip('/') else '/'
     candidates = [name for name, type_ in held if type_ == topic.type and name.startswith(prefix)]
     for ending in (topic.resolved, f'/{topic.leaf}'):

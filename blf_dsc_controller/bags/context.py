@@ -80,21 +80,6 @@ class Losses:
 
 
 @dataclass(frozen=True)
-class RecordedController:
-    """A controller as recorded in a bag.
-
-    Attributes:
-        node: its full name.
-        config: its configuration.
-        known_at: when the recorder received it [ns].
-    """
-
-    node: str
-    config: ControllerConfig
-    known_at: int
-
-
-@dataclass(frozen=True)
 class Context:
     """What a bag records of its run; empty, if another recorder made it.
 
@@ -137,15 +122,15 @@ class Context:
         }
         return {topic: text for topic, text in texts.items() if text not in ('', _NOTHING_MISSED)}
 
-    def controller(self) -> RecordedController:
-        """Controller of the run and its configuration.
+    def controller_config(self) -> ControllerConfig:
+        """Configuration of the controller, as it was first recorded.
 
         Raises:
             BagError: there is no bag, it is damaged, or it holds no configuration.
             ConfigurationError: this version of the package cannot run the configuration.
         """
         damage = ''
-        for stored, text in self.configurations:
+        for _, text in self.configurations:
             try:
                 sections = parse(text)
             except ConfigurationError as error:
@@ -161,8 +146,7 @@ class Context:
                     source = f'{self.path}, {ATTACHMENT}'
                     if self.version != __version__:
                         source += f' by version {self.version or "unknown"}, not {__version__}'
-                    config = build(ControllerConfig, values, source)
-                    return RecordedController(section.pattern, config, stored)
+                    return build(ControllerConfig, values, source)
         reason = (
             f'{self.path} holds a configuration that cannot be read ({damage})'
             if damage

@@ -11,7 +11,6 @@ import numpy as np
 
 from blf_dsc_controller.bags.batch import decode_arrays, decode_joint_states, joint_names
 from blf_dsc_controller.bags.content import Content, TopicMessages, read_content
-from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.messages.names import COMPUTE_TIME, REJECTED
 from blf_dsc_controller.messages.topics import (
     BOUND,
@@ -72,7 +71,7 @@ def read_run(path: str | Path, namespace: str = '') -> Run:
         timing=_vector(content, TIMING),
         monitor=_vector(content, MONITOR),
         message_counts=content.message_counts,
-        refused=_rejected_columns(Path(path), learning, namespace),
+        refused=_rejected_columns(content, learning, namespace),
     )
 
 
@@ -126,30 +125,23 @@ def _torque(content: Content, states: _Decoded, errors: _Decoded | None) -> Floa
     return np.vstack([states.effort.values[1:], np.full(len(states.names), np.nan)])
 
 
-def _rejected_columns(path: Path, learning: Series | None, namespace: str) -> dict[str, str]:
+def _rejected_columns(content: Content, learning: Series | None, namespace: str) -> dict[str, str]:
     """Columns that are NaN at the end of the learning, with the reason given in /diagnostics."""
     if learning is None:
         return {}
     last = dict(zip(learning.names, learning.values[-1], strict=True))
     columns = [name for name, value in last.items() if name != COMPUTE_TIME and np.isnan(value)]
-    reasons = _reasons(path, namespace.strip('/')) if columns else {}
+    reasons: dict[str, str] = {}
+    diagnostics = content.topics.get(DIAGNOSTICS)
+    for raw in reversed(diagnostics.raw if columns and diagnostics is not None else []):
+        message: Any = typestore().deserialize_cdr(raw, DIAGNOSTICS.type)
+        reasons = {
+            pair.key.removeprefix(REJECTED): pair.value
+            for status in message.status
+            if status.name.startswith(namespace.strip('/'))
+            for pair in status.values
+            if pair.key.startswith(REJECTED)
+        }
+        if reasons:
+            break
     return {column: reasons.get(column, '') for column in columns}
-
-
-def _reasons(path: Path, namespace: str) -> dict[str, str]:
-    """Reasons by column, from the last message that holds any."""
-    with open_bag(path) as bag:
-        if (DIAGNOSTICS.resolved, DIAGNOSTICS.type) not in bag.held:
-            return {}
-        for _, _, raw in reversed(list(bag.messages({DIAGNOSTICS.resolved}))):
-            message: Any = typestore().deserialize_cdr(raw, DIAGNOSTICS.type)
-            found = {
-                pair.key.removeprefix(REJECTED): pair.value
-                for status in message.status
-                if status.name.startswith(namespace)
-                for pair in status.values
-                if pair.key.startswith(REJECTED)
-            }
-            if found:
-                return found
-    return {}

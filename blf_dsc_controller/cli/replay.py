@@ -63,7 +63,7 @@ def _play(options: Namespace) -> int:
 
 def _identify(options: Namespace) -> int:
     if options.config is None:
-        config = read_context(options.bag).controller().config
+        config = read_context(options.bag).controller_config()
     else:
         config = load(locate(options.config), CONTROLLER, ControllerConfig)
     found = identify(options.bag, config, options.namespace, NameMap.parse(options.map))
