@@ -60,10 +60,11 @@ paper: $(READY) ## Run the paper's simulation with every law and judge its claim
 	while [ -e "$$out" ]; do n=$$((n + 1)); out=out/paper-$$n; done; \
 	$(RUN) -m blf_dsc_controller paper --out "$$out"
 
-# A file's tests stay together on one of the workers, for what they set up is shared.
+# A file's tests stay together on one of the workers, for what they set up is shared; the files
+# come in the order of test/conftest.py.
 test: $(READY) ## Run the tests (TESTS=test/test_x.py for some, WORKERS=0 in one process)
 	@PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(RUN) -m pytest -p xdist -p _hypothesis_pytestplugin \
-	    -n $(WORKERS) --dist loadfile $(TESTS)
+	    -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(TESTS)
 
 test-long: $(READY) ## Kill the recorder ten times within a minute; record a minute in real time
 	@LONG_TESTS=1 $(RUN) -m pytest -rP test/test_bag_recorder_killed.py \

@@ -24,3 +24,21 @@ os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_LOG_DIR'] = _LOG_FOLDER
 
 atexit.register(shutil.rmtree, _LOG_FOLDER, ignore_errors=True)
+
+# They take longest, and first come first served: so no worker is left with one of them at the end.
+_FIRST = (
+    'test_closed_loop',
+    'test_presets',
+    'test_montecarlo',
+    'test_benchmark',
+    'test_bag_recorder',
+    'test_replay',
+    'test_managed',
+    'test_nodes',
+    'test_soak',
+    'test_study',
+)
+
+
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: not item.path.stem.startswith(_FIRST))

@@ -239,8 +239,9 @@ def test_data_leaves_the_process_as_time_goes_by(tmp_path):
     for k in range(1, 1001):
         now = k * 1e-3
         bag.write(handle, raw, START + k)
-        on_disk = readable(tmp_path / 'bag' / 'bag_0.mcap')
-        assert on_disk >= k - 100  # of one message a millisecond
+        if k % 7 == 0:  # each phase of the interval
+            on_disk = readable(tmp_path / 'bag' / 'bag_0.mcap')
+            assert on_disk >= k - 100  # of one message a millisecond
     bag.close()
 
 
