@@ -24,34 +24,7 @@ FLAGS = ('-O3', '-march=native', '-ffp-contract=off')
 COLUMNS = 9
 """Of a row: xi1 (2), torque (2), theta (5)."""
 
-_N, _P, _M = 2, 3, 5
-_Joint = ctypes.c_double * _N
-
-
-class _Settings(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_double) for name in ('l1', 'l2', 'm1', 'm2', 'g')),
-        *((name, _Joint) for name in ('constant', 'amplitude', 'frequency', 'phase')),
-        *((name, _Joint) for name in ('viscous', 'coulomb')),
-        ('coulomb_velocity', ctypes.c_double),
-        *((name, _Joint) for name in ('q0', 'dq0')),
-        *((name, ctypes.c_double) for name in ('position_noise', 'velocity_noise')),
-        ('offset', _Joint),
-        ('swing', _Joint),
-        ('tone', ctypes.c_double),
-        *((name, _Joint) for name in ('bound', 'weight', 'slope_limit', 'knee', 'K', 'mu')),
-        ('lambda', ctypes.c_double),
-        *((name, _Joint) for name in ('Kp', 'gamma', 'limit')),
-        ('P0', ctypes.c_double * _P),
-        ('Gamma', ctypes.c_double * _M),
-        *((name, ctypes.c_double) for name in ('kappa', 'rho', 'sigma', 'start', 'pole')),
-        ('radius', ctypes.c_double),
-        ('T', ctypes.c_double),
-        ('window', ctypes.c_long),
-        ('interval', ctypes.c_long),
-        ('differenced', ctypes.c_long),
-        ('delay', ctypes.c_long),
-    )
+_N, _P = 2, 3
 
 
 class Reference:
@@ -69,7 +42,7 @@ class Reference:
             subprocess.run(command, check=True)
             self._run = ctypes.CDLL(str(library)).run
         vectors = [ctypes.c_void_p] * 3
-        self._run.argtypes = (ctypes.POINTER(_Settings), ctypes.c_long, ctypes.c_long, *vectors)
+        self._run.argtypes = (ctypes.c_void_p, ctypes.c_long, ctypes.c_long, *vectors)
 
     def rows(self, controller: ControllerConfig, plant: PlantConfig) -> np.ndarray:
         """Rows (samples, COLUMNS) of a run without noise; the sample at `duration` is left out."""
@@ -93,7 +66,7 @@ class Reference:
             for (settings, plant), row in zip(laid_out, figures, strict=True):
                 samples = round(plant.duration / plant.sample_time) + 1
                 noise = None
-                if settings.position_noise > 0.0 or settings.velocity_noise > 0.0:
+                if plant.sensor.position_noise > 0.0 or plant.sensor.velocity_noise > 0.0:
                     noise = generator(plant.seed).standard_normal((samples, 2 * _N))
                 settled = round(settled_after / plant.sample_time)
                 self._call(settings, samples, settled, noise, None, row)
@@ -102,62 +75,47 @@ class Reference:
         return run_all
 
     def _call(
-        self, settings: _Settings, samples: int, settled: int, *vectors: np.ndarray | None
+        self, settings: ctypes.Structure, samples: int, settled: int, *vectors: np.ndarray | None
     ) -> None:
         addresses = (None if vector is None else vector.ctypes.data for vector in vectors)
         if self._run(ctypes.byref(settings), samples, settled, *addresses) != 0:
             raise MemoryError
 
 
-def _settings(controller: ControllerConfig, plant: PlantConfig) -> _Settings:
+def _settings(controller: ControllerConfig, plant: PlantConfig) -> ctypes.Structure:
+    """Lay out `struct settings` of the C file: its fields in their order, integers as long."""
     law = settings_of_config(controller)
-    disturbance = plant.disturbance
+    arm, torque, reference = plant.arm, plant.disturbance, controller.reference
     values: dict[str, Any] = {
-        'l1': plant.arm.l1,
-        'l2': plant.arm.l2,
-        'm1': plant.arm.m1,
-        'm2': plant.arm.m2,
-        'g': plant.arm.gravity,
-        'constant': disturbance.constant,
-        'amplitude': disturbance.amplitude,
-        'frequency': disturbance.frequency,
-        'phase': disturbance.phase,
-        'viscous': disturbance.viscous,
-        'coulomb': disturbance.coulomb,
-        'coulomb_velocity': disturbance.coulomb_velocity,
+        **{name: getattr(arm, name) for name in ('l1', 'l2', 'm1', 'm2', 'gravity')},
+        **{name: getattr(torque, name) for name in ('constant', 'amplitude', 'frequency', 'phase')},
+        **{name: getattr(torque, name) for name in ('viscous', 'coulomb', 'coulomb_velocity')},
         'q0': plant.initial.position,
         'dq0': plant.initial.velocity,
         'position_noise': plant.sensor.position_noise,
         'velocity_noise': plant.sensor.velocity_noise,
-        'differenced': plant.sensor.velocity == 'differenced',
-        'delay': plant.actuator.delay,
-        'offset': controller.reference.offset,
-        'swing': controller.reference.amplitude,
-        'tone': controller.reference.frequency[0],
-        'bound': law.bound,
-        'weight': law.weight,
-        'slope_limit': law.slope_limit,
-        'knee': law.knee,
-        'K': law.K,
-        'mu': law.mu,
-        'lambda': law.time_constant,
-        'Kp': law.Kp,
-        'gamma': law.gamma,
+        'offset': reference.offset,
+        'swing': reference.amplitude,
+        'tone': reference.frequency[0],
+        **{name: getattr(law, name) for name in ('bound', 'weight', 'slope_limit', 'knee')},
+        **{name: getattr(law, name) for name in ('K', 'mu', 'time_constant', 'Kp', 'gamma')},
         'limit': law.torque_limit,
         'P0': law.initial_estimate[:_P],
-        'Gamma': law.Gamma,
-        'kappa': law.kappa,
-        'rho': law.rho,
-        'sigma': law.sigma,
-        'start': law.learning_start,
-        'pole': law.pole,
-        'radius': law.radius,
+        **{name: getattr(law, name) for name in ('Gamma', 'kappa', 'rho', 'sigma')},
+        **{name: getattr(law, name) for name in ('learning_start', 'pole', 'radius')},
         'T': plant.sample_time,
         'window': law.window,
         'interval': law.interval,
+        'differenced': int(plant.sensor.velocity == 'differenced'),
+        'delay': plant.actuator.delay,
     }
-    settings = _Settings()
-    for name, *_ in _Settings._fields_:
-        value = values[name]
-        setattr(settings, name, value if np.ndim(value) == 0 else tuple(value))
+    fields = {
+        name: ctypes.c_long if isinstance(value, int) else ctypes.c_double
+        for name, value in values.items()
+    }
+    sizes = {name: len(value) for name, value in values.items() if np.ndim(value)}
+    kinds = [(name, kind * sizes[name] if name in sizes else kind) for name, kind in fields.items()]
+    settings: ctypes.Structure = type('Settings', (ctypes.Structure,), {'_fields_': kinds})(
+        *(tuple(value) if np.ndim(value) else value for value in values.values())
+    )
     return settings

@@ -12,7 +12,6 @@ from functools import partial
 import numpy as np
 from c_reference import Reference
 from peers import loops
-from peers.octave import octave_loop
 from timing import Ratio, interleaved, ratio
 
 from blf_dsc_controller.simulation.loop import simulate
@@ -84,7 +83,7 @@ def _beside_peers() -> Iterator[Ratio]:
             contestants[name] = partial(_peer, loop)
             notes[name] = note
     if shutil.which('octave'):
-        contestants['Octave'] = lambda: octave_loop(_SHORT)
+        contestants['Octave'] = lambda: loops.octave_loop(_SHORT)
         notes['Octave'] = 'the whole loop in Octave, the stand-in for MATLAB; with its start-up'
     times = interleaved(contestants, _ROUNDS)
     for name, note in notes.items():

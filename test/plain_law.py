@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole law once more, in plain numpy and sharing nothing with the package: the tests' oracle.
+"""The law in plain numpy, as a control engineer would write it, sharing nothing with the package.
 
-Written for reading: the regressors are found by putting unit vectors for P into M, C and G, the
-window is the list of its rows, the Newton step solves its equations.
+The tests' oracle, and the law of every peer in benchmark/ that brings only a simulator.
 """
 
 from __future__ import annotations
@@ -33,7 +32,9 @@ class PlainLaw:
         self.tau = np.zeros(2)
         self.alpha2 = None
         self.previous = None
-        self.window = []
+        self.ring = np.zeros((settings.window, 2, settings.m + 1))
+        self.total = np.zeros((settings.m + 1, settings.m + 1))
+        self.rows = 0
         self.latched = None
         self.samples = 0
         self.pole1 = self.pole2 = np.zeros((2, settings.m + 1))
@@ -61,33 +62,50 @@ class PlainLaw:
         return np.where(np.abs(xi1) < k, tau_aux, 0.0) - g.mu * xi1 + dqr + xi1 * dk / k
 
     def regressor(self, q, dq, v, a):
-        """H, column by column: M a + C v + G of each unit parameter."""
-        columns = (dynamics(e, self.gains.model.r, q, dq) for e in np.eye(3))
-        return np.column_stack([M @ a + C @ v + G for M, C, G in columns])
+        """H of Section IV, with cos q1 in its first gravity term."""
+        r = self.gains.model.r
+        c2, s2, c12 = np.cos(q[1]), np.sin(q[1]), np.cos(q[0] + q[1])
+        coriolis = s2 * (dq[1] * v[0] + (dq[0] + dq[1]) * v[1])
+        return np.array(
+            [
+                [a[0] + r * np.cos(q[0]), a[0] + a[1], c2 * (2 * a[0] + a[1]) - coriolis + r * c12],
+                [0.0, a[0] + a[1], c2 * a[0] + s2 * dq[0] * v[0] + r * c12],
+            ]
+        )
 
-    def take_in(self, t, dt, q, dq, applied):
-        """Filter and keep the row of the last interval; latch the window when it is time."""
+    def momentum_regressors(self, q, dq):
+        """Yp and [Yr | bias columns]."""
+        r = self.gains.model.r
+        c2, s2, c12 = np.cos(q[1]), np.sin(q[1]), np.cos(q[0] + q[1])
+        both = dq[0] + dq[1]
+        Yp = np.array([[dq[0], both, c2 * (dq[0] + both)], [0.0, both, c2 * dq[0]]])
+        Yr = np.array([[r * np.cos(q[0]), 0.0, r * c12], [0.0, 0.0, s2 * dq[0] * both + r * c12]])
+        return Yp, np.column_stack([Yr, np.eye(2)[:, : self.gains.m - 3]])
+
+    def learn(self, t, dt, q, dq, applied):
+        """Filter the row of the last interval into the window; latch the window when it is time."""
         g = self.gains
-        columns = [dynamics(e, g.model.r, q, dq) for e in np.eye(3)]
-        Yp = np.column_stack([M @ dq for M, _, _ in columns])
-        Yr = np.column_stack([G - C.T @ dq for _, C, G in columns])
+        Yp, Yr = self.momentum_regressors(q, dq)
         if self.previous is not None:
-            X = (Yp - self.previous[0]) / dt + (Yr + self.previous[1]) / 2.0
-            raw = np.column_stack([X, np.eye(2)[:, : g.m - 3], applied])
-            share = 1.0 - np.exp(-g.pole * dt)
-            self.pole1 = self.pole1 + share * (raw - self.pole1)
-            self.pole2 = self.pole2 + share * (self.pole1 - self.pole2)
-            self.window = [*self.window, self.pole2][-g.window :]
+            X = (Yr + self.previous[1]) / 2.0
+            X[:, :3] += (Yp - self.previous[0]) / dt
+            pole = 1.0 - np.exp(-g.pole * dt)
+            self.pole1 = self.pole1 + pole * (np.column_stack([X, applied]) - self.pole1)
+            self.pole2 = self.pole2 + pole * (self.pole1 - self.pole2)
+            oldest = self.ring[self.rows % g.window]
+            self.total = self.total + self.pole2.T @ self.pole2 - oldest.T @ oldest
+            self.ring[self.rows % g.window] = self.pole2
+            self.rows += 1
             if self.samples % g.interval == 0 and t >= g.learning_start:
-                self.look()
+                self.latch_if_excited()
         self.previous = Yp, Yr
 
-    def look(self):
+    def latch_if_excited(self):
         """(21), (22), (26), (27)."""
-        rows = np.array(self.window).reshape(-1, self.gains.m + 1)
-        Phi = rows[:, :-1].T @ rows[:, :-1] / len(self.window)
+        mean = self.total / min(self.rows, self.gains.window)
+        Phi, b = mean[:-1, :-1], mean[:-1, -1]
         if np.linalg.eigvalsh(Phi)[0] >= self.gains.sigma:
-            self.latched = Phi, rows[:, :-1].T @ rows[:, -1] / len(self.window)
+            self.latched = Phi.copy(), b.copy()
 
     def adapt(self, dt, H, xi2, *, saturated):
         """(20) with its sign corrected and projected in the Gamma metric, (30)."""
@@ -116,7 +134,7 @@ class PlainLaw:
     def update(self, t, dt, qr, dqr, measurement):
         """Torque (28) for a measurement; `tau`, what went out last, is the caller's to set."""
         g = self.gains
-        q, dq, effort = measurement.reshape(3, 2).copy()
+        q, dq, effort = np.reshape(measurement, (3, 2)).copy()
         xi1 = q - qr
         beta2 = self.virtual_control(xi1, dqr, t)
         if self.alpha2 is None:
@@ -124,7 +142,7 @@ class PlainLaw:
         following = beta2 + (self.alpha2 - beta2) * np.exp(-dt / g.time_constant)
         dalpha2 = (following - self.alpha2) / dt
         xi2 = dq - self.alpha2
-        self.take_in(t, dt, q, dq, effort if self.effort else self.tau)
+        self.learn(t, dt, q, dq, effort if self.effort else self.tau)
         H = self.regressor(q, dq, self.alpha2, dalpha2)
         demand = (
             self.barrier_torque(xi1, t)

@@ -7,14 +7,19 @@ torque over the sample and have the disturbance; what differs is who integrates 
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
-from peers.numpy_law import NumpyLaw
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.law.factory import settings_of_config
+
+sys.path.append(str(Path(__file__).parents[2] / 'test'))
+from plain_law import PlainLaw, dynamics
 
 Step = Callable[[float, np.ndarray], None]
 State = Callable[[], tuple[np.ndarray, np.ndarray]]
@@ -34,7 +39,7 @@ def disturbance(t: float) -> np.ndarray:
 
 def run(duration: float, state: State, step: Step) -> np.ndarray:
     """Close the loop around a simulator with the numpy law."""
-    law = NumpyLaw(settings_of_config(CONTROLLER), T)
+    law = PlainLaw(settings_of_config(CONTROLLER))
     reference = CONTROLLER.reference
     offset, swing = np.array(reference.offset), np.array(reference.amplitude)
     w = reference.frequency[0]
@@ -43,9 +48,10 @@ def run(duration: float, state: State, step: Step) -> np.ndarray:
         t = k * T
         q, dq = state()
         qr = offset + swing * np.cos(w * t)
-        tau = law.update(t, qr, -w * swing * np.sin(w * t), q, dq)
+        dqr = -w * swing * np.sin(w * t)
+        law.tau = law.update(t, T, qr, dqr, np.concatenate((q, dq, law.tau)))
         errors[k] = q - qr
-        step(t, tau)
+        step(t, law.tau)
     return errors
 
 
@@ -190,12 +196,15 @@ def _integrated(
 
 
 def _numpy_acceleration(q: np.ndarray, dq: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    p1 = (_ARM.m1 + _ARM.m2) * _ARM.l1**2
-    p2 = _ARM.m2 * _ARM.l2**2
-    p3 = _ARM.m2 * _ARM.l1 * _ARM.l2
-    coupling, c = p3 * np.cos(q[1]), p3 * np.sin(q[1])
-    M = np.array([[p1 + p2 + 2.0 * coupling, p2 + coupling], [p2 + coupling, p2]])
-    C = np.array([[-c * dq[1], -c * (dq[0] + dq[1])], [c * dq[0], 0.0]])
-    outer = _ARM.m2 * _ARM.gravity * _ARM.l2 * np.cos(q[0] + q[1])
-    G = np.array([(_ARM.m1 + _ARM.m2) * _ARM.gravity * _ARM.l1 * np.cos(q[0]) + outer, outer])
+    arm = PLANT.arm
+    P = ((arm.m1 + arm.m2) * arm.l1**2, arm.m2 * arm.l2**2, arm.m2 * arm.l1 * arm.l2)
+    M, C, G = dynamics(P, arm.gravity / arm.l1, q, dq)
     return np.linalg.solve(M, torque - C @ dq - G)
+
+
+def octave_loop(duration: float) -> int:
+    """Run `closed_loop.m` in Octave for `duration` [s] and return the number of samples."""
+    script = Path(__file__).with_name('closed_loop.m')
+    command = ['octave', '--no-gui', '--quiet', str(script), str(duration)]
+    output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    return int(output.split()[-1])
