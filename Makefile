@@ -71,7 +71,7 @@ test-long: $(READY) ## Kill the recorder ten times within a minute; record a min
 	    test/test_bag_recorder_beside_loop.py
 
 test-browser: $(READY) ## Open the page of bag_report in a headless Chromium, if there is one
-	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_report_page.py
+	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_analysis_report_page.py
 
 test-nightly: $(READY) ## Run ten thousand examples of each property of the nodes
 	@BLF_DSC_EXAMPLES=10000 $(RUN) -m pytest -q test/test_nodes_properties.py

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Run:
-    """What a bag tells of N samples of n joints; None or NaN is what it does not tell."""
+    """N samples of n joints, simulated, recorded or replayed; None or NaN where unknown."""
 
     joints: tuple[str, ...]
     stamp: Stamps  # (N,) ns, of the joint states
@@ -54,14 +54,14 @@ class Run:
     torque: Floats  # (N, n) N m, applied from this sample to the next
     reference: Floats | None  # (N, n) rad, qr
     error: Floats | None  # (N, n) rad, xi1 = q - qr
-    bound: Floats | None  # (N, n) rad, kc
+    bound: Floats | None  # (N, n) rad, k_c
     torque_limit: Floats | None  # (N, n) N m
-    learning: Series | None
-    truth: Series | None
-    timing: Series | None
-    monitor: Series | None
-    message_counts: Mapping[str, int]
-    refused: Mapping[str, str]  # disturbance columns that are not estimated, and why
+    learning: Series | None = None
+    truth: Series | None = None
+    timing: Series | None = None
+    monitor: Series | None = None
+    message_counts: Mapping[str, int] = field(default_factory=dict)
+    rejected: Mapping[str, str] = field(default_factory=dict)  # disturbance columns, and why
 
     @property
     def time(self) -> Floats:

@@ -21,7 +21,7 @@ from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from blf_dsc_controller.analysis.subject import read_subjects
+from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.bags.context import Losses, read_context
 from blf_dsc_controller.bags.errors import BagError
 from blf_dsc_controller.errors import ConfigurationError
@@ -293,7 +293,7 @@ def test_a_beginning_that_was_not_heard_is_told_in_the_bag_and_by_what_reads_it(
     lost = '0 missed, 7 sent before the recorder heard them'
     assert f'/joint_states: 3 messages, {lost}' in capfd.readouterr().err
     assert read_context(run.bag).losses == {'/joint_states': lost}
-    (subject,) = read_subjects([run.bag])
+    (subject,) = read_bags([run.bag])
     assert [(event.kind, event.text) for event in subject.events] == [
         ('lost', f'/joint_states: {lost}')
     ]

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from paper_case import EXACT, configured
 
-from blf_dsc_controller.analysis.monitors_figure import draw_monitors
-from blf_dsc_controller.analysis.summary import summarize
-from blf_dsc_controller.analysis.table import format_table
+from blf_dsc_controller.analysis.figures import draw
+from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.law.factory import controller_of, estimate_names, settings_of_config
 from blf_dsc_controller.messages import topics
@@ -112,10 +111,10 @@ def rejecting_run(tmp_path_factory):
 
 def test_rejected_columns_reach_the_summary_with_their_reason(rejecting_run):
     learning = summarize(rejecting_run)['learning']
-    ((refused, reason),) = learning['refused_columns'].items()
+    ((refused, reason),) = learning['rejected_columns'].items()
     assert refused.startswith('cos 1 rad/s ')
     assert reason.startswith(f'{refused} is not estimated: on this window it cannot be told from ')
-    assert f'refused     {reason}' in format_table(summarize(rejecting_run))
+    assert f'rejected    {reason}' in format_table(summarize(rejecting_run))
     assert learning['final_relative_error'] < 0.5
 
 
@@ -123,13 +122,13 @@ def test_a_run_without_rejected_columns(tmp_path):
     config = configured('recommended', 8.0)
     write_bag(tmp_path / 'bag', simulate(*config[1::-1]), config.controller, 'none')
     run = read_run(tmp_path / 'bag')
-    assert summarize(run)['learning']['refused_columns'] == {}
+    assert summarize(run)['learning']['rejected_columns'] == {}
     assert 'V barrier' not in run.monitor.names
 
 
 def test_monitors_are_drawn_from_the_bag(rejecting_run, tmp_path):
     path = tmp_path / 'monitors.png'
-    assert draw_monitors(rejecting_run, path)
+    assert path in draw(rejecting_run, tmp_path)
     image = matplotlib.image.imread(path)
     assert image.shape[1] > 1200
     dark = (image[..., :3].max(axis=2) < 0.3).sum()

@@ -54,7 +54,7 @@ def test_offline_run_warns_of_a_refused_column_and_what_it_is_like(tmp_path, cap
     printed = capsys.readouterr().out
     assert 'warning: cos 1 rad/s joint1 is not estimated' in printed
     assert 'cannot be told from m2*l2^2 + cos 1 rad/s joint2' in printed
-    assert 'refused     cos 1 rad/s joint1' in printed
+    assert 'rejected    cos 1 rad/s joint1' in printed
 
 
 @pytest.mark.skipif(importlib.util.find_spec('rclpy') is None, reason='needs ROS 2')

@@ -1,27 +1,164 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All pictures of a run."""
+"""The panels of a run as PNG files: tracking.png, parameters.png and monitors.png."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from blf_dsc_controller.analysis.monitors_figure import draw_monitors
-from blf_dsc_controller.analysis.parameters_figure import draw_parameters
-from blf_dsc_controller.analysis.tracking_figure import draw_tracking
+from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter
+
+from blf_dsc_controller.analysis.metrics import measure
+from blf_dsc_controller.analysis.panels import Line, Mark, Panel, panels, thin
+from blf_dsc_controller.analysis.style import (
+    COLOURS,
+    GREEN,
+    INK,
+    ORANGE,
+    SHADE,
+    Picture,
+    formula,
+    head,
+)
+from blf_dsc_controller.messages.names import DISTURBANCE
 from blf_dsc_controller.run import Run
+
+_SIZE = (6.2, 2.6)  # inches
+_HIGH = (6.2, 3.2)
+_ALONE = {'Torque': ORANGE, 'Excitation': GREEN}  # colour of one line
+_WIDE = {'Motion': (3.2, 0.55), 'Estimates': (2.4, 0.75)}  # width and opacity
+_WIDTHS_UPON_EACH_OTHER = (5.0, 2.4)
 
 
 def draw(run: Run, folder: Path) -> list[Path]:
-    """Draw tracking.png and what else the run tells of, and return the paths.
+    """Draw tracking.png and what else the run has data for, and return the paths.
 
-    parameters.png if something was learned, monitors.png if the monitors were recorded.
+    parameters.png if parameters were learned, monitors.png if the monitor was recorded.
     """
-    written = [folder / 'tracking.png']
-    draw_tracking(run, written[0])
-    for name, picture in (
-        ('parameters.png', draw_parameters),
-        ('monitors.png', draw_monitors),
-    ):
-        if picture(run, folder / name):
-            written.append(folder / name)
-    return written
+    found = panels([run])
+    motion = [panel for panel in found if panel.group in ('Motion', 'Tracking', 'Torque')]
+    excitation = [panel for panel in found if panel.group == 'Excitation']
+    monitors = [panel for panel in found if panel.group == 'Monitors']
+    parameters = [panel for panel in found if panel.group == 'Parameters']
+    pictures = [('tracking.png', _title(run), motion, _SIZE)]
+    if parameters:
+        error = measure(run).final_parameter_error
+        title = 'Learning'
+        if not math.isnan(error):
+            title += f': relative parameter error {100 * error:.2g} % at the end'
+        pictures.append(('parameters.png', title, [*_overlaid(found), *excitation], _HIGH))
+    if monitors:
+        shown = [monitors[0], *excitation, *monitors[1:]]
+        pictures.append(('monitors.png', 'Monitors', shown, _HIGH))
+    for name, title, shown, size in pictures:
+        columns = len(run.joints) if shown is motion else min(2, len(shown))
+        draw_panels(folder / name, title, shown, columns, size)
+    return [folder / name for name, *_ in pictures]
+
+
+def _title(run: Run) -> str:
+    held = measure(run).held
+    if held is None:
+        return f'Motion over {run.duration:.4g} s'
+    return f'Tracking over {run.duration:.4g} s: bound {"held" if held else "VIOLATED"}'
+
+
+def draw_panels(
+    path: Path,
+    title: str,
+    shown: Sequence[Panel],
+    columns: int,
+    size: tuple[float, float],
+    runs: Sequence[str] = (),
+    until: float = math.inf,
+) -> None:
+    """Draw panels of this size [inches] row by row, up to a time [s].
+
+    `runs` are the names of several runs, which the legends then show.
+    """
+    picture = Picture(-(-len(shown) // columns), columns, title, size)
+    for axes, panel in zip(picture.axes.flat, shown, strict=False):
+        _draw_panel(axes, panel, runs, until)
+    for axes in picture.axes.flat[len(shown) :]:
+        axes.set_visible(False)
+    picture.save(path)
+
+
+def _draw_panel(axes: Axes, panel: Panel, runs: Sequence[str], until: float) -> None:
+    plain = [line for line in panel.lines if not line.colour]
+    for k, line in enumerate(plain):
+        width, alpha = _WIDE.get(panel.group, (1.3, 1.0))
+        if runs and panel.group == 'Motion':
+            width, alpha = _WIDTHS_UPON_EACH_OTHER[line.run % 2], 1.0
+        colour = COLOURS[(line.run if runs else k) % len(COLOURS)]
+        if len(plain) == 1:
+            colour = _ALONE.get(panel.group, colour)
+        label = runs[line.run] if runs else line.name
+        _draw_line(axes, line, until, label=label, color=colour, lw=width, alpha=alpha)
+    for line in panel.lines:
+        if line.colour:
+            _draw_line(axes, line, until, label=line.name, color=line.colour, lw=1.2)
+    for mark in panel.marks:
+        if mark.time <= until:
+            _draw_mark(axes, mark)
+    if panel.log:
+        axes.set_yscale('log')
+    if panel.unit == '%':
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g} %'))
+    axes.set_ylabel(panel.symbol or f'[{panel.unit}]')
+    title = formula(panel.title) if panel.group == 'Parameters' else panel.title
+    head(axes, title + (panel.note and f': {panel.note}'))
+
+
+def _draw_line(axes: Axes, line: Line, until: float, *, label: str, **style: Any) -> None:
+    shown = line.time <= until
+    time, values = thin(line.time[shown], line.values[shown])
+    style['ls'] = '--' if line.dashed else '-'
+    if line.shaded:
+        axes.fill_between(time, -values, values, color=SHADE, lw=0)
+    is_known = label in axes.get_legend_handles_labels()[1]
+    axes.plot(time, values, label=None if is_known else label, **style)
+    if line.mirrored:
+        axes.plot(time, -values, **style)
+
+
+def _draw_mark(axes: Axes, mark: Mark) -> None:
+    if not mark.colour:
+        axes.axvline(mark.time, color=INK, lw=1.1, ls=(0, (1, 2)), zorder=1)
+        return
+    axes.axvline(mark.time, color=mark.colour, lw=1.4)
+    is_early = mark.time < sum(axes.get_xlim()) / 2.0
+    axes.annotate(
+        mark.text,
+        (mark.time, 1.0),
+        (4 if is_early else -4, -2),
+        xycoords=axes.get_xaxis_transform(),
+        textcoords='offset points',
+        ha='left' if is_early else 'right',
+        va='top',
+        fontsize=9.5,
+        color=mark.colour,
+    )
+
+
+def _overlaid(found: Sequence[Panel]) -> Iterator[Panel]:
+    """Panels of the learning: all parameters in one, all disturbances in one."""
+    parameters = [panel for panel in found if panel.group == 'Parameters' and not panel.log]
+    disturbances = [panel for panel in found if panel.group == 'Disturbance']
+    yield _overlay('estimates', parameters)
+    yield from (panel for panel in found if panel.group == 'Parameters' and panel.log)
+    if disturbances:
+        yield _overlay('disturbance estimates', disturbances)
+
+
+def _overlay(title: str, shown: Sequence[Panel]) -> Panel:
+    lines = []
+    for panel in shown:
+        name = panel.title.removeprefix(DISTURBANCE)
+        name = formula(name) if panel.group == 'Parameters' else name
+        lines += [line if line.colour else line._replace(name=name) for line in panel.lines]
+    return replace(shown[0], group='Estimates', title=title, lines=tuple(lines))

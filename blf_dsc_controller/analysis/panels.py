@@ -1,228 +1,249 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the page plots, as plain data for plotly: panels of traces, thinned without losing a peak.
-
-Time panels share their time axis; several bags lie over each other, a colour each.
-"""
+"""The panels of runs: what is plotted, by matplotlib in `figures` and by plotly in `report`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
-from typing import Any, TypeAlias
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.analysis.envelope import envelope
-from blf_dsc_controller.analysis.estimation import Estimation, latch_time
-from blf_dsc_controller.analysis.style import COLOURS, INK, MUTED
-from blf_dsc_controller.analysis.subject import Subject
-from blf_dsc_controller.messages.names import COMPUTE_TIME, DISTURBANCE, LAMBDA_MIN, LATENCY
+from blf_dsc_controller.analysis.metrics import estimates_of, latch_time, outside, rms
+from blf_dsc_controller.analysis.style import ALARM, INK, MUTED
+from blf_dsc_controller.messages.monitor import LYAPUNOV_BOUND, LYAPUNOV_TERMS
+from blf_dsc_controller.messages.names import (
+    COMPUTE_TIME,
+    DISTURBANCE,
+    LAMBDA_MIN,
+    LATENCY,
+    LYAPUNOV,
+)
 from blf_dsc_controller.run import Floats, Run, Series
 
-Trace: TypeAlias = dict[str, Any]
-Panel: TypeAlias = dict[str, Any]
-Lines: TypeAlias = Callable[[Run], Iterator[Trace]]
-
-_MILLI = 1e3
-_MICRO = 1e6
-_BINS = 200
-_TAIL = 99.9  # percentile up to which a histogram is drawn
-_DIGITS = 7
-
-
-def panels(subjects: Sequence[Subject]) -> list[Panel]:
-    """Every panel that some bag has something for.
-
-    Each is a dictionary: group, title, traces, the label of its values, whether it is over time,
-    whether its values are drawn on a logarithmic axis, and times to mark.
-    """
-    found = [*_motion(subjects), *_learning(subjects), *_timing(subjects)]
-    return [panel for panel in found if panel['traces']]
+GROUPS = (
+    'Motion',
+    'Tracking',
+    'Torque',
+    'Parameters',
+    'Disturbance',
+    'Excitation',
+    'Monitors',
+    'Timing',
+)
+_LEARNING = GROUPS[3:7]
+_LEAST = 1e-12  # J, the smallest value on a logarithmic axis
+_LEAST_ERROR = 1e-5  # %
 
 
-def colour(k: int) -> str:
-    """Colour of the k-th bag."""
-    return COLOURS[k % len(COLOURS)]
+class Line(NamedTuple):
+    """A line of a panel; without a colour it has that of its run."""
+
+    name: str  # in the legend
+    time: Floats  # s
+    values: Floats  # NaN: a gap
+    colour: str = ''
+    dashed: bool = False
+    mirrored: bool = False  # drawn with both signs
+    shaded: bool = False  # between both signs
+    run: int = 0
 
 
-def _motion(subjects: Sequence[Subject]) -> Iterator[Panel]:
-    joints = list(dict.fromkeys(joint for one in subjects for joint in one.run.joints))
-    for group, what, unit, lines in (
-        ('Tracking', 'error', 'mrad', _error),
-        ('Motion', 'position', 'rad', _position),
-        ('Torque', 'torque', 'N m', _torque),
-    ):
-        for joint in joints:
-            yield _over_time(subjects, group, f'{what} of {joint}', unit, partial(lines, joint))
+class Mark(NamedTuple):
+    """A vertical line."""
+
+    time: float
+    text: str
+    colour: str = ''
+    run: int = 0
 
 
-def _error(joint: str, run: Run) -> Iterator[Trace]:
-    if run.error is None or joint not in run.joints:
-        return
-    i = run.joints.index(joint)
-    yield _line('error', run.time, _MILLI * run.error[:, i])
-    if run.bound is not None:
-        yield from _limits('bound', run.time, _MILLI * run.bound[:, i])
+@dataclass(frozen=True)
+class Panel:
+    """Lines over time, or the histograms of their values."""
+
+    group: str
+    title: str
+    unit: str
+    lines: tuple[Line, ...]
+    note: str = ''  # on the one run that is shown
+    symbol: str = ''  # label of the axis in mathematical type, instead of the unit
+    log: bool = False
+    histogram: bool = False
+    marks: tuple[Mark, ...] = ()
 
 
-def _position(joint: str, run: Run) -> Iterator[Trace]:
-    if joint not in run.joints:
-        return
-    i = run.joints.index(joint)
-    yield _line('measured', run.time, run.position[:, i])
-    if run.reference is not None:
-        yield _line('reference', run.time, run.reference[:, i], dash='dash', colour=INK)
+def panels(runs: Sequence[Run]) -> list[Panel]:
+    """Every panel that some of the runs have data for, several runs over each other."""
+    found: dict[tuple[str, str], Panel] = {}
+    for k, run in enumerate(runs):
+        latched = latch_time(run)
+        latch = () if latched is None else (Mark(latched, 'latch'),)
+        for panel in (*_motion(run), *_learning(run), *_monitors(run), *_timing(run)):
+            before = found.get((panel.group, panel.title), replace(panel, lines=(), marks=()))
+            marks = latch if panel.group in _LEARNING else panel.marks
+            found[panel.group, panel.title] = replace(
+                before,
+                lines=(*before.lines, *(line._replace(run=k) for line in panel.lines)),
+                marks=(*before.marks, *(mark._replace(run=k) for mark in marks)),
+                note=panel.note if len(runs) == 1 else '',
+            )
+    drawn = [panel for panel in found.values() if panel.lines]
+    return sorted(drawn, key=lambda panel: GROUPS.index(panel.group))
 
 
-def _torque(joint: str, run: Run) -> Iterator[Trace]:
-    if joint not in run.joints or np.isnan(run.torque).all():
-        return
-    i = run.joints.index(joint)
-    yield _line('torque', run.time, run.torque[:, i])
-    if run.torque_limit is not None:
-        yield from _limits('limit', run.time, run.torque_limit[:, i])
-
-
-def _learning(subjects: Sequence[Subject]) -> Iterator[Panel]:
-    known = [Estimation.of(one.run) for one in subjects]
-    names = list(dict.fromkeys(name for one in known if one is not None for name in one.names))
-    for name in names:
-        yield _over_time(subjects, 'Parameters', name, 'kg m^2', partial(_parameter, name))
-    yield _over_time(subjects, 'Parameters', 'relative parameter error', '', _relative, log=True)
-    yield _over_time(subjects, 'Excitation', 'least eigenvalue', '', _excitation, log=True)
-    told = [one.run.learning for one in subjects]
-    columns = [name for one in told if one is not None for name in one.names]
-    for name in dict.fromkeys(name for name in columns if name.startswith(DISTURBANCE)):
-        yield _over_time(subjects, 'Disturbance', name, 'N m', partial(_disturbance, name))
-
-
-def _parameter(name: str, run: Run) -> Iterator[Trace]:
-    estimation = Estimation.of(run)
-    if estimation is None or name not in estimation.names:
-        return
-    j = estimation.names.index(name)
-    yield _line('estimate', estimation.time, estimation.estimate[:, j])
-    if estimation.true is not None:
-        yield _line('true', estimation.time, estimation.true[:, j], dash='dash', colour=INK)
-
-
-def _relative(run: Run) -> Iterator[Trace]:
-    estimation = Estimation.of(run)
-    if estimation is not None and estimation.relative_error is not None:
-        yield _line('relative error', estimation.time, estimation.relative_error)
-
-
-def _excitation(run: Run) -> Iterator[Trace]:
-    if run.learning is not None and LAMBDA_MIN in run.learning.names:
-        yield _column(run, run.learning, LAMBDA_MIN, 'lambda_min')
-
-
-def _disturbance(name: str, run: Run) -> Iterator[Trace]:
-    if run.learning is not None and name in run.learning.names:
-        yield _column(run, run.learning, name, 'estimate')
-    if run.truth is not None and name in run.truth.names:
-        yield {**_column(run, run.truth, name, 'true'), 'line': {'dash': 'dash', 'color': INK}}
-
-
-def _timing(subjects: Sequence[Subject]) -> Iterator[Panel]:
-    measured = (
-        ('period of the joint states, as received', _period),
-        ('state to torque', lambda run: _told(run.timing, LATENCY)),
-        ('time that the law takes', lambda run: _told(run.learning, COMPUTE_TIME)),
-    )
-    for title, values_of in measured:
-        traces = []
-        for k, one in enumerate(subjects):
-            values = values_of(one.run)
-            known = values[np.isfinite(values)]
-            if known.size:
-                traces.append({**_histogram(known), **_identity(one, k, subjects, 'samples')})
-        yield {
-            'group': 'Timing',
-            'title': title,
-            'unit': 'us',
-            'traces': traces,
-            'time': False,
-            'log': True,
-            'marks': [],
-        }
-
-
-def _period(run: Run) -> Floats:
-    return np.diff(run.received) * 1e-9
-
-
-def _told(series: Series | None, name: str) -> Floats:
-    return np.empty(0) if series is None or name not in series.names else series.column(name)
-
-
-def _histogram(values: Floats) -> Trace:
-    """Counts of values [s] up to the tail [us]; those beyond it fall into the last bin."""
-    end = float(np.percentile(values, _TAIL)) * _MICRO
-    counts, edges = np.histogram(np.minimum(values * _MICRO, end), _BINS)
-    middle = (edges[1:] + edges[:-1]) / 2
-    return {'x': _numbers(middle), 'y': counts.tolist(), 'type': 'bar', 'opacity': 0.7}
-
-
-def _over_time(
-    subjects: Sequence[Subject],
-    group: str,
-    title: str,
-    unit: str,
-    lines: Lines,
-    *,
-    log: bool = False,
-) -> Panel:
-    traces = []
-    for k, one in enumerate(subjects):
-        for trace in lines(one.run):
-            line = {'width': 1.3, 'color': colour(k), **trace.get('line', {})}
-            if len(subjects) > 1 and line['color'] == INK:
-                line['color'] = colour(k)
-            traces.append({**trace, **_identity(one, k, subjects, trace['name']), 'line': line})
-    marks = [(latch_time(one.run), colour(k)) for k, one in enumerate(subjects)]
-    learns = group in ('Parameters', 'Excitation', 'Disturbance')
-    return {
-        'group': group,
-        'title': title,
-        'unit': unit,
-        'traces': traces,
-        'time': True,
-        'log': log,
-        'marks': [mark for mark in marks if mark[0] is not None] if learns else [],
-    }
-
-
-def _identity(one: Subject, k: int, subjects: Sequence[Subject], name: str) -> Trace:
-    if len(subjects) == 1:
-        return {'name': name, 'marker': {'color': colour(k)}}
-    return {'name': f'{one.name}: {name}', 'marker': {'color': colour(k)}}
-
-
-def _column(run: Run, series: Series, column: str, name: str) -> Trace:
-    return _line(name, run.time_of(series.stamp), series.column(column))
-
-
-def _limits(name: str, time: Floats, values: Floats) -> Iterator[Trace]:
-    for sign in (1.0, -1.0):
-        line = _line(name, time, sign * values, dash='dash', colour=MUTED)
-        yield {**line, 'showlegend': sign > 0}
-
-
-def _line(name: str, time: Floats, values: Floats, dash: str = 'solid', colour: str = '') -> Trace:
-    x, y = _corners(time, values)
-    line = {'dash': dash, **({'color': colour} if colour else {})}
-    return {'name': name, 'x': _numbers(x), 'y': _numbers(y), 'type': 'scatter', 'line': line}
-
-
-def _corners(time: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Thin a series; where it is constant for long, its corners say all."""
+def thin(time: Floats, values: Floats, pieces: int = 1500) -> tuple[Floats, Floats]:
+    """Thin a series without losing a peak; of a mostly constant one the corners remain."""
     changes = np.flatnonzero(np.diff(values) != 0.0)
     if changes.size < values.size // 100:
         kept = np.unique(np.concatenate([[0], changes, changes + 1, [values.size - 1]]))
         return time[kept], values[kept]
-    return envelope(time, values)
+    return envelope(time, values, pieces)
 
 
-def _numbers(values: Floats) -> list[float | None]:
-    return [float(f'{one:.{_DIGITS}g}') if np.isfinite(one) else None for one in values.tolist()]
+def envelope(time: Floats, values: Floats, pieces: int = 1500) -> tuple[Floats, Floats]:
+    """Lowest and highest sample of each piece of a series (N,), in their order.
+
+    NaN is unknown; a piece in which nothing is known stays a gap. At most two samples of each piece
+    remain, all of them if they are so few.
+    """
+    if values.size <= 2 * pieces:
+        return time, values
+    edges = np.linspace(0, values.size, pieces + 1).astype(np.intp)[:-1]
+    low = _extreme(np.where(np.isnan(values), np.inf, values), edges, np.minimum)
+    high = _extreme(np.where(np.isnan(values), -np.inf, values), edges, np.maximum)
+    kept = np.sort(np.stack([low, high]), axis=0).T.ravel()
+    return time[kept], values[kept]
+
+
+def _extreme(values: Floats, edges: np.ndarray, reduction: np.ufunc) -> np.ndarray:
+    """Index of the first sample of each piece that is its extreme one."""
+    extremes = np.repeat(reduction.reduceat(values, edges), np.diff([*edges, values.size]))
+    found = np.where(values == extremes, np.arange(values.size), values.size)
+    return np.asarray(np.minimum.reduceat(found, edges))
+
+
+def _motion(run: Run) -> Iterator[Panel]:
+    t = run.time
+    for i, joint in enumerate(run.joints):
+        lines = [Line('measured', t, run.position[:, i])]
+        if run.reference is not None:
+            lines.append(Line('reference', t, run.reference[:, i], INK, dashed=True))
+        yield Panel('Motion', f'position of {joint}', 'rad', tuple(lines))
+        if run.error is not None:
+            yield _error(run, i, 1e3 * run.error[:, i])
+        torque = run.torque[:, i]
+        if np.isnan(run.torque).all():
+            continue
+        lines = [Line('torque', t, torque)]
+        if run.torque_limit is not None and not np.isnan(run.torque_limit[:, i]).all():
+            limit = run.torque_limit[:, i]
+            lines.append(Line('limit', t, limit, MUTED, dashed=True, mirrored=True))
+        note = '' if np.isnan(torque).all() else f'peak {np.nanmax(np.abs(torque)):.3g}'
+        yield Panel('Torque', f'torque of {joint}', 'N m', tuple(lines), note)
+
+
+def _error(run: Run, i: int, error: Floats) -> Panel:
+    lines, violated = [Line('error', run.time, error)], outside(run)
+    marks: tuple[Mark, ...] = ()
+    if run.bound is not None and violated is not None:
+        bound = 1e3 * run.bound[:, i]
+        lines.append(Line('bound', run.time, bound, MUTED, True, True, True))  # noqa: FBT003
+        first = run.time[violated[:, i]][:1].tolist()
+        marks = tuple(Mark(time, f'outside from {time:.3f} s', ALARM) for time in first)
+    note = ''
+    if not np.isnan(error).all():
+        note = f'max {np.nanmax(np.abs(error)):.3g}, rms {rms(error):.3g}'
+    title = f'error of {run.joints[i]}'
+    return Panel('Tracking', title, 'mrad', tuple(lines), note, marks=marks)
+
+
+def _learning(run: Run) -> Iterator[Panel]:
+    estimates = estimates_of(run)
+    if estimates is None or run.learning is None:
+        return
+    for j, name in enumerate(estimates.names):
+        lines = [Line('estimate', estimates.time, estimates.estimate[:, j])]
+        if estimates.true is not None:
+            lines.append(Line('true', estimates.time, estimates.true[:, j], INK, dashed=True))
+        yield Panel('Parameters', name, 'kg m²', tuple(lines))
+    if estimates.relative_error is not None:
+        error = np.maximum(100.0 * estimates.relative_error, _LEAST_ERROR)
+        lines = [
+            Line('relative error', estimates.time, error),
+            Line('1 %', estimates.time, np.ones_like(error), MUTED, dashed=True),
+        ]
+        symbol, title = r'$\|\hat P - P\| \;/\; \|P\|$', 'relative parameter error'
+        yield Panel('Parameters', title, '%', tuple(lines), symbol=symbol, log=True)
+    for name in run.learning.names:
+        if name.startswith(DISTURBANCE):
+            true = _column(run, run.truth, name, 'true')
+            lines = [line._replace(colour=INK, dashed=True) for line in true]
+            lines = [*_column(run, run.learning, name, 'estimate'), *lines]
+            yield Panel('Disturbance', name, 'N m', tuple(lines))
+
+
+def _monitors(run: Run) -> Iterator[Panel]:
+    latched = latch_time(run)
+    note = 'learning never began' if latched is None else f'learning from {latched:.4g} s on'
+    excitation = [
+        line._replace(values=np.where(line.values > 0.0, line.values, np.nan))  # 0: no update yet
+        for series in (run.learning, run.monitor)
+        for line in _column(run, series, LAMBDA_MIN, 'minimum eigenvalue')
+    ]
+    symbol = r'$\lambda_{\min}(\Phi)$'
+    yield Panel(
+        'Excitation', 'minimum eigenvalue', '', (*excitation[:1],), note, symbol=symbol, log=True
+    )
+    if run.monitor is None:
+        return
+    if run.error is not None and run.bound is not None:
+        distance = 1e3 * (run.bound - np.abs(run.error))
+        lines = [Line(joint, run.time, distance[:, i]) for i, joint in enumerate(run.joints)]
+        lines.append(Line('', run.time, np.zeros_like(run.time), ALARM))
+        note, symbol = f'minimum {np.nanmin(distance):.3g}', r'$k_c - |\xi_1|$ [mrad]'
+        yield Panel('Monitors', 'distance to bound', 'mrad', tuple(lines), note, symbol)
+    if LYAPUNOV_TERMS[0] in run.monitor.names:
+        yield from _lyapunov(run, run.monitor)
+
+
+def _lyapunov(run: Run, monitor: Series) -> Iterator[Panel]:
+    terms = [
+        line._replace(values=np.maximum(line.values, _LEAST))
+        for term in LYAPUNOV_TERMS
+        for line in _column(run, monitor, term, term.removeprefix(LYAPUNOV))
+        if np.any(line.values > 0.0)
+    ]
+    symbol = 'terms of $V$ [J]'
+    yield Panel('Monitors', 'terms of V (29)', 'J', tuple(terms), symbol=symbol, log=True)
+    V = monitor.select(LYAPUNOV_TERMS).sum(axis=1)
+    lines = [Line('V', run.time_of(monitor.stamp), np.maximum(V, _LEAST), INK)]
+    note = ''
+    for line in _column(run, monitor, LYAPUNOV_BOUND, 'bound (32)'):
+        known = np.isfinite(line.values)
+        note = r'no bound, as $\kappa_e = 0$'
+        if known.any():
+            lines.append(line._replace(colour=MUTED, dashed=True))
+            met = float(np.mean(V[known] <= line.values[known]))
+            note = f'met {100 * met:.3g} % of the time'
+    yield Panel('Monitors', 'V and its bound (32)', 'J', tuple(lines), note, log=True)
+
+
+def _timing(run: Run) -> Iterator[Panel]:
+    periods = Series(('period',), run.stamp[1:], np.diff(run.received)[:, np.newaxis] * 1e-9)
+    for title, series, name in (
+        ('period of the joint states, as received', periods, 'period'),
+        ('state to torque', run.timing, LATENCY),
+        ('computing time of the law', run.learning, COMPUTE_TIME),
+    ):
+        times = [
+            line._replace(values=1e6 * line.values)
+            for line in _column(run, series, name, 'samples')
+            if np.isfinite(line.values).any()
+        ]
+        yield Panel('Timing', title, 'µs', tuple(times), log=True, histogram=True)
+
+
+def _column(run: Run, series: Series | None, column: str, name: str) -> Iterator[Line]:
+    if series is not None and column in series.names:
+        yield Line(name, run.time_of(series.stamp), series.column(column))

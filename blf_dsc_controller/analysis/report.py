@@ -5,8 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
-from blf_dsc_controller.analysis.animation import animation
+import numpy as np
+
 from blf_dsc_controller.analysis.page import (
     Cell,
     Content,
@@ -17,16 +19,22 @@ from blf_dsc_controller.analysis.page import (
     Section,
     Table,
 )
-from blf_dsc_controller.analysis.panels import colour, panels
-from blf_dsc_controller.analysis.subject import Subject
-from blf_dsc_controller.analysis.summary import summarize
-from blf_dsc_controller.analysis.table import format_table
+from blf_dsc_controller.analysis.panels import Line, Panel, panels, thin
+from blf_dsc_controller.analysis.reported_bag import ReportedBag
+from blf_dsc_controller.analysis.style import COLOURS, INK
+from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.errors import MissingExtraError
+from blf_dsc_controller.run import Floats
 
+_BINS = 200
+_TAIL = 99.9  # percentile up to which a histogram is drawn
+_DIGITS = 7
+_RATE = 50.0  # pictures of the arm a second
+_MOST_PICTURES = 6000
 _ALARMING = ('violation', 'ERROR', 'lost')
 
 
-def write_report(subjects: Sequence[Subject], path: Path) -> None:
+def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
     """Write the page of these bags.
 
     Raises:
@@ -36,47 +44,47 @@ def write_report(subjects: Sequence[Subject], path: Path) -> None:
         from plotly.offline import get_plotlyjs
     except ImportError:
         raise MissingExtraError('plotly', 'report', 'the page') from None
-    drawn = panels(subjects)
-    data = {'panels': drawn, 'arms': animation(subjects)}
-    links = [*dict.fromkeys(panel['group'] for panel in drawn), 'The arm', 'Events']
+    found = panels([bag.run for bag in bags])
+    data = {'panels': plots(found, bags), 'arms': [arm(bag, k) for k, bag in enumerate(bags)]}
+    links = [*dict.fromkeys(panel.group for panel in found), 'The arm', 'Events']
     Page(
-        title=' and '.join(one.name for one in subjects),
-        introduction=[Paragraph(_subtitle(subjects), 'muted')],
+        title=' and '.join(bag.name for bag in bags),
+        introduction=[Paragraph(_subtitle(bags), 'muted')],
         links=[(name.lower().replace(' ', '-'), name) for name in [*links, 'Configuration']],
         sections=[
-            Section('Summary', [_summary(one, k) for k, one in enumerate(subjects)]),
+            Section('Summary', [_summary(bag, k) for k, bag in enumerate(bags)]),
             Section('', [Fragment('plots.html', {'data': data, 'plotly': get_plotlyjs()})]),
-            Section('Events', [_events(subjects)]),
-            Section('Configuration', list(_configuration(subjects))),
+            Section('Events', [_events(bags)]),
+            Section('Configuration', list(_configuration(bags))),
         ],
     ).write(path)
 
 
-def _subtitle(subjects: Sequence[Subject]) -> str:
-    versions = sorted({one.context.version or 'another recorder' for one in subjects})
-    seconds = max(one.run.duration for one in subjects)
+def _subtitle(bags: Sequence[ReportedBag]) -> str:
+    versions = sorted({bag.context.version or 'another recorder' for bag in bags})
+    seconds = max(bag.run.duration for bag in bags)
     return (
         f'{seconds:.3f} s, recorded by {", ".join(versions)}. Drag to zoom, double-click to zoom '
         'out; long series are thinned to their minima and maxima.'
     )
 
 
-def _summary(subject: Subject, k: int) -> Listing:
-    return Listing(subject.name, format_table(summarize(subject.run)), colour(k))
+def _summary(bag: ReportedBag, k: int) -> Listing:
+    return Listing(bag.name, format_table(summarize(bag.run)), colour(k))
 
 
-def _events(subjects: Sequence[Subject]) -> Content:
+def _events(bags: Sequence[ReportedBag]) -> Content:
     rows = sorted(
         (event.time, k, event.kind, event.text)
-        for k, one in enumerate(subjects)
-        for event in one.events
+        for k, bag in enumerate(bags)
+        for event in bag.events
     )
     if not rows:
         return Paragraph('none')
     cells = [
         (
             Cell(f'{time:.3f} s', 'number'),
-            Cell(subjects[k].name, colour=colour(k)),
+            Cell(bags[k].name, colour=colour(k)),
             Cell(kind, 'bad' if kind in _ALARMING else ''),
             text,
         )
@@ -85,8 +93,8 @@ def _events(subjects: Sequence[Subject]) -> Content:
     return Table(('time', 'bag', 'kind', 'event'), cells)
 
 
-def _configuration(subjects: Sequence[Subject]) -> Iterator[Content]:
-    recorded = [one.parameters for one in subjects]
+def _configuration(bags: Sequence[ReportedBag]) -> Iterator[Content]:
+    recorded = [bag.parameters for bag in bags]
     names = list(dict.fromkeys(name for one in recorded for name in one))
     if not names:
         yield Paragraph('not recorded in the bag')
@@ -99,8 +107,94 @@ def _configuration(subjects: Sequence[Subject]) -> Iterator[Content]:
         rows.append([Cell(name, 'marked') if differs else name, *values])
         if differs:
             different.append(rows[-1])
-    header = ('parameter', *(one.name for one in subjects))
-    if len(subjects) > 1:
+    header = ('parameter', *(bag.name for bag in bags))
+    if len(bags) > 1:
         yield Paragraph(f'{len(different)} parameters differ.')
         yield Table(header, different)
     yield Table(header, rows, folded=f'all {len(rows)} parameters')
+
+
+def plots(shown: Sequence[Panel], bags: Sequence[ReportedBag]) -> list[dict[str, Any]]:
+    """Panels as data for plotly, whose traces are thinned without losing a peak."""
+    names = [bag.name for bag in bags] if len(bags) > 1 else []
+    return [
+        {
+            'group': panel.group,
+            'title': panel.title,
+            'unit': panel.unit,
+            'traces': list((_histograms if panel.histogram else _traces)(panel, names)),
+            'time': not panel.histogram,
+            'log': panel.log,
+            'marks': [
+                (mark.time, mark.text, mark.colour or colour(mark.run)) for mark in panel.marks
+            ],
+        }
+        for panel in shown
+    ]
+
+
+def _traces(panel: Panel, names: Sequence[str]) -> Iterator[dict[str, Any]]:
+    drawn = 0
+    for line in panel.lines:
+        shade = line.colour or colour(line.run if names else drawn)
+        drawn += not line.colour
+        if names and shade == INK:
+            shade = colour(line.run)
+        time, values = thin(line.time, line.values)
+        for sign in (1.0, -1.0) if line.mirrored else (1.0,):
+            yield {
+                'type': 'scatter',
+                'name': _name(line, names),
+                'x': _numbers(time),
+                'y': _numbers(sign * values),
+                'line': {'width': 1.3, 'color': shade, 'dash': 'dash' if line.dashed else 'solid'},
+                'showlegend': bool(line.name) and sign > 0.0,
+            }
+
+
+def _histograms(panel: Panel, names: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Counts up to the tail; values beyond it fall into the last bin."""
+    for line in panel.lines:
+        values = line.values[np.isfinite(line.values)]
+        counts, edges = np.histogram(np.minimum(values, np.percentile(values, _TAIL)), _BINS)
+        yield {
+            'type': 'bar',
+            'name': _name(line, names),
+            'x': _numbers((edges[1:] + edges[:-1]) / 2),
+            'y': counts.tolist(),
+            'opacity': 0.7,
+            'marker': {'color': colour(line.run)},
+        }
+
+
+def _name(line: Line, names: Sequence[str]) -> str:
+    return f'{names[line.run]}: {line.name}' if names else line.name
+
+
+def _numbers(values: Floats) -> list[float | None]:
+    return [float(f'{one:.{_DIGITS}g}') if np.isfinite(one) else None for one in values.tolist()]
+
+
+def colour(k: int) -> str:
+    """Colour of the k-th bag."""
+    return COLOURS[k % len(COLOURS)]
+
+
+def arm(bag: ReportedBag, k: int) -> dict[str, Any]:
+    """Angles and link lengths of an arm, at a rate that the eye can follow.
+
+    Joint 1 is measured from the horizontal, each further joint from the link before it.
+    """
+    run = bag.run
+    pictures = int(min(_MOST_PICTURES, max(2.0, run.duration * _RATE)))
+    times = np.linspace(0.0, run.duration, pictures)
+    rows = np.minimum(np.searchsorted(run.time, times), run.time.size - 1)
+    reference: Any = [] if run.reference is None else np.nan_to_num(run.reference[rows]).round(4)
+    return {
+        'name': bag.name,
+        'colour': colour(k),
+        'lengths': bag.lengths,
+        'time': times.round(4).tolist(),
+        'angles': np.nan_to_num(run.position[rows]).round(4).tolist(),
+        'reference': np.asarray(reference).tolist(),
+    }

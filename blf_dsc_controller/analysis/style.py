@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,10 @@ MUTED = '#6B7280'
 SHADE = '#DCE9F5'
 ALARM = '#B3001B'
 
-_COLUMNS = 2
 _DPI = 130
-_MOST_ABOVE = 4  # entries of a legend that fit beside a title
+_CHARACTER = 0.085  # inches, about, of a title and a legend
+_HANDLE = 0.45
+_MARGIN = 0.75  # of a panel, beside its axes
 _SETTINGS: Any = {
     'font.family': 'DejaVu Sans',
     'font.size': 11,
@@ -79,40 +79,20 @@ class Picture:
             self._figure.savefig(path, dpi=_DPI, facecolor='white')
 
 
-def save_panels(
-    path: Path,
-    title: str,
-    panels: Sequence[Callable[[Axes], None]],
-    size: tuple[float, float],
-    latched: float | None,
-) -> None:
-    """Write a picture of panels in two columns, with a line where learning began.
-
-    Args:
-        path: of the PNG.
-        title: above all.
-        panels: what draws each.
-        size: of a panel [inches].
-        latched: when learning began [s]; None: never.
-    """
-    rows = -(-len(panels) // _COLUMNS)
-    picture = Picture(rows, min(len(panels), _COLUMNS), title, size)
-    for axes, panel in zip(picture.axes.flat, panels, strict=False):
-        panel(axes)
-        if latched is not None:
-            axes.axvline(latched, color=INK, lw=1.1, ls=(0, (1, 2)), zorder=1)
-    for axes in picture.axes.flat[len(panels) :]:
-        axes.set_visible(False)
-    picture.save(path)
-
-
 def head(axes: Axes, title: str) -> None:
-    """Put the title above a panel and its legend off the data: above as well, or beside it."""
+    """Put the title above a panel and its legend off the data: above as well, or beside it.
+
+    A single line without another needs no legend but the title.
+    """
     axes.set_title(title, loc='left', fontsize=11.5)
-    entries = len(axes.get_legend_handles_labels()[1])
-    if entries == 0:
+    labels = axes.get_legend_handles_labels()[1]
+    entries = len(labels)
+    if entries == 0 or labels == [title.partition(':')[0]]:
         return
-    above = entries <= _MOST_ABOVE
+    grid = axes.get_subplotspec()
+    width = axes.figure.get_figwidth() / (grid.get_gridspec().ncols if grid else 1)  # type: ignore[union-attr]
+    characters = re.sub(r'\\hat|[\\${}_^,]', '', title + ''.join(labels))
+    above = _CHARACTER * len(characters) + _HANDLE * entries < width - _MARGIN
     axes.legend(
         loc='lower right' if above else 'center left',
         bbox_to_anchor=(1.0, 1.0) if above else (1.0, 0.5),

@@ -1,40 +1,53 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run in figures: the content of summary.json."""
+"""Summary of a run: metrics and timing as JSON (summary.json), and as a table for the terminal."""
 
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.analysis.estimation import Estimation, latch_time
+from blf_dsc_controller.analysis.metrics import Estimates, Metrics, estimates_of, measure
 from blf_dsc_controller.messages.names import COMPUTE_TIME, LATE_STEPS, LATENCY
 from blf_dsc_controller.run import Floats, Run, Series
 
 Summary = dict[str, Any]
 
-MOMENTS = (5, 10, 20, 40, 60)
-"""Times at which the parameter error is told [s]."""
-
-_LEARNED = 0.01
 _PERCENTILES = {'p50': 50.0, 'p99': 99.0, 'p99.9': 99.9, 'max': 100.0}
 _MICROSECONDS = 1e6
+_COLUMNS = (  # title, entry of the summary, unit, how many units to 1, decimals
+    ('max |xi1|', 'max_abs_error_rad', 'mrad', 1e3, 3),
+    ('rms xi1', 'rms_error_rad', 'mrad', 1e3, 3),
+    ('bound', 'bound_rad', 'mrad', 1e3, 3),
+    ('peak torque', 'peak_torque_nm', 'N m', 1.0, 2),
+    ('rms torque', 'rms_torque_nm', 'N m', 1.0, 2),
+    ('limit', 'torque_limit_nm', 'N m', 1.0, 2),
+)
 
 
 def summarize(run: Run) -> Summary:
     """Summary of a run as plain data for JSON; units are part of the names.
 
-    What the run does not tell is None, as is what has not happened.
+    What is unknown or has not happened is None.
     """
+    metrics = measure(run)
+    estimates = estimates_of(run)
+    violated = {'time_s': metrics.first_violation, 'joint': metrics.violating_joint}
     return {
         'duration_s': run.duration,
         'samples': int(run.stamp.size),
-        'tracking': _tracking(run),
-        'learning': _learning(run),
+        'tracking': {
+            'held': metrics.held,
+            'first_violation': None if math.isnan(metrics.first_violation) else violated,
+            'joints': {joint: _joint(metrics, i) for i, joint in enumerate(run.joints)},
+        },
+        'learning': None if estimates is None else _learning(run, estimates, metrics),
         'timing': _timing(run),
-        'compute_time_us': _compute_time(run),
+        'compute_time_us': _percentiles(run.learning, COMPUTE_TIME),
         'messages': dict(run.message_counts),
     }
 
@@ -44,68 +57,48 @@ def write_summary(summary: Summary, path: Path) -> None:
     path.write_text(json.dumps(summary, indent=2, allow_nan=False) + '\n', encoding='utf-8')
 
 
-def _tracking(run: Run) -> Summary:
-    joints = {joint: _joint(run, i) for i, joint in enumerate(run.joints)}
-    summary: Summary = {'held': None, 'first_violation': None, 'joints': joints}
-    if run.error is not None and run.bound is not None:
-        outside = np.abs(run.error) >= run.bound
-        summary['held'] = not outside.any()
-        if outside.any():
-            k, i = np.argwhere(outside)[0]
-            summary['first_violation'] = {'time_s': float(run.time[k]), 'joint': run.joints[i]}
-    return summary
+def plain(value: Any) -> Any:
+    """Data for JSON: lists and dictionaries, None instead of NaN."""
+    if isinstance(value, dict):
+        return {str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(each) for each in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
-def _joint(run: Run, i: int) -> Summary:
-    error = None if run.error is None else run.error[:, i]
-    torque = run.torque[:, i]
-    return {
-        'max_abs_error_rad': _peak(error),
-        'rms_error_rad': _rms(error),
-        'bound_rad': _least(None if run.bound is None else run.bound[:, i]),
-        'peak_torque_nm': _peak(torque),
-        'rms_torque_nm': _rms(torque),
-        'torque_limit_nm': _least(None if run.torque_limit is None else run.torque_limit[:, i]),
-    }
+def _joint(metrics: Metrics, i: int) -> Summary:
+    joint: Summary = plain(
+        {
+            'max_abs_error_rad': metrics.max_error[i],
+            'rms_error_rad': metrics.rms_error[i],
+            'bound_rad': metrics.bound[i],
+            'peak_torque_nm': metrics.peak_torque[i],
+            'rms_torque_nm': metrics.rms_torque[i],
+            'torque_limit_nm': metrics.torque_limit[i],
+        }
+    )
+    return joint
 
 
-def _learning(run: Run) -> Summary | None:
-    estimation = Estimation.of(run)
-    if estimation is None:
-        return None
-    summary: Summary = {
-        'latch_time_s': latch_time(run),
-        'relative_error_at_s': None,
-        'final_relative_error': None,
-        'time_to_1_percent_s': None,
-        'final_estimate': {
-            name: None if np.isnan(value) else float(value)
-            for name, value in zip(estimation.names, estimation.estimate[-1], strict=True)
-        },
-        'refused_columns': {name: reason or None for name, reason in run.refused.items()},
-        'true': None,
-    }
-    error = estimation.relative_error
-    if error is not None and estimation.true is not None:
-        summary['relative_error_at_s'] = _at_moments(estimation.time, error)
-        summary['final_relative_error'] = float(error[-1])
-        summary['time_to_1_percent_s'] = _time_below(estimation.time, error, _LEARNED)
-        summary['true'] = dict(zip(estimation.names, estimation.true[-1].tolist(), strict=True))
-    return summary
+def _learning(run: Run, estimates: Estimates, metrics: Metrics) -> Summary:
+    reached = {t: error for t, error in metrics.parameter_error.items() if not math.isnan(error)}
+    is_known = estimates.true is not None
+    learning: Summary = plain(
+        {
+            'latch_time_s': metrics.latch_time,
+            'relative_error_at_s': reached if is_known else None,
+            'final_relative_error': metrics.final_parameter_error,
+            'time_to_1_percent_s': metrics.time_to_1_percent,
+            'final_estimate': _named(estimates, estimates.estimate),
+            'rejected_columns': {name: reason or None for name, reason in run.rejected.items()},
+            'true': None if estimates.true is None else _named(estimates, estimates.true),
+        }
+    )
+    return learning
 
 
-def _at_moments(time: Floats, error: Floats) -> Summary:
-    """Error at the sample next to each moment that the run has reached, to within a sample."""
-    sample_time = float(np.median(np.diff(time))) if time.size > 1 else 0.0
-    reached = [moment for moment in MOMENTS if time[0] <= moment <= time[-1] + 1.5 * sample_time]
-    return {str(moment): float(error[np.abs(time - moment).argmin()]) for moment in reached}
-
-
-def _time_below(time: Floats, error: Floats, threshold: float) -> float | None:
-    """Time from which on the error stays below a threshold to the end."""
-    above = np.flatnonzero(~(error < threshold))
-    first = above[-1] + 1 if above.size else 0
-    return float(time[first]) if first < time.size else None
+def _named(estimates: Estimates, values: Floats) -> dict[str, float]:
+    return dict(zip(estimates.names, values[-1].tolist(), strict=True))
 
 
 def _timing(run: Run) -> Summary | None:
@@ -114,44 +107,105 @@ def _timing(run: Run) -> Summary | None:
         return None
     moving = run.received[1:]  # the first state waits, braked, for the controller
     elapsed = float(moving[-1] - moving[0]) * 1e-9 if moving.size else 0.0
+    late = run.timing.column(LATE_STEPS)[-1] if LATE_STEPS in run.timing.names else None
     return {
         'rate_hz': (moving.size - 1) / elapsed if elapsed > 0 else None,
-        'latency_us': _percentiles(_MICROSECONDS * run.timing.column(LATENCY)),
-        'late_steps': _late_steps(run.timing),
+        'latency_us': _percentiles(run.timing, LATENCY),
+        'late_steps': None if late is None else int(late),
     }
 
 
-def _late_steps(timing: Series) -> int | None:
-    return int(timing.column(LATE_STEPS)[-1]) if LATE_STEPS in timing.names else None
-
-
-def _compute_time(run: Run) -> Summary | None:
-    if run.learning is None or COMPUTE_TIME not in run.learning.names:
+def _percentiles(series: Series | None, name: str) -> Summary | None:
+    if series is None or name not in series.names:
         return None
-    return _percentiles(_MICROSECONDS * run.learning.column(COMPUTE_TIME))
-
-
-def _percentiles(values: Floats) -> Summary | None:
-    known = values[np.isfinite(values)]
+    known = _MICROSECONDS * series.column(name)
+    known = known[np.isfinite(known)]
     if known.size == 0:
         return None
     return {name: float(np.percentile(known, q)) for name, q in _PERCENTILES.items()}
 
 
-def _known(values: Floats | None) -> Floats:
-    return np.empty(0) if values is None else values[np.isfinite(values)]
+def format_table(summary: Summary) -> str:
+    """Format a summary as a few lines for the terminal, without a newline at the end."""
+    lines = [*_joint_lines(summary['tracking']['joints']), '', *_sentences(summary)]
+    return '\n'.join(lines)
 
 
-def _peak(values: Floats | None) -> float | None:
-    known = _known(values)
-    return float(np.abs(known).max()) if known.size else None
+def _joint_lines(joints: Summary) -> Iterator[str]:
+    rows = [
+        ['', *(title for title, *_ in _COLUMNS)],
+        *(
+            [
+                name,
+                *(
+                    _number(joint[key], factor, decimals, unit)
+                    for _, key, unit, factor, decimals in _COLUMNS
+                ),
+            ]
+            for name, joint in joints.items()
+        ),
+    ]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        name, *cells = (cell for cell in row)
+        padded = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
+        yield '  '.join([name.ljust(widths[0]), *padded])
 
 
-def _rms(values: Floats | None) -> float | None:
-    known = _known(values)
-    return float(np.sqrt(np.mean(known**2))) if known.size else None
+def _sentences(summary: Summary) -> Iterator[str]:
+    seconds, samples = summary['duration_s'], summary['samples']
+    yield f'run         {seconds:.3f} s, {samples} samples'
+    yield f'bound       {_bound_kept(summary["tracking"])}'
+    if summary['learning'] is not None:
+        yield from _learning_lines(summary['learning'])
+    if summary['timing'] is not None:
+        yield f'real time   {_real_time(summary["timing"])}'
+    if summary['compute_time_us'] is not None:
+        yield f'law         {_microseconds(summary["compute_time_us"])}'
 
 
-def _least(values: Floats | None) -> float | None:
-    known = _known(values)
-    return float(known.min()) if known.size else None
+def _bound_kept(tracking: Summary) -> str:
+    if tracking['held'] is None:
+        return 'unknown'
+    if tracking['held']:
+        return 'held by every joint'
+    first = tracking['first_violation']
+    return f'VIOLATED, first by {first["joint"]} at {first["time_s"]:.3f} s'
+
+
+def _learning_lines(learning: Summary) -> Iterator[str]:
+    latched = learning['latch_time_s']
+    yield f'learning    {"never began" if latched is None else f"began at {latched:.3f} s"}'
+    for column, reason in learning['rejected_columns'].items():
+        yield f'rejected    {reason or f"{column}: see the log for the reason"}'
+    if learning['final_relative_error'] is None:
+        return
+    moments = [f'{moment} s {_percent(e)}' for moment, e in learning['relative_error_at_s'].items()]
+    moments.append(f'end {_percent(learning["final_relative_error"])}')
+    settled = learning['time_to_1_percent_s']
+    ending = 'not below 1 %' if settled is None else f'below 1 % from {settled:.3f} s on'
+    yield f'parameters  error {", ".join(moments)}; {ending}'
+
+
+def _real_time(timing: Summary) -> str:
+    parts = []
+    if timing['rate_hz'] is not None:
+        parts.append(f'{timing["rate_hz"]:.2f} Hz')
+    if timing['latency_us'] is not None:
+        parts.append(f'state to torque {_microseconds(timing["latency_us"])}')
+    if timing['late_steps'] is not None:
+        parts.append(f'{timing["late_steps"]} late steps')
+    return ', '.join(parts)
+
+
+def _microseconds(values: Summary) -> str:
+    figures = '/'.join(f'{value:.1f}' for value in values.values())
+    return f'{figures} us ({"/".join(values)})'
+
+
+def _percent(value: float) -> str:
+    return f'{100 * value:.3g} %'
+
+
+def _number(value: float | None, factor: float, decimals: int, unit: str) -> str:
+    return '-' if value is None else f'{factor * value:.{decimals}f} {unit}'

@@ -71,7 +71,7 @@ def read_run(path: str | Path, namespace: str = '') -> Run:
         timing=_vector(content, TIMING),
         monitor=_vector(content, MONITOR),
         message_counts=content.message_counts,
-        refused=_rejected_columns(content, learning, namespace),
+        rejected=_rejected_columns(content, learning, namespace),
     )
 
 

@@ -6,8 +6,9 @@ from __future__ import annotations
 from argparse import Namespace
 from collections.abc import Iterator
 
-from blf_dsc_controller.analysis import figures, subject, summary, table
+from blf_dsc_controller.analysis import figures, summary
 from blf_dsc_controller.analysis.report import write_report
+from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.bags import recover as recovering
 from blf_dsc_controller.bags.export import export as export_run
 from blf_dsc_controller.bags.reader import read_run
@@ -16,7 +17,7 @@ from blf_dsc_controller.bags.salvage import format_time
 
 def report(options: Namespace) -> None:
     """Write the HTML page of one or several bags."""
-    write_report(subject.read_subjects(options.bags, options.namespace), options.out)
+    write_report(read_bags(options.bags, options.namespace), options.out)
     print(f'wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB)')
 
 
@@ -34,7 +35,7 @@ def plot(options: Namespace) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     summary.write_summary(metrics, options.out / 'summary.json')
     written = [options.out / 'summary.json', *figures.draw(run, options.out)]
-    print(table.format_table(metrics))
+    print(summary.format_table(metrics))
     print('wrote', ', '.join(str(path) for path in written))
 
 

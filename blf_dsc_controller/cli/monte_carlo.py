@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from blf_dsc_controller.analysis.table import format_table
+from blf_dsc_controller.analysis.summary import format_table
 from blf_dsc_controller.cli.run import announce_compilation, make_folder
 from blf_dsc_controller.configuration.params_file import locate
 from blf_dsc_controller.errors import BlfDscError

@@ -6,11 +6,11 @@ from __future__ import annotations
 from argparse import Namespace
 
 from blf_dsc_controller.cli.run import make_folder
-from blf_dsc_controller.paper.report import study
+from blf_dsc_controller.paper.report import compare
 
 
 def paper(options: Namespace) -> None:
     """Run the study and print the claims."""
-    for claim in study(make_folder(options.out)):
-        print(f'{claim.where:<18} {claim.says}\n{"":<18} {claim.judgement}')
+    for claim in compare(make_folder(options.out)):
+        print(f'{claim.where:<18} {claim.says}\n{"":<18} {claim.full_verdict}')
     print(f'wrote {options.out / "index.html"}')

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from blf_dsc_controller.analysis.figures import draw
-from blf_dsc_controller.analysis.summary import summarize, write_summary
-from blf_dsc_controller.analysis.table import format_table
+from blf_dsc_controller.analysis.summary import format_table, summarize, write_summary
 from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import INTERRUPTED, require_ros

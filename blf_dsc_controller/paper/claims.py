@@ -1,51 +1,77 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The claims of the paper, one by one: what is said, what was measured, and what that makes of it.
+"""The claims of the paper: what is said, what was measured, and the verdict.
 
-Every verdict is computed from the runs.  `holds only if` is given where a claim holds in some of
-the runs that it speaks of and fails in others; `condition` then says what tells them apart.
+Every verdict is computed from the runs. `holds only if` is given where a claim holds in some of the
+runs that it speaks of and fails in others; `condition` then says what tells them apart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
+from blf_dsc_controller.analysis.metrics import Metrics, estimates_of
 from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.messages.monitor import ExponentialBound, decay_rate
-from blf_dsc_controller.paper.cases import SIDE_BY_SIDE, VARIATIONS
-from blf_dsc_controller.paper.evidence import Claim, Evidence, verdict
-from blf_dsc_controller.paper.metrics import Courses, Metrics
-from blf_dsc_controller.paper.runs import Outcome
-from blf_dsc_controller.paper.sweeps import BOUND, SWEEPS
+from blf_dsc_controller.messages.monitor import LYAPUNOV_TERMS, ExponentialBound, decay_rate
+from blf_dsc_controller.messages.names import LAMBDA_MIN, LATCHED
+from blf_dsc_controller.paper.cases import BOUND, SIDE_BY_SIDE, SWEEPS, VARIATIONS
+from blf_dsc_controller.paper.results import Results
+from blf_dsc_controller.run import Floats, Run
 
-STUDY = 'paper_study'
+HOLDS = 'holds'
+ONLY_IF = 'holds only if'
+FAILS = 'does not hold'
+
+STUDY = 'blf_dsc paper'
 _CASES = {case.name: case for case in SIDE_BY_SIDE + VARIATIONS}
 _FITTED = 0.95  # of the variance of log |P~| that an exponential must explain
 
 
-def claims(outcomes: Mapping[str, Outcome]) -> list[Claim]:
+@dataclass(frozen=True)
+class Claim:
+    """A row of the table; `condition` continues the verdict `holds only if`."""
+
+    where: str
+    says: str
+    measured: str
+    verdict: str
+    condition: str
+    command: str
+
+    @property
+    def full_verdict(self) -> str:
+        """Verdict with its condition."""
+        return f'{self.verdict} {self.condition}' if self.verdict == ONLY_IF else self.verdict
+
+
+def verdict(*runs: bool | None) -> str:
+    """`holds` where all of the runs agree, `does not hold` where none does."""
+    return HOLDS if all(runs) else ONLY_IF if any(runs) else FAILS
+
+
+def claims(results: Results) -> list[Claim]:
     """Every claim of abstract, sections and conclusion that a run can be held against."""
-    evidence = Evidence(outcomes)
     return [
-        *_of_abstract(evidence),
-        *_of_section_3(evidence),
-        *_of_section_4(evidence),
-        *_of_conclusion(evidence),
+        *_of_abstract(results),
+        *_of_section_3(results),
+        *_of_section_4(results),
+        *_of_conclusion(results),
     ]
 
 
-def _of_abstract(evidence: Evidence) -> Iterator[Claim]:
-    held = {sweep: evidence.held(sweep, 'paper_tuned') for sweep in ('delay', 'sample time')}
-    limit = evidence.held('torque limit', 'paper_tuned')
+def _of_abstract(results: Results) -> Iterator[Claim]:
+    held = {sweep: results.held(sweep, 'paper_tuned') for sweep in ('delay', 'sample time')}
+    limit = results.held('torque limit', 'paper_tuned')
     everywhere = all(
-        len(evidence.held(sweep.name, 'paper_tuned')) == len(sweep.values) for sweep in SWEEPS
+        len(results.held(sweep.name, 'paper_tuned')) == len(sweep.values) for sweep in SWEEPS
     )
-    paper = evidence.metrics('paper')
+    paper = results.metrics('paper')
     yield Claim(
         'Abstract',
         'The scheme guarantees a small bounded tracking error.',
-        f"largest |xi1| / k_c {paper.largest_ratio:.2f} with the paper's choices; with the tuned "
+        f"largest |xi1| / k_c {paper.max_error_ratio:.2f} with the paper's choices; with the tuned "
         f'gains kept for a delay up to {max(held["delay"], default=0):g} samples, a sample time '
         f'up to {max(held["sample time"], default=0):g} ms and torque limits from '
         f'{min(limit, default=np.nan):g} N m on',
@@ -53,23 +79,24 @@ def _of_abstract(evidence: Evidence) -> Iterator[Claim]:
         'torque, sample time, delay and sensors allow it',
         STUDY,
     )
-    quiet, told = evidence.metrics('paper_quiet'), evidence.metrics('paper')
-    rest = evidence.metrics('paper_at_rest')
+    quiet, disturbed = results.metrics('paper_quiet'), results.metrics('paper')
+    rest = results.metrics('paper_at_rest')
     yield Claim(
         'Abstract',
         'The parameters converge without persistent excitation.',
         f'error after 60 s {_percent(quiet.parameter_error[60])} without the disturbance, '
-        f'{_percent(told.parameter_error[60])} with it, {_percent(rest.parameter_error[60])} with '
-        f'a reference at rest, where no window is ever excited',
+        f'{_percent(disturbed.parameter_error[60])} with it, '
+        f'{_percent(rest.parameter_error[60])} with a reference at rest, where no window is ever '
+        f'excited',
         verdict(
             quiet.parameter_error[60] < 0.01,
-            told.parameter_error[60] < 0.01,
+            disturbed.parameter_error[60] < 0.01,
             rest.parameter_error[60] < 0.01,
         ),
         'one window was excited, and no disturbance is left in it',
         STUDY,
     )
-    lag = _lag(evidence) / BOUND
+    lag = _lag(results) / BOUND
     yield Claim(
         'Abstract, I',
         'Dynamic surface control spares the derivatives of the virtual control.',
@@ -79,18 +106,18 @@ def _of_abstract(evidence: Evidence) -> Iterator[Claim]:
         '',
         _CASES['model_based'].command,
     )
-    yield _superiority(evidence, 'Abstract', 'It is superior in tracking and in estimation.')
+    yield _superiority(results, 'Abstract', 'It is superior in tracking and in estimation.')
 
 
-def _lag(evidence: Evidence) -> float:
+def _lag(results: Results) -> float:
     """Largest error [rad] of the law that knows everything, once it has settled."""
-    courses = evidence.courses('model_based')
-    return float(np.abs(courses.error[courses.time >= 1.0]).max())
+    run = results.run('model_based')
+    return float(np.abs(_error(run)[run.time >= 1.0]).max())
 
 
-def _superiority(evidence: Evidence, where: str, says: str) -> Claim:
-    proposed, tuned = evidence.metrics('paper_tuned'), evidence.metrics('comparison')
-    detuned = evidence.metrics('comparison_detuned')
+def _superiority(results: Results, where: str, says: str) -> Claim:
+    proposed, tuned = results.metrics('paper_tuned'), results.metrics('comparison')
+    detuned = results.metrics('comparison_detuned')
     better = []
     for other in (tuned, detuned):
         better += [
@@ -112,12 +139,12 @@ def _superiority(evidence: Evidence, where: str, says: str) -> Claim:
     )
 
 
-def _of_section_3(evidence: Evidence) -> Iterator[Claim]:
-    V = evidence.courses('model_based').lyapunov.sum(axis=1)
-    later = evidence.courses('model_based').time >= 1.0
+def _of_section_3(results: Results) -> Iterator[Claim]:
+    V = _energy(results.run('model_based'))
+    later = results.run('model_based').time >= 1.0
     above = np.flatnonzero(10.0 * V[later].max() < V)
     rises = int(np.count_nonzero(np.diff(V[: above[-1] + 2]) >= 0.0))
-    lag = _lag(evidence)
+    lag = _lag(results)
     yield Claim(
         'III-A, (17)',
         'With everything known V falls for ever.',
@@ -132,7 +159,7 @@ def _of_section_3(evidence: Evidence) -> Iterator[Claim]:
         name: decay_rate(settings_of_config(_CASES[name].loop().controller))
         for name in ('paper', 'leaky')
     }
-    met = {name: _share_met(evidence, name) for name in ('leaky', 'leaky_constant')}
+    met = {name: _fraction_met(results, name) for name in ('leaky', 'leaky_constant')}
     yield Claim(
         'III-B, (32)',
         'All errors fall exponentially at the rate kappa_e into a small set.',
@@ -146,44 +173,44 @@ def _of_section_3(evidence: Evidence) -> Iterator[Claim]:
     )
 
 
-def _share_met(evidence: Evidence, name: str) -> float:
-    courses = evidence.courses(name)
+def _fraction_met(results: Results, name: str) -> float:
+    run = results.run(name)
     bound = ExponentialBound(settings_of_config(_CASES[name].loop().controller))
-    V = courses.lyapunov.sum(axis=1)
+    V = _energy(run)
     values = np.array(
         [
             bound.at(float(t), float(v), latched > 0.5)
-            for t, v, latched in zip(courses.time, V, courses.latched, strict=True)
+            for t, v, latched in zip(run.time, V, _learned(run, LATCHED), strict=True)
         ]
     )
     known = np.isfinite(values)
     return float(np.mean(V[known] <= values[known]))
 
 
-def _of_section_4(evidence: Evidence) -> Iterator[Claim]:
-    paper, tuned = evidence.metrics('paper'), evidence.metrics('comparison')
+def _of_section_4(results: Results) -> Iterator[Claim]:
+    paper, tuned = results.metrics('paper'), results.metrics('comparison')
     yield Claim(
         'IV, Fig. 2 (c)(d)',
         'The proposed controller always stays within the boundaries.',
-        f'largest |xi1| / k_c {paper.largest_ratio:.2f}; of the comparison '
-        f'{tuned.largest_ratio:.2f} if tuned, '
-        f'{evidence.metrics("comparison_detuned").largest_ratio:.2f} with low gains',
+        f'largest |xi1| / k_c {paper.max_error_ratio:.2f}; of the comparison '
+        f'{tuned.max_error_ratio:.2f} if tuned, '
+        f'{results.metrics("comparison_detuned").max_error_ratio:.2f} with low gains',
         verdict(paper.held),
         '',
         _CASES['paper'].command,
     )
-    yield _swift_torque(evidence)
+    yield _swift_torque(results)
     yield Claim(
         'IV, Fig. 3',
         'It estimates better; the comparison is far from satisfactory.',
         f"error at 60 s {_percent(paper.parameter_error[60])} with the paper's choices, "
         f'{_percent(tuned.parameter_error[60])} of the tuned comparison, '
-        f'{_percent(evidence.metrics("recommended").parameter_error[60])} recommended',
+        f'{_percent(results.metrics("recommended").parameter_error[60])} recommended',
         verdict(paper.parameter_error[60] < tuned.parameter_error[60]),
         '',
         f'{_CASES["paper"].command}; {_CASES["comparison"].command}',
     )
-    least = float(evidence.courses('paper_quiet').lambda_min[-1])
+    least = float(_learned(results.run('paper_quiet'), LAMBDA_MIN)[-1])
     yield Claim(
         'IV',
         'The reference does not fully excite the system.',
@@ -191,17 +218,17 @@ def _of_section_4(evidence: Evidence) -> Iterator[Claim]:
         f'excited, the second one weakly',
         verdict(least < 1e-6),
         '',
-        'closed_loop --offline --config paper (monitors.png)',
+        'blf_dsc run --offline --config paper (monitors.png)',
     )
-    zero = evidence.metrics('paper_from_zero')
+    zero = results.metrics('paper_from_zero')
     others = {
-        law: 0.0 in evidence.held('initial parameters', law)
+        law: 0.0 in results.held('initial parameters', law)
         for law in ('paper_tuned', 'recommended')
     }
     yield Claim(
         'IV',
         'P^(0) cannot be zero: the error would reach the boundary at once.',
-        f"with the paper's choices |xi1| / k_c reaches {zero.largest_ratio:.2f}"
+        f"with the paper's choices |xi1| / k_c reaches {zero.max_error_ratio:.2f}"
         + ('' if zero.held else f' (violated after {1e3 * zero.first_violation:.0f} ms)')
         + ''.join(
             f'; {law} from zero: {"kept" if kept else "violated"}' for law, kept in others.items()
@@ -212,32 +239,31 @@ def _of_section_4(evidence: Evidence) -> Iterator[Claim]:
     )
 
 
-def _swift_torque(evidence: Evidence) -> Claim:
+def _swift_torque(results: Results) -> Claim:
     """How much of the torque is the barrier's when the error is largest, and when pushed."""
-    courses, config = evidence.courses('paper'), _CASES['paper'].loop().controller
+    run, config = results.run('paper'), _CASES['paper'].loop().controller
     w, bound = np.array(config.barrier.weight), np.array(config.barrier.bound)
-    ratio = np.abs(courses.error) / bound
+    error = _error(run)
+    ratio = np.abs(error) / bound
     k, i = np.unravel_index(ratio.argmax(), ratio.shape)
-    barrier = w[i] * abs(courses.error[k, i]) / np.cos(0.5 * np.pi * ratio[k, i] ** 2) ** 2
-    pushed, recommended = (evidence.metrics(f'{name}_pushed') for name in ('paper', 'recommended'))
+    barrier = w[i] * abs(error[k, i]) / np.cos(0.5 * np.pi * ratio[k, i] ** 2) ** 2
+    pushed, recommended = (results.metrics(f'{name}_pushed') for name in ('paper', 'recommended'))
     return Claim(
         'IV, Fig. 2 (e)',
         'Violation is avoided by the swift torque close to the boundary.',
         f'at the largest error the barrier gives {1e3 * barrier:.2g} mN m of a torque of '
-        f"{abs(courses.torque[k, i]):.2g} N m; pushed by 8 N m the paper's choices reach "
-        f'{pushed.largest_ratio:.2f} k_c and the recommended ones (w = 1000) '
-        f'{recommended.largest_ratio:.2f} k_c',
+        f"{abs(run.torque[k, i]):.2g} N m; pushed by 8 N m the paper's choices reach "
+        f'{pushed.max_error_ratio:.2f} k_c and the recommended ones (w = 1000) '
+        f'{recommended.max_error_ratio:.2f} k_c',
         verdict(pushed.held, recommended.held),
         'the barrier is weighted: w of some 1000 N m/rad instead of 1',
         STUDY,
     )
 
 
-def _of_conclusion(evidence: Evidence) -> Iterator[Claim]:
-    explained = {
-        name: _exponential_fit(evidence.courses(name)) for name in ('paper_quiet', 'paper')
-    }
-    residue = {name: evidence.metrics(name).parameter_error[60] for name in explained}
+def _of_conclusion(results: Results) -> Iterator[Claim]:
+    explained = {name: _exponential_fit(results.run(name)) for name in ('paper_quiet', 'paper')}
+    residue = {name: results.metrics(name).parameter_error[60] for name in explained}
     yield Claim(
         'V',
         'Tracking and parameter errors converge like an exponential.',
@@ -245,23 +271,46 @@ def _of_conclusion(evidence: Evidence) -> Iterator[Claim]:
         f'to twice its residue without the disturbance (residue '
         f'{_percent(residue["paper_quiet"])}), {_percent(explained["paper"])} with it (residue '
         f'{_percent(residue["paper"])})',
-        verdict(*(share > _FITTED for share in explained.values())),
+        verdict(*(fraction > _FITTED for fraction in explained.values())),
         'no disturbance remains',
         STUDY,
     )
-    yield _superiority(evidence, 'IV, V', 'The proposed controller outperforms the comparison.')
+    yield _superiority(results, 'IV, V', 'The proposed controller outperforms the comparison.')
 
 
-def _exponential_fit(courses: Courses) -> float:
-    """Share of the variance of log |P~| that a straight line explains."""
-    error = courses.parameter_error
-    residue = error[courses.time > courses.time[-1] - 10.0].max()
-    begin = int(np.argmax(courses.latched > 0.5))
+def _exponential_fit(run: Run) -> float:
+    """Fraction of the variance of log |P~| that a straight line explains."""
+    error = _parameter_error(run)
+    residue = error[run.time > run.time[-1] - 10.0].max()
+    begin = int(np.argmax(_learned(run, LATCHED) > 0.5))
     end = begin + int(np.argmax(error[begin:] < 2.0 * residue))
-    t, y = courses.time[begin:end], np.log(error[begin:end])
+    t, y = run.time[begin:end], np.log(error[begin:end])
     if t.size < 3:
         return 0.0
     return float(np.corrcoef(t, y)[0, 1] ** 2)
+
+
+def _energy(run: Run) -> Floats:
+    """V of (29), (N,) [J]."""
+    assert run.monitor is not None  # noqa: S101
+    return np.asarray(run.monitor.select(LYAPUNOV_TERMS).sum(axis=1))
+
+
+def _error(run: Run) -> Floats:
+    assert run.error is not None  # noqa: S101
+    return run.error
+
+
+def _learned(run: Run, name: str) -> Floats:
+    assert run.learning is not None  # noqa: S101
+    return run.learning.column(name)
+
+
+def _parameter_error(run: Run) -> Floats:
+    estimates = estimates_of(run)
+    assert estimates is not None  # noqa: S101
+    assert estimates.relative_error is not None  # noqa: S101
+    return estimates.relative_error
 
 
 def _percent(value: float) -> str:

@@ -1,92 +1,111 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fig. 2 (a)-(f) and Fig. 3 as the paper draws them: the proposed law and the comparison."""
+"""The paper's Fig. 2 and 3 with two laws each, and small multiples of the sweeps."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from blf_dsc_controller.analysis.envelope import envelope
-from blf_dsc_controller.analysis.style import (
-    ALARM,
-    BLUE,
-    INK,
-    MUTED,
-    ORANGE,
-    SHADE,
-    Picture,
-    formula,
-    head,
-)
-from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
-from blf_dsc_controller.paper.metrics import Courses
+from blf_dsc_controller.analysis.figures import draw_panels
+from blf_dsc_controller.analysis.metrics import Metrics
+from blf_dsc_controller.analysis.panels import panels
+from blf_dsc_controller.analysis.style import ALARM, COLOURS, MUTED, Picture
+from blf_dsc_controller.paper.cases import LAWS, SWEEPS, Sweep, case_name
+from blf_dsc_controller.paper.results import Results
+from blf_dsc_controller.run import Run
 
-_MILLI = 1e3
 _TRACKING = (6.4, 2.5)  # inches
 _ESTIMATES = (8.6, 2.4)
-_COLOURS = (BLUE, ORANGE)
-_WIDTHS = (5.0, 2.4)  # where the curves lie upon each other
-_LETTERS = ('(a)', '(b)', '(c)', '(d)', '(e)', '(f)')
+_PANEL = (4.6, 2.9)
+_COLUMNS = 3
+_UNTIL = 10.0  # s, of Fig. 2
+_BROKEN = 10.0  # of the bound: larger ratios are drawn there
+_MARKS = 'os^D'
 
 
-def draw_figure_2(
-    title: str, courses: Mapping[str, Courses], bound: np.ndarray, until: float, path: Path
-) -> None:
-    """Positions, errors within their bound, and torques of both joints, up to a time [s]."""
-    picture = Picture(3, 2, title, _TRACKING)
-    for letter, axes in zip(_LETTERS, picture.axes.flat, strict=True):
-        row, i = divmod(_LETTERS.index(letter), 2)
-        (_positions, _errors, _torques)[row](axes, courses, i, until, float(bound[i]))
-        head(axes, f'{letter} {("position", "tracking error", "torque")[row]} of joint {i + 1}')
-    picture.save(path)
+def draw_figure_2(title: str, runs: Mapping[str, Run], path: Path) -> None:
+    """Positions, errors within their bound, and torques of both joints."""
+    shown = panels([replace(run, torque_limit=None) for run in runs.values()])
+    lettered = [
+        replace(panel, title=f'({letter}) {panel.title}')
+        for letter, panel in zip('abcdef', shown, strict=False)
+    ]
+    draw_panels(path, title, lettered, 2, _TRACKING, list(runs), _UNTIL)
 
 
-def _positions(
-    axes: Axes, courses: Mapping[str, Courses], i: int, until: float, _bound: float
-) -> None:
-    for (name, one), colour, width in zip(courses.items(), _COLOURS, _WIDTHS, strict=False):
-        shown = one.time <= until
-        values = envelope(one.time[shown], one.position[shown, i])
-        axes.plot(*values, color=colour, lw=width, label=name if i == 0 else None)
-    one = next(iter(courses.values()))
-    shown = one.time <= until
-    reference = envelope(one.time[shown], one.reference[shown, i])
-    axes.plot(*reference, color=INK, lw=1.0, ls='--', label=None if i == 0 else 'reference')
-    axes.set_ylabel('[rad]')
-
-
-def _errors(axes: Axes, courses: Mapping[str, Courses], i: int, until: float, bound: float) -> None:
-    axes.axhspan(-_MILLI * bound, _MILLI * bound, color=SHADE, lw=0)
-    for sign in (-1.0, 1.0):
-        axes.axhline(sign * _MILLI * bound, color=ALARM, lw=1.1, ls='--')
-    for (_, one), colour in zip(courses.items(), _COLOURS, strict=False):
-        shown = one.time <= until
-        values = envelope(one.time[shown], _MILLI * one.error[shown, i])
-        axes.plot(*values, color=colour, lw=1.2)
-    axes.set_ylabel('[mrad]')
-
-
-def _torques(
-    axes: Axes, courses: Mapping[str, Courses], i: int, until: float, _bound: float
-) -> None:
-    for (_, one), colour in zip(courses.items(), _COLOURS, strict=False):
-        shown = one.time <= until
-        axes.plot(*envelope(one.time[shown], one.torque[shown, i]), color=colour, lw=1.1, alpha=0.8)
-    axes.set_ylabel('[N m]')
-
-
-def draw_figure_3(title: str, courses: Mapping[str, Courses], path: Path) -> None:
+def draw_figure_3(title: str, runs: Mapping[str, Run], path: Path) -> None:
     """Estimates of each parameter beside its true value."""
-    picture = Picture(len(PARAMETER_NAMES), 1, title, _ESTIMATES)
-    for j, (name, axes) in enumerate(zip(PARAMETER_NAMES, picture.axes.flat, strict=True)):
-        for (label, one), colour in zip(courses.items(), _COLOURS, strict=False):
-            values = envelope(one.time, one.estimate[:, j])
-            axes.plot(*values, color=colour, lw=1.8, label=label if j == 0 else None)
-        true = next(iter(courses.values())).truth[j]
-        axes.axhline(true, color=MUTED, lw=1.2, ls='--', label='true' if j == 0 else None)
-        axes.set_ylabel('[kg m²]')
-        head(axes, formula(name))
+    shown = [one for one in panels(list(runs.values())) if one.group == 'Parameters']
+    estimates = [panel for panel in shown if not panel.log]
+    draw_panels(path, title, estimates, 1, _ESTIMATES, list(runs))
+
+
+def draw_robustness(results: Results, folder: Path) -> list[Path]:
+    """Draw the largest error and the parameter error of every sweep; return both paths."""
+    tracking, learning = folder / 'robustness_tracking.png', folder / 'robustness_learning.png'
+    _draw_sweeps(
+        'Largest error, in units of the bound: above the red line it was left',
+        results,
+        lambda metrics: min(metrics.max_error_ratio, _BROKEN),
+        _dress_ratio,
+        tracking,
+    )
+    _draw_sweeps(
+        'Parameter error over the last ten of 30 s',
+        results,
+        lambda metrics: metrics.tail_parameter_error,
+        _dress_learning,
+        learning,
+    )
+    return [tracking, learning]
+
+
+def _draw_sweeps(
+    title: str,
+    results: Results,
+    value_of: Callable[[Metrics], float],
+    dress: Callable[[Axes], None],
+    path: Path,
+) -> None:
+    picture = Picture(-(-len(SWEEPS) // _COLUMNS), _COLUMNS, title, _PANEL, share_time=False)
+    for sweep, axes in zip(SWEEPS, picture.axes.flat, strict=False):
+        for law, colour, mark in zip(LAWS, COLOURS, _MARKS, strict=False):
+            if law in sweep.laws:
+                names = [case_name(sweep.name, law, value) for value in sweep.values]
+                values = [value_of(results.metrics(name)) for name in names]
+                axes.plot(sweep.values, values, color=colour, marker=mark, ms=4.5, label=LAWS[law])
+        _dress_condition(axes, sweep)
+        dress(axes)
+    picture.axes.flat[0].legend(frameon=False, fontsize=9, loc='best')
     picture.save(path)
+
+
+def _dress_condition(axes: Axes, sweep: Sweep) -> None:
+    if sweep.logarithmic:
+        axes.set_xscale('log')
+        shown = sweep.values[:: 1 if len(sweep.values) <= 7 else 2]
+        axes.set_xticks(shown, [f'{value:g}' for value in shown])
+        axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel(sweep.label)
+
+
+def _dress_ratio(axes: Axes) -> None:
+    axes.set_yscale('log')
+    axes.set_ylim(0.15, 1.3 * _BROKEN)
+    axes.axhline(1.0, color=ALARM, lw=1.2, ls='--')
+    ticks = [0.2, 0.5, 1.0, 2.0, 5.0, _BROKEN]
+    axes.set_yticks(ticks, [*(f'{tick:g}' for tick in ticks[:-1]), f'{_BROKEN:g}+'])
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.set_ylabel('max $|\\xi_1| / k_c$')
+
+
+def _dress_learning(axes: Axes) -> None:
+    axes.set_yscale('log')
+    axes.set_ylim(3e-5, 5.0)
+    axes.axhline(0.01, color=MUTED, lw=1.2, ls='--')
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{100 * value:g} %'))
+    axes.set_ylabel(r'$\|\hat P - P\| \;/\; \|P\|$')

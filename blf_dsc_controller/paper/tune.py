@@ -19,13 +19,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import differential_evolution
+from scipy.stats import qmc
 from tqdm import tqdm
 
+from blf_dsc_controller.analysis.metrics import Metrics, measure
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.params_file import format_value, load_loop, locate
-from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.configuration.schema import change, flatten
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.paper.metrics import Courses, Metrics, measure
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -116,29 +119,28 @@ def settings_of(task: Task, exponents: Floats) -> dict[str, object]:
     return {**chosen, **per_joint}
 
 
-def judge(metrics: Metrics, sample_time: float) -> float:
+def cost_of(metrics: Metrics, sample_time: float) -> float:
     """Objective of one run, in decades: largest error, rms error and parameter error; less is more.
 
     Leaving the bound costs ten decades a decade, and so does a torque rougher than `ROUGHEST`.
     """
-    largest = np.log10(metrics.largest_ratio)
+    largest = np.log10(metrics.max_error_ratio)
     typical = np.log10(np.linalg.norm(metrics.rms_error))
-    learned = np.log10(metrics.tail_error + 1e-12)
+    learned = np.log10(metrics.tail_parameter_error + 1e-12)
     rough = np.log10(max(metrics.torque_rate) * sample_time / ROUGHEST)
     value = largest + typical + learned + 10.0 * (max(largest, 0.0) + max(rough, 0.0))
     return float(value) if np.isfinite(value) else HOPELESS
 
 
 def objective(exponents: Floats, task: Task, loops: Sequence[LoopConfig]) -> float:
-    """Mean of `judge` over the plants."""
+    """Mean of `cost_of` over the plants."""
     changes = settings_of(task, exponents)
     values = []
     for loop in loops:
         config = change(loop.controller, changes)
         with np.errstate(all='ignore'):
-            courses = Courses.of(simulate(config, loop.plant))
-            metrics = measure(courses, np.array(config.barrier.bound))
-            values.append(judge(metrics, config.sample_time))
+            metrics = measure(simulate(config, loop.plant).run(config))
+            values.append(cost_of(metrics, config.sample_time))
     return min(float(np.mean(values)), HOPELESS)
 
 
@@ -151,20 +153,21 @@ def loops_of(task: Task) -> list[LoopConfig]:
 
 def tune(task: Task, generations: int = GENERATIONS) -> tuple[Floats, float, int]:
     """Best exponents, their objective, and how many times it was evaluated."""
-    from scipy.optimize import differential_evolution
-
     loops = loops_of(task)
     ranges = [(np.log10(gain.least), np.log10(gain.most)) for gain in task.gains]
+    low, high = np.array(ranges).T
     with tqdm(total=POPULATION * (generations + 1), desc='tuning', unit='run') as bar:
 
         def cost(exponents: Floats) -> float:
             bar.update()
             return objective(exponents, task, loops)
 
+        # Evenly spread, as many points for every law.
+        spread = qmc.LatinHypercube(low.size, rng=np.random.default_rng(SEED)).random(POPULATION)
         found = differential_evolution(
             cost,
             ranges,
-            init=first_population(len(ranges)) * np.diff(ranges).T + np.array(ranges)[:, 0],
+            init=spread * (high - low) + low,
             maxiter=generations,
             tol=0.0,
             polish=False,
@@ -173,22 +176,21 @@ def tune(task: Task, generations: int = GENERATIONS) -> tuple[Floats, float, int
     return found.x, float(found.fun), int(found.nfev)
 
 
-def first_population(dimensions: int) -> Floats:
-    """Evenly spread points of the unit cube, as many for every law."""
-    from scipy.stats import qmc
-
-    sampler = qmc.LatinHypercube(dimensions, rng=np.random.default_rng(SEED))
-    return np.asarray(sampler.random(POPULATION))
-
-
 def preset(name: str, exponents: Floats, value: float, evaluations: int) -> str:
-    """Text of the parameter file that holds the result."""
+    """Text of the parameter file that holds the result: its changes of the defaults.
+
+    The truth is that of the preset paper, for the monitors.
+    """
     task = TASKS[name]
-    base = load_loop(locate(task.preset)).controller
-    changes = {**_differences(base), **settings_of(task, exponents)}
+    base, defaults = (
+        flatten(one) for one in (load_loop(locate(task.preset)).controller, ControllerConfig())
+    )
+    truth = flatten(load_loop(locate('paper')).controller)
+    base |= {key: value for key, value in truth.items() if key.startswith('truth.')}
+    changes = {key: value for key, value in base.items() if value != defaults[key]}
     lines = ''.join(
         f'    {key}: {format_value(tuple(entry) if isinstance(entry, list) else entry)}\n'  # type: ignore[arg-type]
-        for key, entry in changes.items()
+        for key, entry in {**changes, **settings_of(task, exponents)}.items()
     )
     return (
         f'# {task.title}.\n'
@@ -196,23 +198,6 @@ def preset(name: str, exponents: Floats, value: float, evaluations: int) -> str:
         f'# {evaluations} evaluations, objective {value:.3f} (decades of error; less is better).\n'
         f'\nblf_dsc_controller:\n  ros__parameters:\n{lines}'
     )
-
-
-def _differences(config: object) -> dict[str, object]:
-    """What a preset changes of the defaults, and the truth that the monitors show."""
-    from blf_dsc_controller.configuration.schema import flatten
-
-    plain = flatten(type(config)())
-    truth = flatten(load_loop(locate('paper')).controller)
-    return {
-        key: value
-        for key, value in {**flatten(config), **_truth(truth)}.items()
-        if value != plain[key]
-    }
-
-
-def _truth(flat: Mapping[str, object]) -> dict[str, object]:
-    return {key: value for key, value in flat.items() if key.startswith('truth.')}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -17,10 +17,15 @@ from blf_dsc_controller.compiled.views import borrowed
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.law.controller import Controller, answer
-from blf_dsc_controller.law.factory import begin, controller_of
+from blf_dsc_controller.law.factory import begin, controller_of, estimate_names
+from blf_dsc_controller.law.rejected_columns import refusals
 from blf_dsc_controller.law.sample import Sample, sample_of
 from blf_dsc_controller.law.settings import settings_of
 from blf_dsc_controller.law.state import signals_of, state_of
+from blf_dsc_controller.messages.monitor import LYAPUNOV_TERMS
+from blf_dsc_controller.messages.names import LAMBDA_MIN, LATCHED
+from blf_dsc_controller.messages.telemetry import disturbance_names
+from blf_dsc_controller.run import Run, Series
 from sim_plant import plant as plants
 from sim_plant.factory import plant_of, steps_of
 from sim_plant.sampled import Plant
@@ -53,6 +58,36 @@ class Record:
     def sample(self, row: int) -> Sample:
         """Names for one row of `samples`."""
         return sample_of(self.samples[row], self.controller.settings)
+
+    def run(self, config: ControllerConfig) -> Run:
+        """All samples as a `Run`, with the truth and the terms of (29) at each of them."""
+        settings, names = self.controller.settings, estimate_names(config)
+        columns = sample_of(np.arange(self.samples.shape[1], dtype=np.float64), settings)
+        part = {
+            name: self.samples[:, getattr(columns, name).astype(int)] for name in columns._fields
+        }
+        disturbances = disturbance_names(config.joints)
+        learned = [part[name] for name in ('estimate', 'disturbance', 'lambda_min', 'latched')]
+        position, velocity, _ = np.split(self.measurements, 3, axis=1)
+        true = (*names[: settings.p], *disturbances)
+        return Run(
+            joints=config.joints,
+            stamp=self.stamps,
+            received=self.stamps,
+            position=position,
+            velocity=velocity,
+            torque=part['torque'],
+            reference=part['qr'],
+            error=part['xi1'],
+            bound=part['bound'],
+            torque_limit=np.broadcast_to(config.torque.limit, position.shape),
+            learning=Series(
+                (*names, *disturbances, LAMBDA_MIN, LATCHED), self.stamps, np.hstack(learned)
+            ),
+            truth=Series(true, self.stamps, self.truths[:, : len(true)]),
+            monitor=Series(LYAPUNOV_TERMS, self.stamps, part['lyapunov']),
+            rejected={one.column: f'{one}' for one in refusals(self.controller, names)},
+        )
 
 
 @kernel

@@ -23,10 +23,10 @@ function layoutOf(panel) {
       ...(panel.time ? {range: [0, duration]} : {})},
     yaxis: {...grid, title: {text: panel.time ? panel.unit : 'count', standoff: 4},
       type: panel.log ? 'log' : 'linear', exponentformat: 'power'},
-    shapes: panel.marks.map(([time, colour]) => ({type: 'line', x0: time, x1: time, y0: 0, y1: 1,
-      yref: 'paper', line: {color: colour, width: 1.2, dash: 'dot'}})),
-    annotations: panel.marks.map(([time, colour]) => ({x: time, y: 1, yref: 'paper', yanchor: 'top',
-      xanchor: 'left', text: 'latch', showarrow: false, font: {size: 11, color: colour}})),
+    shapes: panel.marks.map(([time, , colour]) => ({type: 'line', x0: time, x1: time, y0: 0,
+      y1: 1, yref: 'paper', line: {color: colour, width: 1.2, dash: 'dot'}})),
+    annotations: panel.marks.map(([time, text, colour]) => ({x: time, y: 1, yref: 'paper',
+      yanchor: 'top', xanchor: 'left', text, showarrow: false, font: {size: 11, color: colour}})),
   };
 }
 

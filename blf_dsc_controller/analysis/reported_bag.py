@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.analysis.estimation import latch_time
+from blf_dsc_controller.analysis.metrics import latch_time, outside
 from blf_dsc_controller.bags.context import Context, read_context
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.sources import open_bag
@@ -36,7 +36,7 @@ class Event:
 
 
 @dataclass(frozen=True)
-class Subject:
+class ReportedBag:
     """A bag under the name that the page gives it."""
 
     name: str
@@ -61,8 +61,18 @@ class Subject:
             for name, entry in sorted(section.entries.items())
         }
 
+    @property
+    def lengths(self) -> list[float]:
+        """Length of each link [m]; one that is not recorded is that of the first link."""
+        entries = {
+            name: entry for section in self.sections for name, entry in section.entries.items()
+        }
+        count = len(self.run.joints)
+        names = [name if (name := f'arm.l{i + 1}') in entries else 'arm.l1' for i in range(count)]
+        return [float(str(entries[name].value)) if name in entries else 1.0 for name in names]
 
-def read_subjects(paths: Sequence[Path], namespace: str = '') -> list[Subject]:
+
+def read_bags(paths: Sequence[Path], namespace: str = '') -> list[ReportedBag]:
     """Read bags; each is named by its folder, and those above it where that is not enough.
 
     Raises:
@@ -86,37 +96,25 @@ def _names(paths: Sequence[Path]) -> list[str]:
     ]
 
 
-def _read(path: Path, name: str, namespace: str) -> Subject:
-    run = read_run(path, namespace)
-    events = [*_learning_events(run), *_bound_events(run), *_torque_events(run)]
-    events += _diagnosed(path, run)
-    context = read_context(path)
+def _read(path: Path, name: str, namespace: str) -> ReportedBag:
+    run, context = read_run(path, namespace), read_context(path)
+    events = [*_events(run), *_diagnosed(path, run)]
     events += (Event(0.0, 'lost', f'{topic}: {text}') for topic, text in context.losses.items())
-    events.sort(key=lambda event: event.time)
-    return Subject(name, run, context, tuple(events))
+    return ReportedBag(name, run, context, tuple(sorted(events, key=lambda event: event.time)))
 
 
-def _learning_events(run: Run) -> Iterator[Event]:
-    latched = latch_time(run)
+def _events(run: Run) -> Iterator[Event]:
+    latched, violated = latch_time(run), outside(run)
     if latched is not None:
         yield Event(latched, 'learning', 'the first window was excited enough: learning began')
-    for column, reason in run.refused.items():
-        text = reason or f'{column} is not estimated: its column was refused'
+    for column, reason in run.rejected.items():
+        text = reason or f'{column} is not estimated: its column was rejected'
         yield Event(run.duration, 'learning', text)
-
-
-def _bound_events(run: Run) -> Iterator[Event]:
-    if run.error is None or run.bound is None:
-        return
-    outside = np.abs(run.error) >= run.bound
-    yield from _spells(run, outside, 'violation', 'outside of its bound')
-
-
-def _torque_events(run: Run) -> Iterator[Event]:
-    if run.torque_limit is None:
-        return
-    limited = np.abs(run.torque) >= _AT_LIMIT * run.torque_limit
-    yield from _spells(run, limited, 'saturation', 'at its torque limit')
+    if violated is not None:
+        yield from _spells(run, violated, 'violation', 'outside of its bound')
+    if run.torque_limit is not None:
+        limited = np.abs(run.torque) >= _AT_LIMIT * run.torque_limit
+        yield from _spells(run, limited, 'saturation', 'at its torque limit')
 
 
 def _spells(run: Run, holds: np.ndarray, kind: str, what: str) -> Iterator[Event]:
@@ -124,8 +122,8 @@ def _spells(run: Run, holds: np.ndarray, kind: str, what: str) -> Iterator[Event
         edges = np.diff(np.concatenate([[0], holds[:, i].astype(np.int8), [0]]))
         begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
         for begin, end in list(zip(begins, ends, strict=True))[:_MOST_OF_A_KIND]:
-            length = f'{end - begin} samples'
-            yield Event(float(run.time[begin]), kind, f'{joint} {what} for {length}')
+            text = f'{joint} {what} for {end - begin} samples'
+            yield Event(float(run.time[begin]), kind, text)
         if begins.size > _MOST_OF_A_KIND:
             more = begins.size - _MOST_OF_A_KIND
             at = float(run.time[begins[_MOST_OF_A_KIND]])
@@ -157,6 +155,4 @@ def _moment(run: Run, received: int) -> float:
 
 
 def _shown(value: object) -> str:
-    if isinstance(value, list):
-        return '[' + ', '.join(_shown(entry) for entry in value) + ']'
-    return f'{value}'
+    return f'[{", ".join(map(_shown, value))}]' if isinstance(value, list) else f'{value}'

@@ -11,8 +11,7 @@ import pytest
 import synthetic_bag
 from synthetic_bag import BOUND_RAD, JOINTS, LATCH_S, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 
-from blf_dsc_controller.analysis.summary import summarize, write_summary
-from blf_dsc_controller.analysis.table import format_table
+from blf_dsc_controller.analysis.summary import format_table, summarize, write_summary
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.messages.topics import BOUND, JOINT_STATES, LEARNING, TRUTH
 
@@ -154,7 +153,7 @@ def test_the_table_tells_a_violation_and_copes_with_little(run):
         summarize(dataclasses.replace(run, error=error))
     )
     little = dataclasses.replace(run, error=None, learning=None, timing=None)
-    assert 'bound       not told' in format_table(summarize(little))
+    assert 'bound       unknown' in format_table(summarize(little))
 
 
 def test_learning_is_optional_in_a_bag(tmp_path):

@@ -13,10 +13,9 @@ import recorded_run
 import synthetic_bag
 from synthetic_bag import JOINTS, Synthetic
 
-from blf_dsc_controller.analysis.animation import animation, lengths
 from blf_dsc_controller.analysis.panels import panels
-from blf_dsc_controller.analysis.report import write_report
-from blf_dsc_controller.analysis.subject import read_subjects
+from blf_dsc_controller.analysis.report import arm, plots, write_report
+from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.topics import JOINT_STATES
 
@@ -35,23 +34,23 @@ def folder(tmp_path_factory):
     return path
 
 
-def by_title(subjects):
-    return {panel['title']: panel for panel in panels(subjects)}
+def by_title(bags):
+    return {plot['title']: plot for plot in plots(panels([bag.run for bag in bags]), bags)}
 
 
 def test_every_quantity_has_its_panel(folder):
-    titles = set(by_title(read_subjects([folder / 'synthetic'])))
+    titles = set(by_title(read_bags([folder / 'synthetic'])))
     expected = {
         f'{what} of {joint}' for what in ('error', 'position', 'torque') for joint in JOINTS
     }
     expected |= {'(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2', 'relative parameter error'}
-    expected |= {'least eigenvalue', *(f'disturbance {joint}' for joint in JOINTS)}
+    expected |= {'minimum eigenvalue', *(f'disturbance {joint}' for joint in JOINTS)}
     expected |= {'period of the joint states, as received', 'state to torque'}
-    assert titles == {*expected, 'time that the law takes'}
+    assert titles == {*expected, 'computing time of the law'}
 
 
 def test_a_peak_of_one_sample_is_not_thinned_away(folder):
-    panel = by_title(read_subjects([folder / 'synthetic']))['error of shoulder']
+    panel = by_title(read_bags([folder / 'synthetic']))['error of shoulder']
     error, bound, _ = panel['traces']
     k = int(np.argmin(error['y']))
     assert (error['x'][k], error['y'][k]) == (1.234, -5.0)
@@ -60,8 +59,8 @@ def test_a_peak_of_one_sample_is_not_thinned_away(folder):
 
 
 def test_events_tell_violations_saturation_and_the_latch(folder):
-    (subject,) = read_subjects([folder / 'synthetic'])
-    told = {(event.kind, round(event.time, 3)): event.text for event in subject.events}
+    (bag,) = read_bags([folder / 'synthetic'])
+    told = {(event.kind, round(event.time, 3)): event.text for event in bag.events}
     assert told == {
         ('violation', 1.234): 'shoulder outside of its bound for 1 samples',
         ('learning', 1.5): 'the first window was excited enough: learning began',
@@ -70,14 +69,14 @@ def test_events_tell_violations_saturation_and_the_latch(folder):
 
 
 def test_several_bags_lie_over_each_other_and_their_differences_are_told(folder, tmp_path):
-    subjects = read_subjects([folder / 'one', folder / 'other'])
-    panel = by_title(subjects)['error of joint1']
+    bags = read_bags([folder / 'one', folder / 'other'])
+    panel = by_title(bags)['error of joint1']
     names = [trace['name'] for trace in panel['traces']]
     assert names == [
         f'{bag}: {what}' for bag in ('one', 'other') for what in ('error', *['bound'] * 2)
     ]
     assert panel['traces'][0]['line']['color'] != panel['traces'][3]['line']['color']
-    write_report(subjects, tmp_path / 'page.html')
+    write_report(bags, tmp_path / 'page.html')
     text = (tmp_path / 'page.html').read_text()
     assert '<p>1 parameters differ.</p>' in text
     row = 'blf_dsc_controller: feedback.gain</td><td>[60.0, 20.0]</td><td>[30.0, 10.0]</td>'
@@ -86,22 +85,22 @@ def test_several_bags_lie_over_each_other_and_their_differences_are_told(folder,
 
 def test_bags_of_one_name_are_told_apart(folder):
     with_bag = [folder / 'one', folder / '..' / folder.name / 'other', folder / 'one']
-    assert [one.name for one in read_subjects(with_bag)] == ['one (1)', 'other', 'one (2)']
+    assert [one.name for one in read_bags(with_bag)] == ['one (1)', 'other', 'one (2)']
 
 
 def test_the_arm_has_its_lengths_and_moves_as_measured(folder):
-    (subject,) = read_subjects([folder / 'one'])
-    assert lengths(subject) == [1.0, 0.8]  # of the plant's configuration
-    (arm,) = animation([subject])
-    assert len(arm['time']) == 50  # a second, at fifty pictures
-    assert arm['angles'][-1] == pytest.approx(subject.run.position[-1], abs=1e-4)
-    assert arm['reference'][0] == pytest.approx(subject.run.reference[0], abs=1e-4)
+    (bag,) = read_bags([folder / 'one'])
+    moving = arm(bag, 0)
+    assert moving['lengths'] == [1.0, 0.8]  # of the plant's configuration
+    assert len(moving['time']) == 50  # a second, at fifty pictures
+    assert moving['angles'][-1] == pytest.approx(bag.run.position[-1], abs=1e-4)
+    assert moving['reference'][0] == pytest.approx(bag.run.reference[0], abs=1e-4)
 
 
 def test_a_page_is_one_file_whose_data_no_name_can_break(folder, tmp_path):
-    (subject,) = read_subjects([folder / 'one'])
+    (bag,) = read_bags([folder / 'one'])
     nasty = '</script><b>&{{data}}'
-    write_report([replace(subject, name=nasty)], tmp_path / 'page.html')
+    write_report([replace(bag, name=nasty)], tmp_path / 'page.html')
     text = (tmp_path / 'page.html').read_text()
     ours = text.split('<script>')[0] + text.rsplit('<script>', 1)[1]  # without plotly's own script
     assert not re.search(r'(?:src|href)="(?!#|data:)|https?:', ours)

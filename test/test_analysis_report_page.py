@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a bag in a browser: it draws, it zooms, it complains of nothing. `make test-browser`.
 
-What is plotted is checked without a browser in test_report.py.
+What is plotted is checked without a browser in test_analysis_report.py.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import recorded_run
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 
 from blf_dsc_controller.analysis.report import write_report
-from blf_dsc_controller.analysis.subject import read_subjects
+from blf_dsc_controller.analysis.reported_bag import read_bags
 
 pytestmark = [
     pytest.mark.skipif(chromium.find() is None, reason='there is no Chromium here'),
@@ -34,8 +34,8 @@ def pages(tmp_path_factory):
     folder = tmp_path_factory.mktemp('pages')
     one = recorded_run.record(folder / 'one', 4.0)
     other = recorded_run.record(folder / 'other', 4.0, **{'feedback.gain': [30.0, 10.0]})
-    write_report(read_subjects([one]), folder / 'one.html')
-    write_report(read_subjects([one, other]), folder / 'both.html')
+    write_report(read_bags([one]), folder / 'one.html')
+    write_report(read_bags([one, other]), folder / 'both.html')
     return folder
 
 

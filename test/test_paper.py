@@ -11,41 +11,47 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.params_file import load_loop, locate
 from blf_dsc_controller.paper import claims, tune
-from blf_dsc_controller.paper.cases import SIDE_BY_SIDE, VARIATIONS
-from blf_dsc_controller.paper.evidence import FAILS, HOLDS, ONLY_IF, verdict
-from blf_dsc_controller.paper.metrics import Courses, measure
-from blf_dsc_controller.paper.runs import Outcome
-from blf_dsc_controller.paper.sweeps import SWEEPS, case_name
-from blf_dsc_controller.paper.tables import kept_bounds
+from blf_dsc_controller.paper.cases import SIDE_BY_SIDE, SWEEPS, VARIATIONS, case_name
+from blf_dsc_controller.paper.claims import FAILS, HOLDS, ONLY_IF, verdict
+from blf_dsc_controller.paper.results import CaseResult, Results, kept_bounds
+from blf_dsc_controller.run import Run, Series
 from blf_dsc_controller.simulation.loop import simulate
 
 BOUND = np.array([0.002, 0.004])
+TRUE = np.array([3.0, 4.0])
 
 
-def courses(**changes):
-    """Ten seconds at 100 Hz of a made-up run."""
-    time = np.arange(1001) * 0.01
+def made(period=0.01, **changes):
+    """1001 samples of a made-up run, by default at 100 Hz."""
+    stamp = np.arange(1001) * round(period * 1e9)
+    time = stamp * 1e-9
     falling = np.exp(-time)[:, np.newaxis]
-    made = Courses(
-        time=time,
+    error = changes.pop('error', falling * [0.001, -0.002])
+    estimate = changes.pop('estimate', (1.0 - falling) * TRUE)
+    latched = (time >= 2.0).astype(float)
+    run = Run(
+        joints=('one', 'two'),
+        stamp=stamp,
+        received=stamp,
         position=np.zeros((1001, 2)),
-        reference=np.zeros((1001, 2)),
-        error=falling * [0.001, -0.002],
+        velocity=np.zeros((1001, 2)),
         torque=np.column_stack([3.0 * time, -np.ones(1001)]),
-        estimate=(1.0 - falling) * [3.0, 4.0],
-        truth=np.array([3.0, 4.0]),
-        lyapunov=np.zeros((1001, 4)),
-        lambda_min=np.zeros(1001),
-        latched=(time >= 2.0).astype(float),
+        reference=np.zeros((1001, 2)),
+        error=error,
+        bound=np.broadcast_to(BOUND, (1001, 2)),
+        torque_limit=None,
+        learning=Series(('P1', 'P2', 'latched'), stamp, np.column_stack([estimate, latched])),
+        truth=Series(('P1', 'P2'), stamp[:1], TRUE[np.newaxis]),
     )
-    return replace(made, **changes)
+    return replace(run, **changes)
 
 
-def test_numbers_of_a_run_are_those_of_its_courses():
-    found = measure(courses(), BOUND)
+def test_metrics_are_those_of_the_run():
+    found = measure(made())
     assert found.max_error == pytest.approx((0.001, 0.002))
     assert found.rms_error[0] == pytest.approx(0.001 * np.sqrt(0.05), rel=1e-2)
     assert found.peak_torque == (30.0, 1.0)
@@ -53,17 +59,16 @@ def test_numbers_of_a_run_are_those_of_its_courses():
     assert found.parameter_error[5] == pytest.approx(np.exp(-5.0))
     assert np.isnan(found.parameter_error[20])
     assert found.time_to_1_percent == pytest.approx(np.log(100.0), abs=0.01)
-    assert found.largest_ratio == pytest.approx(0.5)
+    assert found.max_error_ratio == pytest.approx(0.5)
     assert found.held
-    assert found.learning_start == 2.0
+    assert found.latch_time == 2.0
 
 
-def test_first_violation_is_told_and_a_late_error_resets_the_time_to_one_percent():
-    error = courses().error.copy()
+def test_first_violation_and_a_late_error_resets_the_time_to_one_percent():
+    error, estimate = made().error.copy(), made().learning.values[:, :2].copy()
     error[300, 1] = -0.004
-    estimate = courses().estimate.copy()
     estimate[900] = 0.0
-    found = measure(courses(error=error, estimate=estimate), BOUND)
+    found = measure(made(error=error, estimate=estimate))
     assert (found.held, found.first_violation) == (False, 3.0)
     assert found.time_to_1_percent == pytest.approx(9.01)
 
@@ -132,13 +137,14 @@ def test_tables_hold_every_run(report):
 
 
 def test_bounds_that_were_kept_are_told_by_condition_and_law():
-    held, left = (Outcome(measure(courses(), np.full(2, k))) for k in (0.004, 0.001))
-    outcomes = {
+    bounds = (np.full((1001, 2), k) for k in (0.004, 0.001))
+    held, left = (CaseResult(measure(made(bound=bound))) for bound in bounds)
+    results = {
         case.name: left if case.name.endswith((' 10', ' 0')) else held
         for sweep in SWEEPS
         for case in sweep.cases()
     }
-    header, table = kept_bounds(outcomes)
+    header, table = kept_bounds(Results(results))
     rows = {row[0]: row[1:] for row in table}
     assert len(header) == 5
     assert rows['delay of the torque [samples]'] == ['1, 2, 3, 4, 5, 6, 8'] * 4
@@ -146,7 +152,7 @@ def test_bounds_that_were_kept_are_told_by_condition_and_law():
     assert rows['excitation window [s]'][2:] == ['-', '-']
 
 
-def test_claims_are_judged_by_the_runs(report):
+def test_verdicts_follow_from_the_runs_of_the_report(report):
     """The verdicts that the mathematics leaves no doubt about."""
     by_words = {row['says']: row['verdict'] for row in rows(report / 'claims.csv')}
     assert len(by_words) >= 11
@@ -155,7 +161,7 @@ def test_claims_are_judged_by_the_runs(report):
     assert by_words['It is superior in tracking and in estimation.'] == ONLY_IF
     assert by_words['The proposed controller always stays within the boundaries.'] == HOLDS
     for row in rows(report / 'claims.csv'):
-        assert row['command'].startswith(('paper_study', 'closed_loop'))
+        assert row['command'].startswith('blf_dsc ')
         assert bool(row['condition']) or row['verdict'] != ONLY_IF
 
 
@@ -163,9 +169,9 @@ def test_kept_configurations_are_those_that_ran(report):
     """One of a sweep, run again from its file, gives the number of the report."""
     name = case_name('delay', 'comparison', 1.0)
     loop = load_loop(report / 'configurations' / f'{name.replace(" ", "_")}.yaml')
-    again = measure(Courses.of(simulate(loop.controller, loop.plant)), np.full(2, 0.002))
+    again = measure(simulate(loop.controller, loop.plant).run(loop.controller))
     metrics = json.loads((report / 'metrics.json').read_text(encoding='utf-8'))
-    assert metrics[name]['largest_ratio'] == again.largest_ratio
+    assert metrics[name]['max_error_ratio'] == again.max_error_ratio
     assert loop.plant.actuator.delay == 1
     count = len(SIDE_BY_SIDE) + len(VARIATIONS) + sum(len(sweep.cases()) for sweep in SWEEPS)
     assert len(list((report / 'configurations').iterdir())) == len(metrics) == count
@@ -174,8 +180,8 @@ def test_kept_configurations_are_those_that_ran(report):
 def test_barrier_of_the_paper_gives_next_to_nothing_where_it_is_needed(report):
     """w = 1 N m/rad is a spring of 2 mN m at 2 mrad, and 8 N m push through it."""
     metrics = json.loads((report / 'metrics.json').read_text(encoding='utf-8'))
-    assert metrics['paper_pushed']['largest_ratio'] > 1.0
-    assert metrics['recommended_pushed']['largest_ratio'] < 0.5
+    assert metrics['paper_pushed']['max_error_ratio'] > 1.0
+    assert metrics['recommended_pushed']['max_error_ratio'] < 0.5
 
 
 def test_study_does_not_overwrite(report, capsys):
@@ -186,14 +192,11 @@ def test_study_does_not_overwrite(report, capsys):
 
 
 def test_exponential_fit_tells_a_line_from_a_bend():
-    straight = courses(time=np.arange(1001) * 0.02)
-    bent = 1.0 / (1.0 + straight.time) ** 3
+    time = np.arange(1001) * 0.02
+    line, bend = np.exp(-time), 1.0 / (1.0 + time) ** 3
     fits = [
-        claims._exponential_fit(each)
-        for each in (
-            replace(straight, estimate=straight.truth * (1.0 - np.exp(-straight.time))[:, None]),
-            replace(straight, estimate=straight.truth * (1.0 - bent)[:, None]),
-        )
+        claims._exponential_fit(made(period=0.02, estimate=(1.0 - error)[:, np.newaxis] * TRUE))
+        for error in (line, bend)
     ]
     assert fits[0] > 0.999
     assert fits[1] < fits[0]

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Metrics of a run: tracking, torque and learning, each as one number."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.messages.names import BIAS, COMPUTE_TIME, DISTURBANCE, LAMBDA_MIN, LATCHED
+from blf_dsc_controller.run import Floats, Run
+
+MOMENTS = (5, 10, 20, 40, 60)
+"""Times at which the parameter error is reported [s]."""
+
+_LEARNED = 0.01
+_TAIL = 10.0  # s
+_NO_PARAMETERS = (DISTURBANCE, BIAS, LAMBDA_MIN, LATCHED, COMPUTE_TIME)
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """Estimated model parameters over m samples."""
+
+    names: tuple[str, ...]
+    time: Floats  # (m,) s since the first sample of the run
+    estimate: Floats  # (m, p)
+    true: Floats | None  # (m, p)
+
+    @property
+    def relative_error(self) -> Floats | None:
+        """|P^ - P| / |P|, (m,)."""
+        if self.true is None:
+            return None
+        error = np.linalg.norm(self.estimate - self.true, axis=1)
+        return np.asarray(error / np.linalg.norm(self.true, axis=1))
+
+
+def estimates_of(run: Run) -> Estimates | None:
+    """Estimates of the model parameters, None if nothing was learned.
+
+    The parameters are those whose true values are known; if none are, all that is estimated beside
+    disturbances.
+    """
+    if run.learning is None:
+        return None
+    names = tuple(name for name in run.learning.names if not name.startswith(_NO_PARAMETERS))
+    known = () if run.truth is None else tuple(name for name in names if name in run.truth.names)
+    true = None
+    if run.truth is not None and known:
+        columns = [run.truth.names.index(name) for name in known]
+        true = run.truth.held(run.learning.stamp)[:, columns]
+    chosen = known or names
+    return Estimates(chosen, run.time_of(run.learning.stamp), run.learning.select(chosen), true)
+
+
+def latch_time(run: Run) -> float | None:
+    """Time at which learning began [s], None if it never did or is not recorded."""
+    if run.learning is None or LATCHED not in run.learning.names:
+        return None
+    latched = np.flatnonzero(run.learning.column(LATCHED) > 0.5)
+    return float(run.time_of(run.learning.stamp)[latched[0]]) if latched.size else None
+
+
+def outside(run: Run) -> NDArray[np.bool_] | None:
+    """Where |xi1| >= k_c, (N, n); None if error or bound is unknown."""
+    if run.error is None or run.bound is None:
+        return None
+    return np.asarray(np.abs(run.error) >= run.bound)
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Metrics of n joints; NaN for what is unknown or has not happened."""
+
+    max_error: tuple[float, ...]  # (n,) rad, of |xi1|
+    rms_error: tuple[float, ...]  # (n,) rad
+    bound: tuple[float, ...]  # (n,) rad, the smallest
+    peak_torque: tuple[float, ...]  # (n,) N m
+    rms_torque: tuple[float, ...]  # (n,) N m
+    torque_limit: tuple[float, ...]  # (n,) N m, the smallest
+    torque_rate: tuple[float, ...]  # (n,) N m/s, rms of the change per sample time
+    max_error_ratio: float  # of |xi1| / k_c
+    first_violation: float  # s
+    violating_joint: str
+    latch_time: float  # s
+    parameter_error: dict[int, float]  # |P^ - P| / |P| at MOMENTS
+    final_parameter_error: float
+    tail_parameter_error: float  # rms over the last ten seconds
+    time_to_1_percent: float  # s, from which on the parameter error stays below
+
+    @property
+    def held(self) -> bool | None:
+        """Whether no sample left the bound, None if error or bound is unknown."""
+        return None if math.isnan(self.max_error_ratio) else math.isnan(self.first_violation)
+
+
+def measure(run: Run) -> Metrics:
+    """Metrics of a run."""
+    error, torque = run.error, run.torque
+    step = float(run.time[1]) if run.stamp.size > 1 else math.nan
+    first, joint = _first_violation(run)
+    latched = latch_time(run)
+    estimates = estimates_of(run)
+    learned = None if estimates is None else estimates.relative_error
+    if estimates is None or learned is None:
+        learning = dict.fromkeys(MOMENTS, math.nan), math.nan, math.nan, math.nan
+    else:
+        at = estimates.time
+        tail = rms(learned[at >= at[-1] - _TAIL])
+        learning = _at_moments(at, learned), float(learned[-1]), tail, _settled(at, learned)
+    n = len(run.joints)
+    return Metrics(
+        _columns(_peak, error, n),
+        _columns(rms, error, n),
+        _columns(_least, run.bound, n),
+        _columns(_peak, torque, n),
+        _columns(rms, torque, n),
+        _columns(_least, run.torque_limit, n),
+        tuple(change / step for change in _columns(rms, np.diff(torque, axis=0), n)),
+        math.nan if error is None or run.bound is None else _peak(error / run.bound),
+        first,
+        joint,
+        math.nan if latched is None else latched,
+        *learning,
+    )
+
+
+def rms(values: Floats) -> float:
+    """Root of the mean square of the known values."""
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
+
+
+def _columns(reduce: Callable[[Floats], float], values: Floats | None, n: int) -> tuple[float, ...]:
+    if values is None:
+        return (math.nan,) * n
+    return tuple(reduce(values[:, i]) for i in range(n))
+
+
+def _peak(values: Floats) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.abs(known).max()) if known.size else math.nan
+
+
+def _least(values: Floats) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.min()) if known.size else math.nan
+
+
+def _first_violation(run: Run) -> tuple[float, str]:
+    violated = outside(run)
+    if violated is None or not violated.any():
+        return math.nan, ''
+    k, i = np.argwhere(violated)[0]
+    return float(run.time[k]), run.joints[i]
+
+
+def _at_moments(time: Floats, error: Floats) -> dict[int, float]:
+    """Error at the sample next to each moment that the run has reached, to within a sample."""
+    end = time[-1] + 1.5 * (float(np.median(np.diff(time))) if time.size > 1 else 0.0)
+    return {
+        moment: float(error[np.abs(time - moment).argmin()])
+        if time[0] <= moment <= end
+        else math.nan
+        for moment in MOMENTS
+    }
+
+
+def _settled(time: Floats, error: Floats) -> float:
+    above = np.flatnonzero(~(error < _LEARNED))
+    first = above[-1] + 1 if above.size else 0
+    return float(time[first]) if first < time.size else math.nan
