@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The quick look: yes where all is well, no for each single thing that is not."""
+"""Checks of joint states, stamps and samples: each single fault is flagged."""
 
 from __future__ import annotations
 
@@ -8,8 +8,13 @@ from math import inf, nan
 import numpy as np
 import pytest
 from closed_loop_case import controller, plant, recommended
+from hypothesis import given
+from hypothesis import strategies as st
 
+from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.supervision.checks import OUTSIDE, SUSPECT, check_sample, is_valid_state
+from blf_dsc_controller.supervision.reasons import Phase
+from blf_dsc_controller.supervision.supervisor import Supervisor, Verdict
 
 DT = 1e-3
 
@@ -75,3 +80,42 @@ def test_a_state_is_sound_if_finite_and_slow(value):
     assert is_valid_state(still, np.array([50.0, 0.0]), 50.0)
     if value != 50.1:
         assert not is_valid_state(np.array([value, 0.0]), still, 50.0)
+
+
+STILL = np.zeros(2)
+SAFETY = Safety()
+# Repeated, early, usual, jittering, missed and much too late; now and then backwards.
+STEPS = st.sampled_from([0, 1, 499_999, 500_001, 1_000_000, 1_000_001, 1_499_999, 1_500_001])
+RARE_STEPS = st.sampled_from([2_000_000, 3_000_000, 41_000_000, 50_000_000, -1_000_000])
+
+
+class FullCheck(Supervisor):
+    """Checks each stamp in full."""
+
+    def _is_next(self, _stamp):
+        return False
+
+
+@given(steps=st.lists(STEPS | RARE_STEPS | st.just(1_000_000), max_size=60))
+def test_the_short_check_of_a_stamp_is_the_full_one(steps):
+    short, full = Supervisor(['joint1', 'joint2'], 1e-3), FullCheck(['joint1', 'joint2'], 1e-3)
+    for one in (short, full):
+        one.enter(Phase.STARTING)
+        one.enter(Phase.TRACKING)
+    stamp = 1_000_000_000
+    for step in steps:
+        stamp += step
+        verdicts = [one.check_state(SAFETY, stamp, STILL, STILL) for one in (short, full)]
+        assert verdicts[0] is verdicts[1]
+        for of in ('reason', 'text', 'repeated', 'stops', 'revision'):
+            assert getattr(short, of) == getattr(full, of)
+        assert vars(short.overruns) == vars(full.overruns)
+
+
+def test_velocities_are_checked_after_the_short_check_too():
+    supervisor = Supervisor(['joint1', 'joint2'], 1e-3)
+    supervisor.enter(Phase.STARTING)
+    supervisor.enter(Phase.TRACKING)
+    assert supervisor.check_state(SAFETY, 1_000_000_000, STILL, STILL) is Verdict.USE
+    too_fast = np.array([0.0, 2.0 * SAFETY.velocity_limit])
+    assert supervisor.check_state(SAFETY, 1_001_000_000, STILL, too_fast) is Verdict.STOP
