@@ -490,7 +490,8 @@ PREFACE = """\
 # Faults
 
 What the controller does when something breaks: each row is run by
-`test/test_supervision_faults.py`, in a loop of 1 kHz with the recommended settings, and this page is made by `python test/fault_table.py
+`test/test_supervision_faults.py`, in a loop of 1 kHz with the recommended settings,
+and this page is made by `python test/fault_table.py
 doc/faults.md`. *Noticed* counts the samples from the fault to the safe stop; a fault that is passed
 over does no harm, and tracking goes on within the bound. *Torque* is the largest commanded from
 then on. A stop lasts until `~/reset`, after which the loop runs again.
