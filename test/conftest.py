@@ -36,7 +36,7 @@ _FIRST = (
     'test_managed',
     'test_nodes',
     'test_soak',
-    'test_study',
+    'test_paper',
 )
 
 

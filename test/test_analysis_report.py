@@ -60,8 +60,8 @@ def test_a_peak_of_one_sample_is_not_thinned_away(folder):
 
 def test_events_tell_violations_saturation_and_the_latch(folder):
     (bag,) = read_bags([folder / 'synthetic'])
-    told = {(event.kind, round(event.time, 3)): event.text for event in bag.events}
-    assert told == {
+    events = {(event.kind, round(event.time, 3)): event.text for event in bag.events}
+    assert events == {
         ('violation', 1.234): 'shoulder outside of its bound for 1 samples',
         ('learning', 1.5): 'the first window was excited enough: learning began',
         ('saturation', 2.0): 'elbow at its torque limit for 10 samples',

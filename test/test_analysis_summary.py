@@ -8,12 +8,14 @@ import json
 
 import numpy as np
 import pytest
+import recorded_run
 import synthetic_bag
 from synthetic_bag import BOUND_RAD, JOINTS, LATCH_S, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 
 from blf_dsc_controller.analysis.summary import format_table, summarize, write_summary
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.messages.topics import BOUND, JOINT_STATES, LEARNING, TRUTH
+from blf_dsc_controller.simulation.loop import simulate
 
 SAMPLES = 10_000
 
@@ -161,3 +163,11 @@ def test_learning_is_optional_in_a_bag(tmp_path):
     summary = summarize(read_run(synthetic_bag.write(tmp_path / 'bag', messages)))
     assert summary['learning'] is None
     assert summary['compute_time_us'] is None
+
+
+def test_a_simulation_and_its_bag_have_the_same_metrics(tmp_path):
+    config = recorded_run.loop_config()
+    simulated = summarize(simulate(config.controller, config.plant).run(config.controller))
+    recorded = summarize(read_run(recorded_run.record(tmp_path / 'bag')))
+    for part in ('duration_s', 'samples', 'tracking', 'learning'):
+        assert simulated[part] == recorded[part]

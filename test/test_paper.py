@@ -93,7 +93,7 @@ def test_tuning_searches_as_hard_for_every_law():
 
 @pytest.mark.parametrize('name', ['proposed', 'comparison', 'slotine_li'])
 def test_committed_gains_beat_the_middle_of_their_ranges(name):
-    """By a decade or more of the search's objective, which is the one that their file tells."""
+    """By a decade or more of the search's objective, which is the one stated in their file."""
     task = tune.TASKS[name]
     preset = {'proposed': 'paper_tuned'}.get(name, name)
     tuned = {case.name: case for case in SIDE_BY_SIDE}[preset].loop().controller
@@ -102,8 +102,8 @@ def test_committed_gains_beat_the_middle_of_their_ranges(name):
     bare = replace(task, gains=())
     best = tune.objective(np.array([]), bare, [loop._replace(controller=tuned) for loop in loops])
     assert best < tune.objective(middle, task, loops) - 1.0
-    told = re.search(r'objective (-?[\d.]+)', locate(preset).read_text(encoding='utf-8'))
-    assert best == pytest.approx(float(told.group(1)), abs=0.01)
+    stated = re.search(r'objective (-?[\d.]+)', locate(preset).read_text(encoding='utf-8'))
+    assert best == pytest.approx(float(stated.group(1)), abs=0.01)
 
 
 @pytest.fixture(scope='module')

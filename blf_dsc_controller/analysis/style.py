@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the pictures look: colours that the colour-blind can tell apart, legends beside the data."""
+"""Style of the figures: colours for the colour-blind, legends beside the data."""
 
 from __future__ import annotations
 

@@ -67,17 +67,15 @@ def plain(value: Any) -> Any:
 
 
 def _joint(metrics: Metrics, i: int) -> Summary:
-    joint: Summary = plain(
-        {
-            'max_abs_error_rad': metrics.max_error[i],
-            'rms_error_rad': metrics.rms_error[i],
-            'bound_rad': metrics.bound[i],
-            'peak_torque_nm': metrics.peak_torque[i],
-            'rms_torque_nm': metrics.rms_torque[i],
-            'torque_limit_nm': metrics.torque_limit[i],
-        }
-    )
-    return joint
+    columns = {
+        'max_abs_error_rad': metrics.max_error,
+        'rms_error_rad': metrics.rms_error,
+        'bound_rad': metrics.bound,
+        'peak_torque_nm': metrics.peak_torque,
+        'rms_torque_nm': metrics.rms_torque,
+        'torque_limit_nm': metrics.torque_limit,
+    }
+    return {name: plain(values[i]) for name, values in columns.items()}
 
 
 def _learning(run: Run, estimates: Estimates, metrics: Metrics) -> Summary:
@@ -132,22 +130,11 @@ def format_table(summary: Summary) -> str:
 
 
 def _joint_lines(joints: Summary) -> Iterator[str]:
-    rows = [
-        ['', *(title for title, *_ in _COLUMNS)],
-        *(
-            [
-                name,
-                *(
-                    _number(joint[key], factor, decimals, unit)
-                    for _, key, unit, factor, decimals in _COLUMNS
-                ),
-            ]
-            for name, joint in joints.items()
-        ),
-    ]
+    rows = [['', *(title for title, *_ in _COLUMNS)]]
+    for name, joint in joints.items():
+        rows.append([name, *(_number(joint[key], *form) for _, key, *form in _COLUMNS)])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        name, *cells = (cell for cell in row)
+    for name, *cells in rows:
         padded = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
         yield '  '.join([name.ljust(widths[0]), *padded])
 
@@ -207,5 +194,5 @@ def _percent(value: float) -> str:
     return f'{100 * value:.3g} %'
 
 
-def _number(value: float | None, factor: float, decimals: int, unit: str) -> str:
+def _number(value: float | None, unit: str, factor: float, decimals: int) -> str:
     return '-' if value is None else f'{factor * value:.{decimals}f} {unit}'

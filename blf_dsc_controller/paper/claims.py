@@ -2,7 +2,7 @@
 """The claims of the paper: what is said, what was measured, and the verdict.
 
 Every verdict is computed from the runs. `holds only if` is given where a claim holds in some of the
-runs that it speaks of and fails in others; `condition` then says what tells them apart.
+runs that it speaks of and fails in others; `condition` then says where.
 """
 
 from __future__ import annotations
