@@ -19,13 +19,13 @@ Summary = dict[str, Any]
 
 _PERCENTILES = {'p50': 50.0, 'p99': 99.0, 'p99.9': 99.9, 'max': 100.0}
 _MICROSECONDS = 1e6
-_COLUMNS = (  # title, entry of the summary, unit, how many units to 1, decimals
-    ('max |xi1|', 'max_abs_error_rad', 'mrad', 1e3, 3),
-    ('rms xi1', 'rms_error_rad', 'mrad', 1e3, 3),
-    ('bound', 'bound_rad', 'mrad', 1e3, 3),
-    ('peak torque', 'peak_torque_nm', 'N m', 1.0, 2),
-    ('rms torque', 'rms_torque_nm', 'N m', 1.0, 2),
-    ('limit', 'torque_limit_nm', 'N m', 1.0, 2),
+_COLUMNS = (  # title, entry of the summary; unit, how many units to 1, decimals
+    ('max |xi1|', 'max_abs_error_rad', ('mrad', 1e3, 3)),
+    ('rms xi1', 'rms_error_rad', ('mrad', 1e3, 3)),
+    ('bound', 'bound_rad', ('mrad', 1e3, 3)),
+    ('peak torque', 'peak_torque_nm', ('N m', 1.0, 2)),
+    ('rms torque', 'rms_torque_nm', ('N m', 1.0, 2)),
+    ('limit', 'torque_limit_nm', ('N m', 1.0, 2)),
 )
 
 
@@ -132,7 +132,7 @@ def format_table(summary: Summary) -> str:
 def _joint_lines(joints: Summary) -> Iterator[str]:
     rows = [['', *(title for title, *_ in _COLUMNS)]]
     for name, joint in joints.items():
-        rows.append([name, *(_number(joint[key], *form) for _, key, *form in _COLUMNS)])
+        rows.append([name, *(_number(joint[key], *form) for _, key, form in _COLUMNS)])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for name, *cells in rows:
         padded = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
