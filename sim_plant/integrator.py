@@ -1,25 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One fixed step of the equation of motion, the torque held, the disturbance free to vary.
+"""One fixed step of the equation of motion, with the torque held and the disturbance varying.
 
 Two explicit Runge-Kutta methods: the classic one of order 4, and the fifth-order solution of
-Dormand and Prince (1980), which MATLAB calls ode5. A stage i is evaluated at t + c_i h and
-x + h sum_j a_ij k_j, the step ends at x + h sum_i b_i k_i.
+Dormand and Prince (1980), which MATLAB calls ode5.  Stage i is evaluated at t + c_i h and
+x + h sum_j a_ij k_j; the step ends at x + h sum_i b_i k_i.
 """
 
+from typing import Annotated, NamedTuple
+
 import numpy as np
-from numpy.typing import NDArray
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.views import part
-from sim_plant.dynamics import JOINTS, Arm
-from sim_plant.motion import motion
+from blf_dsc_controller.compiled.layout import Array
+from sim_plant.dynamics import JointDisturbance, PointMassArm, state_derivative
 
 RK4 = 0
 DOPRI5 = 1
 INTEGRATORS = {'rk4': RK4, 'dopri5': DOPRI5}
-STAGES = 6
-
-_SIZE = 2 * JOINTS
 
 _RK4_C = np.array([0, 1 / 2, 1 / 2, 1])
 _RK4_A = np.array([[0, 0, 0, 0], [1 / 2, 0, 0, 0], [0, 1 / 2, 0, 0], [0, 0, 1, 0]])
@@ -39,35 +36,35 @@ _DOPRI5_A = np.array(
 _DOPRI5_B = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
 
 
-@inner
-def scratch_size(n: int) -> int:
-    """Length of the work vector `integrate` needs for n joints: the stages and one point."""
-    return (STAGES + 1) * 2 * n
+class Stages(NamedTuple):
+    """Working memory of a step."""
+
+    point: Annotated[Array, '2 * n']
+    k: Annotated[Array, '6', '2 * n']
 
 
 @inner
 def _explicit_step(
-    a: NDArray[np.float64],
-    b: NDArray[np.float64],
-    c: NDArray[np.float64],
-    arm: Arm,
-    disturbance: NDArray[np.float64],
+    a: np.ndarray,
+    b: np.ndarray,
+    c: np.ndarray,
+    arm: PointMassArm,
+    disturbance: JointDisturbance,
     t: float,
     h: float,
-    torque: NDArray[np.float64],
-    x: NDArray[np.float64],
-    scratch: NDArray[np.float64],
+    torque: np.ndarray,
+    x: np.ndarray,
+    stages: Stages,
 ) -> None:
-    point = part(scratch, 0, (_SIZE,))
-    k = part(scratch, _SIZE, (STAGES, _SIZE))
+    point, k = stages.point, stages.k
     for stage in range(b.size):
-        for i in range(_SIZE):
+        for i in range(x.size):
             slope = 0.0
             for j in range(stage):
                 slope += a[stage, j] * k[j, i]
             point[i] = x[i] + h * slope
-        motion(arm, disturbance, t + c[stage] * h, point, torque, k[stage])
-    for i in range(_SIZE):
+        state_derivative(arm, disturbance, t + c[stage] * h, point, torque, k[stage])
+    for i in range(x.size):
         slope = 0.0
         for j in range(b.size):
             slope += b[j] * k[j, i]
@@ -77,19 +74,16 @@ def _explicit_step(
 @inner
 def integrate(
     method: int,
-    arm: Arm,
-    disturbance: NDArray[np.float64],
+    arm: PointMassArm,
+    disturbance: JointDisturbance,
     t: float,
     h: float,
-    torque: NDArray[np.float64],
-    x: NDArray[np.float64],
-    scratch: NDArray[np.float64],
+    torque: np.ndarray,
+    x: np.ndarray,
+    stages: Stages,
 ) -> None:
-    """Advance x = [q, dq], (2n,), in place from t to t + h seconds under a held torque.
-
-    `method` is RK4 or DOPRI5; `scratch` has `scratch_size(n)` entries, its contents do not matter.
-    """
+    """Advance x = [q, dq] (2n,) in place from t to t + h [s] under a held torque (n,) [N m]."""
     if method == RK4:
-        _explicit_step(_RK4_A, _RK4_B, _RK4_C, arm, disturbance, t, h, torque, x, scratch)
+        _explicit_step(_RK4_A, _RK4_B, _RK4_C, arm, disturbance, t, h, torque, x, stages)
     else:
-        _explicit_step(_DOPRI5_A, _DOPRI5_B, _DOPRI5_C, arm, disturbance, t, h, torque, x, scratch)
+        _explicit_step(_DOPRI5_A, _DOPRI5_B, _DOPRI5_C, arm, disturbance, t, h, torque, x, stages)

@@ -39,11 +39,10 @@ from blf_dsc_controller.nodes.endpoints import (
     have_subscribers,
 )
 from blf_dsc_controller.nodes.lifecycle import ManagedNode
-from sim_plant import plant as plant_kernels
+from sim_plant import kernels as plant_kernels
 from sim_plant.command_input import Latency, TorqueInput
-from sim_plant.factory import plant_of, steps_of
 from sim_plant.handshake import Handshake
-from sim_plant.sampled import Plant
+from sim_plant.plant import Plant, plant_of, steps_of
 
 LOCKSTEP_START = 1_000_000_000
 """First stamp in lock-step [ns]: a zero stamp says 'not set' in ROS."""

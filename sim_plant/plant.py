@@ -1,239 +1,147 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sampled plant: a reading of sample k, then the torque over [k, k + 1], and so on.
+"""The simulated plant in Python: it owns its vectors and its random generator."""
 
-Settings and state are one flat float64 vector each, named by the views below. Time is counted in
-whole nanoseconds, t_k = (k T_ns) 1e-9 s, so every caller meets the same floats. The kernels serve
-the ROS 2 node and the compiled offline loop alike, bit for bit.
-"""
+from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.views import borrowed, part
-from blf_dsc_controller.errors import ConfigurationError
-from sim_plant.actuator import Actuator, ActuatorState, actuate, actuator_view
-from sim_plant.disturbance import DISTURBANCE_TERMS, disturbance_torque
-from sim_plant.dynamics import ARM_SIZE, Arm, arm_view, parameters
-from sim_plant.integrator import integrate, scratch_size
-from sim_plant.sensors import SENSOR_SIZE, Sensor, SensorState, draw, is_noisy, sense, sensor_view
-
-PARAMETERS = 3
-_SCALARS = 2 + ARM_SIZE + SENSOR_SIZE + 1
-_PER_JOINT = DISTURBANCE_TERMS + 1
-
-
-class PlantSettings(NamedTuple):
-    """All that defines a plant but its seed and its initial state."""
-
-    period_ns: float  # sample time, whole ns
-    integrator: int  # RK4 or DOPRI5
-    arm: Arm
-    sensor: Sensor
-    disturbance: NDArray[np.float64]  # of `disturbance_vector`
-    actuator: Actuator
+from blf_dsc_controller.compiled.layout import pack
+from blf_dsc_controller.configuration.plant import PlantConfig
+from sim_plant.actuator import Drives
+from sim_plant.dynamics import PARAMETERS, JointDisturbance, PointMassArm, parameters
+from sim_plant.integrator import INTEGRATORS
+from sim_plant.kernels import (
+    PlantSettings,
+    observe_plant,
+    plant_truth,
+    state_of,
+    state_size,
+    step_plant,
+)
+from sim_plant.sensors import VELOCITY_SOURCES, Encoders, generator, is_noisy
 
 
-class PlantState(NamedTuple):
-    """All that changes from sample to sample but the random generator."""
+class SavedPlant(NamedTuple):
+    """A plant's state at one moment, random generator included."""
 
-    sample: NDArray[np.float64]  # (1,), k
-    x: NDArray[np.float64]  # (2n,) q [rad], dq [rad/s], noise-free
-    sensor: SensorState
-    actuator: ActuatorState
-    scratch: NDArray[np.float64]  # of the integrator
+    state: np.ndarray
+    generator: Mapping[str, Any]
 
 
-def settings_vector(settings: PlantSettings) -> NDArray[np.float64]:
-    """Return the flat vector of the settings, whose arrays may be any sequences of numbers.
+class Plant:
+    """A sampled arm: `measure()`, then `step(torque)`, and so on.
 
-    Raises
-    ------
-    ConfigurationError
-        If the torque limit and the disturbance are not of the same joints.
-
+    It starts at `position` (n,) [rad] with `velocity` (n,) [rad/s]; `seed` is that of the sensor
+    noise: the same seed repeats the run.
     """
-    n = len(settings.disturbance) // DISTURBANCE_TERMS
-    limits = len(settings.actuator.torque_limit)
-    if limits != n:
-        problem = f'actuator.torque_limit has {limits} entries: expected one for each of {n} joints'
-        raise ConfigurationError([problem])
-    parts: list[ArrayLike] = [settings.period_ns, settings.integrator]
-    parts += [*settings.arm, *settings.sensor, settings.disturbance, *settings.actuator]
-    return np.concatenate([np.ravel(np.asarray(part, dtype=np.float64)) for part in parts])
+
+    def __init__(
+        self, settings: PlantSettings, position: ArrayLike, velocity: ArrayLike, seed: int = 0
+    ) -> None:
+        self.settings = pack(settings)
+        self.joints = settings.n
+        self.period_ns = settings.period_ns
+        self.state = np.zeros(state_size(settings))
+        self._noisy = is_noisy(settings.encoders)
+        self._now = state_of(self.state, settings)
+        self._now.x[:] = np.concatenate((position, velocity))
+        self._now.reading.sample[0] = -1.0
+        self._initial = self.state.copy()
+        self._measurement = np.zeros(3 * self.joints)
+        self._truth = np.zeros(PARAMETERS + 3 * self.joints)
+        self._seed = seed
+        self.rng = generator(seed)
+
+    @property
+    def sample(self) -> int:
+        """Samples stepped since the start, k."""
+        return int(self.state[0])
+
+    @property
+    def elapsed_ns(self) -> int:
+        """Time since the start [ns]."""
+        return self.sample * self.period_ns
+
+    def measure(self) -> np.ndarray:
+        """[q, dq, effort] (3n,) of this sample: a view, overwritten by the next call.
+
+        The noise is drawn here and not by a kernel, which would draw the same numbers: passing a
+        generator to compiled code costs more than the rest of the call.
+        """
+        if self._noisy and self._now.reading.sample[0] != self.sample:
+            self.rng.standard_normal(out=self._now.reading.noise)
+        observe_plant(self.settings, self.state, self._measurement)
+        return self._measurement
+
+    def step(self, torque: np.ndarray) -> None:
+        """Apply the commanded torque (n,) [N m] and advance to the next sample."""
+        step_plant(self.settings, self.state, torque)
+
+    def hold(self) -> None:
+        """Stay at rest and without torque for one sample: the brakes are on."""
+        self._now.x[self.joints :] = 0.0
+        self._now.drives.applied[:] = 0.0
+        self._now.sample[0] += 1.0
+
+    def truth(self) -> np.ndarray:
+        """[P, tau_dist, q, dq] (3 + 3n,) of this sample: a view, overwritten by the next call."""
+        plant_truth(self.settings, self.state, self._truth)
+        return self._truth
+
+    def reset(self) -> None:
+        """Return to sample 0 and repeat the run of the same seed."""
+        self.state[:] = self._initial
+        self.rng = generator(self._seed)
+
+    def save(self) -> SavedPlant:
+        """Copy of everything that changes."""
+        return SavedPlant(self.state.copy(), self.rng.bit_generator.state)
+
+    def restore(self, saved: SavedPlant) -> None:
+        """Resume from a saved moment of a plant of the same settings."""
+        self.state[:] = saved.state
+        self.rng.bit_generator.state = saved.generator
 
 
-@inner
-def joint_count(settings: NDArray[np.float64]) -> int:
-    """Return n of a settings vector."""
-    return (settings.size - _SCALARS) // _PER_JOINT
+def arm_of(config: PlantConfig) -> PointMassArm:
+    """Arm of a configuration."""
+    return PointMassArm(*vars(config.arm).values())
 
 
-@inner
-def settings_view(flat: NDArray[np.float64]) -> PlantSettings:
-    """Name the parts of a settings vector."""
-    sensor = 2 + ARM_SIZE
-    disturbance = sensor + SENSOR_SIZE
-    actuator = flat.size - 1 - joint_count(flat)
-    return PlantSettings(
-        flat[0],
-        int(flat[1]),
-        arm_view(flat[2:sensor]),
-        sensor_view(flat[sensor:disturbance]),
-        flat[disturbance:actuator],
-        actuator_view(flat[actuator:]),
-    )
+def parameters_of(config: PlantConfig) -> np.ndarray:
+    """True parameters P (3,) [kg m^2] of a configured arm."""
+    P = np.zeros(PARAMETERS)
+    parameters(arm_of(config), P)
+    return P
 
 
-@inner
-def state_view(flat: NDArray[np.float64], n: int, delay: int) -> PlantState:
-    """Name the parts of a state vector of n joints and a delay in samples."""
-    sensor = 1 + 2 * n
-    actuator = sensor + 1 + 4 * n
-    ring = actuator + n
-    scratch = ring + delay * n
-    return PlantState(
-        flat[:1],
-        flat[1:sensor],
-        SensorState(
-            flat[sensor : sensor + 1],
-            flat[sensor + 1 : sensor + 1 + 2 * n],
-            flat[sensor + 1 + 2 * n : sensor + 1 + 3 * n],
-            flat[sensor + 1 + 3 * n : actuator],
+def plant_of(config: PlantConfig) -> Plant:
+    """Plant of a configuration, at sample 0."""
+    n = len(config.joints)
+    sensor, actuator = config.sensor, config.actuator
+    settings = PlantSettings(
+        n=n,
+        period_ns=config.sample_time_ns,
+        integrator=INTEGRATORS[config.integrator],
+        arm=arm_of(config),
+        encoders=Encoders(
+            sensor.position_noise,
+            sensor.velocity_noise,
+            sensor.resolution,
+            VELOCITY_SOURCES[sensor.velocity],
         ),
-        ActuatorState(flat[actuator:ring], flat[ring:scratch].reshape((delay, n))),
-        flat[scratch:],
+        disturbance=JointDisturbance(
+            **{name: np.full(n, value) for name, value in vars(config.disturbance).items()}
+        ),
+        drives=Drives(np.array(actuator.torque_limit), actuator.delay),
     )
+    return Plant(settings, config.initial.position, config.initial.velocity, config.seed)
 
 
-def initial_state(
-    settings: NDArray[np.float64], position: ArrayLike, velocity: ArrayLike
-) -> NDArray[np.float64]:
-    """Return the state vector of sample 0 at a position, (n,) rad, and velocity, (n,) rad/s."""
-    n = joint_count(settings)
-    delay = settings_view(settings).actuator.delay
-    flat = np.zeros(1 + 2 * n + 1 + 4 * n + n + delay * n + scratch_size(n))
-    state = state_view(flat, n, delay)
-    state.x[:n] = position
-    state.x[n:] = velocity
-    state.sensor.sample[0] = -1.0
-    return flat
-
-
-@inner
-def draw_next(plant: PlantSettings, now: PlantState, rng: np.random.Generator) -> None:
-    """Draw the noise of the next reading, where the sensor has any and the sample is unread."""
-    if is_noisy(plant.sensor) and now.sensor.sample[0] != now.sample[0]:
-        draw(rng, now.sensor.noise)
-
-
-@inner
-def read(plant: PlantSettings, now: PlantState, measurement: NDArray[np.float64]) -> None:
-    """Write [q, dq, effort], (3n,), of this sample; see `observe`."""
-    n = now.actuator.applied.size
-    if now.sensor.sample[0] != now.sample[0]:
-        period = plant.period_ns * 1e-9
-        q = part(now.x, 0, (n,))
-        dq = part(now.x, n, (n,))
-        sense(plant.sensor, int(now.sample[0]), period, q, dq, now.sensor)
-    for i in range(n):
-        measurement[i] = now.sensor.position[i]
-        measurement[n + i] = now.sensor.velocity[i]
-        measurement[2 * n + i] = now.actuator.applied[i]
-
-
-@inner
-def move(plant: PlantSettings, now: PlantState, command: NDArray[np.float64]) -> None:
-    """Take the commanded torque of this sample and go on to the next one; see `step`."""
-    actuate(plant.actuator, int(now.sample[0]), command, now.actuator)
-    integrate(
-        plant.integrator,
-        plant.arm,
-        plant.disturbance,
-        now.sample[0] * plant.period_ns * 1e-9,
-        plant.period_ns * 1e-9,
-        now.actuator.applied,
-        now.x,
-        now.scratch,
-    )
-    now.sample[0] += 1.0
-
-
-@inner
-def reveal(plant: PlantSettings, now: PlantState, out: NDArray[np.float64]) -> None:
-    """Write what no sensor tells; see `truth`."""
-    n = now.actuator.applied.size
-    t = now.sample[0] * plant.period_ns * 1e-9
-    parameters(plant.arm, out)
-    dq = part(now.x, n, (n,))
-    disturbance_torque(plant.disturbance, t, dq, part(out, PARAMETERS, (n,)))
-    for i in range(2 * n):
-        out[PARAMETERS + n + i] = now.x[i]
-
-
-@inner
-def plant_of(
-    settings: NDArray[np.float64], state: NDArray[np.float64]
-) -> tuple[PlantSettings, PlantState]:
-    """Name the parts of both vectors, without counting references to them."""
-    plant = settings_view(borrowed(settings))
-    return plant, state_view(borrowed(state), joint_count(settings), plant.actuator.delay)
-
-
-@kernel
-def draw_noise(
-    settings: NDArray[np.float64], state: NDArray[np.float64], rng: np.random.Generator
-) -> None:
-    """Draw the noise of the next reading, where the sensor has any and the sample is unread."""
-    plant, now = plant_of(settings, state)
-    draw_next(plant, now, rng)
-
-
-@kernel
-def observe(
-    settings: NDArray[np.float64], state: NDArray[np.float64], measurement: NDArray[np.float64]
-) -> None:
-    """Write [q, dq, effort], (3n,), of this sample, with the noise already drawn.
-
-    `effort` is the torque applied over the last interval, N m. A sample is read once: asking for
-    it again gives the same numbers.
-    """
-    plant, now = plant_of(settings, state)
-    read(plant, now, measurement)
-
-
-@kernel
-def measure(
-    settings: NDArray[np.float64],
-    state: NDArray[np.float64],
-    rng: np.random.Generator,
-    measurement: NDArray[np.float64],
-) -> None:
-    """Draw the noise of this sample and `observe` it."""
-    plant, now = plant_of(settings, state)
-    draw_next(plant, now, rng)
-    read(plant, now, measurement)
-
-
-@kernel
-def step(
-    settings: NDArray[np.float64], state: NDArray[np.float64], command: NDArray[np.float64]
-) -> None:
-    """Take the commanded torque, (n,) N m, of this sample and go on to the next one."""
-    plant, now = plant_of(settings, state)
-    move(plant, now, command)
-
-
-@kernel
-def truth(
-    settings: NDArray[np.float64], state: NDArray[np.float64], out: NDArray[np.float64]
-) -> None:
-    """Write what no sensor tells, (3 + 3n,): [P, tau_dist, q, dq] of this sample."""
-    plant, now = plant_of(settings, state)
-    reveal(plant, now, out)
-
-
-KERNELS = (observe, step, truth)
-"""What Python calls of a plant; compiled before the node starts."""
+def steps_of(config: PlantConfig) -> int:
+    """Number of steps; 0 runs until stopped."""
+    return round(config.duration / config.sample_time)

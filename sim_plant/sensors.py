@@ -1,24 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the encoders tell of the true state: white noise, quantisation, and a velocity.
+"""Encoder readings of the true state: white noise, quantisation, and a velocity.
 
 The velocity is either measured, with noise of its own, or differenced from the measured positions.
-Noise comes from one seeded generator, so a run is repeated exactly by repeating its seed.
+Noise comes from one seeded generator, so the same seed repeats a run exactly.
 """
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array, Cell
 
 MEASURED = 0
 DIFFERENCED = 1
 VELOCITY_SOURCES = {'measured': MEASURED, 'differenced': DIFFERENCED}
-SENSOR_SIZE = 4
 
 
-class Sensor(NamedTuple):
+class Encoders(NamedTuple):
     """Quality of the encoders, the same on every joint."""
 
     position_noise: float  # rad, standard deviation
@@ -27,42 +26,36 @@ class Sensor(NamedTuple):
     velocity_source: int  # MEASURED or DIFFERENCED
 
 
-class SensorState(NamedTuple):
-    """The latest reading, and which sample it is of."""
+class EncoderReading(NamedTuple):
+    """The latest reading, and its sample."""
 
-    sample: NDArray[np.float64]  # (1,), -1 before the first reading
-    noise: NDArray[np.float64]  # (2n,) standard normal: positions, velocities
-    position: NDArray[np.float64]  # (n,) rad
-    velocity: NDArray[np.float64]  # (n,) rad/s
-
-
-@inner
-def sensor_view(flat: NDArray[np.float64]) -> Sensor:
-    """Read a sensor from its (SENSOR_SIZE,) vector."""
-    return Sensor(flat[0], flat[1], flat[2], int(flat[3]))
+    sample: Cell  # -1 before the first reading
+    noise: Annotated[Array, '2 * n']  # standard normal: positions, velocities
+    position: Annotated[Array, 'n']  # rad
+    velocity: Annotated[Array, 'n']  # rad/s
 
 
 def generator(seed: int) -> np.random.Generator:
-    """Return the generator of a seed: PCG64, on every version of numpy."""
+    """Generator of a seed: PCG64, on every version of numpy."""
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
 
 
 @inner
-def is_noisy(sensor: Sensor) -> bool:
-    """Return whether a reading needs random numbers at all."""
-    return sensor.position_noise > 0.0 or sensor.velocity_noise > 0.0
+def is_noisy(encoders: Encoders) -> bool:
+    """Whether a reading needs random numbers at all."""
+    return encoders.position_noise > 0.0 or encoders.velocity_noise > 0.0
 
 
 @inner
-def draw(rng: np.random.Generator, noise: NDArray[np.float64]) -> None:
-    """Fill with standard normal numbers: the same as `rng.standard_normal(out=noise)`."""
+def draw(rng: np.random.Generator, noise: np.ndarray) -> None:
+    """Fill with the same standard normal numbers as `rng.standard_normal(out=noise)`."""
     for i in range(noise.size):
         noise[i] = rng.standard_normal()
 
 
 @inner
 def quantised(angle: float, resolution: float) -> float:
-    """Return the nearest multiple of the resolution; a resolution of 0 is none."""
+    """Nearest multiple of the resolution; a resolution of 0 is none."""
     if resolution == 0.0:
         return angle
     return float(np.rint(angle / resolution) * resolution)
@@ -70,28 +63,28 @@ def quantised(angle: float, resolution: float) -> float:
 
 @inner
 def sense(
-    sensor: Sensor,
+    encoders: Encoders,
     sample: int,
     period: float,
-    q: NDArray[np.float64],
-    dq: NDArray[np.float64],
-    state: SensorState,
+    q: np.ndarray,
+    dq: np.ndarray,
+    reading: EncoderReading,
 ) -> None:
-    """Write the reading of this sample into the state, of the noise that is there.
+    """Write the reading of this sample, with the noise that is in it.
 
-    A differenced velocity spans the samples since the last reading, `period` seconds each; at the
-    first reading there is no other, so the true velocity is told.
+    A differenced velocity spans the samples since the last reading, `period` seconds each; the
+    first reading has no predecessor and gets the true velocity.
     """
     n = q.size
-    first = state.sample[0] < 0
-    span = (sample - state.sample[0]) * period
+    first = reading.sample[0] < 0
+    span = (sample - reading.sample[0]) * period
     for i in range(n):
-        position = quantised(q[i] + sensor.position_noise * state.noise[i], sensor.resolution)
-        if sensor.velocity_source == MEASURED:
-            state.velocity[i] = dq[i] + sensor.velocity_noise * state.noise[n + i]
+        position = quantised(q[i] + encoders.position_noise * reading.noise[i], encoders.resolution)
+        if encoders.velocity_source == MEASURED:
+            reading.velocity[i] = dq[i] + encoders.velocity_noise * reading.noise[n + i]
         elif first:
-            state.velocity[i] = dq[i]
+            reading.velocity[i] = dq[i]
         else:
-            state.velocity[i] = (position - state.position[i]) / span
-        state.position[i] = position
-    state.sample[0] = sample
+            reading.velocity[i] = (position - reading.position[i]) / span
+        reading.position[i] = position
+    reading.sample[0] = sample

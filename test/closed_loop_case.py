@@ -9,6 +9,8 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+import plants
+from plants import START
 
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -17,24 +19,17 @@ from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.reference import terms as reference
-from sim_plant.actuator import Actuator
-from sim_plant.disturbance import disturbance_vector
-from sim_plant.dynamics import Arm
-from sim_plant.integrator import DOPRI5
-from sim_plant.plant import PlantSettings
-from sim_plant.sampled import Plant
-from sim_plant.sensors import DIFFERENCED, MEASURED, Sensor
+from sim_plant.plant import Plant
+from sim_plant.sensors import DIFFERENCED, MEASURED
 
 T = 1e-3
 P = np.array([1.0, 0.32, 0.4])
-ARM = Arm(l1=1.0, l2=0.8, m1=0.5, m2=0.5, g=9.8)
 R = 9.8  # 1/s^2, g / l1
 MODEL = TwoLink(R)
 REFERENCE = reference.pack(
     2, [reference.sinusoids_term((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))]
 )
 JOINTS = ('shoulder', 'elbow')
-START = (2.293, 1.696)
 QUIET = (0.0, 0.0)
 
 
@@ -71,23 +66,16 @@ def plant(
     seed: int = 0,
 ) -> Plant:
     """Section IV's arm at its start, with its disturbance 0.1 + 0.1 sin t on each joint."""
-    settings = PlantSettings(
+    return plants.plant(
         period_ns=round(sample_time * 1e9),
-        integrator=DOPRI5,
-        arm=ARM,
-        sensor=Sensor(noise, 0.0, 0.0, DIFFERENCED if differenced else MEASURED),
-        disturbance=disturbance_vector(
-            constant=constant,
-            amplitude=amplitude,
-            frequency=1.0,
-            phase=0.0,
-            viscous=viscous,
-            coulomb=0.0,
-            coulomb_velocity=0.01,
-        ),
-        actuator=Actuator(np.array(torque_limit), delay),
+        position_noise=noise,
+        velocity_source=DIFFERENCED if differenced else MEASURED,
+        load=plants.disturbance(constant=constant, amplitude=amplitude, viscous=viscous),
+        torque_limit=torque_limit,
+        delay=delay,
+        start=start,
+        seed=seed,
     )
-    return Plant(settings, start, QUIET, seed)
 
 
 class Sample(NamedTuple):

@@ -18,7 +18,7 @@ from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, Joint
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.command_input import TorqueInput
-from sim_plant.factory import plant_of
+from sim_plant.plant import plant_of
 
 JOINTS = ('joint1', 'joint2')
 MILLISECOND = 1_000_000  # ns

@@ -3,40 +3,34 @@
 
 import numpy as np
 
-from sim_plant.actuator import Actuator
-from sim_plant.disturbance import disturbance_vector
-from sim_plant.dynamics import Arm
+from sim_plant.actuator import Drives
+from sim_plant.dynamics import JointDisturbance, PointMassArm
 from sim_plant.integrator import DOPRI5
-from sim_plant.plant import PlantSettings
-from sim_plant.sampled import Plant
-from sim_plant.sensors import MEASURED, Sensor
+from sim_plant.kernels import PlantSettings
+from sim_plant.plant import Plant
+from sim_plant.sensors import MEASURED, Encoders
 
-ARM = Arm(l1=1.0, l2=0.8, m1=0.5, m2=0.5, g=9.8)
-ODD_ARM = Arm(l1=0.7, l2=1.1, m1=1.3, m2=0.4, g=9.81)  # no two of its numbers are the same
+ARM = PointMassArm(l1=1.0, l2=0.8, m1=0.5, m2=0.5, g=9.8)
+ODD_ARM = PointMassArm(l1=0.7, l2=1.1, m1=1.3, m2=0.4, g=9.81)  # no two of its numbers are the same
 PERIOD = 1e-3  # s
 START = (2.293, 1.696)  # rad
 
 
-def disturbance(
-    constant=0.0,
-    amplitude=0.0,
-    frequency=1.0,
-    phase=0.0,
-    viscous=0.0,
-    coulomb=0.0,
-    coulomb_velocity=0.01,
-):
-    """Disturbance vector of two joints, none unless asked for."""
-    vector = disturbance_vector(
-        constant=constant,
-        amplitude=amplitude,
-        frequency=frequency,
-        phase=phase,
-        viscous=viscous,
-        coulomb=coulomb,
-        coulomb_velocity=coulomb_velocity,
-    )
-    return vector if vector.size > 7 else np.tile(vector, 2)
+def energies(arm, q, dq):
+    """Kinetic and potential energy of the arm's two point masses [J]."""
+    (s1, c1), (s12, c12) = ((np.sin(angle), np.cos(angle)) for angle in np.cumsum(q))
+    v1 = arm.l1 * dq[0] * np.array([-s1, c1])
+    v2 = v1 + arm.l2 * (dq[0] + dq[1]) * np.array([-s12, c12])
+    height1 = arm.l1 * s1
+    kinetic = 0.5 * (arm.m1 * v1 @ v1 + arm.m2 * v2 @ v2)
+    return kinetic, arm.g * (arm.m1 * height1 + arm.m2 * (height1 + arm.l2 * s12))
+
+
+def disturbance(**terms):
+    """Disturbance of two joints, none unless asked for; each term for both, or one by one."""
+    none = dict.fromkeys(JointDisturbance._fields, 0.0) | {'frequency': 1.0}
+    terms = none | {'coulomb_velocity': 0.01} | terms
+    return JointDisturbance(**{name: np.full(2, value, float) for name, value in terms.items()})
 
 
 def rough_disturbance():
@@ -54,6 +48,7 @@ def rough_disturbance():
 
 def settings(
     *,
+    period_ns=1_000_000,
     integrator=DOPRI5,
     load=None,
     position_noise=0.0,
@@ -65,18 +60,19 @@ def settings(
 ):
     """Settings of the arm of Section IV at 1 kHz."""
     return PlantSettings(
-        period_ns=1_000_000,
+        n=2,
+        period_ns=period_ns,
         integrator=integrator,
         arm=ARM,
-        sensor=Sensor(position_noise, velocity_noise, resolution, velocity_source),
+        encoders=Encoders(position_noise, velocity_noise, resolution, velocity_source),
         disturbance=disturbance() if load is None else load,
-        actuator=Actuator(np.array(torque_limit), delay),
+        drives=Drives(np.array(torque_limit), delay),
     )
 
 
-def plant(*, seed=0, velocity=(0.0, 0.0), **changes):
+def plant(*, seed=0, start=START, velocity=(0.0, 0.0), **changes):
     """A plant at the paper's initial position."""
-    return Plant(settings(**changes), START, velocity, seed)
+    return Plant(settings(**changes), start, velocity, seed)
 
 
 def commands(samples, seed=5):

@@ -11,7 +11,7 @@ from paper_case import configured, run
 from blf_dsc_controller.law import columns
 from blf_dsc_controller.law.factory import column_names, controller_of
 from blf_dsc_controller.law.settings import LATCHES
-from sim_plant.factory import plant_of
+from sim_plant.plant import plant_of
 
 
 def test_columns_are_those_of_their_names():

@@ -14,7 +14,7 @@ from scipy.signal import cont2discrete
 from blf_dsc_controller.law import prediction
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.settings import EFFORT, PREDICTIONS
-from sim_plant.factory import plant_of
+from sim_plant.plant import plant_of
 
 R = 9.8  # 1/s^2, g / l1
 ACCELERATION = PREDICTIONS.index('acceleration')

@@ -6,23 +6,23 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from blf_dsc_controller.arms import two_link
 from blf_dsc_controller.arms.two_link_urdf import urdf
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
-from sim_plant import dynamics as arms
+from sim_plant.plant import parameters_of
 
 CONFIG = build(PlantConfig, {'arm.l1': 1.1, 'arm.l2': 0.7, 'arm.m1': 0.6, 'arm.m2': 0.45})
 
 
 def test_mujoco_reads_the_very_arm_from_it():
-    """Mass matrix and gravity torque of the URDF, compiled by MuJoCo, against the plant's own."""
+    """Mass matrix and gravity torque of the URDF, compiled by MuJoCo, against the model's."""
     mujoco = pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
     text = urdf('arm', CONFIG.joints, CONFIG.arm, (0.0, 0.0))
     model = mujoco.MjModel.from_xml_string(text)
     model.opt.gravity[:] = (0.0, 0.0, -CONFIG.arm.gravity)
     data = mujoco.MjData(model)
-    a = CONFIG.arm
-    arm = arms.Arm(a.l1, a.l2, a.m1, a.m2, a.gravity)
+    P, constants = parameters_of(CONFIG), np.array([CONFIG.arm.gravity / CONFIG.arm.l1])
     mass, weight, theirs = np.zeros((2, 2)), np.zeros(2), np.zeros((2, 2))
     for q in np.random.default_rng(0).uniform(-3.0, 3.0, (20, 2)):
         for joint, angle in zip(CONFIG.joints, q, strict=True):
@@ -30,8 +30,8 @@ def test_mujoco_reads_the_very_arm_from_it():
         mujoco.mj_forward(model, data)
         for i in range(2):
             mujoco.mj_mulM(model, data, theirs[i], np.eye(2)[i])
-        arms.mass_matrix(arm, q, mass)
-        arms.gravity(arm, q, weight)
+        two_link.inertia(P, q, mass)
+        two_link.gravity(constants, P, q, weight)
         np.testing.assert_allclose(theirs, mass, atol=1e-7)  # a point has 1e-9 kg m^2 in it
         np.testing.assert_allclose(data.qfrc_bias, weight, atol=1e-7)
 

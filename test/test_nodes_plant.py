@@ -14,8 +14,8 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder
-from sim_plant.factory import plant_of
 from sim_plant.node import PlantNode
+from sim_plant.plant import plant_of
 
 TORQUE = (5.0, 3.0)  # N m
 

@@ -3,10 +3,7 @@
 
 import numpy as np
 import pytest
-from plants import commands, plant, run, settings
-
-from blf_dsc_controller.errors import ConfigurationError
-from sim_plant.plant import settings_vector
+from plants import commands, plant, run
 
 SAMPLES = 40
 
@@ -42,8 +39,3 @@ def test_a_limit_of_zero_is_none():
     effort = run(plant(torque_limit=(0.0, 7.0)), torques)[1:, 4:]
     assert (effort[:, 0] == torques[:-1, 0]).all()
     assert (np.abs(effort[:, 1]) == 7.0).all()
-
-
-def test_a_limit_for_another_number_of_joints_is_refused():
-    with pytest.raises(ConfigurationError, match=r'torque_limit has 3 entries.*2 joints'):
-        settings_vector(settings(torque_limit=(1.0, 2.0, 3.0)))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from plants import disturbance, plant, rough_disturbance
 
-from sim_plant.disturbance import disturbance_torque
+from sim_plant.dynamics import disturbance_torque
 
 
 def torque(vector, t, dq):
@@ -51,10 +51,10 @@ def test_a_push_moves_the_joint_against_its_sign():
     assert pushed.truth()[-1] < calm.truth()[-1]
 
 
-def test_the_truth_tells_the_disturbance_of_the_moment():
+def test_the_truth_has_the_disturbance_of_the_moment():
     arm = plant(load=rough_disturbance(), velocity=(0.3, -0.2))
     for _ in range(100):
         arm.step(np.array([-6.0, -2.0]))
-    told = arm.truth()
-    assert told[:3] == pytest.approx([1.0, 0.32, 0.4])
-    assert (told[3:5] == torque(rough_disturbance(), 100_000_000 * 1e-9, told[7:9])).all()
+    truth = arm.truth()
+    assert truth[:3] == pytest.approx([1.0, 0.32, 0.4])
+    assert (truth[3:5] == torque(rough_disturbance(), 100_000_000 * 1e-9, truth[7:9])).all()

@@ -3,20 +3,19 @@
 
 import numpy as np
 import pytest
-from plants import ARM, PERIOD, START, commands, disturbance, rough_disturbance
+from plants import ARM, PERIOD, START, commands, disturbance, energies, rough_disturbance
 from scipy.integrate import RK45, simpson, solve_ivp
 
-from sim_plant.dynamics import kinetic_energy, potential_energy
-from sim_plant.integrator import DOPRI5, RK4, integrate, scratch_size
-from sim_plant.motion import motion
+from sim_plant.dynamics import state_derivative
+from sim_plant.integrator import DOPRI5, RK4, Stages, integrate
 
-SCRATCH = np.empty(scratch_size(2))
+STAGES = Stages(np.empty(4), np.empty((6, 4)))
 INITIAL = np.array([*START, 0.5, -1.0])
 TORQUE = np.array([-6.0, -2.0])
 
 
 def advance(method, load, t, h, torque, x):
-    integrate(method, ARM, load, t, h, torque, x, SCRATCH)
+    integrate(method, ARM, load, t, h, torque, x, STAGES)
 
 
 def states(method, load, torque, h, steps):
@@ -34,7 +33,7 @@ def slope(load, torque):
 
     def evaluate(t, x):
         dx = np.empty(4)
-        motion(ARM, load, t, x, torque, dx)
+        state_derivative(ARM, load, t, x, torque, dx)
         return dx
 
     return evaluate
@@ -47,9 +46,7 @@ def exact(load, t, h, torque, x):
 
 
 def energy(rows):
-    return np.array(
-        [kinetic_energy(ARM, x[:2], x[2:]) + potential_energy(ARM, x[:2]) for x in rows]
-    )
+    return np.array([sum(energies(ARM, x[:2], x[2:])) for x in rows])
 
 
 @pytest.mark.parametrize(('method', 'order'), [(RK4, 4), (DOPRI5, 5)], ids=['rk4', 'dopri5'])

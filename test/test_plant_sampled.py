@@ -11,13 +11,12 @@ import numba
 import numpy as np
 import pytest
 from numba.core.runtime import _nrt_python, rtsys
-from plants import ARM, START, commands, plant, rough_disturbance, run, settings
+from plants import ARM, START, commands, plant, rough_disturbance, run
 
 from blf_dsc_controller.compiled.jit import kernel
-from sim_plant.integrator import DOPRI5, RK4, integrate, scratch_size
-from sim_plant.plant import initial_state, measure, settings_vector, settings_view, step
-from sim_plant.sampled import Plant
-from sim_plant.sensors import DIFFERENCED, MEASURED, generator
+from sim_plant.integrator import DOPRI5, RK4, Stages, integrate
+from sim_plant.kernels import draw_noise, observe, plant_views, step
+from sim_plant.sensors import DIFFERENCED, MEASURED
 
 EVERYTHING = {
     'position_noise': 1e-5,
@@ -36,9 +35,11 @@ def full_plant(**changes):
 
 @kernel
 def compiled_run(settings, state, rng, torques, rows):
+    plant, now = plant_views(settings, state)
     for k in range(len(torques)):
-        measure(settings, state, rng, rows[k])
-        step(settings, state, torques[k])
+        draw_noise(plant, now, rng)
+        observe(plant, now, rows[k])
+        step(plant, now, torques[k])
 
 
 @pytest.mark.parametrize('source', [MEASURED, DIFFERENCED])
@@ -46,13 +47,12 @@ def compiled_run(settings, state, rng, torques, rows):
 @pytest.mark.parametrize('noise', [0.0, 1e-5])
 def test_a_compiled_loop_and_python_calls_give_the_same_bits(source, integrator, noise):
     changes = {'velocity_source': source, 'integrator': integrator, 'position_noise': noise}
-    arm = full_plant(seed=11, **changes)
-    flat, rng = arm.settings.copy(), generator(11)
-    state, rows = initial_state(flat, START, np.zeros(2)), np.empty((300, 6))
-    compiled_run(flat, state, rng, commands(300), rows)
+    arm, other = (full_plant(seed=11, **changes) for _ in range(2))
+    rows = np.empty((300, 6))
+    compiled_run(other.settings, other.state, other.rng, commands(300), rows)
     assert (run(arm, commands(300)) == rows).all()
-    assert (arm.state == state).all()
-    assert arm.rng.bit_generator.state == rng.bit_generator.state
+    assert (arm.state == other.state).all()
+    assert arm.rng.bit_generator.state == other.rng.bit_generator.state
 
 
 def test_without_noise_a_compiled_loop_draws_nothing():
@@ -65,22 +65,12 @@ def test_without_noise_a_compiled_loop_draws_nothing():
 def test_a_sample_begins_when_whole_nanoseconds_say():
     """The disturbance is that of t_k = (k T_ns) 1e-9 s, to the last bit."""
     period_ns, load = 333_333, rough_disturbance()
-    arm = Plant(settings(load=load)._replace(period_ns=period_ns), START, (0.0, 0.0))
-    x, scratch = np.array([*START, 0.0, 0.0]), np.empty(scratch_size(2))
+    arm = plant(load=load, period_ns=period_ns)
+    x, stages = np.array([*START, 0.0, 0.0]), Stages(np.empty(4), np.empty((6, 4)))
     for k, torque in enumerate(commands(100)):
         arm.step(torque)
-        integrate(DOPRI5, ARM, load, (k * period_ns) * 1e-9, period_ns * 1e-9, torque, x, scratch)
+        integrate(DOPRI5, ARM, load, (k * period_ns) * 1e-9, period_ns * 1e-9, torque, x, stages)
     assert (arm.truth()[5:] == x).all()
-
-
-def test_settings_survive_their_vector():
-    given = settings(load=rough_disturbance(), velocity_source=DIFFERENCED, **EVERYTHING)
-    found = settings_view(settings_vector(given))
-    assert (found.period_ns, found.integrator) == (given.period_ns, given.integrator)
-    assert (found.arm, found.sensor) == (given.arm, given.sensor)
-    assert (found.disturbance == given.disturbance).all()
-    assert (found.actuator.torque_limit == given.actuator.torque_limit).all()
-    assert found.actuator.delay == given.actuator.delay
 
 
 def test_a_reset_plant_repeats_its_run():

@@ -24,7 +24,7 @@ from blf_dsc_controller.monte_carlo.report import (
 from blf_dsc_controller.monte_carlo.runs import KEPT, Columns, warm_up
 from blf_dsc_controller.monte_carlo.store import Span, Store, require_pyarrow
 from blf_dsc_controller.monte_carlo.study import load_study
-from blf_dsc_controller.simulation import figures_loop
+from blf_dsc_controller.simulation.loop import run_loop
 
 _PAUSE_IN_A_LOG = 10.0  # s between two states of the bar
 
@@ -54,7 +54,7 @@ def _run_study(options: Namespace) -> None:
         size = options.chunk or executors.chunk_size(study.settings.runs, engine.workers)
         spans = store.missing(size)
         if spans:
-            announce_compilation(figures_loop.run)
+            announce_compilation(run_loop)
             warm_up(study)
             _compute(store, spans, engine)
         _report(store)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 from blf_dsc_controller.configuration.plant import PlantConfig
-from sim_plant import dynamics as arm
+from sim_plant.plant import parameters_of
 
 _FORMAT = '{desc} |{bar}| {n:.1f}/{total:g} s [{elapsed}<{remaining}]{postfix}'
 _LINE_PERIOD = 10.0  # s between two lines where there is no terminal to draw a bar on
@@ -24,10 +24,7 @@ class Progress:
     """
 
     def __init__(self, config: PlantConfig) -> None:
-        self._truth = np.zeros(3)
-        lengths = (config.arm.l1, config.arm.l2)
-        masses = (config.arm.m1, config.arm.m2)
-        arm.parameters(arm.Arm(*lengths, *masses, config.arm.gravity), self._truth)
+        self._truth = parameters_of(config)
         self._duration = config.duration
         self._line = ''
         self._due = time.monotonic() + _LINE_PERIOD

@@ -28,9 +28,9 @@ from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.rejected_columns import refusals
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import Record, loop, simulate
+from blf_dsc_controller.simulation.loop import Record, run_loop, simulate
 from blf_dsc_controller.supervision.config_warnings import config_warnings
-from sim_plant import plant as plant_kernels
+from sim_plant import kernels as plant_kernels
 
 _FOLDER = 'closed_loop'
 _DURATION = 60.0  # s, where neither the file nor an option gives one
@@ -123,7 +123,7 @@ def _configuration(options: Namespace) -> LoopConfig:
 
 
 def _run_offline(config: LoopConfig, bag: Path) -> None:
-    announce_compilation(loop)
+    announce_compilation(run_loop)
     progress = Progress(config.plant)
 
     def show(record: Record, rows: int) -> None:

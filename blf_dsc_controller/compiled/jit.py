@@ -45,6 +45,7 @@ _ABOVE = {
     'factory.py',
     'handshake.py',
     'node.py',
+    'plant.py',
     'status.py',
 }
 

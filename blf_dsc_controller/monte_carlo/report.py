@@ -11,18 +11,20 @@ from blf_dsc_controller.analysis.page import Cell, Figure, Page, Paragraph, Sect
 from blf_dsc_controller.analysis.summary import summarize as summarize_run
 from blf_dsc_controller.analysis.summary import write_summary
 from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
 from blf_dsc_controller.configuration.params_file import dump
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.monte_carlo.figures import draw_study
-from blf_dsc_controller.monte_carlo.runs import OUTCOMES, measure_record
+from blf_dsc_controller.monte_carlo.runs import OUTCOMES, metrics_row, metrics_settings
 from blf_dsc_controller.monte_carlo.statistics import Summary, summarize
 from blf_dsc_controller.monte_carlo.store import Store, differences
 from blf_dsc_controller.monte_carlo.study import Study, draw, origin_of, plant_of_draw
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.metrics import metrics_of, new_metrics
 
 _QUANTILES = ('min', 'median', 'p95', 'p99', 'max')
 
@@ -74,13 +76,15 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
     study = store.study
     plant = plant_of_run(study, run)
     dump(out / 'config.yaml', {PLANT: plant, CONTROLLER: study.controller})
-    record = simulate(study.controller, plant)
+    settings = metrics_settings(study, plant)
+    metrics = new_metrics(settings)
+    record = simulate(study.controller, plant, metrics=(pack(settings), metrics))
     write_bag(out / 'bag', record, study.controller, 'none')
     recorded = read_run(out / 'bag')
     summary = summarize_run(recorded)
     write_summary(summary, out / 'summary.json')
     draw_run(recorded, out)
-    here = measure_record(study, plant, record)
+    here = metrics_row(study, metrics_of(metrics, settings))
     row = int((results['run'] == run).argmax())
     different = differences({name: results[name][row] for name in here}, here)
     if different:

@@ -13,24 +13,33 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import kernel
-from blf_dsc_controller.compiled.views import borrowed
+from blf_dsc_controller.compiled.layout import pack
+from blf_dsc_controller.compiled.views import borrowed, part
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.law.controller import Controller, answer
+from blf_dsc_controller.law.controller import Controller, decide
 from blf_dsc_controller.law.factory import begin, controller_of, estimate_names
 from blf_dsc_controller.law.rejected_columns import refusals
-from blf_dsc_controller.law.sample import Sample, sample_of
+from blf_dsc_controller.law.sample import Sample, sample_of, tell_energies
 from blf_dsc_controller.law.settings import settings_of
 from blf_dsc_controller.law.state import signals_of, state_of
 from blf_dsc_controller.messages.monitor import LYAPUNOV_TERMS
 from blf_dsc_controller.messages.names import LAMBDA_MIN, LATCHED
 from blf_dsc_controller.messages.telemetry import disturbance_names
 from blf_dsc_controller.run import Run, Series
-from sim_plant import plant as plants
-from sim_plant.factory import plant_of, steps_of
-from sim_plant.sampled import Plant
+from blf_dsc_controller.simulation.metrics import (
+    LoopMetrics,
+    MetricsSettings,
+    metrics_of,
+    metrics_settings_of,
+    new_metrics,
+    update_metrics,
+)
+from sim_plant import kernels as plants
+from sim_plant.plant import Plant, plant_of, steps_of
 
 _CHUNK = 1000  # samples between two reports of progress
+_NO_METRICS = MetricsSettings(0, 0, 0, 0, *np.zeros((3, 0)))
 
 
 @dataclass(frozen=True)
@@ -40,11 +49,11 @@ class Record:
     Attributes:
         stamps: time since the start (k,) [ns].
         measurements: [q, dq, applied torque of the last interval] (k, 3 n).
-        samples: rows of `core.sample` (k, s).
+        samples: rows of `law.sample` (k, s).
         truths: [P, tau_dist, q, dq] (k, p + 3 n).
         joints: number of joints n.
         estimates: number of estimates m.
-        controller: the law as the run has left it.
+        controller: the controller after the run.
     """
 
     stamps: np.ndarray
@@ -63,11 +72,11 @@ class Record:
         """All samples as a `Run`, with the truth and the terms of (29) at each of them."""
         settings, names = self.controller.settings, estimate_names(config)
         columns = sample_of(np.arange(self.samples.shape[1], dtype=np.float64), settings)
-        part = {
+        values = {
             name: self.samples[:, getattr(columns, name).astype(int)] for name in columns._fields
         }
         disturbances = disturbance_names(config.joints)
-        learned = [part[name] for name in ('estimate', 'disturbance', 'lambda_min', 'latched')]
+        learned = [values[name] for name in ('estimate', 'disturbance', 'lambda_min', 'latched')]
         position, velocity, _ = np.split(self.measurements, 3, axis=1)
         true = (*names[: settings.p], *disturbances)
         return Run(
@@ -76,22 +85,22 @@ class Record:
             received=self.stamps,
             position=position,
             velocity=velocity,
-            torque=part['torque'],
-            reference=part['qr'],
-            error=part['xi1'],
-            bound=part['bound'],
+            torque=values['torque'],
+            reference=values['qr'],
+            error=values['xi1'],
+            bound=values['bound'],
             torque_limit=np.broadcast_to(config.torque.limit, position.shape),
             learning=Series(
                 (*names, *disturbances, LAMBDA_MIN, LATCHED), self.stamps, np.hstack(learned)
             ),
             truth=Series(true, self.stamps, self.truths[:, : len(true)]),
-            monitor=Series(LYAPUNOV_TERMS, self.stamps, part['lyapunov']),
+            monitor=Series(LYAPUNOV_TERMS, self.stamps, values['lyapunov']),
             rejected={one.column: f'{one}' for one in refusals(self.controller, names)},
         )
 
 
 @kernel
-def loop(
+def run_loop(
     plant_settings: np.ndarray,
     plant_state: np.ndarray,
     rng: np.random.Generator,
@@ -100,46 +109,63 @@ def loop(
     reference: np.ndarray,
     state: np.ndarray,
     signals: np.ndarray,
-    stamps: np.ndarray,
+    first: int,
+    last: int,
+    is_end: bool,
     measurements: np.ndarray,
     samples: np.ndarray,
-    truths: np.ndarray,
-    is_last: bool,
+    truths: np.ndarray | None,
+    metrics_settings: np.ndarray,
+    metrics: np.ndarray,
 ) -> None:
-    """Run as many samples as there are rows; the torque of the last row of all is not applied."""
+    """Run the samples from number `first` to `last`; at the end, the torque is not applied.
+
+    Without `truths`, `measurements` and `samples` have one row, which each sample overwrites, there
+    are no energies, and a number that is not finite ends the run; numba compiles this apart.
+    Metrics are updated if their settings have joints.
+    """
     law = settings_of(settings, model)
     law_state = state_of(state, law)
     law_signals = signals_of(signals, law)
-    arm, now = plants.plant_of(plant_settings, plant_state)
-    wanted, seen = borrowed(reference), borrowed(measurements)
-    told, true = borrowed(samples), borrowed(truths)
-    period = arm.period_ns * 1e-9
-    rows = stamps.size
-    for k in range(rows):
-        sample = sample_of(told[k], law)
-        plants.draw_next(arm, now, rng)
-        plants.read(arm, now, seen[k])
-        plants.reveal(arm, now, true[k])
-        t = stamps[k] * 1e-9
-        answer(law, wanted, law_state, law_signals, t, period, seen[k], sample)
-        if not (is_last and k == rows - 1):
-            plants.move(arm, now, sample.torque)
+    plant, now = plants.plant_views(plant_settings, plant_state)
+    reference_view, measured = borrowed(reference), borrowed(measurements)
+    rows = borrowed(samples)
+    chosen = metrics_settings_of(borrowed(metrics_settings))
+    found = metrics_of(borrowed(metrics), chosen)
+    dt = plant.period_ns * 1e-9
+    for k in range(first, last + 1):
+        row = 0 if truths is None else k - first
+        measurement, sample = measured[row], sample_of(rows[row], law)
+        t = (k * plant.period_ns) * 1e-9
+        plants.draw_noise(plant, now, rng)
+        plants.observe(plant, now, measurement)
+        decide(law, reference_view, law_state, law_signals, t, dt, measurement, sample)
+        if truths is not None:
+            plants.truth(plant, now, borrowed(truths)[row])
+            tell_energies(law, law_state, law_signals, part(measurement, 0, (law.n,)), sample)
+        if chosen.n > 0:
+            if found.finite[0] == 1.0:
+                update_metrics(chosen, found, t, measurement, sample)
+            elif truths is None:
+                return
+        if not (is_end and k == last):
+            plants.step(plant, now, sample.torque)
 
 
 def simulate(
     controller_config: ControllerConfig,
     plant_config: PlantConfig,
     progress: Callable[[Record, int], None] | None = None,
+    metrics: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Record:
     """Run both configurations against each other for `duration` and return every sample.
 
-    Args:
-        controller_config: of the law.
-        plant_config: of the arm; its duration must not be 0.
-        progress: called now and then with the record and the number of rows that are filled.
+    The plant's duration must not be 0.  `progress` is called now and then with the record and the
+    number of rows that are filled.  `metrics` are packed `MetricsSettings` and the vector of
+    `new_metrics`, which is updated.
 
     Raises:
-        OutsideBarrierError: the arm starts outside the bound, and there is to be no approach.
+        OutsideBarrierError: the arm starts outside the bound, and approach.enabled is false.
         MotionError: there is no approach within the limits.
     """
     controller = controller_of(controller_config)
@@ -147,33 +173,8 @@ def simulate(
     n = controller.settings.n
     measurement = plant.measure()
     begin(controller, controller_config, measurement[:n], measurement[n : 2 * n])
-    record = _empty_record(controller, plant, steps_of(plant_config) + 1)
-    rows = record.stamps.size
-    for first in range(0, rows, _CHUNK):
-        part = slice(first, min(first + _CHUNK, rows))
-        loop(
-            plant.settings,
-            plant.state,
-            plant.rng,
-            controller.settings.model,
-            controller.settings_vector,
-            controller.reference_vector,
-            controller.state_vector,
-            controller.signals_vector,
-            record.stamps[part],
-            record.measurements[part],
-            record.samples[part],
-            record.truths[part],
-            part.stop == rows,
-        )
-        if progress is not None:
-            progress(record, part.stop)
-    return record
-
-
-def _empty_record(controller: Controller, plant: Plant, rows: int) -> Record:
-    n = controller.settings.n
-    return Record(
+    rows = steps_of(plant_config) + 1
+    record = Record(
         stamps=np.arange(rows, dtype=np.int64) * plant.period_ns,
         measurements=np.zeros((rows, 3 * n)),
         samples=np.zeros((rows, controller.sample_vector.size)),
@@ -181,4 +182,56 @@ def _empty_record(controller: Controller, plant: Plant, rows: int) -> Record:
         joints=n,
         estimates=controller.settings.m,
         controller=controller,
+    )
+    metrics = metrics or (pack(_NO_METRICS), new_metrics(_NO_METRICS))
+    for first in range(0, rows, _CHUNK):
+        chunk = slice(first, min(first + _CHUNK, rows))
+        arrays = (record.measurements[chunk], record.samples[chunk], record.truths[chunk])
+        _run(controller, plant, first, chunk.stop - 1, chunk.stop == rows, *arrays, *metrics)
+        if progress is not None:
+            progress(record, chunk.stop)
+    return record
+
+
+def run_metrics(
+    controller: Controller, plant: Plant, samples: int, settings: MetricsSettings
+) -> LoopMetrics:
+    """Run so many samples, with a controller that has begun, and return the metrics alone."""
+    metrics = new_metrics(settings)
+    measurements = np.zeros((1, 3 * plant.joints))
+    rows = controller.sample_vector.reshape(1, -1)
+    arrays = (measurements, rows, None, pack(settings), metrics)
+    _run(controller, plant, 0, samples - 1, True, *arrays)
+    return metrics_of(metrics, settings)
+
+
+def _run(
+    controller: Controller,
+    plant: Plant,
+    first: int,
+    last: int,
+    is_end: bool,
+    measurements: np.ndarray,
+    samples: np.ndarray,
+    truths: np.ndarray | None,
+    metrics_settings: np.ndarray,
+    metrics: np.ndarray,
+) -> None:
+    run_loop(
+        plant.settings,
+        plant.state,
+        plant.rng,
+        controller.settings.model,
+        controller.settings_vector,
+        controller.reference_vector,
+        controller.state_vector,
+        controller.signals_vector,
+        first,
+        last,
+        is_end,
+        measurements,
+        samples,
+        truths,
+        metrics_settings,
+        metrics,
     )

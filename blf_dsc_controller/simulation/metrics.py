@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Metrics that the closed loop updates sample by sample, for studies of thousands of runs."""
+
+from __future__ import annotations
+
+from math import isfinite, isnan, nan, sqrt
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
+from blf_dsc_controller.law.sample import Sample
+
+
+class MetricsSettings(NamedTuple):
+    """Limits and moments of the metrics of a run."""
+
+    n: int
+    p: int
+    moments: int
+    settled: int  # first sample of the rms error
+    limit: Annotated[Array, 'n']  # N m, torque at which a joint is saturated; 0: none
+    P: Annotated[Array, 'p']  # kg m^2, true parameters
+    samples: Annotated[Array, 'moments']  # at which the parameter error is kept
+
+
+class LoopMetrics(NamedTuple):
+    """Metrics of a run up to the present sample."""
+
+    samples: Cell
+    finite: Cell  # 0 after the first number that is not finite
+    violation: Cell  # s, first time of |xi1| >= k(t), or NaN
+    latch: Cell  # s, first time with a latched window, or NaN
+    saturated: Cell  # samples in which a joint was saturated
+    settled: Cell  # samples in the rms error
+    ratio: Annotated[Array, 'n']  # max |xi1| / k(t)
+    squares: Annotated[Array, 'n']  # rad^2, sum of xi1^2 of the settled samples
+    peak: Annotated[Array, 'n']  # N m, max |applied torque|
+    error: Annotated[Array, 'moments']  # |P^ - P| / |P|, or NaN
+
+
+metrics_settings_of = view_of(MetricsSettings)
+metrics_of, _metrics_size = view_of(LoopMetrics), size_of(LoopMetrics)
+
+
+def new_metrics(settings: MetricsSettings) -> np.ndarray:
+    """Vector of the metrics before the first sample."""
+    vector = np.zeros(_metrics_size(settings))
+    metrics = metrics_of(vector, settings)
+    metrics.finite[0] = 1.0
+    for field in (metrics.violation, metrics.latch, metrics.error):
+        field.fill(nan)
+    return vector
+
+
+@inner
+def is_finite(vector: np.ndarray) -> bool:
+    """Whether all entries are finite."""
+    finite = True
+    for i in range(vector.size):
+        finite = finite and isfinite(vector[i])
+    return finite
+
+
+@inner
+def relative_error(estimate: np.ndarray, P: np.ndarray) -> float:
+    """|P^ - P| / |P|."""
+    difference = 0.0
+    size = 0.0
+    for j in range(P.size):
+        difference += (estimate[j] - P[j]) ** 2
+        size += P[j] ** 2
+    return sqrt(difference) / sqrt(size)
+
+
+@inner
+def update_joint(
+    settings: MetricsSettings, metrics: LoopMetrics, i: int, t: float, applied: float, s: Sample
+) -> bool:
+    """Update the metrics of joint i; True if it is saturated."""
+    error = abs(s.xi1[i])
+    if error >= s.bound[i] and isnan(metrics.violation[0]):
+        metrics.violation[0] = t
+    metrics.ratio[i] = max(metrics.ratio[i], error / s.bound[i])
+    metrics.peak[i] = max(metrics.peak[i], abs(applied))
+    if metrics.samples[0] >= settings.settled:
+        metrics.squares[i] += error * error
+    return bool(settings.limit[i] > 0.0 and abs(s.torque[i]) >= settings.limit[i])
+
+
+@inner
+def update_metrics(
+    settings: MetricsSettings,
+    metrics: LoopMetrics,
+    t: float,
+    measurement: np.ndarray,
+    sample: Sample,
+) -> None:
+    """Update the metrics with the sample of time t [s]; a sample that is not finite ends them."""
+    if not (is_finite(measurement) and is_finite(sample.torque)):
+        metrics.finite[0] = 0.0
+        if isnan(metrics.violation[0]):
+            metrics.violation[0] = t
+        return
+    n = settings.n
+    saturated = False
+    for i in range(n):
+        if update_joint(settings, metrics, i, t, measurement[2 * n + i], sample):
+            saturated = True
+    if saturated:
+        metrics.saturated[0] += 1.0
+    if metrics.samples[0] >= settings.settled:
+        metrics.settled[0] += 1.0
+    if sample.latched[0] == 1.0 and isnan(metrics.latch[0]):
+        metrics.latch[0] = t
+    for j in range(settings.moments):
+        if settings.samples[j] == metrics.samples[0]:
+            metrics.error[j] = relative_error(sample.estimate, settings.P)
+    metrics.samples[0] += 1.0

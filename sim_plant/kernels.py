@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sampled plant: a reading at sample k, then a held torque over [k, k + 1], and so on.
+
+Settings and state are a flat vector each.  Time is counted in whole nanoseconds,
+t_k = (k T_ns) 1e-9 s, so every caller computes the same floats.  The kernels serve the ROS 2 node
+and the compiled offline loop alike, bit for bit.
+"""
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.compiled.jit import inner, kernel
+from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
+from blf_dsc_controller.compiled.views import borrowed, part
+from sim_plant.actuator import Drives, DriveState, actuate
+from sim_plant.dynamics import (
+    PARAMETERS,
+    JointDisturbance,
+    PointMassArm,
+    disturbance_torque,
+    parameters,
+)
+from sim_plant.integrator import Stages, integrate
+from sim_plant.sensors import EncoderReading, Encoders, draw, is_noisy, sense
+
+
+class PlantSettings(NamedTuple):
+    """Everything that defines a plant except its seed and its initial state."""
+
+    n: int
+    period_ns: int
+    integrator: int  # RK4 or DOPRI5
+    arm: PointMassArm
+    encoders: Encoders
+    disturbance: JointDisturbance
+    drives: Drives
+
+
+class PlantState(NamedTuple):
+    """Everything that changes from sample to sample except the random generator."""
+
+    sample: Cell  # k
+    x: Annotated[Array, '2 * n']  # q [rad], dq [rad/s], noise-free
+    reading: EncoderReading
+    drives: DriveState
+    stages: Stages
+
+
+settings_of = view_of(PlantSettings)
+state_of, state_size = view_of(PlantState), size_of(PlantState)
+
+
+@inner
+def plant_views(settings: np.ndarray, state: np.ndarray) -> tuple[PlantSettings, PlantState]:
+    """Views of both vectors, not reference-counted."""
+    plant = settings_of(borrowed(settings))
+    return plant, state_of(borrowed(state), plant)
+
+
+@inner
+def draw_noise(plant: PlantSettings, now: PlantState, rng: np.random.Generator) -> None:
+    """Draw the noise of the next reading, if the encoders have any and the sample is unread."""
+    if is_noisy(plant.encoders) and now.reading.sample[0] != now.sample[0]:
+        draw(rng, now.reading.noise)
+
+
+@inner
+def observe(plant: PlantSettings, now: PlantState, measurement: np.ndarray) -> None:
+    """Write [q, dq, effort] (3n,) of this sample, with the noise already drawn.
+
+    `effort` is the torque applied over the last interval [N m].  Reading a sample again gives the
+    same numbers.
+    """
+    n = plant.n
+    if now.reading.sample[0] != now.sample[0]:
+        q, dq = part(now.x, 0, (n,)), part(now.x, n, (n,))
+        sense(plant.encoders, int(now.sample[0]), plant.period_ns * 1e-9, q, dq, now.reading)
+    for i in range(n):
+        measurement[i] = now.reading.position[i]
+        measurement[n + i] = now.reading.velocity[i]
+        measurement[2 * n + i] = now.drives.applied[i]
+
+
+@inner
+def step(plant: PlantSettings, now: PlantState, command: np.ndarray) -> None:
+    """Apply the commanded torque (n,) [N m] of this sample and advance to the next one."""
+    actuate(plant.drives, int(now.sample[0]), command, now.drives)
+    integrate(
+        plant.integrator,
+        plant.arm,
+        plant.disturbance,
+        now.sample[0] * plant.period_ns * 1e-9,
+        plant.period_ns * 1e-9,
+        now.drives.applied,
+        now.x,
+        now.stages,
+    )
+    now.sample[0] += 1.0
+
+
+@inner
+def truth(plant: PlantSettings, now: PlantState, out: np.ndarray) -> None:
+    """Write what no sensor measures, [P, tau_dist, q, dq] (3 + 3n,) of this sample."""
+    n = plant.n
+    t = now.sample[0] * plant.period_ns * 1e-9
+    parameters(plant.arm, out)
+    dq = part(now.x, n, (n,))
+    disturbance_torque(plant.disturbance, t, dq, part(out, PARAMETERS, (n,)))
+    for i in range(2 * n):
+        out[PARAMETERS + n + i] = now.x[i]
+
+
+@kernel
+def observe_plant(settings: np.ndarray, state: np.ndarray, measurement: np.ndarray) -> None:
+    """`observe` of packed vectors."""
+    plant, now = plant_views(settings, state)
+    observe(plant, now, measurement)
+
+
+@kernel
+def step_plant(settings: np.ndarray, state: np.ndarray, command: np.ndarray) -> None:
+    """`step` of packed vectors."""
+    plant, now = plant_views(settings, state)
+    step(plant, now, command)
+
+
+@kernel
+def plant_truth(settings: np.ndarray, state: np.ndarray, out: np.ndarray) -> None:
+    """`truth` of packed vectors."""
+    plant, now = plant_views(settings, state)
+    truth(plant, now, out)
+
+
+KERNELS = (observe_plant, step_plant, plant_truth)
+"""The kernels that Python calls of a plant; compiled before the node starts."""
