@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from plain_law import dynamics
 
-from blf_dsc_controller.arms import two_link
 from blf_dsc_controller.arms.two_link_urdf import urdf
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
@@ -22,16 +22,14 @@ def test_mujoco_reads_the_very_arm_from_it():
     model = mujoco.MjModel.from_xml_string(text)
     model.opt.gravity[:] = (0.0, 0.0, -CONFIG.arm.gravity)
     data = mujoco.MjData(model)
-    P, constants = parameters_of(CONFIG), np.array([CONFIG.arm.gravity / CONFIG.arm.l1])
-    mass, weight, theirs = np.zeros((2, 2)), np.zeros(2), np.zeros((2, 2))
+    P, r, theirs = parameters_of(CONFIG), CONFIG.arm.gravity / CONFIG.arm.l1, np.zeros((2, 2))
     for q in np.random.default_rng(0).uniform(-3.0, 3.0, (20, 2)):
         for joint, angle in zip(CONFIG.joints, q, strict=True):
             data.joint(joint).qpos[0] = angle
         mujoco.mj_forward(model, data)
         for i in range(2):
             mujoco.mj_mulM(model, data, theirs[i], np.eye(2)[i])
-        two_link.inertia(P, q, mass)
-        two_link.gravity(constants, P, q, weight)
+        mass, _, weight = dynamics(P, r, q, np.zeros(2))
         np.testing.assert_allclose(theirs, mass, atol=1e-7)  # a point has 1e-9 kg m^2 in it
         np.testing.assert_allclose(data.qfrc_bias, weight, atol=1e-7)
 
