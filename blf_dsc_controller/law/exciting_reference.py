@@ -2,8 +2,8 @@
 """Search for the sum of sinusoids that excites the learning most.
 
 The minimum eigenvalue of the excitation matrix says how well the worst determined combination of
-parameters and disturbance columns can be told from a window.  For a reference whose period is the
-window it is, in the steady state,
+parameters and disturbance columns can be identified from a window.  For a reference whose period is
+the window it is, in the steady state,
 
     Phi = 1/tau_d int X_f^T X_f dt,      X_f = [H(q, dq, dq, ddq) | D] behind the learning's filter
 

@@ -61,12 +61,12 @@ def write_bag(
             if topic not in handles:
                 handles[topic] = bag.add_topic(topic.resolved, topic.type, [topic.offered])
             bag.write(handles[topic], raw, stamp)
-        refused = refusals(record.controller, estimate_names(config))
-        if refused:
+        rejected = refusals(record.controller, estimate_names(config))
+        if rejected:
             stamp = START + int(record.stamps[-1])
             topic = topics.DIAGNOSTICS
             handle = bag.add_topic(topic.resolved, topic.type, [topic.offered])
-            bag.write(handle, encode_rejected_columns(stamp, refused), stamp)
+            bag.write(handle, encode_rejected_columns(stamp, rejected), stamp)
 
 
 def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, Message]]:
@@ -80,18 +80,18 @@ def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, M
     bound = np.zeros(record.joints)
     for row, elapsed in enumerate(record.stamps.tolist()):
         stamp = START + elapsed
-        told = record.sample(row)
-        np.maximum(ratio, np.abs(told.xi1) / told.bound, out=ratio)
-        if not np.array_equal(told.bound, bound):
-            bound = told.bound
+        sample = record.sample(row)
+        np.maximum(ratio, np.abs(sample.xi1) / sample.bound, out=ratio)
+        if not np.array_equal(sample.bound, bound):
+            bound = sample.bound
             yield stamp, controller.bound(stamp, bound, limit)
         yield stamp, plant.joint_states(stamp, record.measurements[row])
-        yield stamp, controller.command(told.torque)
-        for message in controller.sample(stamp, told, float('nan')):
+        yield stamp, controller.command(sample.torque)
+        for message in controller.sample(stamp, sample, float('nan')):
             yield stamp, message
         if row % DECIMATION == 0:
             yield stamp, plant.truth(stamp, record.truths[row])
-            yield stamp, monitor.message(stamp, told, ratio, bound)
+            yield stamp, monitor.message(stamp, sample, ratio, bound)
 
 
 def _events(config: ControllerConfig) -> Iterable[Event]:

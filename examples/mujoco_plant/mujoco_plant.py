@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same arm in MuJoCo, behind the same two topics: for a controller that does not know.
+"""The same arm simulated by MuJoCo, behind the same two topics.
 
 It publishes `joint_states` with the joints in another order than the controller's and a gripper
 among them, and takes a step for each torque on `blf_dsc_controller/commands` (lock-step).
@@ -51,7 +51,7 @@ class MujocoPlant(Node):
     def _on_command(self, message: Float64MultiArray) -> None:
         torque = np.array(message.data)
         if torque.shape != (len(COMMANDED),) or not np.isfinite(torque).all():
-            self.get_logger().error(f'command passed over: {list(message.data)}')
+            self.get_logger().error(f'command rejected: {list(message.data)}')
             return
         disturbance = 0.1 + 0.1 * np.sin(self.data.time)  # N m, on each joint
         for name, value in zip(COMMANDED, torque, strict=True):
