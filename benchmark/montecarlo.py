@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 from c_reference import Reference
-from timing import Ratio, interleaved, ratio
+from harness import Ratio, interleaved, ratio
 
 from blf_dsc_controller.configuration.params_file import locate
 from blf_dsc_controller.law.factory import controller_of

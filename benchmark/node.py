@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The controller node beside a node that echoes a torque at once.
 
-This process plays the arm: it publishes the joint states of a recorded run and takes the torques.
-Every contestant is started anew in each round: a process of its own, or a node of this process, on
-the arm's executor.
+This process stands in for the plant: it publishes the joint states of a recorded run and takes the
+torques.  Every contestant is started anew in each round: a process of its own, or a node of this
+process, on the same executor.
 
 There are two null nodes: one as users of rclpy write it, and one that passes serialised messages
 without a look at them, which is the least that Python can do.
@@ -21,8 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from contestant import Contestant, ContestantError, Watched, own_graph, wait_for
-from timing import Ratio, ratio
+from harness import Contestant, ContestantError, Ratio, Watched, own_graph, ratio, wait_for
 
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -90,8 +89,8 @@ class Guest:
         return time.process_time()
 
 
-class Arm:
-    """Publishes recorded states and waits for torques, in lock-step or at 1 kHz."""
+class StandIn:
+    """Stands in for the plant: publishes recorded states and waits for torques."""
 
     def __init__(self, messages: Sequence[bytes]) -> None:
         import rclpy
@@ -116,14 +115,14 @@ class Arm:
             qos_profile(commands.requested),
             raw=True,
         )
-        self.answered = False
+        self.has_torque = False
         self.messages = messages
 
     def _take(self, _torque: bytes) -> None:
-        self.answered = True
+        self.has_torque = True
 
     def play(self, contestants: Sequence[Watched], period: float) -> Run:
-        """Play all states, each `period` [s] after the last; 0: each when the last is answered.
+        """Play all states, each `period` [s] after the last; 0: each when the last has its torque.
 
         The last of the contestants is the node; the others are beside it.
         """
@@ -144,10 +143,10 @@ class Arm:
                 due = begin + (k - _WARM_UP if k >= _WARM_UP else k) * period
                 while (left := due - time.perf_counter()) > 0.0:
                     self.executor.spin_once(timeout_sec=left)
-            self.answered = False
+            self.has_torque = False
             sent = time.perf_counter()
             self.publisher.publish(message)
-            while not self.answered:
+            while not self.has_torque:
                 self.executor.spin_once(timeout_sec=_PATIENCE)
                 if time.perf_counter() - sent > _PATIENCE:
                     node.check()
@@ -159,12 +158,12 @@ class Arm:
         return Run(latency[_WARM_UP:], elapsed, node.cpu_time() - busy)
 
     def _greet(self, node: Watched) -> None:
-        """Send the first state until it is answered: what finds a reader half matched is lost."""
-        self.answered = False
+        """Send the first state until its torque comes: a reader half matched loses messages."""
+        self.has_torque = False
         for _ in range(_GREETINGS):
             self.publisher.publish(self.messages[0])
             self._spin_for(_SETTLING)
-            if self.answered:
+            if self.has_torque:
                 return
             node.check()
         raise ContestantError(f'{node.name}: no torque for the first state')
@@ -211,7 +210,7 @@ def measure() -> Iterator[Ratio]:
     lockstep: dict[str, list[Run]] = {name: [] for name in _PROCESSES}
     together: dict[str, list[Run]] = {name: [] for name in _GUESTS}
     states = _recorded_states()
-    with own_graph(), tempfile.TemporaryDirectory() as folder, closing(Arm(states)) as arm:
+    with own_graph(), tempfile.TemporaryDirectory() as folder, closing(StandIn(states)) as arm:
         for k in range(_ROUNDS):
             for name in _PROCESSES:
                 for runs, period in ((real, 1e-3), (lockstep, 0.0)):
@@ -221,7 +220,7 @@ def measure() -> Iterator[Ratio]:
             for name, each in together.items():
                 # An arm of its own: readers within its process hear nothing from a publisher that
                 # has sent more than it keeps for those who come late.
-                with closing(Arm(states)) as here, here.host(name) as guests:
+                with closing(StandIn(states)) as here, here.host(name) as guests:
                     each.append(here.play(guests, 0.0))
     yield from _real_time(real)
     yield from _rates('node, lock-step', lockstep)
@@ -291,13 +290,3 @@ def _recorded_states() -> list[bytes]:
     telemetry = PlantTelemetry(plant.joints, PARAMETER_NAMES)
     rows = zip(record.stamps[:-1].tolist(), record.measurements, strict=False)
     return [telemetry.joint_states(_START + stamp, row)[1] for stamp, row in rows]
-
-
-def main() -> None:
-    """Print the ratios."""
-    for row in measure():
-        print(row)
-
-
-if __name__ == '__main__':
-    main()

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The least a node can do: echo a torque at once. Typed as usual in rclpy, or serialised.
+"""The least a node can do: echo a torque at once, or throw messages away.
 
-Usage: python null_node.py typed|raw [ROS arguments]
+Usage: python null_node.py typed|raw      echo, typed as usual in rclpy, or serialised
+       python null_node.py drop TOPICS    subscribe to as many topics in serialised form
 """
 
 from __future__ import annotations
@@ -16,21 +17,23 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.endpoints import qos_profile
+from blf_dsc_controller.nodes.raw_subscriptions import compatible_profile
 
 
 def echo(node: Any, kind: str) -> None:
-    """Let a node answer every joint state with the same torque, `typed` or `raw`."""
+    """Let a node respond to every joint state with the same torque, `typed` or `raw`."""
     publisher = node.create_publisher(
         Float64MultiArray, topics.COMMANDS.relative, qos_profile(topics.COMMANDS.offered)
     )
-    answer = Float64MultiArray(data=[1.0, 2.0])
-    serialised = serialize_message(answer)
+    torque = Float64MultiArray(data=[1.0, 2.0])
+    serialised = serialize_message(torque)
 
     def typed(_state: JointState) -> None:
-        answer.data = array('d', (1.0, 2.0))
-        publisher.publish(answer)
+        torque.data = array('d', (1.0, 2.0))
+        publisher.publish(torque)
 
     def raw(_state: bytes) -> None:
         publisher.publish(serialised)
@@ -45,11 +48,22 @@ def echo(node: Any, kind: str) -> None:
     )
 
 
+def drop(node: Any, count: int) -> None:
+    """Let a node subscribe to topics, with the QoS of the recorder, and do nothing."""
+    profile = compatible_profile([topics.STREAM], RecorderConfig().queue_depth)
+    for i in range(count):
+        node.create_subscription(JointState, f'topic{i}', lambda _: None, profile, raw=True)
+
+
 def main() -> None:
-    """Answer until the process is ended."""
+    """Run until the process is ended."""
     rclpy.init(args=sys.argv)
+    kind, *arguments = sys.argv[1:]
     node = rclpy.create_node(topics.CONTROLLER)
-    echo(node, sys.argv[1])
+    if kind == 'drop':
+        drop(node, int(arguments[0]))
+    else:
+        echo(node, kind)
     executor = EventsExecutor()
     executor.add_node(node)
     while True:

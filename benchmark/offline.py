@@ -11,8 +11,8 @@ from functools import partial
 
 import numpy as np
 from c_reference import Reference
+from harness import Ratio, interleaved, ratio
 from peers import loops
-from timing import Ratio, interleaved, ratio
 
 from blf_dsc_controller.simulation.loop import simulate
 

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from contestant import Contestant, own_graph, wait_for
-from timing import Ratio, ratio
+from harness import Contestant, Ratio, own_graph, ratio, wait_for
 
 from blf_dsc_controller.messages.encoders import JointStateEncoder
 from blf_dsc_controller.messages.topics import STREAM
@@ -55,7 +54,7 @@ def _cpu_times() -> dict[str, np.ndarray]:
 
 def _command(name: str, bag: Path) -> list[str]:
     if name == _SUBSCRIBER:
-        return [str(Path(__file__).with_name('raw_subscriber.py')), str(_TOPICS)]
+        return [str(Path(__file__).with_name('null_node.py')), 'drop', str(_TOPICS)]
     parameters = (f'output:={bag}', f'compression:={_RECORDERS[name]}')
     arguments = [word for parameter in parameters for word in ('-p', parameter)]
     return ['-m', 'blf_dsc_controller.nodes.recorder_node', '--ros-args', *arguments]

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from harness import Ratio, interleaved, ratio
 from mcap.reader import make_reader
-from timing import Ratio, interleaved, ratio
 
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.configuration.controller import ControllerConfig

@@ -14,9 +14,9 @@ import platform
 from itertools import groupby
 from pathlib import Path
 
+from harness import Ratio
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from timing import Ratio
 
 from blf_dsc_controller import __version__
 

@@ -7,14 +7,14 @@ import itertools
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from contestant import Contestant, own_graph, wait_for
-from timing import Ratio, ratio
+from harness import Contestant, Ratio, own_graph, ratio, wait_for
+from node import StandIn
 
-from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.telemetry import PlantTelemetry
 
 _ROUNDS = 3
 _NULL = 'null node'
@@ -39,48 +39,22 @@ def measure() -> Iterator[Ratio]:
 
 
 def _first_torque(name: str, cache: str) -> float:
-    import rclpy
-    from rclpy.experimental import EventsExecutor
-
-    from blf_dsc_controller.messages.telemetry import PlantTelemetry
-    from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
-
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node: Any = rclpy.create_node('sim_plant', context=context)
-    executor = EventsExecutor(context=context)
-    executor.add_node(node)
-    came: list[float] = []
-    states, commands = topics.JOINT_STATES, topics.COMMANDS
-    publisher = node.create_publisher(
-        message_class(states.type), states.name, qos_profile(states.offered)
-    )
-    node.create_subscription(
-        message_class(commands.type),
-        commands.relative,
-        lambda _torque: came.append(time.perf_counter()),
-        qos_profile(commands.requested),
-        raw=True,
-    )
     encoder = PlantTelemetry(('joint1', 'joint2'), ())
     state = np.array((2.293, 1.696, 0.0, 0.0, 0.0, 0.0))
+    stamps = itertools.count(1_000_000_000, 1_000_000)
+    command = ['-m', 'blf_dsc_controller.nodes.controller_node']
     if name == _NULL:
         command = [str(Path(__file__).with_name('null_node.py')), 'raw']
-    else:
-        command = ['-m', 'blf_dsc_controller.nodes.controller_node']
-    begin = time.perf_counter()
-    contestant = Contestant(name, command, {'NUMBA_CACHE_DIR': cache})
-    stamps = itertools.count(1_000_000_000, 1_000_000)
+    with closing(StandIn(())) as arm:
 
-    def ask() -> None:
-        publisher.publish(encoder.joint_states(next(stamps), state)[1])
-        executor.spin_once(timeout_sec=_POLL)
+        def publish() -> None:
+            arm.publisher.publish(encoder.joint_states(next(stamps), state)[1])
+            arm.executor.spin_once(timeout_sec=_POLL)
 
-    try:
-        wait_for(lambda: bool(came), 'the first torque', [contestant], ask)
-    finally:
-        contestant.end()
-        executor.remove_node(node)
-        node.destroy_node()
-        rclpy.try_shutdown(context=context)
-    return came[0] - begin
+        begin = time.perf_counter()
+        contestant = Contestant(name, command, {'NUMBA_CACHE_DIR': cache})
+        try:
+            wait_for(lambda: arm.has_torque, 'the first torque', [contestant], publish)
+            return time.perf_counter() - begin
+        finally:
+            contestant.end()

@@ -135,12 +135,12 @@ def test_replay_beside_the_reader_of_mcap(monkeypatch):
 def test_contestant_that_dies_ends_the_measurement(monkeypatch):
     recording = tiny(monkeypatch, 'recording')
     monkeypatch.setattr(recording, '_command', lambda *_: ['-c', 'raise SystemExit("no disk")'])
-    error = importlib.import_module('contestant').ContestantError
+    error = importlib.import_module('harness').ContestantError
     with pytest.raises(error, match=r'raw subscriber.* ended with exit code 1:\nno disk'):
         list(recording.measure())
 
 
 def test_contestant_that_does_not_answer_is_not_waited_for_for_ever():
-    contestant = importlib.import_module('contestant')
-    with pytest.raises(contestant.ContestantError, match=r'waited 0\.1 s for a torque in vain'):
-        contestant.wait_for(lambda: False, 'a torque', patience=0.1)
+    harness = importlib.import_module('harness')
+    with pytest.raises(harness.ContestantError, match=r'waited 0\.1 s for a torque in vain'):
+        harness.wait_for(lambda: False, 'a torque', timeout=0.1)

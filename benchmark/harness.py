@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ratios measured side by side, and contestants that are processes.
+
+On a shared machine only what is measured in turns can be compared.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from blf_dsc_controller.errors import BlfDscError
+
+_START_UP = 120.0  # s, kernels may have to be compiled
+_ENDING = 20.0  # s from SIGINT to the end
+_TAIL = 2000  # characters of stderr that an error repeats
+_CPUCLOCK_SCHED = 2  # as clock_getcpuclockid(3) does it: nanoseconds, where /proc has hundredths
+
+
+class Ratio(NamedTuple):
+    """How much more than the baseline of its group something takes."""
+
+    group: str
+    what: str  # the contestant
+    baseline: str
+    median: float  # of the ratios of all rounds; a round measures both within seconds
+    low: float
+    high: float
+    note: str = ''
+
+
+def ratio(
+    group: str, what: str, baseline: str, mine: np.ndarray, theirs: np.ndarray, note: str = ''
+) -> Ratio:
+    """Ratio of two series (rounds,) that were measured in turns."""
+    each = mine / theirs
+    median, low, high = float(np.median(each)), float(each.min()), float(each.max())
+    return Ratio(group, what, baseline, median, low, high, note)
+
+
+def interleaved(contestants: Mapping[str, Callable[[], int]], rounds: int) -> dict[str, np.ndarray]:
+    """Seconds per unit of work (rounds,) of each contestant, all of them in each round.
+
+    A contestant does its work and returns how many units that was.  The first round is a warm-up.
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in contestants}
+    for counted in range(-1, rounds):
+        for name, work in contestants.items():
+            gc.collect()
+            begin = time.perf_counter()
+            units = work()
+            elapsed = time.perf_counter() - begin
+            if counted >= 0:
+                seconds[name].append(elapsed / units)
+    return {name: np.array(values) for name, values in seconds.items()}
+
+
+class Watched(Protocol):
+    """What is waited for: a process, or a node in this one."""
+
+    name: str
+
+    def check(self) -> None:
+        """Raise ContestantError if it cannot go on."""
+
+    def cpu_time(self) -> float:
+        """CPU time so far [s]."""
+
+
+class ContestantError(BlfDscError):
+    """A contestant has ended too early, or does not respond."""
+
+
+class Contestant:
+    """A process of this Python: a script or `-m module`, and its arguments."""
+
+    def __init__(
+        self, name: str, arguments: Sequence[str], environment: Mapping[str, str] | None = None
+    ) -> None:
+        self.name = name
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
+        self._process = subprocess.Popen(
+            [sys.executable, *arguments],
+            env={**os.environ, **(environment or {})},
+            stdout=subprocess.DEVNULL,
+            stderr=self._errors,
+        )
+
+    def cpu_time(self) -> float:
+        """User and system time of the process so far [s]."""
+        return time.clock_gettime(~self._process.pid << 3 | _CPUCLOCK_SCHED)
+
+    def check(self) -> None:
+        """Raise ContestantError, with the end of its stderr, if the process has ended."""
+        code = self._process.poll()
+        if code is not None:
+            self._errors.seek(0)
+            errors = self._errors.read().decode(errors='replace')[-_TAIL:].strip()
+            raise ContestantError(f'{self.name} ended with exit code {code}:\n{errors}')
+
+    def end(self) -> None:
+        """End the process as Ctrl-C does, and by force where that is not enough."""
+        self._process.send_signal(signal.SIGINT)
+        try:
+            self._process.wait(_ENDING)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._errors.close()
+
+
+def wait_for(
+    condition: Callable[[], bool],
+    what: str,
+    contestants: Sequence[Watched] = (),
+    pause: Callable[[], object] = lambda: time.sleep(0.02),
+    timeout: float = _START_UP,
+) -> None:
+    """Wait until the condition holds; ContestantError after `timeout` [s] or if one has ended."""
+    begin = time.perf_counter()
+    while not condition():
+        for contestant in contestants:
+            contestant.check()
+        if time.perf_counter() - begin > timeout:
+            raise ContestantError(f'waited {timeout:g} s for {what} in vain')
+        pause()
+
+
+@contextmanager
+def own_graph() -> Iterator[None]:
+    """Let the ROS nodes of this process and of its contestants hear nobody else."""
+    from blf_dsc_controller.cli.session import own_domain
+
+    with own_domain() as domain:
+        os.environ['ROS_DOMAIN_ID'] = str(domain)
+        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        yield
