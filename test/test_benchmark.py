@@ -128,8 +128,9 @@ def test_replay_beside_the_reader_of_mcap(monkeypatch):
     measured = replay.interleaved
     monkeypatch.setattr(replay, 'interleaved', counting)
     assert len(contestants(list(replay.measure()))) == 2
-    # 101 samples of five messages, two more in each tenth from the first on, and the bound.
-    assert units == 3 * [101 * 5 + 11 * 2 + 1]
+    # 101 samples of five messages, two more in each tenth from the first on, the bound, and the
+    # three events of the journal.
+    assert units == 3 * [101 * 5 + 11 * 2 + 1 + 3]
 
 
 def test_contestant_that_dies_ends_the_measurement(monkeypatch):
