@@ -1,4 +1,49 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Output-constrained tracking of robot arms with unknown dynamics, as ROS 2 nodes."""
+"""Output-constrained tracking of robot arms with unknown dynamics, as ROS 2 nodes and in Python.
+
+The names below are the public interface; each is imported when it is first used, so that a node
+does not load what only an analysis needs.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from blf_dsc_controller.analysis.figures import draw as draw
+    from blf_dsc_controller.analysis.metrics import measure as measure
+    from blf_dsc_controller.bags.reader import read_run as read_run
+    from blf_dsc_controller.configuration.controller import ControllerConfig as ControllerConfig
+    from blf_dsc_controller.configuration.params_file import load_loop as load_loop
+    from blf_dsc_controller.configuration.plant import PlantConfig as PlantConfig
+    from blf_dsc_controller.law.factory import controller_of as controller_of
+    from blf_dsc_controller.monte_carlo.runs import run_chunk as run_chunk
+    from blf_dsc_controller.monte_carlo.study import load_study as load_study
+    from blf_dsc_controller.replay.verify import verify as verify
+    from blf_dsc_controller.run import Run as Run
+    from blf_dsc_controller.simulation.loop import simulate as simulate
 
 __version__ = '0.1.0'
+
+_PUBLIC = {
+    'ControllerConfig': 'configuration.controller',
+    'PlantConfig': 'configuration.plant',
+    'Run': 'run',
+    'controller_of': 'law.factory',
+    'draw': 'analysis.figures',
+    'load_loop': 'configuration.params_file',
+    'load_study': 'monte_carlo.study',
+    'measure': 'analysis.metrics',
+    'read_run': 'bags.reader',
+    'run_chunk': 'monte_carlo.runs',
+    'simulate': 'simulation.loop',
+    'verify': 'replay.verify',
+}
+__all__ = list(_PUBLIC)
+
+
+def __getattr__(name: str) -> object:
+    if name not in _PUBLIC:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    return getattr(import_module(f'{__name__}.{_PUBLIC[name]}'), name)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.configuration.nodes import LoopConfig
-from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.sample import sample_of
 from blf_dsc_controller.simulation.loop import simulate
@@ -30,7 +30,7 @@ def configured(
     arm: Mapping[str, object] | None = None,
 ) -> LoopConfig:
     """A preset, with changes to the controller (`law`) and to the plant (`arm`)."""
-    config = load_loop(locate(preset), {'sim_plant': {'duration': duration}})
+    config = load_loop(preset, {'sim_plant': {'duration': duration}})
     return config._replace(
         controller=change(config.controller, law or {}), plant=change(config.plant, arm or {})
     )

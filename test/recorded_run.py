@@ -6,7 +6,7 @@ from __future__ import annotations
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
-from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -21,7 +21,7 @@ QUICK = {
 def loop_config(duration=1.0, **controller):
     """Recommended configuration that learns quickly."""
     overrides = {PLANT: {'duration': duration}, CONTROLLER: {**QUICK, **controller}}
-    return load_loop(locate('recommended'), overrides)
+    return load_loop('recommended', overrides)
 
 
 def record(path, duration=1.0, compression='none', **controller):

@@ -167,7 +167,7 @@ def test_learning_is_optional_in_a_bag(tmp_path):
 
 def test_a_simulation_and_its_bag_have_the_same_metrics(tmp_path):
     config = recorded_run.loop_config()
-    simulated = summarize(simulate(config.controller, config.plant).run(config.controller))
+    simulated = summarize(simulate(config.controller, config.plant).run())
     recorded = summarize(read_run(recorded_run.record(tmp_path / 'bag')))
     for part in ('duration_s', 'samples', 'tracking', 'learning'):
         assert simulated[part] == recorded[part]

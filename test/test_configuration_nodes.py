@@ -33,7 +33,7 @@ def test_the_defaults_are_valid(cls):
 
 
 def test_the_recommended_preset_is_the_defaults():
-    assert load_loop(locate('recommended')) == DEFAULTS
+    assert load_loop('recommended') == DEFAULTS
 
 
 @pytest.mark.parametrize('node', NODES)
@@ -46,7 +46,7 @@ def test_the_recommended_preset_shows_every_parameter(node):
 
 
 def test_the_noisy_preset_changes_sensors_and_delay_alone():
-    noisy = load_loop(locate('noisy'))
+    noisy = load_loop('noisy')
     assert noisy.controller == DEFAULTS.controller
     assert noisy.plant == change(
         DEFAULTS.plant,

@@ -11,7 +11,7 @@ import pytest
 
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.configuration.reference import MotionLimits
 from blf_dsc_controller.law.exciting_reference import ExcitationProblem, search
 from blf_dsc_controller.reference.limits import MotionError
@@ -22,7 +22,7 @@ SIGMA = ControllerConfig().learning.excitation_threshold
 
 
 def excitation(name):
-    reference = load_loop(locate(name)).controller.reference
+    reference = load_loop(name).controller.reference
     names = ('offset', 'amplitude', 'frequency', 'phase')
     parameters = {one: getattr(reference, one) for one in names}
     return ExcitationProblem(ControllerConfig(), P, 0.8, 2).evaluate(parameters)
@@ -31,7 +31,7 @@ def excitation(name):
 @cache
 def run(name, phase=0.0):
     """Samples of 16 s: the window of 2 pi s is then full of the reference alone."""
-    loop = load_loop(locate(name))
+    loop = load_loop(name)
     disturbance = replace(loop.plant.disturbance, phase=(phase, phase))
     plant = replace(loop.plant, disturbance=disturbance, duration=16.0)
     return simulate(loop.controller, plant)

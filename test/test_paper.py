@@ -169,7 +169,7 @@ def test_kept_configurations_are_those_that_ran(report):
     """One of a sweep, run again from its file, gives the number of the report."""
     name = case_name('delay', 'comparison', 1.0)
     loop = load_loop(report / 'configurations' / f'{name.replace(" ", "_")}.yaml')
-    again = measure(simulate(loop.controller, loop.plant).run(loop.controller))
+    again = measure(simulate(loop.controller, loop.plant).run())
     metrics = json.loads((report / 'metrics.json').read_text(encoding='utf-8'))
     assert metrics[name]['max_error_ratio'] == again.max_error_ratio
     assert loop.plant.actuator.delay == 1

@@ -65,7 +65,7 @@ def test_a_node_without_parameters_has_the_defaults(start, name):
 
 @pytest.mark.parametrize('preset', ['recommended', 'noisy'])
 def test_a_node_reads_a_preset_as_a_run_without_ros_does(start, preset):
-    loop = load_loop(locate(preset))
+    loop = load_loop(preset)
     for name, config in loop.by_node.items():
         node = start(name, path=locate(preset))
         assert declare(node, type(config)) == config

@@ -11,7 +11,7 @@ import pytest
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.configuration.share import share_folder
 
 PRESETS = sorted(path.stem for path in (share_folder() / 'config').glob('*.yaml'))
@@ -35,7 +35,7 @@ def test_preset_runs_by_name_and_is_kept_as_it_ran(preset, tmp_path, capsys, mon
     assert offline(preset, tmp_path / 'out', 0.5) == 0
     printed = capsys.readouterr().out
     summary = json.loads((tmp_path / 'out' / 'summary.json').read_text(encoding='utf-8'))
-    assert summary['samples'] == round(0.5 / load_loop(locate(preset)).plant.sample_time) + 1
+    assert summary['samples'] == round(0.5 / load_loop(preset).plant.sample_time) + 1
     kept = load_loop(tmp_path / 'out' / 'config.yaml').controller
     assert kept.law == LAW.get(preset, 'blf_dsc')
     held = preset != 'comparison_detuned'

@@ -10,7 +10,7 @@ import recorded_run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import PLANT
-from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.replay.identify import identify
@@ -21,7 +21,7 @@ TRUE = np.array([1.0, 0.32, 0.4])  # of the recommended plant: (m1+m2) l1^2, m2 
 
 
 def record(path, preset='recommended', **plant):
-    config = load_loop(locate(preset), {PLANT: {'duration': 8.0, **plant}})
+    config = load_loop(preset, {PLANT: {'duration': 8.0, **plant}})
     run = simulate(config.controller, config.plant)
     write_bag(path, run, config.controller, 'none', config.plant)
     return path

@@ -8,7 +8,7 @@ import pytest
 from paper_case import EXACT, NO_DISTURBANCE, P, configured, run
 
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.supervision.config_warnings import config_warnings, reference_load
 
@@ -21,7 +21,7 @@ def told(changes, preset='recommended', q=None):
 
 @pytest.mark.parametrize('preset', ['recommended', 'paper', 'noisy', 'two_tone', 'model_based'])
 def test_presets_are_not_warned_of(preset):
-    config = load_loop(locate(preset))
+    config = load_loop(preset)
     assert config_warnings(config.controller, np.array(config.plant.initial.position)) == []
 
 

@@ -37,8 +37,10 @@ _WIDTHS_UPON_EACH_OTHER = (5.0, 2.4)
 def draw(run: Run, folder: Path) -> list[Path]:
     """Draw tracking.png and what else the run has data for, and return the paths.
 
-    parameters.png if parameters were learned, monitors.png if the monitor was recorded.
+    parameters.png if parameters were learned, monitors.png if the monitor was recorded; the folder
+    is made if need be.
     """
+    folder.mkdir(parents=True, exist_ok=True)
     found = panels([run])
     motion = [panel for panel in found if panel.group in ('Motion', 'Tracking', 'Torque')]
     excitation = [panel for panel in found if panel.group == 'Excitation']

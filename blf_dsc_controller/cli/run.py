@@ -127,7 +127,7 @@ def _run_offline(config: LoopConfig, bag: Path) -> None:
     progress = Progress(config.plant)
 
     def show(record: Record, rows: int) -> None:
-        n = record.joints
+        n = len(record.config.joints)
         errors = abs(record.samples[:rows, 2 * n : 3 * n] / record.samples[:rows, 6 * n : 7 * n])
         estimate = record.sample(rows - 1).estimate[:3]
         progress.show(record.stamps[rows - 1] * 1e-9, errors.max(), estimate)

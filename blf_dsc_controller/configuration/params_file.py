@@ -81,13 +81,14 @@ def load(
 
 
 def load_loop(
-    path: str | Path, overrides: Mapping[str, Mapping[str, object]] | None = None
+    given: str | Path, overrides: Mapping[str, Mapping[str, object]] | None = None
 ) -> LoopConfig:
-    """Load the configurations of plant, controller and recorder from one file.
+    """Load the configurations of plant, controller and recorder from a preset or a file.
 
     `overrides`, by node and dotted name, take precedence over the file. Raises ConfigurationError
     with the problems of all nodes, or where plant and controller disagree.
     """
+    path = locate(given)
     sections = read(path)
     problems = [*_unknown_names(sections), *_unknown_nodes(sections)]
     configs: dict[str, Any] = {}

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
-from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.configuration.schema import change
 
 DURATION = 60.0  # s
@@ -35,7 +35,7 @@ class Case:
 
     def loop(self) -> LoopConfig:
         """Configuration of the case."""
-        loop = load_loop(locate(self.preset), {PLANT: {'duration': self.duration}, CONTROLLER: {}})
+        loop = load_loop(self.preset, {PLANT: {'duration': self.duration}, CONTROLLER: {}})
         return loop._replace(
             controller=change(loop.controller, self.law), plant=change(loop.plant, self.plant)
         )

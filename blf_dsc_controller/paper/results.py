@@ -77,7 +77,7 @@ def run_case(case: Case) -> CaseResult:
     """Simulate a case."""
     loop = case.loop()
     with np.errstate(all='ignore'):  # a run that diverges has metrics too
-        run = simulate(loop.controller, loop.plant).run(loop.controller)
+        run = simulate(loop.controller, loop.plant).run()
         return CaseResult(measure(run), run if case.keep_run else None)
 
 

@@ -26,7 +26,7 @@ from tqdm import tqdm
 from blf_dsc_controller.analysis.metrics import Metrics, measure
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig
-from blf_dsc_controller.configuration.params_file import format_value, load_loop, locate
+from blf_dsc_controller.configuration.params_file import format_value, load_loop
 from blf_dsc_controller.configuration.schema import change, flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Floats
@@ -139,15 +139,15 @@ def objective(exponents: Floats, task: Task, loops: Sequence[LoopConfig]) -> flo
     for loop in loops:
         config = change(loop.controller, changes)
         with np.errstate(all='ignore'):
-            metrics = measure(simulate(config, loop.plant).run(config))
+            metrics = measure(simulate(config, loop.plant).run())
             values.append(cost_of(metrics, config.sample_time))
     return min(float(np.mean(values)), HOPELESS)
 
 
 def loops_of(task: Task) -> list[LoopConfig]:
     """The task's controller against each plant, for the duration of the tuning."""
-    law = load_loop(locate(task.preset)).controller
-    loops = (load_loop(locate(name), {'sim_plant': {'duration': DURATION}}) for name in PLANTS)
+    law = load_loop(task.preset).controller
+    loops = (load_loop(name, {'sim_plant': {'duration': DURATION}}) for name in PLANTS)
     return [loop._replace(controller=law) for loop in loops]
 
 
@@ -183,9 +183,9 @@ def preset(name: str, exponents: Floats, value: float, evaluations: int) -> str:
     """
     task = TASKS[name]
     base, defaults = (
-        flatten(one) for one in (load_loop(locate(task.preset)).controller, ControllerConfig())
+        flatten(one) for one in (load_loop(task.preset).controller, ControllerConfig())
     )
-    truth = flatten(load_loop(locate('paper')).controller)
+    truth = flatten(load_loop('paper').controller)
     base |= {key: value for key, value in truth.items() if key.startswith('truth.')}
     changes = {key: value for key, value in base.items() if value != defaults[key]}
     lines = ''.join(

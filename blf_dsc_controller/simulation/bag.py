@@ -76,8 +76,8 @@ def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, M
     limit = np.array(config.torque.limit)
     for event in _events(config):
         yield START, (topics.JOURNAL, event.encode())
-    ratio = np.zeros(record.joints)
-    bound = np.zeros(record.joints)
+    ratio = np.zeros(len(record.config.joints))
+    bound = np.zeros(len(record.config.joints))
     for row, elapsed in enumerate(record.stamps.tolist()):
         stamp = START + elapsed
         sample = record.sample(row)

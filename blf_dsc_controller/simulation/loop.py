@@ -51,8 +51,7 @@ class Record:
         measurements: [q, dq, applied torque of the last interval] (k, 3 n).
         samples: rows of `law.sample` (k, s).
         truths: [P, tau_dist, q, dq] (k, p + 3 n).
-        joints: number of joints n.
-        estimates: number of estimates m.
+        config: configuration of the controller.
         controller: the controller after the run.
     """
 
@@ -60,16 +59,16 @@ class Record:
     measurements: np.ndarray
     samples: np.ndarray
     truths: np.ndarray
-    joints: int
-    estimates: int
+    config: ControllerConfig
     controller: Controller
 
     def sample(self, row: int) -> Sample:
         """Names for one row of `samples`."""
         return sample_of(self.samples[row], self.controller.settings)
 
-    def run(self, config: ControllerConfig) -> Run:
+    def run(self) -> Run:
         """All samples as a `Run`, with the truth and the terms of (29) at each of them."""
+        config = self.config
         settings, names = self.controller.settings, estimate_names(config)
         columns = sample_of(np.arange(self.samples.shape[1], dtype=np.float64), settings)
         values = {
@@ -179,8 +178,7 @@ def simulate(
         measurements=np.zeros((rows, 3 * n)),
         samples=np.zeros((rows, controller.sample_vector.size)),
         truths=np.zeros((rows, plant.truth().size)),
-        joints=n,
-        estimates=controller.settings.m,
+        config=controller_config,
         controller=controller,
     )
     metrics = metrics or (pack(_NO_METRICS), new_metrics(_NO_METRICS))

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The public interface: README's example runs, and nothing is loaded before it is used."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import blf_dsc_controller as blf
+
+README = Path(__file__).resolve().parents[1] / 'README.md'
+
+
+def run_python(*arguments, folder):
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
+
+
+def test_example_of_the_readme_runs(tmp_path):
+    (example,) = re.findall(r'```python\n(.*?)```', README.read_text(), re.DOTALL)
+    assert len(example.splitlines()) <= 10
+    largest = ast.literal_eval(run_python('-c', example, folder=tmp_path))
+    assert all(0.0 < error < 0.002 for error in largest)
+    assert (tmp_path / 'pictures' / 'tracking.png').stat().st_size > 0
+
+
+def test_every_public_name_is_there_and_documented():
+    assert set(blf.__all__) <= set(re.findall(r'\w+', README.read_text())) | {'PlantConfig', 'Run'}
+    for name in blf.__all__:
+        assert getattr(blf, name).__doc__, name
+
+
+def test_importing_the_package_loads_none_of_it(tmp_path):
+    program = 'import sys, blf_dsc_controller; print("numpy" in sys.modules)'
+    assert run_python('-c', program, folder=tmp_path).strip() == 'False'
