@@ -58,7 +58,7 @@ def test_refused_columns_are_logged_and_diagnosed_with_what_they_are_like(loop):
             for array in diagnostics
             for status in array.status
             for value in status.values
-            if value.key.startswith('refused cos 1 rad/s')
+            if value.key.startswith('rejected cos 1 rad/s')
         ]
 
     loop.spin_until(lambda: arm.finished and refused())
