@@ -12,7 +12,7 @@ import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
-from blf_dsc_controller.compiled.views import borrowed, part
+from blf_dsc_controller.compiled.views import part, view
 from sim_plant.actuator import Drives, DriveState, actuate
 from sim_plant.dynamics import (
     PARAMETERS,
@@ -54,8 +54,8 @@ state_of, state_size = view_of(PlantState), size_of(PlantState)
 @inner
 def plant_views(settings: np.ndarray, state: np.ndarray) -> tuple[PlantSettings, PlantState]:
     """Views of both vectors, not reference-counted."""
-    plant = settings_of(borrowed(settings))
-    return plant, state_of(borrowed(state), plant)
+    plant = settings_of(view(settings))
+    return plant, state_of(view(state), plant)
 
 
 @inner

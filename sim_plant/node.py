@@ -24,7 +24,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
-from blf_dsc_controller.arms.two_link_urdf import urdf
+from blf_dsc_controller.arms.two_link_geometry import urdf
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder
@@ -135,7 +135,8 @@ class PlantNode(ManagedNode):
 
     def _publish_description(self) -> None:
         limits = self.config.actuator.torque_limit
-        text = urdf(topics.PLANT, self.config.joints, self.config.arm, limits)
+        arm = self.config.arm
+        text = urdf(topics.PLANT, self.config.joints, (arm.l1, arm.l2), (arm.m1, arm.m2), limits)
         create_publisher(self, topics.ROBOT_DESCRIPTION).publish(String(data=text))
 
     def activate(self) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.sample import sample_of
+from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.simulation.loop import simulate
 
 P = np.array([1.0, 0.32, 0.4])

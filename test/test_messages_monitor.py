@@ -12,14 +12,10 @@ from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.law.factory import controller_of, estimate_names, settings_of_config
+from blf_dsc_controller.law.lyapunov import ExponentialBound, decay_rate, largest_inertia
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.decoders import JointStateDecoder
-from blf_dsc_controller.messages.monitor import (
-    ExponentialBound,
-    Monitor,
-    decay_rate,
-    largest_inertia,
-)
+from blf_dsc_controller.messages.monitor import Monitor
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 

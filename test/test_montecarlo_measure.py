@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from montecarlo_case import LOOP, STUDY, study, whole
 
-from blf_dsc_controller.law.sample import sample_of
+from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.monte_carlo.report import plant_of_run
 from blf_dsc_controller.monte_carlo.runs import run_chunk
 from blf_dsc_controller.simulation.loop import simulate

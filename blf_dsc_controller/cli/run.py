@@ -23,9 +23,9 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
 from blf_dsc_controller.configuration.params_file import dump, load_loop, locate
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.controller import respond
+from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.factory import estimate_names
-from blf_dsc_controller.law.rejected_columns import refusals
+from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import Record, run_loop, simulate
@@ -134,8 +134,8 @@ def _run_offline(config: LoopConfig, bag: Path) -> None:
 
     record = simulate(config.controller, config.plant, show)
     progress.close()
-    for refusal in refusals(record.controller, estimate_names(config.controller)):
-        print(f'warning: {refusal}')
+    for rejected in rejected_columns(record.controller, estimate_names(config.controller)):
+        print(f'warning: {rejected}')
     write_bag(bag, record, config.controller, config.recorder.compression, config.plant)
 
 
@@ -143,7 +143,7 @@ def _run_over_ros(config: LoopConfig, out: Path, domain: int | None) -> bool:
     """Run the three nodes; False if a signal ended the run."""
     from blf_dsc_controller.cli.session import run_session
 
-    announce_compilation(respond, *plant_kernels.KERNELS)
+    announce_compilation(update, *plant_kernels.KERNELS)
     return run_session(config.plant, out, domain)
 
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compilation of the numerical kernels, with a cache that knows what it depends on.
+"""Compilation of the numerical kernels, with a cache that knows what each depends on.
 
 Numba keys a cached function by the contents of its own file, not by those of the functions it
-calls in other files, so an edit there would leave stale machine code behind. Here the cache folder
-is named after a digest of every source file of both packages' ground floor: any change of any
-kernel compiles afresh, and a reinstall of the same version finds its old cache again.
+calls in other files, so an edit there would leave stale machine code behind.  Here the cache folder
+of a kernel is named after a digest of every source file it is compiled from and of the constants it
+uses: an edit compiles afresh what depends on it, and a reinstall finds the old cache again.
 
 Where nothing can be written below the home folder, the cache is in the folder for temporary files.
 """
@@ -13,11 +13,14 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import inspect
 import os
+import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypeVar, cast
+from types import FunctionType, ModuleType
+from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import config
@@ -28,44 +31,59 @@ F = TypeVar('F', bound=Callable[..., object])
 INLINED = {'error_model': 'numpy', 'forceinline': True, 'no_cfunc_wrapper': True}
 """Compiler options of functions that are compiled into kernels."""
 
-_PACKAGE_ROOT = Path(__file__).resolve().parents[2]
-_GROUND_FLOOR = (
-    'blf_dsc_controller/compiled/*.py',
-    'blf_dsc_controller/arms/*.py',
-    'blf_dsc_controller/law/*.py',
-    'blf_dsc_controller/reference/*.py',
-    'blf_dsc_controller/supervision/checks.py',
-    'blf_dsc_controller/simulation/*.py',
-    'sim_plant/*.py',
-)
-_ABOVE = {
-    'approach.py',
-    'command_input.py',
-    'exciting_reference.py',
-    'factory.py',
-    'handshake.py',
-    'node.py',
-    'plant.py',
-    'status.py',
-}
+_PACKAGES = ('blf_dsc_controller.', 'sim_plant.')
+_ROOM = Path(__file__).resolve().parents[1]
+# Layouts and arm models reach a kernel through the types of its arguments.
+_IN_EVERY_KERNEL = (*_ROOM.glob('compiled/*.py'), *_ROOM.glob('arms/*.py'))
 
 
-def ground_floor_sources() -> list[Path]:
-    """Every source file a kernel can live in."""
-    found = (path for pattern in _GROUND_FLOOR for path in _PACKAGE_ROOT.glob(pattern))
-    return sorted(path for path in found if path.name not in _ABOVE)
+def dependencies(function: Callable[..., object]) -> tuple[set[Path], set[str]]:
+    """Source files that a kernel is compiled from, and the constants in it as `name=value`."""
+    files, constants = set(_IN_EVERY_KERNEL), set()
+    pending: list[tuple[str, Any]] = [('', function)]
+    seen: list[object] = []
+    while pending:
+        name, value = pending.pop()
+        value = getattr(value, 'py_func', value)
+        if isinstance(value, (int, float, str, tuple)):
+            constants.add(f'{name}={value!r}')
+        module = getattr(value, '__module__', None) or ''
+        if not module.startswith(_PACKAGES) or any(value is other for other in seen):
+            continue
+        seen.append(value)
+        files.add(Path(inspect.getfile(sys.modules[module])).resolve())
+        if isinstance(value, FunctionType):
+            pending.extend(_globals_of(value))
+    return files, constants
 
 
-@functools.cache
-def cache_folder() -> Path:
-    """Folder of this version's machine code, below NUMBA_CACHE_DIR or else the user's cache."""
-    digest = hashlib.sha256(numba.__version__.encode())
-    for source in ground_floor_sources():
-        digest.update(source.read_bytes())
+def _globals_of(function: FunctionType) -> Iterator[tuple[str, object]]:
+    """What a function names, with what it names of the modules it names."""
+    names = function.__code__.co_names
+    for name in names:
+        value = function.__globals__.get(name)
+        yield name, value
+        if isinstance(value, ModuleType) and value.__name__.startswith(_PACKAGES):
+            for attribute in names:
+                yield f'{value.__name__}.{attribute}', getattr(value, attribute, None)
+
+
+def cache_folder(function: Callable[..., object]) -> Path:
+    """Folder of a kernel's machine code, below NUMBA_CACHE_DIR or else the user's cache."""
+    files, constants = dependencies(function)
+    digest = hashlib.sha256(' '.join([numba.__version__, *sorted(constants)]).encode())
+    for source in sorted(files):
+        digest.update(_contents(source))
     chosen = os.environ.get('NUMBA_CACHE_DIR')
     return (Path(chosen) if chosen else _base()) / digest.hexdigest()[:16]
 
 
+@functools.cache
+def _contents(source: Path) -> bytes:
+    return source.read_bytes()
+
+
+@functools.cache
 def _base() -> Path:
     try:
         users = Path(os.environ.get('XDG_CACHE_HOME') or '~/.cache').expanduser()
@@ -89,7 +107,8 @@ def _writable(folder: Path) -> Path:
 def is_compiled(*functions: Callable[..., object]) -> bool:
     """Whether the machine code of all these kernels is in the cache already."""
     return bool(config.DISABLE_JIT) or all(
-        any(cache_folder().glob(f'*/{_file_stem(function)}-*.nbi')) for function in functions
+        any(cache_folder(function).glob(f'*/{_file_stem(function)}-*.nbi'))
+        for function in functions
     )
 
 
@@ -103,10 +122,16 @@ def inner(function: F) -> F:
     return function
 
 
+def called(function: F) -> F:
+    """Let kernels call `function` without inlining it: for large ones, which compile faster so."""
+    register_jitable(**INLINED | {'forceinline': False})(function)
+    return function
+
+
 def kernel(function: F) -> F:
     """Compile `function`, which Python calls: IEEE arithmetic (no fast-math), cached."""
     before = config.CACHE_DIR
-    config.CACHE_DIR = str(cache_folder())
+    config.CACHE_DIR = str(cache_folder(function))
     try:
         compiled = numba.njit(
             function, cache=True, error_model='numpy', nogil=True, no_cfunc_wrapper=True

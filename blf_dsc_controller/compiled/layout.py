@@ -63,7 +63,8 @@ def view_of(layout: type[T]) -> Callable[..., T]:
 
     Kernels may call it; its arrays are views that must not outlive the vector (`views.part`).
     """
-    names: dict[str, Any] = {'_part': part}  # no field's name starts with an underscore
+    # No field's name starts with an underscore.
+    names: dict[str, Any] = {'_part': part, '__name__': layout.__module__}
     hints = _hints(layout)
     own = tuple(name for name, hint in hints.items() if hint is int)
     lines = ['_at = 0']

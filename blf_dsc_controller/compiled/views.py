@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of vectors that compiled code uses without counting references to them.
+"""Views on parts of vectors without reference counting in compiled code.
 
 Numba counts the references to every slice of an array with an atomic operation, and checks every
 slice and reshape, which in a step of a few hundred floating point operations costs more than the
@@ -18,7 +18,7 @@ from numba.np.arrayobj import populate_array
 from numpy.typing import NDArray
 
 
-def borrowed(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+def view(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the same vector; its slices are not reference-counted in compiled code.
 
     Never return it, or a slice of it, from a kernel that Python calls.
@@ -32,7 +32,7 @@ def part(vector: NDArray[np.float64], at: int, shape: tuple[int, ...]) -> NDArra
 
 
 @intrinsic
-def _borrowed(_typing: Any, vector: Any) -> Any:
+def _view(_typing: Any, vector: Any) -> Any:
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         array = context.make_array(signature.return_type)(context, builder, args[0])
         array.meminfo = cgutils.get_null_value(array.meminfo.type)
@@ -67,9 +67,9 @@ def _part(_typing: Any, vector: Any, at: Any, shape: Any) -> Any:
     return view(vector, at, shape), generate
 
 
-@overload(borrowed, strict=False)
-def _compiled_borrowed(vector: Any) -> Any:  # noqa: ARG001 - numba looks at the names
-    return lambda vector: _borrowed(vector)  # noqa: PLW0108
+@overload(view, strict=False)
+def _compiled_view(vector: Any) -> Any:  # noqa: ARG001 - numba looks at the names
+    return lambda vector: _view(vector)  # noqa: PLW0108
 
 
 @overload(part, strict=False)

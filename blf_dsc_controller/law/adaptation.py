@@ -19,7 +19,7 @@ from blf_dsc_controller.law.state import Signals, State
 
 @inner
 def prediction_error(settings: Settings, state: State, signals: Signals) -> None:
-    """Leave W eps (m,) in `signals.rate`; zero before the first latch."""
+    """Compute W eps (m,) in `signals.rate`; zero before the first latch."""
     for i in range(settings.m):
         signals.rate[i] = 0.0
     if state.latched[0] == 0.0:
@@ -36,8 +36,8 @@ def prediction_error(settings: Settings, state: State, signals: Signals) -> None
 def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturated: bool) -> None:
     """Step theta^ and d^3 by `dt` [s]: (20), (30).
 
-    While a torque is at its limit the tracking error tells of the limit, not of the parameters:
-    then only the prediction error, which knows the applied torque, goes on correcting.
+    While a torque is saturated the tracking error reflects the limit, not the parameters: then only
+    the prediction error, which uses the applied torque, adapts.
     """
     prediction_error(settings, state, signals)
     for j in range(settings.m):

@@ -7,13 +7,24 @@
 The paper's w = 1 N m/rad makes V1 (11) add rad^2 to J; the weight repairs the unit and lets the
 barrier act before the last microradian.  dV/dxi has slope w (1 + 4 s tan s) / cos^2 s, unbounded at
 the bound, while a torque that is held for a sample can only stabilise a finite stiffness.  Past the
-error where the slope reaches `slope_limit` (the knee) the torque goes on as a straight line of that
-slope: continuous with its derivative, strong enough to throw the arm back, and defined everywhere.
+error where the slope reaches `slope_limit` (the knee) the torque continues as a straight line of
+that slope: continuous with its derivative, strong enough to return the arm, and defined everywhere.
+
+The bound is constant, or a funnel that narrows to k_c:
+
+    k(t) = k_c + (k_0 - k_c) exp(-a t)                                                 [rad]
+
+The potential depends on xi and k as k^2 v(xi / k), its continuation past the knee included, so that
+V' = dV/dxi (xi1' - xi1 k'/k) + 2 (k'/k) V.  With xi1 k'/k added to the virtual control, V' is that
+of a constant bound plus 2 (k'/k) V, which is not positive while the bound narrows
+(doc/theory-funnel.md).
 """
 
-from math import cos, pi, tan
+from math import cos, exp, pi, tan
 
 from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.law.settings import Settings
+from blf_dsc_controller.law.state import Signals
 
 _BISECTIONS = 60
 
@@ -58,3 +69,14 @@ def potential(xi: float, bound: float, weight: float, slope_limit: float, knee: 
     return inside + past * (
         gradient(edge, bound, weight, slope_limit, knee) + 0.5 * slope_limit * past
     )
+
+
+@inner
+def update_bound(settings: Settings, signals: Signals, t: float) -> None:
+    """Compute k(t), the knee of its barrier, and k'/k [1/s] of time t [s]."""
+    for i in range(settings.n):
+        final = settings.bound[i]
+        above = (settings.initial_bound[i] - final) * exp(-settings.funnel_rate * t)
+        signals.bound[i] = final + above
+        signals.knee[i] = settings.knee[i] * (signals.bound[i] / final)
+        signals.narrowing[i] = -settings.funnel_rate * above / signals.bound[i]

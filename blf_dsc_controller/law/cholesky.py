@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cholesky factor and solve in place: numpy's own allocate, which a 1 kHz kernel must not."""
+"""Cholesky factor and solve in place; numpy's own allocate memory."""
 
 from math import sqrt
 

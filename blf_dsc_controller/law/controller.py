@@ -1,76 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller as its users see it: an explicit state, `reset`, and `update` once a sample."""
+"""The controller: a law with explicit state, `reset`, and `update` once a sample."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
-from blf_dsc_controller.compiled.jit import inner, kernel
+from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.compiled.views import part
-from blf_dsc_controller.law import funnel
-from blf_dsc_controller.law import step as law
-from blf_dsc_controller.law.sample import Sample, sample_of, sample_size, tell, tell_energies
+from blf_dsc_controller.law import barrier
+from blf_dsc_controller.law.lyapunov import fill_energies
 from blf_dsc_controller.law.settings import Settings, settings_of
 from blf_dsc_controller.law.state import (
-    Signals,
-    State,
+    sample_of,
+    sample_size,
     signals_of,
     signals_size,
     state_of,
     state_size,
 )
+from blf_dsc_controller.law.step import step
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import check_start
 
 
-@inner
-def decide(
-    settings: Settings,
-    reference_vector: np.ndarray,
-    state: State,
-    signals: Signals,
-    t: float,
-    dt: float,
-    measurement: np.ndarray,
-    sample: Sample,
-) -> None:
-    """`answer`, without the energies of the sample."""
-    reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
-    law.answer(settings, state, signals, t, dt, measurement)
-    tell(settings, state, signals, sample)
-
-
-@inner
-def answer(
-    settings: Settings,
-    reference_vector: np.ndarray,
-    state: State,
-    signals: Signals,
-    t: float,
-    dt: float,
-    measurement: np.ndarray,
-    sample: Sample,
-) -> None:
-    """Reference at t, then the law: everything between a measurement and its torque.
-
-    Args:
-        settings: of the law.
-        reference_vector: of `reference.pack`.
-        state: moved on by one sample.
-        signals: overwritten.
-        t: time since the start [s].
-        dt: time since the last sample [s].
-        measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
-        sample: filled.
-    """
-    decide(settings, reference_vector, state, signals, t, dt, measurement, sample)
-    tell_energies(settings, state, signals, part(measurement, 0, (settings.n,)), sample)
-
-
 @kernel
-def respond(
+def update(
     model: ArmModel,
     settings_vector: np.ndarray,
     reference_vector: np.ndarray,
@@ -81,28 +37,23 @@ def respond(
     measurement: np.ndarray,
     sample_vector: np.ndarray,
 ) -> None:
-    """`answer` for an arm model, with settings, state, signals and sample as packed vectors."""
+    """One sample of the law with its whole telemetry, on packed vectors: see `step`."""
     settings = settings_of(settings_vector, model)
-    answer(
-        settings,
-        reference_vector,
-        state_of(state_vector, settings),
-        signals_of(signals_vector, settings),
-        t,
-        dt,
-        measurement,
-        sample_of(sample_vector, settings),
-    )
+    state = state_of(state_vector, settings)
+    signals = signals_of(signals_vector, settings)
+    sample = sample_of(sample_vector, settings)
+    step(settings, reference_vector, state, signals, t, dt, measurement, sample)
+    fill_energies(settings, state, signals, part(measurement, 0, (settings.n,)), sample)
 
 
 class Controller:
     """A law with its settings, its reference and its state.
 
     Attributes:
-        settings: names of the settings vector's parts.
-        state: views on `state_vector`, which is all the controller remembers.
+        settings: of the law; views on `settings_vector`.
+        state: views on `state_vector`, the whole state of the controller.
         signals: views on what the last update computed.
-        sample: views on what is told of it; `sample.torque` is the answer.
+        sample: telemetry of the last update.
     """
 
     def __init__(self, settings: Settings, reference_vector: np.ndarray) -> None:
@@ -123,7 +74,7 @@ class Controller:
 
     def bound_at(self, t: float) -> np.ndarray:
         """Bound k(t) (n,) [rad] at a time [s] since the start."""
-        funnel.narrow(self.settings, self.signals, t)
+        barrier.update_bound(self.settings, self.signals, t)
         return self.signals.bound.copy()
 
     def reference_at(self, t: float) -> np.ndarray:
@@ -133,29 +84,27 @@ class Controller:
 
     @property
     def samples(self) -> int:
-        """Samples answered since the start."""
+        """Samples since the start."""
         return int(self.state.samples[0])
 
     def reset(self) -> None:
-        """Forget everything: estimates back to P^(0), filters and window empty."""
+        """Return to the initial state: estimates P^(0), filters and window empty."""
         self.state_vector.fill(0.0)
         self.state.estimate[:] = self.settings.initial_estimate
-        self.state.weakest.fill(self.settings.m**-0.5)
+        self.state.min_eigenvector.fill(self.settings.m**-0.5)
         self.state.active.fill(1.0)
 
     def check_start(self, joints: tuple[str, ...], q: np.ndarray, t: float = 0.0) -> None:
-        """Refuse measured positions (n,) [rad] outside the barrier: see `check_start`."""
+        """Raise OutsideBarrierError for positions (n,) [rad] outside the bound."""
         check_start(joints, q, self.bound_at(t), self.reference_vector, t)
 
     def update(self, t: float, dt: float, measurement: np.ndarray) -> np.ndarray:
         """Torque (n,) [N m] for a measurement; a view that the next update overwrites.
 
-        Args:
-            t: time since the start [s].
-            dt: time since the last sample [s].
-            measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
+        The measurement is [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,)
+        N m], t [s] the time since the start and dt [s] since the last sample.
         """
-        respond(
+        update(
             self.settings.model,
             self.settings_vector,
             self.reference_vector,
@@ -173,5 +122,5 @@ class Controller:
         return self.state_vector.copy()
 
     def restore(self, saved: np.ndarray) -> None:
-        """Go back to a saved state; the loop continues from there bit for bit."""
+        """Return to a saved state; the loop continues from there bit for bit."""
         self.state_vector[:] = saved

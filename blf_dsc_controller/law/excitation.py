@@ -1,34 +1,83 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well the window excites the parameters, and the latch (27) that keeps an excited window."""
+"""Excitation: the sliding window (21), (22), lambda_min of its Phi, and the latch (27).
+
+The window's sums of X^T [X | u] take constant time and do not drift.  A running sum that adds the
+new and subtracts the old term accumulates one rounding error a sample.  Beside the running sum S
+the window keeps F, the sum of what was written since the ring last wrapped; at the wrap F is the
+exact content of the ring and replaces S.
+
+Disturbance columns that the window cannot tell from the parameters are rejected: theta_j = 0.
+"""
 
 from math import sqrt
 
 import numpy as np
 
-from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law import cholesky, window
+from blf_dsc_controller.compiled.jit import called, inner
+from blf_dsc_controller.law import cholesky
 from blf_dsc_controller.law.settings import BEST, Settings
 from blf_dsc_controller.law.state import Signals, State
 
-_WARM = 4  # inverse iterations from the last look's direction
-_COLD = 60  # from anywhere
+_WARM = 4  # inverse iterations from the previous direction
+_COLD = 60  # from any direction
 
 
 @inner
-def weakest_direction(
+def push_row(
+    ring: np.ndarray, cursor: int, running: np.ndarray, fresh: np.ndarray, row: np.ndarray
+) -> int:
+    """Replace the oldest row of the window by `row` and return the next cursor.
+
+    `ring` (N, n, m + 1) has the oldest row at `cursor` and zeros before it is full; `running` S and
+    `fresh` F (m, m + 1) are filled in the upper triangle and the last column; `row` is [X | u]
+    (n, m + 1).
+    """
+    old = ring[cursor]
+    n = row.shape[0]
+    m = row.shape[1] - 1
+    for a in range(m):
+        for b in range(a, m + 1):
+            new_term = 0.0
+            old_term = 0.0
+            for i in range(n):
+                new_term += row[i, a] * row[i, b]
+                old_term += old[i, a] * old[i, b]
+            running[a, b] += new_term - old_term
+            fresh[a, b] += new_term
+    for i in range(n):
+        for a in range(m + 1):
+            old[i, a] = row[i, a]
+    cursor += 1
+    if cursor < ring.shape[0]:
+        return cursor
+    for a in range(m):
+        for b in range(a, m + 1):
+            running[a, b] = fresh[a, b]
+            fresh[a, b] = 0.0
+    return 0
+
+
+@inner
+def average_window(running: np.ndarray, samples: int, Phi: np.ndarray, b: np.ndarray) -> None:
+    """Fill Phi (m, m) and b (m,), the means (21) and (22) over the window."""
+    m = Phi.shape[0]
+    for i in range(m):
+        b[i] = running[i, m] / samples
+        for j in range(i, m):
+            Phi[i, j] = running[i, j] / samples
+            Phi[j, i] = Phi[i, j]
+
+
+@inner
+def min_eigenvector(
     Phi: np.ndarray, factor: np.ndarray, direction: np.ndarray, work: np.ndarray, iterations: int
 ) -> float:
-    """lambda_min(Phi) by inverse iteration, going on from `direction`.
+    """lambda_min(Phi) by inverse iteration, which improves `direction`, its unit eigenvector.
 
-    Exact in the limit; from a warm start a few iterations are (the Rayleigh quotient's error is the
-    square of the direction's), at a fixed cost and without the m^3 of an eigenvalue decomposition.
+    From a warm start a few iterations suffice (the error of the Rayleigh quotient is the square of
+    the direction's), at a fixed cost and without the m^3 of an eigenvalue decomposition.
 
-    Args:
-        Phi: excitation matrix (m, m).
-        factor: Cholesky factor of Phi + rho I.
-        direction: unit vector (m,), improved in place.
-        work: scratch (m,).
-        iterations: how many.
+    `factor` is the Cholesky factor of Phi + rho I, `work` (m,) scratch.
     """
     m = direction.size
     for _ in range(iterations):
@@ -49,8 +98,8 @@ def weakest_direction(
 
 
 @inner
-def leave_out(active: np.ndarray, Phi: np.ndarray, b: np.ndarray) -> None:
-    """Take the columns that are not active out of Phi theta = b: theta_j = 0 instead."""
+def remove_rejected(active: np.ndarray, Phi: np.ndarray, b: np.ndarray) -> None:
+    """Remove the rejected columns from Phi theta = b: theta_j = 0 instead."""
     for i in range(active.size):
         if active[i] == 0.0:
             for j in range(active.size):
@@ -60,59 +109,88 @@ def leave_out(active: np.ndarray, Phi: np.ndarray, b: np.ndarray) -> None:
             b[i] = 0.0
 
 
+@called
+def min_eigenvalue(
+    running: np.ndarray,
+    samples: int,
+    active: np.ndarray,
+    rho: float,
+    Phi: np.ndarray,
+    b: np.ndarray,
+    factor: np.ndarray,
+    direction: np.ndarray,
+    work: np.ndarray,
+    iterations: int,
+) -> float:
+    """lambda_min of the present window's Phi, which is computed with b and its factor."""
+    average_window(running, samples, Phi, b)
+    remove_rejected(active, Phi, b)
+    cholesky.factor(Phi, rho, factor)
+    return min_eigenvector(Phi, factor, direction, work, iterations)
+
+
 @inner
-def measure(settings: Settings, state: State, signals: Signals, iterations: int) -> float:
+def window_excitation(settings: Settings, state: State, signals: Signals, iterations: int) -> float:
     """lambda_min of the present window's Phi, which is left in `signals` with b and its factor."""
-    window.average(state.running, int(state.rows[0]), signals.Phi, signals.b)
-    leave_out(state.active, signals.Phi, signals.b)
-    cholesky.factor(signals.Phi, settings.rho, signals.factor)
-    return weakest_direction(signals.Phi, signals.factor, state.weakest, signals.look, iterations)
+    return min_eigenvalue(
+        state.running,
+        int(state.rows[0]),
+        state.active,
+        settings.rho,
+        signals.Phi,
+        signals.b,
+        signals.factor,
+        state.min_eigenvector,
+        signals.work,
+        iterations,
+    )
 
 
 @inner
-def restart(settings: Settings, state: State) -> None:
-    """Forget the weakest direction: the matrix it belonged to has changed."""
+def reset_direction(settings: Settings, state: State) -> None:
+    """Start the inverse iteration afresh, for a matrix that has changed."""
     for i in range(settings.m):
-        state.weakest[i] = settings.m**-0.5
+        state.min_eigenvector[i] = settings.m**-0.5
 
 
 @inner
-def judge(settings: Settings, state: State, signals: Signals) -> None:
-    """Refuse the disturbance columns that this window cannot tell from the parameters.
+def reject_columns(settings: Settings, state: State, signals: Signals) -> None:
+    """Reject the disturbance columns that this window cannot tell from the parameters.
 
-    Only where the window excites the parameters without any of the columns; then the column that
-    is strongest in the weakest direction goes, until the rest is excited.  Done once, at the first
-    full window that is good enough: a column that came and went would move the estimates.
+    Only if the window excites the parameters without any column; then the column with the largest
+    entry in the minimum eigenvector is rejected, until the rest is excited.  This happens once, at
+    the first full window that is excited enough: a column that came and went would move the
+    estimates.
     """
     for j in range(settings.p, settings.m):
         state.active[j] = 0.0
-    restart(settings, state)
-    parameters_excited = measure(settings, state, signals, _COLD) >= settings.sigma
+    reset_direction(settings, state)
+    parameters_excited = window_excitation(settings, state, signals, _COLD) >= settings.sigma
     for j in range(settings.p, settings.m):
         state.active[j] = 1.0
     if not parameters_excited:
-        restart(settings, state)
+        reset_direction(settings, state)
         return
-    state.judged[0] = 1.0
+    state.columns_checked[0] = 1.0
     for _ in range(settings.p, settings.m):
-        restart(settings, state)
-        if measure(settings, state, signals, _COLD) >= settings.sigma:
+        reset_direction(settings, state)
+        if window_excitation(settings, state, signals, _COLD) >= settings.sigma:
             return
         worst = settings.p
         for j in range(settings.p, settings.m):
-            strength = abs(state.weakest[j]) * state.active[j]
-            if strength > abs(state.weakest[worst]) * state.active[worst]:
+            strength = abs(state.min_eigenvector[j]) * state.active[j]
+            if strength > abs(state.min_eigenvector[worst]) * state.active[worst]:
                 worst = j
         state.active[worst] = 0.0
 
 
 @inner
-def look(settings: Settings, state: State, signals: Signals, t: float) -> None:
-    """Measure the present window's excitation; from tau_d + T_a on, latch it where it suffices."""
+def update_excitation(settings: Settings, state: State, signals: Signals, t: float) -> None:
+    """Compute lambda_min of the window; latch it from tau_d + T_a on if it suffices (27)."""
     learning = t >= settings.learning_start
-    if learning and state.judged[0] == 0.0:
-        judge(settings, state, signals)
-    value = measure(settings, state, signals, _WARM)
+    if learning and state.columns_checked[0] == 0.0:
+        reject_columns(settings, state, signals)
+    value = window_excitation(settings, state, signals, _WARM)
     state.lambda_min[0] = value
     better = settings.latch != BEST or value > state.latched_lambda[0]
     if learning and value >= settings.sigma and better:

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a configuration to what runs: the model, the packed settings, the controller.
+"""From a configuration to its model, settings and controller.
 
-Here a law's name becomes gains.  All laws share one kernel; they differ in the surface and in which
-gains are zero:
+All laws share one kernel; they differ in the surface and in which gains are zero:
 
     blf_dsc       (28): filtered surface, barrier, composite learning, d^3
     model_based   (16): the same with P^ = P and the disturbance known, nothing adapted
@@ -35,12 +34,12 @@ COLUMN_GAIN = 1.0
 
 
 def model_of(config: ControllerConfig) -> ArmModel:
-    """Model named by `model`, with the geometry that the controller is told."""
+    """Model named by `model`, with the geometry known to the controller."""
     return arm_model(config.model, len(config.joints), config.arm.l1, config.arm.gravity)
 
 
 def column_names(config: ControllerConfig) -> tuple[str, ...]:
-    """Name of each disturbance column, in the order of `core.columns`."""
+    """Name of each disturbance column, in the order of `prediction.fill_columns`."""
     learning = config.learning
     switched = {'bias': learning.bias, 'viscous': learning.viscous, 'coulomb': learning.coulomb}
     blocks = [name for name, is_on in switched.items() if is_on]
@@ -54,14 +53,14 @@ def estimate_names(config: ControllerConfig) -> tuple[str, ...]:
 
 
 def required_fields(config: ControllerConfig) -> tuple[str, ...]:
-    """Fields of a joint state that the controller cannot do without."""
+    """Fields of a joint state that the controller needs."""
     velocity = ('velocity',) if config.safety.velocity == 'measured' else ()
     effort = ('effort',) if config.learning.torque_source == 'effort' else ()
     return ('position', *velocity, *effort)
 
 
 def settings_of_config(config: ControllerConfig) -> Settings:
-    """Translate the configuration's words into the paper's symbols."""
+    """Settings of a configuration, in the paper's symbols."""
     model = model_of(config)
     learning = config.learning
     p, columns = len(model.parameter_names), len(column_names(config))

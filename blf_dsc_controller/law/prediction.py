@@ -14,31 +14,60 @@ takes the noise off the difference quotient.  No acceleration is needed.
 Lambda = x^T y / x^T x,  x = [xi2'^ + alpha2'; xi2 + alpha2; 1],  y = [alpha2'; alpha2; 1].  Since
 tau = [M C G] x and H P = [M C G] y, this is exact only where y is parallel to x: its error is of
 first order in xi2 and xi2', and changes with the units.
+
+Beside P the learning estimates the coefficients d of the disturbance columns
+
+    tau_dist = D d,    D = [ I | diag(dq) | diag(tanh(dq / v_c)) | I sin(w t) | I cos(w t) | ... ]
+
+as far as each block is configured.  (22)-(24) instead subtract the estimate d^3 from the torque,
+which hides the parameter error.
 """
 
-from math import exp
+from math import cos, exp, sin, tanh
 
 import numpy as np
 
-from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.arms.model import ArmModel
+from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.law import surface
-from blf_dsc_controller.law.settings import FILTERED, LAMBDA, Settings
+from blf_dsc_controller.law.settings import FILTERED, LAMBDA, Settings, settings_of
 from blf_dsc_controller.law.state import Signals, State
+
+
+@inner
+def set_block(rest: np.ndarray, at: int, i: int, value: float) -> None:
+    """Entry (i, i) of the block that starts at column `at`; the others of its row are zero."""
+    for k in range(rest.shape[0]):
+        rest[i, at + k] = 0.0
+    rest[i, at + i] = value
+
+
+@inner
+def fill_columns(settings: Settings, t: float, dq: np.ndarray, rest: np.ndarray) -> None:
+    """Fill columns p.. of `rest` (n, m) with D at time t [s] and velocity dq (n,) [rad/s]."""
+    n = settings.n
+    for i in range(n):
+        at = settings.p
+        if settings.bias == 1:
+            set_block(rest, at, i, 1.0)
+            at += n
+        if settings.viscous == 1:
+            set_block(rest, at, i, dq[i])
+            at += n
+        if settings.coulomb == 1:
+            set_block(rest, at, i, tanh(dq[i] / settings.coulomb_velocity))
+            at += n
+        for k in range(settings.tones):
+            set_block(rest, at, i, sin(settings.frequencies[k] * t))
+            set_block(rest, at + n, i, cos(settings.frequencies[k] * t))
+            at += 2 * n
 
 
 @inner
 def filter_row(
     settings: Settings, state: State, signals: Signals, dt: float, torque: np.ndarray
 ) -> None:
-    """Pass [X | u] of the last interval through both poles, leaving it in `signals.row`.
-
-    Args:
-        settings: the law's settings.
-        state: holds Yp and [Yr | D] of the last sample and the filter's state.
-        signals: holds Yp and [Yr | D] of this sample.
-        dt: length of the interval [s].
-        torque: torque applied over the interval (n,) [N m].
-    """
+    """Pass [X | u] of the last interval through both poles, leaving it in `signals.row`."""
     gain = surface.filter_gain(1.0 / settings.pole, dt)
     p = settings.p
     m = settings.m
@@ -125,18 +154,7 @@ def form_row(
     dq: np.ndarray,
     torque: np.ndarray,
 ) -> None:
-    """Leave the configured row of the last interval in `signals.row` (n, m + 1).
-
-    Args:
-        settings: the law's settings.
-        state: the law's state.
-        signals: of this sample: H, alpha2', xi2, the columns D and, where they are needed, Yp and
-            Yr are read.
-        dt: length of the interval [s].
-        q: joint positions (n,) [rad].
-        dq: joint velocities (n,) [rad/s].
-        torque: torque applied over the interval (n,) [N m].
-    """
+    """Leave the configured row of the last interval in `signals.row` (n, m + 1)."""
     if settings.prediction != FILTERED:
         differentiate(settings, state, signals, dt)
         accelerated_row(settings, state, signals, q, dq, torque)
@@ -144,3 +162,27 @@ def form_row(
     if state.samples[0] > 0.0:
         filter_row(settings, state, signals, dt, torque)
     remember(settings, state, signals)
+
+
+@kernel
+def rows_along(
+    model: ArmModel,
+    settings_vector: np.ndarray,
+    times: np.ndarray,
+    motion: np.ndarray,
+    rows: np.ndarray,
+) -> None:
+    """Fill `rows` (k, n, m) with [H(q, dq, dq, ddq) | D].
+
+    `times` (k,) [s], `motion` (k, 3, n) q, dq, ddq at each time.
+    """
+    settings = settings_of(settings_vector, model)
+    H = np.zeros((settings.n, settings.p))
+    for k in range(times.size):
+        q = motion[k, 0]
+        dq = motion[k, 1]
+        model.regressor(q, dq, dq, motion[k, 2], H)
+        fill_columns(settings, times[k], dq, rows[k])
+        for i in range(settings.n):
+            for j in range(settings.p):
+                rows[k, i, j] = H[i, j]

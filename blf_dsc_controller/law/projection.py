@@ -22,11 +22,8 @@ _MOST_STEPS = 20  # of Newton's method; 12 for a Gamma of eight decades, ten rad
 def project(estimate: np.ndarray, rate: np.ndarray, gain: np.ndarray, radius: float) -> None:
     """Remove from `rate` (p,) what leads out of the ball:  v - Gamma w w^T v / (w^T Gamma w).
 
-    Args:
-        estimate: P^ (p,), the direction w.
-        rate: wanted rate v of P^ (p,), changed in place.
-        gain: diagonal of Gamma (p,).
-        radius: omega_a.
+    `estimate` P^ (p,) is the direction w, `rate` (p,) changes in place, `gain` (p,) is the diagonal
+    of Gamma and `radius` omega_a.
     """
     square = 0.0
     outward = 0.0
@@ -46,11 +43,6 @@ def retract(estimate: np.ndarray, gain: np.ndarray, radius: float) -> None:
 
     That is P^_j / (1 + nu Gamma_j) with the nu > 0 that gives it the length omega_a, found by
     Newton's method on 1 / length: exact after one step if Gamma is even, monotone if it is not.
-
-    Args:
-        estimate: P^ (p,), changed in place.
-        gain: diagonal of Gamma (p,).
-        radius: omega_a.
     """
     square = 0.0
     for j in range(gain.size):

@@ -1,70 +1,57 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which disturbance columns the learning has refused, and what they could not be told from.
-
-`core.excitation.judge` takes out the columns that make the window's excitation matrix too weak.
-Here the same window says why: a refused column is, up to a small rest, a combination of others.
-"""
+"""Which disturbance columns are rejected (`excitation.reject_columns`), and what they resemble."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.law.controller import Controller
 
-_NOTABLE = 0.1  # of the strongest part of the combination
+_NOTABLE = 0.1  # of the largest component
 
 
-@dataclass(frozen=True)
-class Refusal:
-    """A disturbance column that is not estimated.
+class RejectedColumn(NamedTuple):
+    """A disturbance column that is not estimated."""
 
-    Attributes:
-        column: its name.
-        alike: names of what, combined, looks like it on this window, the strongest first.
-        share: how much of the column they explain, in [0, 1].
-    """
-
-    column: str
-    alike: tuple[str, ...]
-    share: float
+    column: str  # its name
+    alike: tuple[str, ...]  # names of the columns whose combination resembles it, largest first
+    fraction: float  # of the column that they explain, in [0, 1]
 
     def __str__(self) -> str:
         return (
             f'{self.column} is not estimated: on this window it cannot be told from '
-            f'{" + ".join(self.alike)} ({100 * self.share:.4g} % of it is theirs). A reference of '
-            f'more tones can tell them apart; how clearly, learning.excitation_threshold says'
+            f'{" + ".join(self.alike)} ({100 * self.fraction:.4g} % of it is explained by them). '
+            'A reference with more tones can separate them; learning.excitation_threshold says '
+            'how clearly'
         )
 
 
-def refusals(controller: Controller, names: Sequence[str]) -> tuple[Refusal, ...]:
-    """Refused columns of a controller that learns, by its present window.
+def rejected_columns(controller: Controller, names: Sequence[str]) -> tuple[RejectedColumn, ...]:
+    """Rejected columns of a controller that learns, with the reason from its present window.
 
-    Args:
-        controller: whose excitation window is looked at.
-        names: of the m entries of theta^, as `assembly.estimate_names` gives them.
+    `names` are those of the m entries of theta^, as `factory.estimate_names` returns them.
     """
     state = controller.state
-    refused = np.flatnonzero(state.active == 0.0)
-    if controller.settings.kappa == 0.0 or state.judged[0] == 0.0 or refused.size == 0:
+    rejected = np.flatnonzero(state.active == 0.0)
+    if controller.settings.kappa == 0.0 or state.columns_checked[0] == 0.0:
         return ()
     upper = np.triu(state.running[:, :-1])
     Phi = upper + np.triu(upper, 1).T
     kept = np.flatnonzero(state.active > 0.0)
-    return tuple(_refusal(Phi, int(column), kept, names) for column in refused)
+    return tuple(_explained(Phi, int(column), kept, names) for column in rejected)
 
 
-def _refusal(Phi: np.ndarray, column: int, kept: np.ndarray, names: Sequence[str]) -> Refusal:
+def _explained(
+    Phi: np.ndarray, column: int, kept: np.ndarray, names: Sequence[str]
+) -> RejectedColumn:
     """Regress the column on those that are kept, by their inner products over the window."""
     products = Phi[kept, column]
     parts = np.linalg.lstsq(Phi[np.ix_(kept, kept)], products, rcond=None)[0]
     strength = np.abs(parts) * np.sqrt(np.diag(Phi)[kept])
     order = np.argsort(-strength)
     notable = [k for k in order if strength[k] >= _NOTABLE * strength[order[0]]]
-    return Refusal(
-        column=names[column],
-        alike=tuple(names[kept[k]] for k in notable),
-        share=float(np.clip(parts @ products / Phi[column, column], 0.0, 1.0)),
-    )
+    fraction = float(np.clip(parts @ products / Phi[column, column], 0.0, 1.0))
+    return RejectedColumn(names[column], tuple(names[kept[k]] for k in notable), fraction)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The limits of the torque, on its size and on its rate of change.
+"""Saturation of the torque, in level and rate.
 
-The rate counts from the torque commanded last; the first torque after a reset has none before it.
-A limit of the size that has been lowered below the last torque counts more than the rate.
+The rate counts from the last commanded torque, not at the first sample after a reset.  The level
+limit takes precedence, as when it is lowered below the last torque.
 """
 
 from blf_dsc_controller.compiled.jit import inner
@@ -15,7 +15,7 @@ RATE_CUT = 2.0
 
 @inner
 def clip(x: float, low: float, high: float) -> float:
-    """Cut x at `low` and `high`; what is no number stays none."""
+    """Limit x to [low, high]; NaN passes through."""
     if x < low:
         return low
     if x > high:
@@ -24,12 +24,12 @@ def clip(x: float, low: float, high: float) -> float:
 
 
 @inner
-def cut_torque(settings: Settings, state: State, signals: Signals, dt: float) -> bool:
-    """Cut `signals.demand` to `signals.torque` [N m], counting by joint; True if any was cut.
+def saturate(settings: Settings, state: State, signals: Signals, dt: float) -> bool:
+    """Limit `signals.demand` to `signals.torque` [N m]; True if any joint is saturated.
 
     `dt` [s] is the time since the last torque.
     """
-    is_cut = False
+    saturated = False
     for i in range(settings.n):
         top = settings.torque_limit[i]
         torque = clip(signals.demand[i], -top, top)
@@ -46,5 +46,5 @@ def cut_torque(settings: Settings, state: State, signals: Signals, dt: float) ->
                 state.rate_cuts[i] += 1.0
             torque = clip(slowed, -top, top)
         signals.torque[i] = torque
-        is_cut = is_cut or signals.cuts[i] > 0.0
-    return is_cut
+        saturated = saturated or signals.cuts[i] > 0.0
+    return saturated

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The settings of a law: named in Python and in the kernels, one flat vector in between."""
+"""Settings of a law: gains and choices, packed into one flat vector."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.layout import Array, view_of
 
-# What these settings may be called; the vector holds the index.
+# The vector holds the index of the choice.
 SURFACES = ('filtered', 'linear')
 PREDICTIONS = ('filtered', 'acceleration', 'lambda')
 LATCHES = ('last', 'max')
@@ -26,7 +26,7 @@ EFFORT = TORQUE_SOURCES.index('effort')
 class Settings(NamedTuple):
     """Gains and choices of a law for n joints, p parameters and m - p disturbance columns.
 
-    The kernels' view of the flat vector that `pack` makes; the order of the fields is its layout.
+    The model is passed to kernels as it is, everything else in one vector.
     """
 
     model: ArmModel
@@ -39,7 +39,7 @@ class Settings(NamedTuple):
     update: int
     torque_source: int
     window: int  # N, samples in tau_d
-    interval: int  # samples between two looks at the excitation
+    interval: int  # samples between two checks of the excitation
     bias: int  # 1: a constant column per joint
     viscous: int  # 1: a column dq_i per joint
     coulomb: int  # 1: a column tanh(dq_i / coulomb_velocity) per joint
@@ -60,7 +60,7 @@ class Settings(NamedTuple):
     Wc: float  # leakage of P^ in (35)
     funnel_rate: float  # a, at which the bound narrows, 1/s
     bound: Annotated[Array, 'n']  # k_c, rad
-    initial_bound: Annotated[Array, 'n']  # k_0, rad; k_c: the bound stands still
+    initial_bound: Annotated[Array, 'n']  # k_0, rad; k_c: constant bound
     weight: Annotated[Array, 'n']  # w, N m/rad; of z1 in (35)
     slope_limit: Annotated[Array, 'n']  # S_lim, N m/rad
     knee: Annotated[Array, 'n']  # where the slope reaches S_lim if the bound is k_c, rad

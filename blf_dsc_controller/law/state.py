@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a law remembers between two samples, and what it computes in one: two flat vectors.
+"""State of a law between two samples, signals within one, and the telemetry sample: flat vectors.
 
-Saving, restoring and comparing a controller is copying and comparing its state vector; nothing else
-in the package remembers anything about the loop.
+Saving, restoring and comparing a controller is copying and comparing its state vector: the package
+keeps no other state of the loop.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
 
 
 class State(NamedTuple):
-    """Views on a state vector. One-element arrays are scalars that the kernels write."""
+    """What a law keeps from one sample to the next."""
 
-    samples: Cell  # samples answered
+    samples: Cell  # samples so far
     cursor: Cell  # oldest row of the window
     rows: Cell  # rows in the window
     latched: Cell  # 1 once (Phi_e, b_e) is kept
     latch_time: Cell  # T_e, s
-    lambda_min: Cell  # of Phi at the last look
+    lambda_min: Cell  # of Phi at the last check
     latched_lambda: Cell  # lambda_min of the latched window
-    judged: Cell  # 1 once the disturbance columns are accepted or refused
+    columns_checked: Cell  # 1 once the disturbance columns are accepted or rejected
     alpha2: Annotated[Array, 'n']  # rad/s
     torque: Annotated[Array, 'n']  # torque commanded last, N m
     disturbance: Annotated[Array, 'n']  # d^3, N m
@@ -40,13 +40,13 @@ class State(NamedTuple):
     Phi: Annotated[Array, 'm', 'm']  # latched Phi_e
     b: Annotated[Array, 'm']  # latched b_e
     factor: Annotated[Array, 'm', 'm']  # Cholesky factor of Phi_e + rho I
-    weakest: Annotated[Array, 'm']  # unit vector of the least excited direction
-    active: Annotated[Array, 'm']  # 0 where a disturbance column has been refused
+    min_eigenvector: Annotated[Array, 'm']  # of Phi, a unit vector
+    active: Annotated[Array, 'm']  # 0 where a disturbance column has been rejected
     ring: Annotated[Array, 'window', 'n', 'm + 1']  # the window's rows
 
 
 class Signals(NamedTuple):
-    """Views on what one sample computes; nothing in it outlives the sample."""
+    """What a law computes in one sample."""
 
     qr: Annotated[Array, 'n']  # rad
     dqr: Annotated[Array, 'n']  # rad/s
@@ -71,8 +71,26 @@ class Signals(NamedTuple):
     b: Annotated[Array, 'm']
     factor: Annotated[Array, 'm', 'm']
     rate: Annotated[Array, 'm']  # theta^' [1/s]
-    look: Annotated[Array, 'm']  # scratch of the look at the excitation
+    work: Annotated[Array, 'm']  # scratch of the inverse iteration
+
+
+class Sample(NamedTuple):
+    """Telemetry of one sample; a run is a matrix of such rows."""
+
+    qr: Annotated[Array, 'n']  # rad
+    dqr: Annotated[Array, 'n']  # rad/s
+    xi1: Annotated[Array, 'n']  # rad
+    xi2: Annotated[Array, 'n']  # rad/s
+    torque: Annotated[Array, 'n']  # commanded, after the limit, N m
+    disturbance: Annotated[Array, 'n']  # d^3, N m
+    bound: Annotated[Array, 'n']  # k(t), rad
+    cuts: Annotated[Array, 'n']  # 0, or LEVEL_CUT + RATE_CUT as the torque was cut in this sample
+    estimate: Annotated[Array, 'm']  # theta^; NaN for a disturbance column that has been rejected
+    lyapunov: Annotated[Array, 4]  # terms of (29): error, kinetic, parameters, disturbance; or NaN
+    lambda_min: Cell  # of the present window's Phi
+    latched: Cell  # 0 or 1
 
 
 state_of, state_size = view_of(State), size_of(State)
 signals_of, signals_size = view_of(Signals), size_of(Signals)
+sample_of, sample_size = view_of(Sample), size_of(Sample)

@@ -1,9 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The dynamic surface: virtual control (18) with (15), and the filter (13) that follows it."""
+"""Errors and surfaces: virtual control (15), (18) with its filter (13), and the linear one of (35).
+
+xi1 = q - qr,   xi2 = dq - alpha2,   lambda alpha2' = beta2 - alpha2,   alpha2(0) = beta2(0)
+"""
 
 from math import exp, pi, sin
 
+import numpy as np
+
 from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.law.settings import LINEAR, Settings
+from blf_dsc_controller.law.state import Signals, State
 
 
 @inner
@@ -21,8 +28,8 @@ def virtual_control(
     """beta2 = -(K/2) xi1 sinc(pi xi1^2 / k_c^2) - mu xi1 + dqr   [rad/s], (15) and (18).
 
     (15) is printed as a quotient that is 0/0 at xi1 = 0; sin s cos s = sin(2 s)/2 turns it into a
-    sinc.  Its barrier part falls to zero AT the bound, where mu alone carries it, and would change
-    sign beyond: it is left at zero there.
+    sinc.  Its barrier part falls to zero at the bound, where only mu acts, and would change sign
+    beyond: it is zero there.
     """
     ratio = xi1 / bound
     barrier_part = 0.0
@@ -33,5 +40,64 @@ def virtual_control(
 
 @inner
 def filter_gain(time_constant: float, dt: float) -> float:
-    """Share of the way to its held input that a first-order lag goes in `dt` [s], exactly."""
+    """Exact gain 1 - exp(-dt / time_constant) of a first-order lag with a held input."""
     return 1.0 - exp(-dt / time_constant)
+
+
+@inner
+def filtered_surface(settings: Settings, state: State, signals: Signals, dt: float) -> None:
+    """beta2 of (18) and alpha2' of the filter (13); `filter_step` moves alpha2 itself.
+
+    beta2 is held for the sample, in which alpha2' decays from (beta2 - alpha2) / lambda by the
+    factor exp(-dt / lambda).  The torque is held too, so it uses the mean of alpha2': with
+    lambda = 2 dt the initial value would be 27 % too large.
+    """
+    gain = filter_gain(settings.time_constant, dt)
+    for i in range(settings.n):
+        signals.beta2[i] = virtual_control(
+            signals.xi1[i],
+            signals.bound[i],
+            settings.K[i],
+            settings.mu[i],
+            signals.dqr[i] + signals.narrowing[i] * signals.xi1[i],
+        )
+        if state.samples[0] == 0.0:
+            state.alpha2[i] = signals.beta2[i]
+        signals.dalpha2[i] = gain * (signals.beta2[i] - state.alpha2[i]) / dt
+
+
+@inner
+def linear_surface(settings: Settings, state: State, signals: Signals, dq: np.ndarray) -> None:
+    """alpha2 = dqr - lambda_s z1 of (35), and its derivative, which needs ddqr."""
+    for i in range(settings.n):
+        state.alpha2[i] = signals.dqr[i] - settings.K[i] * signals.xi1[i]
+        signals.beta2[i] = state.alpha2[i]
+        signals.dalpha2[i] = signals.ddqr[i] - settings.K[i] * (dq[i] - signals.dqr[i])
+
+
+@inner
+def compute_errors(
+    settings: Settings,
+    state: State,
+    signals: Signals,
+    dt: float,
+    q: np.ndarray,
+    dq: np.ndarray,
+) -> None:
+    """Errors xi1 and xi2, and the surface between them."""
+    for i in range(settings.n):
+        signals.xi1[i] = q[i] - signals.qr[i]
+    if settings.surface == LINEAR:
+        linear_surface(settings, state, signals, dq)
+    else:
+        filtered_surface(settings, state, signals, dt)
+    for i in range(settings.n):
+        signals.xi2[i] = dq[i] - state.alpha2[i]
+
+
+@inner
+def filter_step(settings: Settings, state: State, signals: Signals, dt: float) -> None:
+    """Move alpha2 of the filter (13) by `dt` [s], exactly for the held beta2."""
+    gain = filter_gain(settings.time_constant, dt)
+    for i in range(settings.n):
+        state.alpha2[i] += gain * (signals.beta2[i] - state.alpha2[i])

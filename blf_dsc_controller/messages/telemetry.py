@@ -12,8 +12,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from blf_dsc_controller.law.rejected_columns import Refusal
-from blf_dsc_controller.law.sample import Sample
+from blf_dsc_controller.law.rejected_columns import RejectedColumn
+from blf_dsc_controller.law.state import Sample
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.encoders import (
@@ -125,7 +125,7 @@ class PlantTelemetry:
         return topics.CLOCK, encode_clock(stamp)
 
 
-def encode_rejected_columns(stamp: int, columns: Sequence[Refusal]) -> bytes:
+def encode_rejected_columns(stamp: int, columns: Sequence[RejectedColumn]) -> bytes:
     """Return /diagnostics at a time [ns] with the reason for each rejected column."""
     types = typestore().types
     key_value = types['diagnostic_msgs/msg/KeyValue']

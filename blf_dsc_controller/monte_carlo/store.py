@@ -29,6 +29,7 @@ from blf_dsc_controller.compiled.jit import cache_folder
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.monte_carlo.runs import Columns
 from blf_dsc_controller.monte_carlo.study import Study, load_study, write_study
+from blf_dsc_controller.simulation.loop import run_loop
 
 _STUDY = 'study.yaml'
 _VERSIONS = 'versions.json'
@@ -57,7 +58,7 @@ def versions() -> dict[str, str]:
     """What the numbers depend on beside the configuration."""
     return {
         'blf_dsc_controller': blf_dsc_controller.__version__,
-        'kernels': cache_folder().name,
+        'kernels': cache_folder(run_loop).name,
         'numpy': np.__version__,
     }
 

@@ -14,8 +14,8 @@ from std_srvs.srv import Trigger
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law import factory as assembly
-from blf_dsc_controller.law.controller import Controller, respond
-from blf_dsc_controller.law.rejected_columns import refusals
+from blf_dsc_controller.law.controller import Controller, update
+from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.decoders import JointStateDecoder
 from blf_dsc_controller.messages.errors import MessageError
@@ -109,7 +109,7 @@ class ControllerNode(ManagedNode):
 
     def configure(self) -> None:
         """Compile the law; create the topics of the loop the first time."""
-        process.log_compilation(self.get_logger(), respond)
+        process.log_compilation(self.get_logger(), update)
         self.guard = Guard(self.config, *self._clocks)
         for warning in config_warnings(self.config):
             self.get_logger().warning(warning)
@@ -199,7 +199,7 @@ class ControllerNode(ManagedNode):
         return guard.update(stamp, self._decoder.values), stamp
 
     def _publish_telemetry(self, guard: Guard, stamp: int) -> None:
-        if guard.controller.state.judged[0] != self._columns_checked:
+        if guard.controller.state.columns_checked[0] != self._columns_checked:
             self._report_rejected_columns(guard)
         if not self.config.telemetry.enabled:
             return
@@ -216,11 +216,11 @@ class ControllerNode(ManagedNode):
             self._publish(self._monitor.message(stamp, sample, guard.ratio, sample.bound))
 
     def _report_rejected_columns(self, guard: Guard) -> None:
-        self._columns_checked = bool(guard.controller.state.judged[0])
-        self._status.refusals = refusals(guard.controller, self._estimates)
-        for refusal in self._status.refusals:
-            self.get_logger().warning(f'{refusal}')
-        if self._status.refusals:
+        self._columns_checked = bool(guard.controller.state.columns_checked[0])
+        self._status.rejected = rejected_columns(guard.controller, self._estimates)
+        for column in self._status.rejected:
+            self.get_logger().warning(f'{column}')
+        if self._status.rejected:
             self._report()
 
     def _command(self, torque: np.ndarray) -> None:

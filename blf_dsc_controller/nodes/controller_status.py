@@ -9,7 +9,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
-from blf_dsc_controller.law.rejected_columns import Refusal
+from blf_dsc_controller.law.rejected_columns import RejectedColumn
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.names import PHASE, REASON, REJECTED, STOPS
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher
@@ -38,14 +38,14 @@ class ControllerStatus:
 
     Attributes:
         journal: publisher of `~/journal`.
-        refusals: disturbance columns that are not estimated, and why.
+        rejected: disturbance columns that are not estimated, and why.
         trajectories: accepted and rejected trajectories.
     """
 
     def __init__(self, node: Node, joints: Sequence[str]) -> None:
         """Create the publishers of a node that controls `joints`."""
         self.journal = create_publisher(node, topics.JOURNAL)
-        self.refusals: tuple[Refusal, ...] = ()
+        self.rejected: tuple[RejectedColumn, ...] = ()
         self.trajectories: TrajectoryInput | None = None
         self._joints = tuple(joints)
         self._diagnostics = DiagnosticsPublisher(node, joints, topics.STATE)
@@ -132,8 +132,8 @@ class ControllerStatus:
         state = guard.controller.state
         learning = 'latched' if state.latched[0] else 'not yet excited'
         values = {'lambda_min': f'{state.lambda_min[0]:.3g}', 'learning': learning}
-        values |= {f'{REJECTED}{refusal.column}': f'{refusal}' for refusal in self.refusals}
-        if self.refusals:
-            columns = ', '.join(refusal.column for refusal in self.refusals)
+        values |= {f'{REJECTED}{one.column}': f'{one}' for one in self.rejected}
+        if self.rejected:
+            columns = ', '.join(one.column for one in self.rejected)
             return self._diagnostics.status('learning', WARN, f'not estimated: {columns}', values)
         return self._diagnostics.status('learning', OK, learning, values)

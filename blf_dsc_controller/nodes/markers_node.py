@@ -14,7 +14,7 @@ from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from blf_dsc_controller.arms.two_link_pose import points, tip_radius
+from blf_dsc_controller.arms.two_link_geometry import points, tip_radius
 from blf_dsc_controller.configuration.nodes import MarkersConfig
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.decoders import JointStateDecoder

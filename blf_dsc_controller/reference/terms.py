@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.views import borrowed, part
+from blf_dsc_controller.compiled.views import part, view
 
 SINUSOIDS = 0
 SPLINE = 1
@@ -196,9 +196,9 @@ def evaluate(
 
 @kernel
 def _sample(vector: np.ndarray, times: np.ndarray, out: np.ndarray) -> None:
-    view = borrowed(vector)
+    uncounted = view(vector)
     for k in range(times.size):
-        evaluate(view, times[k], out[k, 0], out[k, 1], out[k, 2])
+        evaluate(uncounted, times[k], out[k, 0], out[k, 1], out[k, 2])
 
 
 def sampled(vector: np.ndarray, times: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from blf_dsc_controller.bags.batch import decode_arrays, decode_joint_states
 from blf_dsc_controller.bags.content import Content, TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import estimate_names
-from blf_dsc_controller.law.sample import Sample
+from blf_dsc_controller.law.state import Sample
 from blf_dsc_controller.messages.cdr import JointStateLayout
 from blf_dsc_controller.messages.encoders import JOINT_STATE_FIELDS
 from blf_dsc_controller.messages.names import LAMBDA_MIN, LATCHED

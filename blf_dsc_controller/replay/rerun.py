@@ -18,8 +18,8 @@ import numpy as np
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import estimate_names
-from blf_dsc_controller.law.sample import Sample, sample_of
 from blf_dsc_controller.law.settings import Settings
+from blf_dsc_controller.law.state import Sample, sample_of
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.messages.monitor import Monitor
 from blf_dsc_controller.messages.telemetry import DECIMATION

@@ -18,7 +18,7 @@ from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, TopicMes
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import begin, controller_of
-from blf_dsc_controller.law.sample import Sample
+from blf_dsc_controller.law.state import Sample
 from blf_dsc_controller.messages.cdr import JointStateLayout
 from blf_dsc_controller.messages.decoders import columns_of as places_of
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE, JOINT_STATES, TRACKING_ERROR

@@ -14,7 +14,7 @@ from blf_dsc_controller.configuration.params_file import dumps
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.factory import estimate_names, model_of
-from blf_dsc_controller.law.rejected_columns import refusals
+from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import Event, EventType, Journal
 from blf_dsc_controller.messages.monitor import Monitor
@@ -61,7 +61,7 @@ def write_bag(
             if topic not in handles:
                 handles[topic] = bag.add_topic(topic.resolved, topic.type, [topic.offered])
             bag.write(handles[topic], raw, stamp)
-        rejected = refusals(record.controller, estimate_names(config))
+        rejected = rejected_columns(record.controller, estimate_names(config))
         if rejected:
             stamp = START + int(record.stamps[-1])
             topic = topics.DIAGNOSTICS

@@ -14,15 +14,16 @@ import numpy as np
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.compiled.layout import pack
-from blf_dsc_controller.compiled.views import borrowed, part
+from blf_dsc_controller.compiled.views import part, view
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.law.controller import Controller, decide
+from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import begin, controller_of, estimate_names
-from blf_dsc_controller.law.rejected_columns import refusals
-from blf_dsc_controller.law.sample import Sample, sample_of, tell_energies
+from blf_dsc_controller.law.lyapunov import fill_energies
+from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.law.settings import settings_of
-from blf_dsc_controller.law.state import signals_of, state_of
+from blf_dsc_controller.law.state import Sample, sample_of, signals_of, state_of
+from blf_dsc_controller.law.step import step
 from blf_dsc_controller.messages.monitor import LYAPUNOV_TERMS
 from blf_dsc_controller.messages.names import LAMBDA_MIN, LATCHED
 from blf_dsc_controller.messages.telemetry import disturbance_names
@@ -49,7 +50,7 @@ class Record:
     Attributes:
         stamps: time since the start (k,) [ns].
         measurements: [q, dq, applied torque of the last interval] (k, 3 n).
-        samples: rows of `law.sample` (k, s).
+        samples: rows of `law.state.Sample` (k, s).
         truths: [P, tau_dist, q, dq] (k, p + 3 n).
         config: configuration of the controller.
         controller: the controller after the run.
@@ -94,7 +95,7 @@ class Record:
             ),
             truth=Series(true, self.stamps, self.truths[:, : len(true)]),
             monitor=Series(LYAPUNOV_TERMS, self.stamps, values['lyapunov']),
-            rejected={one.column: f'{one}' for one in refusals(self.controller, names)},
+            rejected={one.column: f'{one}' for one in rejected_columns(self.controller, names)},
         )
 
 
@@ -127,10 +128,10 @@ def run_loop(
     law_state = state_of(state, law)
     law_signals = signals_of(signals, law)
     plant, now = plants.plant_views(plant_settings, plant_state)
-    reference_view, measured = borrowed(reference), borrowed(measurements)
-    rows = borrowed(samples)
-    chosen = metrics_settings_of(borrowed(metrics_settings))
-    found = metrics_of(borrowed(metrics), chosen)
+    reference_view, measured = view(reference), view(measurements)
+    rows = view(samples)
+    chosen = metrics_settings_of(view(metrics_settings))
+    found = metrics_of(view(metrics), chosen)
     dt = plant.period_ns * 1e-9
     for k in range(first, last + 1):
         row = 0 if truths is None else k - first
@@ -138,10 +139,10 @@ def run_loop(
         t = (k * plant.period_ns) * 1e-9
         plants.draw_noise(plant, now, rng)
         plants.observe(plant, now, measurement)
-        decide(law, reference_view, law_state, law_signals, t, dt, measurement, sample)
+        step(law, reference_view, law_state, law_signals, t, dt, measurement, sample)
         if truths is not None:
-            plants.truth(plant, now, borrowed(truths)[row])
-            tell_energies(law, law_state, law_signals, part(measurement, 0, (law.n,)), sample)
+            plants.truth(plant, now, view(truths)[row])
+            fill_energies(law, law_state, law_signals, part(measurement, 0, (law.n,)), sample)
         if chosen.n > 0:
             if found.finite[0] == 1.0:
                 update_metrics(chosen, found, t, measurement, sample)

@@ -10,7 +10,7 @@ import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
-from blf_dsc_controller.law.sample import Sample
+from blf_dsc_controller.law.state import Sample
 
 
 class MetricsSettings(NamedTuple):

@@ -10,9 +10,8 @@ import numpy as np
 
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.compiled.views import part
-from blf_dsc_controller.law.sample import sample_of
 from blf_dsc_controller.law.settings import LINEAR, settings_of
-from blf_dsc_controller.law.state import signals_of, state_of
+from blf_dsc_controller.law.state import sample_of, signals_of, state_of
 
 SUSPECT = 1
 OUTSIDE = 2

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.law import funnel
+from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import COLUMN_GAIN, settings_of_config
 from blf_dsc_controller.law.settings import LINEAR
@@ -67,7 +67,7 @@ def problems(controller: Controller, config: ControllerConfig, t: float) -> Iter
     """Why a running law cannot take a valid configuration at the time t [s], a sentence each."""
     state, p, learning = controller.state, controller.settings.p, config.learning
     errors, torques = np.abs(controller.sample.xi1), np.abs(controller.sample.torque)
-    funnel.narrow(settings_of_config(config), controller.signals, t)
+    barrier.update_bound(settings_of_config(config), controller.signals, t)
     for joint, error, bound in zip(config.joints, errors, controller.signals.bound, strict=True):
         if not error < bound:
             yield (

@@ -11,7 +11,7 @@ from arbitrary_case import arbitrary
 from closed_loop_case import P, R, closed_loop, controller, plant, recommended
 from plain_law import dynamics
 
-from blf_dsc_controller.law import barrier, funnel, surface
+from blf_dsc_controller.law import barrier, surface
 
 K0, K, RATE = 0.02, 0.0015, 2.0
 WEIGHT, LIMIT = 1000.0, 2e4
@@ -24,7 +24,7 @@ NARROWING = {
 
 def at(t, **changes):
     case = arbitrary(0, **changes)
-    funnel.narrow(case.settings, case.signals, t)
+    barrier.update_bound(case.settings, case.signals, t)
     return case.settings, case.signals
 
 

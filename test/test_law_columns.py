@@ -8,7 +8,7 @@ import pytest
 from closed_loop_case import closed_loop, controller, plant, recommended
 from paper_case import configured, run
 
-from blf_dsc_controller.law import columns
+from blf_dsc_controller.law import prediction
 from blf_dsc_controller.law.factory import column_names, controller_of
 from blf_dsc_controller.law.settings import LATCHES
 from sim_plant.plant import plant_of
@@ -26,7 +26,7 @@ def test_columns_are_those_of_their_names():
     t, dq = 0.7, np.array([0.3, -0.1])
     rest = np.full((2, settings.m), np.nan)
 
-    columns.fill(settings, t, dq, rest)
+    prediction.fill_columns(settings, t, dq, rest)
 
     value = {'bias': (1.0, 1.0), 'viscous': dq, 'coulomb': np.tanh(dq / 0.2)}
     for w in (1.5, 4.0):

@@ -25,10 +25,16 @@ from closed_loop_case import (
 from numba.core.runtime import _nrt_python, rtsys
 
 from blf_dsc_controller.compiled.layout import pack
-from blf_dsc_controller.law.controller import respond
-from blf_dsc_controller.law.sample import sample_of, sample_size
+from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.settings import Settings, settings_of
-from blf_dsc_controller.law.state import signals_of, signals_size, state_of, state_size
+from blf_dsc_controller.law.state import (
+    sample_of,
+    sample_size,
+    signals_of,
+    signals_size,
+    state_of,
+    state_size,
+)
 
 SHAPES = [(1, 1), (2, 3), (3, 4), (6, 30)]
 SIZES = ('n', 'p', 'm', 'tones', 'model')
@@ -96,7 +102,7 @@ def test_state_has_the_shapes_it_is_documented_with():
         {
             (1,): 'samples cursor rows latched latch_time lambda_min',
             (n,): 'alpha2 torque disturbance',
-            (m,): 'estimate b weakest',
+            (m,): 'estimate b min_eigenvector',
             (n, p): 'momentum',
             (n, m): 'rest',
             (n, m + 1): 'filter1 filter2',
@@ -118,7 +124,7 @@ def test_signals_have_the_shapes_they_are_documented_with():
             (n, m): 'rest',
             (n, m + 1): 'row',
             (m, m): 'Phi factor',
-            (m,): 'b rate look',
+            (m,): 'b rate work',
         },
     )
 
@@ -162,7 +168,7 @@ def test_a_restored_loop_continues_bit_for_bit():
 @numba.njit
 def many_updates(model, settings, reference, state, signals, measurement, sample, count):
     for k in range(count):
-        respond(model, settings, reference, state, signals, k * 1e-3, 1e-3, measurement, sample)
+        update(model, settings, reference, state, signals, k * 1e-3, 1e-3, measurement, sample)
 
 
 def test_updates_in_a_compiled_loop_allocate_nothing():

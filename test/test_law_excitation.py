@@ -8,7 +8,7 @@ import pytest
 from arbitrary_case import arbitrary
 from closed_loop_case import closed_loop, controller, plant, quick
 
-from blf_dsc_controller.law import cholesky, excitation, window
+from blf_dsc_controller.law import cholesky, excitation
 
 
 def excitation_matrix(random, m, rank):
@@ -63,7 +63,7 @@ def excited_case(seed):
     random = np.random.default_rng(seed)
     for _ in range(settings.window):
         signals.row[:] = random.normal(size=signals.row.shape)
-        cursor = window.push(state.ring, cursor, state.running, state.fresh, signals.row)
+        cursor = excitation.push_row(state.ring, cursor, state.running, state.fresh, signals.row)
     return case
 
 
@@ -75,7 +75,7 @@ def excited():
 def settled_look(case, t):
     """The looks of a while: the first starts from no direction in particular."""
     for _ in range(50):
-        excitation.look(*case, t)
+        excitation.update_excitation(*case, t)
 
 
 @pytest.mark.parametrize('seed', range(5))
@@ -85,8 +85,8 @@ def test_inverse_iteration_finds_the_smallest_eigenvalue_and_its_direction(seed)
 
     values, vectors = np.linalg.eigh(case.signals.Phi)
     assert case.state.lambda_min[0] == pytest.approx(values[0], rel=1e-10)
-    assert abs(vectors[:, 0] @ case.state.weakest) == pytest.approx(1.0, rel=1e-10)
-    assert np.linalg.norm(case.state.weakest) == pytest.approx(1.0, rel=1e-14)
+    assert abs(vectors[:, 0] @ case.state.min_eigenvector) == pytest.approx(1.0, rel=1e-10)
+    assert np.linalg.norm(case.state.min_eigenvector) == pytest.approx(1.0, rel=1e-14)
 
 
 def test_warm_started_iteration_follows_the_smallest_eigenvalue_along_a_loop():

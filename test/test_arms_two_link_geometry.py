@@ -7,18 +7,19 @@ import numpy as np
 import pytest
 from plain_law import dynamics
 
-from blf_dsc_controller.arms.two_link_urdf import urdf
+from blf_dsc_controller.arms.two_link_geometry import urdf
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from sim_plant.plant import parameters_of
 
 CONFIG = build(PlantConfig, {'arm.l1': 1.1, 'arm.l2': 0.7, 'arm.m1': 0.6, 'arm.m2': 0.45})
+ARM = (1.1, 0.7), (0.6, 0.45)
 
 
 def test_mujoco_reads_the_very_arm_from_it():
     """Mass matrix and gravity torque of the URDF, compiled by MuJoCo, against the model's."""
     mujoco = pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
-    text = urdf('arm', CONFIG.joints, CONFIG.arm, (0.0, 0.0))
+    text = urdf('arm', CONFIG.joints, *ARM, (0.0, 0.0))
     model = mujoco.MjModel.from_xml_string(text)
     model.opt.gravity[:] = (0.0, 0.0, -CONFIG.arm.gravity)
     data = mujoco.MjData(model)
@@ -35,6 +36,6 @@ def test_mujoco_reads_the_very_arm_from_it():
 
 
 def test_a_limit_of_the_motors_is_told_where_there_is_one():
-    assert 'effort="12"' in urdf('arm', ('a', 'b'), CONFIG.arm, (12.0, 0.0))
-    assert urdf('arm', ('a', 'b'), CONFIG.arm, (12.0, 0.0)).count('<limit') == 1
-    assert '<joint name="b"' in urdf('arm', ('a', 'b'), CONFIG.arm, (0.0, 0.0))
+    assert 'effort="12"' in urdf('arm', ('a', 'b'), *ARM, (12.0, 0.0))
+    assert urdf('arm', ('a', 'b'), *ARM, (12.0, 0.0)).count('<limit') == 1
+    assert '<joint name="b"' in urdf('arm', ('a', 'b'), *ARM, (0.0, 0.0))

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-from blf_dsc_controller.law import window
+from blf_dsc_controller.law import excitation
 
 
 class Window:
@@ -24,7 +24,7 @@ class Window:
     def push(self, row):
         oldest = self.ring[self.cursor].copy()
         self.naive += terms(row) - terms(oldest)
-        self.cursor = window.push(self.ring, self.cursor, self.running, self.fresh, row)
+        self.cursor = excitation.push_row(self.ring, self.cursor, self.running, self.fresh, row)
         self.history = [*self.history, row][-len(self.ring) :]
 
     def direct(self):
@@ -34,7 +34,7 @@ class Window:
     def average(self):
         m = len(self.running)
         Phi, b = np.full((m, m), np.nan), np.full(m, np.nan)
-        window.average(self.running, len(self.history), Phi, b)
+        excitation.average_window(self.running, len(self.history), Phi, b)
         return Phi, b
 
 

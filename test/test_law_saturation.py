@@ -8,7 +8,7 @@ import pytest
 from arbitrary_case import arbitrary
 from closed_loop_case import closed_loop, controller, plant, quick, recommended, record
 
-from blf_dsc_controller.law.saturation import LEVEL_CUT, RATE_CUT, cut_torque
+from blf_dsc_controller.law.saturation import LEVEL_CUT, RATE_CUT, saturate
 
 DT = 2e-3  # s: with 500 N m/s, 1 N m from sample to sample
 
@@ -19,8 +19,8 @@ def cut(demand, last, *, level=10.0, rate=500.0, samples=7.0):
     case.state.torque[0] = last
     case.state.level_cuts[0] = case.state.rate_cuts[0] = 0.0
     case.signals.demand[0] = demand
-    is_cut = cut_torque(case.settings, case.state, case.signals, DT)
-    return case.signals.torque[0], case.signals.cuts[0], is_cut, case.state
+    saturated = saturate(case.settings, case.state, case.signals, DT)
+    return case.signals.torque[0], case.signals.cuts[0], saturated, case.state
 
 
 @pytest.mark.parametrize(
@@ -36,10 +36,10 @@ def cut(demand, last, *, level=10.0, rate=500.0, samples=7.0):
         (13.0, 14.0, 10.0, LEVEL_CUT + RATE_CUT),  # the level has been lowered below the last one
     ],
 )
-def test_torque_is_cut_at_its_level_and_at_its_rate(demand, last, torque, cuts):
-    answer, told, is_cut, state = cut(demand, last)
+def test_torque_saturated_at_its_level_and_at_its_rate(demand, last, torque, cuts):
+    answer, told, saturated, state = cut(demand, last)
     assert (answer, told) == (torque, cuts)
-    assert bool(is_cut) is (cuts > 0.0)
+    assert bool(saturated) is (cuts > 0.0)
     assert state.level_cuts[0] == (cuts in {LEVEL_CUT, LEVEL_CUT + RATE_CUT})
     assert state.rate_cuts[0] == (cuts in {RATE_CUT, LEVEL_CUT + RATE_CUT})
 
@@ -74,7 +74,7 @@ def test_over_a_loop_no_step_is_larger_than_the_rate_and_every_cut_is_counted_by
     np.testing.assert_array_equal(law.state.level_cuts, 0.0)
 
 
-def test_while_one_joint_is_cut_the_tracking_error_teaches_nothing():
+def test_while_one_joint_saturated_the_tracking_error_teaches_nothing():
     law = controller(quick(rate_limit=np.array([0.1, 0.0])))
     loop = closed_loop(law, plant(), 0.3)
     next(loop)

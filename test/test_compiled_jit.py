@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Machine code is cached by the contents of every file that a kernel is compiled from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numba
+import pytest
+
+import blf_dsc_controller
+from blf_dsc_controller.compiled import jit
+from blf_dsc_controller.law.controller import update
+from blf_dsc_controller.simulation.loop import run_loop
+from blf_dsc_controller.supervision.checks import check_sample
+from sim_plant.kernels import step_plant
+
+PACKAGE = Path(blf_dsc_controller.__file__).resolve().parent
+LAW = {f'{PACKAGE.name}/law/{name}.py' for name in ('barrier', 'prediction', 'step', 'settings')}
+PLANT = {f'sim_plant/{name}.py' for name in ('actuator', 'dynamics', 'integrator', 'kernels')}
+REFERENCE = {f'{PACKAGE.name}/reference/terms.py'}
+ALWAYS = {f'{PACKAGE.name}/{name}.py' for name in ('compiled/layout', 'arms/two_link')}
+
+
+def names(kernel):
+    return {str(path.relative_to(PACKAGE.parent)) for path in jit.dependencies(kernel)[0]}
+
+
+def test_a_kernel_depends_on_the_files_it_is_compiled_from():
+    assert names(update) >= LAW | REFERENCE | ALWAYS
+    assert names(run_loop) >= LAW | REFERENCE | PLANT | ALWAYS
+    assert names(step_plant) >= PLANT | ALWAYS
+
+
+def test_a_kernel_does_not_depend_on_other_files():
+    """A change of the plant does not compile the law again, nor one of the configuration any."""
+    assert not names(update) & PLANT
+    assert not names(step_plant) & (LAW | REFERENCE)
+    assert not any('configuration' in name for name in names(run_loop))
+
+
+def test_a_kernel_depends_on_its_constants():
+    constants = jit.dependencies(check_sample)[1]
+    assert {'SUSPECT=1', 'OUTSIDE=2', 'LINEAR=1'} <= constants
+
+
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is cached')
+@pytest.mark.parametrize('kernel', [update, run_loop, check_sample, step_plant])
+def test_the_cache_of_a_kernel_is_where_its_dependencies_say(kernel):
+    """What a kernel calls is defined before it, or an edit would run on stale machine code."""
+    assert str(jit.cache_folder(kernel)) in kernel._cache.cache_path
