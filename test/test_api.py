@@ -27,8 +27,7 @@ def test_example_of_the_readme_runs(tmp_path):
     assert (tmp_path / 'pictures' / 'tracking.png').stat().st_size > 0
 
 
-def test_every_public_name_is_there_and_documented():
-    assert set(blf.__all__) <= set(re.findall(r'\w+', README.read_text())) | {'PlantConfig', 'Run'}
+def test_every_public_name_is_documented():
     for name in blf.__all__:
         assert getattr(blf, name).__doc__, name
 

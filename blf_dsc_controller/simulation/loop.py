@@ -68,7 +68,7 @@ class Record:
         return sample_of(self.samples[row], self.controller.settings)
 
     def run(self) -> Run:
-        """All samples as a `Run`, with the truth and the terms of (29) at each of them."""
+        """All samples as a `Run`, with the truth and, where the law knows it, the terms of (29)."""
         config = self.config
         settings, names = self.controller.settings, estimate_names(config)
         columns = sample_of(np.arange(self.samples.shape[1], dtype=np.float64), settings)
@@ -79,6 +79,7 @@ class Record:
         learned = [values[name] for name in ('estimate', 'disturbance', 'lambda_min', 'latched')]
         position, velocity, _ = np.split(self.measurements, 3, axis=1)
         true = (*names[: settings.p], *disturbances)
+        monitor = Series(LYAPUNOV_TERMS, self.stamps, values['lyapunov'])
         return Run(
             joints=config.joints,
             stamp=self.stamps,
@@ -94,7 +95,7 @@ class Record:
                 (*names, *disturbances, LAMBDA_MIN, LATCHED), self.stamps, np.hstack(learned)
             ),
             truth=Series(true, self.stamps, self.truths[:, : len(true)]),
-            monitor=Series(LYAPUNOV_TERMS, self.stamps, values['lyapunov']),
+            monitor=monitor if settings.truth_known else None,
             rejected={one.column: f'{one}' for one in rejected_columns(self.controller, names)},
         )
 
