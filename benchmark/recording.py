@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from harness import Contestant, Ratio, own_graph, ratio, wait_for
 
-from blf_dsc_controller.messages.encoders import JointStateEncoder
+from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import STREAM
 
 _ROUNDS = 5

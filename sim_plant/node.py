@@ -27,8 +27,8 @@ from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.arms.two_link_geometry import urdf
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder
-from blf_dsc_controller.messages.errors import MessageError
+from blf_dsc_controller.messages.cdr import MessageError
+from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder
 from blf_dsc_controller.messages.telemetry import DECIMATION, Message, PlantTelemetry
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher
@@ -223,7 +223,7 @@ class PlantNode(ManagedNode):
             return
         if not self._offered and self.state_label != 'inactive':
             return
-        if not self.input.take(size, self._decoder.data, self.plant.sample):
+        if not self.input.take(size, self._decoder.values, self.plant.sample):
             self.get_logger().error(self.input.problem, throttle_duration_sec=1.0)
             return
         if not self._offered:

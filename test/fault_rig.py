@@ -13,9 +13,13 @@ import numpy as np
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder, JointStateDecoder
-from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
-from blf_dsc_controller.messages.errors import MessageError
+from blf_dsc_controller.messages.cdr import MessageError
+from blf_dsc_controller.messages.codecs import (
+    Float64MultiArrayDecoder,
+    Float64MultiArrayEncoder,
+    JointStateDecoder,
+    JointStateEncoder,
+)
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.command_input import TorqueInput
 from sim_plant.plant import plant_of
@@ -96,7 +100,7 @@ class Rig:
         for raw in self.actuate(Float64MultiArrayEncoder(2).encode(torque)):
             decoder = Float64MultiArrayDecoder(2)
             size = decoder.decode(raw)
-            self.input.take(size, decoder.data, self.plant.sample)
+            self.input.take(size, decoder.values, self.plant.sample)
 
     def step(self, count=1):
         """Go on by milliseconds: measure, deliver, look at the clock now and then, move."""

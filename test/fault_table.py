@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from fault_rig import JOINTS, MILLISECOND, Rig
 
-from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.supervision.reasons import Phase, Reason
 
 LEAD = 40  # samples that run well before the fault

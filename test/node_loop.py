@@ -18,8 +18,11 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder, JointStateDecoder
-from blf_dsc_controller.messages.encoders import JointStateEncoder
+from blf_dsc_controller.messages.codecs import (
+    Float64MultiArrayDecoder,
+    JointStateDecoder,
+    JointStateEncoder,
+)
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -113,7 +116,7 @@ def torques(commands):
     rows = []
     for raw in commands:
         assert decoder.decode(raw) == 2
-        rows.append(decoder.data.copy())
+        rows.append(decoder.values.copy())
     return np.array(rows)
 
 

@@ -26,7 +26,7 @@ from rclpy.parameter import Parameter
 from ros_rig import RosRig, activate, deactivate
 
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.supervision.reasons import Phase

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from blf_dsc_controller.bags.writer import BagWriter
-from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import (
     BOUND,
     COMMANDS,

@@ -25,7 +25,7 @@ from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.bags.context import Losses, read_context
 from blf_dsc_controller.bags.errors import BagError
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.messages.encoders import JointStateEncoder
+from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import FOREVER, JOINT_STATES, Quality
 from blf_dsc_controller.messages.types import definition
 from blf_dsc_controller.nodes import recorder_node

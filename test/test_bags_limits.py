@@ -15,7 +15,7 @@ from blf_dsc_controller.bags.errors import DiskFullError
 from blf_dsc_controller.bags.recover import recover
 from blf_dsc_controller.bags.ring import Ring
 from blf_dsc_controller.bags.writer import BagWriter, SplitLimits
-from blf_dsc_controller.messages.encoders import JointStateEncoder
+from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import BOUND, JOINT_STATES, STREAM
 
 SECOND = 1_000_000_000

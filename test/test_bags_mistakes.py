@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Reader
 
 from blf_dsc_controller.bags.context import ATTACHMENT, read_context
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.messages.encoders import JointStateEncoder
+from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE, JOINT_STATES
 from blf_dsc_controller.messages.types import definition
 

@@ -11,7 +11,7 @@ from synthetic_bag import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthet
 
 from blf_dsc_controller.bags.errors import BagError, UnreadableMessageError
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.messages.encoders import JointStateEncoder
+from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
     DIAGNOSTICS,

@@ -19,7 +19,7 @@ from blf_dsc_controller.bags.recover import recover
 from blf_dsc_controller.bags.salvage import Salvage
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES
 from blf_dsc_controller.messages.types import typestore
 

@@ -14,10 +14,9 @@ from mcap.stream_reader import StreamReader
 
 from blf_dsc_controller.bags.errors import BagError
 from blf_dsc_controller.bags.writer import BagWriter
-from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
-from blf_dsc_controller.messages.errors import UnknownTypeError
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import BOUND, COMMANDS, JOINT_STATES, Quality
-from blf_dsc_controller.messages.types import Definition
+from blf_dsc_controller.messages.types import Definition, UnknownTypeError
 
 START = 1_734_000_000_000_000_000
 MILLISECOND = 1_000_000

@@ -8,17 +8,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder, JointStateDecoder
-from blf_dsc_controller.messages.encoders import (
-    Float64MultiArrayEncoder,
-    JointStateEncoder,
-    encode_clock,
-)
-from blf_dsc_controller.messages.errors import (
+from blf_dsc_controller.messages.cdr import (
     DuplicatedJointError,
     MessageError,
     MissingJointError,
     ShortArrayError,
+)
+from blf_dsc_controller.messages.codecs import (
+    Float64MultiArrayDecoder,
+    Float64MultiArrayEncoder,
+    JointStateDecoder,
+    JointStateEncoder,
+    encode_clock,
 )
 from blf_dsc_controller.messages.types import typestore
 
@@ -181,7 +182,7 @@ def test_multi_array_round_trip(data):
 
     assert encoder.encode(data) == typestore().serialize_cdr(message, message.__msgtype__)
     assert decoder.decode(encoder.encode(data)) == len(data)
-    assert decoder.data.tolist() == data
+    assert decoder.values.tolist() == data
 
 
 @pytest.mark.parametrize('little_endian', [False, True])
@@ -195,14 +196,14 @@ def test_multi_array_with_dimensions(little_endian):
     )
     decoder = Float64MultiArrayDecoder(3)
     assert decoder.decode(raw) == 3
-    assert decoder.data.tolist() == [1, 2, 3]
+    assert decoder.values.tolist() == [1, 2, 3]
 
 
 def test_multi_array_of_another_size_returns_its_length():
     decoder = Float64MultiArrayDecoder(2)
     decoder.decode(Float64MultiArrayEncoder(2).encode([1, 2]))
     assert decoder.decode(Float64MultiArrayEncoder(3).encode([4, 5, 6])) == 3
-    assert decoder.data.tolist() == [1, 2]
+    assert decoder.values.tolist() == [1, 2]
 
 
 def test_truncated_multi_array_is_rejected():

@@ -16,9 +16,13 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from blf_dsc_controller.messages.cdr import JointStateLayout
-from blf_dsc_controller.messages.decoders import Float64MultiArrayDecoder, JointStateDecoder
-from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.cdr import joint_state_layout
+from blf_dsc_controller.messages.codecs import (
+    Float64MultiArrayDecoder,
+    Float64MultiArrayEncoder,
+    JointStateDecoder,
+    JointStateEncoder,
+)
 from blf_dsc_controller.messages.topics import TOPICS
 from blf_dsc_controller.messages.types import definition
 from blf_dsc_controller.nodes.endpoints import message_class
@@ -66,8 +70,8 @@ def message_of(frame_id, names):
 
 def without_padding(raw):
     """The meaningful pieces of a JointState: rclpy leaves its padding bytes uninitialised."""
-    layout = JointStateLayout.parse(raw)
-    return [raw[:2], raw[4:12], layout.frame_id, layout.names] + [
+    layout = joint_state_layout(raw)
+    return [raw[:2], raw[4:12], layout.names] + [
         raw[array.offset : array.offset + 8 * array.size] for array in layout.arrays
     ]
 
@@ -109,4 +113,4 @@ def test_multi_array_in_both_directions():
     assert list(deserialize_message(raw, Float64MultiArray).data) == data
     decoder = Float64MultiArrayDecoder(3)
     assert decoder.decode(serialize_message(Float64MultiArray(data=data))) == 3
-    assert decoder.data.tolist() == data
+    assert decoder.values.tolist() == data

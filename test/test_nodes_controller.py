@@ -17,7 +17,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import ConfigurationError, OutsideBarrierError
 from blf_dsc_controller.law import factory as assembly
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.encoders import JointStateEncoder
+from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 
 NOTHING = (0.0, 0.0)

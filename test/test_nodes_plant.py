@@ -13,7 +13,7 @@ from node_loop import NodeLoop, states
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from sim_plant.node import PlantNode
 from sim_plant.plant import plant_of
 

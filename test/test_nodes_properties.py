@@ -21,7 +21,7 @@ from lifecycle_msgs.srv import ChangeState
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from sim_plant.node import PlantNode
 

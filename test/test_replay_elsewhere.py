@@ -15,7 +15,7 @@ from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.errors import BagError, UnreadableMessageError
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.messages.encoders import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE, JOINT_STATES
 from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.replay.what_if import what_if

@@ -16,8 +16,7 @@ from blf_dsc_controller.bags.errors import BagError, UnreadableMessageError
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.law.factory import controller_of, estimate_names
-from blf_dsc_controller.messages.decoders import JointStateDecoder
-from blf_dsc_controller.messages.encoders import JointStateEncoder
+from blf_dsc_controller.messages.codecs import JointStateDecoder, JointStateEncoder
 from blf_dsc_controller.messages.journal import Event, EventType, decode
 from blf_dsc_controller.messages.telemetry import ControllerTelemetry
 from blf_dsc_controller.messages.topics import (

@@ -24,7 +24,7 @@ from blf_dsc_controller.analysis.style import (
     formula,
     head,
 )
-from blf_dsc_controller.messages.names import DISTURBANCE
+from blf_dsc_controller.messages.topics import DISTURBANCE
 from blf_dsc_controller.run import Run
 
 _SIZE = (6.2, 2.6)  # inches

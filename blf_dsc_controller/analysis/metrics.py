@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.messages.names import BIAS, COMPUTE_TIME, DISTURBANCE, LAMBDA_MIN, LATCHED
+from blf_dsc_controller.messages.topics import BIAS, COMPUTE_TIME, DISTURBANCE, LAMBDA_MIN, LATCHED
 from blf_dsc_controller.run import Floats, Run
 
 MOMENTS = (5, 10, 20, 40, 60)

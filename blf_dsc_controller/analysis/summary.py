@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from blf_dsc_controller.analysis.metrics import Estimates, Metrics, estimates_of, measure
-from blf_dsc_controller.messages.names import COMPUTE_TIME, LATE_STEPS, LATENCY
+from blf_dsc_controller.messages.topics import COMPUTE_TIME, LATE_STEPS, LATENCY
 from blf_dsc_controller.run import Floats, Run, Series
 
 Summary = dict[str, Any]

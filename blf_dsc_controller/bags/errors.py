@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.messages.errors import MessageError, MissingJointError
+from blf_dsc_controller.messages.cdr import MessageError, MissingJointError
 
 
 class BagError(BlfDscError):

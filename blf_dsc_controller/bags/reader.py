@@ -11,15 +11,16 @@ import numpy as np
 
 from blf_dsc_controller.bags.batch import decode_arrays, decode_joint_states, joint_names
 from blf_dsc_controller.bags.content import Content, TopicMessages, read_content
-from blf_dsc_controller.messages.names import COMPUTE_TIME, REJECTED
 from blf_dsc_controller.messages.topics import (
     BOUND,
     COMMANDS,
+    COMPUTE_TIME,
     DIAGNOSTICS,
     JOINT_STATES,
     LEARNING,
     MONITOR,
     REFERENCE,
+    REJECTED,
     TIMING,
     TRACKING_ERROR,
     TRUTH,

@@ -18,8 +18,7 @@ from blf_dsc_controller.bags.mcap_writer import CHANNEL_RECORD
 from blf_dsc_controller.bags.metadata import parse_qualities
 from blf_dsc_controller.bags.salvage import Loss, Salvage
 from blf_dsc_controller.bags.writer import BagWriter
-from blf_dsc_controller.messages.errors import UnknownTypeError
-from blf_dsc_controller.messages.types import Definition, definition
+from blf_dsc_controller.messages.types import Definition, UnknownTypeError, definition
 
 
 @dataclass

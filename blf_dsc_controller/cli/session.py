@@ -27,8 +27,8 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.names import RATIO
 from blf_dsc_controller.messages.telemetry import DECIMATION
+from blf_dsc_controller.messages.topics import RATIO
 from blf_dsc_controller.nodes.endpoints import qos_profile
 
 # In the order in which they start. They end in reverse: the recorder last, to get every message.

@@ -11,7 +11,7 @@ from __future__ import annotations
 from struct import unpack_from
 from typing import NamedTuple
 
-from blf_dsc_controller.messages.errors import MessageError
+from blf_dsc_controller.errors import BlfDscError
 
 NANOSECONDS = 1_000_000_000
 """Of one second."""
@@ -19,6 +19,32 @@ NANOSECONDS = 1_000_000_000
 ORIGIN = 4  # alignment is counted from here
 STAMP_OFFSET = 4  # of a message that starts with a std_msgs/Header
 _BYTE_ORDERS = {b'\x00\x00': '>', b'\x00\x01': '<'}
+
+
+class MessageError(BlfDscError):
+    """A serialised message that cannot be used."""
+
+
+class MissingJointError(MessageError):
+    """An expected joint is not among the names of the message."""
+
+    def __init__(self, joint: str, names: tuple[str, ...]) -> None:
+        self.joint = joint
+        self.names = names
+        self.fact = (
+            f'joint {joint!r} is not in the message, which names {", ".join(names) or "none"}'
+        )
+        super().__init__(
+            f'{self.fact}: set the parameter `joints` to names from this list, or publish the joint'
+        )
+
+
+class DuplicatedJointError(MessageError):
+    """An expected joint is named more than once."""
+
+
+class ShortArrayError(MessageError):
+    """An array of the message does not hold one value for each name."""
 
 
 class Doubles(NamedTuple):
@@ -29,42 +55,37 @@ class Doubles(NamedTuple):
     size: int
 
 
-class JointStateLayout(NamedTuple):
-    """Names of a sensor_msgs/JointState and the places of its arrays."""
+class Layout(NamedTuple):
+    """Byte order of a message, names in it, and the places of its arrays."""
 
     byte_order: str
-    frame_id: str
     names: tuple[str, ...]
-    arrays: tuple[Doubles, Doubles, Doubles]  # position, velocity, effort
+    arrays: tuple[Doubles, ...]
 
-    @classmethod
-    def parse(cls, raw: bytes | bytearray) -> JointStateLayout:
-        """Find them in `raw`; MessageError if it is not plain CDR or ends too early."""
-        cursor = _Cursor(raw)
+
+def joint_state_layout(raw: bytes | bytearray) -> Layout:
+    """Find position, velocity and effort of a sensor_msgs/JointState.
+
+    Raises:
+        MessageError: not plain CDR, or `raw` ends too early.
+    """
+    cursor = _Cursor(raw)
+    cursor.unsigned()
+    cursor.unsigned()
+    cursor.text()
+    names = tuple(cursor.text() for _ in range(cursor.unsigned()))
+    return Layout(cursor.byte_order, names, tuple(cursor.doubles() for _ in range(3)))
+
+
+def array_layout(raw: bytes | bytearray) -> Layout:
+    """Find the values of a std_msgs/Float64MultiArray behind its dimensions; MessageError too."""
+    cursor = _Cursor(raw)
+    for _ in range(cursor.unsigned()):
+        cursor.text()
         cursor.unsigned()
         cursor.unsigned()
-        frame_id = cursor.text()
-        names = tuple(cursor.text() for _ in range(cursor.unsigned()))
-        arrays = cursor.doubles(), cursor.doubles(), cursor.doubles()
-        return cls(cursor.byte_order, frame_id, names, arrays)
-
-
-class ArrayLayout(NamedTuple):
-    """Place of the values of a std_msgs/Float64MultiArray."""
-
-    byte_order: str
-    data: Doubles
-
-    @classmethod
-    def parse(cls, raw: bytes | bytearray) -> ArrayLayout:
-        """Find it in `raw` behind the dimensions; MessageError as for a joint state."""
-        cursor = _Cursor(raw)
-        for _ in range(cursor.unsigned()):
-            cursor.text()
-            cursor.unsigned()
-            cursor.unsigned()
-        cursor.unsigned()
-        return cls(cursor.byte_order, cursor.doubles())
+    cursor.unsigned()
+    return Layout(cursor.byte_order, (), (cursor.doubles(),))
 
 
 class _Cursor:

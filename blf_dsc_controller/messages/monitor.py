@@ -14,8 +14,8 @@ from blf_dsc_controller.law.lyapunov import ExponentialBound
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Sample
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.encoders import JointStateEncoder
-from blf_dsc_controller.messages.names import DISTANCE, LAMBDA_MIN, LATCHED, LYAPUNOV, RATIO
+from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.topics import DISTANCE, LAMBDA_MIN, LATCHED, LYAPUNOV, RATIO
 
 LYAPUNOV_TERMS = tuple(
     LYAPUNOV + term for term in ('barrier', 'velocity', 'parameters', 'disturbance')

@@ -16,12 +16,12 @@ from blf_dsc_controller.law.rejected_columns import RejectedColumn
 from blf_dsc_controller.law.state import Sample
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.cdr import NANOSECONDS
-from blf_dsc_controller.messages.encoders import (
+from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateEncoder,
     encode_clock,
 )
-from blf_dsc_controller.messages.names import (
+from blf_dsc_controller.messages.topics import (
     COMPUTE_TIME,
     DISTURBANCE,
     LAMBDA_MIN,

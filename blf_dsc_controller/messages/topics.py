@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics of the package: name, message type, quality of service.
+"""The topics of the package: name, message type, quality of service, names of their values.
 
 Nodes, offline writer and reader share this table, so that a bag made without ROS holds the same
 topics as a recording of the running nodes.
@@ -69,7 +69,7 @@ FLOAT64_MULTI_ARRAY = 'std_msgs/msg/Float64MultiArray'
 LATEST = Quality(depth=1)
 STREAM = Quality(depth=5000)
 HISTORY = Quality(depth=5000, durability='transient_local')
-LATCHED = Quality(depth=1, durability='transient_local')
+LATCHED_QUALITY = Quality(depth=1, durability='transient_local')
 DIAGNOSTIC = Quality(depth=10)
 
 # Transient local: a recorder may be matched a moment after the controller.
@@ -78,8 +78,10 @@ COMMANDS = Topic(CONTROLLER, '~/commands', FLOAT64_MULTI_ARRAY, STREAM, LATEST)
 REFERENCE = Topic(CONTROLLER, '~/reference', JOINT_STATE, STREAM, STREAM)
 TRACKING_ERROR = Topic(CONTROLLER, '~/tracking_error', JOINT_STATE, STREAM, STREAM)
 LEARNING = Topic(CONTROLLER, '~/learning', JOINT_STATE, STREAM, STREAM)
-BOUND = Topic(CONTROLLER, '~/bound', JOINT_STATE, HISTORY, LATCHED)
-STATE = Topic(CONTROLLER, '~/state', 'diagnostic_msgs/msg/DiagnosticStatus', LATCHED, LATCHED)
+BOUND = Topic(CONTROLLER, '~/bound', JOINT_STATE, HISTORY, LATCHED_QUALITY)
+STATE = Topic(
+    CONTROLLER, '~/state', 'diagnostic_msgs/msg/DiagnosticStatus', LATCHED_QUALITY, LATCHED_QUALITY
+)
 MONITOR = Topic(CONTROLLER, '~/monitor', JOINT_STATE, HISTORY, STREAM)
 TRUTH = Topic(PLANT, '~/truth', JOINT_STATE, HISTORY, STREAM)
 TIMING = Topic(PLANT, '~/timing', JOINT_STATE, STREAM, STREAM)
@@ -87,7 +89,9 @@ CLOCK = Topic(PLANT, '/clock', 'rosgraph_msgs/msg/Clock', STREAM, LATEST)
 DIAGNOSTICS = Topic(
     CONTROLLER, '/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', DIAGNOSTIC, DIAGNOSTIC
 )
-ROBOT_DESCRIPTION = Topic(PLANT, 'robot_description', 'std_msgs/msg/String', LATCHED, LATCHED)
+ROBOT_DESCRIPTION = Topic(
+    PLANT, 'robot_description', 'std_msgs/msg/String', LATCHED_QUALITY, LATCHED_QUALITY
+)
 """The URDF; not in TOPICS, since the offline writer does not write it."""
 JOINT_TRAJECTORY = Topic(
     CONTROLLER,
@@ -115,3 +119,26 @@ TOPICS = (
     CLOCK,
     DIAGNOSTICS,
 )
+
+# In the vectors learning, truth, timing, monitor.
+DISTURBANCE = 'disturbance '  # followed by the joint
+BIAS = 'bias '  # followed by the joint: a constant torque that is learned
+POSITION = 'position '  # followed by the joint
+VELOCITY = 'velocity '  # followed by the joint
+RATIO = 'max_error_ratio '  # followed by the joint: the largest |xi1| / k_c so far
+DISTANCE = 'distance_to_bound '  # followed by the joint: k_c - |xi1|
+LYAPUNOV = 'V '  # followed by the term of (29), or by `bound` for (32)
+LAMBDA_MIN = 'lambda_min'
+LATCHED = 'latched'
+COMPUTE_TIME = 'compute_time'
+LATENCY = 'latency'
+LATENESS = 'lateness'
+LATE_STEPS = 'late_steps'
+
+# In /diagnostics.
+REJECTED = 'rejected '  # followed by the column that is not estimated
+
+# In ~/state.
+PHASE = 'phase'
+REASON = 'reason'
+STOPS = 'stops'  # since the node was configured

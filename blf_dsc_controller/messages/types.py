@@ -9,13 +9,16 @@ from typing import NamedTuple
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from blf_dsc_controller.messages.errors import UnknownTypeError
+from blf_dsc_controller.errors import BlfDscError
 
 
-@functools.cache
-def typestore() -> Typestore:
-    """Types of Jazzy's common interfaces, to which further types can be registered."""
-    return get_typestore(Stores.ROS2_JAZZY)
+class UnknownTypeError(BlfDscError):
+    """A message type without a known definition."""
+
+    def __init__(self, type_name: str) -> None:
+        super().__init__(
+            f'message type {type_name!r} is not known here: its definition is needed to record it'
+        )
 
 
 class Definition(NamedTuple):
@@ -24,6 +27,12 @@ class Definition(NamedTuple):
     text: str  # with those of all nested types
     hash: str  # RIHS01_...
     encoding: str = 'ros2msg'
+
+
+@functools.cache
+def typestore() -> Typestore:
+    """Types of Jazzy's common interfaces, to which further types can be registered."""
+    return get_typestore(Stores.ROS2_JAZZY)
 
 
 def definition(type_name: str) -> Definition:

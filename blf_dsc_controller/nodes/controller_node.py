@@ -17,8 +17,8 @@ from blf_dsc_controller.law import factory as assembly
 from blf_dsc_controller.law.controller import Controller, update
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.decoders import JointStateDecoder
-from blf_dsc_controller.messages.errors import MessageError
+from blf_dsc_controller.messages.cdr import MessageError
+from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.messages.monitor import Monitor
 from blf_dsc_controller.messages.telemetry import DECIMATION, ControllerTelemetry, Message
 from blf_dsc_controller.nodes import parameters, process

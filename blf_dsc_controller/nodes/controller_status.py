@@ -11,7 +11,7 @@ from rclpy.node import Node
 
 from blf_dsc_controller.law.rejected_columns import RejectedColumn
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.names import PHASE, REASON, REJECTED, STOPS
+from blf_dsc_controller.messages.topics import PHASE, REASON, REJECTED, STOPS
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import create_publisher
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput

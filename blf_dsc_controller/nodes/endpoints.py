@@ -19,9 +19,8 @@ from rclpy.timer import Timer
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_msg
 
-from blf_dsc_controller.messages.errors import UnknownTypeError
 from blf_dsc_controller.messages.topics import Quality, Topic
-from blf_dsc_controller.messages.types import typestore
+from blf_dsc_controller.messages.types import UnknownTypeError, typestore
 
 
 def message_class(type_name: str) -> Any:

@@ -11,8 +11,8 @@ from blf_dsc_controller.bags.context import MESSAGES, Losses
 from blf_dsc_controller.bags.errors import BagError, DiskFullError
 from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.configuration.params_file import dumps
-from blf_dsc_controller.messages.errors import UnknownTypeError
 from blf_dsc_controller.messages.topics import Quality
+from blf_dsc_controller.messages.types import UnknownTypeError
 from blf_dsc_controller.nodes.bag_sinks import BagSink, RingSink
 from blf_dsc_controller.nodes.endpoints import (
     create_steady_timer,

@@ -14,12 +14,13 @@ from blf_dsc_controller.bags.content import Content, TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.state import Sample
-from blf_dsc_controller.messages.cdr import JointStateLayout
-from blf_dsc_controller.messages.encoders import JOINT_STATE_FIELDS
-from blf_dsc_controller.messages.names import LAMBDA_MIN, LATCHED
+from blf_dsc_controller.messages.cdr import joint_state_layout
+from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS
 from blf_dsc_controller.messages.telemetry import disturbance_names
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
+    LAMBDA_MIN,
+    LATCHED,
     LEARNING,
     MONITOR,
     REFERENCE,
@@ -113,7 +114,7 @@ def _of_monitor(monitored: Mapping[int, bytes], count: int) -> Columns:
     if not monitored:
         return {}
     messages = list(monitored.values())
-    names = JointStateLayout.parse(messages[0]).names
+    names = joint_state_layout(messages[0]).names
     _, values = decode_joint_states(TopicMessages(MONITOR.resolved, raw=messages), names, ())
     table = np.full((count, len(names)), np.nan)
     table[list(monitored)] = values[:, 0]
@@ -200,7 +201,7 @@ def _is_doubtful(alike: NDArray[np.bool_], exact: NDArray[np.bool_]) -> NDArray[
 def _compare_stamped(
     recorded: TopicMessages, states: States, columns: Columns, *, is_named: bool
 ) -> Comparison:
-    names = JointStateLayout.parse(recorded.raw[0]).names
+    names = joint_state_layout(recorded.raw[0]).names
     stamp, values = decode_joint_states(recorded, names, ())
     rows = np.searchsorted(states.stamp, stamp)
     known = np.isin(stamp, states.stamp)

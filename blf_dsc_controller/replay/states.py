@@ -12,8 +12,8 @@ import numpy as np
 from blf_dsc_controller.bags.batch import decode_joint_states
 from blf_dsc_controller.bags.content import Content
 from blf_dsc_controller.bags.errors import UnreadableMessageError
-from blf_dsc_controller.messages.decoders import JointStateDecoder
-from blf_dsc_controller.messages.errors import MessageError
+from blf_dsc_controller.messages.cdr import MessageError
+from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.messages.topics import JOINT_STATES, LEARNING, REFERENCE, TRACKING_ERROR
 from blf_dsc_controller.run import Floats, Stamps
 

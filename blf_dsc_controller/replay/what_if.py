@@ -19,8 +19,8 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.law.state import Sample
-from blf_dsc_controller.messages.cdr import JointStateLayout
-from blf_dsc_controller.messages.decoders import columns_of as places_of
+from blf_dsc_controller.messages.cdr import joint_state_layout
+from blf_dsc_controller.messages.codecs import columns_of as places_of
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE, JOINT_STATES, TRACKING_ERROR
 from blf_dsc_controller.replay.rerun import columns_of
 from blf_dsc_controller.replay.states import States, law_states
@@ -159,7 +159,7 @@ def _command_values(content: Content, recorded: TopicMessages, joints: Sequence[
         return decode_joint_states(recorded, joints, ('effort',))[1][:, 2]
     size = array_size(recorded)
     values = decode_arrays(recorded, size)
-    names = JointStateLayout.parse(content.topics[JOINT_STATES].raw[0]).names
+    names = joint_state_layout(content.topics[JOINT_STATES].raw[0]).names
     if values is None or size not in (len(joints), len(names)):
         reason = (
             f'{recorded.name} has {size} values, but there are {len(joints)} joints, and '

@@ -20,7 +20,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError, OutsideBarrierError
 from blf_dsc_controller.law.factory import begin, controller_of
-from blf_dsc_controller.messages.errors import (
+from blf_dsc_controller.messages.cdr import (
     DuplicatedJointError,
     MessageError,
     MissingJointError,
