@@ -9,6 +9,7 @@ for as long as the messages have the same names and lengths.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from operator import itemgetter
 from struct import Struct, pack
 
 import numpy as np
@@ -113,30 +114,18 @@ class _Decoder:
         self.values = np.full(size, np.nan)
         self._length = -1  # of the messages whose layout is known
 
-    def _is_known(self, raw: bytes) -> bool:
-        """Whether a message has the known layout."""
-        if len(raw) != self._length:
-            return False
-        for part, content in self._fixed:  # noqa: SIM110 - all() takes twice as long
-            if raw[part] != content:
-                return False
-        return True
-
     def _learn(self, raw: bytes, layout: Layout, index: NDArray[np.intp], names_at: int) -> None:
         """Know the layout of a message from here on; `index` of the values in the grid."""
         sizes = [array.size_offset for array in layout.arrays]
-        parts = [slice(2), slice(names_at, sizes[0] + 4), *(slice(at, at + 4) for at in sizes[1:])]
-        self._fixed = [(part, raw[part]) for part in parts]
+        self._extents = [(0, 2), (names_at, sizes[0] + 4), *((at, at + 4) for at in sizes[1:])]
+        self._parts = itemgetter(*(slice(*extent) for extent in self._extents))
+        self._fixed = self._parts(raw)
         self._index = index
         self._order = layout.byte_order
         self._buffer = bytearray(_MARGIN + len(raw))
         self._grid = np.frombuffer(self._buffer, self._order + 'f8', len(self._buffer) // 8)
         self._grid[0] = np.nan
         self._length = len(raw)
-
-    def _take(self, raw: bytes) -> None:
-        self._buffer[_MARGIN:] = raw
-        self._grid.take(self._index, out=self.values, mode='clip')
 
     def _grid_of(self, raw: Sequence[bytes]) -> Floats | None:
         """Grid of each of N messages (N, :); None if one does not have the known layout."""
@@ -147,9 +136,9 @@ class _Decoder:
         margin = bytes(rest) + pack(self._order + 'd4x', np.nan)
         joined = margin.join([b'', *raw, b''])
         table = np.frombuffer(joined, np.uint8, count * 8 * row, rest).reshape(count, -1)
-        for part, content in self._fixed:
-            start = _MARGIN + (part.start or 0)
-            if (table[:, start : start + len(content)] != np.frombuffer(content, np.uint8)).any():
+        for (start, end), fixed in zip(self._extents, self._fixed, strict=True):
+            part = table[:, _MARGIN + start : _MARGIN + end]
+            if (part != np.frombuffer(fixed, np.uint8)).any():
                 return None
         return np.frombuffer(joined, self._order + 'f8', count * row, rest).reshape(count, -1)
 
@@ -182,11 +171,12 @@ class JointStateDecoder(_Decoder):
             DuplicatedJointError: one of `joints` is named twice.
             ShortArrayError: an array is not as long as the names.
         """
-        if not self._is_known(raw):
+        if len(raw) != self._length or self._parts(raw) != self._fixed:
             layout = joint_state_layout(raw)
             self._learn(raw, layout, self._index_in(layout), STAMP_OFFSET + 8)
             self._stamp = _STAMPS[layout.byte_order]
-        self._take(raw)
+        self._buffer[_MARGIN:] = raw
+        self._grid.take(self._index, out=self.values, mode='clip')
         seconds, nanoseconds = self._stamp.unpack_from(raw, STAMP_OFFSET)
         return int(seconds * NANOSECONDS + nanoseconds)
 
@@ -228,13 +218,14 @@ class Float64MultiArrayDecoder(_Decoder):
         Raises:
             MessageError: not plain CDR, or `raw` ends too early.
         """
-        if not self._is_known(raw):
+        if len(raw) != self._length or self._parts(raw) != self._fixed:
             layout = array_layout(raw)
             (array,) = layout.arrays
             if array.size != self.values.size:
                 return array.size
             self._learn(raw, layout, np.arange(array.size) + _place(array), ORIGIN)
-        self._take(raw)
+        self._buffer[_MARGIN:] = raw
+        self._grid.take(self._index, out=self.values, mode='clip')
         return self.values.size
 
     def decode_all(self, raw: Sequence[bytes]) -> Floats | None:
