@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from blf_dsc_controller.analysis.summary import format_table
-from blf_dsc_controller.cli.run import announce_compilation, make_folder
+from blf_dsc_controller.cli.run import announced_compilation, make_folder
 from blf_dsc_controller.configuration.params_file import locate
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.monte_carlo import executors
@@ -24,7 +24,6 @@ from blf_dsc_controller.monte_carlo.report import (
 from blf_dsc_controller.monte_carlo.runs import KEPT, Columns, warm_up
 from blf_dsc_controller.monte_carlo.store import Span, Store, require_pyarrow
 from blf_dsc_controller.monte_carlo.study import load_study
-from blf_dsc_controller.simulation.loop import run_loop
 
 _PAUSE_IN_A_LOG = 10.0  # s between two states of the bar
 
@@ -54,8 +53,8 @@ def _run_study(options: Namespace) -> None:
         size = options.chunk or executors.chunk_size(study.settings.runs, engine.workers)
         spans = store.missing(size)
         if spans:
-            announce_compilation(run_loop)
-            warm_up(study)
+            with announced_compilation():
+                warm_up(study)
             _compute(store, spans, engine)
         _report(store)
 

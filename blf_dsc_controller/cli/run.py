@@ -6,10 +6,12 @@ from __future__ import annotations
 import itertools
 import sys
 from argparse import Namespace
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numba.core import event
 
 from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.summary import format_table, summarize, write_summary
@@ -28,7 +30,7 @@ from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import Record, run_loop, simulate
+from blf_dsc_controller.simulation.loop import Record, simulate
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from sim_plant import kernels as plant_kernels
 
@@ -123,7 +125,6 @@ def _configuration(options: Namespace) -> LoopConfig:
 
 
 def _run_offline(config: LoopConfig, bag: Path) -> None:
-    announce_compilation(run_loop)
     progress = Progress(config.plant)
 
     def show(record: Record, rows: int) -> None:
@@ -132,7 +133,8 @@ def _run_offline(config: LoopConfig, bag: Path) -> None:
         estimate = record.sample(rows - 1).estimate[:3]
         progress.show(record.stamps[rows - 1] * 1e-9, errors.max(), estimate)
 
-    record = simulate(config.controller, config.plant, show)
+    with announced_compilation():
+        record = simulate(config.controller, config.plant, show)
     progress.close()
     for rejected in rejected_columns(record.controller, estimate_names(config.controller)):
         print(f'warning: {rejected}')
@@ -143,14 +145,38 @@ def _run_over_ros(config: LoopConfig, out: Path, domain: int | None) -> bool:
     """Run the three nodes; False if a signal ended the run."""
     from blf_dsc_controller.cli.session import run_session
 
-    announce_compilation(update, *plant_kernels.KERNELS)
+    if not is_compiled(update, *plant_kernels.KERNELS):
+        _print_notice()
     return run_session(config.plant, out, domain)
 
 
-def announce_compilation(*kernels: Any) -> None:
-    """Print a notice if the kernels must be compiled first, a wait that would look like a hang."""
-    if not is_compiled(*kernels):
-        print(COMPILATION_NOTICE, file=sys.stderr, flush=True)
+class _CompilationListener(event.Listener):  # type: ignore[misc]
+    """Prints a notice when numba begins to compile what it does not find in its cache."""
+
+    announced = False
+
+    def on_start(self, _event: object) -> None:
+        if not self.announced:
+            _print_notice()
+        self.announced = True
+
+    def on_end(self, _event: object) -> None:
+        pass
+
+
+def announced_compilation() -> AbstractContextManager[object]:
+    """Print a notice if a kernel is compiled in this context, a wait that would look like a hang.
+
+    Kernels have a version for each type of arguments, of which some may be in the cache.
+    """
+    listener: AbstractContextManager[object] = event.install_listener(
+        'numba:compile', _CompilationListener()
+    )
+    return listener
+
+
+def _print_notice() -> None:
+    print(COMPILATION_NOTICE, file=sys.stderr, flush=True)
 
 
 def _report(out: Path) -> None:
