@@ -15,8 +15,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.errors import BagError
-from blf_dsc_controller.bags.recover import recover
-from blf_dsc_controller.bags.salvage import Salvage
+from blf_dsc_controller.bags.recover import Salvage, recover
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
@@ -130,7 +129,8 @@ def test_a_corrupted_chunk_is_skipped_and_reported_with_its_times_and_messages(w
     assert (chunk.message_start_time, chunk.message_end_time) == (start, stop)
     assert (loss.start, loss.end) == (start, stop)
     assert loss.messages == {JOINT_STATES.resolved: PER_CHUNK, COMMANDS.resolved: PER_CHUNK}
-    assert recovery.missed == {JOINT_STATES.resolved: PER_CHUNK, COMMANDS.resolved: PER_CHUNK}
+    missed = {topic: one.missed for topic, one in recovery.missing.items()}
+    assert missed == {JOINT_STATES.resolved: PER_CHUNK, COMMANDS.resolved: PER_CHUNK}
     remaining = [one for one in read(whole.parent) if not start <= one[1] <= stop]
     assert read(recovery.path) == remaining
     assert 'from 1734000000.010000000 s (2024-12-12 10:40:00 UTC)' in str(loss)

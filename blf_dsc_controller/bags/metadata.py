@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 import yaml
@@ -16,10 +16,6 @@ VERSION = 9
 ROS_DISTRO = 'jazzy'
 
 _DURATIONS = ('deadline', 'lifespan', 'liveliness_lease_duration')
-_QUALITY = (
-    *('history', 'depth', 'reliability', 'durability', 'deadline', 'lifespan'),
-    *('liveliness', 'liveliness_lease_duration'),
-)
 
 
 @dataclass
@@ -107,23 +103,22 @@ def parse_qualities(text: str) -> tuple[Quality, ...]:
     """Qualities of service in such a text; none, if it is something else."""
     try:
         return tuple(
-            Quality(
-                **{name: tree[name] for name in _QUALITY if name not in _DURATIONS},
-                **{
-                    name: tree[name]['sec'] * NANOSECONDS + tree[name]['nsec']
-                    for name in _DURATIONS
-                },
-            )
+            Quality(**{one.name: _plain(tree[one.name]) for one in fields(Quality)})
             for tree in yaml.safe_load(text) or ()
         )
     except (yaml.YAMLError, KeyError, TypeError, AttributeError):
         return ()
 
 
+def _plain(value: Any) -> Any:
+    """A duration in ns; everything else as it is."""
+    return value['sec'] * NANOSECONDS + value['nsec'] if isinstance(value, dict) else value
+
+
 def _quality_trees(offered: Iterable[Quality]) -> list[dict[str, Any]]:
     trees = []
     for quality in offered:
-        tree = {name: getattr(quality, name) for name in _QUALITY}
+        tree = {'history': quality.history, **asdict(quality)}  # in the order of rosbag2
         for name in _DURATIONS:
             seconds, nanoseconds = divmod(tree[name], NANOSECONDS)
             tree[name] = {'sec': seconds, 'nsec': nanoseconds}

@@ -1,47 +1,97 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make a clean bag of what a damaged one still holds; the damaged one is only read."""
+"""Make a clean bag of what a damaged one still holds; the damaged one is only read.
+
+Where a record makes no sense, the next chunk is searched for byte by byte: a chunk holds its length
+three times, so that hardly anything else looks like one.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import datetime, timezone
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
+from struct import Struct
+from struct import error as struct_error
+from typing import NamedTuple
 
-from mcap.records import Channel
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Schema
 
 from blf_dsc_controller.bags.context import ATTACHMENT, MESSAGES, RECORD, Losses
 from blf_dsc_controller.bags.errors import BagError
-from blf_dsc_controller.bags.mcap_reader import Data, StoredMessage
+from blf_dsc_controller.bags.mcap_reader import (
+    HEAD,
+    MAGIC,
+    Data,
+    MalformedRecordError,
+    StoredMessage,
+    messages_in,
+    read_record,
+    record_head,
+    unpack,
+)
 from blf_dsc_controller.bags.mcap_writer import CHANNEL_RECORD
 from blf_dsc_controller.bags.metadata import parse_qualities
-from blf_dsc_controller.bags.salvage import Loss, Salvage
 from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.types import Definition, UnknownTypeError, definition
+
+_TIMES_AND_SIZES = 28  # bytes from the start of a chunk's content to its compression
+_COMPRESSIONS = (b'', b'zstd', b'lz4')
+_CHUNK_BYTE = bytes([Opcode.CHUNK])
+_INDEX = Struct('<HI')  # channel number, bytes of the entries
+_INDEX_ENTRY = 16  # bytes
+_U32 = Struct('<I')
+_U64 = Struct('<Q')
+
+
+class Piece(NamedTuple):
+    """A whole record of a file, or a gap: bytes that make no sense (opcode 0)."""
+
+    at: int
+    size: int
+    opcode: int
+    content: bytes = b''
+    reason: str = ''
+
+
+@dataclass
+class Loss:
+    """A part of a file that could not be recovered."""
+
+    file: str
+    at: int  # offset [bytes]
+    size: int  # bytes
+    reason: str
+    start: int | None = None  # earliest time of its messages [ns], None if unknown
+    end: int | None = None  # latest
+    messages: dict[str, int] = field(default_factory=dict)  # by topic, as far as the index counts
+
+    def __str__(self) -> str:
+        if self.start is None:
+            span = 'of unknown time' if self.end is None else f'before {format_time(self.end)}'
+        elif self.end is None:
+            span = f'after {format_time(self.start)}'
+        else:
+            seconds = (self.end - self.start) / NANOSECONDS
+            span = f'from {format_time(self.start)} to {format_time(self.end)} ({seconds:.3f} s)'
+        counts = ', '.join(f'{count} of {topic}' for topic, count in self.messages.items())
+        lost = f'; messages lost: {counts}' if counts else ''
+        return f'{self.file}: {self.size} bytes at byte {self.at} ({self.reason}), {span}{lost}'
 
 
 @dataclass
 class Recovery:
-    """Result of a recovery.
+    """Result of a recovery."""
 
-    Attributes:
-        path: of the clean bag.
-        messages: recovered, by topic.
-        missed: sequence numbers missing between them, by topic; None if not numbered.
-        before: sequence numbers missing before the first one, by topic.
-        losses: parts of the files that could not be read.
-        unfinished: files that were not ended properly, and the time of their last message [ns].
-        unknown: messages of topics whose name or type is lost.
-    """
-
-    path: Path
-    messages: dict[str, int] = field(default_factory=dict)
-    missed: dict[str, int | None] = field(default_factory=dict)
-    before: dict[str, int] = field(default_factory=dict)
+    path: Path  # of the clean bag
+    messages: dict[str, int] = field(default_factory=dict)  # recovered, by topic
+    missing: dict[str, Losses] = field(default_factory=dict)  # sequence numbers, by topic
     losses: list[Loss] = field(default_factory=list)
-    unfinished: list[tuple[str, int | None]] = field(default_factory=list)
-    unknown: int = 0
+    unfinished: list[tuple[str, int | None]] = field(default_factory=list)  # file, last time [ns]
+    unknown: int = 0  # messages of topics whose name or type is lost
 
     @property
     def is_whole(self) -> bool:
@@ -50,11 +100,7 @@ class Recovery:
 
 
 def recover(path: Path, out: Path) -> Recovery:
-    """Make a clean bag.
-
-    Args:
-        path: folder of the damaged bag, or one of its MCAP files.
-        out: folder of the clean bag, which must not exist yet.
+    """Make a clean bag `out` of a folder or an MCAP file.
 
     Raises:
         BagError: there is no MCAP file, or `out` exists already.
@@ -65,7 +111,7 @@ def recover(path: Path, out: Path) -> Recovery:
         raise BagError(f'{path} cannot be read as a bag: there is no MCAP file to recover')
     recovery = Recovery(out)
     with BagWriter(out, flush_interval=None) as bag:
-        transfer = _Transfer(bag)
+        transfer = _Transfer(bag, recovery.missing)
         for file in files:
             salvage = Salvage(file)
             recovery.unknown += transfer.copy(salvage)
@@ -74,34 +120,40 @@ def recover(path: Path, out: Path) -> Recovery:
                 recovery.unfinished.append((file.name, salvage.last))
         recovery.messages = bag.message_counts
         statistics = {
-            f'{MESSAGES}{topic}': f'{count} written{transfer.missing[topic].text()}'
+            f'{MESSAGES}{topic}': f'{count} written{recovery.missing[topic].text()}'
             for topic, count in recovery.messages.items()
         }
         bag.note({'recovered_from': str(path), **statistics})
-    recovery.missed = {topic: one.missed for topic, one in transfer.missing.items()}
-    recovery.before = {topic: one.before for topic, one in transfer.missing.items()}
     return recovery
 
 
+def _file_number(path: Path) -> tuple[int, str]:
+    """Order of the files of a bag: bag_10.mcap after bag_9.mcap."""
+    number = path.stem.rsplit('_', 1)[-1]
+    return (int(number) if number.isdecimal() else -1, path.name)
+
+
+@dataclass
 class _Transfer:
     """Copies the content of damaged files into a clean bag."""
 
-    def __init__(self, bag: BagWriter) -> None:
-        self._bag = bag
-        self._handles: dict[str, int] = {}
-        self.missing: dict[str, Losses] = {}
+    bag: BagWriter
+    missing: dict[str, Losses]
+    handles: dict[str, int] = field(default_factory=dict)
 
     def copy(self, salvage: Salvage) -> int:
         """Copy a file and return the number of messages whose topic is lost."""
-        with _mapped(salvage.path) as data:
-            # The index at the end, or another record, may still name the topic of a message.
-            early = [one for one in salvage.messages(data) if not self._write(salvage, one)]
+        with salvage.path.open('rb') as stream:
+            is_empty = salvage.path.stat().st_size == 0
+            data = b'' if is_empty else mmap(stream.fileno(), 0, access=ACCESS_READ)
+        # The index at the end, or another record, may still name the topic of a message.
+        early = [one for one in salvage.messages(data) if not self._write(salvage, one)]
         unknown = sum(not self._write(salvage, one) for one in early)
         for one in salvage.attachments:
             if one.name == ATTACHMENT:
-                self._bag.configure(one.data.decode(errors='replace'), one.log_time)
+                self.bag.configure(one.data.decode(errors='replace'), one.log_time)
         facts = salvage.metadata.get(RECORD, {})
-        self._bag.note({k: v for k, v in facts.items() if not k.startswith(MESSAGES)})
+        self.bag.note({k: v for k, v in facts.items() if not k.startswith(MESSAGES)})
         return unknown
 
     def _write(self, salvage: Salvage, message: StoredMessage) -> bool:
@@ -112,11 +164,11 @@ class _Transfer:
             if entries is None or 'topic' not in entries:
                 return False
             channel = Channel(number, entries['topic'], 'cdr', entries, 0)
-        handle = self._handles.get(channel.topic) or self._add_topic(salvage, channel)
+        handle = self.handles.get(channel.topic) or self._add_topic(salvage, channel)
         if handle is None:
             return False
         self.missing[channel.topic].count(sequence)
-        self._bag.write(handle, raw, log_time, publish_time, sequence)
+        self.bag.write(handle, raw, log_time, publish_time, sequence)
         return True
 
     def _add_topic(self, salvage: Salvage, channel: Channel) -> int | None:
@@ -134,23 +186,144 @@ class _Transfer:
         if channel.metadata.get('topic_type_hash'):
             known = known._replace(hash=channel.metadata['topic_type_hash'])
         offered = parse_qualities(channel.metadata.get('offered_qos_profiles', ''))
-        handle = self._bag.add_topic(channel.topic, type_name, offered, known)
-        self._handles[channel.topic] = handle
+        handle = self.bag.add_topic(channel.topic, type_name, offered, known)
+        self.handles[channel.topic] = handle
         self.missing[channel.topic] = Losses(len(offered))
         return handle
 
 
-def _file_number(path: Path) -> tuple[int, str]:
-    """Order of the files of a bag: bag_10.mcap after bag_9.mcap."""
-    number = path.stem.rsplit('_', 1)[-1]
-    return (int(number) if number.isdecimal() else -1, path.name)
+@dataclass
+class Salvage:
+    """The content of one damaged file; complete once its `messages` have been read."""
+
+    path: Path
+    schemas: dict[int, Schema] = field(default_factory=dict)  # by number in the file
+    channels: dict[int, Channel] = field(default_factory=dict)
+    attachments: list[Attachment] = field(default_factory=list)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # the later over the earlier
+    losses: list[Loss] = field(default_factory=list)
+    is_complete: bool = False  # the recording was ended properly
+    last: int | None = None  # latest time of a message [ns]
+
+    def messages(self, data: Data) -> Iterator[StoredMessage]:
+        """Every whole message of the file's content, in its order."""
+        lost_chunk: Loss | None = None
+        counts: list[tuple[Loss, int, int]] = []
+        for piece in scan(data):
+            opcode, content = piece.opcode, piece.content
+            if opcode == Opcode.CHUNK:
+                chunk, lost_chunk = read_record(opcode, content), None
+                try:
+                    records = unpack(chunk)
+                except MalformedRecordError as error:
+                    lost_chunk = self._lose(piece, f'chunk: {error}')
+                    lost_chunk.start = chunk.message_start_time
+                    lost_chunk.end = chunk.message_end_time
+                else:
+                    yield from self._messages_in(records, piece, 'part of a chunk: ')
+            elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+                record = HEAD.pack(opcode, len(content)) + content
+                yield from self._messages_in(record, piece, '')
+            elif opcode == Opcode.MESSAGE_INDEX and lost_chunk is not None:
+                number, size = _INDEX.unpack_from(content)
+                counts.append((lost_chunk, number, size // _INDEX_ENTRY))
+            elif opcode:
+                self._describe(opcode, content)
+            elif not self.is_complete:
+                self._lose(piece, piece.reason)
+        for loss, number, count in counts:
+            channel = self.channels.get(number)
+            topic = f'topic number {number}' if channel is None else channel.topic
+            loss.messages[topic] = count
+
+    def _messages_in(self, records: bytes, piece: Piece, kind: str) -> Iterator[StoredMessage]:
+        try:
+            for message in messages_in(records, self.schemas, self.channels):
+                log_time = message[2]
+                if self.losses and self.losses[-1].end is None:
+                    self.losses[-1].end = log_time
+                if self.last is None or log_time > self.last:
+                    self.last = log_time
+                yield message
+        except MalformedRecordError as error:
+            self._lose(piece, f'{kind}{error}')
+
+    def _describe(self, opcode: int, content: bytes) -> None:
+        if opcode == Opcode.ATTACHMENT:
+            self.attachments.append(read_record(opcode, content))
+        elif opcode == Opcode.METADATA:
+            record = read_record(opcode, content)
+            self.metadata.setdefault(record.name, {}).update(record.metadata)
+        elif opcode == Opcode.DATA_END:
+            self.is_complete = True
+
+    def _lose(self, piece: Piece, reason: str) -> Loss:
+        loss = Loss(self.path.name, piece.at, piece.size, reason, self.last)
+        self.losses.append(loss)
+        return loss
 
 
-@contextmanager
-def _mapped(path: Path) -> Iterator[Data]:
-    with path.open('rb') as stream:
-        if path.stat().st_size == 0:
-            yield b''
+def scan(data: Data) -> Iterator[Piece]:
+    """Whole records and gaps of a file, in its order; together all but the magic bytes."""
+    at = len(MAGIC) if data[: len(MAGIC)] == MAGIC else 0
+    while at < len(data) and not (at == len(data) - len(MAGIC) and data[at:] == MAGIC):
+        try:
+            opcode, end = _check_record(data, at)
+        except MalformedRecordError as error:
+            end = data.find(_CHUNK_BYTE, at + 1)
+            while end >= 0 and not _is_chunk(data, end):
+                end = data.find(_CHUNK_BYTE, end + 1)
+            end = len(data) if end < 0 else end
+            yield Piece(at, end - at, 0, reason=str(error))
         else:
-            with mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
-                yield data
+            content = data[at + HEAD.size : end]
+            yield Piece(at, len(content), opcode, content)
+        at = end
+
+
+def format_time(stamp: int) -> str:
+    """Log time [ns] as a plain number and as UTC; one out of range as the number alone."""
+    plain = f'{stamp // NANOSECONDS}.{stamp % NANOSECONDS:09d} s'
+    try:
+        moment = datetime.fromtimestamp(stamp // NANOSECONDS, tz=timezone.utc)
+    except (OverflowError, OSError, ValueError):
+        return plain
+    return f'{plain} ({moment:%Y-%m-%d %H:%M:%S} UTC)'
+
+
+def _check_record(data: Data, at: int) -> tuple[int, int]:
+    """Opcode and end of a record whose content fits its length, or MalformedRecordError.
+
+    Where the content does not determine its length, another record must follow.
+    """
+    opcode, end = record_head(data, at)
+    content_at = at + HEAD.size
+    if opcode == Opcode.CHUNK:
+        if not _is_chunk(data, at):
+            raise MalformedRecordError('the head of a chunk is damaged')
+    elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT):
+        read_record(opcode, data[content_at:end])
+    elif opcode == Opcode.MESSAGE_INDEX:
+        entries_at = content_at + _INDEX.size
+        if entries_at > end or entries_at + _INDEX.unpack_from(data, content_at)[1] != end:
+            raise MalformedRecordError('the record does not fit its length')
+    elif end + HEAD.size < len(data):
+        record_head(data, end)
+    return opcode, end
+
+
+def _is_chunk(data: Data, at: int) -> bool:
+    """Whether the three lengths in the head of a chunk agree, and its compression is known."""
+    name_at = at + HEAD.size + _TIMES_AND_SIZES + _U32.size
+    try:
+        _, length = HEAD.unpack_from(data, at)
+        (name_length,) = _U32.unpack_from(data, name_at - _U32.size)
+        (packed_length,) = _U64.unpack_from(data, name_at + name_length)
+    except struct_error:
+        return False
+    end = name_at + name_length + _U64.size + packed_length
+    return (
+        end == at + HEAD.size + length
+        and end <= len(data)
+        and data[name_at : name_at + name_length] in _COMPRESSIONS
+    )

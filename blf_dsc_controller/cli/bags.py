@@ -12,7 +12,6 @@ from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.bags import recover as recovering
 from blf_dsc_controller.bags.export import export as export_run
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.bags.salvage import format_time
 
 
 def report(options: Namespace) -> None:
@@ -48,14 +47,18 @@ def recover(options: Namespace) -> None:
 
 def _losses(recovery: recovering.Recovery) -> Iterator[str]:
     for topic, count in recovery.messages.items():
-        missed, before = recovery.missed[topic], recovery.before[topic]
-        gaps = f', {missed} numbers missing in between' if missed else ''
-        begun = f', {before} numbers missing before the first' if before else ''
+        missing = recovery.missing[topic]
+        gaps = f', {missing.missed} numbers missing in between' if missing.missed else ''
+        begun = f', {missing.before} numbers missing before the first' if missing.before else ''
         yield f'{topic}: {count} messages{gaps}{begun}'
     for loss in recovery.losses:
         yield f'LOST {loss}'
     for name, last in recovery.unfinished:
-        after = 'nothing in it could be read' if last is None else f'it ends at {format_time(last)}'
+        after = (
+            'nothing in it could be read'
+            if last is None
+            else f'it ends at {recovering.format_time(last)}'
+        )
         yield (
             f'{name}: the recording was not ended; {after}. What came later is not in the file: '
             'at most 0.1 s if the recorder was killed'
