@@ -86,12 +86,7 @@ class Content:
 
 
 def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Content:
-    """Read the messages of the package's topics.
-
-    Args:
-        path: folder of the bag, one of its storage files, or a ROS 1 `.bag`.
-        namespace: of the robot, if the bag holds several.
-        names: of topics that have other names in the bag.
+    """Read the messages of the package's topics from a folder, a storage file or a ROS 1 `.bag`.
 
     Raises:
         BagError: there is no bag, it is damaged, it holds no joint states or not a topic of

@@ -42,18 +42,11 @@ class Losses:
     """Counts messages of one topic that were published but not recorded, by sequence number.
 
     Each publisher has its own numbers, so that nothing is known of a topic that ever had several.
-
-    Args:
-        publishers: present number of publishers.
-
-    Attributes:
-        missed: messages between recorded ones that were not; None if unknown.
-        before: messages that a publisher had sent before its first recorded one.
     """
 
     def __init__(self, publishers: int) -> None:
-        self.missed: int | None = 0
-        self.before = 0
+        self.missed: int | None = 0  # between recorded ones; None if unknown
+        self.before = 0  # sent by a publisher before its first recorded one
         self._last = 0
         self.publishers_seen(publishers)
 
@@ -83,11 +76,8 @@ class Losses:
 class Context:
     """What a bag records of its run; empty, if another recorder made it.
 
-    Attributes:
-        path: of the bag.
-        configurations: time of storage [ns] and text of each parameter file, in turn; each holds
-            the nodes known by then.
-        facts: by name, such as `package_version`, `law`, `model`, `seed`, `clock`.
+    Each of the configurations, time of storage [ns] and text of a parameter file, holds the nodes
+    known by then. Facts are such as `package_version`, `law`, `model`, `seed`, `clock`.
     """
 
     path: Path

@@ -89,13 +89,9 @@ def messages_in(
     channels: dict[int, Channel],
     topics: Collection[str] | None = None,
 ) -> Iterator[StoredMessage]:
-    """Messages among the records of a chunk; schemas and channels are added to the dictionaries.
+    """Messages among the records of a chunk, of all topics or the given ones.
 
-    Args:
-        records: of an unpacked chunk.
-        schemas: by number.
-        channels: by number.
-        topics: whose channels and messages are wanted; None for all.
+    Schemas and channels are added to the dictionaries by their numbers.
 
     Raises:
         MalformedRecordError: a record does not fit its length.

@@ -17,7 +17,6 @@ from blf_dsc_controller.bags.metadata import (
     TopicInformation,
     quality_text,
 )
-from blf_dsc_controller.messages.types import Definition
 
 COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
 CHANNEL_RECORD = 'blf_dsc_controller channel '
@@ -34,14 +33,9 @@ _LARGEST_BUFFER = 1 << 20  # bytes
 
 
 class McapFile:
-    """Messages in chunks, with an index of them all at the end.
+    """A new file of messages in chunks (`none` or `zstd`), with an index of them all at the end.
 
-    Args:
-        path: of a file that does not exist yet.
-        compression: of the chunks, `none` or `zstd`.
-
-    Attributes:
-        information: the entry of this file in metadata.yaml.
+    `information` is the entry of this file in metadata.yaml.
     """
 
     def __init__(self, path: Path, compression: str) -> None:
@@ -69,19 +63,19 @@ class McapFile:
         """Store a text of this time [ns] as an attachment."""
         self._writer.add_attachment(log_time, log_time, name, media_type, text.encode())
 
-    def add_channel(self, topic: TopicInformation, definition: Definition) -> int:
+    def add_channel(self, topic: TopicInformation) -> int:
         """Add a topic and return its number within the file.
 
         It is stored in the chunk of its first message, in the index at the end, and in a record of
         its own, for a file that has lost both.
         """
         if topic.type not in self._schemas:
-            self._schemas[topic.type] = self._writer.register_schema(
-                topic.type, definition.encoding, definition.text.encode()
-            )
+            text, _, encoding = topic.definition
+            schema = self._writer.register_schema(topic.type, encoding, text.encode())
+            self._schemas[topic.type] = schema
         metadata = {
             'offered_qos_profiles': quality_text(topic.offered),
-            'topic_type_hash': topic.type_hash,
+            'topic_type_hash': topic.definition.hash,
         }
         schema = self._schemas[topic.type]
         self._channels += 1
@@ -127,16 +121,10 @@ class ReservedFile:
     """A file, buffered until `flush`, that can still be ended when its disk is full.
 
     A second file of zeros reserves room for what is not written yet: the current chunk, the index,
-    metadata.yaml. It is removed when the disk is full.
-
-    Args:
-        path: of a file that does not exist yet.
-
-    Attributes:
-        is_full: whether the disk has been found full; the file should be ended then.
+    metadata.yaml. It is removed when the disk is full, `is_full`, and the file should be ended.
 
     Raises:
-        OSError: it cannot be made, or there is not even room for the reserve.
+        OSError: the file cannot be made, or there is not even room for the reserve.
     """
 
     def __init__(self, path: Path) -> None:

@@ -11,6 +11,7 @@ import yaml
 
 from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.topics import FOREVER, Quality
+from blf_dsc_controller.messages.types import Definition
 
 VERSION = 9
 ROS_DISTRO = 'jazzy'
@@ -25,7 +26,7 @@ class TopicInformation:
     name: str
     type: str
     offered: tuple[Quality, ...]
-    type_hash: str
+    definition: Definition
     message_count: int = 0
 
 
@@ -67,7 +68,7 @@ class BagInformation:
                     'type': topic.type,
                     'serialization_format': 'cdr',
                     'offered_qos_profiles': _quality_trees(topic.offered),
-                    'type_description_hash': topic.type_hash,
+                    'type_description_hash': topic.definition.hash,
                 },
                 'message_count': topic.message_count,
             }

@@ -36,10 +36,6 @@ def read_run(path: str | Path, namespace: str = '') -> Run:
     The k-th command belongs to the k-th joint state if there are as many; otherwise the torque is
     that of the tracking error, or else the effort of the next joint state.
 
-    Args:
-        path: folder of the bag, or one of its storage files.
-        namespace: of the robot, if the bag holds several.
-
     Raises:
         BagError: there is no bag, it is damaged, it holds no joint states, or the topics of several
             robots.

@@ -6,28 +6,18 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TypeAlias
 
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.topics import Quality
 
-
-class _Message(NamedTuple):
-    log_time: int
-    handle: int
-    raw: bytes
-    publish_time: int
-    sequence: int
+_Message: TypeAlias = tuple[int, bytes, int, int, int]
+"""As `write` takes it."""
 
 
 class Ring:
-    """Messages of the last `seconds`, and the last of each latched topic however old it is.
-
-    Args:
-        seconds: to be kept.
-        compression: of the bags, `none` or `zstd`.
-    """
+    """Messages of the last `seconds`, and the last of each latched topic however old it is."""
 
     def __init__(self, seconds: float, compression: str) -> None:
         self._span = round(seconds * NANOSECONDS)
@@ -46,11 +36,11 @@ class Ring:
         self, handle: int, raw: bytes, log_time: int, publish_time: int, sequence: int
     ) -> None:
         """Keep a message, and drop those that are too old by now."""
-        self._messages.append(_Message(log_time, handle, raw, publish_time, sequence))
-        while self._messages[0].log_time < log_time - self._span:
+        self._messages.append((handle, raw, log_time, publish_time, sequence))
+        while self._messages[0][2] < log_time - self._span:
             old = self._messages.popleft()
-            if self._is_latched(old.handle):
-                self._latched[old.handle] = old
+            if self._is_latched(old[0]):
+                self._latched[old[0]] = old
 
     def configure(self, configuration: str, known_at: int) -> None:
         """Keep the configuration of the run, as in BagWriter."""
@@ -71,7 +61,7 @@ class Ring:
             for name, type_name, offered in self._topics:
                 bag.add_topic(name, type_name, offered)
             for message in kept:
-                bag.write(message.handle, message.raw, message.log_time, *message[3:])
+                bag.write(*message)
             bag.flush()
         return len(kept)
 

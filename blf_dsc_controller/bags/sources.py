@@ -23,9 +23,7 @@ _STORAGES = ('mcap', 'sqlite3')
 class OpenBag:
     """An open bag. rosbags' AnyReader would reject bags with one bad type definition.
 
-    Attributes:
-        held: name and type of each topic; the type is empty where it is unknown.
-        counts: number of messages of each topic.
+    `held` is name and type, empty where unknown, of each topic; `counts` its number of messages.
     """
 
     def __init__(self, reader: Reader1 | Reader2, files: list[Path]) -> None:

@@ -28,16 +28,9 @@ class SplitLimits:
 class BagWriter:
     """Writes serialised messages into a new bag.
 
-    Data leaves the process within `flush_interval` plus the time to the next call of `write` or
-    `flush_if_due`; then it survives the process being killed.
-
-    Args:
-        path: folder of the bag, which must not exist yet.
-        compression: of the chunks, `none` or `zstd`.
-        flush_interval: longest time that data stays in the process [s]; None: until a chunk is
-            full, for bags that can be made again.
-        clock: monotonic time [s].
-        limits: of one file.
+    Data leaves the process within `flush_interval` [s] plus the time to the next call of `write` or
+    `flush_if_due`; then it survives the process being killed. Without an interval it leaves when a
+    chunk is full. The chunks are compressed by `none` or `zstd`.
 
     Raises:
         BagError: `path` exists already.
@@ -56,7 +49,6 @@ class BagWriter:
         self._compression = compression
         self._limits = limits
         self._bag = BagInformation()
-        self._definitions: list[Definition] = []
         self._configuration: tuple[str, int] | None = None
         try:
             self.path.mkdir(parents=True)
@@ -77,22 +69,18 @@ class BagWriter:
         offered: Sequence[Quality],
         known: Definition | None = None,
     ) -> int:
-        """Add a topic and return the handle to write to it.
+        """Add a topic by its full name, with the quality of service of each publisher.
 
-        Args:
-            name: full name.
-            type_name: such as `sensor_msgs/msg/JointState`.
-            offered: quality of service of each publisher.
-            known: definition of the type; may be left out for a common type of Jazzy.
+        Returns:
+            the handle to write to it.
 
         Raises:
-            UnknownTypeError: the definition is left out and the type is none of the common ones.
+            UnknownTypeError: the definition is left out and the type is no common one of Jazzy.
         """
         found = definition(type_name) if known is None else known
-        topic = TopicInformation(name, type_name, tuple(offered), found.hash)
-        self._definitions.append(found)
+        topic = TopicInformation(name, type_name, tuple(offered), found)
         self._bag.topics.append(topic)
-        return self._file.add_channel(topic, found)
+        return self._file.add_channel(topic)
 
     def write(
         self,
@@ -104,12 +92,8 @@ class BagWriter:
     ) -> None:
         """Write one serialised message.
 
-        Args:
-            handle: from `add_topic`.
-            raw: the message in CDR.
-            log_time: when it was received [ns].
-            publish_time: when it was published [ns], `log_time` if not known.
-            sequence: number given by the publisher, 0 if not known.
+        It was received at `log_time` [ns] and published at `publish_time` [ns], or `log_time` if
+        not known, with the `sequence` number of the publisher, 0 if not known.
 
         Raises:
             DiskFullError: there is no room left; the bag is complete and closed.
@@ -121,12 +105,7 @@ class BagWriter:
         self.flush_if_due()
 
     def configure(self, configuration: str, known_at: int | None = None) -> None:
-        """Store the configuration of the run.
-
-        Args:
-            configuration: text of a parameter file of all nodes known so far.
-            known_at: when it was received [ns], now if not given.
-        """
+        """Store a parameter file of all nodes known so far, received now or at `known_at` [ns]."""
         self._configuration = configuration, time.time_ns() if known_at is None else known_at
         self._bag.custom_data.update(facts_of(configuration))
         self._describe(self._file)
@@ -181,8 +160,8 @@ class BagWriter:
         file = McapFile(self.path / name, self._compression)
         self._bag.files.append(file.information)
         file.describe(self._bag)
-        for topic, found in zip(self._bag.topics, self._definitions, strict=True):
-            file.add_channel(topic, found)
+        for topic in self._bag.topics:
+            file.add_channel(topic)
         self._describe(file)
         return file
 

@@ -24,13 +24,7 @@ LYAPUNOV_BOUND = LYAPUNOV + 'bound'
 
 
 class Monitor:
-    """Builds the messages of `~/monitor`.
-
-    Args:
-        joints: names of the n joints.
-        estimates: names of the m entries of theta^.
-        settings: of the law.
-    """
+    """Builds the messages of `~/monitor`; `estimates` are the names of theta^ (m,)."""
 
     def __init__(self, joints: Sequence[str], estimates: Sequence[str], settings: Settings) -> None:
         names = [what + joint for what in (RATIO, DISTANCE) for joint in joints]
@@ -45,14 +39,7 @@ class Monitor:
     def message(
         self, stamp: int, sample: Sample, ratio: np.ndarray, bound: np.ndarray
     ) -> tuple[topics.Topic, bytes]:
-        """Message of a telemetry sample.
-
-        Args:
-            stamp: of the sample [ns].
-            sample: telemetry of the law.
-            ratio: largest |xi1| / k_c so far (n,).
-            bound: present k_c (n,) [rad].
-        """
+        """Message of a telemetry sample: largest |xi1| / k_c so far, present k_c (n,) [rad]."""
         distance = bound - np.abs(sample.xi1)
         values = [*ratio, *distance, *sample.estimate, sample.lambda_min[0], sample.latched[0]]
         if self._ceiling is not None:

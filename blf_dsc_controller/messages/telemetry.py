@@ -47,12 +47,7 @@ def disturbance_names(joints: Sequence[str]) -> tuple[str, ...]:
 
 
 class ControllerTelemetry:
-    """Messages of the controller.
-
-    Args:
-        joints: names of the n joints.
-        estimates: names of the m entries of theta^.
-    """
+    """Messages of the controller of n joints and `estimates`, the m entries of theta^."""
 
     def __init__(self, joints: Sequence[str], estimates: Sequence[str]) -> None:
         learning = (*estimates, *disturbance_names(joints), LAMBDA_MIN, LATCHED, COMPUTE_TIME)
@@ -91,12 +86,7 @@ class ControllerTelemetry:
 
 
 class PlantTelemetry:
-    """Messages of the plant.
-
-    Args:
-        joints: names of the n joints.
-        parameters: names of the p true parameters.
-    """
+    """Messages of the plant of n joints and p true parameters."""
 
     def __init__(self, joints: Sequence[str], parameters: Sequence[str]) -> None:
         true_state = [what + joint for what in (POSITION, VELOCITY) for joint in joints]
