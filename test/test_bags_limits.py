@@ -13,8 +13,7 @@ from small_disk import small_disk
 from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.errors import DiskFullError
 from blf_dsc_controller.bags.recover import recover
-from blf_dsc_controller.bags.ring import Ring
-from blf_dsc_controller.bags.writer import BagWriter, SplitLimits
+from blf_dsc_controller.bags.writer import BagWriter, Ring, SplitLimits
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import BOUND, JOINT_STATES, STREAM
 

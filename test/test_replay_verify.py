@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import recorded_run
 
-from blf_dsc_controller.bags.batch import decode_joint_states
-from blf_dsc_controller.bags.content import read_content
+from blf_dsc_controller.bags.content import decode_joint_states, read_content
 from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.errors import BagError, UnreadableMessageError
 from blf_dsc_controller.configuration.schema import change

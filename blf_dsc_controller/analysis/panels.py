@@ -11,13 +11,14 @@ import numpy as np
 
 from blf_dsc_controller.analysis.metrics import estimates_of, latch_time, outside, rms
 from blf_dsc_controller.analysis.style import ALARM, INK, MUTED
-from blf_dsc_controller.messages.monitor import LYAPUNOV_BOUND, LYAPUNOV_TERMS
 from blf_dsc_controller.messages.topics import (
     COMPUTE_TIME,
     DISTURBANCE,
     LAMBDA_MIN,
     LATENCY,
     LYAPUNOV,
+    LYAPUNOV_BOUND,
+    LYAPUNOV_TERMS,
 )
 from blf_dsc_controller.run import Floats, Run, Series
 

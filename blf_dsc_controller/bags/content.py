@@ -1,17 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The undecoded messages of a bag, its topics and joints matched to ours by name."""
+"""The messages of a bag, its topics and joints matched to ours by name.
+
+All messages of a topic are decoded at once, without a loop where they differ only in numbers.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
-from blf_dsc_controller.bags.errors import BagError
+from blf_dsc_controller.bags.errors import BagError, UnreadableMessageError
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages.cdr import MessageError, array_layout, joint_state_layout
+from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder, JointStateDecoder
 from blf_dsc_controller.messages.topics import (
     CLOCK,
     COMMANDS,
@@ -20,7 +26,9 @@ from blf_dsc_controller.messages.topics import (
     TOPICS,
     Topic,
 )
+from blf_dsc_controller.run import Floats, Stamps
 
+_T = TypeVar('_T')
 _OF_INTEREST = tuple(one for one in TOPICS if one is not CLOCK)
 
 
@@ -164,3 +172,68 @@ def _bad_entry(entry: str, reason: str) -> BlfDscError:
         f'--map {entry}: {reason}; expected OURS=THEIRS with a topic, as in '
         'joint_states=/arm/states, or a joint, as in joint1=shoulder'
     )
+
+
+def decode_joint_states(
+    messages: TopicMessages,
+    names: Sequence[str],
+    required: Sequence[str] = ('position', 'velocity'),
+) -> tuple[Stamps, Floats]:
+    """Stamps (N,) [ns] and [position, velocity, effort] (N, 3, n) of the n `names`.
+
+    Raises:
+        UnreadableMessageError: a message cannot be decoded.
+    """
+    decoder = JointStateDecoder(names, required)
+    next(_decoded(messages, decoder.decode))
+    shape = len(messages.raw), 3, len(names)
+    at_once = decoder.decode_all(messages.raw)
+    if at_once is not None:
+        return at_once[0], at_once[1].reshape(shape)
+    stamp, values = np.empty(shape[0], dtype=np.int64), np.empty(shape)
+    for k, stamp_k in enumerate(_decoded(messages, decoder.decode)):
+        stamp[k] = stamp_k
+        values[k].flat = decoder.values
+    return stamp, values
+
+
+def decode_arrays(messages: TopicMessages, size: int) -> Floats | None:
+    """Values (N, size) of Float64MultiArrays, None if one of them has another size.
+
+    Raises:
+        UnreadableMessageError: a message cannot be decoded.
+    """
+    decoder = Float64MultiArrayDecoder(size)
+    if next(_decoded(messages, decoder.decode)) != size:
+        return None
+    at_once = decoder.decode_all(messages.raw)
+    if at_once is not None:
+        return at_once
+    values = np.empty((len(messages.raw), size))
+    for k, got in enumerate(_decoded(messages, decoder.decode)):
+        if got != size:
+            return None
+        values[k] = decoder.values
+    return values
+
+
+def joint_names(messages: TopicMessages) -> tuple[str, ...]:
+    """Names in the first of some joint states; UnreadableMessageError if there are none."""
+    names = next(_decoded(messages, joint_state_layout)).names
+    if not names:
+        unnamed = MessageError('it names no joint, so its values cannot be told apart')
+        raise UnreadableMessageError(messages.name, 0, unnamed)
+    return names
+
+
+def array_size(messages: TopicMessages) -> int:
+    """Number of values in the first of some Float64MultiArrays."""
+    return next(_decoded(messages, array_layout)).arrays[0].size
+
+
+def _decoded(messages: TopicMessages, decode: Callable[[bytes], _T]) -> Iterator[_T]:
+    for k, raw in enumerate(messages.raw):
+        try:
+            yield decode(raw)
+        except MessageError as error:
+            raise UnreadableMessageError(messages.name, k, error) from error

@@ -9,8 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.bags.batch import decode_arrays, decode_joint_states, joint_names
-from blf_dsc_controller.bags.content import Content, TopicMessages, read_content
+from blf_dsc_controller.bags.content import (
+    Content,
+    TopicMessages,
+    decode_arrays,
+    decode_joint_states,
+    joint_names,
+    read_content,
+)
 from blf_dsc_controller.messages.topics import (
     BOUND,
     COMMANDS,

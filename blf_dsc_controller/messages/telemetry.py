@@ -12,7 +12,9 @@ from typing import TypeAlias
 
 import numpy as np
 
+from blf_dsc_controller.law.lyapunov import ExponentialBound
 from blf_dsc_controller.law.rejected_columns import RejectedColumn
+from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Sample
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.cdr import NANOSECONDS
@@ -23,13 +25,17 @@ from blf_dsc_controller.messages.codecs import (
 )
 from blf_dsc_controller.messages.topics import (
     COMPUTE_TIME,
+    DISTANCE,
     DISTURBANCE,
     LAMBDA_MIN,
     LATCHED,
     LATE_STEPS,
     LATENCY,
     LATENESS,
+    LYAPUNOV_BOUND,
+    LYAPUNOV_TERMS,
     POSITION,
+    RATIO,
     REJECTED,
     VELOCITY,
 )
@@ -113,6 +119,34 @@ class PlantTelemetry:
     def clock(self, stamp: int) -> Message:
         """Plant time [ns] on /clock."""
         return topics.CLOCK, encode_clock(stamp)
+
+
+class Monitor:
+    """Messages of the slow topic `~/monitor`: how far the guarantees of the law hold.
+
+    Where the truth is known: the Lyapunov function (29) term by term, and the bound (32) on it.
+    """
+
+    def __init__(self, joints: Sequence[str], estimates: Sequence[str], settings: Settings) -> None:
+        names = [what + joint for what in (RATIO, DISTANCE) for joint in joints]
+        names += [*estimates, LAMBDA_MIN, LATCHED]
+        self._ceiling = None
+        if settings.truth_known == 1:
+            names += [*LYAPUNOV_TERMS, LYAPUNOV_BOUND]
+            self._ceiling = ExponentialBound(settings)
+        self._encoder = JointStateEncoder(names, ('position',))
+        self._start: int | None = None
+
+    def message(self, stamp: int, sample: Sample, ratio: np.ndarray, bound: np.ndarray) -> Message:
+        """Telemetry sample, largest |xi1| / k_c so far (n,), and present k_c (n,) [rad]."""
+        distance = bound - np.abs(sample.xi1)
+        values = [*ratio, *distance, *sample.estimate, sample.lambda_min[0], sample.latched[0]]
+        if self._ceiling is not None:
+            self._start = stamp if self._start is None else self._start
+            V = float(sample.lyapunov.sum())
+            t = (stamp - self._start) * 1e-9
+            values += [*sample.lyapunov, self._ceiling.at(t, V, bool(sample.latched[0]))]
+        return topics.MONITOR, self._encoder.encode(stamp, values)
 
 
 def encode_rejected_columns(stamp: int, columns: Sequence[RejectedColumn]) -> bytes:

@@ -12,8 +12,7 @@ from pathlib import Path
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from blf_dsc_controller.bags.ring import Ring
-from blf_dsc_controller.bags.writer import BagWriter, SplitLimits
+from blf_dsc_controller.bags.writer import BagWriter, Ring, SplitLimits
 from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import Quality

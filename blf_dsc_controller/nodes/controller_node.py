@@ -19,8 +19,7 @@ from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.codecs import JointStateDecoder
-from blf_dsc_controller.messages.monitor import Monitor
-from blf_dsc_controller.messages.telemetry import DECIMATION, ControllerTelemetry, Message
+from blf_dsc_controller.messages.telemetry import DECIMATION, ControllerTelemetry, Message, Monitor
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.controller_status import ControllerStatus
 from blf_dsc_controller.nodes.endpoints import (

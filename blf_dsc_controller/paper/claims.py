@@ -15,8 +15,7 @@ import numpy as np
 from blf_dsc_controller.analysis.metrics import Metrics, estimates_of
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.lyapunov import ExponentialBound, decay_rate
-from blf_dsc_controller.messages.monitor import LYAPUNOV_TERMS
-from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED
+from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LYAPUNOV_TERMS
 from blf_dsc_controller.paper.cases import BOUND, SIDE_BY_SIDE, SWEEPS, VARIATIONS
 from blf_dsc_controller.paper.results import Results
 from blf_dsc_controller.run import Floats, Run

@@ -9,8 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.bags.batch import decode_arrays, decode_joint_states
-from blf_dsc_controller.bags.content import Content, TopicMessages
+from blf_dsc_controller.bags.content import (
+    Content,
+    TopicMessages,
+    decode_arrays,
+    decode_joint_states,
+)
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.state import Sample

@@ -21,8 +21,7 @@ from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Sample, sample_of
 from blf_dsc_controller.messages.journal import Event, EventType
-from blf_dsc_controller.messages.monitor import Monitor
-from blf_dsc_controller.messages.telemetry import DECIMATION
+from blf_dsc_controller.messages.telemetry import DECIMATION, Monitor
 from blf_dsc_controller.messages.topics import FOREVER, TRACKING_ERROR
 from blf_dsc_controller.reference.trajectory import (
     Trajectory,

@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from blf_dsc_controller.bags.batch import decode_joint_states
-from blf_dsc_controller.bags.content import Content
+from blf_dsc_controller.bags.content import Content, decode_joint_states
 from blf_dsc_controller.bags.errors import UnreadableMessageError
 from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.codecs import JointStateDecoder

@@ -13,8 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
-from blf_dsc_controller.bags.batch import array_size, decode_arrays, decode_joint_states
-from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, TopicMessages, read_content
+from blf_dsc_controller.bags.content import (
+    NO_NAMES,
+    Content,
+    NameMap,
+    TopicMessages,
+    array_size,
+    decode_arrays,
+    decode_joint_states,
+    read_content,
+)
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import begin, controller_of

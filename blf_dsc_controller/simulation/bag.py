@@ -17,11 +17,11 @@ from blf_dsc_controller.law.factory import estimate_names, model_of
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import Event, EventType, Journal
-from blf_dsc_controller.messages.monitor import Monitor
 from blf_dsc_controller.messages.telemetry import (
     DECIMATION,
     ControllerTelemetry,
     Message,
+    Monitor,
     PlantTelemetry,
     encode_rejected_columns,
 )

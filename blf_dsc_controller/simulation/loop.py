@@ -24,9 +24,8 @@ from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.law.settings import settings_of
 from blf_dsc_controller.law.state import Sample, sample_of, signals_of, state_of
 from blf_dsc_controller.law.step import step
-from blf_dsc_controller.messages.monitor import LYAPUNOV_TERMS
 from blf_dsc_controller.messages.telemetry import disturbance_names
-from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED
+from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LYAPUNOV_TERMS
 from blf_dsc_controller.run import Run, Series
 from blf_dsc_controller.simulation.metrics import (
     LoopMetrics,
