@@ -483,7 +483,7 @@ def rows() -> Iterator[str]:
         noticed = f'{outcome.noticed}' if stopped else 'passed over'
         largest = f'{np.abs(outcome.after).max():.3g}'
         recovered = 'yes' if outcome.recovered else 'NO'
-        yield f'| {fault.name} | {noticed} | {outcome.reason.value} | {largest} | {recovered} |\n'
+        yield f'| {fault.name} | {noticed} | {outcome.reason} | {largest} | {recovered} |\n'
 
 
 PREFACE = """\

@@ -96,7 +96,7 @@ class Soak:
     def recover(self):
         """Reset what has stopped; the loop runs from its start."""
         supervisor = self.law.guard.supervisor
-        self.report.reasons[supervisor.reason.value] += 1
+        self.report.reasons[supervisor.reason] += 1
         if supervisor.phase is Phase.SAFE_STOP or self.arm.plant.sample == 0:
             assert self.ros.reset(self.arm).success
         self.ros.until(lambda: self.law.guard.supervisor.phase is Phase.TRACKING)

@@ -124,8 +124,8 @@ def test_the_watchdog_s_torques_replay_too(tmp_path):
         'reset',
         'safe stop (bad message)',
     ]
-    assert result.count(EventType.SILENCE) == 2
-    assert result.count(EventType.TRAJECTORY) == 1
+    assert [one.type for one in result.events].count(EventType.SILENCE) == 2
+    assert [one.type for one in result.events].count(EventType.TRAJECTORY) == 1
     assert compared(result)['commands'] == 2 * len(of(rig, COMMANDS))
     states = len(of(rig, JOINT_STATES))
     assert len(of(rig, COMMANDS)) > states + 10

@@ -180,8 +180,8 @@ def test_trajectories_and_a_gain_replay_where_they_took_effect(moved):
     result = verify(moved)
     assert result.difference is None
     assert result.remarks == ()
-    assert result.count(EventType.PARAMETERS) == 1
-    assert result.count(EventType.TRAJECTORY) == 2
+    assert [one.type for one in result.events].count(EventType.PARAMETERS) == 1
+    assert [one.type for one in result.events].count(EventType.TRAJECTORY) == 2
     samples = result.states.stamp.size
     assert samples >= 1300
     assert compared(result)['commands'] == 2 * samples
@@ -224,7 +224,7 @@ def test_stops_ramps_and_starts_replay_with_every_torque(stopped):
     result = verify(stopped)
     assert result.difference is None
     assert result.remarks == ()
-    assert result.count(EventType.PARAMETERS) == 1
+    assert [one.type for one in result.events].count(EventType.PARAMETERS) == 1
     assert ', '.join(result.turns) == (
         'activate, deactivate, activate, safe stop (stamp jump), deactivate, '
         'activate, reset, safe stop (joint missing)'

@@ -85,7 +85,10 @@ def test_a_bound_that_narrows_replays_too(tmp_path):
     funnel = {'barrier.initial_bound': [0.02, 0.01], 'barrier.funnel_rate': 5.0}
     result = verify(recorded_run.record(tmp_path / 'bag', 0.3, **funnel))
     assert result.difference is None
-    assert (result.count(EventType.PARAMETERS), result.remarks) == (0, ())
+    assert ([one.type for one in result.events].count(EventType.PARAMETERS), result.remarks) == (
+        0,
+        (),
+    )
 
 
 def test_the_learning_has_begun_in_that_bag(bag):
@@ -223,7 +226,7 @@ def retuned(bag):
 def test_parameters_changed_on_the_way_are_replayed_where_they_took_effect(bag, rewritten):
     messages = list(retuned(bag))
     result = verify(rewritten(messages))
-    assert result.count(EventType.PARAMETERS) == 2
+    assert [one.type for one in result.events].count(EventType.PARAMETERS) == 2
     assert result.difference is None
 
 
@@ -287,7 +290,7 @@ def test_a_configuration_of_another_version_is_refused_as_that(entries, tmp_path
     path = recorded_run.write(tmp_path / 'bag', changed, package_version='0.1.0')
     with pytest.raises(ConfigurationError, match=r'barrier\.shape'):
         verify(path)
-    monkeypatch.setattr('blf_dsc_controller.replay.verify.__version__', '9.9.9')
+    monkeypatch.setattr('blf_dsc_controller.bags.context.__version__', '9.9.9')
     with pytest.raises(ConfigurationError, match=r'journal by version 0\.1\.0, not 9\.9\.9'):
         verify(path)
 

@@ -11,6 +11,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from mcap.reader import make_reader
 
@@ -133,10 +134,7 @@ class Context:
                         for name, entry in section.entries.items()
                         if not is_builtin(name)
                     }
-                    source = f'{self.path}, {ATTACHMENT}'
-                    if self.version != __version__:
-                        source += f' by version {self.version or "unknown"}, not {__version__}'
-                    return build(ControllerConfig, values, source)
+                    return self.build_config(values, ATTACHMENT)
         reason = (
             f'{self.path} holds a configuration that cannot be read ({damage})'
             if damage
@@ -145,6 +143,17 @@ class Context:
         )
         with open_bag(self.path):  # raises if there is no bag
             raise BagError(f'{reason}; name one, as in --config recommended')
+
+    def build_config(self, values: Mapping[str, Any], place: str) -> ControllerConfig:
+        """Configuration of the controller from its parameters, recorded in this place of the bag.
+
+        Raises:
+            ConfigurationError: this version of the package cannot run the configuration.
+        """
+        source = f'{self.path}, {place}'
+        if self.version != __version__:
+            source += f' by version {self.version or "unknown"}, not {__version__}'
+        return build(ControllerConfig, values, source)
 
 
 def facts_of(configuration: str) -> dict[str, str]:

@@ -86,7 +86,7 @@ class ControllerStatus:
             message = f'stopped: {guard.supervisor.text}'
         else:
             message = _MESSAGES[phase] if guard else 'not configured'
-        values: dict[str, Any] = {PHASE: phase.value, REASON: reason.value, 'lifecycle': life}
+        values: dict[str, Any] = {PHASE: phase, REASON: reason.value, 'lifecycle': life}
         if guard is not None:
             values[STOPS] = guard.supervisor.stops
             values['safe torque'] = guard.config.safety.torque

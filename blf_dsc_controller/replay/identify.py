@@ -9,8 +9,9 @@ filtered residuals in samples, which is on the careful side.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,30 +25,18 @@ from blf_dsc_controller.run import Floats
 _CANDIDATES = 600  # windows
 
 
-@dataclass(frozen=True)
-class Identification:
-    """Estimates of m unknowns from one window.
+class Identification(NamedTuple):
+    """Estimates of m unknowns from one window."""
 
-    Attributes:
-        names: of the unknowns.
-        estimate: (m,) in the units of the model; NaN for a rejected column.
-        deviation: standard deviation of each (m,).
-        excitation: lambda_min(Phi).
-        threshold: of the controller on it, sigma.
-        begin, end: of the window [s].
-        residual: root mean square of X theta - u, N m after the filter.
-        source: topic of the torques.
-    """
-
-    names: tuple[str, ...]
-    estimate: Floats
-    deviation: Floats
-    excitation: float
-    threshold: float
-    begin: float
-    end: float
-    residual: float
-    source: str
+    names: tuple[str, ...]  # of the unknowns
+    estimate: Floats  # (m,) in the units of the model; NaN for a rejected column
+    deviation: Floats  # standard deviation of each (m,)
+    excitation: float  # lambda_min(Phi)
+    threshold: float  # of the controller on it, sigma
+    begin: float  # of the window, s
+    end: float  # of the window, s
+    residual: float  # root mean square of X theta - u, N m after the filter
+    source: str  # topic of the torques
 
     @property
     def is_excited(self) -> bool:
@@ -58,13 +47,9 @@ class Identification:
 def identify(
     path: Path, config: ControllerConfig, namespace: str = '', names: NameMap = NO_NAMES
 ) -> Identification:
-    """Identify the arm of a bag, whatever moved it.
+    """Identify the arm of a bag, whatever moved it; path, namespace and names as for `what_if`.
 
-    Args:
-        path: folder of the bag, one of its storage files, or a ROS 1 `.bag`.
-        config: model, window, columns and filters of the learning.
-        namespace: of the robot, if the bag holds several.
-        names: of topics and joints that have other names in the bag.
+    `config` gives the model, and the window, columns and filters of the learning.
 
     Raises:
         BlfDscError: the bag cannot be read, ends before a window is full, or does not hold the

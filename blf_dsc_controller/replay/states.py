@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,19 +18,12 @@ from blf_dsc_controller.messages.topics import JOINT_STATES, LEARNING, REFERENCE
 from blf_dsc_controller.run import Floats, Stamps
 
 
-@dataclass(frozen=True)
-class States:
-    """N joint states of n joints that the law uses.
+class States(NamedTuple):
+    """N joint states of n joints that the law uses."""
 
-    Attributes:
-        stamp: (N,) [ns], increasing.
-        measurement: [q (n,) rad, dq (n,) rad/s, torque of the last interval (n,) N m] (N, 3 n).
-        passed_over: number of states that the law did not use.
-    """
-
-    stamp: Stamps
-    measurement: Floats
-    passed_over: int = 0
+    stamp: Stamps  # (N,) ns, increasing
+    measurement: Floats  # [q rad, dq rad/s, torque of the last interval N m] (N, 3 n)
+    passed_over: int  # number of states that the law did not use
 
     @property
     def time(self) -> Floats:
@@ -45,9 +39,7 @@ class States:
 def law_states(content: Content, joints: Sequence[str]) -> States:
     """Return the states with telemetry of the law; all of them if the bag has no telemetry.
 
-    Args:
-        content: of the bag.
-        joints: the n names that they have in the bag.
+    `joints` are the names in the bag.
 
     Raises:
         UnreadableMessageError: a state cannot be decoded, or a joint is not in it.
@@ -72,19 +64,12 @@ def sampled_stamps(content: Content) -> Stamps | None:
     return np.unique(np.concatenate(stamps)) if stamps else None
 
 
-@dataclass(frozen=True)
-class Arrivals:
-    """Every joint-state message of a bag, readable or not.
+class Arrivals(NamedTuple):
+    """Every joint-state message of a bag, readable or not."""
 
-    Attributes:
-        stamp: of each [ns]; 0 for an unreadable message.
-        measurement: (N, 3 n) as in `States`.
-        errors: why a message is unreadable, by its number.
-    """
-
-    stamp: list[int]
-    measurement: Floats
-    errors: Mapping[int, MessageError]
+    stamp: list[int]  # of each, ns; 0 for an unreadable message
+    measurement: Floats  # (N, 3 n) as in `States`
+    errors: Mapping[int, MessageError]  # why a message is unreadable, by its number
 
 
 def arrivals(

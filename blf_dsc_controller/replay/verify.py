@@ -4,56 +4,34 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.content import Content, read_content
 from blf_dsc_controller.bags.context import Context, read_context
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import required_fields
 from blf_dsc_controller.messages.journal import Event, EventType, decode
 from blf_dsc_controller.messages.topics import FOREVER, JOURNAL
-from blf_dsc_controller.replay.comparison import (
-    Comparison,
-    Difference,
-    compare,
-    expected,
-    first,
-)
-from blf_dsc_controller.replay.rerun import rerun
+from blf_dsc_controller.replay.comparison import Comparison, compare
+from blf_dsc_controller.replay.rerun import Difference, Rerun
 from blf_dsc_controller.replay.states import States, arrivals, sampled_stamps
 
 _TURNS = (EventType.ACTIVATE, EventType.DEACTIVATE, EventType.RESET, EventType.STOP)
 
 
-@dataclass(frozen=True)
-class Verification:
-    """What a replay found.
+class Verification(NamedTuple):
+    """What a replay found."""
 
-    Attributes:
-        states: that the law used.
-        comparisons: one for each topic of the controller.
-        events: that were replayed.
-        safe_torques: number of replayed torques that are not the law's.
-        remarks: what limits the result.
-        difference: earliest difference, in a topic or in an event; None if there is none.
-    """
-
-    states: States
-    comparisons: tuple[Comparison, ...]
-    events: tuple[Event, ...]
-    safe_torques: int
-    remarks: tuple[str, ...]
-    difference: Difference | None
-
-    def count(self, event: EventType) -> int:
-        """Number of replayed events of a type."""
-        return sum(one.type is event for one in self.events)
+    states: States  # that the law used
+    comparisons: tuple[Comparison, ...]  # one for each topic of the controller
+    events: tuple[Event, ...]  # that were replayed
+    safe_torques: int  # number of replayed torques that are not the law's
+    remarks: tuple[str, ...]  # what limits the result
+    difference: Difference | None  # the earliest, in a topic or in an event
 
     @property
     def turns(self) -> list[str]:
@@ -68,9 +46,7 @@ class Verification:
 def verify(path: Path, namespace: str = '') -> Verification:
     """Replay a bag and compare every message of the controller bit for bit.
 
-    Args:
-        path: folder of the bag, or one of its storage files.
-        namespace: of the robot, if the bag holds several.
+    `namespace` is that of the robot, if the bag holds several.
 
     Raises:
         ConfigurationError: this version of the package cannot run the configuration.
@@ -79,7 +55,7 @@ def verify(path: Path, namespace: str = '') -> Verification:
     """
     context, content = read_context(path), read_content(path, namespace)
     events, until, end = _events(path, content)
-    config = _config(path, context, events[0])
+    config = context.build_config(events[0].content['parameters'], JOURNAL.resolved)
     came = arrivals(content, config.joints, required_fields(config), until)
     start = next((one.stamp for one in events if one.type is EventType.START), None)
     if start is not None and start not in came.stamp:
@@ -88,23 +64,20 @@ def verify(path: Path, namespace: str = '') -> Verification:
             f'{start} ns, so its state at any later one is not known: start the recorder first'
         )
         raise BlfDscError(reason)
-    in_step = context.facts.get('clock') == 'lockstep'
-    run = rerun(config, events[1:], came, sampled_stamps(content), in_step=in_step)
+    run = Rerun(config, came, sampled_stamps(content))
+    run.run(events[1:], in_step=context.facts.get('clock') == 'lockstep')
     gappy = [topic for topic in content.message_counts if context.missed(topic)]
-    columns = expected(config, run.samples, run.monitored)
-    comparisons = tuple(compare(content, run.states, columns, run.commands, config.joints, gappy))
+    comparisons = tuple(compare(content, config, run, gappy))
     if not (run.departure or any(one.values for one in comparisons)):
         raise _nothing_to_compare(path, content)
-    found = first(comparisons)
-    if run.departure and not (found and found.stamp < run.departure.stamp):
-        found = run.departure
+    found = [run.departure, *(one.difference for one in comparisons)]
     return Verification(
         run.states,
         comparisons,
-        run.events,
+        tuple(run.events),
         int(np.count_nonzero(~run.commands.of_law)),
         tuple(_remarks(context, run.end or end)),
-        found,
+        min((one for one in found if one), key=lambda one: one.stamp, default=None),
     )
 
 
@@ -123,13 +96,6 @@ def _events(path: Path, content: Content) -> tuple[list[Event], int, str]:
         reason = f'{path} does not hold the beginning of {recorded.name}: start the recorder first'
         raise BlfDscError(reason)
     return events, FOREVER, ''
-
-
-def _config(path: Path, context: Context, event: Event) -> ControllerConfig:
-    source = f'{path}, {JOURNAL.resolved}'
-    if context.version != __version__:
-        source += f' by version {context.version or "unknown"}, not {__version__}'
-    return build(ControllerConfig, event.content['parameters'], source)
 
 
 def _nothing_to_compare(path: Path, content: Content) -> BlfDscError:

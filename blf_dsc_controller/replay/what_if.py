@@ -8,8 +8,9 @@ ones.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,25 +39,15 @@ from blf_dsc_controller.supervision.velocity import Velocity
 _NANO = 1e-9
 
 
-@dataclass(frozen=True)
-class WhatIf:
-    """Torques of another configuration beside the applied ones.
+class WhatIf(NamedTuple):
+    """Torques of another configuration beside the applied ones."""
 
-    Attributes:
-        states: that the law used.
-        samples: columns of the law's telemetry samples, each (N, its length).
-        rows: of the window's regression in each sample, [X | u] (N, n, m + 1).
-        active: which disturbance columns are estimated at the end (m,).
-        applied: torque from each state to the next (N, n) [N m]; NaN where unknown.
-        source: topic that it comes from.
-    """
-
-    states: States
-    samples: Sample
-    rows: Floats
-    active: Floats
-    applied: Floats
-    source: str
+    states: States  # that the law used
+    samples: Sample  # columns of the law's telemetry samples, each (N, its length)
+    rows: Floats  # of the window's regression in each sample, [X | u] (N, n, m + 1)
+    active: Floats  # which disturbance columns are estimated at the end (m,)
+    applied: Floats  # torque from each state to the next (N, n), N m; NaN where unknown
+    source: str  # topic that it comes from
 
     @property
     def difference(self) -> Floats:
@@ -72,13 +63,10 @@ class WhatIf:
 def what_if(
     path: Path, config: ControllerConfig, namespace: str = '', names: NameMap = NO_NAMES
 ) -> WhatIf:
-    """Run a configuration over the states of any bag.
+    """Run a configuration over the states of any bag (folder, storage file, or ROS 1 `.bag`).
 
-    Args:
-        path: folder of the bag, one of its storage files, or a ROS 1 `.bag`.
-        config: of the controller.
-        namespace: of the robot, if the bag holds several.
-        names: of topics and joints that have other names in the bag.
+    `namespace` is that of the robot, if the bag holds several; `names` are those of topics and
+    joints that have other names in the bag.
 
     Raises:
         OutsideBarrierError: the first state is outside the bound, and approaches are disabled.

@@ -159,7 +159,7 @@ class Guard:
         supervisor = self.supervisor
         if not supervisor.running:
             stopped = supervisor.phase is Phase.SAFE_STOP
-            why = supervisor.text if stopped else supervisor.phase.value
+            why = supervisor.text if stopped else supervisor.phase
             raise TrajectoryError([f'the controller is not in command: {why}'])
         now = self._time_of(self.last_stamp)
         vector, limits = self.controller.reference_vector, limits_of(self.config)
@@ -368,7 +368,7 @@ class Guard:
 
     def _on_stop(self) -> None:
         supervisor = self.supervisor
-        self.journal.note(EventType.STOP, reason=supervisor.reason.value, text=supervisor.text)
+        self.journal.note(EventType.STOP, reason=supervisor.reason, text=supervisor.text)
         self._clean = self._resumable = False
         self._ramp.begin(self._torque, self.config.safety.stop_ramp)
 

@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import StrEnum
 
 
-class Phase(Enum):
+class Phase(StrEnum):
     """What the controller is doing."""
 
     INACTIVE = 'inactive'  # not in command: the safe torque, or on the ramp to it
@@ -16,7 +16,7 @@ class Phase(Enum):
     SAFE_STOP = 'safe stop'  # the safe torque until the next reset or activation
 
 
-class Reason(Enum):
+class Reason(StrEnum):
     """Why the controller stopped."""
 
     NONE = 'none'
