@@ -23,7 +23,7 @@ from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.bags.context import Losses, read_context
-from blf_dsc_controller.bags.errors import BagError
+from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import FOREVER, JOINT_STATES, Quality

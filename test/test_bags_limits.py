@@ -11,9 +11,8 @@ from rosbags.rosbag2 import Reader
 from small_disk import small_disk
 
 from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.errors import DiskFullError
 from blf_dsc_controller.bags.recover import recover
-from blf_dsc_controller.bags.writer import BagWriter, Ring, SplitLimits
+from blf_dsc_controller.bags.writer import BagWriter, DiskFullError, Ring, SplitLimits
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import BOUND, JOINT_STATES, STREAM
 

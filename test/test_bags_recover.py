@@ -14,8 +14,8 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.errors import BagError
 from blf_dsc_controller.bags.recover import Salvage, recover
+from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder

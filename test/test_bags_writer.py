@@ -12,7 +12,7 @@ import yaml
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
-from blf_dsc_controller.bags.errors import BagError
+from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import BOUND, COMMANDS, JOINT_STATES, Quality

@@ -10,8 +10,13 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from blf_dsc_controller.bags.content import NameMap, decode_joint_states, read_content
-from blf_dsc_controller.bags.errors import BagError, UnreadableMessageError
+from blf_dsc_controller.bags.content import (
+    NameMap,
+    UnreadableMessageError,
+    decode_joint_states,
+    read_content,
+)
+from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder

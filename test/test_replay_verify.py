@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 import recorded_run
 
-from blf_dsc_controller.bags.content import decode_joint_states, read_content
+from blf_dsc_controller.bags.content import (
+    UnreadableMessageError,
+    decode_joint_states,
+    read_content,
+)
 from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.errors import BagError, UnreadableMessageError
+from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.law.factory import controller_of, estimate_names

@@ -13,10 +13,14 @@ from typing import TypeVar
 
 import numpy as np
 
-from blf_dsc_controller.bags.errors import BagError, UnreadableMessageError
-from blf_dsc_controller.bags.sources import open_bag
+from blf_dsc_controller.bags.sources import BagError, open_bag
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.messages.cdr import MessageError, array_layout, joint_state_layout
+from blf_dsc_controller.messages.cdr import (
+    MessageError,
+    MissingJointError,
+    array_layout,
+    joint_state_layout,
+)
 from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder, JointStateDecoder
 from blf_dsc_controller.messages.topics import (
     CLOCK,
@@ -30,6 +34,19 @@ from blf_dsc_controller.run import Floats, Stamps
 
 _T = TypeVar('_T')
 _OF_INTEREST = tuple(one for one in TOPICS if one is not CLOCK)
+
+
+class UnreadableMessageError(BagError):
+    """A message of a bag that cannot be decoded."""
+
+    def __init__(self, topic: str, index: int, error: MessageError) -> None:
+        reason = str(error)
+        if isinstance(error, MissingJointError):
+            reason = (
+                f'{error.fact}: the bag is of another robot, or has other names for its joints, '
+                f'as in bag_replay --config FILE --map {error.joint}=ITS_NAME'
+            )
+        super().__init__(f'message {index + 1} of {topic} cannot be read: {reason}')
 
 
 @dataclass(frozen=True)

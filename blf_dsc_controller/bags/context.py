@@ -16,8 +16,7 @@ from typing import Any
 from mcap.reader import make_reader
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.errors import BagError
-from blf_dsc_controller.bags.sources import open_bag
+from blf_dsc_controller.bags.sources import BagError, open_bag
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import is_builtin
 from blf_dsc_controller.configuration.ros_yaml import parse

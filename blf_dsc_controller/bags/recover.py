@@ -20,7 +20,6 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Schema
 
 from blf_dsc_controller.bags.context import ATTACHMENT, MESSAGES, RECORD, Losses
-from blf_dsc_controller.bags.errors import BagError
 from blf_dsc_controller.bags.mcap_reader import (
     HEAD,
     MAGIC,
@@ -34,6 +33,7 @@ from blf_dsc_controller.bags.mcap_reader import (
 )
 from blf_dsc_controller.bags.mcap_writer import CHANNEL_RECORD
 from blf_dsc_controller.bags.metadata import parse_qualities
+from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.types import Definition, UnknownTypeError, definition

@@ -11,13 +11,16 @@ import yaml
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 
-from blf_dsc_controller.bags.errors import BagError
 from blf_dsc_controller.bags.mcap_reader import read_messages
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.types import typestore
 
 _NEWEST = 9  # version of rosbag2's metadata.yaml that is known
 _STORAGES = ('mcap', 'sqlite3')
+
+
+class BagError(BlfDscError):
+    """A bag that cannot be read or written."""
 
 
 class OpenBag:

@@ -12,15 +12,26 @@ from pathlib import Path
 from typing import TypeAlias
 
 from blf_dsc_controller.bags.context import ATTACHMENT, RECORD, facts_of
-from blf_dsc_controller.bags.errors import BagError, DiskFullError
 from blf_dsc_controller.bags.mcap_writer import McapFile
 from blf_dsc_controller.bags.metadata import BagInformation, TopicInformation
+from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.topics import Quality
 from blf_dsc_controller.messages.types import Definition, definition
 
 _Message: TypeAlias = tuple[int, bytes, int, int, int]
 """As `write` takes it."""
+
+
+class DiskFullError(BagError):
+    """The disk is full; the bag was ended in order before."""
+
+    def __init__(self, path: Path, messages: int) -> None:
+        self.messages = messages
+        super().__init__(
+            f'the disk is full: recording into {path} has ended with {messages} messages, which '
+            'are complete and readable; make room, or split and move bags while they are recorded'
+        )
 
 
 @dataclass(frozen=True)

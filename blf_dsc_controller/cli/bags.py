@@ -10,7 +10,7 @@ from blf_dsc_controller.analysis import figures, summary
 from blf_dsc_controller.analysis.report import write_report
 from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.bags import recover as recovering
-from blf_dsc_controller.bags.export import export as export_run
+from blf_dsc_controller.bags.reader import export as export_run
 from blf_dsc_controller.bags.reader import read_run
 
 

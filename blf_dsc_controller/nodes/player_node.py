@@ -17,8 +17,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from blf_dsc_controller.bags.errors import BagError
-from blf_dsc_controller.bags.sources import open_bag
+from blf_dsc_controller.bags.sources import BagError, open_bag
 from blf_dsc_controller.messages.codecs import encode_clock
 from blf_dsc_controller.messages.topics import CLOCK, HISTORY, STREAM
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from blf_dsc_controller.bags.context import MESSAGES, Losses
-from blf_dsc_controller.bags.errors import BagError, DiskFullError
+from blf_dsc_controller.bags.sources import BagError
+from blf_dsc_controller.bags.writer import DiskFullError
 from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.configuration.params_file import dumps
 from blf_dsc_controller.messages.topics import Quality

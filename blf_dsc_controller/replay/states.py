@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.bags.content import Content, decode_joint_states
-from blf_dsc_controller.bags.errors import UnreadableMessageError
+from blf_dsc_controller.bags.content import Content, UnreadableMessageError, decode_joint_states
 from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.messages.topics import JOINT_STATES, LEARNING, REFERENCE, TRACKING_ERROR
