@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag comes back as the arrays it was made of, under any topic names."""
+"""A bag comes back as the arrays it was made of, under any topic names, and as a table."""
 
 from __future__ import annotations
+
+import csv
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from synthetic_bag import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthet
 from blf_dsc_controller.bags.content import UnreadableMessageError
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.sources import BagError
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
@@ -99,15 +102,6 @@ def test_one_of_several_robots_is_read_by_its_namespace(tmp_path, messages):
     assert read_run(tmp_path / 'bag', '/right').stamp.size < SAMPLES
 
 
-def test_without_joint_states_the_bag_is_rejected_with_a_list_of_its_topics(tmp_path, messages):
-    path = synthetic_bag.write(tmp_path / 'bag', without(messages, JOINT_STATES))
-    with pytest.raises(BagError) as caught:
-        read_run(path)
-    said = str(caught.value)
-    assert "'joint_states' of type sensor_msgs/msg/JointState" in said
-    assert '/blf_dsc_controller/commands (std_msgs/msg/Float64MultiArray)' in said
-
-
 def test_only_joint_states_are_essential(tmp_path, made, messages):
     states = [entry for entry in messages if entry[0] is JOINT_STATES]
     run = read_run(synthetic_bag.write(tmp_path / 'bag', states))
@@ -137,11 +131,15 @@ def test_torque_without_a_command_for_each_state(tmp_path, made, messages):
     assert np.isnan(torque[-1]).all()
 
 
-def test_a_sample_that_was_lost_is_a_gap_and_shifts_nothing(tmp_path, made, messages):
-    lost = [
-        entry for entry in messages if not (entry[0] is REFERENCE and entry[1] == made.stamp[5])
-    ]
-    reference = read_run(synthetic_bag.write(tmp_path / 'bag', lost)).reference
+@pytest.fixture
+def lost(tmp_path, made, messages):
+    """A bag without one sample of the reference."""
+    kept = [one for one in messages if not (one[0] is REFERENCE and one[1] == made.stamp[5])]
+    return synthetic_bag.write(tmp_path / 'bag', kept)
+
+
+def test_a_sample_that_was_lost_is_a_gap_and_shifts_nothing(made, lost):
+    reference = read_run(lost).reference
     assert np.isnan(reference[5]).all()
     np.testing.assert_array_equal(reference[6:], made.reference[6:])
 
@@ -189,3 +187,37 @@ def test_a_message_that_cannot_be_decoded_is_named_by_topic_and_number(tmp_path,
         place = [bytes(raw) for _, _, raw in reader.messages([learning])].index(b'\0\1\0\0')
     with pytest.raises(UnreadableMessageError, match=f'message {place + 1} of /blf.*/learning'):
         read_run(path)
+
+
+def read_table(path):
+    if path.suffix == '.parquet':
+        parquet = pytest.importorskip('pyarrow.parquet', reason='needs pyarrow')
+        return {name: np.array(v) for name, v in parquet.read_table(path).to_pydict().items()}
+    with path.open(newline='') as stream:
+        names, *rows = csv.reader(stream)
+    return dict(zip(names, np.array(rows, dtype=float).T, strict=True))
+
+
+@pytest.mark.parametrize('ending', ['csv', 'parquet'])
+def test_every_number_of_the_table_reads_back_equal_in_its_row(tmp_path, made, lost, ending):
+    if ending == 'parquet':
+        pytest.importorskip('pyarrow', reason='needs pyarrow')
+    out = tmp_path / f'table.{ending}'
+    assert main(['export', str(lost), '--out', str(out)]) == 0
+    found = read_table(out)
+    np.testing.assert_array_equal(found['stamp'], made.stamp)
+    np.testing.assert_array_equal(found['position elbow'], made.position[:, 1])
+    np.testing.assert_array_equal(found['torque shoulder'], made.torque[:, 0])
+    np.testing.assert_array_equal(found['learning m2*l2^2'], made.estimate[:, 1])
+    assert np.isnan(found['reference elbow'][5])  # lost, and no other row has moved up
+    np.testing.assert_array_equal(found['reference elbow'][6:], made.reference[6:, 1])
+    # Told each tenth sample, and held in between.
+    np.testing.assert_array_equal(
+        found['truth disturbance elbow'], np.repeat(made.disturbance[::10, 1], 10)
+    )
+    assert set(found['bound shoulder']) == {0.002}
+
+
+def test_a_table_of_another_ending_is_rejected(tmp_path, lost, capsys):
+    assert main(['export', str(lost), '--out', str(tmp_path / 'table.xlsx')]) == 1
+    assert 'neither .csv nor .parquet' in capsys.readouterr().err

@@ -287,10 +287,3 @@ def test_topics_of_one_type_share_its_definition(tmp_path):
         summary = make_reader(stream).get_summary()
     assert len(summary.schemas) == 1
     assert len(summary.channels) == 2
-
-
-def test_closing_twice_is_harmless(tmp_path):
-    bag = BagWriter(tmp_path / 'bag')
-    bag.close()
-    bag.close()
-    assert read_by_others(tmp_path / 'bag')['mcap'] == []

@@ -37,11 +37,20 @@ def joint_state(names, position, velocity, effort, stamp=STAMP, frame_id=''):
     return types['sensor_msgs/msg/JointState'](header, list(names), *arrays)
 
 
-def raw_joint_state(*arguments, little_endian=True, **options):
-    message = joint_state(*arguments, **options)
+def serialised(message, *, little_endian=True):
     return bytes(
         typestore().serialize_cdr(message, message.__msgtype__, little_endian=little_endian)
     )
+
+
+def multi_array(data, dimensions=()):
+    types = typestore().types
+    layout = types['std_msgs/msg/MultiArrayLayout'](list(dimensions), 0)
+    return types['std_msgs/msg/Float64MultiArray'](layout, np.array(data, dtype=float))
+
+
+def raw_joint_state(*arguments, little_endian=True, **options):
+    return serialised(joint_state(*arguments, **options), little_endian=little_endian)
 
 
 @given(NAMES, FRAMES, st.sets(st.sampled_from(('position', 'velocity', 'effort'))), st.data())
@@ -135,9 +144,15 @@ def test_velocity_of_another_length_is_rejected(velocity):
 
 
 @pytest.mark.parametrize('warm', [False, True])
-def test_every_truncation_is_rejected(warm):
-    raw = raw_joint_state('ab', [1, 2], [3, 4], [5, 6])
-    decoder = JointStateDecoder('ab')
+@pytest.mark.parametrize(
+    ('create', 'raw'),
+    [
+        (lambda: JointStateDecoder('ab'), raw_joint_state('ab', [1, 2], [3, 4], [5, 6])),
+        (lambda: Float64MultiArrayDecoder(2), Float64MultiArrayEncoder(2).encode([1, 2])),
+    ],
+)
+def test_every_truncation_is_rejected(create, raw, warm):
+    decoder = create()
     for length in range(len(raw)):
         if warm:
             decoder.decode(raw)
@@ -174,26 +189,18 @@ def test_encoder_rejects_arrays_of_another_length():
 
 @given(st.lists(VALUES, max_size=9))
 def test_multi_array_round_trip(data):
-    types = typestore().types
-    layout = types['std_msgs/msg/MultiArrayLayout']([], 0)
-    message = types['std_msgs/msg/Float64MultiArray'](layout, np.array(data, dtype=float))
     encoder = Float64MultiArrayEncoder(len(data))
     decoder = Float64MultiArrayDecoder(len(data))
 
-    assert encoder.encode(data) == typestore().serialize_cdr(message, message.__msgtype__)
+    assert encoder.encode(data) == serialised(multi_array(data))
     assert decoder.decode(encoder.encode(data)) == len(data)
     assert decoder.values.tolist() == data
 
 
 @pytest.mark.parametrize('little_endian', [False, True])
 def test_multi_array_with_dimensions(little_endian):
-    types = typestore().types
-    dimension = types['std_msgs/msg/MultiArrayDimension']('joints', 3, 3)
-    layout = types['std_msgs/msg/MultiArrayLayout']([dimension], 0)
-    message = types['std_msgs/msg/Float64MultiArray'](layout, np.array([1.0, 2.0, 3.0]))
-    raw = bytes(
-        typestore().serialize_cdr(message, message.__msgtype__, little_endian=little_endian)
-    )
+    dimension = typestore().types['std_msgs/msg/MultiArrayDimension']('joints', 3, 3)
+    raw = serialised(multi_array([1, 2, 3], [dimension]), little_endian=little_endian)
     decoder = Float64MultiArrayDecoder(3)
     assert decoder.decode(raw) == 3
     assert decoder.values.tolist() == [1, 2, 3]
@@ -206,14 +213,7 @@ def test_multi_array_of_another_size_returns_its_length():
     assert decoder.values.tolist() == [1, 2]
 
 
-def test_truncated_multi_array_is_rejected():
-    raw = Float64MultiArrayEncoder(2).encode([1, 2])
-    for length in range(len(raw)):
-        with pytest.raises(MessageError, match='is cut off'):
-            Float64MultiArrayDecoder(2).decode(raw[:length])
-
-
 def test_clock_equals_full_serialisation():
     types = typestore().types
     clock = types['rosgraph_msgs/msg/Clock'](types['builtin_interfaces/msg/Time'](1, 5))
-    assert encode_clock(1_000_000_005) == typestore().serialize_cdr(clock, clock.__msgtype__)
+    assert encode_clock(1_000_000_005) == serialised(clock)
