@@ -13,15 +13,12 @@ resets the controller, if there is one, before it sends the first state.
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
-from rclpy.publisher import Publisher
 from rclpy.timer import Timer
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.arms.two_link_geometry import urdf
@@ -29,16 +26,11 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder
-from blf_dsc_controller.messages.telemetry import DECIMATION, Message, PlantTelemetry
+from blf_dsc_controller.messages.telemetry import DECIMATION, PlantTelemetry
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher
-from blf_dsc_controller.nodes.endpoints import (
-    create_publisher,
-    create_steady_timer,
-    create_subscription,
-    have_subscribers,
-)
-from blf_dsc_controller.nodes.lifecycle import ManagedNode
+from blf_dsc_controller.nodes.endpoints import create_publisher, create_steady_timer
+from blf_dsc_controller.nodes.lifecycle import LoopNode
 from sim_plant import kernels as plant_kernels
 from sim_plant.command_input import Latency, TorqueInput
 from sim_plant.handshake import Handshake
@@ -47,42 +39,19 @@ from sim_plant.plant import Plant, plant_of, steps_of
 LOCKSTEP_START = 1_000_000_000
 """First stamp in lock-step [ns]: a zero stamp says 'not set' in ROS."""
 
-_POLL_PERIOD = 0.01  # s
-_REPEAT_PERIOD = 3.0  # s, for a state that nobody has answered
-_DIAGNOSTICS_PERIOD = 1.0  # s
+_REPEAT_PERIOD = 3.0  # s, for a state that has got no torque
 _EARLY = 0.05  # of a sample: a timer that fires this much early is on time
 _BETWEEN_RUNS = 1_000_000_000  # ns from the last stamp before a reset to the first after it
 
 
-class PlantNode(ManagedNode):
+class PlantNode(LoopNode[PlantConfig]):
     """Publishes measured joint states and applies the torques that come back.
 
-    Args:
-        steady: steady clock [ns], which paces real time.
-        wall: time of day [ns], with which stamps begin in real time.
-        options: of rclpy's LifecycleNode.
-
-    Attributes:
-        config: the configuration.
-        plant: the simulated arm.
-        input: the torques received.
-        latency: how long, in real time, the arm waits for its torques.
-
-    Raises:
-        ConfigurationError: the parameters do not describe a plant.
+    `latency` is how long, in real time, the arm waits for its torques.
     """
 
-    def __init__(
-        self,
-        *,
-        steady: Callable[[], int] = time.monotonic_ns,
-        wall: Callable[[], int] = time.time_ns,
-        **options: Any,
-    ) -> None:
-        super().__init__(topics.PLANT, **options)
-        self._now = lambda: steady() * 1e-9
-        self._wall = wall
-        self.config = parameters.declare(self, PlantConfig)
+    def __init__(self, **options: Any) -> None:
+        super().__init__(topics.PLANT, PlantConfig, **options)
         parameters.on_change(self, PlantConfig, self._reconfigure)
         self.latency = Latency()
         joints = self.config.joints
@@ -92,22 +61,20 @@ class PlantNode(ManagedNode):
         self._decoder = Float64MultiArrayDecoder(len(joints))
         self.input = TorqueInput(joints)
         self._reported_stale = self._reported_rejected = 0
-        self._outputs: dict[topics.Topic, Publisher] = {}
         self._diagnostics = DiagnosticsPublisher(self, joints)
         self._step_timer: Timer | None = None
         self._start_stamp = LOCKSTEP_START
         self._handshake = Handshake(self, self._now)
-        create_steady_timer(self, _POLL_PERIOD, self._on_poll)
-        create_steady_timer(self, _DIAGNOSTICS_PERIOD, self._report)
-        self.create_service(Trigger, '~/reset', self._on_reset)
         self.plant: Plant
         self._rest()
-        if self.config.autostart:
-            self.autostart()
+        self.start()
+
+    def _now(self) -> float:
+        return self._steady() * 1e-9
 
     def _rest(self) -> None:
         """Stand still: neither sending states nor running."""
-        self._offered = self._running = self._active = False
+        self._offered = self._running = False
         self._has_torque = True
         self._published = self._began = 0.0
         self._first = 0
@@ -127,11 +94,11 @@ class PlantNode(ManagedNode):
         self.plant.step(np.zeros(len(self.config.joints)))
         self.plant.reset()
         self._rest()
-        if not self._outputs:
-            self._outputs = {one: create_publisher(self, one) for one in self._output_topics()}
+        outputs = [topics.JOINT_STATES, topics.TRUTH]
+        outputs += [] if self._lockstep else [topics.TIMING]
+        outputs += [topics.CLOCK] if self.config.publish_clock else []
+        if self.connect(outputs, topics.COMMANDS, self._on_command):
             self._publish_description()
-            create_subscription(self, topics.COMMANDS, self._on_command)
-            process.request_realtime(self.config.realtime, self.get_logger())
 
     def _publish_description(self) -> None:
         limits = self.config.actuator.torque_limit
@@ -141,7 +108,6 @@ class PlantNode(ManagedNode):
 
     def activate(self) -> None:
         """Send the present state once a controller listens, and continue with its torque."""
-        self._active = True
         self._handshake.begin(reset=False)
         self.get_logger().info(f'{self.config.mode}, waiting for a controller')
 
@@ -157,37 +123,24 @@ class PlantNode(ManagedNode):
         """Wait until every subscriber has the last messages."""
         process.drain(self._outputs.values())
 
-    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._active
-        if not response.success:
-            response.message = f'{self.get_name()} is {self.state_label}: activate it first'
-            return response
+    def reset(self) -> str:
+        """Take the arm to its start, braked, and reset the controller before the first state."""
         self._start_stamp = self.stamp + _BETWEEN_RUNS
         self._rest()
-        self._active = True
         self.plant.reset()
         self.input.restart()
         self._handshake.begin(reset=True)
-        response.message = 'the arm is at its start, braked until the first torque comes'
-        return response
+        return 'the arm is at its start, braked until the first torque comes'
 
     @property
     def stamp(self) -> int:
         """Time of the present sample [ns]."""
         return self._start_stamp + self.plant.elapsed_ns
 
-    def _output_topics(self) -> tuple[topics.Topic, ...]:
-        outputs = [topics.JOINT_STATES, topics.TRUTH]
-        if not self._lockstep:
-            outputs.append(topics.TIMING)
-        if self.config.publish_clock:
-            outputs.append(topics.CLOCK)
-        return tuple(outputs)
-
     # The loop.
 
     def _on_poll(self) -> None:
-        if not self._active or self.finished:
+        if self.finished or self.state_label != 'active':
             return
         if not self._offered:
             if self._handshake.is_done(observed=self._is_observed()):
@@ -210,10 +163,6 @@ class PlantNode(ManagedNode):
             self._advance()
         else:
             self._publish_state()
-
-    def _is_observed(self) -> bool:
-        observers = self.config.wait_for_subscribers
-        return have_subscribers(self._outputs, topics.JOINT_STATES, observers)
 
     def _on_command(self, raw: bytes) -> None:
         try:
@@ -258,7 +207,9 @@ class PlantNode(ManagedNode):
             waited = self.latency.step(self._now())
             deadline = (self.plant.sample + 1 - self._first) * self.config.sample_time
             self._advance()
-            self._publish_timing(waited, max(0.0, self._now() - self._began - deadline))
+            lateness = max(0.0, self._now() - self._began - deadline)
+            late_steps = self.latency.late_steps
+            self._publish(self._telemetry.timing(self.stamp, waited, lateness, late_steps))
 
     def _advance(self) -> None:
         if self._is_over():
@@ -297,14 +248,6 @@ class PlantNode(ManagedNode):
         if self.config.publish_clock:
             self._publish(self._telemetry.clock(stamp))
 
-    def _publish_timing(self, waited: float, lateness: float) -> None:
-        late_steps = self.latency.late_steps
-        self._publish(self._telemetry.timing(self.stamp, waited, lateness, late_steps))
-
-    def _publish(self, message: Message) -> None:
-        topic, raw = message
-        self._outputs[topic].publish(raw)
-
     def _reconfigure(self, config: PlantConfig) -> None:
         self.config = config
 
@@ -318,7 +261,8 @@ class PlantNode(ManagedNode):
         }
         if not self._running:
             waits = WARN, 'braked: waiting for the first torque'
-            level, message = waits if self._active else (STALE, self.state_label)
+            active = self.state_label == 'active'
+            level, message = waits if active else (STALE, self.state_label)
         elif self.input.stale_steps > self._reported_stale:
             message = 'the last torque is too old (actuator.command_timeout): not applied'
             level = ERROR
@@ -331,10 +275,7 @@ class PlantNode(ManagedNode):
         self._diagnostics.publish([self._diagnostics.status('torque', level, message, values)])
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return process.run(PlantNode)
-
+main = partial(process.run, PlantNode)
 
 if __name__ == '__main__':
     sys.exit(main())

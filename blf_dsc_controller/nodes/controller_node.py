@@ -4,13 +4,10 @@
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
-from rclpy.publisher import Publisher
-from std_srvs.srv import Trigger
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law import factory as assembly
@@ -19,23 +16,14 @@ from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.codecs import JointStateDecoder
-from blf_dsc_controller.messages.telemetry import DECIMATION, ControllerTelemetry, Message, Monitor
+from blf_dsc_controller.messages.telemetry import DECIMATION, ControllerTelemetry, Monitor
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.controller_status import ControllerStatus
-from blf_dsc_controller.nodes.endpoints import (
-    create_publisher,
-    create_steady_timer,
-    create_subscription,
-    have_subscribers,
-)
-from blf_dsc_controller.nodes.lifecycle import ManagedNode
+from blf_dsc_controller.nodes.lifecycle import POLL_PERIOD, LoopNode
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.reasons import Phase
-
-_POLL_PERIOD = 0.01  # s, while waiting for subscribers
-_DIAGNOSTICS_PERIOD = 1.0  # s
 
 OUTPUTS = (
     topics.COMMANDS,
@@ -47,32 +35,14 @@ OUTPUTS = (
 )
 
 
-class ControllerNode(ManagedNode):
+class ControllerNode(LoopNode[ControllerConfig]):
     """Commands a torque on `~/commands` for each joint state, and publishes telemetry.
 
-    Args:
-        steady: steady clock of the watchdog [ns].
-        wall: time of day, by which live stamps are recognised [ns].
-        options: of rclpy's LifecycleNode.
-
-    Attributes:
-        config: the configuration in force.
-        guard: the law behind its supervisor; None until configured.
-
-    Raises:
-        ConfigurationError: the parameters do not describe a law that can run.
+    `guard` is the law behind its supervisor, None until the node is configured.
     """
 
-    def __init__(
-        self,
-        *,
-        steady: Callable[[], int] = time.monotonic_ns,
-        wall: Callable[[], int] = time.time_ns,
-        **options: Any,
-    ) -> None:
-        super().__init__(topics.CONTROLLER, **options)
-        self._clocks = steady, wall
-        self.config = parameters.declare(self, ControllerConfig)
+    def __init__(self, **options: Any) -> None:
+        super().__init__(topics.CONTROLLER, ControllerConfig, **options)
         self.guard: Guard | None = None
         joints = self.config.joints
         self._estimates = assembly.estimate_names(self.config)
@@ -83,14 +53,9 @@ class ControllerNode(ManagedNode):
         self._decoder = JointStateDecoder(joints, assembly.required_fields(self.config))
         self._pending: bytes | None = None
         self._observed = self._started = False
-        self._outputs: dict[topics.Topic, Publisher] = {}
         self._status = ControllerStatus(self, joints)
-        self._watch_timer = create_steady_timer(self, _POLL_PERIOD, self._on_poll)
-        create_steady_timer(self, _DIAGNOSTICS_PERIOD, self._report)
         parameters.on_change(self, ControllerConfig, self._retune, self._problems)
-        self.create_service(Trigger, '~/reset', self._on_reset)
-        if self.config.autostart:
-            self.autostart()
+        self.start()
 
     @property
     def controller(self) -> Controller:
@@ -109,15 +74,12 @@ class ControllerNode(ManagedNode):
     def configure(self) -> None:
         """Compile the law; create the topics of the loop the first time."""
         process.log_compilation(self.get_logger(), update)
-        self.guard = Guard(self.config, *self._clocks)
+        self.guard = Guard(self.config, self._steady, self._wall)
         for warning in config_warnings(self.config):
             self.get_logger().warning(warning)
-        if not self._outputs:
-            outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
-            self._outputs = {topic: create_publisher(self, topic) for topic in outputs}
-            create_subscription(self, topics.JOINT_STATES, self._on_joint_state)
+        outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
+        if self.connect(outputs, topics.JOINT_STATES, self._on_joint_state):
             self._status.trajectories = TrajectoryInput(self, lambda: self.guard)
-            process.request_realtime(self.config.realtime, self.get_logger())
         self._report()
 
     def activate(self) -> None:
@@ -153,16 +115,13 @@ class ControllerNode(ManagedNode):
             self.guard.release()
             self._status.publish_events(self.guard)
 
-    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self.guard is not None and self.state_label == 'active'
-        if self.guard is not None and response.success:
+    def reset(self) -> str:
+        """Start again with the next joint state, with the initial estimates."""
+        if self.guard is not None:
             self.guard.reset()
-            self.failure = None
-            response.message = 'everything learned is forgotten: starting with the next state'
-            self._report()
-        else:
-            response.message = f'{self.get_name()} is {self.state_label}: activate it first'
-        return response
+        self.failure = None
+        self._report()
+        return 'everything learned is forgotten: starting with the next state'
 
     # The loop.
 
@@ -225,28 +184,20 @@ class ControllerNode(ManagedNode):
     def _command(self, torque: np.ndarray) -> None:
         self._publish(self._telemetry.command(torque))
 
-    def _publish(self, message: Message) -> None:
-        topic, raw = message
-        self._outputs[topic].publish(raw)
-
     def _publish_bound(self, stamp: int, bound: np.ndarray) -> None:
         self._published_bound[:] = bound
         limit = self.controller.settings.torque_limit
         self._publish(self._telemetry.bound(stamp, bound, limit))
 
-    def _is_observed(self) -> bool:
-        observers = self.config.wait_for_subscribers
-        return have_subscribers(self._outputs, topics.COMMANDS, observers)
-
     def _on_poll(self) -> None:
-        """Watch, and set the timer to when there may be something to see: waking up is costly."""
-        wait = _POLL_PERIOD
+        """Check for missing states, and set the timer to the next check: waking up is costly."""
+        wait = POLL_PERIOD
         if self.guard is not None:
             self._watch(self.guard)
             if self._pending is None:
                 wait = self.guard.next_watch
-        self._watch_timer.timer_period_ns = int(1e9 * wait)
-        self._watch_timer.reset()
+        self._poll_timer.timer_period_ns = int(1e9 * wait)
+        self._poll_timer.reset()
 
     def _watch(self, guard: Guard) -> None:
         if self._pending is not None and self._is_observed():
@@ -286,10 +237,7 @@ class ControllerNode(ManagedNode):
         self._status.report(self.state_label, self.guard)
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return process.run(ControllerNode)
-
+main = partial(process.run, ControllerNode)
 
 if __name__ == '__main__':
     sys.exit(main())

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import importlib
 import sysconfig
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -99,14 +99,6 @@ def create_subscription(node: Node, topic: Topic, callback: Callable[[bytes], No
 def create_steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
     """Timer [s] on the steady clock, which also runs while simulated time stands still."""
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-
-def have_subscribers(publishers: Mapping[Topic, Publisher], loop: Topic, observers: int) -> bool:
-    """Whether each topic has `observers` subscribers, and `loop` the peer's beside them."""
-    return all(
-        publisher.get_subscription_count() >= observers + (topic is loop)
-        for topic, publisher in publishers.items()
-    )
 
 
 def _overridable() -> QoSOverridingOptions:

@@ -1,28 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A managed (lifecycle) node that starts by itself, and that no request can bring down."""
+"""Managed (lifecycle) nodes: any of them, and the two of the control loop."""
 
 from __future__ import annotations
 
+import time
 import traceback
-from collections.abc import Callable
-from typing import Any
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, TypeVar
 
 from lifecycle_msgs.srv import ChangeState
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.publisher import Publisher
+from std_srvs.srv import Trigger
 
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages.telemetry import Message
+from blf_dsc_controller.messages.topics import Topic
+from blf_dsc_controller.nodes import parameters, process
+from blf_dsc_controller.nodes.endpoints import (
+    create_publisher,
+    create_steady_timer,
+    create_subscription,
+)
 from blf_dsc_controller.nodes.rclpy_internals import RCLError, lifecycle_state, wrap_change_state
+
+Config = TypeVar('Config', ControllerConfig, PlantConfig)
+
+POLL_PERIOD = 0.01  # s
+_DIAGNOSTICS_PERIOD = 1.0  # s
 
 
 class ManagedNode(LifecycleNode):
-    """Base class of the nodes: override `configure`, `activate`, `deactivate` and `release`.
+    """A lifecycle node that starts by itself, and that no request can bring down.
 
-    Topics, services and parameters exist for the life of the node; what it computes with is made
-    when it is configured and released when it is cleaned up.
-
-    Attributes:
-        finished: True once the node has nothing more to do.
-        failure: why the node cannot go on; the process ends with it.
+    Override `configure`, `activate`, `deactivate` and `release`. Topics, services and parameters
+    exist for the life of the node; what it computes with is made when it is configured and released
+    when it is cleaned up. `finished` and `failure` are those of `process.PlainNode`.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
@@ -53,11 +69,7 @@ class ManagedNode(LifecycleNode):
         return lifecycle_state(self)
 
     def autostart(self) -> None:
-        """Configure and activate the node, as a manager would.
-
-        Raises:
-            BlfDscError: a step failed; the error that it raised, if that was one of ours.
-        """
+        """Configure and activate the node, as a manager would; BlfDscError if a step fails."""
         for name, step in (
             ('configure', self.trigger_configure),
             ('activate', self.trigger_activate),
@@ -68,21 +80,21 @@ class ManagedNode(LifecycleNode):
                     raise error
                 raise BlfDscError(f'{self.get_name()} could not {name}: {error!r}') from error
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: D102
-        return self._try(self.configure, state)
+    def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:  # noqa: D102
+        return self._try(self.configure)
 
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: D102
-        return self._try(self.activate, state)
+    def on_activate(self, _state: LifecycleState) -> TransitionCallbackReturn:  # noqa: D102
+        return self._try(self.activate)
 
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: D102
-        return self._try(self.deactivate, state)
+    def on_deactivate(self, _state: LifecycleState) -> TransitionCallbackReturn:  # noqa: D102
+        return self._try(self.deactivate)
 
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: D102
-        return self._try(self.release, state)
+    def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:  # noqa: D102
+        return self._try(self.release)
 
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_shutdown(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Release everything and end the process."""
-        result = self._try(self.release, state)
+        result = self._try(self.release)
         self.finished = True
         return result
 
@@ -91,7 +103,7 @@ class ManagedNode(LifecycleNode):
         self.release()
         return TransitionCallbackReturn.SUCCESS
 
-    def _try(self, step: Callable[[], None], _state: LifecycleState) -> TransitionCallbackReturn:
+    def _try(self, step: Callable[[], None]) -> TransitionCallbackReturn:
         try:
             step()
         except BlfDscError as error:
@@ -119,3 +131,73 @@ class ManagedNode(LifecycleNode):
                 return response
 
         return callback
+
+
+class LoopNode(ManagedNode, Generic[Config]):
+    """One of the two nodes of the control loop: configuration, topics, diagnostics, `~/reset`.
+
+    `steady` [ns] is the clock of timeouts and of real time, `wall` [ns] that of live stamps.
+    Raises ConfigurationError if a parameter is wrong.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        cls: type[Config],
+        *,
+        steady: Callable[[], int] = time.monotonic_ns,
+        wall: Callable[[], int] = time.time_ns,
+        **options: Any,
+    ) -> None:
+        super().__init__(name, **options)
+        self._steady, self._wall = steady, wall
+        self.config: Config = parameters.declare(self, cls)
+        self._outputs: dict[Topic, Publisher] = {}
+
+    def start(self) -> None:
+        """Start timers and services, and the node itself if it is configured to."""
+        self._poll_timer = create_steady_timer(self, POLL_PERIOD, self._on_poll)
+        create_steady_timer(self, _DIAGNOSTICS_PERIOD, self._report)
+        self.create_service(Trigger, '~/reset', self._on_reset)
+        if self.config.autostart:
+            self.autostart()
+
+    def connect(
+        self, outputs: Sequence[Topic], source: Topic, callback: Callable[[bytes], None]
+    ) -> bool:
+        """Create the topics of the loop, `outputs[0]` to the other node, unless they exist."""
+        if self._outputs:
+            return False
+        self._outputs = {topic: create_publisher(self, topic) for topic in outputs}
+        create_subscription(self, source, callback)
+        process.request_realtime(self.config.realtime, self.get_logger())
+        return True
+
+    @abstractmethod
+    def reset(self) -> str:
+        """Start again, while active; return the message of the response."""
+
+    @abstractmethod
+    def _on_poll(self) -> None: ...
+
+    @abstractmethod
+    def _report(self) -> None:
+        """Publish diagnostics."""
+
+    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = self.state_label == 'active'
+        inactive = f'{self.get_name()} is {self.state_label}: activate it first'
+        response.message = self.reset() if response.success else inactive
+        return response
+
+    def _publish(self, message: Message) -> None:
+        topic, raw = message
+        self._outputs[topic].publish(raw)
+
+    def _is_observed(self) -> bool:
+        """Whether each output has its subscribers, the first the other node's beside them."""
+        observers = self.config.wait_for_subscribers
+        return all(
+            publisher.get_subscription_count() >= observers + (number == 0)
+            for number, publisher in enumerate(self._outputs.values())
+        )

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import rclpy
 from rclpy.duration import Duration
@@ -25,8 +25,10 @@ from blf_dsc_controller.compiled import COMPILATION_NOTICE
 from blf_dsc_controller.compiled.jit import is_compiled
 from blf_dsc_controller.configuration.common import Realtime
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.nodes.lifecycle import ManagedNode
 from blf_dsc_controller.nodes.rclpy_internals import RCLError, UnknownROSArgsError
+
+if TYPE_CHECKING:
+    from blf_dsc_controller.nodes.lifecycle import ManagedNode
 
 _POLL = 0.1  # s; EventsExecutor has no usable spin()
 _DRAIN_TIMEOUT = 10.0  # s for all topics; a recorder on a busy machine has been seen 2 s behind
@@ -51,7 +53,7 @@ class PlainNode(Node):
         """Save and release what must not be lost, while ROS is still up."""
 
 
-Runnable: TypeAlias = PlainNode | ManagedNode
+Runnable: TypeAlias = 'PlainNode | ManagedNode'
 
 
 def run(make_node: Callable[[], Runnable]) -> int:
