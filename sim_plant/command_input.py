@@ -12,17 +12,10 @@ from numpy.typing import NDArray
 
 
 class TorqueInput:
-    """The last valid torque, and what was rejected.
+    """The last valid `torque` (n,) [N m] of the n joints, and what was rejected.
 
-    Args:
-        joints: names of the n joints.
-
-    Attributes:
-        torque: (n,) the last valid one [N m].
-        wrong_length: commands rejected because they were not of n values.
-        not_finite: commands rejected because of NaN or infinity.
-        problem: what was wrong with the last rejected command.
-        stale_steps: steps for which the torque was too old.
+    `wrong_length` and `not_finite` count the rejected commands by cause, `problem` describes the
+    last one; `stale_steps` counts the steps for which the torque was too old.
     """
 
     def __init__(self, joints: tuple[str, ...]) -> None:
@@ -42,8 +35,7 @@ class TorqueInput:
     def take(self, size: int, torque: NDArray[np.float64], sample: int) -> bool:
         """Take a command of `size` values, `torque` (n,), at a sample of the plant.
 
-        Returns:
-            Whether it is valid; `problem` says why not.
+        Returns whether it is valid; `problem` describes why not.
         """
         if size != self.torque.size:
             self.wrong_length += 1
@@ -68,7 +60,7 @@ class TorqueInput:
     def restart(self) -> None:
         """Forget the torque; sample 0 comes next."""
         self.torque[:] = 0.0
-        self._taken_at = 0
+        self.renew(0)
 
     def renew(self, sample: int) -> None:
         """Count the age of the torque from `sample` on."""
@@ -79,10 +71,8 @@ class Latency:
     """Time from a published state to the torque that follows it, and the number of late steps.
 
     A torque does not say which state it belongs to. It is matched with the oldest state that has
-    had no torque yet, so that a late torque counts with its whole delay. Times are in s.
-
-    Attributes:
-        late_steps: steps taken before any torque had come for their state.
+    had no torque yet, so that a late torque counts with its whole delay. Times are in s;
+    `late_steps` counts the steps taken before any torque had come for their state.
     """
 
     def __init__(self) -> None:

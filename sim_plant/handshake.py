@@ -19,11 +19,8 @@ class Handshake:
     """Waits until the first state can be sent.
 
     After a reset of the plant the wait also lets torques of the previous run expire, and the
-    controller is reset if it has the service; any other controller has to be reset by hand.
-
-    Args:
-        node: of the plant.
-        clock: steady clock [s].
+    controller is reset if it has the service; any other controller has to be reset by hand. `clock`
+    is steady [s].
     """
 
     def __init__(self, node: LifecycleNode, clock: Callable[[], float]) -> None:

@@ -26,19 +26,16 @@ from blf_dsc_controller.messages.types import UnknownTypeError, typestore
 def message_class(type_name: str) -> Any:
     """Class of a message type such as `sensor_msgs/msg/JointState`.
 
-    Raises:
-        ImportError: its package is not installed.
-        AttributeError: the package has no such type.
+    Raises ImportError if its package is not installed, AttributeError if that has no such type.
     """
     package, kind, name = type_name.split('/')
     return getattr(importlib.import_module(f'{package}.{kind}'), name)
 
 
 def register_definition(type_name: str) -> None:
-    """Register a type, and those nested in it, from the .msg files of its installed package.
+    """Register a type, and those nested in it, from the .msg files of their installed packages.
 
-    Raises:
-        UnknownTypeError: there is no such file, also for a nested type.
+    Raises UnknownTypeError if there is no such file.
     """
     if type_name in typestore().fielddefs:
         return
@@ -74,6 +71,10 @@ def qos_profile(quality: Quality) -> QoSProfile:
     )
 
 
+# Declares `qos_overrides.TOPIC.publisher.depth` and so on: history, depth, reliability.
+_overridable = QoSOverridingOptions.with_default_policies
+
+
 def create_publisher(node: Node, topic: Topic) -> Publisher:
     """Publisher of one of the node's own topics, for serialised messages."""
     return node.create_publisher(
@@ -99,8 +100,3 @@ def create_subscription(node: Node, topic: Topic, callback: Callable[[bytes], No
 def create_steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
     """Timer [s] on the steady clock, which also runs while simulated time stands still."""
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-
-def _overridable() -> QoSOverridingOptions:
-    """Declare `qos_overrides.TOPIC.publisher.depth` and so on: history, depth, reliability."""
-    return QoSOverridingOptions.with_default_policies()

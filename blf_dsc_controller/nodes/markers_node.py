@@ -7,6 +7,7 @@ It takes the newest messages a few times a second instead of a callback for each
 from __future__ import annotations
 
 import sys
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,11 +34,7 @@ _WIDTH = 0.01  # m
 
 
 class MarkersNode(PlainNode):
-    """Publishes `~/markers`.
-
-    Raises:
-        ConfigurationError: a parameter is wrong.
-    """
+    """Publishes `~/markers`; ConfigurationError if a parameter is wrong."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NAME, **options)
@@ -114,10 +111,7 @@ def _point(at: tuple[float, float, float]) -> Point:
     return Point(x=at[0], y=at[1], z=at[2])
 
 
-def main() -> int:
-    """Run the node as a process."""
-    return run(MarkersNode)
-
+main = partial(run, MarkersNode)
 
 if __name__ == '__main__':
     sys.exit(main())

@@ -26,8 +26,7 @@ _WITHOUT_YAML = (ParameterType.PARAMETER_NOT_SET, ParameterType.PARAMETER_BYTE_A
 class ParameterClient:
     """Reads the parameters of each requested node once, when its services are there.
 
-    Args:
-        callback: called with the full name of a node and the values of its parameters.
+    `callback` is called with the full name of the node and the values of its parameters.
     """
 
     def __init__(self, callback: Callable[[str, Values], None]) -> None:

@@ -33,7 +33,10 @@ if TYPE_CHECKING:
 
 Config = TypeVar('Config')
 
-_LARGEST_INTEGER = 2**63 - 1
+_RANGES: dict[Kind, tuple[str, type[Any], type[Any], Any]] = {
+    Kind.DOUBLE: ('floating_point_range', FloatingPointRange, float, sys.float_info.max),
+    Kind.INTEGER: ('integer_range', IntegerRange, int, 2**63 - 1),
+}
 
 
 def declare(node: Node, cls: type[Config]) -> Config:
@@ -112,21 +115,11 @@ def descriptor(one: Parameter) -> ParameterDescriptor:
     )
     low = one.above if one.at_least is None else one.at_least
     high = one.below if one.at_most is None else one.at_most
-    if one.kind is Kind.DOUBLE and (low, high) != (None, None):
-        largest = sys.float_info.max
-        described.floating_point_range = [
-            FloatingPointRange(
-                from_value=-largest if low is None else low,
-                to_value=largest if high is None else high,
-            )
-        ]
-    if one.kind is Kind.INTEGER and (low, high) != (None, None):
-        described.integer_range = [
-            IntegerRange(
-                from_value=-_LARGEST_INTEGER if low is None else int(low),
-                to_value=_LARGEST_INTEGER if high is None else int(high),
-            )
-        ]
+    if one.kind in _RANGES and (low, high) != (None, None):
+        name, message, number, largest = _RANGES[one.kind]
+        from_value = -largest if low is None else number(low)
+        to_value = largest if high is None else number(high)
+        setattr(described, name, [message(from_value=from_value, to_value=to_value)])
     return described
 
 

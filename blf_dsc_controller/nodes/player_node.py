@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,17 +32,10 @@ _LATCHED = ('bound',)
 
 
 class PlayerNode(Node):
-    """Publishes the messages of a bag in its time.
+    """Publishes the messages of a bag in its time, and that time on /clock if `clock` is set.
 
-    Args:
-        path: of the bag.
-        rate: bag time per time; 0: as fast as possible.
-        loop: whether to begin again at the end.
-        clock: whether to publish the bag's time on /clock.
-        options: of rclpy's Node.
-
-    Raises:
-        BagError: there is no bag, it is damaged, or it holds nothing that can be played here.
+    `rate` is bag time per time, 0 as fast as possible; a `loop` begins again at the end. Raises
+    BagError if there is no bag, it is damaged, or it holds nothing that can be played here.
     """
 
     def __init__(self, path: Path, rate: float, *, loop: bool, clock: bool, **options: Any) -> None:
@@ -60,8 +54,15 @@ class PlayerNode(Node):
             self.create_publisher(message_class(CLOCK.type), '/clock', 10) if clock else None
         )
         self._clock_published = 0
-        for name, action in self._actions().items():
-            self.create_service(Trigger, f'~/{name}', _callback(action))
+        actions: dict[str, Callable[[], tuple[bool, str]]] = {
+            'pause': self.pause,
+            'resume': self._resume,
+            'toggle_paused': lambda: self._resume() if self.timeline.paused else self.pause(),
+            'is_paused': lambda: (self.timeline.paused, ''),
+            'play_next': self._play_next,
+        }
+        for name, action in actions.items():
+            self.create_service(Trigger, f'~/{name}', partial(_respond, action))
 
     def play(self) -> None:
         """Publish what is due."""
@@ -89,16 +90,8 @@ class PlayerNode(Node):
         output, raw = self._messages[number]
         output.publish(raw)
 
-    def _actions(self) -> dict[str, Callable[[], tuple[bool, str]]]:
-        return {
-            'pause': self._pause,
-            'resume': self._resume,
-            'toggle_paused': lambda: self._resume() if self.timeline.paused else self._pause(),
-            'is_paused': lambda: (self.timeline.paused, ''),
-            'play_next': self._play_next,
-        }
-
-    def _pause(self) -> tuple[bool, str]:
+    def pause(self) -> tuple[bool, str]:
+        """Hold the position in the bag."""
         self.timeline.pause(time.monotonic_ns())
         return True, 'paused'
 
@@ -114,12 +107,11 @@ class PlayerNode(Node):
         return True, f'message {number + 1} of {len(self._messages)}'
 
 
-def _callback(action: Callable[[], tuple[bool, str]]) -> Callable[[Any, Any], Any]:
-    def callback(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = action()
-        return response
-
-    return callback
+def _respond(
+    action: Callable[[], tuple[bool, str]], _: Trigger.Request, response: Trigger.Response
+) -> Trigger.Response:
+    response.success, response.message = action()
+    return response
 
 
 def play(
@@ -132,19 +124,10 @@ def play(
     delay: float,
     remaps: Sequence[str],
 ) -> None:
-    """Play a bag until its end, or until Ctrl-C.
+    """Play a bag as PlayerNode does, until its end or until Ctrl-C.
 
-    Args:
-        path: of the bag.
-        rate: bag time per time; 0: as fast as possible.
-        loop: whether to begin again at the end.
-        clock: whether to publish the bag's time on /clock.
-        paused: whether to wait for the service `resume`.
-        delay: time for subscribers to be found before the first message [s].
-        remaps: such as `joint_states:=other`.
-
-    Raises:
-        BagError: there is no bag, or it is damaged.
+    Subscribers have `delay` [s] to be found before the first message; a start that is `paused`
+    waits for the service `resume`. `remaps` are such as `joint_states:=other`.
     """
     words = [word for remap in remaps for word in ('--remap', remap)]
     rclpy.init(args=['bag_replay', '--ros-args', *words] if words else None)
@@ -156,7 +139,7 @@ def play(
         while time.monotonic() - begin < delay:
             executor.spin_once(timeout_sec=_LONGEST_WAIT)
         if paused:
-            node.timeline.pause(time.monotonic_ns())
+            node.pause()
         while rclpy.ok() and not node.timeline.is_over:
             node.play()
             wait = node.timeline.wait(time.monotonic_ns())

@@ -41,9 +41,8 @@ _MCL_FUTURE = 2
 class PlainNode(Node):
     """A node without a life cycle for `run`.
 
-    Attributes:
-        finished: True once the node has nothing more to do.
-        failure: why the node cannot go on; the process ends with it.
+    It sets `finished` once it has nothing more to do, and `failure` if it cannot go on; the process
+    ends with it.
     """
 
     finished = False
@@ -59,8 +58,8 @@ Runnable: TypeAlias = 'PlainNode | ManagedNode'
 def run(make_node: Callable[[], Runnable]) -> int:
     """Run a node until it has finished, a signal comes, or it fails.
 
-    Returns:
-        Exit code: 0 at the end or on SIGINT and SIGTERM, 1 after an error, which is on stderr.
+    Returns the exit code: 0 at the end or on SIGINT and SIGTERM, 1 after an error, printed on
+    stderr.
     """
     signals: list[int] = []  # a flag, so that no callback is cut off in the middle
     for number in (signal.SIGINT, signal.SIGTERM):

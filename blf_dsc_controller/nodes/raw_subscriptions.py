@@ -16,11 +16,11 @@ from typing import NamedTuple
 
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
 from blf_dsc_controller.messages.topics import Quality
-from blf_dsc_controller.nodes.endpoints import message_class
+from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.nodes.rclpy_internals import take_messages
 
 _BATCH = 1000  # messages taken of one topic before the next has its turn
@@ -29,24 +29,15 @@ _BATCH = 1000  # messages taken of one topic before the next has its turn
 class RawMessage(NamedTuple):
     """A serialised message with what the middleware knows of it."""
 
+    handle: int
+    raw: bytes
     received: int  # ns, system time
     published: int  # ns, system time of the publisher
     sequence: int  # number given by the publisher, 0 if not known
-    handle: int
-    raw: bytes
 
 
 class RawSubscriptions:
-    """Subscriptions to a growing set of topics.
-
-    Args:
-        context: of the node that they are for.
-        name: of the hidden node that subscribes.
-        depth: messages that may wait for each topic.
-
-    Attributes:
-        node: the hidden node.
-    """
+    """Subscriptions of a hidden `node` to any number of topics, each with a queue of `depth`."""
 
     def __init__(self, context: Context, name: str, depth: int) -> None:
         self.node = Node(
@@ -62,12 +53,7 @@ class RawSubscriptions:
     def subscribe(
         self, topic: str, type_name: str, offered: Sequence[Quality], handle: int
     ) -> None:
-        """Subscribe to a topic; its messages carry `handle`.
-
-        Raises:
-            ImportError: the package of the type is not installed.
-            AttributeError: the package has no such type.
-        """
+        """Subscribe to a topic; its messages carry `handle`. Raises as `message_class`."""
         subscription = self.node.create_subscription(
             message_class(type_name),
             topic,
@@ -85,7 +71,7 @@ class RawSubscriptions:
                 received = info['received_timestamp'] or time.time_ns()
                 published = info['source_timestamp'] or received
                 sequence = info['publication_sequence_number'] or 0
-                messages.append(RawMessage(received, published, sequence, handle, raw))
+                messages.append(RawMessage(handle, raw, received, published, sequence))
         messages.sort(key=attrgetter('received'))
         return messages
 
@@ -99,11 +85,9 @@ def compatible_profile(offered: Sequence[Quality], depth: int) -> QoSProfile:
     """Strictest quality of service that is compatible with every one of the publishers."""
     reliable = all(quality.reliability == 'reliable' for quality in offered)
     latched = all(quality.durability == 'transient_local' for quality in offered)
-    return QoSProfile(
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
+    reliability = 'reliable' if reliable else 'best_effort'
+    durability = 'transient_local' if latched else 'volatile'
+    return qos_profile(Quality(depth, reliability, durability))
 
 
 def quality_of(profile: QoSProfile) -> Quality:

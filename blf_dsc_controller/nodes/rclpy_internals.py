@@ -13,15 +13,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.subscription import Subscription
 
-__all__ = [
-    'RCLError',
-    'UnknownROSArgsError',
-    'lifecycle_state',
-    'parameter_overrides',
-    'take_messages',
-    'take_response',
-    'wrap_change_state',
-]
+__all__ = ['RCLError', 'UnknownROSArgsError']  # exported again
 
 
 def parameter_overrides(node: Node) -> Mapping[str, Parameter]:
@@ -34,9 +26,8 @@ def take_messages(
 ) -> Iterator[tuple[bytes, Mapping[str, int | None]]]:
     """Take up to `limit` waiting messages of a subscription that no executor spins.
 
-    Yields:
-        The serialised message with `source_timestamp` [ns], `received_timestamp` [ns] and
-        `publication_sequence_number`, each None where the middleware does not know it.
+    Each comes serialised, with `source_timestamp` [ns], `received_timestamp` [ns] and
+    `publication_sequence_number`, each None where the middleware does not know it.
     """
     take, type_ = subscription.handle.take_message, subscription.msg_type
     for _ in range(limit):

@@ -5,16 +5,21 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from functools import partial
+from math import inf
+from pathlib import Path
 from typing import Any
+
+from std_srvs.srv import Trigger
 
 from blf_dsc_controller.bags.context import MESSAGES, Losses
 from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.bags.writer import DiskFullError
+from blf_dsc_controller.bags.writer import BagWriter, DiskFullError, Ring, SplitLimits
 from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.configuration.params_file import dumps
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import Quality
 from blf_dsc_controller.messages.types import UnknownTypeError
-from blf_dsc_controller.nodes.bag_sinks import BagSink, RingSink
 from blf_dsc_controller.nodes.endpoints import (
     create_steady_timer,
     message_class,
@@ -27,16 +32,16 @@ from blf_dsc_controller.nodes.raw_subscriptions import RawSubscriptions, quality
 
 _DISCOVERY_PERIOD = 0.1  # s
 _TAKE_PERIOD = 0.01  # s
-_UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'  # rmw's words
+_FLUSH_INTERVAL = 0.05  # s; with that of taking, data is in the process for less than 0.1 s
+_MEGABYTE = 1_000_000
+_UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'  # of rmw
 _OF_EVERY_NODE = ('/parameter_events', '/rosout')
 
 
 class BagRecorderNode(PlainNode):
-    """Subscribes to topics as they appear and records their messages.
+    """Subscribes to topics as they appear and records their messages, or keeps the last seconds.
 
-    Raises:
-        ConfigurationError: a parameter is wrong.
-        BagError: the folder of the bag is there already.
+    Raises ConfigurationError if a parameter is wrong, BagError if the bag's folder exists already.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -56,15 +61,54 @@ class BagRecorderNode(PlainNode):
         create_steady_timer(self, _DISCOVERY_PERIOD, self._discover)
         create_steady_timer(self, _TAKE_PERIOD, self._record)
         # The folder comes last: whatever ends the node from here on also completes the bag.
-        self._sink = RingSink(self, self._config) if self._config.ring else BagSink(self._config)
-        self.get_logger().info(self._sink.notice)
+        self._sink = self._record_ring() if self._config.ring else self._record_bag()
+
+    def _record_bag(self) -> BagWriter | Ring:
+        config = self._config
+        limits = SplitLimits(config.split_size * _MEGABYTE or inf, config.split_duration or inf)
+        bag = BagWriter(
+            config.output,
+            compression=config.compression,
+            flush_interval=_FLUSH_INTERVAL,
+            limits=limits,
+        )
+        self.get_logger().info(f'recording into {bag.path}')
+        return bag
+
+    def _record_ring(self) -> Ring:
+        seconds = self._config.ring
+        ring = Ring(seconds, self._config.compression)
+        self.create_service(Trigger, '~/trigger', partial(self._on_trigger, ring))
+        self.get_logger().info(
+            f'keeping the last {seconds:g} s in memory, until ~/trigger is called'
+        )
+        return ring
+
+    def _on_trigger(
+        self, ring: Ring, _: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        output = path = Path(self._config.output)
+        number = 1
+        while path.exists():
+            number += 1
+            path = output.with_name(f'{output.name}-{number}')
+        try:
+            count = ring.dump(path, {'ring': 'the last time before a trigger'})
+        except (BlfDscError, OSError) as error:
+            response.success, response.message = False, str(error)
+        else:
+            response.success, response.message = True, f'wrote {count} messages into {path}'
+        self.get_logger().info(response.message)
+        return response
 
     def close(self) -> None:
         """Write what still waits, complete the bag and log a summary."""
         if self.failure is None:
             self._record()
         self._raw_subscriptions.close()
-        self._sink.finish(self._statistics())
+        if not self._sink.closed:
+            self._sink.note(self._statistics())
+            self._sink.close()
         for line in self._summary():
             self.get_logger().info(line)
 
@@ -138,13 +182,7 @@ class BagRecorderNode(PlainNode):
         try:
             for message in self._raw_subscriptions.take():
                 self._losses_by_handle[message.handle].count(message.sequence)
-                self._sink.write(
-                    message.handle,
-                    message.raw,
-                    message.received,
-                    message.published,
-                    message.sequence,
-                )
+                self._sink.write(*message)
             self._parameter_client.poll()
             if flush:
                 self._sink.flush()
@@ -174,10 +212,7 @@ class BagRecorderNode(PlainNode):
             yield f'{topic}: {count} messages{self._losses[topic].text()}'
 
 
-def main() -> int:
-    """Run the recorder as a process."""
-    return run(BagRecorderNode)
-
+main = partial(run, BagRecorderNode)
 
 if __name__ == '__main__':
     sys.exit(main())
