@@ -25,6 +25,7 @@ layout itself.  A field of any other type is in no vector: the view takes it as 
 from __future__ import annotations
 
 import ast
+import functools
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any, TypeVar, get_type_hints
 
@@ -107,6 +108,7 @@ def _sizes(layout: type) -> Iterator[str]:
             yield _product([_length(length, ()) for length in getattr(hint, '__metadata__', '1')])
 
 
+@functools.cache  # it evaluates the text of the annotations
 def _hints(layout: type) -> dict[str, Any]:
     return get_type_hints(layout, include_extras=True)
 
