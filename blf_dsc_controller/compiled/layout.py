@@ -40,6 +40,10 @@ Cell = Annotated[Array, '1']
 
 T = TypeVar('T')
 
+_hints: Callable[[Any], dict[str, Any]] = functools.cache(
+    functools.partial(get_type_hints, include_extras=True)
+)
+
 
 def pack(layout: Any) -> np.ndarray:
     """Vector of a layout's numbers and arrays (or sequences), in the order of its fields."""
@@ -106,11 +110,6 @@ def _sizes(layout: type) -> Iterator[str]:
             yield from _sizes(hint)
         elif _is_part(hint):
             yield _product([_length(length, ()) for length in getattr(hint, '__metadata__', '1')])
-
-
-@functools.cache  # it evaluates the text of the annotations
-def _hints(layout: type) -> dict[str, Any]:
-    return get_type_hints(layout, include_extras=True)
 
 
 def _is_part(hint: Any) -> bool:
