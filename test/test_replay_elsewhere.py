@@ -55,8 +55,8 @@ def foreign(run, torque='array'):
     arrays = {4: Float64MultiArrayEncoder(4), 2: Float64MultiArrayEncoder(2)}
     for k, stamp in enumerate(stamps.tolist()):
         q, dq, effort = (spread(field) for field in values[k])
-        told = effort if torque == 'effort' else [0.0] * 4
-        yield '/arm/states', JOINT_STATE, stamp, states.encode(stamp, q, dq, told)
+        measured = effort if torque == 'effort' else [0.0] * 4
+        yield '/arm/states', JOINT_STATE, stamp, states.encode(stamp, q, dq, measured)
         command = ours.applied[k]
         if torque == 'array':
             yield '/arm/torque', FLOAT64_MULTI_ARRAY, stamp + 9, arrays[4].encode(spread(command))
@@ -167,7 +167,7 @@ def names_of(**changes):
         ({'joint3': 'base'}, BlfDscError, 'joint3 is neither a topic nor one of the joints'),
     ],
 )
-def test_a_wrong_name_is_told_with_what_there_is(run, tmp_path, changes, error, said):
+def test_a_wrong_name_is_reported_with_those_in_the_bag(run, tmp_path, changes, error, said):
     path = write(tmp_path / 'bag', foreign(run))
     with pytest.raises(error, match=said):
         what_if(path, CONFIG, names=names_of(**changes))
@@ -185,7 +185,7 @@ def test_without_any_torque_it_is_said_where_it_was_looked_for(run, tmp_path):
         what_if(write(tmp_path / 'bag', bare), CONFIG, names=names)
 
 
-def test_commands_that_are_of_no_known_order_are_refused(run, tmp_path):
+def test_commands_that_are_of_unknown_order_are_rejected(run, tmp_path):
     three = Float64MultiArrayEncoder(3)
     messages = [
         one if one[0] == '/arm/states' else (*one[:3], three.encode([1, 2, 3]))
@@ -202,7 +202,7 @@ def test_an_empty_bag_is_called_empty(tmp_path):
         what_if(tmp_path / 'bag', CONFIG)
 
 
-def test_a_bag_of_a_later_format_is_refused_in_words(run, tmp_path):
+def test_a_bag_of_a_later_format_is_rejected(run, tmp_path):
     path = write(tmp_path / 'bag', foreign(run))
     text = (path / 'metadata.yaml').read_text()
     (path / 'metadata.yaml').write_text(text.replace('version: 9', 'version: 99'))
@@ -211,11 +211,11 @@ def test_a_bag_of_a_later_format_is_refused_in_words(run, tmp_path):
 
 
 @pytest.mark.parametrize('entry', ['joint1', '=x', 'joint1='])
-def test_an_entry_with_one_side_is_refused(entry):
+def test_an_entry_with_one_side_is_rejected(entry):
     with pytest.raises(BlfDscError, match='one side is missing'):
         NameMap.parse([entry])
 
 
-def test_a_name_given_twice_is_refused():
+def test_a_name_given_twice_is_rejected():
     with pytest.raises(BlfDscError, match='given before'):
         NameMap.parse(['joint1=a', 'joint2=a'])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whatever happens to a controller replays from its journal, with every torque; without ROS."""
+"""Every event of a controller replays from its journal, with every torque; without ROS."""
 
 from __future__ import annotations
 
@@ -169,8 +169,8 @@ def test_an_unexpected_error_is_replayed_as_a_stop(tmp_path):
     assert compared(result)['commands'] >= 2 * (50 + 30)
 
 
-def test_a_state_with_a_torque_of_its_own_is_a_departure(tmp_path):
-    """Where the recorded law was answered by a stop that the replay does not make."""
+def test_a_changed_stop_reason_is_a_departure(tmp_path):
+    """The recorded controller stopped where the replayed one does not."""
     rig = eventful()
     for entry in of(rig, JOURNAL):
         event = decode(entry[3])
@@ -192,7 +192,7 @@ def test_a_stop_that_is_moved_is_named(tmp_path):
     stop[3] = later.encode()
     difference = rig.verify(tmp_path, clock='lockstep').difference
     assert difference.stamp == LOCKSTEP + 49 * MILLISECOND
-    assert difference.field.startswith('answered (')
+    assert difference.field.startswith('used by the law (')
 
 
 def test_a_second_controller_in_a_bag_is_not_replayed(tmp_path):

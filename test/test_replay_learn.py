@@ -41,7 +41,7 @@ def test_the_parameters_are_found(bag):
     assert found.end - found.begin == pytest.approx(2 * np.pi, abs=0.002)
 
 
-def test_noise_leaves_the_truth_within_the_confidence_told(tmp_path):
+def test_noise_leaves_the_truth_within_the_deviations(tmp_path):
     noise = {'sensor.position_noise': 1e-5, 'sensor.velocity_noise': 1e-3}
     noise['disturbance.amplitude'] = [0.0, 0.0]  # which would be left over, and widen all
     runs = [record(tmp_path / f'{seed}', **noise, seed=seed) for seed in range(4)]
@@ -50,7 +50,7 @@ def test_noise_leaves_the_truth_within_the_confidence_told(tmp_path):
     deviation = np.array([one.deviation[:3] for one in found])
     # Four deviations: of twelve draws none should be further off; 2e-3 is what sampling leaves.
     assert (np.abs(estimates - TRUE) < 4.0 * deviation + 2e-3 * TRUE).all()
-    # What is told covers the spread of the draws, which four of them show to a factor of three. It
+    # The deviations cover the spread of the draws, which four of them show to a factor of three. It
     # may be wider: of the residuals only their own correlation is known, not that with X.
     spread = np.sqrt(np.mean(estimates.var(axis=0, ddof=1) / deviation.mean(axis=0) ** 2))
     assert 0.05 < spread < 3
@@ -64,13 +64,13 @@ def test_joint_states_with_their_effort_are_enough(bag, tmp_path):
     assert alone.estimate == pytest.approx(identify(bag, ControllerConfig()).estimate, rel=1e-6)
 
 
-def test_a_bag_too_short_is_told(tmp_path):
+def test_a_bag_too_short_is_rejected(tmp_path):
     path = recorded_run.record(tmp_path / 'bag', 0.3)
     with pytest.raises(BlfDscError, match=r'holds 0\.3 s, .* window of 6\.28 s'):
         identify(path, ControllerConfig())
 
 
-def test_the_command_tells_figures_and_excitation(bag, capsys):
+def test_the_command_prints_estimates_and_excitation(bag, capsys):
     assert main(['replay', str(bag), '--learn']) == 0
     said = capsys.readouterr().out
     assert '(m1+m2)*l1^2' in said

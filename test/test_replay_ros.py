@@ -259,7 +259,7 @@ def test_one_flipped_bit_of_a_safe_torque_is_found(stopped, rewritten, part):
     ('name', 'value', 'departure'),
     [
         ('safety.state_timeout', 1.0, 'stop: stamp jump'),
-        ('safety.error_ratio', 0.001, r"answered (joint 'joint1' is"),
+        ('safety.error_ratio', 0.001, r"used by the law (joint 'joint1' is"),
     ],
 )
 def test_a_stop_that_only_one_of_the_two_makes_is_a_difference(

@@ -127,7 +127,7 @@ def test_one_flipped_bit_is_found_and_named(entries, rewritten, topic, at, field
     assert f'recorded {difference.recorded!r}, replayed {difference.replayed!r}' in str(difference)
 
 
-def test_the_earliest_of_several_differences_is_told(entries, rewritten):
+def test_the_earliest_of_several_differences_is_reported(entries, rewritten):
     changed = [list(entry) for entry in entries]
     for topic, k in ((COMMANDS, 500), (TRACKING_ERROR, 400), (LEARNING, 600)):
         of(changed, topic)[k][3] = of(entries, topic)[k - 100][3][:20] + bytes(
@@ -142,7 +142,7 @@ def test_the_earliest_of_several_differences_is_told(entries, rewritten):
     )
 
 
-def test_repeated_and_unanswered_states_are_passed_over(entries, rewritten):
+def test_repeated_and_unused_states_are_skipped(entries, rewritten):
     states = of(entries, JOINT_STATES)
     late = JointStateEncoder(('joint1', 'joint2')).encode(
         START + 300 * MILLISECOND + 5, [9, 9], [9, 9], [9, 9]
@@ -183,13 +183,13 @@ def test_what_the_recorder_missed_is_remarked(entries, rewritten):
 
 
 def test_without_its_telemetry_the_torques_are_still_compared(entries, rewritten):
-    told = {COMMANDS.resolved, JOINT_STATES.resolved, JOURNAL.resolved}
-    result = verify(rewritten([entry for entry in entries if entry[0] in told]))
+    kept = {COMMANDS.resolved, JOINT_STATES.resolved, JOURNAL.resolved}
+    result = verify(rewritten([entry for entry in entries if entry[0] in kept]))
     assert [one.topic for one in result.comparisons] == [COMMANDS.resolved]
     assert result.difference is None
 
 
-def test_commands_that_cannot_be_told_apart_are_left_out_in_words(entries, rewritten):
+def test_commands_of_unknown_number_are_left_out(entries, rewritten):
     lost = of(entries, COMMANDS)[500]
     result = verify(rewritten([entry for entry in entries if entry is not lost]))
     commands = next(one for one in result.comparisons if one.topic == COMMANDS.resolved)
@@ -242,7 +242,7 @@ def test_an_event_that_the_recorder_lost_ends_the_replay(bag, rewritten):
     assert result.remarks == ('an event of the journal is not in the bag: the replay ends there',)
 
 
-def test_another_configuration_answers_in_open_loop(bag):
+def test_another_configuration_runs_in_open_loop(bag):
     config = recorded_run.loop_config().controller
     same = what_if(bag, config)
     assert np.abs(same.difference).max() == 0.0
@@ -285,7 +285,7 @@ def test_another_version_is_remarked(bag, monkeypatch):
     assert any('recorded by version 0.1.0 and replayed by 9.9.9' in one for one in result.remarks)
 
 
-def test_a_configuration_of_another_version_is_refused_as_that(entries, tmp_path, monkeypatch):
+def test_a_configuration_of_another_version_is_rejected_as_such(entries, tmp_path, monkeypatch):
     changed = [list(entry) for entry in entries]
     first = of(changed, JOURNAL)[0]
     event = decode(first[3])
@@ -299,14 +299,14 @@ def test_a_configuration_of_another_version_is_refused_as_that(entries, tmp_path
         verify(path)
 
 
-def test_the_bag_of_another_robot_is_told_by_its_joints(entries, rewritten):
+def test_the_bag_of_another_robot_is_recognised_by_its_joints(entries, rewritten):
     states = of(entries, JOINT_STATES)
     decoder = JointStateDecoder(('joint1', 'joint2'))
     other = JointStateEncoder(('wheel', 'arm'))
     foreign = []
     for topic, type_name, at, raw in states:
         stamp = decoder.decode(raw)
-        told = other.encode(stamp, decoder.position, decoder.velocity, decoder.effort)
-        foreign.append([topic, type_name, at, told])
+        renamed = other.encode(stamp, decoder.position, decoder.velocity, decoder.effort)
+        foreign.append([topic, type_name, at, renamed])
     with pytest.raises(UnreadableMessageError, match=r"'joint1' is not in .*names wheel, arm"):
         verify(rewritten([*of(entries, JOURNAL), *foreign]))

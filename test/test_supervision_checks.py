@@ -21,10 +21,10 @@ DT = 1e-3
 
 @pytest.fixture
 def law():
-    """A controller that has answered one sample, inside its bound and below its limit."""
-    answering = controller(recommended())
-    answering.update(0.0, DT, plant().measure())
-    return answering
+    """A controller that has processed one sample, inside its bound and below its limit."""
+    law = controller(recommended())
+    law.update(0.0, DT, plant().measure())
+    return law
 
 
 def verdict(law, ratio=None, kept=None, error_ratio=1.0):
@@ -33,7 +33,7 @@ def verdict(law, ratio=None, kept=None, error_ratio=1.0):
     return check_sample(*vectors, error_ratio, ratio, np.zeros(7) if kept is None else kept)
 
 
-def test_a_sound_answer_is_kept(law):
+def test_estimates_of_a_valid_sample_are_kept(law):
     ratio, kept = np.array([0.9, 0.0]), np.zeros(7)
     assert verdict(law, ratio, kept) == 0
     np.testing.assert_array_equal(kept, [*law.state.estimate, *law.state.disturbance])
@@ -47,7 +47,7 @@ def test_a_sound_answer_is_kept(law):
     ('part', 'name', 'i'),
     [('state', 'estimate', 4), ('state', 'disturbance', 1), ('signals', 'demand', 0)],
 )
-def test_whatever_is_not_finite_is_suspect_and_not_kept(law, part, name, i, bad):
+def test_values_that_are_not_finite_are_suspect_and_not_kept(law, part, name, i, bad):
     getattr(getattr(law, part), name)[i] = bad
     kept = np.full(7, 3.0)
     assert verdict(law, kept=kept) & SUSPECT
@@ -67,13 +67,13 @@ def test_an_error_past_the_bound_is_outside_and_suspect_if_it_is_to_stop(law, er
     assert verdict(law, error_ratio=0.0) == OUTSIDE
 
 
-def test_a_refused_column_is_told_as_unknown_and_is_no_fault(law):
+def test_the_nan_of_a_rejected_column_is_no_fault(law):
     law.sample.estimate[4] = nan
     assert verdict(law) == 0
 
 
 @pytest.mark.parametrize('value', [nan, inf, 50.1])
-def test_a_state_is_sound_if_finite_and_slow(value):
+def test_a_state_is_valid_if_finite_and_slow(value):
     still = np.zeros(2)
     assert is_valid_state(still, still, 50.0)
     assert not is_valid_state(still, np.array([0.0, -value]), 50.0)

@@ -15,7 +15,7 @@ from blf_dsc_controller.supervision.config_warnings import config_warnings, refe
 BOUND = 0.002  # rad
 
 
-def told(changes, preset='recommended', q=None):
+def warnings(changes, preset='recommended', q=None):
     return config_warnings(configured(preset, 1.0, changes).controller, q)
 
 
@@ -46,21 +46,21 @@ def test_presets_are_not_warned_of(preset):
         ),
     ],
 )
-def test_what_cannot_work_is_named(parameter, changes):
-    (warning,) = told(changes)
+def test_gains_that_cannot_work_are_named(parameter, changes):
+    (warning,) = warnings(changes)
     assert warning.startswith(parameter)
 
 
 def test_a_start_close_to_the_bound_is_named_with_its_joint():
     qr = np.array([2.2935, 1.6961])
-    (warning,) = told({}, q=qr - np.array([0.0, 0.9 * BOUND]))
+    (warning,) = warnings({}, q=qr - np.array([0.0, 0.9 * BOUND]))
     assert warning.startswith('barrier.bound: joint2 starts -0.0018 rad')
-    assert told({}, q=qr - np.array([0.0, 0.5 * BOUND])) == []
+    assert warnings({}, q=qr - np.array([0.0, 0.5 * BOUND])) == []
 
 
 def test_laws_are_not_warned_of_gains_they_do_not_have():
     changes = {'surface.time_constant': 0.05, 'learning.window': 5.0, 'law': 'backstepping'}
-    assert told(changes) == []
+    assert warnings(changes) == []
 
 
 def test_load_needs_the_torque_that_the_run_needs():
@@ -91,7 +91,7 @@ def test_too_high_a_feedback_chatters_from_twice_the_inertia_s_rate_on():
 
 def test_too_heavy_a_gradient_diverges_as_it_is_warned():
     changes = {'learning.update': 'gradient', 'learning.weight': 30.0}
-    assert told(changes)[0].startswith('learning.weight')
+    assert warnings(changes)[0].startswith('learning.weight')
     loop = run(configured('recommended', 9.0, changes))
     assert loop.parameter_error[-1] > 0.5
     assert np.linalg.norm(P) > 0.0
@@ -99,14 +99,14 @@ def test_too_heavy_a_gradient_diverges_as_it_is_warned():
 
 def test_a_window_of_no_whole_period_keeps_the_disturbance():
     changes = {'learning.window': 5.0}
-    assert told(changes)[0].startswith('learning.window')
+    assert warnings(changes)[0].startswith('learning.window')
     errors = [run(configured('recommended', 12.0, each)).error_at(12.0) for each in (changes, {})]
     assert errors[0] > 100.0 * errors[1]
 
 
 def test_too_small_a_torque_limit_breaks_the_bound():
     changes = {'torque.limit': [5.5, 20.0]}
-    assert told(changes)[0].startswith('torque.limit: joint1')
+    assert warnings(changes)[0].startswith('torque.limit: joint1')
     changes['approach.enabled'] = False
     assert np.abs(run(configured('recommended', 1.0, changes)).xi1).max() > BOUND
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is injected, when it is noticed, what is commanded from then on, and what is told."""
+"""What is injected, when it is noticed, the commands from then on, and the reason."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LIMIT = 20.0  # N m, the default torque limit
 
 
 @pytest.mark.parametrize('fault', FAULTS, ids=lambda fault: fault.name)
-def test_a_fault_is_noticed_answered_named_and_overcome(fault):
+def test_a_fault_is_detected_named_and_overcome(fault):
     outcome = run(fault)
 
     assert outcome.reason is fault.reason, outcome.text

@@ -41,7 +41,7 @@ def test_each_safe_torque_is_what_its_name_says():
     np.testing.assert_allclose(safe('hold_gravity'), weight(Q) + np.array([-1.0, 2.0]))
 
 
-def test_a_safe_torque_keeps_the_limit_and_is_none_where_it_cannot_be_told():
+def test_a_safe_torque_keeps_the_limit_and_is_zero_if_not_finite():
     limited = safe('hold_gravity', **{'torque.limit': (3.0, 3.0)})
     np.testing.assert_array_equal(limited, [3.0, 3.0])
     np.testing.assert_array_equal(safe('hold_gravity', estimate=P * np.nan), [0.0, 0.0])
@@ -70,9 +70,9 @@ def test_missed_states_are_averaged():
     assert overruns.fraction < 1e-4
 
 
-def test_silence_is_told_by_a_watch_that_was_awake():
+def test_silence_is_detected_by_a_check_in_time():
     silence = Silence()
-    assert silence.check(0, 0.04) == 0.0  # nothing has come yet: nobody is missed
+    assert silence.check(0, 0.04) == 0.0  # no state has come yet
     silence.restart(10 * MILLISECOND)
     assert silence.check(41 * MILLISECOND, 0.04) == 0.0
     assert silence.next_check == pytest.approx(0.01)  # 1 ms after it could be silent
@@ -198,8 +198,8 @@ def test_after_a_reset_on_the_way_learning_waits_for_a_full_window():
     assert state.latched[0] == 1.0
 
 
-def test_a_column_that_learning_refuses_is_no_fault():
-    """Its estimate is told as NaN, which says that there is none."""
+def test_a_rejected_column_is_no_fault():
+    """Its estimate is NaN."""
     rig = Rig()
     rig.step(20)
     rig.guard.controller.state.active[-1] = 0.0
@@ -208,7 +208,7 @@ def test_a_column_that_learning_refuses_is_no_fault():
     assert rig.supervisor.phase is Phase.TRACKING
 
 
-def test_an_error_nobody_foresaw_stops_too():
+def test_an_unexpected_error_stops_too():
     rig = Rig()
     rig.step(20)
     torque = rig.guard.fail('ZeroDivisionError: x')
@@ -266,7 +266,7 @@ def test_nor_does_the_bump_come_later(given):
         ({'learning.radius': 0.58}, 'learning.radius: the estimate is at'),
     ],
 )
-def test_what_a_running_law_cannot_take_is_refused_with_the_reason(given, said):
+def test_gains_that_a_running_law_cannot_take_are_rejected(given, said):
     rig = Rig()
     rig.step(200)
     (problem,) = rig.guard.problems(change(rig.guard.config, given))
@@ -275,7 +275,7 @@ def test_what_a_running_law_cannot_take_is_refused_with_the_reason(given, said):
     assert rig.guard.problems(change(rig.guard.config, given)) == []
 
 
-def test_an_update_that_would_diverge_is_refused():
+def test_an_update_that_would_diverge_is_rejected():
     """Gradient: kappa Gamma lambda_max T >= 2; here kappa is 100 and lambda_max some 100."""
     rig = Rig(
         {

@@ -100,7 +100,7 @@ class ControllerStatus:
             'samples outside the bound': guard.outside,
             'largest error against the bound': f'{guard.ratio.max():.3g}',
             'states missed': supervisor.overruns.count,
-            'samples with a torque at its limit': supervisor.saturation.count,
+            'samples with a torque at its limit': supervisor.saturated,
             'messages for other joints': guard.foreign,
             'watchdog on the steady clock': 'on' if guard.watching else 'off',
             **self._cuts(guard),
@@ -108,7 +108,7 @@ class ControllerStatus:
         }
         if guard.outside:
             return self._diagnostics.status('loop', WARN, 'the error has left its bound', values)
-        if supervisor.saturation.lasted > 0.0:
+        if supervisor.saturated_time > 0.0:
             message = 'torque at its limit: adaptation by the tracking error is frozen'
             return self._diagnostics.status('loop', WARN, message, values)
         if guard.has_sample and guard.controller.sample.cuts.any():

@@ -221,7 +221,7 @@ class Rerun:
                 self._sample(k, stamp)
             self._command(stamp, torque, is_exact=is_exact)
             if is_due and not guard.has_sample and not _stops_at(event, stamp):
-                self._depart(f'answered ({guard.supervisor.text})', stamp)
+                self._depart(f'used by the law ({guard.supervisor.text})', stamp)
         pending = guard.journal.pending
         if pending and _key(pending[0]) != _key(event):
             self._depart_by(pending[0], event)
@@ -297,7 +297,7 @@ class Rerun:
     def _depart_by(self, own: Event, event: Event | None) -> None:
         """The replayed controller started or stopped where the recorded one did not, or not so."""
         text = own.content['text'] if own.type is EventType.STOP else own.type
-        what = f'stop: {_reason(event)}' if _stops_at(event, own.stamp) else 'answered'
+        what = f'stop: {_reason(event)}' if _stops_at(event, own.stamp) else 'used by the law'
         self._depart(f'{what} ({text})', own.stamp)
 
     def _depart(self, what: str, stamp: int) -> None:

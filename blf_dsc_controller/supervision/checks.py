@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compiled checks of every joint state and every sample: flags only.
 
-The supervisor derives the reason of whatever is flagged.
+The supervisor derives the reason of each flag.
 """
 
 from math import isfinite
@@ -39,10 +39,8 @@ def check_sample(
     """Check what the law computed in a sample.
 
     Args:
-        settings_vector: packed `Settings`.
-        state_vector: packed `State` after the sample; the estimate of a rejected column is finite.
-        signals_vector: packed `Signals` of the sample.
-        sample_vector: packed `Sample`.
+        settings_vector, state_vector, signals_vector, sample_vector: packed; the state's estimate
+            of a rejected column is finite.
         error_ratio: |xi1| / k_c from which on an error is suspect; 0 switches this off.
         ratio: largest |xi1| / k_c so far (n,), updated.
         kept: estimates and d^3 (m + n,) of the last sample that was not suspect, updated.

@@ -44,14 +44,11 @@ def config_warnings(config: ControllerConfig, q: Floats | None = None) -> list[s
     """
     settings = settings_of_config(config)
     load = reference_load(config, settings)
-    found = list(_of_start(config, q))
-    found += _of_torque(config, load)
-    found += _of_feedback(config, settings, load)
+    found = [*_of_start(config, q), *_of_torque(config, settings, load)]
     if settings.surface != LINEAR:
         found += _of_surface(config, settings)
-    if settings.surface != LINEAR and settings.kappa > 0.0 and settings.Gamma.any():
-        found += _of_update(config, settings, load)
-        found += _of_window(config, settings, load)
+        if settings.kappa > 0.0 and settings.Gamma.any():
+            found += [*_of_update(config, settings, load), *_of_window(config, settings, load)]
     return found
 
 
@@ -66,11 +63,11 @@ def reference_load(config: ControllerConfig, settings: Settings) -> ReferenceLoa
     torque, rate = np.zeros(settings.n), 0.0
     excitation = np.zeros((settings.p, settings.p))
     moments = np.linspace(0.0, horizon, _POINTS, endpoint=False)
+    M = np.zeros((settings.n, settings.n))
     for q, dq, ddq in sampled(reference_of(config), moments):
         settings.model.regressor(q, dq, dq, ddq, H)
         torque = np.maximum(torque, np.abs(H @ P))
         excitation += H.T @ H / _POINTS
-        M = np.zeros((settings.n, settings.n))
         for i, unit in enumerate(np.eye(settings.n)):
             settings.model.momentum_regressor(q, unit, Yp, Yr)
             M[:, i] = Yp @ P
@@ -92,7 +89,7 @@ def _of_start(config: ControllerConfig, q: Floats | None) -> Iterator[str]:
             )
 
 
-def _of_torque(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
+def _of_torque(config: ControllerConfig, settings: Settings, load: ReferenceLoad) -> Iterator[str]:
     for joint, need, limit in zip(config.joints, load.torque, config.torque.limit, strict=True):
         if limit < _MARGIN * need:
             yield (
@@ -100,11 +97,6 @@ def _of_torque(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
                 f'the reference alone needs up to {need:.3g} N m: no bound can be kept with less '
                 f'than that, and a quarter more is wanted for errors and disturbances'
             )
-
-
-def _of_feedback(
-    config: ControllerConfig, settings: Settings, load: ReferenceLoad
-) -> Iterator[str]:
     product = load.rate * config.sample_time
     if product > 1.0:
         yield (
@@ -148,12 +140,10 @@ def _of_surface(config: ControllerConfig, settings: Settings) -> Iterator[str]:
 
 def _of_update(config: ControllerConfig, settings: Settings, load: ReferenceLoad) -> Iterator[str]:
     T = config.sample_time
-    Gamma = float(settings.Gamma[: settings.p].max())
-    if settings.update == NEWTON:
-        step, what = settings.kappa * Gamma * T, 'kappa Gamma T'
-    else:
-        largest = float(np.linalg.eigvalsh(load.excitation)[-1])
-        step, what = settings.kappa * Gamma * T * largest, 'kappa Gamma lambda_max(Phi) T'
+    step, what = settings.kappa * float(settings.Gamma[: settings.p].max()) * T, 'kappa Gamma T'
+    if settings.update != NEWTON:
+        step *= float(np.linalg.eigvalsh(load.excitation)[-1])
+        what = 'kappa Gamma lambda_max(Phi) T'
     if step > 1.0:
         yield (
             f'learning.weight: {what} is {step:.2g}: the estimate oversteps from 1 on and '

@@ -158,8 +158,7 @@ class Guard:
         """
         supervisor = self.supervisor
         if not supervisor.running:
-            stopped = supervisor.phase is Phase.SAFE_STOP
-            why = supervisor.text if stopped else supervisor.phase
+            why = supervisor.text or supervisor.phase
             raise TrajectoryError([f'the controller is not in command: {why}'])
         now = self._time_of(self.last_stamp)
         vector, limits = self.controller.reference_vector, limits_of(self.config)
@@ -218,11 +217,9 @@ class Guard:
     # From here on: what comes from the arm.
 
     def update(self, stamp: int, measurement: Vector) -> Vector | None:
-        """Return the torque for a joint state, None to command nothing.
+        """Return the torque for a joint state with its stamp [ns], None to command nothing.
 
-        Args:
-            stamp: of the state [ns].
-            measurement: [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
+        `measurement` is [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
         """
         self._begin_message()
         self.journal.stamp = stamp
@@ -234,8 +231,11 @@ class Guard:
         verdict = self.supervisor.check_state(self.config.safety, stamp, q, dq, effort)
         if verdict is Verdict.SKIP:
             return None
-        if verdict is Verdict.STOP:
-            self._remember_valid(q, dq)
+        if verdict is Verdict.STOP:  # keep what the safe torque can use
+            if np.isfinite(q).all():
+                self._q[:] = q
+            plausible = np.abs(dq) <= self.config.safety.velocity_limit
+            self._dq[:] = np.where(plausible, dq, 0.0)
             return self._safe(self.config.sample_time)
         self._measurement[:] = measurement
         if self.supervisor.phase is Phase.STARTING and not self._start(stamp, q, dq):
@@ -291,14 +291,18 @@ class Guard:
         self._note(EventType.RELEASE)
 
     def _begin_message(self) -> None:
-        if self.watchdog_torques:
-            self.end_silence()
+        self.end_silence()
         self.has_sample = False
         self.journal.messages += 1
 
     def _start(self, stamp: int, q: Vector, dq: Vector) -> bool:
         """Resume along the running reference if it is within the bound, or else start at t = 0."""
-        resumed = self._resumable and stamp > self.last_stamp and self._is_within_bound(stamp, q)
+        resumed = self._resumable and stamp > self.last_stamp
+        if resumed:
+            try:
+                self.controller.check_start(self.config.joints, q, self._time_of(stamp))
+            except OutsideBarrierError:
+                resumed = False
         if not resumed:
             try:
                 self.settled = begin(self.controller, self.config, q, dq)
@@ -313,13 +317,6 @@ class Guard:
         is_live = abs(self._wall() - stamp) < _SAME_CLOCK
         self.watching = watchdog == 'on' or (watchdog == 'auto' and is_live)
         self.supervisor.enter(Phase.APPROACHING)
-        return True
-
-    def _is_within_bound(self, stamp: int, q: Vector) -> bool:
-        try:
-            self.controller.check_start(self.config.joints, q, self._time_of(stamp))
-        except OutsideBarrierError:
-            return False
         return True
 
     def _control(self, stamp: int, measurement: Vector) -> Vector | None:
@@ -352,19 +349,12 @@ class Guard:
         if flags & checks.OUTSIDE:
             self.outside += 1
         if not flags & checks.SUSPECT:
-            self.supervisor.saturation.lasted = 0.0
+            self.supervisor.saturated_time = 0.0
             return True
         is_valid = self.supervisor.check_sample(safety, controller, dt)
         if is_valid:
             self._keep()
         return is_valid
-
-    def _remember_valid(self, q: Vector, dq: Vector) -> None:
-        """Keep of an invalid state what the safe torque can use."""
-        if np.isfinite(q).all():
-            self._q[:] = q
-        plausible = np.abs(dq) <= self.config.safety.velocity_limit
-        self._dq[:] = np.where(plausible, dq, 0.0)
 
     def _on_stop(self) -> None:
         supervisor = self.supervisor

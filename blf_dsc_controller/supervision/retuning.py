@@ -36,11 +36,7 @@ def apply_bumpless(
 ) -> None:
     """Replace the settings of a running law such that its torque does not jump.
 
-    Args:
-        controller: between two samples.
-        config: the new one.
-        t: time of the last sample [s].
-        measurement: of the last sample (3 n,).
+    `t` [s] and `measurement` (3 n,) are those of the last sample.
     """
     before_beta2, before = _trial(controller, t, config.sample_time, measurement)
     apply(controller, config)

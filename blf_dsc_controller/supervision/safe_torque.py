@@ -17,12 +17,8 @@ def safe_torque(
 ) -> Vector:
     """Safe torque (n,) [N m], within the torque limit and always finite.
 
-    Args:
-        safety: selects zero, damping -D dq, or damping with the gravity H(q, 0, 0, 0) P^.
-        settings: of the law: model and torque limit.
-        q: last valid positions (n,) [rad].
-        dq: velocities (n,) [rad/s]; zero if unknown.
-        estimate: theta^ (m,).
+    It is zero, damping -D dq, or damping with the gravity H(q, 0, 0, 0) P^, at the last valid
+    positions q (n,) [rad]; dq (n,) [rad/s] is zero if unknown.
     """
     torque = np.zeros(settings.n)
     with np.errstate(over='ignore', invalid='ignore'):  # checked below

@@ -17,7 +17,7 @@ from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import LINEAR
 from blf_dsc_controller.supervision.checks import is_valid_state
 from blf_dsc_controller.supervision.reasons import Phase, Reason
-from blf_dsc_controller.supervision.watchdogs import Overruns, Saturation
+from blf_dsc_controller.supervision.watchdogs import Overruns
 
 Vector = NDArray[np.float64]
 _NANO = 1e-9
@@ -37,7 +37,9 @@ class Supervisor:
     Attributes:
         phase: what the controller is doing.
         reason, text: why it stopped, the latter with the figures; `NONE` and empty if it did not.
-        saturation, overruns: torques at their limit, and missed states, since the start.
+        overruns: missed states since the start.
+        saturated: samples with a torque at its limit since the start.
+        saturated_time: time that they have lasted without a break [s].
         repeated: states skipped because their stamp was repeated.
         stops: since the controller was configured.
         revision: how often phase, reason or text have been set.
@@ -59,10 +61,7 @@ class Supervisor:
         self.repeated = 0
         self.stops = 0
         self.revision = 0
-        self.saturation = Saturation()
-        self.overruns = Overruns()
-        self._last_stamp = -1
-        self._repeats = 0
+        self._clear()
         self._one_sample = (0.5e9 * sample_time, 1.5e9 * sample_time)  # ns
 
     @property
@@ -75,10 +74,14 @@ class Supervisor:
         self.phase, self.reason, self.text = phase, Reason.NONE, ''
         self.revision += 1
         if phase in (Phase.STARTING, Phase.INACTIVE):
-            self._last_stamp = -1
-            self._repeats = 0
-            self.saturation = Saturation()
-            self.overruns = Overruns()
+            self._clear()
+
+    def _clear(self) -> None:
+        self.overruns = Overruns()
+        self.saturated = 0
+        self.saturated_time = 0.0
+        self._last_stamp = -1
+        self._repeats = 0
 
     def stop(self, reason: Reason, text: str) -> Verdict:
         """Enter the safe stop, unless stopped already or inactive; always returns STOP."""
@@ -92,14 +95,9 @@ class Supervisor:
     def check_state(
         self, safety: Safety, stamp: int, q: Vector, dq: Vector, effort: Vector | None = None
     ) -> Verdict:
-        """Check a joint state before the law uses it, and stop if it is not valid.
+        """Check a joint state (ns, rad, rad/s) before the law uses it; stop if it is not valid.
 
-        Args:
-            safety: the limits.
-            stamp: of the state [ns].
-            q: positions (n,) [rad].
-            dq: velocities (n,) [rad/s].
-            effort: applied torques (n,) [N m] if learning uses them.
+        `effort` are the applied torques (n,) [N m] if learning uses them.
         """
         if self.phase in (Phase.SAFE_STOP, Phase.INACTIVE):
             return Verdict.STOP
@@ -177,12 +175,9 @@ class Supervisor:
         return self.stop(Reason.VELOCITY, text)
 
     def check_sample(self, safety: Safety, controller: Controller, dt: float) -> bool:
-        """Check a sample that `checks.check_sample` flagged; False: its torque must not be used.
+        """Check a sample that `checks.check_sample` flagged, `dt` [s] after the one before.
 
-        Args:
-            safety: the limits.
-            controller: the law, just updated.
-            dt: time since the last sample [s].
+        Returns False if its torque must not be used.
         """
         state, signals, sample = controller.state, controller.signals, controller.sample
         if not (np.isfinite(state.estimate).all() and np.isfinite(state.disturbance).all()):
@@ -210,11 +205,13 @@ class Supervisor:
 
     def _check_saturation(self, safety: Safety, demand: Vector, limit: Vector, dt: float) -> None:
         worst = int(np.argmax(np.abs(demand) - limit))
-        self.saturation.count_sample(dt, saturated=bool(np.abs(demand[worst]) > limit[worst]))
-        if self.saturation.lasted <= safety.saturation_time:
+        is_saturated = bool(np.abs(demand[worst]) > limit[worst])
+        self.saturated += is_saturated
+        self.saturated_time = self.saturated_time + dt if is_saturated else 0.0
+        if self.saturated_time <= safety.saturation_time:
             return
         text = (
             f'joint {self._joints[worst]!r} needs {demand[worst]:+.4g} N m and has had '
-            f'only its limit of {limit[worst]:g} N m for {self.saturation.lasted:.4g} s'
+            f'only its limit of {limit[worst]:g} N m for {self.saturated_time:.4g} s'
         )
         self.stop(Reason.SATURATED, text)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watchdogs over many samples: saturation, missed states, silence."""
+"""Watchdogs over many samples: missed states and silence."""
 
 from __future__ import annotations
 
@@ -8,24 +8,6 @@ PERIOD = 0.008
 
 _MARGIN = 0.001  # s past the limit, for a state that is on its way
 _NANO = 1e-9
-
-
-class Saturation:
-    """Samples with a torque at its limit.
-
-    Attributes:
-        lasted: time without a break [s].
-        count: samples since the start.
-    """
-
-    def __init__(self) -> None:
-        self.lasted = 0.0
-        self.count = 0
-
-    def count_sample(self, dt: float, *, saturated: bool) -> None:
-        """Count one sample of `dt` [s]."""
-        self.lasted = self.lasted + dt if saturated else 0.0
-        self.count += saturated
 
 
 class Overruns:
@@ -56,10 +38,7 @@ class Silence:
     """Time on the steady clock since the last joint state.
 
     A check that is itself late proves nothing, since states may wait in the queue behind it; the
-    next one decides.
-
-    Attributes:
-        next_check: time [s] from the last check to the next.
+    next one decides. `next_check` is the time [s] from the last check to the next.
     """
 
     def __init__(self) -> None:
@@ -72,12 +51,7 @@ class Silence:
         self._last_state = now
 
     def check(self, now: int, limit: float) -> float:
-        """Return the length of a silence [s] past `limit` [s], else 0.
-
-        Args:
-            now: steady clock [ns], `next_check` after the last check.
-            limit: longest time between two states [s].
-        """
+        """Return the length of a silence [s] past `limit` [s], else 0; `now` is in ns."""
         is_late = (now - self._last_check) * _NANO > self.next_check + PERIOD
         self._last_check = now
         silent = (now - self._last_state) * _NANO if self._last_state >= 0 else 0.0
