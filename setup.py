@@ -34,7 +34,7 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*', 'sim_plant', 'sim_plant.*']),
-    package_data={NAME: ['py.typed', 'analysis/templates/*'], 'sim_plant': ['py.typed']},
+    package_data={NAME: ['py.typed', 'templates/*'], 'sim_plant': ['py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (SHARE, ['package.xml']),

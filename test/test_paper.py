@@ -17,7 +17,8 @@ from blf_dsc_controller.configuration.params_file import load_loop, locate
 from blf_dsc_controller.paper import claims, tune
 from blf_dsc_controller.paper.cases import SIDE_BY_SIDE, SWEEPS, VARIATIONS, case_name
 from blf_dsc_controller.paper.claims import FAILS, HOLDS, ONLY_IF, verdict
-from blf_dsc_controller.paper.results import CaseResult, Results, kept_bounds
+from blf_dsc_controller.paper.report import kept_bounds
+from blf_dsc_controller.paper.results import Results
 from blf_dsc_controller.run import Run, Series
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -99,7 +100,7 @@ def test_committed_gains_beat_the_middle_of_their_ranges(name):
     tuned = {case.name: case for case in SIDE_BY_SIDE}[preset].loop().controller
     middle = np.array([np.log10(gain.least * gain.most) / 2.0 for gain in task.gains])
     loops = tune.loops_of(task)
-    bare = replace(task, gains=())
+    bare = task._replace(gains=())
     best = tune.objective(np.array([]), bare, [loop._replace(controller=tuned) for loop in loops])
     assert best < tune.objective(middle, task, loops) - 1.0
     stated = re.search(r'objective (-?[\d.]+)', locate(preset).read_text(encoding='utf-8'))
@@ -138,13 +139,13 @@ def test_tables_hold_every_run(report):
 
 def test_bounds_that_were_kept_are_told_by_condition_and_law():
     bounds = (np.full((1001, 2), k) for k in (0.004, 0.001))
-    held, left = (CaseResult(measure(made(bound=bound))) for bound in bounds)
-    results = {
+    held, left = (measure(made(bound=bound)) for bound in bounds)
+    metrics = {
         case.name: left if case.name.endswith((' 10', ' 0')) else held
         for sweep in SWEEPS
         for case in sweep.cases()
     }
-    header, table = kept_bounds(Results(results))
+    header, *table = kept_bounds(Results(metrics, {}))
     rows = {row[0]: row[1:] for row in table}
     assert len(header) == 5
     assert rows['delay of the torque [samples]'] == ['1, 2, 3, 4, 5, 6, 8'] * 4

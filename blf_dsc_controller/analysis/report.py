@@ -9,17 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.analysis.page import (
-    Cell,
-    Content,
-    Fragment,
-    Listing,
-    Page,
-    Paragraph,
-    Section,
-    Table,
-)
-from blf_dsc_controller.analysis.panels import Line, Panel, panels, thin
+from blf_dsc_controller.analysis.page import Cell, write_page
+from blf_dsc_controller.analysis.panels import Panel, panels, thin
 from blf_dsc_controller.analysis.reported_bag import ReportedBag
 from blf_dsc_controller.analysis.style import COLOURS, INK
 from blf_dsc_controller.analysis.summary import format_table, summarize
@@ -45,84 +36,56 @@ def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
     except ImportError:
         raise MissingExtraError('plotly', 'report', 'the page') from None
     found = panels([bag.run for bag in bags])
-    data = {'panels': plots(found, bags), 'arms': [arm(bag, k) for k, bag in enumerate(bags)]}
-    links = [*dict.fromkeys(panel.group for panel in found), 'The arm', 'Events']
-    Page(
-        title=' and '.join(bag.name for bag in bags),
-        introduction=[Paragraph(_subtitle(bags), 'muted')],
-        links=[(name.lower().replace(' ', '-'), name) for name in [*links, 'Configuration']],
-        sections=[
-            Section('Summary', [_summary(bag, k) for k, bag in enumerate(bags)]),
-            Section('', [Fragment('plots.html', {'data': data, 'plotly': get_plotlyjs()})]),
-            Section('Events', [_events(bags)]),
-            Section('Configuration', list(_configuration(bags))),
-        ],
-    ).write(path)
-
-
-def _subtitle(bags: Sequence[ReportedBag]) -> str:
-    versions = sorted({bag.context.version or 'another recorder' for bag in bags})
-    seconds = max(bag.run.duration for bag in bags)
-    return (
-        f'{seconds:.3f} s, recorded by {", ".join(versions)}. Drag to zoom, double-click to zoom '
-        'out; long series are thinned to their minima and maxima.'
-    )
-
-
-def _summary(bag: ReportedBag, k: int) -> Listing:
-    return Listing(bag.name, format_table(summarize(bag.run)), colour(k))
-
-
-def _events(bags: Sequence[ReportedBag]) -> Content:
-    rows = sorted(
+    groups = dict.fromkeys(panel.group for panel in found)
+    events = sorted(
         (event.time, k, event.kind, event.text)
         for k, bag in enumerate(bags)
         for event in bag.events
     )
-    if not rows:
-        return Paragraph('none')
-    cells = [
-        (
-            Cell(f'{time:.3f} s', 'number'),
-            Cell(bags[k].name, colour=colour(k)),
-            Cell(kind, 'bad' if kind in _ALARMING else ''),
-            text,
-        )
-        for time, k, kind, text in rows
-    ]
-    return Table(('time', 'bag', 'kind', 'event'), cells)
-
-
-def _configuration(bags: Sequence[ReportedBag]) -> Iterator[Content]:
-    recorded = [bag.parameters for bag in bags]
-    names = list(dict.fromkeys(name for one in recorded for name in one))
-    if not names:
-        yield Paragraph('not recorded in the bag')
-        return
-    rows: list[list[str | Cell]] = []
+    parameters: list[list[str | Cell]] = []
     different = []
-    for name in names:
-        values = [one.get(name, 'not recorded') for one in recorded]
-        differs = len(set(values)) > 1
-        rows.append([Cell(name, 'marked') if differs else name, *values])
-        if differs:
-            different.append(rows[-1])
-    header = ('parameter', *(bag.name for bag in bags))
-    if len(bags) > 1:
-        yield Paragraph(f'{len(different)} parameters differ.')
-        yield Table(header, different)
-    yield Table(header, rows, folded=f'all {len(rows)} parameters')
+    for name in dict.fromkeys(name for bag in bags for name in bag.parameters):
+        values = [bag.parameters.get(name, 'not recorded') for bag in bags]
+        parameters.append([name, *values])
+        if len(set(values)) > 1:
+            parameters[-1][0] = Cell(name, 'marked')
+            different.append(parameters[-1])
+    write_page(
+        path,
+        'report.html',
+        ' and '.join(bag.name for bag in bags),
+        names=[bag.name for bag in bags],
+        seconds=max(bag.run.duration for bag in bags),
+        versions=sorted({bag.version or 'another recorder' for bag in bags}),
+        links=[*groups, 'The arm', 'Events', 'Configuration'],
+        summaries=[
+            (bag.name, colour(k), format_table(summarize(bag.run))) for k, bag in enumerate(bags)
+        ],
+        data={'panels': plots(found, bags), 'arms': [arm(bag, k) for k, bag in enumerate(bags)]},
+        plotly=get_plotlyjs(),
+        events=[
+            (
+                Cell(f'{time:.3f} s', 'number'),
+                Cell(bags[k].name, colour=colour(k)),
+                Cell(kind, 'bad' if kind in _ALARMING else ''),
+                text,
+            )
+            for time, k, kind, text in events
+        ],
+        parameters=parameters,
+        different=different,
+    )
 
 
 def plots(shown: Sequence[Panel], bags: Sequence[ReportedBag]) -> list[dict[str, Any]]:
     """Panels as data for plotly, whose traces are thinned without losing a peak."""
-    names = [bag.name for bag in bags] if len(bags) > 1 else []
+    prefixes = [f'{bag.name}: ' for bag in bags] if len(bags) > 1 else []
     return [
         {
             'group': panel.group,
             'title': panel.title,
             'unit': panel.unit,
-            'traces': list((_histograms if panel.histogram else _traces)(panel, names)),
+            'traces': list((_histograms if panel.histogram else _traces)(panel, prefixes)),
             'time': not panel.histogram,
             'log': panel.log,
             'marks': [
@@ -133,18 +96,18 @@ def plots(shown: Sequence[Panel], bags: Sequence[ReportedBag]) -> list[dict[str,
     ]
 
 
-def _traces(panel: Panel, names: Sequence[str]) -> Iterator[dict[str, Any]]:
+def _traces(panel: Panel, prefixes: Sequence[str]) -> Iterator[dict[str, Any]]:
     drawn = 0
     for line in panel.lines:
-        shade = line.colour or colour(line.run if names else drawn)
+        shade = line.colour or colour(line.run if prefixes else drawn)
         drawn += not line.colour
-        if names and shade == INK:
+        if prefixes and shade == INK:
             shade = colour(line.run)
         time, values = thin(line.time, line.values)
         for sign in (1.0, -1.0) if line.mirrored else (1.0,):
             yield {
                 'type': 'scatter',
-                'name': _name(line, names),
+                'name': (prefixes[line.run] if prefixes else '') + line.name,
                 'x': _numbers(time),
                 'y': _numbers(sign * values),
                 'line': {'width': 1.3, 'color': shade, 'dash': 'dash' if line.dashed else 'solid'},
@@ -152,23 +115,19 @@ def _traces(panel: Panel, names: Sequence[str]) -> Iterator[dict[str, Any]]:
             }
 
 
-def _histograms(panel: Panel, names: Sequence[str]) -> Iterator[dict[str, Any]]:
+def _histograms(panel: Panel, prefixes: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Counts up to the tail; values beyond it fall into the last bin."""
     for line in panel.lines:
         values = line.values[np.isfinite(line.values)]
         counts, edges = np.histogram(np.minimum(values, np.percentile(values, _TAIL)), _BINS)
         yield {
             'type': 'bar',
-            'name': _name(line, names),
+            'name': (prefixes[line.run] if prefixes else '') + line.name,
             'x': _numbers((edges[1:] + edges[:-1]) / 2),
             'y': counts.tolist(),
             'opacity': 0.7,
             'marker': {'color': colour(line.run)},
         }
-
-
-def _name(line: Line, names: Sequence[str]) -> str:
-    return f'{names[line.run]}: {line.name}' if names else line.name
 
 
 def _numbers(values: Floats) -> list[float | None]:
@@ -189,12 +148,15 @@ def arm(bag: ReportedBag, k: int) -> dict[str, Any]:
     pictures = int(min(_MOST_PICTURES, max(2.0, run.duration * _RATE)))
     times = np.linspace(0.0, run.duration, pictures)
     rows = np.minimum(np.searchsorted(run.time, times), run.time.size - 1)
-    reference: Any = [] if run.reference is None else np.nan_to_num(run.reference[rows]).round(4)
+    position, reference = (
+        [] if angles is None else np.nan_to_num(angles[rows]).round(4).tolist()
+        for angles in (run.position, run.reference)
+    )
     return {
         'name': bag.name,
         'colour': colour(k),
         'lengths': bag.lengths,
         'time': times.round(4).tolist(),
-        'angles': np.nan_to_num(run.position[rows]).round(4).tolist(),
-        'reference': np.asarray(reference).tolist(),
+        'angles': position,
+        'reference': reference,
     }

@@ -6,15 +6,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.analysis.metrics import latch_time, outside
-from blf_dsc_controller.bags.context import Context, read_context
+from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.sources import open_bag
-from blf_dsc_controller.configuration.ros_yaml import Section, parse
+from blf_dsc_controller.configuration.ros_yaml import parse
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages.topics import DIAGNOSTICS
 from blf_dsc_controller.messages.types import typestore
@@ -22,12 +22,10 @@ from blf_dsc_controller.run import Run
 
 _LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 _MOST_OF_A_KIND = 50
-_NANO = 1e-9
 _AT_LIMIT = 1.0 - 1e-9
 
 
-@dataclass(frozen=True)
-class Event:
+class Event(NamedTuple):
     """Something that happened."""
 
     time: float  # s since the first sample
@@ -41,35 +39,10 @@ class ReportedBag:
 
     name: str
     run: Run
-    context: Context
-    events: tuple[Event, ...]
-
-    @property
-    def sections(self) -> list[Section]:
-        """Sections of the recorded configuration, none if it is not there or cannot be read."""
-        try:
-            return parse(self.context.configuration)
-        except ConfigurationError:
-            return []
-
-    @property
-    def parameters(self) -> dict[str, str]:
-        """Every recorded parameter, `node name: parameter` to its value as text."""
-        return {
-            f'{section.pattern.removeprefix("/")}: {name}': _shown(entry.value)
-            for section in self.sections
-            for name, entry in sorted(section.entries.items())
-        }
-
-    @property
-    def lengths(self) -> list[float]:
-        """Length of each link [m]; one that is not recorded is that of the first link."""
-        entries = {
-            name: entry for section in self.sections for name, entry in section.entries.items()
-        }
-        count = len(self.run.joints)
-        names = [name if (name := f'arm.l{i + 1}') in entries else 'arm.l1' for i in range(count)]
-        return [float(str(entries[name].value)) if name in entries else 1.0 for name in names]
+    version: str  # that recorded it, empty if it was another recorder
+    parameters: dict[str, str]  # `node name: parameter` to its value as text
+    lengths: list[float]  # of each link [m]
+    events: list[Event]  # by time
 
 
 def read_bags(paths: Sequence[Path], namespace: str = '') -> list[ReportedBag]:
@@ -78,8 +51,7 @@ def read_bags(paths: Sequence[Path], namespace: str = '') -> list[ReportedBag]:
     Raises:
         BlfDscError: one of them cannot be read.
     """
-    names = _names(paths)
-    return [_read(path, name, namespace) for path, name in zip(paths, names, strict=True)]
+    return [_read(path, name, namespace) for path, name in zip(paths, _names(paths), strict=True)]
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -98,9 +70,28 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 def _read(path: Path, name: str, namespace: str) -> ReportedBag:
     run, context = read_run(path, namespace), read_context(path)
-    events = [*_events(run), *_diagnosed(path, run)]
-    events += (Event(0.0, 'lost', f'{topic}: {text}') for topic, text in context.losses.items())
-    return ReportedBag(name, run, context, tuple(sorted(events, key=lambda event: event.time)))
+    try:
+        sections = parse(context.configuration)
+    except ConfigurationError:  # not there, or it cannot be read
+        sections = []
+    entries = {name: entry.value for section in sections for name, entry in section.entries.items()}
+    # A link without a length of its own has that of the first.
+    keys = (f'arm.l{i + 1}' for i in range(len(run.joints)))
+    lengths = [entries.get(key, entries.get('arm.l1', 1.0)) for key in keys]
+    lost = (Event(0.0, 'lost', f'{topic}: {text}') for topic, text in context.losses.items())
+    events = (*_events(run), *_diagnosed(path, run), *lost)
+    return ReportedBag(
+        name,
+        run,
+        context.version,
+        parameters={
+            f'{section.pattern.removeprefix("/")}: {name}': _shown(entry.value)
+            for section in sections
+            for name, entry in sorted(section.entries.items())
+        },
+        lengths=[float(f'{length}') for length in lengths],
+        events=sorted(events, key=lambda event: event.time),
+    )
 
 
 def _events(run: Run) -> Iterator[Event]:
@@ -132,26 +123,20 @@ def _spells(run: Run, holds: np.ndarray, kind: str, what: str) -> Iterator[Event
 
 def _diagnosed(path: Path, run: Run) -> Iterator[Event]:
     """Each change of a level or a message, at the time of the sample received last."""
-    said: dict[str, tuple[int, str]] = {}
+    shown: dict[str, tuple[int, str]] = {}
     with open_bag(path) as bag:
         if (DIAGNOSTICS.resolved, DIAGNOSTICS.type) not in bag.held:
             return
         for _, received, raw in bag.messages({DIAGNOSTICS.resolved}):
             message: Any = typestore().deserialize_cdr(raw, DIAGNOSTICS.type)
+            k = int(np.searchsorted(run.received, received)) - 1
+            time = float(run.time[k]) if k >= 0 else (received - int(run.received[0])) * 1e-9
             for status in message.status:
                 now = (int(status.level), str(status.message))
-                if said.get(status.name) == now:
-                    continue
-                said[status.name] = now
-                level = _LEVELS[min(now[0], len(_LEVELS) - 1)]
-                yield Event(_moment(run, received), level, f'{status.name}: {now[1]}')
-
-
-def _moment(run: Run, received: int) -> float:
-    k = int(np.searchsorted(run.received, received)) - 1
-    if k < 0:
-        return (received - int(run.received[0])) * _NANO
-    return float(run.time[k])
+                if shown.get(status.name) != now:
+                    shown[status.name] = now
+                    level = _LEVELS[min(now[0], len(_LEVELS) - 1)]
+                    yield Event(time, level, f'{status.name}: {now[1]}')
 
 
 def _shown(value: object) -> str:

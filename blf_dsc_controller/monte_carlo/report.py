@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 
 from blf_dsc_controller.analysis.figures import draw as draw_run
-from blf_dsc_controller.analysis.page import Cell, Figure, Page, Paragraph, Section, Table
+from blf_dsc_controller.analysis.page import Cell, write_page
 from blf_dsc_controller.analysis.summary import summarize as summarize_run
 from blf_dsc_controller.analysis.summary import write_summary
 from blf_dsc_controller.bags.reader import read_run
@@ -38,7 +38,7 @@ def write_report(store: Store) -> tuple[Summary, list[Path]]:
     summary = summarize(store.study, results)
     figures = draw_study(store.study, results, store.folder)
     path = store.folder / 'report.html'
-    _page(store.study, summary, store.folder, figures).write(path)
+    _write_page(path, store.study, summary, figures)
     write_summary(summary, store.folder / 'summary.json')
     return summary, [path, *figures, store.folder / 'summary.json']
 
@@ -95,21 +95,7 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
     return summary
 
 
-def _page(study: Study, summary: Summary, folder: Path, figures: list[Path]) -> Page:
-    introduction = [Paragraph(f'{headline(summary)}.', 'lead')]
-    if summary['runs'] < summary['planned']:
-        text = f'The study is not complete: {summary["planned"]} runs are planned.'
-        introduction.append(Paragraph(text))
-    outcomes = [(name, str(count), OUTCOMES[name]) for name, count in summary['outcomes'].items()]
-    method = (
-        f'The interval is that of Wilson. Seed {summary["seed"]}; everything else is in study.yaml '
-        'and versions.json, the results in runs/*.parquet.'
-    )
-    quantiles: list[tuple[str | Cell, ...]] = [
-        (Cell(name, 'code'), *(_number(values[one]) for one in _QUANTILES))
-        for name, values in summary['figures'].items()
-        if values is not None
-    ]
+def _write_page(path: Path, study: Study, summary: Summary, figures: list[Path]) -> None:
     varied = [
         (
             Cell(one.column.removeprefix('plant.'), 'code'),
@@ -118,44 +104,31 @@ def _page(study: Study, summary: Summary, folder: Path, figures: list[Path]) -> 
         )
         for one in study.variations
     ]
-    return Page(
+    write_page(
+        path,
+        'study.html',
         f'Monte Carlo study: {summary["runs"]} runs of {summary["duration_s"]:g} s',
-        [*introduction, Table(('outcome', 'runs', 'meaning'), outcomes), Paragraph(method)],
-        [
-            Section(
-                'Distributions',
-                [
-                    *(Figure(path, path.stem) for path in figures),
-                    Table(('', *_QUANTILES), quantiles, numeric=True),
-                ],
-            ),
-            Section(
-                'The worst runs',
-                [
-                    Table(
-                        ('run', 'outcome', 'max |ξ1|/k_c', 'first outside', 'again, with a bag'),
-                        [_worst_row(one, folder) for one in summary['worst']],
-                    )
-                ],
-            ),
-            Section(
-                'What varied',
-                [
-                    Paragraph(
-                        'Variance of the largest error that each number explains by itself: '
-                        'correlation ratio of the ranks over ten groups.'
-                    ),
-                    Table(('parameter', 'distribution', 'explains'), varied),
-                ],
+        headline=headline(summary),
+        summary=summary,
+        outcomes=[(name, f'{n}', OUTCOMES[name]) for name, n in summary['outcomes'].items()],
+        figures=figures,
+        quantiles=[
+            ('', *_QUANTILES),
+            *(
+                (Cell(name, 'code'), *(_number(values[one]) for one in _QUANTILES))
+                for name, values in summary['figures'].items()
+                if values is not None
             ),
         ],
+        worst=[_worst_row(one, path.parent) for one in summary['worst']],
+        varied=varied,
     )
 
 
 def _worst_row(one: Summary, folder: Path) -> tuple[str | Cell, ...]:
     first = one['first_violation_s']
     return (
-        str(one['run']),
+        f'{one["run"]}',
         one['outcome'],
         ', '.join(_number(ratio) for ratio in one['max_error_ratio'].values()),
         '-' if first is None else f'{first:.3f} s',

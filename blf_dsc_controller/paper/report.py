@@ -3,178 +3,117 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import astuple, fields
+import csv
+import json
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 
-from blf_dsc_controller.analysis.page import Cell, Figure, Page, Paragraph, Section, Table
+from blf_dsc_controller.analysis.metrics import MOMENTS
+from blf_dsc_controller.analysis.page import Cell, write_page
+from blf_dsc_controller.analysis.summary import plain
 from blf_dsc_controller.configuration.params_file import dump
 from blf_dsc_controller.paper import tune
-from blf_dsc_controller.paper.cases import CASES, SIDE_BY_SIDE
+from blf_dsc_controller.paper.cases import CASES, LAWS, SIDE_BY_SIDE, SWEEPS, Sweep, case_name
 from blf_dsc_controller.paper.claims import FAILS, HOLDS, ONLY_IF, Claim, claims
-from blf_dsc_controller.paper.figures import draw_figure_2, draw_figure_3, draw_robustness
-from blf_dsc_controller.paper.results import (
-    HEADER,
-    Results,
-    kept_bounds,
-    run_all,
-    side_by_side,
-    write_csv,
-    write_tables,
-)
+from blf_dsc_controller.paper.figures import draw_pairs, draw_robustness
+from blf_dsc_controller.paper.results import Results, run_all
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 
-PAIRS = {
-    'tuned': (
-        'both laws tuned by the same procedure',
-        {'proposed': 'paper_tuned', 'comparison': 'comparison'},
-    ),
-    'low_gains': (
-        "the paper's choices against a comparison with low gains",
-        {'proposed': 'paper', 'comparison': 'comparison_detuned'},
-    ),
-    'recommended': (
-        'the recommended form against the tuned comparison',
-        {'recommended': 'recommended', 'comparison': 'comparison'},
-    ),
-}
 _STYLES = {HOLDS: 'good', ONLY_IF: 'partly', FAILS: 'bad'}
 
 
 def compare(folder: Path) -> list[Claim]:
     """Run every case, write the report into an empty folder and return the claims."""
-    keep_configurations(folder / 'configurations')
+    (folder / 'configurations').mkdir()
+    for case in CASES:
+        name = case.name.replace(' ', '_')
+        dump(folder / 'configurations' / f'{name}.yaml', case.loop().by_node)
     results = run_all()
     found = claims(results)
-    write_tables(results, folder)
-    names = [field.name for field in fields(Claim)]
-    write_csv(folder / 'claims.csv', names, (astuple(claim) for claim in found))
-    Page(
+    laws = list(side_by_side(results))
+    _write_csv(folder / 'side_by_side.csv', laws)
+    _write_csv(folder / 'claims.csv', [Claim._fields, *found])
+    _write_csv(folder / 'robustness.csv', _robustness(results))
+    metrics = {name: plain(asdict(one)) for name, one in sorted(results.metrics.items())}
+    text = json.dumps(metrics, indent=1) + '\n'
+    (folder / 'metrics.json').write_text(text, encoding='utf-8')
+    write_page(
+        folder / 'index.html',
+        'paper.html',
         'The paper, side by side',
-        [
-            Paragraph(
-                'Section IV of the paper, run offline with the kernels that the ROS 2 node runs. '
-                'Made by `blf_dsc paper`. Values of two joints are written joint1 / joint2.'
-            )
+        claims=[
+            (*claim[:3], Cell(claim.full_verdict, _STYLES[claim.verdict]), Cell(claim[-1], 'code'))
+            for claim in found
         ],
-        _sections(results, found, folder),
-    ).write(folder / 'index.html')
+        laws=laws,
+        presets=', '.join(f'{case.label}: {case.preset}' for case in SIDE_BY_SIDE),
+        warnings=[
+            f'{case.label}: {warning}'
+            for case in SIDE_BY_SIDE
+            for warning in config_warnings(case.loop().controller)
+        ],
+        tune=tune,
+        figures=list(draw_pairs(results, folder)),
+        kept=kept_bounds(results),
+        robustness=draw_robustness(results, folder),
+        runs=len(CASES),
+        folder=folder.name,
+    )
     return found
 
 
-def keep_configurations(folder: Path) -> None:
-    """Write every parameter of each case as it is run."""
-    folder.mkdir()
-    for case in CASES:
-        dump(folder / f'{case.name.replace(" ", "_")}.yaml', case.loop().by_node)
+def side_by_side(results: Results) -> Iterator[list[str]]:
+    """A header, and a row for each law; two joints are written as one / other."""
+    columns = {  # title: entry of the metrics, units to 1, decimals
+        'max |xi1| [mrad]': ('max_error', 1e3, 3),
+        'rms xi1 [mrad]': ('rms_error', 1e3, 4),
+        'peak torque [N m]': ('peak_torque', 1.0, 2),
+        'rms torque [N m]': ('rms_torque', 1.0, 2),
+        'torque rate [N m/s]': ('torque_rate', 1.0, 1),
+    }
+    yield ['law', *columns, *(f'error at {t} s' for t in MOMENTS), 'below 1 % from', 'bound']
+    for case in SIDE_BY_SIDE:
+        metrics = results.metrics[case.name]
+        settled = metrics.time_to_1_percent
+        yield [
+            case.label,
+            *(
+                ' / '.join(f'{factor * value:.{decimals}f}' for value in getattr(metrics, name))
+                for name, factor, decimals in columns.values()
+            ),
+            *(f'{100 * error:.2g} %' for error in metrics.parameter_error.values()),
+            'never' if math.isnan(settled) else f'{settled:.2f} s',
+            'kept' if metrics.held else f'left at {metrics.first_violation:.3f} s',
+        ]
 
 
-def draw(results: Results, folder: Path) -> list[Figure]:
-    """Draw Fig. 2 and 3 of each pair of laws."""
-    figures = []
-    for name, (caption, pair) in PAIRS.items():
-        runs = {label: results.run(case) for label, case in pair.items()}
-        for number, draw_figure, note in (
-            (2, draw_figure_2, '. Shaded: within the bound'),
-            (3, draw_figure_3, ''),
-        ):
-            path = folder / f'figure_{number}_{name}.png'
-            draw_figure(f'Fig. {number}, {caption}', runs, path)
-            figures.append(Figure(path, f'Fig. {number}: {caption}{note}.'))
-    return figures
+def kept_bounds(results: Results) -> list[list[str]]:
+    """A header, and at which values of each condition each law has kept its bound."""
+    rows = [[sweep.label, *(_kept(results, sweep, law) for law in LAWS)] for sweep in SWEEPS]
+    return [['bound kept at', *LAWS.values()], *rows]
 
 
-def _sections(results: Results, found: Sequence[Claim], folder: Path) -> list[Section]:
-    tracking, learning = draw_robustness(results, folder)
-    presets = ', '.join(f'{case.label}: {case.preset}' for case in SIDE_BY_SIDE)
-    header, rows = kept_bounds(results)
-    return [
-        Section('Claims', [_claims_table(found)]),
-        Section(
-            'Laws',
-            [
-                Table(HEADER, side_by_side(results), numeric=True),
-                Paragraph(
-                    f'Presets, each of which blf_dsc run --offline --config PRESET runs by '
-                    f'itself: {presets}. The torque rate is the rms of the change per sample over '
-                    f'the sample time.'
-                ),
-            ],
-        ),
-        Section('Configuration warnings', [Paragraph(text) for text in warnings()]),
-        Section('What was equalised', [Paragraph(text) for text in equalised()]),
-        Section('Figures', draw(results, folder)),
-        Section(
-            'Where each law breaks',
-            [
-                Table(header, rows, numeric=True),
-                Figure(
-                    tracking,
-                    'Largest error of 30 s in units of the bound, which is the red line; points '
-                    'at the upper edge have diverged. One condition is changed at a time.',
-                ),
-                Figure(
-                    learning,
-                    'Parameter error; grey: 1 %. Laws without a window are not in the last panel.',
-                ),
-            ],
-        ),
-        Section(
-            'Files',
-            [
-                Paragraph(
-                    f'side_by_side.csv, claims.csv, robustness.csv and metrics.json hold the '
-                    f'numbers, configurations/ every parameter of the {len(results.by_case)} runs '
-                    f'as files for blf_dsc run --config. Beside this page in {folder.name}/.'
-                )
-            ],
-        ),
-    ]
+def _kept(results: Results, sweep: Sweep, law: str) -> str:
+    if law not in sweep.laws:
+        return '-'
+    held = results.held(sweep.name, law)
+    if len(held) == len(sweep.values):
+        return 'all'
+    return ', '.join(f'{value:g}' for value in held) or 'none'
 
 
-def _claims_table(found: Sequence[Claim]) -> Table:
-    rows = [
-        (
-            claim.where,
-            claim.says,
-            claim.measured,
-            Cell(claim.full_verdict, _STYLES[claim.verdict]),
-            Cell(claim.command, 'code'),
-        )
-        for claim in found
-    ]
-    return Table(('where', 'says', 'measured', 'verdict', 'shown by'), rows)
+def _robustness(results: Results) -> Iterator[tuple[object, ...]]:
+    yield 'condition', 'law', 'value', 'max |xi1| / k_c', 'parameter error', 'bound'
+    for sweep in SWEEPS:
+        for law in sweep.laws:
+            for value in sweep.values:
+                metrics = results.metrics[case_name(sweep.name, law, value)]
+                numbers = value, metrics.max_error_ratio, metrics.tail_parameter_error
+                yield sweep.label, law, *numbers, 'kept' if metrics.held else 'left'
 
 
-def warnings() -> list[str]:
-    """Configuration warnings of the side-by-side cases."""
-    found = [
-        f'{case.label}: {warning}'
-        for case in SIDE_BY_SIDE
-        for warning in config_warnings(case.loop().controller)
-    ]
-    return found or ['There are none.']
-
-
-def equalised() -> list[str]:
-    """What the compared laws have in common, and what they have not."""
-    evaluations = tune.POPULATION * (tune.GENERATIONS + 1)
-    sizes = ', '.join(f'{len(task.gains)} for {name}' for name, task in tune.TASKS.items())
-    same = (
-        'All laws have the same arm, disturbance, reference, start, first estimate (half the '
-        'truth), sample time and torque limit (20 N m), and the same projection of the estimate.'
-    )
-    tuned = (
-        f'Gains called tuned come from one procedure (python -m blf_dsc_controller.paper.tune): '
-        f"scipy's differential evolution, seed {tune.SEED}, {evaluations} evaluations of two runs "
-        f'of {tune.DURATION:g} s each, with exact sensors and with the sensors and delay of the '
-        f'preset noisy. The objective adds the decades of the largest and the rms error and of '
-        f'the parameter error; leaving the bound, and a torque that changes by more than '
-        f'{tune.ROUGHEST:g} N m rms from sample to sample, cost ten times as much. '
-        f'Gains searched: {sizes}; those that laws share have the same ranges.'
-    )
-    different = (
-        'Not equal: the proposed law knows its bound, the comparison does not; the comparison '
-        'needs the second derivative of the reference, the proposed law does not.'
-    )
-    return [same, tuned, different]
+def _write_csv(path: Path, rows: Iterable[Iterable[object]]) -> None:
+    with path.open('w', encoding='utf-8', newline='') as file:
+        csv.writer(file).writerows(rows)

@@ -15,8 +15,8 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import differential_evolution
@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from blf_dsc_controller.analysis.metrics import Metrics, measure
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import LoopConfig
+from blf_dsc_controller.configuration.nodes import PLANT, LoopConfig
 from blf_dsc_controller.configuration.params_file import format_value, load_loop
 from blf_dsc_controller.configuration.schema import change, flatten
 from blf_dsc_controller.errors import BlfDscError
@@ -35,6 +35,7 @@ from blf_dsc_controller.simulation.loop import simulate
 SEED = 1
 POPULATION = 96
 GENERATIONS = 12
+EVALUATIONS = POPULATION * (GENERATIONS + 1)
 DURATION = 30.0  # s
 ROUGHEST = 2.0  # N m, rms change of a torque from sample to sample that a motor is to be spared
 HOPELESS = 30.0
@@ -43,9 +44,8 @@ PLANTS = ('recommended', 'noisy')
 """Presets whose plants a law is tuned on."""
 
 
-@dataclass(frozen=True)
-class Gain:
-    """One tuned number: the parameter it sets, for which of two joints, and its range."""
+class Gain(NamedTuple):
+    """One tuned number: the parameter it sets, its range, and for which of two joints."""
 
     name: str
     least: float
@@ -54,17 +54,8 @@ class Gain:
     length: int = 2  # entries of the parameter; 0: a scalar
 
 
-SHARED = (
-    Gain('feedback.gain', 5.0, 200.0, joint=0),
-    Gain('feedback.gain', 2.0, 100.0, joint=1),
-    Gain('learning.adaptation_gain', 0.01, 30.0, length=3),
-)
-SURFACE_OF_35 = Gain('comparison.surface_gain', 10.0, 300.0)
-
-
-@dataclass(frozen=True)
-class Task:
-    """A law to tune: the preset or choices it starts from, and its gains."""
+class Task(NamedTuple):
+    """A law to tune: the preset and choices it starts from, and its gains."""
 
     title: str
     preset: str
@@ -72,36 +63,44 @@ class Task:
     gains: tuple[Gain, ...]
 
 
+_SHARED = (
+    Gain('feedback.gain', 5.0, 200.0, joint=0),
+    Gain('feedback.gain', 2.0, 100.0, joint=1),
+    Gain('learning.adaptation_gain', 0.01, 30.0, length=3),
+)
+_SURFACE_OF_35 = Gain('comparison.surface_gain', 10.0, 300.0)
+_PROPOSED = (
+    *_SHARED,
+    Gain('surface.gain', 10.0, 600.0),
+    Gain('surface.mu', 1.0, 100.0),
+    Gain('disturbance.gain', 0.1, 300.0),
+    Gain('learning.weight', 0.1, 100.0, length=0),
+)
+_COMPARISON = (
+    *_SHARED,
+    _SURFACE_OF_35,
+    Gain('comparison.position_gain', 0.1, 1e4),
+    Gain('comparison.robust_gain', 1e-3, 5.0),
+    Gain('comparison.leakage', 1e-5, 1.0, length=0),
+)
 TASKS = {
     'proposed': Task(
         "The proposed law in the paper's own form (preset paper), its gains tuned",
         'paper',
         {},
-        (
-            *SHARED,
-            Gain('surface.gain', 10.0, 600.0),
-            Gain('surface.mu', 1.0, 100.0),
-            Gain('disturbance.gain', 0.1, 300.0),
-            Gain('learning.weight', 0.1, 100.0, length=0),
-        ),
+        _PROPOSED,
     ),
     'comparison': Task(
         'The comparison controller (35), its gains tuned',
         'recommended',
         {'law': 'backstepping'},
-        (
-            *SHARED,
-            SURFACE_OF_35,
-            Gain('comparison.position_gain', 0.1, 1e4),
-            Gain('comparison.robust_gain', 1e-3, 5.0),
-            Gain('comparison.leakage', 1e-5, 1.0, length=0),
-        ),
+        _COMPARISON,
     ),
     'slotine_li': Task(
         'The classical adaptive law of Slotine and Li, its gains tuned',
         'recommended',
         {'law': 'slotine_li'},
-        (*SHARED, SURFACE_OF_35),
+        (*_SHARED, _SURFACE_OF_35),
     ),
 }
 
@@ -134,10 +133,9 @@ def cost_of(metrics: Metrics, sample_time: float) -> float:
 
 def objective(exponents: Floats, task: Task, loops: Sequence[LoopConfig]) -> float:
     """Mean of `cost_of` over the plants."""
-    changes = settings_of(task, exponents)
     values = []
     for loop in loops:
-        config = change(loop.controller, changes)
+        config = change(loop.controller, settings_of(task, exponents))
         with np.errstate(all='ignore'):
             metrics = measure(simulate(config, loop.plant).run())
             values.append(cost_of(metrics, config.sample_time))
@@ -147,28 +145,27 @@ def objective(exponents: Floats, task: Task, loops: Sequence[LoopConfig]) -> flo
 def loops_of(task: Task) -> list[LoopConfig]:
     """The task's controller against each plant, for the duration of the tuning."""
     law = load_loop(task.preset).controller
-    loops = (load_loop(name, {'sim_plant': {'duration': DURATION}}) for name in PLANTS)
+    loops = (load_loop(name, {PLANT: {'duration': DURATION}}) for name in PLANTS)
     return [loop._replace(controller=law) for loop in loops]
 
 
-def tune(task: Task, generations: int = GENERATIONS) -> tuple[Floats, float, int]:
+def tune(task: Task) -> tuple[Floats, float, int]:
     """Best exponents, their objective, and how many times it was evaluated."""
     loops = loops_of(task)
-    ranges = [(np.log10(gain.least), np.log10(gain.most)) for gain in task.gains]
-    low, high = np.array(ranges).T
-    with tqdm(total=POPULATION * (generations + 1), desc='tuning', unit='run') as bar:
+    ranges = np.log10([(gain.least, gain.most) for gain in task.gains])
+    # Evenly spread, as many points for every law.
+    points = qmc.LatinHypercube(len(ranges), rng=np.random.default_rng(SEED)).random(POPULATION)
+    with tqdm(total=EVALUATIONS, desc='tuning', unit='run') as bar:
 
         def cost(exponents: Floats) -> float:
             bar.update()
             return objective(exponents, task, loops)
 
-        # Evenly spread, as many points for every law.
-        spread = qmc.LatinHypercube(low.size, rng=np.random.default_rng(SEED)).random(POPULATION)
         found = differential_evolution(
             cost,
             ranges,
-            init=spread * (high - low) + low,
-            maxiter=generations,
+            init=points * np.diff(ranges).T + ranges[:, 0],
+            maxiter=GENERATIONS,
             tol=0.0,
             polish=False,
             rng=np.random.default_rng(SEED),
@@ -181,13 +178,11 @@ def preset(name: str, exponents: Floats, value: float, evaluations: int) -> str:
 
     The truth is that of the preset paper, for the monitors.
     """
-    task = TASKS[name]
-    base, defaults = (
-        flatten(one) for one in (load_loop(task.preset).controller, ControllerConfig())
-    )
+    task, defaults = TASKS[name], flatten(ControllerConfig())
+    base = flatten(load_loop(task.preset).controller)
     truth = flatten(load_loop('paper').controller)
-    base |= {key: value for key, value in truth.items() if key.startswith('truth.')}
-    changes = {key: value for key, value in base.items() if value != defaults[key]}
+    base |= {key: entry for key, entry in truth.items() if key.startswith('truth.')}
+    changes = {key: entry for key, entry in base.items() if entry != defaults[key]}
     lines = ''.join(
         f'    {key}: {format_value(tuple(entry) if isinstance(entry, list) else entry)}\n'  # type: ignore[arg-type]
         for key, entry in {**changes, **settings_of(task, exponents)}.items()
@@ -200,21 +195,19 @@ def preset(name: str, exponents: Floats, value: float, evaluations: int) -> str:
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main() -> None:
     """Tune one law and write its preset."""
     options = argparse.ArgumentParser(prog='tune', description='Tune one of the compared laws.')
     options.add_argument('law', choices=TASKS)
     options.add_argument('out', type=Path, help='parameter file to write')
-    chosen = options.parse_args(arguments)
+    chosen = options.parse_args()
     try:
         exponents, value, evaluations = tune(TASKS[chosen.law])
         chosen.out.write_text(preset(chosen.law, exponents, value, evaluations), encoding='utf-8')
     except BlfDscError as error:
-        print(f'tune: {error}', file=sys.stderr)
-        return 1
+        sys.exit(f'tune: {error}')
     print(f'wrote {chosen.out}: objective {value:.4f} after {evaluations} evaluations')
-    return 0
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()
