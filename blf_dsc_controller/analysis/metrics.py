@@ -102,7 +102,8 @@ def measure(run: Run) -> Metrics:
     """Metrics of a run."""
     error, torque = run.error, run.torque
     step = float(run.time[1]) if run.stamp.size > 1 else math.nan
-    first, joint = _first_violation(run)
+    violated = outside(run)
+    first = np.argwhere(violated)[:1].tolist() if violated is not None else []
     latched = latch_time(run)
     estimates = estimates_of(run)
     learned = None if estimates is None else estimates.relative_error
@@ -122,8 +123,8 @@ def measure(run: Run) -> Metrics:
         _columns(_least, run.torque_limit, n),
         tuple(change / step for change in _columns(rms, np.diff(torque, axis=0), n)),
         math.nan if error is None or run.bound is None else _peak(error / run.bound),
-        first,
-        joint,
+        float(run.time[first[0][0]]) if first else math.nan,
+        run.joints[first[0][1]] if first else '',
         math.nan if latched is None else latched,
         *learning,
     )
@@ -149,14 +150,6 @@ def _peak(values: Floats) -> float:
 def _least(values: Floats) -> float:
     known = values[np.isfinite(values)]
     return float(known.min()) if known.size else math.nan
-
-
-def _first_violation(run: Run) -> tuple[float, str]:
-    violated = outside(run)
-    if violated is None or not violated.any():
-        return math.nan, ''
-    k, i = np.argwhere(violated)[0]
-    return float(run.time[k]), run.joints[i]
 
 
 def _at_moments(time: Floats, error: Floats) -> dict[int, float]:

@@ -19,14 +19,14 @@ Summary = dict[str, Any]
 
 _PERCENTILES = {'p50': 50.0, 'p99': 99.0, 'p99.9': 99.9, 'max': 100.0}
 _MICROSECONDS = 1e6
-_COLUMNS = (  # title, entry of the summary; unit, how many units to 1, decimals
-    ('max |xi1|', 'max_abs_error_rad', ('mrad', 1e3, 3)),
-    ('rms xi1', 'rms_error_rad', ('mrad', 1e3, 3)),
-    ('bound', 'bound_rad', ('mrad', 1e3, 3)),
-    ('peak torque', 'peak_torque_nm', ('N m', 1.0, 2)),
-    ('rms torque', 'rms_torque_nm', ('N m', 1.0, 2)),
-    ('limit', 'torque_limit_nm', ('N m', 1.0, 2)),
-)
+_JOINT = {  # entry of the summary: metric; title, unit, units to 1 and decimals in the table
+    'max_abs_error_rad': ('max_error', 'max |xi1|', 'mrad', 1e3, 3),
+    'rms_error_rad': ('rms_error', 'rms xi1', 'mrad', 1e3, 3),
+    'bound_rad': ('bound', 'bound', 'mrad', 1e3, 3),
+    'peak_torque_nm': ('peak_torque', 'peak torque', 'N m', 1.0, 2),
+    'rms_torque_nm': ('rms_torque', 'rms torque', 'N m', 1.0, 2),
+    'torque_limit_nm': ('torque_limit', 'limit', 'N m', 1.0, 2),
+}
 
 
 def summarize(run: Run) -> Summary:
@@ -43,7 +43,13 @@ def summarize(run: Run) -> Summary:
         'tracking': {
             'held': metrics.held,
             'first_violation': None if math.isnan(metrics.first_violation) else violated,
-            'joints': {joint: _joint(metrics, i) for i, joint in enumerate(run.joints)},
+            'joints': {
+                joint: {
+                    entry: plain(getattr(metrics, metric)[i])
+                    for entry, (metric, *_) in _JOINT.items()
+                }
+                for i, joint in enumerate(run.joints)
+            },
         },
         'learning': None if estimates is None else _learning(run, estimates, metrics),
         'timing': _timing(run),
@@ -64,18 +70,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain(each) for each in value]
     return None if isinstance(value, float) and math.isnan(value) else value
-
-
-def _joint(metrics: Metrics, i: int) -> Summary:
-    columns = {
-        'max_abs_error_rad': metrics.max_error,
-        'rms_error_rad': metrics.rms_error,
-        'bound_rad': metrics.bound,
-        'peak_torque_nm': metrics.peak_torque,
-        'rms_torque_nm': metrics.rms_torque,
-        'torque_limit_nm': metrics.torque_limit,
-    }
-    return {name: plain(values[i]) for name, values in columns.items()}
 
 
 def _learning(run: Run, estimates: Estimates, metrics: Metrics) -> Summary:
@@ -125,39 +119,35 @@ def _percentiles(series: Series | None, name: str) -> Summary | None:
 
 def format_table(summary: Summary) -> str:
     """Format a summary as a few lines for the terminal, without a newline at the end."""
-    lines = [*_joint_lines(summary['tracking']['joints']), '', *_sentences(summary)]
-    return '\n'.join(lines)
-
-
-def _joint_lines(joints: Summary) -> Iterator[str]:
-    rows = [['', *(title for title, *_ in _COLUMNS)]]
-    for name, joint in joints.items():
-        rows.append([name, *(_number(joint[key], *form) for _, key, form in _COLUMNS)])
+    rows = [['', *(title for _, title, *_ in _JOINT.values())]]
+    for name, joint in summary['tracking']['joints'].items():
+        cells = (
+            '-' if joint[entry] is None else f'{factor * joint[entry]:.{decimals}f} {unit}'
+            for entry, (_, _, unit, factor, decimals) in _JOINT.items()
+        )
+        rows.append([name, *cells])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for name, *cells in rows:
-        padded = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
-        yield '  '.join([name.ljust(widths[0]), *padded])
+    lines = []
+    for name, *values in rows:
+        padded = (cell.rjust(width) for cell, width in zip(values, widths[1:], strict=True))
+        lines.append('  '.join([name.ljust(widths[0]), *padded]))
+    return '\n'.join([*lines, '', *_sentences(summary)])
 
 
 def _sentences(summary: Summary) -> Iterator[str]:
-    seconds, samples = summary['duration_s'], summary['samples']
-    yield f'run         {seconds:.3f} s, {samples} samples'
-    yield f'bound       {_bound_kept(summary["tracking"])}'
+    yield f'run         {summary["duration_s"]:.3f} s, {summary["samples"]} samples'
+    held, first = summary['tracking']['held'], summary['tracking']['first_violation']
+    if first is not None:
+        kept = f'VIOLATED, first by {first["joint"]} at {first["time_s"]:.3f} s'
+    else:
+        kept = 'unknown' if held is None else 'held by every joint'
+    yield f'bound       {kept}'
     if summary['learning'] is not None:
         yield from _learning_lines(summary['learning'])
     if summary['timing'] is not None:
-        yield f'real time   {_real_time(summary["timing"])}'
+        yield f'real time   {", ".join(_real_time(summary["timing"]))}'
     if summary['compute_time_us'] is not None:
         yield f'law         {_microseconds(summary["compute_time_us"])}'
-
-
-def _bound_kept(tracking: Summary) -> str:
-    if tracking['held'] is None:
-        return 'unknown'
-    if tracking['held']:
-        return 'held by every joint'
-    first = tracking['first_violation']
-    return f'VIOLATED, first by {first["joint"]} at {first["time_s"]:.3f} s'
 
 
 def _learning_lines(learning: Summary) -> Iterator[str]:
@@ -174,15 +164,13 @@ def _learning_lines(learning: Summary) -> Iterator[str]:
     yield f'parameters  error {", ".join(moments)}; {ending}'
 
 
-def _real_time(timing: Summary) -> str:
-    parts = []
+def _real_time(timing: Summary) -> Iterator[str]:
     if timing['rate_hz'] is not None:
-        parts.append(f'{timing["rate_hz"]:.2f} Hz')
+        yield f'{timing["rate_hz"]:.2f} Hz'
     if timing['latency_us'] is not None:
-        parts.append(f'state to torque {_microseconds(timing["latency_us"])}')
+        yield f'state to torque {_microseconds(timing["latency_us"])}'
     if timing['late_steps'] is not None:
-        parts.append(f'{timing["late_steps"]} late steps')
-    return ', '.join(parts)
+        yield f'{timing["late_steps"]} late steps'
 
 
 def _microseconds(values: Summary) -> str:
@@ -192,7 +180,3 @@ def _microseconds(values: Summary) -> str:
 
 def _percent(value: float) -> str:
     return f'{100 * value:.3g} %'
-
-
-def _number(value: float | None, unit: str, factor: float, decimals: int) -> str:
-    return '-' if value is None else f'{factor * value:.{decimals}f} {unit}'
