@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,31 +42,42 @@ def draw(run: Run, folder: Path) -> list[Path]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     found = panels([run])
+    metrics = measure(run)
     motion = [panel for panel in found if panel.group in ('Motion', 'Tracking', 'Torque')]
     excitation = [panel for panel in found if panel.group == 'Excitation']
-    monitors = [panel for panel in found if panel.group == 'Monitors']
     parameters = [panel for panel in found if panel.group == 'Parameters']
-    pictures = [('tracking.png', _title(run), motion, _SIZE)]
+    disturbances = [panel for panel in found if panel.group == 'Disturbance']
+    monitors = [panel for panel in found if panel.group == 'Monitors']
+    title = f'Motion over {run.duration:.4g} s'
+    if metrics.held is not None:
+        kept = 'held' if metrics.held else 'VIOLATED'
+        title = f'Tracking over {run.duration:.4g} s: bound {kept}'
+    paths = [folder / 'tracking.png']
+    draw_panels(paths[0], title, motion, len(run.joints), _SIZE)
     if parameters:
-        error = measure(run).final_parameter_error
-        title = 'Learning'
+        title, error = 'Learning', metrics.final_parameter_error
         if not math.isnan(error):
             title += f': relative parameter error {100 * error:.2g} % at the end'
-        pictures.append(('parameters.png', title, [*_overlaid(found), *excitation], _HIGH))
+        shown = [_overlaid('estimates', [panel for panel in parameters if not panel.log])]
+        shown += [panel for panel in parameters if panel.log]
+        shown += [_overlaid('disturbance estimates', disturbances)] if disturbances else []
+        paths.append(folder / 'parameters.png')
+        draw_panels(paths[-1], title, [*shown, *excitation], 2, _HIGH)
     if monitors:
         shown = [monitors[0], *excitation, *monitors[1:]]
-        pictures.append(('monitors.png', 'Monitors', shown, _HIGH))
-    for name, title, shown, size in pictures:
-        columns = len(run.joints) if shown is motion else min(2, len(shown))
-        draw_panels(folder / name, title, shown, columns, size)
-    return [folder / name for name, *_ in pictures]
+        paths.append(folder / 'monitors.png')
+        draw_panels(paths[-1], 'Monitors', shown, 2, _HIGH)
+    return paths
 
 
-def _title(run: Run) -> str:
-    held = measure(run).held
-    if held is None:
-        return f'Motion over {run.duration:.4g} s'
-    return f'Tracking over {run.duration:.4g} s: bound {"held" if held else "VIOLATED"}'
+def _overlaid(title: str, shown: Sequence[Panel]) -> Panel:
+    """One panel with the lines of several: all parameters, or all disturbances."""
+    lines = []
+    for panel in shown:
+        name = panel.title.removeprefix(DISTURBANCE)
+        name = formula(name) if panel.group == 'Parameters' else name
+        lines += [line if line.colour else line._replace(name=name) for line in panel.lines]
+    return replace(shown[0], group='Estimates', title=title, lines=tuple(lines))
 
 
 def draw_panels(
@@ -82,6 +93,7 @@ def draw_panels(
 
     `runs` are the names of several runs, which the legends then show.
     """
+    columns = min(columns, len(shown))
     picture = Picture(-(-len(shown) // columns), columns, title, size)
     for axes, panel in zip(picture.axes.flat, shown, strict=False):
         _draw_panel(axes, panel, runs, until)
@@ -145,22 +157,3 @@ def _draw_mark(axes: Axes, mark: Mark) -> None:
         fontsize=9.5,
         color=mark.colour,
     )
-
-
-def _overlaid(found: Sequence[Panel]) -> Iterator[Panel]:
-    """Panels of the learning: all parameters in one, all disturbances in one."""
-    parameters = [panel for panel in found if panel.group == 'Parameters' and not panel.log]
-    disturbances = [panel for panel in found if panel.group == 'Disturbance']
-    yield _overlay('estimates', parameters)
-    yield from (panel for panel in found if panel.group == 'Parameters' and panel.log)
-    if disturbances:
-        yield _overlay('disturbance estimates', disturbances)
-
-
-def _overlay(title: str, shown: Sequence[Panel]) -> Panel:
-    lines = []
-    for panel in shown:
-        name = panel.title.removeprefix(DISTURBANCE)
-        name = formula(name) if panel.group == 'Parameters' else name
-        lines += [line if line.colour else line._replace(name=name) for line in panel.lines]
-    return replace(shown[0], group='Estimates', title=title, lines=tuple(lines))

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
@@ -57,43 +57,29 @@ SIDE_BY_SIDE = (
     Case('model_based', 'all known (16)', 'model_based'),
 )
 
+_PUSHED = {'disturbance.constant': [8.0, 0.1]}
+_AT_REST = {'reference.amplitude': [0.0, 0.0], 'reference.offset': [2.2935, 1.6961]}
+
 VARIATIONS = (
     Case('paper_quiet', 'paper, no disturbance', 'paper', plant=NO_DISTURBANCE),
     Case('recommended_quiet', 'recommended, no disturbance', 'recommended', plant=NO_DISTURBANCE),
-    Case(
-        'paper_at_rest',
-        'paper, reference at rest',
-        'paper',
-        law={'reference.amplitude': [0.0, 0.0], 'reference.offset': [2.2935, 1.6961]},
-    ),
-    Case(
-        'paper_from_zero', 'paper, P^(0) = 0', 'paper', law={'learning.initial_estimate': [0.0] * 3}
-    ),
+    Case('paper_at_rest', 'paper, reference at rest', 'paper', _AT_REST),
+    Case('paper_from_zero', 'paper, P^(0) = 0', 'paper', {'learning.initial_estimate': [0.0] * 3}),
     Case(
         'leaky',
         'recommended, eta = 0.02, sinusoidal disturbance',
         'recommended',
-        law={**LEAKY, 'truth.amplitude': [0.1, 0.1]},
+        {**LEAKY, 'truth.amplitude': [0.1, 0.1]},
     ),
     Case(
         'leaky_constant',
         'recommended, eta = 0.02, constant disturbance',
         'recommended',
-        law=LEAKY,
-        plant={'disturbance.amplitude': [0.0, 0.0]},
+        LEAKY,
+        {'disturbance.amplitude': [0.0, 0.0]},
     ),
-    Case(
-        'paper_pushed',
-        'paper, 8 N m against joint 1',
-        'paper',
-        plant={'disturbance.constant': [8.0, 0.1]},
-    ),
-    Case(
-        'recommended_pushed',
-        'recommended, 8 N m against joint 1',
-        'recommended',
-        plant={'disturbance.constant': [8.0, 0.1]},
-    ),
+    Case('paper_pushed', 'paper, 8 N m against joint 1', 'paper', plant=_PUSHED),
+    Case('recommended_pushed', 'recommended, 8 N m against joint 1', 'recommended', plant=_PUSHED),
 )
 
 SWEEP_DURATION = 30.0  # s
@@ -122,17 +108,12 @@ class Sweep:
     logarithmic: bool = True
     laws: tuple[str, ...] = tuple(LAWS)
 
-    def cases(self) -> list[Case]:
+    def cases(self) -> Iterator[Case]:
         """A case for every law and value, named by both."""
-        found = []
         for law in self.laws:
             for value in self.values:
-                of_law, of_plant = self.changes(value)
                 name = case_name(self.name, law, value)
-                found.append(
-                    Case(name, name, law, of_law, of_plant, SWEEP_DURATION, keep_run=False)
-                )
-        return found
+                yield Case(name, name, law, *self.changes(value), SWEEP_DURATION, keep_run=False)
 
 
 def case_name(sweep: str, law: str, value: float) -> str:
