@@ -55,7 +55,7 @@ demo: $(READY) ## Run the closed loop over ROS 2 (CONFIG, DURATION in s) and dra
 	    --duration "$(DURATION)" --out "$$out" && \
 	echo && echo "Pictures to look at:" && ls "$$out"/*.png && echo "The recording: $$out/bag"
 
-paper: $(READY) ## Run the paper's simulation with every law and judge its claims, into out/
+paper: $(READY) ## Run the paper's simulation with every law and check its claims, into out/
 	@mkdir -p out; out=out/paper; n=1; \
 	while [ -e "$$out" ]; do n=$$((n + 1)); out=out/paper-$$n; done; \
 	$(RUN) -m blf_dsc_controller paper --out "$$out"

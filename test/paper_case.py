@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tests of the paper's variants share: presets as configurations, and their runs."""
+"""Presets as configurations, and their runs, for the tests of the paper's variants."""
 
 from __future__ import annotations
 

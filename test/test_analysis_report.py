@@ -58,7 +58,7 @@ def test_a_peak_of_one_sample_is_not_thinned_away(folder):
     assert set(bound['y']) == {2.0}
 
 
-def test_events_tell_violations_saturation_and_the_latch(folder):
+def test_events_are_violations_saturation_and_the_latch(folder):
     (bag,) = read_bags([folder / 'synthetic'])
     events = {(event.kind, round(event.time, 3)): event.text for event in bag.events}
     assert events == {
@@ -68,7 +68,7 @@ def test_events_tell_violations_saturation_and_the_latch(folder):
     }
 
 
-def test_several_bags_lie_over_each_other_and_their_differences_are_told(folder, tmp_path):
+def test_several_bags_lie_over_each_other_and_their_differences_are_listed(folder, tmp_path):
     bags = read_bags([folder / 'one', folder / 'other'])
     panel = by_title(bags)['error of joint1']
     names = [trace['name'] for trace in panel['traces']]
@@ -83,7 +83,7 @@ def test_several_bags_lie_over_each_other_and_their_differences_are_told(folder,
     assert row in text
 
 
-def test_bags_of_one_name_are_told_apart(folder):
+def test_bags_of_one_name_are_numbered(folder):
     with_bag = [folder / 'one', folder / '..' / folder.name / 'other', folder / 'one']
     assert [one.name for one in read_bags(with_bag)] == ['one (1)', 'other', 'one (2)']
 

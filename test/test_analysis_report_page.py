@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a bag in a browser: it draws, it zooms, it complains of nothing. `make test-browser`.
+"""The page of a bag in a browser: it draws and zooms without errors. `make test-browser`.
 
 What is plotted is checked without a browser in test_analysis_report.py.
 """
@@ -59,7 +59,7 @@ def ranges(browser):
 
 
 @pytest.mark.parametrize('name', ['one', 'both'])
-def test_every_panel_is_drawn_and_nothing_complains(browser, pages, name):
+def test_every_panel_is_drawn_without_errors(browser, pages, name):
     show(browser, pages / f'{name}.html')
     drawn = browser.value(f"Array.from({PLOTS}).filter(p => p.querySelector('.trace')).length")
     assert drawn == browser.value('data.panels.length')

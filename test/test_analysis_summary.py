@@ -134,7 +134,7 @@ def test_compute_time_that_was_not_measured_is_null(run):
     assert summarize(unmeasured)['compute_time_us'] is None
 
 
-def test_the_table_tells_it_in_words(run):
+def test_the_table_shows_the_summary(run):
     table = format_table(summarize(run))
     for words in (
         'shoulder  0.800 mrad  0.566 mrad  2.000 mrad     8.00 N m    5.66 N m  20.00 N m',
@@ -149,7 +149,7 @@ def test_the_table_tells_it_in_words(run):
     assert max(map(len, table.splitlines())) <= 120
 
 
-def test_the_table_tells_a_violation_and_copes_with_little(run):
+def test_the_table_shows_a_violation_and_leaves_out_the_unknown(run):
     error = run.error + 1.0
     assert 'VIOLATED, first by shoulder at 0.000 s' in format_table(
         summarize(dataclasses.replace(run, error=error))

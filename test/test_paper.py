@@ -137,7 +137,7 @@ def test_tables_hold_every_run(report):
     assert {row['bound'] for row in sweeps} == {'kept', 'left'}
 
 
-def test_bounds_that_were_kept_are_told_by_condition_and_law():
+def test_kept_bounds_are_listed_by_condition_and_law():
     bounds = (np.full((1001, 2), k) for k in (0.004, 0.001))
     held, left = (measure(made(bound=bound)) for bound in bounds)
     metrics = {
@@ -191,7 +191,7 @@ def test_study_does_not_overwrite(report, capsys):
     assert (report / 'index.html').stat().st_mtime_ns == before
 
 
-def test_exponential_fit_tells_a_line_from_a_bend():
+def test_exponential_fit_distinguishes_a_line_from_a_bend():
     time = np.arange(1001) * 0.02
     line, bend = np.exp(-time), 1.0 / (1.0 + time) ** 3
     fits = [

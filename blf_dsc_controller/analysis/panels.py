@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -145,18 +145,17 @@ def _motion(run: Run) -> Iterator[Panel]:
 
 
 def _error(run: Run, i: int, error: Floats) -> Panel:
-    lines, violated = [Line('error', run.time, error)], outside(run)
-    marks: tuple[Mark, ...] = ()
+    lines, marks, note = [Line('error', run.time, error)], [], ''
+    violated = outside(run)
     if run.bound is not None and violated is not None:
         bound = 1e3 * run.bound[:, i]
         lines.append(Line('bound', run.time, bound, MUTED, True, True, True))  # noqa: FBT003
         first = run.time[violated[:, i]][:1].tolist()
-        marks = tuple(Mark(time, f'outside from {time:.3f} s', ALARM) for time in first)
-    note = ''
+        marks = [Mark(time, f'outside from {time:.3f} s', ALARM) for time in first]
     if not np.isnan(error).all():
         note = f'max {np.nanmax(np.abs(error)):.3g}, rms {rms(error):.3g}'
     title = f'error of {run.joints[i]}'
-    return Panel('Tracking', title, 'mrad', tuple(lines), note, marks=marks)
+    return Panel('Tracking', title, 'mrad', tuple(lines), note, marks=tuple(marks))
 
 
 def _learning(run: Run) -> Iterator[Panel]:
@@ -170,18 +169,15 @@ def _learning(run: Run) -> Iterator[Panel]:
         yield Panel('Parameters', name, 'kg m²', tuple(lines))
     if estimates.relative_error is not None:
         error = np.maximum(100.0 * estimates.relative_error, _LEAST_ERROR)
-        lines = [
-            Line('relative error', estimates.time, error),
-            Line('1 %', estimates.time, np.ones_like(error), MUTED, dashed=True),
-        ]
+        one = Line('1 %', estimates.time, np.ones_like(error), MUTED, dashed=True)
+        lines = [Line('relative error', estimates.time, error), one]
         symbol, title = r'$\|\hat P - P\| \;/\; \|P\|$', 'relative parameter error'
         yield Panel('Parameters', title, '%', tuple(lines), symbol=symbol, log=True)
     for name in run.learning.names:
         if name.startswith(DISTURBANCE):
-            true = _column(run, run.truth, name, 'true')
-            lines = [line._replace(colour=INK, dashed=True) for line in true]
-            lines = [*_column(run, run.learning, name, 'estimate'), *lines]
-            yield Panel('Disturbance', name, 'N m', tuple(lines))
+            estimate = _column(run, run.learning, name, 'estimate')
+            true = _column(run, run.truth, name, 'true', colour=INK, dashed=True)
+            yield Panel('Disturbance', name, 'N m', (*estimate, *true))
 
 
 def _monitors(run: Run) -> Iterator[Panel]:
@@ -193,9 +189,8 @@ def _monitors(run: Run) -> Iterator[Panel]:
         for line in _column(run, series, LAMBDA_MIN, 'minimum eigenvalue')
     ]
     symbol = r'$\lambda_{\min}(\Phi)$'
-    yield Panel(
-        'Excitation', 'minimum eigenvalue', '', (*excitation[:1],), note, symbol=symbol, log=True
-    )
+    lines = excitation[:1]
+    yield Panel('Excitation', 'minimum eigenvalue', '', tuple(lines), note, symbol, log=True)
     if run.monitor is None:
         return
     if run.error is not None and run.bound is not None:
@@ -220,11 +215,11 @@ def _lyapunov(run: Run, monitor: Series) -> Iterator[Panel]:
     V = monitor.select(LYAPUNOV_TERMS).sum(axis=1)
     lines = [Line('V', run.time_of(monitor.stamp), np.maximum(V, _LEAST), INK)]
     note = ''
-    for line in _column(run, monitor, LYAPUNOV_BOUND, 'bound (32)'):
+    for line in _column(run, monitor, LYAPUNOV_BOUND, 'bound (32)', colour=MUTED, dashed=True):
         known = np.isfinite(line.values)
         note = r'no bound, as $\kappa_e = 0$'
         if known.any():
-            lines.append(line._replace(colour=MUTED, dashed=True))
+            lines.append(line)
             met = float(np.mean(V[known] <= line.values[known]))
             note = f'met {100 * met:.3g} % of the time'
     yield Panel('Monitors', 'V and its bound (32)', 'J', tuple(lines), note, log=True)
@@ -245,6 +240,7 @@ def _timing(run: Run) -> Iterator[Panel]:
         yield Panel('Timing', title, 'µs', tuple(times), log=True, histogram=True)
 
 
-def _column(run: Run, series: Series | None, column: str, name: str) -> Iterator[Line]:
-    if series is not None and column in series.names:
-        yield Line(name, run.time_of(series.stamp), series.column(column))
+def _column(run: Run, series: Series | None, column: str, name: str, **style: Any) -> list[Line]:
+    if series is None or column not in series.names:
+        return []
+    return [Line(name, run.time_of(series.stamp), series.column(column), **style)]

@@ -58,16 +58,18 @@ class Picture:
     ) -> None:
         self._share_time = share_time
         with rc_context(_SETTINGS):
-            width, height = panel
             self._figure = Figure(
-                figsize=(width * columns, height * rows + 0.5),
+                figsize=(panel[0] * columns, panel[1] * rows + 0.5),
                 layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08, hspace=0.04),
             )
             FigureCanvasAgg(self._figure)
             self._figure.suptitle(title, x=0.01, ha='left', fontsize=14, fontweight='bold')
             self.axes = self._figure.subplots(rows, columns, sharex=share_time, squeeze=False)
             for axes in self.axes.flat:
-                _dress(axes)
+                axes.spines[['top', 'right']].set_visible(False)
+                axes.grid(visible=True, color='#E5E7EB', linewidth=0.8)
+                axes.set_axisbelow(True)
+                axes.margins(x=0.01)
 
     def save(self, path: Path) -> None:
         """Write the picture as PNG."""
@@ -111,10 +113,3 @@ def formula(name: str) -> str:
         return name
     indexed = re.sub(r'([A-Za-z])(\d+)', r'\1_{\2}', name)
     return f'${indexed.replace("*", chr(92) + ",")}$'
-
-
-def _dress(axes: Axes) -> None:
-    axes.spines[['top', 'right']].set_visible(False)
-    axes.grid(visible=True, color='#E5E7EB', linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.margins(x=0.01)
