@@ -22,21 +22,7 @@ from blf_dsc_controller.bags.content import (
     read_content,
 )
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
-from blf_dsc_controller.messages.topics import (
-    BOUND,
-    COMMANDS,
-    COMPUTE_TIME,
-    DIAGNOSTICS,
-    JOINT_STATES,
-    LEARNING,
-    MONITOR,
-    REFERENCE,
-    REJECTED,
-    TIMING,
-    TRACKING_ERROR,
-    TRUTH,
-    Topic,
-)
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Floats, Run, Series, Stamps
 
@@ -54,11 +40,11 @@ def read_run(path: str | Path, namespace: str = '') -> Run:
     """
     content = read_content(Path(path), namespace)
     joints = _joints(content)
-    states = _decode(content.topics[JOINT_STATES], joints)
-    errors = _optional(content, TRACKING_ERROR, joints)
-    references = _optional(content, REFERENCE, joints)
-    bounds = _optional(content, BOUND, joints)
-    learning = _vector(content, LEARNING)
+    states = _decode(content.topics[topics.JOINT_STATES], joints)
+    errors = _optional(content, topics.TRACKING_ERROR, joints)
+    references = _optional(content, topics.REFERENCE, joints)
+    bounds = _optional(content, topics.BOUND, joints)
+    learning = _vector(content, topics.LEARNING)
     reference = None if references is None else references.position.exact(states.stamp)
     error = None if errors is None else errors.position.exact(states.stamp)
     if error is None and reference is not None:
@@ -75,9 +61,9 @@ def read_run(path: str | Path, namespace: str = '') -> Run:
         bound=None if bounds is None else bounds.position.held(states.stamp),
         torque_limit=None if bounds is None else bounds.effort.held(states.stamp),
         learning=learning,
-        truth=_vector(content, TRUTH),
-        timing=_vector(content, TIMING),
-        monitor=_vector(content, MONITOR),
+        truth=_vector(content, topics.TRUTH),
+        timing=_vector(content, topics.TIMING),
+        monitor=_vector(content, topics.MONITOR),
         message_counts=content.message_counts,
         rejected=_rejected_columns(content, learning, namespace),
     )
@@ -102,8 +88,8 @@ class _Decoded(NamedTuple):
 
 def _joints(content: Content) -> tuple[str, ...]:
     """Joints of the controller, in its order; all of the joint states if it is not in the bag."""
-    topics = (TRACKING_ERROR, REFERENCE, BOUND, JOINT_STATES)
-    return joint_names(next(content.topics[one] for one in topics if one in content.topics))
+    sources = (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND, topics.JOINT_STATES)
+    return joint_names(next(content.topics[one] for one in sources if one in content.topics))
 
 
 def _decode(messages: TopicMessages, names: Sequence[str]) -> _Decoded:
@@ -113,17 +99,17 @@ def _decode(messages: TopicMessages, names: Sequence[str]) -> _Decoded:
     return _Decoded(tuple(names), stamp, received, values[order])
 
 
-def _optional(content: Content, topic: Topic, joints: Sequence[str]) -> _Decoded | None:
+def _optional(content: Content, topic: topics.Topic, joints: Sequence[str]) -> _Decoded | None:
     return _decode(content.topics[topic], joints) if topic in content.topics else None
 
 
-def _vector(content: Content, topic: Topic) -> Series | None:
+def _vector(content: Content, topic: topics.Topic) -> Series | None:
     messages = content.topics.get(topic)
     return None if messages is None else _decode(messages, joint_names(messages)).position
 
 
 def _torque(content: Content, states: _Decoded, errors: _Decoded | None) -> Floats:
-    commands = content.topics.get(COMMANDS)
+    commands = content.topics.get(topics.COMMANDS)
     if commands is not None and len(commands.raw) == states.stamp.size:
         torque = decode_arrays(commands, len(states.names))
         if torque is not None:
@@ -138,17 +124,19 @@ def _rejected_columns(content: Content, learning: Series | None, namespace: str)
     if learning is None:
         return {}
     last = dict(zip(learning.names, learning.values[-1], strict=True))
-    columns = [name for name, value in last.items() if name != COMPUTE_TIME and np.isnan(value)]
+    columns = [
+        name for name, value in last.items() if name != topics.COMPUTE_TIME and np.isnan(value)
+    ]
     reasons: dict[str, str] = {}
-    diagnostics = content.topics.get(DIAGNOSTICS)
+    diagnostics = content.topics.get(topics.DIAGNOSTICS)
     for raw in reversed(diagnostics.raw if columns and diagnostics is not None else []):
-        message: Any = typestore().deserialize_cdr(raw, DIAGNOSTICS.type)
+        message: Any = typestore().deserialize_cdr(raw, topics.DIAGNOSTICS.type)
         reasons = {
-            pair.key.removeprefix(REJECTED): pair.value
+            pair.key.removeprefix(topics.REJECTED): pair.value
             for status in message.status
             if status.name.startswith(namespace.strip('/'))
             for pair in status.values
-            if pair.key.startswith(REJECTED)
+            if pair.key.startswith(topics.REJECTED)
         }
         if reasons:
             break

@@ -23,22 +23,6 @@ from blf_dsc_controller.messages.codecs import (
     JointStateEncoder,
     encode_clock,
 )
-from blf_dsc_controller.messages.topics import (
-    COMPUTE_TIME,
-    DISTANCE,
-    DISTURBANCE,
-    LAMBDA_MIN,
-    LATCHED,
-    LATE_STEPS,
-    LATENCY,
-    LATENESS,
-    LYAPUNOV_BOUND,
-    LYAPUNOV_TERMS,
-    POSITION,
-    RATIO,
-    REJECTED,
-    VELOCITY,
-)
 from blf_dsc_controller.messages.types import typestore
 
 Message: TypeAlias = tuple[topics.Topic, bytes]
@@ -49,14 +33,20 @@ DECIMATION = 10
 
 def disturbance_names(joints: Sequence[str]) -> tuple[str, ...]:
     """Names of the disturbance torques, estimated or true."""
-    return tuple(DISTURBANCE + joint for joint in joints)
+    return tuple(topics.DISTURBANCE + joint for joint in joints)
 
 
 class ControllerTelemetry:
     """Messages of the controller of n joints and `estimates`, the m entries of theta^."""
 
     def __init__(self, joints: Sequence[str], estimates: Sequence[str]) -> None:
-        learning = (*estimates, *disturbance_names(joints), LAMBDA_MIN, LATCHED, COMPUTE_TIME)
+        learning = (
+            *estimates,
+            *disturbance_names(joints),
+            topics.LAMBDA_MIN,
+            topics.LATCHED,
+            topics.COMPUTE_TIME,
+        )
         self._command = Float64MultiArrayEncoder(len(joints))
         self._reference = JointStateEncoder(joints, ('position', 'velocity'))
         self._error = JointStateEncoder(joints)
@@ -95,13 +85,17 @@ class PlantTelemetry:
     """Messages of the plant of n joints and p true parameters."""
 
     def __init__(self, joints: Sequence[str], parameters: Sequence[str]) -> None:
-        true_state = [what + joint for what in (POSITION, VELOCITY) for joint in joints]
+        true_state = [
+            what + joint for what in (topics.POSITION, topics.VELOCITY) for joint in joints
+        ]
         self._joints = len(joints)
         self._joint_states = JointStateEncoder(joints)
         self._truth = JointStateEncoder(
             (*parameters, *disturbance_names(joints), *true_state), ('position',)
         )
-        self._timing = JointStateEncoder((LATENCY, LATENESS, LATE_STEPS), ('position',))
+        self._timing = JointStateEncoder(
+            (topics.LATENCY, topics.LATENESS, topics.LATE_STEPS), ('position',)
+        )
 
     def joint_states(self, stamp: int, measurement: np.ndarray) -> Message:
         """Measured [q, dq, applied torque of the last interval] (3 n,)."""
@@ -128,11 +122,11 @@ class Monitor:
     """
 
     def __init__(self, joints: Sequence[str], estimates: Sequence[str], settings: Settings) -> None:
-        names = [what + joint for what in (RATIO, DISTANCE) for joint in joints]
-        names += [*estimates, LAMBDA_MIN, LATCHED]
+        names = [what + joint for what in (topics.RATIO, topics.DISTANCE) for joint in joints]
+        names += [*estimates, topics.LAMBDA_MIN, topics.LATCHED]
         self._ceiling = None
         if settings.truth_known == 1:
-            names += [*LYAPUNOV_TERMS, LYAPUNOV_BOUND]
+            names += [*topics.LYAPUNOV_TERMS, topics.LYAPUNOV_BOUND]
             self._ceiling = ExponentialBound(settings)
         self._encoder = JointStateEncoder(names, ('position',))
         self._start: int | None = None
@@ -158,7 +152,7 @@ def encode_rejected_columns(stamp: int, columns: Sequence[RejectedColumn]) -> by
         name=f'{topics.CONTROLLER}/learning',
         message=f'not estimated: {", ".join(one.column for one in columns)}',
         hardware_id='',
-        values=[key_value(f'{REJECTED}{one.column}', f'{one}') for one in columns],
+        values=[key_value(f'{topics.REJECTED}{one.column}', f'{one}') for one in columns],
     )
     time = types['builtin_interfaces/msg/Time'](*divmod(stamp, NANOSECONDS))
     header = types['std_msgs/msg/Header'](stamp=time, frame_id='')
