@@ -16,7 +16,7 @@ import numpy as np
 from fault_rig import JOINTS, MILLISECOND, Rig
 
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
-from blf_dsc_controller.supervision.reasons import Phase, Reason
+from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
 LEAD = 40  # samples that run well before the fault
 WATCHED = 120  # samples after it

@@ -16,7 +16,7 @@ from plain_law import dynamics
 from ros_rig import RosRig
 
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from blf_dsc_controller.supervision.reasons import Phase
+from blf_dsc_controller.supervision.supervisor import Phase
 
 EXAMPLE = Path(__file__).parents[1] / 'examples/mujoco_plant/mujoco_plant.py'
 P = np.array([1.0, 0.32, 0.4])  # (m1+m2) l1^2, m2 l2^2, m2 l1 l2 of arm.xml

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.supervision.checks import OUTSIDE, SUSPECT, check_sample, is_valid_state
-from blf_dsc_controller.supervision.reasons import Phase
-from blf_dsc_controller.supervision.supervisor import Supervisor, Verdict
+from blf_dsc_controller.supervision.supervisor import Phase, Supervisor, Verdict
 
 DT = 1e-3
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fault_table import FAULTS, page, run
 
-from blf_dsc_controller.supervision.reasons import Reason
+from blf_dsc_controller.supervision.supervisor import Reason
 
 LIMIT = 20.0  # N m, the default torque limit
 

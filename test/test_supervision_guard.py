@@ -10,8 +10,8 @@ from plain_law import dynamics
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.supervision.reasons import Phase, Reason
 from blf_dsc_controller.supervision.safe_torque import Ramp, safe_torque
+from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from blf_dsc_controller.supervision.watchdogs import Overruns, Silence
 
 Q, DQ = np.array([0.3, -0.4]), np.array([0.5, -2.0])

@@ -23,7 +23,7 @@ from blf_dsc_controller.nodes.lifecycle import POLL_PERIOD, LoopNode
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.reasons import Phase
+from blf_dsc_controller.supervision.supervisor import Phase
 
 OUTPUTS = (
     topics.COMMANDS,

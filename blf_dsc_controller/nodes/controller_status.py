@@ -16,7 +16,7 @@ from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, Diagnos
 from blf_dsc_controller.nodes.endpoints import create_publisher
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.reasons import Phase, Reason
+from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
 _LEVELS = {
     Phase.INACTIVE: STALE,

@@ -28,7 +28,7 @@ from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError,
 from blf_dsc_controller.replay.states import Arrivals, States
 from blf_dsc_controller.run import Floats, Stamps
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.reasons import Phase, Reason
+from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
 _UNREADABLE = frozenset(
     (Reason.BAD_MESSAGE, Reason.JOINT_MISSING, Reason.JOINT_DUPLICATED, Reason.FIELD_MISSING)
@@ -232,11 +232,12 @@ class Rerun:
         self._last = stamp
         self._numbers.append(k)
         self._rows[row] = controller.sample_vector
-        samples, sample = controller.samples, controller.sample
+        samples = controller.samples
         if samples == 1 or self._monitor is None:
             names = estimate_names(self._config)
             self._monitor = Monitor(self._config.joints, names, controller.settings)
         if (samples - 1) % DECIMATION == 0:
+            sample = controller.sample
             message = self._monitor.message(stamp, sample, guard.ratio, sample.bound)
             self.monitored[row] = message[1]
 

@@ -30,9 +30,8 @@ from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.reference.limits import MotionError, limits_of
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, plan_trajectory
 from blf_dsc_controller.supervision import checks, retuning
-from blf_dsc_controller.supervision.reasons import Phase, Reason
 from blf_dsc_controller.supervision.safe_torque import Ramp, safe_torque
-from blf_dsc_controller.supervision.supervisor import Supervisor, Verdict
+from blf_dsc_controller.supervision.supervisor import Phase, Reason, Supervisor, Verdict
 from blf_dsc_controller.supervision.velocity import Velocity
 from blf_dsc_controller.supervision.watchdogs import PERIOD, Silence
 

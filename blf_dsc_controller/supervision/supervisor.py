@@ -7,7 +7,7 @@ The supervisor reads no clock: the same calls lead to the same stops.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from enum import Enum
+from enum import Enum, StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +16,44 @@ from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import LINEAR
 from blf_dsc_controller.supervision.checks import is_valid_state
-from blf_dsc_controller.supervision.reasons import Phase, Reason
 from blf_dsc_controller.supervision.watchdogs import Overruns
 
 Vector = NDArray[np.float64]
 _NANO = 1e-9
+
+
+class Phase(StrEnum):
+    """What the controller is doing."""
+
+    INACTIVE = 'inactive'  # not in command: the safe torque, or on the ramp to it
+    STARTING = 'starting'  # waiting for the first joint state
+    APPROACHING = 'approaching'  # on the way to the reference
+    TRACKING = 'tracking'
+    SAFE_STOP = 'safe stop'  # the safe torque until the next reset or activation
+
+
+class Reason(StrEnum):
+    """Why the controller stopped."""
+
+    NONE = 'none'
+    STATE_TIMEOUT = 'state timeout'
+    STAMP_MISSING = 'stamp missing'
+    STAMP_REPEATED = 'stamp repeated'
+    STAMP_BACKWARD = 'stamp backward'
+    STAMP_JUMP = 'stamp jump'
+    BAD_MESSAGE = 'bad message'
+    JOINT_MISSING = 'joint missing'
+    JOINT_DUPLICATED = 'joint duplicated'
+    FIELD_MISSING = 'field missing'
+    NOT_FINITE = 'measurement not finite'
+    VELOCITY = 'velocity not plausible'
+    START_REJECTED = 'start rejected'
+    OUTSIDE_BOUND = 'error past the bound'
+    SATURATED = 'torque saturated'
+    OVERRUN = 'loop overrun'
+    ESTIMATE = 'estimate not finite'
+    TORQUE = 'torque not finite'
+    FAILED = 'failed'
 
 
 class Verdict(Enum):
