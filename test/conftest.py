@@ -11,6 +11,7 @@ import shutil
 import tempfile
 
 import hypothesis
+import pytest
 from own_domain import own_domain
 
 # How long an example takes says something of the machine, not of the package.
@@ -38,6 +39,16 @@ _FIRST = (
     'test_soak',
     'test_paper',
 )
+
+
+@pytest.fixture
+def ros():
+    """Nodes of the package in this process."""
+    from ros_rig import RosRig
+
+    rig = RosRig()
+    yield rig
+    rig.close()
 
 
 def pytest_collection_modifyitems(items):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes of the package in one process, with what a test listens to and asks."""
+"""Nodes of the package in one process, with topics and services as a test uses them."""
 
 from __future__ import annotations
 
@@ -16,12 +16,19 @@ from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.codecs import JointStateDecoder, JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
+from blf_dsc_controller.simulation.loop import simulate
 from sim_plant.node import PlantNode
 
 PATIENCE = 300.0  # s until a test that waits in vain is given up
+JOINTS = ('joint1', 'joint2')
+START = (2.293, 1.696)  # rad, inside the bound at the reference's start
 
 
 class RosRig:
@@ -60,9 +67,10 @@ class RosRig:
         self.spin(0.05)  # what was on its way to the node runs out before its handles are gone
         node.destroy_node()
 
-    def add(self, make, namespace='', clock=time.monotonic_ns, **given):
-        """Start a node; `__` in a parameter's name stands for the dot."""
-        overrides = [Parameter(k.replace('__', '.'), value=v) for k, v in given.items()]
+    def add(self, make, values=None, *, namespace='', clock=time.monotonic_ns, **given):
+        """Start a node with parameters: `values` by dotted name, or with `__` for the dot."""
+        given = {k.replace('__', '.'): v for k, v in given.items()} | (values or {})
+        overrides = [Parameter(k, value=v) for k, v in given.items()]
         node = make(
             context=self.context,
             namespace=namespace,
@@ -72,10 +80,10 @@ class RosRig:
         )
         return self._keep(node)
 
-    def loop(self, plant=None, controller=None, namespace='', clock=time.monotonic_ns):
+    def loop(self, plant=None, controller=None, **options):
         """Start plant and controller in lock-step; return both."""
-        arm = self.add(PlantNode, namespace, clock, mode='lockstep', **(plant or {}))
-        law = self.add(ControllerNode, namespace, clock, **(controller or {}))
+        arm = self.add(PlantNode, mode='lockstep', **options, **(plant or {}))
+        law = self.add(ControllerNode, **options, **(controller or {}))
         return arm, law
 
     def until(self, condition):
@@ -105,7 +113,13 @@ class RosRig:
         )
         return heard
 
-    def ask(self, service, name, request):
+    def publisher(self, topic):
+        """Publisher of the test's own on a topic of another node."""
+        return self.tester.create_publisher(
+            message_class(topic.type), topic.relative, qos_profile(topic.offered)
+        )
+
+    def call(self, service, name, request):
         """Call a service and return its response."""
         key = (service, name)
         if key not in self._clients:
@@ -118,18 +132,57 @@ class RosRig:
 
     def reset(self, node):
         """Call `~/reset` of a node."""
-        return self.ask(Trigger, f'{node.get_fully_qualified_name()}/reset', Trigger.Request())
+        return self.call(Trigger, f'{node.get_fully_qualified_name()}/reset', Trigger.Request())
 
     def change(self, node, transition):
-        """Ask for a lifecycle transition by its id; return whether it was made."""
+        """Request a lifecycle transition by its id; return whether it was made."""
         request = ChangeState.Request(transition=Transition(id=transition))
         name = f'{node.get_fully_qualified_name()}/change_state'
-        return self.ask(ChangeState, name, request).success
+        return self.call(ChangeState, name, request).success
+
+
+class Arm:
+    """Joint states sent by hand to a controller, and the torques that come back."""
+
+    def __init__(self, ros, names=JOINTS):
+        self._ros = ros
+        self._publisher = ros.publisher(topics.JOINT_STATES)
+        self._commands = ros.listen(topics.COMMANDS)
+        self._encoder = JointStateEncoder(names)
+
+    def torque_for(self, k, position, velocity=None, *, encoder=None):
+        """Send the state of sample k and return the torque that comes back, (2,) N m."""
+        size = len(position)
+        velocity = np.zeros(size) if velocity is None else velocity
+        raw = (encoder or self._encoder).encode(
+            1_000_000_000 + k * 1_000_000, position, velocity, np.zeros(size)
+        )
+        self._ros.until(lambda: self._publisher.get_subscription_count() > 0)
+        before = len(self._commands)
+        self._publisher.publish(raw)
+        self._ros.until(lambda: len(self._commands) > before)
+        return torques(self._commands)[-1]
 
 
 def torques(heard):
     """Values of commands as an array."""
     return np.array([message.data for message in heard])
+
+
+def states(messages, names=JOINTS):
+    """Decode serialised joint states: stamps (k,) ns and values (k, 3, names)."""
+    decoder = JointStateDecoder(names, required=('position',))
+    stamps, rows = [], []
+    for raw in messages:
+        stamps.append(decoder.decode(raw))
+        rows.append(np.reshape(decoder.values, (3, len(names))).copy())
+    return np.array(stamps), np.array(rows)
+
+
+def simulated_torques(plant, controller=None):
+    """Torques of the compiled loop on the same parameters, (k, 2) N m."""
+    record = simulate(build(ControllerConfig, controller or {}), build(PlantConfig, plant))
+    return np.array([record.sample(row).torque for row in range(record.stamps.size)])
 
 
 def values(status):

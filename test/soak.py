@@ -137,7 +137,7 @@ def new_gains(soak):
         request = SetParametersAtomically.Request(
             parameters=[Parameter('feedback.gain', value=gain).to_parameter_msg()]
         )
-        soak.ros.ask(SetParametersAtomically, name, request)
+        soak.ros.call(SetParametersAtomically, name, request)
 
 
 def kill_controller(soak):

@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from command import PATIENCE, PATIENT, closed_loop
-from node_loop import simulated_torques
+from ros_rig import simulated_torques
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.params_file import load_loop

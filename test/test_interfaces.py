@@ -16,7 +16,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 import sros2_graph
 import yaml
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_rig import RosRig, deactivate
+from ros_rig import deactivate
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
@@ -32,13 +32,6 @@ from blf_dsc_controller.simulation.loop import simulate
 from sim_plant.node import PlantNode
 
 CONFIG = Path(__file__).parents[1] / 'config'
-
-
-@pytest.fixture
-def ros():
-    rig = RosRig()
-    yield rig
-    rig.close()
 
 
 def alone(**given):

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from fake_clock import FakeClock
-from ros_rig import RosRig, activate, cleanup, configure, deactivate, shutdown, torques, values
+from ros_rig import activate, cleanup, configure, deactivate, shutdown, torques, values
 
 import sim_plant.node
 from blf_dsc_controller.messages import topics
@@ -17,13 +17,6 @@ from blf_dsc_controller.nodes.controller_node import ControllerNode
 from sim_plant.node import PlantNode
 
 SECOND = 1_000_000_000  # ns
-
-
-@pytest.fixture
-def ros():
-    rig = RosRig()
-    yield rig
-    rig.close()
 
 
 def in_command(node):
@@ -58,7 +51,7 @@ def test_nodes_that_wait_for_a_manager_do_nothing_until_it_comes(ros):
     assert_runs(ros, arm, law)
 
 
-def test_a_transition_that_is_not_possible_is_refused_and_nothing_ends(ros):
+def test_a_transition_that_is_not_possible_is_rejected_and_nothing_ends(ros):
     arm, law = ros.loop()
     assert not activate(ros, law)
     assert not configure(ros, arm)
@@ -66,7 +59,7 @@ def test_a_transition_that_is_not_possible_is_refused_and_nothing_ends(ros):
     assert_runs(ros, arm, law)
 
 
-def test_deactivated_the_torque_ramps_to_the_safe_one_while_states_are_answered(ros):
+def test_deactivated_the_torque_ramps_to_the_safe_one_while_states_come(ros):
     heard = ros.listen(topics.COMMANDS)
     arm, law = ros.loop(controller={'safety__deactivation_ramp': 0.1})
     ros.run(arm, 50)
@@ -152,12 +145,12 @@ def test_a_reset_of_both_is_the_same_run_again(ros):
     np.testing.assert_array_equal(torques(heard)[:100], first)
 
 
-def test_a_reset_is_refused_where_there_is_nothing_to_reset(ros):
+def test_a_reset_is_rejected_where_there_is_nothing_to_reset(ros):
     arm, law = ros.loop({'autostart': False}, {'autostart': False})
     for node in (arm, law):
-        answer = ros.reset(node)
-        assert not answer.success
-        assert 'unconfigured: activate it first' in answer.message
+        response = ros.reset(node)
+        assert not response.success
+        assert 'unconfigured: activate it first' in response.message
 
 
 def test_a_plant_killed_and_started_again_stops_the_controller_until_reset(ros):
@@ -187,7 +180,7 @@ def test_a_controller_killed_and_started_again_takes_the_arm_where_it_is(ros, mo
 
 @pytest.mark.parametrize('brake', ['zero', 'brake'])
 def test_in_real_time_a_torque_that_is_too_old_is_not_applied(ros, brake):
-    told, states = ros.listen(topics.DIAGNOSTICS), ros.listen(topics.JOINT_STATES)
+    diagnostics, states = ros.listen(topics.DIAGNOSTICS), ros.listen(topics.JOINT_STATES)
     clock = FakeClock()
     arm = ros.add(PlantNode, clock=clock, actuator__without_command=brake)
     law = ros.add(ControllerNode, clock=clock)
@@ -202,20 +195,19 @@ def test_in_real_time_a_torque_that_is_too_old_is_not_applied(ros, brake):
     measured = arm.plant.measure()
     assert not measured[4:].any()
     assert measured[2:4].any() == (brake == 'zero')
-    ros.until(lambda: any(said(told, 'sim_plant/torque').values()))
-    assert 'too old' in said(told, 'sim_plant/torque')['message']
+    ros.until(lambda: last_error(diagnostics, 'sim_plant/torque'))
+    assert 'too old' in last_error(diagnostics, 'sim_plant/torque')
     # A controller that comes back and starts with the arm gets it going again.
     again = ros.add(ControllerNode, clock=clock)
     ros.reset(arm)
     ros.until(lambda: clock.advance(0.01) or in_command(again))
 
 
-def said(told, name):
-    """Error that diagnostics told last under a name: its message, and empty if there was none."""
-    found = [
-        s.message for array in told for s in array.status if s.name == name and s.level == b'\2'
-    ]
-    return {'message': found[-1]} if found else {}
+def last_error(diagnostics, name):
+    """Return the message of the last error of a status; empty if there was none."""
+    statuses = [status for array in diagnostics for status in array.status if status.name == name]
+    errors = [status.message for status in statuses if status.level == b'\2']
+    return errors[-1] if errors else ''
 
 
 def test_the_state_is_latched_and_names_the_reason(ros):

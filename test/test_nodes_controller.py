@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller node before states sent by hand: joints by name, refusals, live gains."""
+"""The controller node before states sent by hand: joints by name, rejections, live gains."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from fake_clock import FakeClock
-from node_loop import JOINTS, START, Arm, NodeLoop, torques
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
+from ros_rig import JOINTS, START, Arm, torques
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import ConfigurationError, OutsideBarrierError
@@ -24,14 +24,7 @@ NOTHING = (0.0, 0.0)
 VELOCITY = (0.01, -0.02)  # rad/s
 
 
-@pytest.fixture
-def loop():
-    one = NodeLoop()
-    yield one
-    one.close()
-
-
-def law_answers(*measurements):
+def law_torques(*measurements):
     """Torques of the law without a node, for states (q, dq) one sample apart."""
     controller = assembly.controller_of(ControllerConfig())
     return [
@@ -49,70 +42,70 @@ def law_answers(*measurements):
     ],
     ids=['as configured', 'turned round', 'among others'],
 )
-def test_joints_are_found_by_name_not_by_place(loop, names, order):
-    loop.add(ControllerNode)
-    arm = Arm(loop, names)
+def test_joints_are_found_by_name_not_by_place(ros, names, order):
+    ros.add(ControllerNode)
+    arm = Arm(ros, names)
 
     def placed(values):
         return [9.0 if i is None else values[i] for i in order]
 
-    torque = arm.ask(0, placed(START), placed(VELOCITY))
-    np.testing.assert_array_equal(torque, law_answers((START, VELOCITY))[0])
+    torque = arm.torque_for(0, placed(START), placed(VELOCITY))
+    np.testing.assert_array_equal(torque, law_torques((START, VELOCITY))[0])
 
 
-def test_a_state_that_is_not_finite_stops_the_arm_for_good(loop):
-    node = loop.add(ControllerNode)
-    arm = Arm(loop)
-    assert arm.ask(0, START).any()
-    np.testing.assert_array_equal(arm.ask(1, (START[0], np.nan)), NOTHING)
+def test_a_state_that_is_not_finite_stops_the_arm_for_good(ros):
+    node = ros.add(ControllerNode)
+    arm = Arm(ros)
+    assert arm.torque_for(0, START).any()
+    np.testing.assert_array_equal(arm.torque_for(1, (START[0], np.nan)), NOTHING)
     assert 'not finite' in node.stopped
-    np.testing.assert_array_equal(arm.ask(2, START), NOTHING)
+    np.testing.assert_array_equal(arm.torque_for(2, START), NOTHING)
 
 
-def test_a_state_without_one_of_the_joints_stops_the_arm_and_names_it(loop):
-    node = loop.add(ControllerNode)
-    arm = Arm(loop)
-    assert arm.ask(0, START).any()
+def test_a_state_without_one_of_the_joints_stops_the_arm_and_names_it(ros):
+    node = ros.add(ControllerNode)
+    arm = Arm(ros)
+    assert arm.torque_for(0, START).any()
     stranger = JointStateEncoder(('joint1', 'joint3'))
-    np.testing.assert_array_equal(arm.ask(1, START, encoder=stranger), NOTHING)
+    np.testing.assert_array_equal(arm.torque_for(1, START, encoder=stranger), NOTHING)
     assert "'joint2' is not in the message" in node.stopped
     assert 'joint1, joint3' in node.stopped
 
 
-def test_an_arm_that_falls_silent_gets_the_safe_torque_again_and_again(loop):
+def test_an_arm_that_falls_silent_gets_the_safe_torque_again_and_again(ros):
     clock = FakeClock()
-    node = loop.add(ControllerNode, {'safety.watchdog': 'on'}, steady=clock)
-    arm = Arm(loop)
-    said = loop.listen(topics.COMMANDS)
-    assert arm.ask(0, START).any()
+    node = ros.add(ControllerNode, {'safety.watchdog': 'on'}, clock=clock)
+    arm = Arm(ros)
+    heard = ros.listen(topics.COMMANDS)
+    assert arm.torque_for(0, START).any()
     assert not node.stopped
     clock.advance(0.1)
-    loop.spin_until(lambda: node.stopped)  # with the clock as its only reason
+    ros.until(lambda: node.stopped)  # with the clock as its only reason
     assert 'no joint state has come for' in node.stopped
-    before = len(said)
-    loop.spin_until(lambda: clock.advance(0.01) or len(said) >= before + 20)
-    np.testing.assert_array_equal(torques(said)[-1], NOTHING)
+    before = len(heard)
+    ros.until(lambda: clock.advance(0.01) or len(heard) >= before + 20)
+    np.testing.assert_array_equal(torques(heard)[-1], NOTHING)
 
 
-def test_a_start_outside_the_bound_names_joint_error_and_bound(loop):
-    node = loop.add(ControllerNode, {'approach.enabled': False})
-    states = loop.publisher(topics.JOINT_STATES)
-    loop.listen(topics.COMMANDS)
-    loop.spin_until(lambda: states.get_subscription_count() > 0)
+def test_a_start_outside_the_bound_names_joint_error_and_bound(ros):
+    node = ros.add(ControllerNode, {'approach.enabled': False})
+    states = ros.publisher(topics.JOINT_STATES)
+    ros.listen(topics.COMMANDS)
+    ros.until(lambda: states.get_subscription_count() > 0)
     away = (START[0], START[1] - 0.0021)
     states.publish(JointStateEncoder(JOINTS).encode(10**9, away, NOTHING, NOTHING))
-    loop.spin_until(lambda: node.finished)
-    refused = node.failure
-    assert isinstance(refused, OutsideBarrierError)
+    ros.until(lambda: node.finished)
+    error = node.failure
+    assert isinstance(error, OutsideBarrierError)
     # 1.696 - 0.0021 against the reference's 1.6961 at its start
-    assert (refused.joint, refused.bound) == ('joint2', 0.002)
-    assert refused.error == pytest.approx(-0.0022)
-    assert "joint 'joint2' starts -0.0022 rad" in str(refused)
-    assert 'its bound of 0.002 rad' in str(refused)
+    assert (error.joint, error.bound) == ('joint2', 0.002)
+    assert error.error == pytest.approx(-0.0022)
+    assert "joint 'joint2' starts -0.0022 rad" in str(error)
+    assert 'its bound of 0.002 rad' in str(error)
 
 
 @pytest.mark.parametrize(
-    ('given', 'told'),
+    ('given', 'problem'),
     [
         ({'feedback.gian': [1.0, 1.0]}, 'feedback.gian: unknown parameter'),
         ({'feedback.gain': [-1.0, 2.0]}, 'feedback.gain: got -1.0 at entry 1'),
@@ -121,43 +114,43 @@ def test_a_start_outside_the_bound_names_joint_error_and_bound(loop):
         ({'sample_time': 1}, 'sample_time: got 1'),
     ],
 )
-def test_a_parameter_that_will_not_do_is_named(loop, given, told):
+def test_a_parameter_that_will_not_do_is_named(ros, given, problem):
     with pytest.raises(ConfigurationError) as caught:
-        loop.add(ControllerNode, given)
-    assert told in str(caught.value)
+        ros.add(ControllerNode, given)
+    assert problem in str(caught.value)
 
 
-def set_parameters(loop, node, **values):
-    """Do what `ros2 param set` does; return whether it was taken, and why not."""
-    client = loop.tester.create_client(SetParameters, f'{node.get_name()}/set_parameters')
-    loop.spin_until(client.service_is_ready)
+def set_parameters(ros, node, **values):
+    """Do what `ros2 param set` does; return whether it was accepted, and why not."""
+    client = ros.tester.create_client(SetParameters, f'{node.get_name()}/set_parameters')
+    ros.until(client.service_is_ready)
     request = SetParameters.Request()
     for name, value in values.items():
         dotted = name.replace('__', '.')
         request.parameters.append(Parameter(dotted, value=value).to_parameter_msg())
     future = client.call_async(request)
-    loop.spin_until(future.done)
+    ros.until(future.done)
     results = future.result().results
     return all(result.successful for result in results), [result.reason for result in results]
 
 
-def test_a_gain_changed_while_running_acts_from_the_next_sample_on(loop):
-    node = loop.add(ControllerNode)
-    arm = Arm(loop)
+def test_a_gain_changed_while_running_acts_from_the_next_sample_on(ros):
+    node = ros.add(ControllerNode)
+    arm = Arm(ros)
     gain = [30.0, 10.0]
-    arm.ask(0, START, VELOCITY)
-    assert set_parameters(loop, node, feedback__gain=gain) == (True, [''])
-    torque = arm.ask(1, START, VELOCITY)
+    arm.torque_for(0, START, VELOCITY)
+    assert set_parameters(ros, node, feedback__gain=gain) == (True, [''])
+    torque = arm.torque_for(1, START, VELOCITY)
     np.testing.assert_array_equal(node.controller.settings.Kp, gain)
-    assert not np.array_equal(torque, law_answers(*[(START, VELOCITY)] * 2)[1])
+    assert not np.array_equal(torque, law_torques(*[(START, VELOCITY)] * 2)[1])
 
 
-def test_a_gain_that_will_not_do_changes_nothing_and_says_why(loop):
-    node = loop.add(ControllerNode)
-    arm = Arm(loop)
-    arm.ask(0, START, VELOCITY)
-    taken, reasons = set_parameters(loop, node, feedback__gain=[30.0, -10.0])
-    assert not taken
+def test_a_gain_that_will_not_do_changes_nothing_and_says_why(ros):
+    node = ros.add(ControllerNode)
+    arm = Arm(ros)
+    arm.torque_for(0, START, VELOCITY)
+    accepted, reasons = set_parameters(ros, node, feedback__gain=[30.0, -10.0])
+    assert not accepted
     assert '-10.0' in reasons[0]
-    torque = arm.ask(1, START, VELOCITY)
-    np.testing.assert_array_equal(torque, law_answers(*[(START, VELOCITY)] * 2)[1])
+    torque = arm.torque_for(1, START, VELOCITY)
+    np.testing.assert_array_equal(torque, law_torques(*[(START, VELOCITY)] * 2)[1])

@@ -27,7 +27,7 @@ def test_a_late_torque_counts_with_all_of_its_lateness():
     assert latency.late_steps == 2
 
 
-def test_the_longest_wait_of_a_sample_is_told_once():
+def test_the_longest_wait_of_a_sample_is_published_once():
     latency = Latency()
     latency.state_published(0.0)
     latency.step(1.0)

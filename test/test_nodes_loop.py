@@ -9,8 +9,8 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from fake_clock import FakeClock
-from node_loop import NodeLoop, simulated_torques, states, torques
 from rclpy.time import Time
+from ros_rig import simulated_torques, states, torques
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.messages import topics
@@ -24,24 +24,18 @@ OBSERVED = {'wait_for_subscribers': 1}
 NOISY = {'sensor.position_noise': 1e-5, 'sensor.velocity': 'differenced', 'actuator.delay': 1}
 
 
-@pytest.fixture
-def loop():
-    one = NodeLoop()
-    yield one
-    one.close()
-
-
-def run_lockstep(loop, plant, controller=None):
+def run_lockstep(ros, plant, controller=None):
     """Run to the end; return torques and what else was heard."""
-    heard = {topic: loop.listen(topic) for topic in (topics.COMMANDS, topics.JOINT_STATES)}
-    arm = loop.add(PlantNode, {'mode': 'lockstep', **OBSERVED, **plant})
-    loop.add(ControllerNode, {'telemetry.enabled': False, **OBSERVED, **(controller or {})})
-    truth = loop.listen(topics.TRUTH)
+    commands = ros.listen(topics.COMMANDS)
+    joint_states = ros.listen(topics.JOINT_STATES, raw=True)
+    arm = ros.add(PlantNode, {'mode': 'lockstep', **OBSERVED, **plant})
+    ros.add(ControllerNode, {'telemetry.enabled': False, **OBSERVED, **(controller or {})})
+    truth = ros.listen(topics.TRUTH)
     samples = round(plant['duration'] * 1000) + 1
-    loop.spin_until(lambda: arm.finished and len(heard[topics.COMMANDS]) >= samples)
-    loop.spin_until(lambda: len(heard[topics.JOINT_STATES]) >= samples)
+    ros.until(lambda: arm.finished and len(commands) >= samples)
+    ros.until(lambda: len(joint_states) >= samples)
     assert len(truth) == (samples - 1) // 10 + 1
-    return torques(heard[topics.COMMANDS]), states(heard[topics.JOINT_STATES])[0]
+    return torques(commands), states(joint_states)[0]
 
 
 @pytest.mark.parametrize(
@@ -49,59 +43,59 @@ def run_lockstep(loop, plant, controller=None):
     [{'duration': 10.0}, {'duration': 2.0, 'seed': 5, **NOISY}],
     ids=['learning', 'noise, differenced velocity and delay'],
 )
-def test_lockstep_torques_are_those_of_the_offline_run_bit_for_bit(loop, plant):
-    over_ros, stamps = run_lockstep(loop, plant)
+def test_lockstep_torques_are_those_of_the_offline_run_bit_for_bit(ros, plant):
+    over_ros, stamps = run_lockstep(ros, plant)
     np.testing.assert_array_equal(over_ros, simulated_torques(plant))
     np.testing.assert_array_equal(stamps, LOCKSTEP_START + MILLISECOND * np.arange(len(stamps)))
 
 
-def test_a_seed_is_heard_in_the_torques(loop):
-    over_ros, _ = run_lockstep(loop, {'duration': 0.5, 'seed': 5, **NOISY})
+def test_a_seed_is_heard_in_the_torques(ros):
+    over_ros, _ = run_lockstep(ros, {'duration': 0.5, 'seed': 5, **NOISY})
     assert not np.array_equal(over_ros, simulated_torques({'duration': 0.5, 'seed': 6, **NOISY}))
 
 
-def test_the_clock_is_the_plants_and_nodes_on_simulated_time_follow_it(loop):
-    clock = loop.listen(topics.CLOCK)
+def test_the_clock_is_the_plants_and_nodes_on_simulated_time_follow_it(ros):
+    clock = ros.listen(topics.CLOCK)
     plant = {'duration': 0.5, 'publish_clock': True}
-    over_ros, _ = run_lockstep(loop, plant, {'use_sim_time': True})
-    loop.spin_until(lambda: len(clock) == 501)
+    over_ros, _ = run_lockstep(ros, plant, {'use_sim_time': True})
+    ros.until(lambda: len(clock) == 501)
     now = Time(nanoseconds=LOCKSTEP_START + 500 * MILLISECOND)
-    loop.spin_until(lambda: loop.nodes[1].get_clock().now().nanoseconds == now.nanoseconds)
+    ros.until(lambda: ros.nodes[-1].get_clock().now().nanoseconds == now.nanoseconds)
     np.testing.assert_array_equal(over_ros, simulated_torques({'duration': 0.5}))
 
 
-def test_real_time_is_counted_by_the_plant_in_whole_samples(loop):
+def test_real_time_is_counted_by_the_plant_in_whole_samples(ros):
     heard = {
-        topic: loop.listen(topic)
+        topic: ros.listen(topic, raw=True)
         for topic in (topics.JOINT_STATES, topics.REFERENCE, topics.TIMING, topics.TRUTH)
     }
     clock = FakeClock()
     given = {'mode': 'realtime', 'duration': 0.3, **OBSERVED}
-    plant = loop.add(PlantNode, given, steady=clock)
-    controller = loop.add(ControllerNode, steady=clock)
-    loop.spin_until(lambda: clock.advance(0.01) or heard[topics.JOINT_STATES])
-    loop.spin_until(plant.input.torque.any)
+    plant = ros.add(PlantNode, given, clock=clock)
+    controller = ros.add(ControllerNode, clock=clock)
+    ros.until(lambda: clock.advance(0.01) or heard[topics.JOINT_STATES])
+    ros.until(plant.input.torque.any)
     # In time, but for three steps that the plant has to take at once.
     for steps in [1] * 100 + [3] + [1] * 197:
-        loop.spin_until(lambda: plant._has_torque)
+        ros.until(lambda: plant._has_torque)
         goal = plant.plant.sample + steps
         clock.advance(1e-3 * steps)
-        loop.spin_until(lambda k=goal: plant.plant.sample == k)
+        ros.until(lambda k=goal: plant.plant.sample == k)
     assert not plant.finished
     clock.advance(0.05)
-    loop.spin_until(lambda: plant.finished)
-    loop.spin_until(lambda: len(heard[topics.REFERENCE]) == controller.controller.samples)
-    loop.spin_until(lambda: len(heard[topics.TIMING]) == 300)
+    ros.until(lambda: plant.finished)
+    ros.until(lambda: len(heard[topics.REFERENCE]) == controller.controller.samples)
+    ros.until(lambda: len(heard[topics.TIMING]) == 300)
 
     stamps, _ = states(heard[topics.JOINT_STATES])
     np.testing.assert_array_equal(stamps, stamps[0] + MILLISECOND * np.arange(301))
 
-    # However late a state was answered, the reference is that of the state's own time.
-    told, values = states(heard[topics.REFERENCE])
-    assert set(told) <= set(stamps)
+    # However late the torque for a state was, the reference is that of the state's own time.
+    reference_stamps, values = states(heard[topics.REFERENCE])
+    assert set(reference_stamps) <= set(stamps)
     vector = reference_of(ControllerConfig())
     qr, dqr, ddqr = np.zeros((3, 2))
-    for stamp, value in zip(told, values, strict=True):
+    for stamp, value in zip(reference_stamps, values, strict=True):
         reference.evaluate(vector, (stamp - stamps[0]) * 1e-9, qr, dqr, ddqr)
         np.testing.assert_array_equal(value[0], qr)
 

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from node_loop import NodeLoop, states
+from ros_rig import states
 
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import ConfigurationError
@@ -20,19 +20,12 @@ from sim_plant.plant import plant_of
 TORQUE = (5.0, 3.0)  # N m
 
 
-@pytest.fixture
-def loop():
-    one = NodeLoop()
-    yield one
-    one.close()
-
-
-def started(loop, **values):
+def started(ros, **values):
     """Start a plant in lock-step; return it, what it publishes, and a way to send torques."""
-    heard = loop.listen(topics.JOINT_STATES)
-    node = loop.add(PlantNode, {'mode': 'lockstep', **values})
-    commands = loop.publisher(topics.COMMANDS)
-    loop.spin_until(lambda: len(heard) == 1 and commands.get_subscription_count() > 0)
+    heard = ros.listen(topics.JOINT_STATES, raw=True)
+    node = ros.add(PlantNode, {'mode': 'lockstep', **values})
+    commands = ros.publisher(topics.COMMANDS)
+    ros.until(lambda: len(heard) == 1 and commands.get_subscription_count() > 0)
 
     def send(torque):
         commands.publish(Float64MultiArrayEncoder(len(torque)).encode(torque))
@@ -41,45 +34,45 @@ def started(loop, **values):
 
 
 @pytest.mark.parametrize('wrong', [(1.0,), (1.0, 2.0, 3.0), (1.0, np.nan), (np.inf, 0.0)], ids=str)
-def test_a_command_that_will_not_do_moves_nothing_and_is_counted(loop, wrong):
-    node, heard, send = started(loop)
+def test_a_command_that_will_not_do_moves_nothing_and_is_counted(ros, wrong):
+    node, heard, send = started(ros)
     send(TORQUE)
-    loop.spin_until(lambda: node.plant.sample == 1)
+    ros.until(lambda: node.plant.sample == 1)
     send(wrong)
-    loop.spin_until(lambda: node.input.rejected == 1)
+    ros.until(lambda: node.input.rejected == 1)
     assert node.plant.sample == 1
     send(TORQUE)
-    loop.spin_until(lambda: len(heard) == 3)
+    ros.until(lambda: len(heard) == 3)
 
     alone = plant_of(PlantConfig())
     alone.step(np.array(TORQUE))
     alone.step(np.array(TORQUE))
-    _, told = states(heard)
-    np.testing.assert_array_equal(told[2].ravel(), alone.measure())
+    _, measured = states(heard)
+    np.testing.assert_array_equal(measured[2].ravel(), alone.measure())
     assert node.input.rejected == 1
 
 
-def test_the_brake_holds_until_the_first_torque(loop):
-    node, heard, send = started(loop)
-    _, told = states(heard)
-    np.testing.assert_array_equal(told[0][0], PlantConfig().initial.position)
+def test_the_brake_holds_until_the_first_torque(ros):
+    node, heard, send = started(ros)
+    _, measured = states(heard)
+    np.testing.assert_array_equal(measured[0][0], PlantConfig().initial.position)
     for _ in range(10):
-        loop.executor.spin_once(timeout_sec=0.01)
+        ros.executor.spin_once(timeout_sec=0.01)
     assert node.plant.sample == 0
     send(TORQUE)
-    loop.spin_until(lambda: node.plant.sample == 1)
+    ros.until(lambda: node.plant.sample == 1)
 
 
-def test_it_ends_when_the_last_state_has_been_answered(loop):
-    node, heard, send = started(loop, duration=0.003)
-    for answered in range(1, 5):
+def test_it_ends_when_the_last_state_has_got_its_torque(ros):
+    node, heard, send = started(ros, duration=0.003)
+    for steps in range(1, 5):
         assert not node.finished
         send(TORQUE)
-        loop.spin_until(lambda k=answered: node.finished or len(heard) > k)
+        ros.until(lambda k=steps: node.finished or len(heard) > k)
     assert node.finished
     assert len(heard) == 4
 
 
-def test_a_parameter_that_will_not_do_is_named(loop):
+def test_a_parameter_that_will_not_do_is_named(ros):
     with pytest.raises(ConfigurationError, match=r'arm\.m1: got -0\.5'):
-        loop.add(PlantNode, {'arm.m1': -0.5})
+        ros.add(PlantNode, {'arm.m1': -0.5})

@@ -62,11 +62,11 @@ def joint_states(draw):
         fields |= {'position', 'velocity'}
     encoder = JointStateEncoder(joints, fields)
     values = {'position': q, 'velocity': dq, 'effort': dq}
-    told = {name: (values[name] * 2)[: len(joints)] for name in fields}
+    content = {name: (values[name] * 2)[: len(joints)] for name in fields}
     cut = draw(st.integers(0, 100)) if kind == 'cut' else 0
 
     def raw(stamp):
-        message = encoder.encode(stamp % 2**61, **told)
+        message = encoder.encode(stamp % 2**61, **content)
         return message[: len(message) - cut]
 
     return step, raw
@@ -139,10 +139,10 @@ def bystander(context):
     node.destroy_node()
 
 
-def happen(node, what, told):
+def happen(node, what, content):
     """Let one thing happen to a node, through the callbacks that ROS would call."""
     if what == 'transition':
-        request = ChangeState.Request(transition=Transition(id=told))
+        request = ChangeState.Request(transition=Transition(id=content))
         node._service_change_state.callback(request, ChangeState.Response())
     elif what == 'reset':
         node._on_reset(Trigger.Request(), Trigger.Response())
@@ -150,7 +150,7 @@ def happen(node, what, told):
         node._on_poll()
         node._report()
     elif what == 'parameter':
-        name, value = told
+        name, value = content
         if not node.has_parameter(name):  # of the other node
             return
         typed = Parameter(name, value=value) if value != [] else Parameter(name)
@@ -167,12 +167,12 @@ def test_the_controller_bears_everything(context, sequence):
     node._is_observed = lambda: True
     stamp = 10**9
     try:
-        for what, told in sequence:
+        for what, content in sequence:
             if what == 'message':
-                step, raw = told
+                step, raw = content
                 stamp = max(1, stamp + step * 1_000_000)
                 node._on_joint_state(raw(stamp))
-            happen(node, what, told)
+            happen(node, what, content)
             limit = np.array(node.config.torque.limit)
             for torque in commands:
                 assert np.isfinite(torque).all()
@@ -205,10 +205,10 @@ def test_the_plant_bears_everything(context, sequence):
     node._is_observed = lambda: True
     node._handshake._complete_since = 0.0
     try:
-        for what, told in sequence:
+        for what, content in sequence:
             if what == 'message':
-                node._on_command(told)
-            happen(node, what, told)
+                node._on_command(content)
+            happen(node, what, content)
             assert np.isfinite(node.input.torque).all()
             if node.state_label == 'active':
                 measured = node.plant.measure()

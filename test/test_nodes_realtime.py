@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Asking the operating system: what is asked for, and that a refusal is told and survived."""
+"""Requests to the operating system: refusals are logged and survived."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class Log:
     """Takes what is logged."""
 
     def __init__(self):
-        self.told = []
+        self.logged = []
         self.warned = []
 
     def info(self, text):
-        self.told.append(text)
+        self.logged.append(text)
 
     def warning(self, text):
         self.warned.append(text)
@@ -57,36 +57,36 @@ def system(monkeypatch):
     return one
 
 
-def asked(**values):
+def requested(**values):
     log = Log()
     request_realtime(Realtime(**values), log)
     return log
 
 
-def test_nothing_is_asked_for_by_default(system):
-    log = asked()
+def test_nothing_is_requested_by_default(system):
+    log = requested()
     assert (system.scheduled, system.locked) == ([], [])
-    assert (log.told, log.warned) == ([], [])
+    assert (log.logged, log.warned) == ([], [])
 
 
 def test_every_thread_gets_the_priority(system):
-    log = asked(priority=50)
+    log = requested(priority=50)
     threads = {int(name) for name in os.listdir('/proc/self/task')}  # noqa: PTH208
     assert {thread for thread, *_ in system.scheduled} == threads
     assert {(policy, level) for _, policy, level in system.scheduled} == {(os.SCHED_FIFO, 50)}
-    assert log.told == ['running with SCHED_FIFO priority 50']
+    assert log.logged == ['running with SCHED_FIFO priority 50']
 
 
 def test_memory_is_locked_now_and_for_all_to_come(system):
-    log = asked(lock_memory=True)
+    log = requested(lock_memory=True)
     assert system.locked == [1 | 2]  # MCL_CURRENT | MCL_FUTURE of Linux
-    assert log.told == ['memory locked']
+    assert log.logged == ['memory locked']
 
 
-def test_a_refusal_is_told_with_its_remedy_and_survived(system):
+def test_a_refusal_is_logged_with_its_remedy_and_survived(system):
     system.refused = ('schedule', 'lock')
-    log = asked(priority=50, lock_memory=True)
-    assert log.told == []
+    log = requested(priority=50, lock_memory=True)
+    assert log.logged == []
     schedule, lock = log.warned
     assert 'priority 50 refused (Operation not permitted)' in schedule
     assert 'rtprio' in schedule

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from ros_rig import RosRig, torques
+from ros_rig import torques
 from sent_trajectory import JOINTS, SECOND, inputs, send, trajectory, two_tones
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -23,13 +23,6 @@ from blf_dsc_controller.supervision.supervisor import Phase
 
 AWAY = [0.9, 2.9]  # rad, 1.4 and 1.2 from the paper's reference
 BRISK = {'limits__acceleration': [4.0, 4.0]}  # rad/s^2, for a lead of a second
-
-
-@pytest.fixture
-def ros():
-    rig = RosRig()
-    yield rig
-    rig.close()
 
 
 def phase(law):
@@ -51,7 +44,7 @@ def test_an_approach_over_ros_is_the_offline_one_bit_for_bit(ros):
     np.testing.assert_array_equal(torques(commands)[:4001], offline.samples[:, 8:10])
 
 
-def test_an_approach_that_cannot_be_made_is_refused_and_told(ros):
+def test_an_approach_that_cannot_be_made_is_rejected_with_a_reason(ros):
     _, law = ros.loop(
         {'initial__position': AWAY},
         {'limits__velocity': [0.2, 1.5]},  # the paper's reference moves at 0.3 rad/s
@@ -127,12 +120,12 @@ def test_before_the_start_a_trajectory_is_refused_with_the_reason(ros, sender):
     assert 'not in command: starting' in inputs(law).reason
 
 
-def test_the_moving_bound_is_told_each_sample_and_a_still_one_once(ros):
+def test_the_moving_bound_is_published_each_sample_and_a_still_one_once(ros):
     bounds = ros.listen(replace(topics.BOUND, requested=topics.STREAM))
     arm, _ = ros.loop(None, {'barrier__initial_bound': [0.02, 0.01], 'barrier__funnel_rate': 5.0})
     ros.run(arm, 300)
     ros.until(lambda: len(bounds) >= 300)
     t = np.arange(300) * 1e-3
-    told = np.array([one.position for one in bounds[:300]])
-    np.testing.assert_allclose(told[:, 0], 0.002 + 0.018 * np.exp(-5.0 * t), rtol=1e-12)
-    np.testing.assert_allclose(told[:, 1], 0.002 + 0.008 * np.exp(-5.0 * t), rtol=1e-12)
+    published = np.array([one.position for one in bounds[:300]])
+    np.testing.assert_allclose(published[:, 0], 0.002 + 0.018 * np.exp(-5.0 * t), rtol=1e-12)
+    np.testing.assert_allclose(published[:, 1], 0.002 + 0.008 * np.exp(-5.0 * t), rtol=1e-12)

@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the controller node warns of: refused columns with their reason, gains that cannot work."""
+"""What the controller node warns of: rejected columns with their reason, gains that cannot work."""
 
 from __future__ import annotations
-
-from functools import partial
 
 import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from diagnostic_msgs.msg import DiagnosticArray
-from node_loop import NodeLoop
 from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
@@ -21,38 +18,27 @@ OBSERVED = {'wait_for_subscribers': 0}
 COSINE = {'learning.frequencies': [1.0], 'learning.bias': False}
 
 
-@pytest.fixture
-def loop():
-    one = NodeLoop()
-    yield one
-    one.close()
-
-
-# /rosout keeps what was logged before anyone had found the node.
+# /rosout keeps what was logged before anyone had found the node. rcl keeps a publisher of it for
+# each logger: so the nodes of each test are in a namespace of their own.
 KEPT = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def named(namespace, make_node):
-    """Node whose logger no other test of this process has: rcl keeps a publisher for each name."""
-    return partial(make_node, namespace=namespace)
-
-
-def listen(loop, kind, topic, quality=100):
+def listen(ros, kind, topic, quality=100):
     heard = []
-    loop.tester.create_subscription(kind, topic, heard.append, quality)
+    ros.tester.create_subscription(kind, topic, heard.append, quality)
     return heard
 
 
-def test_refused_columns_are_logged_and_diagnosed_with_what_they_are_like(loop):
+def test_rejected_columns_are_logged_and_diagnosed_with_what_they_are_like(ros):
     """On the paper's reference cos t on both joints is the column of m2 l2^2."""
     log, diagnostics = (
-        listen(loop, Log, '/rosout', KEPT),
-        listen(loop, DiagnosticArray, '/diagnostics'),
+        listen(ros, Log, '/rosout', KEPT),
+        listen(ros, DiagnosticArray, '/diagnostics'),
     )
-    loop.add(named('refused', ControllerNode), COSINE)
-    arm = loop.add(named('refused', PlantNode), {'mode': 'lockstep', 'duration': 7.0})
+    ros.add(ControllerNode, COSINE, namespace='rejected')
+    arm = ros.add(PlantNode, {'mode': 'lockstep', 'duration': 7.0}, namespace='rejected')
 
-    def refused():
+    def rejected():
         return [
             (status.message, value)
             for array in diagnostics
@@ -61,8 +47,8 @@ def test_refused_columns_are_logged_and_diagnosed_with_what_they_are_like(loop):
             if value.key.startswith('rejected cos 1 rad/s')
         ]
 
-    loop.spin_until(lambda: arm.finished and refused())
-    message, value = refused()[-1]
+    ros.until(lambda: arm.finished and rejected())
+    message, value = rejected()[-1]
     assert message.startswith('not estimated: cos 1 rad/s')
     assert 'cannot be told from m2*l2^2' in value.value
     warned = [one.msg for one in log if 'is not estimated' in one.msg]
@@ -70,7 +56,7 @@ def test_refused_columns_are_logged_and_diagnosed_with_what_they_are_like(loop):
     assert 'cannot be told from m2*l2^2' in warned[0]
 
 
-def test_concerns_are_logged_before_the_first_state(loop):
-    log = listen(loop, Log, '/rosout', KEPT)
-    loop.add(named('concerned', ControllerNode), {'learning.window': 5.0})
-    loop.spin_until(lambda: any('learning.window: 5 s' in one.msg for one in log))
+def test_config_warnings_are_logged_before_the_first_state(ros):
+    log = listen(ros, Log, '/rosout', KEPT)
+    ros.add(ControllerNode, {'learning.window': 5.0}, namespace='warned')
+    ros.until(lambda: any('learning.window: 5 s' in one.msg for one in log))
