@@ -98,7 +98,7 @@ class Rerun:
         self._numbers: list[int] = []  # of the joint states that the law used
         self._rows = np.empty((len(came.stamp), self._guard.controller.sample_vector.size))
         self._monitor: Monitor | None = None
-        self._commands: list[tuple[int, Floats, bool, bool]] = []  # as in Commands
+        self._commands: list[tuple[int, bytes, bool, bool]] = []  # as in Commands
         self._offsets = [(0, 0)]  # from a torque on: its number in the bag
         self._failed = False
 
@@ -136,15 +136,15 @@ class Rerun:
     def commands(self) -> Commands:
         """Every torque."""
         count = len(self._commands)
-        flags = np.array([one[2:] for one in self._commands], dtype=np.bool_).reshape(count, 2)
+        torque = np.frombuffer(b''.join(one[1] for one in self._commands))
         number = np.arange(count)
         for own, recorded in self._offsets:
             number[own:] = np.arange(recorded, recorded + count - own)
         return Commands(
             np.array([one[0] for one in self._commands], dtype=np.int64),
-            np.array([one[1] for one in self._commands]).reshape(count, len(self._config.joints)),
-            flags[:, 0],
-            flags[:, 1],
+            torque.reshape(count, len(self._config.joints)),
+            np.array([one[2] for one in self._commands], dtype=np.bool_),
+            np.array([one[3] for one in self._commands], dtype=np.bool_),
             number,
         )
 
@@ -245,7 +245,7 @@ class Rerun:
         if torque is not None:
             of_law = self._guard.has_sample
             is_exact = of_law or (is_exact and not self._failed)
-            self._commands.append((stamp, torque.copy(), of_law, is_exact))
+            self._commands.append((stamp, torque.tobytes(), of_law, is_exact))
 
     # Events.
 
