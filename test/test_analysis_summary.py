@@ -83,10 +83,7 @@ def test_timing(run):
     assert timing['latency_us'] == pytest.approx(expected)
     assert timing['late_steps'] == 99
     assert summarize(run)['compute_time_us']['p50'] == pytest.approx(4.9995)
-
-
-def test_rate_is_that_of_the_wall_clock(run):
-    slow = dataclasses.replace(run, received=run.received * 2)
+    slow = dataclasses.replace(run, received=run.received * 2)  # the rate is of the wall clock
     assert summarize(slow)['timing']['rate_hz'] == pytest.approx(500.0)
 
 
@@ -97,19 +94,10 @@ def test_messages_are_counted(run):
     assert messages[BOUND.resolved] == 1
 
 
-def test_what_is_not_known_is_null_and_never_nan(run, tmp_path):
-    nothing = dataclasses.replace(
-        run,
-        reference=None,
-        error=None,
-        bound=None,
-        torque_limit=None,
-        learning=None,
-        truth=None,
-        timing=None,
-        torque=np.full_like(run.torque, np.nan),
-    )
-    summary = summarize(nothing)
+def test_unknown_is_null_and_never_nan(run, tmp_path):
+    optional = ('reference', 'error', 'bound', 'torque_limit', 'learning', 'truth', 'timing')
+    unknown = dict.fromkeys(optional) | {'torque': np.full_like(run.torque, np.nan)}
+    summary = summarize(dataclasses.replace(run, **unknown))
     write_summary(summary, tmp_path / 'summary.json')
     assert json.loads((tmp_path / 'summary.json').read_text()) == summary
     assert summary['learning'] is None
@@ -117,13 +105,23 @@ def test_what_is_not_known_is_null_and_never_nan(run, tmp_path):
     assert set(summary['tracking']['joints']['elbow'].values()) == {None}
 
 
+def summary_without(topic, folder):
+    messages = [entry for entry in Synthetic(100).messages() if entry[0] is not topic]
+    return summarize(read_run(synthetic_bag.write(folder / 'bag', messages)))
+
+
 def test_unknown_truth_leaves_the_estimates(tmp_path):
-    messages = [entry for entry in Synthetic(100).messages() if entry[0] is not TRUTH]
-    summary = summarize(read_run(synthetic_bag.write(tmp_path / 'bag', messages)))
-    assert summary['learning']['final_relative_error'] is None
-    assert summary['learning']['true'] is None
-    assert list(summary['learning']['final_estimate']) == list(PARAMETERS)
-    assert summary['learning']['latch_time_s'] is None  # too short a run
+    learning = summary_without(TRUTH, tmp_path)['learning']
+    assert learning['final_relative_error'] is None
+    assert learning['true'] is None
+    assert list(learning['final_estimate']) == list(PARAMETERS)
+    assert learning['latch_time_s'] is None  # too short a run
+
+
+def test_learning_is_optional_in_a_bag(tmp_path):
+    summary = summary_without(LEARNING, tmp_path)
+    assert summary['learning'] is None
+    assert summary['compute_time_us'] is None
 
 
 def test_compute_time_that_was_not_measured_is_null(run):
@@ -156,13 +154,6 @@ def test_the_table_shows_a_violation_and_leaves_out_the_unknown(run):
     )
     little = dataclasses.replace(run, error=None, learning=None, timing=None)
     assert 'bound       unknown' in format_table(summarize(little))
-
-
-def test_learning_is_optional_in_a_bag(tmp_path):
-    messages = [entry for entry in Synthetic(100).messages() if entry[0] is not LEARNING]
-    summary = summarize(read_run(synthetic_bag.write(tmp_path / 'bag', messages)))
-    assert summary['learning'] is None
-    assert summary['compute_time_us'] is None
 
 
 def test_a_simulation_and_its_bag_have_the_same_metrics(tmp_path):

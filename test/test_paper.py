@@ -75,11 +75,8 @@ def test_first_violation_and_a_late_error_resets_the_time_to_one_percent():
 
 
 def test_verdict_follows_from_the_runs():
-    assert [verdict(*runs) for runs in ((True, True), (True, False), (False, False))] == [
-        HOLDS,
-        ONLY_IF,
-        FAILS,
-    ]
+    runs = (True, True), (True, False), (False, False)
+    assert [verdict(*one) for one in runs] == [HOLDS, ONLY_IF, FAILS]
 
 
 def test_tuning_searches_as_hard_for_every_law():

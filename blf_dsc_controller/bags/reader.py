@@ -188,6 +188,6 @@ def export(run: Run, path: Path) -> int:
         parquet.write_table(pa.table(columns), path)
     else:
         raise BlfDscError(
-            f'{path} ends in neither .csv nor .parquet: name the file such that it tells its format'
+            f'{path} ends in neither .csv nor .parquet: the ending of the name sets the format'
         )
     return len(columns)
