@@ -14,7 +14,6 @@ from blf_dsc_controller.configuration.params_file import locate
 from blf_dsc_controller.configuration.schema import Kind
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import controller_of
-from blf_dsc_controller.monte_carlo.distribution import TAIL, parse
 from blf_dsc_controller.monte_carlo.study import (
     draw,
     load_study,
@@ -22,8 +21,9 @@ from blf_dsc_controller.monte_carlo.study import (
     plant_of_draw,
     write_study,
 )
+from blf_dsc_controller.monte_carlo.variations import TAIL, parse
 
-SHARES = st.floats(0.0, 1.0, exclude_max=True)
+FRACTIONS = st.floats(0.0, 1.0, exclude_max=True)
 
 
 def drawn_values(a_study, run):
@@ -38,7 +38,7 @@ def drawn_values(a_study, run):
         ('normal(2, 0.5)', stats.truncnorm(-TAIL, TAIL, 2, 0.5)),
     ],
 )
-@given(u=SHARES)
+@given(u=FRACTIONS)
 def test_distributions_are_those_of_their_names(text, reference, u):
     distribution = parse(text, Kind.DOUBLE)
     assert distribution.at(u) == pytest.approx(reference.ppf(u), rel=1e-9, abs=1e-9)
@@ -154,8 +154,8 @@ def test_draws_become_the_plant_of_the_run(tmp_path):
     assert plant.disturbance.constant[0] != plant.disturbance.constant[1]
     assert plant.actuator.delay == values['plant.actuator.delay']
     # The reference begins at offset + 0.3 cos 0, at rest; the bound is 2 mrad.
-    share = np.array([values[f'plant.initial.error.joint{i}'] for i in (1, 2)])
-    start = np.array([1.9935, 1.3961]) + 0.3 + 0.002 * share
+    fraction = np.array([values[f'plant.initial.error.joint{i}'] for i in (1, 2)])
+    start = np.array([1.9935, 1.3961]) + 0.3 + 0.002 * fraction
     np.testing.assert_allclose(plant.initial.position, start, rtol=1e-12)
     velocity = [values[f'plant.initial.velocity_error.joint{i}'] for i in (1, 2)]
     np.testing.assert_allclose(plant.initial.velocity, velocity, atol=1e-15)

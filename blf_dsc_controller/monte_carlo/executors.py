@@ -40,9 +40,6 @@ RETRIES = 3
 """Times in a row that all workers may be lost before any has finished a chunk."""
 
 _AHEAD = 3  # chunks handed out for each worker
-_CHUNKS_EACH = 20
-_MOST_PARTS = 1000
-_LARGEST = (100, 1000)  # runs in a chunk: in a study of up to 100 000, and in any
 
 
 class Engine(NamedTuple):
@@ -59,12 +56,8 @@ def cores() -> int:
 
 def processes(workers: int) -> Engine:
     """Processes of this machine, each of which ends with this one."""
-    method = 'forkserver'
-    if method not in multiprocessing.get_all_start_methods():
-        method = 'spawn'
-    context = multiprocessing.get_context(method)
-    if method == 'forkserver':
-        context.set_forkserver_preload([run_chunk.__module__])  # imported once, for all workers
+    context = multiprocessing.get_context('forkserver')
+    context.set_forkserver_preload([run_chunk.__module__])  # imported once, for all workers
     return Engine(lambda: ProcessPoolExecutor(workers, context, _end_with_parent), workers)
 
 
@@ -118,9 +111,8 @@ def mpi(workers: int) -> Engine:
 
 def chunk_size(runs: int, workers: int) -> int:
     """Runs in a chunk: few files, yet enough chunks for the workers to end together."""
-    usual, ever = _LARGEST
-    largest = min(ever, max(usual, runs // _MOST_PARTS))
-    return max(1, min(largest, runs // (_CHUNKS_EACH * workers)))
+    largest = min(1000, max(100, runs // 1000))
+    return max(1, min(largest, runs // (20 * workers)))
 
 
 def compute(

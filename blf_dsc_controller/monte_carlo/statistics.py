@@ -106,6 +106,7 @@ def _one_run(study: Study, results: Columns, row: int) -> Summary:
     run = {name: np.asarray(values[row]).item() for name, values in results.items()}
     ratios = {joint: run[f'max_error_ratio.{joint}'] for joint in study.plant.joints}
     violation = run['first_violation_s']
+    drawn = {name.removeprefix(_DRAWN): run[name] for name in run if name.startswith(_DRAWN)}
     return {
         'run': run['run'],
         'outcome': run['outcome'],
@@ -113,9 +114,5 @@ def _one_run(study: Study, results: Columns, row: int) -> Summary:
             joint: ratio if math.isfinite(ratio) else None for joint, ratio in ratios.items()
         },
         'first_violation_s': None if math.isnan(violation) else violation,
-        'drawn': {
-            name.removeprefix(_DRAWN): value
-            for name, value in run.items()
-            if name.startswith(_DRAWN)
-        },
+        'drawn': drawn,
     }

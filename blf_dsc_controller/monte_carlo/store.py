@@ -75,9 +75,9 @@ def differences(there: Mapping[str, object], here: Mapping[str, object]) -> str:
 
 
 class Store:
-    """The folder of a study; BlfDscError where there is none.
+    """The folder of a study, with the `study` that its results belong to.
 
-    Attributes: `folder` of the study, and the `study` that its results belong to.
+    Raises BlfDscError where there is none.
     """
 
     def __init__(self, folder: Path) -> None:

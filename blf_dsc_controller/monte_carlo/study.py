@@ -27,8 +27,7 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, flatten, parameter
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.monte_carlo.distribution import Value
-from blf_dsc_controller.monte_carlo.variations import Variation, read_variations, slots
+from blf_dsc_controller.monte_carlo.variations import Value, Variation, read_variations, slots
 
 _NODE = 'monte_carlo'
 _VARY = 'vary.'
@@ -43,10 +42,7 @@ class MonteCarloConfig:
         1000, 'closed loops to run', at_least=1, at_most=100_000_000, read_only=_ONE_STUDY
     )
     seed: int = parameter(
-        0,
-        'run i is determined by this seed and i alone',
-        at_least=0,
-        read_only=_ONE_STUDY,
+        0, 'run i is determined by this seed and i alone', at_least=0, read_only=_ONE_STUDY
     )
     settled_after: float = parameter(
         0.0,
@@ -175,7 +171,7 @@ def _read_section(path: str | Path) -> tuple[dict[str, Any], dict[str, int]]:
 
 
 class Origin(NamedTuple):
-    """Where the reference and the bound begin, to which a start is relative."""
+    """Reference and bound at time 0, to which a start is relative."""
 
     qr: np.ndarray  # (n,) rad
     dqr: np.ndarray  # (n,) rad/s

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.factory import estimate_names, model_of
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.journal import Event, EventType, Journal
+from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.messages.telemetry import (
     DECIMATION,
     ControllerTelemetry,
@@ -38,17 +38,9 @@ def write_bag(
     compression: str,
     plant: PlantConfig | None = None,
 ) -> None:
-    """Write a run as a bag.
+    """Write a run as a bag, with the configuration of the controller and, if given, of the plant.
 
-    Args:
-        path: folder of the bag, which must not exist yet.
-        record: the run.
-        config: of the controller that ran.
-        compression: `none` or `zstd`.
-        plant: configuration of the arm, to be stored beside that of the controller.
-
-    Raises:
-        BagError: `path` is there already.
+    `compression` is `none` or `zstd`. Raises BagError if `path` exists already.
     """
     with BagWriter(path, compression=compression, flush_interval=None) as bag:
         nodes: dict[str, object] = {topics.CONTROLLER: config}
@@ -74,7 +66,12 @@ def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, M
     controller = ControllerTelemetry(config.joints, estimate_names(config))
     monitor = Monitor(config.joints, estimate_names(config), record.controller.settings)
     limit = np.array(config.torque.limit)
-    for event in _events(config):
+    journal = Journal()
+    journal.note(EventType.CONFIGURE, parameters=flatten(config))
+    journal.note(EventType.ACTIVATE)
+    journal.stamp, journal.messages = START, 1
+    journal.note(EventType.START, resumed=False)
+    for event in journal.pending:
         yield START, (topics.JOURNAL, event.encode())
     ratio = np.zeros(len(record.config.joints))
     bound = np.zeros(len(record.config.joints))
@@ -92,13 +89,3 @@ def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, M
         if row % DECIMATION == 0:
             yield stamp, plant.truth(stamp, record.truths[row])
             yield stamp, monitor.message(stamp, sample, ratio, bound)
-
-
-def _events(config: ControllerConfig) -> Iterable[Event]:
-    """The run from the first state on, without any other event."""
-    journal = Journal()
-    journal.note(EventType.CONFIGURE, parameters=flatten(config))
-    journal.note(EventType.ACTIVATE)
-    journal.stamp, journal.messages = START, 1
-    journal.note(EventType.START, resumed=False)
-    return journal.pending

@@ -44,23 +44,14 @@ _NO_METRICS = MetricsSettings(0, 0, 0, 0, *np.zeros((3, 0)))
 
 @dataclass(frozen=True)
 class Record:
-    """All samples of a run, a row each.
+    """All samples of a run, a row each."""
 
-    Attributes:
-        stamps: time since the start (k,) [ns].
-        measurements: [q, dq, applied torque of the last interval] (k, 3 n).
-        samples: rows of `law.state.Sample` (k, s).
-        truths: [P, tau_dist, q, dq] (k, p + 3 n).
-        config: configuration of the controller.
-        controller: the controller after the run.
-    """
-
-    stamps: np.ndarray
-    measurements: np.ndarray
-    samples: np.ndarray
-    truths: np.ndarray
+    stamps: np.ndarray  # (k,) ns, since the start
+    measurements: np.ndarray  # (k, 3 n) [q, dq, applied torque of the last interval]
+    samples: np.ndarray  # (k, s) rows of `law.state.Sample`
+    truths: np.ndarray  # (k, p + 3 n) [P, tau_dist, q, dq]
     config: ControllerConfig
-    controller: Controller
+    controller: Controller  # after the run
 
     def sample(self, row: int) -> Sample:
         """Names for one row of `samples`."""
@@ -164,9 +155,8 @@ def simulate(
     number of rows that are filled.  `metrics` are packed `MetricsSettings` and the vector of
     `new_metrics`, which is updated.
 
-    Raises:
-        OutsideBarrierError: the arm starts outside the bound, and approach.enabled is false.
-        MotionError: there is no approach within the limits.
+    Raises OutsideBarrierError if the arm starts outside the bound and approach.enabled is false,
+    and MotionError if there is no approach within the limits.
     """
     controller = controller_of(controller_config)
     plant = plant_of(plant_config)
@@ -186,7 +176,7 @@ def simulate(
     for first in range(0, rows, _CHUNK):
         chunk = slice(first, min(first + _CHUNK, rows))
         arrays = (record.measurements[chunk], record.samples[chunk], record.truths[chunk])
-        _run(controller, plant, first, chunk.stop - 1, chunk.stop == rows, *arrays, *metrics)
+        _run(controller, plant, (first, chunk.stop - 1, chunk.stop == rows), arrays, metrics)
         if progress is not None:
             progress(record, chunk.stop)
     return record
@@ -197,24 +187,17 @@ def run_metrics(
 ) -> LoopMetrics:
     """Run so many samples, with a controller that has begun, and return the metrics alone."""
     metrics = new_metrics(settings)
-    measurements = np.zeros((1, 3 * plant.joints))
-    rows = controller.sample_vector.reshape(1, -1)
-    arrays = (measurements, rows, None, pack(settings), metrics)
-    _run(controller, plant, 0, samples - 1, True, *arrays)
+    arrays = (np.zeros((1, 3 * plant.joints)), controller.sample_vector.reshape(1, -1), None)
+    _run(controller, plant, (0, samples - 1, True), arrays, (pack(settings), metrics))
     return metrics_of(metrics, settings)
 
 
 def _run(
     controller: Controller,
     plant: Plant,
-    first: int,
-    last: int,
-    is_end: bool,
-    measurements: np.ndarray,
-    samples: np.ndarray,
-    truths: np.ndarray | None,
-    metrics_settings: np.ndarray,
-    metrics: np.ndarray,
+    samples: tuple[int, int, bool],
+    arrays: tuple[np.ndarray, np.ndarray, np.ndarray | None],
+    metrics: tuple[np.ndarray, np.ndarray],
 ) -> None:
     run_loop(
         plant.settings,
@@ -225,12 +208,7 @@ def _run(
         controller.reference_vector,
         controller.state_vector,
         controller.signals_vector,
-        first,
-        last,
-        is_end,
-        measurements,
-        samples,
-        truths,
-        metrics_settings,
-        metrics,
+        *samples,
+        *arrays,
+        *metrics,
     )
