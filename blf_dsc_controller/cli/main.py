@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f'blf_dsc {options.command}: {error}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        remedy = '; the same command resumes the study' if module == 'monte_carlo' else ''
+        remedy = '; the same command resumes the study' if function == 'monte_carlo' else ''
         print(f'blf_dsc {options.command}: interrupted{remedy}', file=sys.stderr)
         return INTERRUPTED
     return code or 0
@@ -182,7 +182,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     paper = command(
         'paper',
-        ('paper', 'paper'),
+        ('studies', 'paper'),
         "compare all laws in the paper's simulation",
         "Run the paper's simulation with every law, check its claims, and find where each law "
         'breaks; offline, on all cores.',
@@ -194,7 +194,7 @@ def _parser() -> argparse.ArgumentParser:
     _monte_carlo_options(
         command(
             'monte-carlo',
-            ('monte_carlo', 'monte_carlo'),
+            ('studies', 'monte_carlo'),
             'run a study of many random plants',
             'Run thousands of closed loops with random plants, in parallel, and report how many '
             'kept the bound. Interrupted studies resume: start the same command again.',

@@ -29,23 +29,27 @@ DIFFERENT = 3
 def replay(options: Namespace) -> int:
     """Replay a bag in the mode that the options choose, and print the result."""
     if options.play:
-        return _play(options)
-    if options.learn:
-        return _identify(options)
+        _play(options)
+        return 0
+    config = None
+    if options.config is not None:
+        config = load(locate(options.config), CONTROLLER, ControllerConfig)
     begin = perf_counter()
-    if options.config is None:
+    if options.learn:
+        _identify(options, config)
+    elif config is None:
         result = verify(options.bag, options.namespace)
         _print_speed(result.states, perf_counter() - begin)
         print('\n'.join(_verification(result)))
         return 0 if result.difference is None else DIFFERENT
-    config = load(locate(options.config), CONTROLLER, ControllerConfig)
-    found = what_if(options.bag, config, options.namespace, NameMap.parse(options.map))
-    _print_speed(found.states, perf_counter() - begin)
-    print('\n'.join(_open_loop(found, config)))
+    else:
+        found = what_if(options.bag, config, options.namespace, NameMap.parse(options.map))
+        _print_speed(found.states, perf_counter() - begin)
+        print('\n'.join(_open_loop(found, config)))
     return 0
 
 
-def _play(options: Namespace) -> int:
+def _play(options: Namespace) -> None:
     require_ros()
     from blf_dsc_controller.nodes.player_node import play
 
@@ -58,14 +62,10 @@ def _play(options: Namespace) -> int:
         delay=options.delay,
         remaps=options.remap,
     )
-    return 0
 
 
-def _identify(options: Namespace) -> int:
-    if options.config is None:
-        config = read_context(options.bag).controller_config()
-    else:
-        config = load(locate(options.config), CONTROLLER, ControllerConfig)
+def _identify(options: Namespace, config: ControllerConfig | None) -> None:
+    config = config or read_context(options.bag).controller_config()
     found = identify(options.bag, config, options.namespace, NameMap.parse(options.map))
     print(f'torque: {found.source}; window from {found.begin:.3f} s to {found.end:.3f} s')
     width = max(len(name) for name in found.names)
@@ -79,7 +79,6 @@ def _identify(options: Namespace) -> int:
         f'excitation {found.excitation:.3g}, threshold {found.threshold:.3g}: {verdict}; '
         f'residual {found.residual:.3g} N m rms'
     )
-    return 0
 
 
 def _print_speed(states: States, took: float) -> None:

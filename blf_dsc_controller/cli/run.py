@@ -41,11 +41,6 @@ _DURATION = 60.0  # s, where neither the file nor an option gives one
 def run(options: Namespace) -> int:
     """Run the closed loop into a new folder."""
     config = _configuration(options)
-    order = [config.plant.joints.index(joint) for joint in config.controller.joints]
-    for warning in config_warnings(
-        config.controller, np.array(config.plant.initial.position)[order]
-    ):
-        print(f'warning: {warning}', file=sys.stderr)
     if not options.offline:
         require_ros()
     out = make_folder(options.out)
@@ -54,10 +49,8 @@ def run(options: Namespace) -> int:
         config = config._replace(recorder=change(config.recorder, recorder))
         dump(out / 'config.yaml', config.by_node)
         if options.offline:
-            completed = True
             _run_offline(config, out / 'bag')
-        else:
-            completed = _run_over_ros(config, out, options.domain)
+        completed = options.offline or _run_over_ros(config, out, options.domain)
         try:
             _report(out)
         except BlfDscError as error:
@@ -100,7 +93,8 @@ def _not_writable(path: Path, error: OSError) -> BlfDscError:
 def _configuration(options: Namespace) -> LoopConfig:
     """Configuration of the three nodes, from the file and the options that override it.
 
-    A start that the controller would reject raises here, by the true state.
+    Raises OutsideBarrierError or MotionError if the controller would reject the true start, and
+    prints warnings.
     """
     chosen = {'duration': options.duration, 'mode': options.mode, 'seed': options.seed}
     given = {name: value for name, value in chosen.items() if value is not None}
@@ -115,12 +109,10 @@ def _configuration(options: Namespace) -> LoopConfig:
         config = load_loop(path, overrides)
     controller, plant = config.controller, config.plant
     order = [plant.joints.index(joint) for joint in controller.joints]
-    plan_start(
-        controller,
-        np.array(controller.barrier.widest),
-        np.array(plant.initial.position)[order],
-        np.array(plant.initial.velocity)[order],
-    )
+    q, dq = (np.array(one)[order] for one in (plant.initial.position, plant.initial.velocity))
+    plan_start(controller, np.array(controller.barrier.widest), q, dq)
+    for warning in config_warnings(controller, q):
+        print(f'warning: {warning}', file=sys.stderr)
     return config
 
 

@@ -15,7 +15,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from math import inf
 from pathlib import Path
-from types import TracebackType
 
 import rclpy
 from rclpy.experimental import EventsExecutor
@@ -56,14 +55,11 @@ def run_session(plant: PlantConfig, out: Path, domain: int | None) -> bool:
     logs = out / 'logs'
     logs.mkdir()
     with own_domain() if domain is None else nullcontext(domain) as chosen:
-        environment = {
-            'ROS_DOMAIN_ID': str(chosen),
-            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-            'ROS_LOG_DIR': str(logs / 'ros'),
-        }
-        os.environ.update(environment)
+        os.environ['ROS_DOMAIN_ID'] = str(chosen)
+        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        os.environ['ROS_LOG_DIR'] = str(logs / 'ros')
         try:
-            return _run_nodes(plant, out / 'config.yaml', logs, environment)
+            return _run_nodes(plant, out / 'config.yaml', logs)
         except NodeFailedError:
             if shutil.disk_usage(out).free < _ROOM:
                 print(f'there is no room left on the disk of {out}', file=sys.stderr)
@@ -94,20 +90,18 @@ class NodeFailedError(BlfDscError):
 class NodeProcess:
     """One node in a process of its own, which does not outlive this one."""
 
-    def __init__(
-        self, name: str, params_file: Path, log: Path, environment: dict[str, str]
-    ) -> None:
+    def __init__(self, name: str, params_file: Path, logs: Path) -> None:
         self.name = name
-        self._log = log
+        self._log = logs / f'{name}.log'
         command = [sys.executable, '-m', _MODULES[name], '--ros-args', '--params-file']
-        with log.open('wb') as output:
+        with self._log.open('wb') as output:
             # A session of its own: Ctrl-C reaches the parent alone, which ends the nodes in order.
             self._process = subprocess.Popen(
                 [*command, str(params_file)],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, 'PYTHONUNBUFFERED': '1', **environment},
+                env={**os.environ, 'PYTHONUNBUFFERED': '1'},
                 start_new_session=True,
                 preexec_fn=_die_with_parent,  # noqa: PLW1509 - no threads have been started yet
             )
@@ -122,7 +116,10 @@ class NodeProcess:
         code = self._process.poll()
         if not code:
             return
-        end = f'was ended by {_signal_name(-code)}' if code < 0 else f'ended with exit code {code}'
+        names = {int(number): number.name for number in signal.Signals}
+        end = f'ended with exit code {code}'
+        if code < 0:
+            end = f'was ended by {names.get(-code, f"signal {-code}")}'
         lines = self._log.read_text(encoding='utf-8', errors='replace').splitlines()[-_TAIL:]
         tail = ''.join(f'\n  {line}' for line in lines)
         raise NodeFailedError(f'{self.name} {end}{remark}:{tail}\n(its whole log: {self._log})')
@@ -181,12 +178,7 @@ class Monitor:
     def __enter__(self) -> Monitor:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             self._receive_last()
         self.progress.close()
@@ -206,9 +198,7 @@ class Monitor:
         self._latest = message
 
 
-def _run_nodes(
-    plant: PlantConfig, params_file: Path, logs: Path, environment: dict[str, str]
-) -> bool:
+def _run_nodes(plant: PlantConfig, params_file: Path, logs: Path) -> bool:
     nodes: list[NodeProcess] = []
     interrupts: list[int] = []
     remark = ''
@@ -219,7 +209,7 @@ def _run_nodes(
     try:
         try:
             for name in _MODULES:
-                nodes.append(NodeProcess(name, params_file, logs / f'{name}.log', environment))  # noqa: PERF401 - those that started are stopped
+                nodes.append(NodeProcess(name, params_file, logs))  # noqa: PERF401 - those that started are stopped
             remark = _monitor(plant, nodes, interrupts)
         finally:
             for node in reversed(nodes):
@@ -256,13 +246,6 @@ def _monitor(plant: PlantConfig, nodes: list[NodeProcess], interrupts: list[int]
                     recorder.check()
             monitor.wait(0.1)
     return '' if recorder.is_running else ' while the loop went on without it'
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f'signal {number}'
 
 
 def _die_with_parent() -> None:
