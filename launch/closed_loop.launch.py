@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start the simulated arm, the controller and, if a bag is asked for, the recorder.
+"""Start the simulated arm, the controller and, with `bag`, the recorder.
 
 For instance: ros2 launch blf_dsc_controller closed_loop.launch.py mode:=lockstep bag:=run1
 """

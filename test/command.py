@@ -26,8 +26,13 @@ COMMAND = (sys.executable, '-m', 'blf_dsc_controller', 'run')
 
 def closed_loop(*arguments, **options):
     """Run the command to its end."""
+    return finished(*COMMAND, *arguments, **options)
+
+
+def finished(*command, **options):
+    """Run any command to its end."""
     return subprocess.run(
-        [*COMMAND, *map(str, arguments)],
+        [*map(str, command)],
         capture_output=True,
         text=True,
         timeout=PATIENCE,

@@ -14,7 +14,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from command import PATIENCE, PATIENT, closed_loop
+from command import PATIENT, closed_loop, finished
 from ros_rig import simulated_torques
 
 from blf_dsc_controller.bags.reader import read_run
@@ -67,21 +67,14 @@ def out(tmp_path_factory):
     out = tmp_path_factory.mktemp('run') / 'results' / 'first'
     run = closed_loop('--mode', 'lockstep', '--duration', DURATION, '--out', out)
     assert run.returncode == 0, run.stderr
-    (out / 'said.txt').write_text(run.stdout + run.stderr)
+    (out / 'output.txt').write_text(run.stdout + run.stderr)
     return out
 
 
 @pytest.fixture(scope='module')
 def reading(out):
     """Topics with types and counts, by two libraries, and the stamps of all joint states."""
-    run = subprocess.run(
-        [sys.executable, '-I', '-c', STRANGER, out / 'bag'],
-        cwd=out,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+    run = finished(sys.executable, '-I', '-c', STRANGER, out / 'bag', cwd=out)
     assert run.returncode == 0, run.stderr
     return json.loads(run.stdout)
 
@@ -131,16 +124,16 @@ def test_programs_without_this_package_read_the_whole_bag(reading, counts):
     assert sorted(stamps) == stamps
 
 
-def test_results_are_where_they_are_said_to_be(out, counts):
+def test_results_are_where_the_command_says(out, counts):
     summary = json.loads((out / 'summary.json').read_text())
     assert summary['samples'] == SAMPLES
     assert summary['tracking']['held'] is True
     assert {topic: summary['messages'][topic] for topic in counts} == counts
     for picture in ('tracking.png', 'parameters.png'):
         assert (out / picture).read_bytes().startswith(b'\x89PNG')
-    said = (out / 'said.txt').read_text()
-    assert 'bound       held by every joint' in said
-    assert f'wrote       {out}: bag, summary.json, tracking.png, parameters.png' in said
+    output = (out / 'output.txt').read_text()
+    assert 'bound       held by every joint' in output
+    assert f'wrote       {out}: bag, summary.json, tracking.png, parameters.png' in output
     for node in ('sim_plant', 'blf_dsc_controller', 'bag_recorder'):
         assert (out / 'logs' / f'{node}.log').read_text()
 
@@ -152,9 +145,9 @@ def test_the_configuration_beside_the_bag_is_the_one_that_ran(out):
 
 
 def test_in_a_log_progress_is_a_few_lines(out):
-    said = (out / 'said.txt').read_text()
-    assert '\r' not in said
-    progress = [line for line in said.splitlines() if line.startswith('closed loop ')]
+    output = (out / 'output.txt').read_text()
+    assert '\r' not in output
+    progress = [line for line in output.splitlines() if line.startswith('closed loop ')]
     assert len(progress) >= 1
     assert 'max|xi1|/bound' in progress[-1]
     assert 'parameter error' in progress[-1]
@@ -175,7 +168,7 @@ def test_real_time_reports_what_it_held(tmp_path):
     assert 'real time' in run.stdout
     assert 'late steps' in run.stdout
     for node in ('sim_plant', 'blf_dsc_controller'):
-        said = (out / 'logs' / f'{node}.log').read_text()
-        # Granted or refused, as this machine permits, but never passed over in silence.
-        assert 'SCHED_FIFO priority 10' in said
-        assert 'memory' in said
+        output = (out / 'logs' / f'{node}.log').read_text()
+        # Granted or denied, as this machine permits, but always logged.
+        assert 'SCHED_FIFO priority 10' in output
+        assert 'memory' in output

@@ -35,23 +35,23 @@ def whole(bag):
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_in_order_with_bag_and_report(running, number):
     running.process.send_signal(number)
-    code, said, complaints = running.end()
-    assert code == 130, complaints
-    assert 'Traceback' not in complaints
+    code, output, errors = running.end()
+    assert code == 130, errors
+    assert 'Traceback' not in errors
     running.wait_for_children()
     samples = whole(running.out / 'bag')
-    assert f'{samples} samples' in said
+    assert f'{samples} samples' in output
     for result in ('summary.json', 'tracking.png', 'bag/metadata.yaml'):
         assert (running.out / result).is_file()
 
 
 def test_a_node_that_is_killed_ends_the_others_and_is_named(running):
     os.kill(running.child('controller_node'), signal.SIGKILL)
-    code, _, complaints = running.end()
+    code, _, errors = running.end()
     assert code == 1
-    assert 'blf_dsc run: blf_dsc_controller was ended by SIGKILL' in complaints
-    assert f'what was recorded until then is in {running.out / "bag"}' in complaints
-    assert 'Traceback' not in complaints
+    assert 'blf_dsc run: blf_dsc_controller was ended by SIGKILL' in errors
+    assert f'what was recorded until then is in {running.out / "bag"}' in errors
+    assert 'Traceback' not in errors
     running.wait_for_children()
     assert whole(running.out / 'bag') > 100
 
@@ -65,9 +65,9 @@ def test_no_node_outlives_the_command(running):
     assert whole(bag) > 100
 
 
-def at_the_end(complaints):
+def at_the_end(errors):
     """Last line of progress."""
-    return [line for line in complaints.splitlines() if line.startswith('closed loop ')][-1]
+    return [line for line in errors.splitlines() if line.startswith('closed loop ')][-1]
 
 
 @pytest.mark.parametrize(('mode', 'duration'), [('lockstep', 20), ('realtime', 5)])

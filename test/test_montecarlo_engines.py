@@ -94,17 +94,17 @@ def killing(engine, kills):
 
 def test_killed_worker_loses_nothing(a_study, undisturbed):
     engine, kill = killing(engines.processes(2), kills=1)
-    parts, told = {}, []
+    parts, warnings = {}, []
 
     def keep(span, columns):
         assert span not in parts
         parts[span] = columns
         kill()
 
-    compute(a_study, spans(1), engine, keep, told.append)
+    compute(a_study, spans(1), engine, keep, warnings.append)
     assert same(joined(parts), undisturbed)
-    assert len(told) == 1
-    assert 'a worker was lost' in told[0]
+    assert len(warnings) == 1
+    assert 'a worker was lost' in warnings[0]
 
 
 class Broken(Executor):
@@ -115,11 +115,11 @@ class Broken(Executor):
 
 
 def test_workers_that_are_always_lost_are_given_up(a_study):
-    told = []
+    warnings = []
     engine = engines.Engine(lambda: nullcontext(Broken()), 2)
     with pytest.raises(BlfDscError, match=r'out of memory.* 24 chunks are left'):
-        compute(a_study, spans(1), engine, pytest.fail, told.append)
-    assert len(told) == RETRIES
+        compute(a_study, spans(1), engine, pytest.fail, warnings.append)
+    assert len(warnings) == RETRIES
 
 
 def test_error_of_a_run_is_no_lost_worker(a_study):

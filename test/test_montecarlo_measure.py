@@ -41,7 +41,7 @@ def plainly(a_study, run):
     motors = np.array(a_study.plant.actuator.torque_limit)
     limit[motors > 0.0] = np.minimum(limit, motors)[motors > 0.0]
     distance = np.linalg.norm(estimate - P, axis=1) / np.linalg.norm(P)
-    told = {
+    figures = {
         'first_violation_s': t[outside[0]] if outside.size else np.nan,
         'latch_time_s': t[latched[0]] if latched.size else np.nan,
         'saturated_fraction': (torque >= limit).any(axis=1).mean(),
@@ -50,10 +50,10 @@ def plainly(a_study, run):
         'parameter_error.end': distance[300],
     }
     for i, joint in enumerate(('joint1', 'joint2')):
-        told[f'max_error_ratio.{joint}'] = error[:, i].max() / 0.002
-        told[f'rms_error_rad.{joint}'] = np.sqrt(np.mean(error[200:, i] ** 2))
-        told[f'peak_torque_nm.{joint}'] = np.abs(record.measurements[:, 4 + i]).max()
-    return told
+        figures[f'max_error_ratio.{joint}'] = error[:, i].max() / 0.002
+        figures[f'rms_error_rad.{joint}'] = np.sqrt(np.mean(error[200:, i] ** 2))
+        figures[f'peak_torque_nm.{joint}'] = np.abs(record.measurements[:, 4 + i]).max()
+    return figures
 
 
 @pytest.mark.parametrize('loop', [LOOP, WEAK, MOTORS], ids=['strong', 'weak', 'motors'])
@@ -83,16 +83,16 @@ def test_loss_of_all_numbers_is_noticed_and_ends_the_run(tmp_path):
     assert np.isnan(results['parameter_error.end']).all()
 
 
-def test_start_that_the_controller_refuses_is_told_apart(tmp_path):
+def test_start_that_the_controller_rejects_has_its_own_outcome(tmp_path):
     """With noise of ten times the bound nearly every start is measured outside."""
     text = STUDY.replace('loguniform(1.0e-6, 2.0e-5)', 'choice(0.02)')
     results = whole(study(tmp_path, LOOP + text))
-    refused = results['outcome'] == 'rejected'
-    assert refused.sum() > 12
-    assert (results['first_violation_s'][refused] == 0.0).all()
+    rejected = results['outcome'] == 'rejected'
+    assert rejected.sum() > 12
+    assert (results['first_violation_s'][rejected] == 0.0).all()
     worst = np.maximum(results['max_error_ratio.joint1'], results['max_error_ratio.joint2'])
-    assert (worst[refused] >= 1.0).all()
-    assert np.isnan(results['latch_time_s'][refused]).all()
+    assert (worst[rejected] >= 1.0).all()
+    assert np.isnan(results['latch_time_s'][rejected]).all()
 
 
 def test_memory_of_one_run_is_not_seen_by_the_next(tmp_path):

@@ -101,9 +101,9 @@ def test_worst_ten_are_reproduced_by_the_commands_of_the_report(store, tmp_path,
     row = store.results()
     bag = read_run(out / 'bag')
     peak = np.abs(bag.error).max(axis=0) / 0.002
-    told = [row[f'max_error_ratio.joint{i}'][run] for i in (1, 2)]
+    expected = [row[f'max_error_ratio.joint{i}'][run] for i in (1, 2)]
     # The bag's errors are divided here in another order than in the kernel.
-    np.testing.assert_allclose(peak, told, rtol=1e-15)
+    np.testing.assert_allclose(peak, expected, rtol=1e-15)
     # The run is an ordinary configuration too.
     loop = load_loop(out / 'config.yaml')
     assert loop.plant == plant_of_run(store.study, run)
@@ -113,7 +113,7 @@ def test_worst_ten_are_reproduced_by_the_commands_of_the_report(store, tmp_path,
     assert main(arguments) == 1
 
 
-def test_run_that_is_not_what_it_was_is_told(store, tmp_path):
+def test_run_that_is_not_what_it_was_is_reported(store, tmp_path):
     folder = tmp_path / 'tampered'
     other = Store.create_or_open(folder, store.study)
     results = store.results()
@@ -124,16 +124,9 @@ def test_run_that_is_not_what_it_was_is_told(store, tmp_path):
         reproduce(other, 4, tmp_path / 'run')
 
 
-def test_run_that_is_not_there_is_told(store, tmp_path, capsys):
-    command = [
-        'monte-carlo',
-        '--reproduce',
-        str(store.folder),
-        '24',
-        '--out',
-        str(tmp_path / 'run'),
-    ]
-    assert main(command) == 1
+def test_run_that_is_not_there_is_reported(store, tmp_path, capsys):
+    out = str(tmp_path / 'run')
+    assert main(['monte-carlo', '--reproduce', str(store.folder), '24', '--out', out]) == 1
     assert 'has no run 24' in capsys.readouterr().err
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A study goes on where it was killed, and never mixes with another one."""
+"""An interrupted study resumes, and never mixes with another one."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_pyarrow_alone_reads_the_results(store):
         ('window: 0.1', 'window: 0.12', r'learning.window: there 0.1, here 0.12'),
     ],
 )
-def test_other_study_is_refused_and_the_difference_named(
+def test_other_study_is_rejected_and_the_difference_named(
     tmp_path, store, before, after, difference
 ):
     other = study(tmp_path, (LOOP + STUDY).replace(before, after, 1))
@@ -143,7 +143,7 @@ def test_other_study_is_refused_and_the_difference_named(
     assert Store(store.folder).study == store.study
 
 
-def test_other_version_is_refused(store, monkeypatch):
+def test_other_version_is_rejected(store, monkeypatch):
     now = stores.versions()
     monkeypatch.setattr(stores, 'versions', lambda: now | {'kernels': 'of tomorrow'})
     with pytest.raises(BlfDscError, match=r'kernels: there .*, here of tomorrow'):

@@ -102,7 +102,7 @@ def test_preset_is_a_study_of_ten_thousand_runs():
         ('monte_carlo:', 'monte:', r'there is no section monte_carlo'),
     ],
 )
-def test_what_is_wrong_is_said(tmp_path, before, after, expected):
+def test_problems_are_named(tmp_path, before, after, expected):
     text = LOOP + STUDY
     assert before in text
     with pytest.raises(ConfigurationError, match=expected) as error:
@@ -110,7 +110,7 @@ def test_what_is_wrong_is_said(tmp_path, before, after, expected):
     assert str(tmp_path / 'study.yaml') in str(error.value)
 
 
-def test_everything_wrong_is_said_at_once(tmp_path):
+def test_all_problems_are_named_at_once(tmp_path):
     text = (LOOP + STUDY).replace('seed: 7', 'seed: -7').replace('arm.m2', 'arm.m3')
     with pytest.raises(ConfigurationError) as error:
         study(tmp_path, text.replace('window: 0.1', 'window: -0.1'))

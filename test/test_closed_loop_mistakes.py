@@ -4,11 +4,10 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 
 import pytest
-from command import PATIENCE, closed_loop
+from command import closed_loop, finished
 
 WITHOUT_ROS = """
 import sys
@@ -24,6 +23,7 @@ from blf_dsc_controller.cli import main
 command = sys.argv.pop(1)
 sys.exit(getattr(main, command)())
 """
+PLANT_NODE = (sys.executable, '-m', 'sim_plant.node', '--ros-args')
 
 
 def written(folder, plant='', controller=''):
@@ -37,7 +37,7 @@ def written(folder, plant='', controller=''):
 
 
 @pytest.mark.parametrize(
-    ('plant', 'controller', 'told'),
+    ('plant', 'controller', 'expected'),
     [
         ('', 'barier.bound: [0.1, 0.1]', 'barier.bound: unknown parameter'),
         ('', 'barrier.bound: [0.1]', 'barrier.bound: got 1 entry, but 2 are needed'),
@@ -51,14 +51,14 @@ def written(folder, plant='', controller=''):
         ),
     ],
 )
-def test_a_configuration_that_cannot_run_is_refused_before_anything_starts(
-    tmp_path, plant, controller, told
+def test_a_configuration_that_cannot_run_is_rejected_before_anything_starts(
+    tmp_path, plant, controller, expected
 ):
     out = tmp_path / 'out'
     run = closed_loop('--config', written(tmp_path, plant, controller), '--out', out)
     assert run.returncode == 1
     assert run.stderr.startswith('blf_dsc run: ')
-    assert told in run.stderr
+    assert expected in run.stderr
     assert 'Traceback' not in run.stderr
     assert run.stdout == ''
     assert not out.exists()
@@ -99,13 +99,7 @@ def test_a_file_that_is_not_there_is_named_with_the_presets(tmp_path):
 )
 def test_without_ros_it_is_said_where_to_get_it(tmp_path, command):
     out = tmp_path / 'out'
-    run = subprocess.run(
-        [sys.executable, '-c', WITHOUT_ROS, command, '--out', out],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+    run = finished(sys.executable, '-c', WITHOUT_ROS, command, '--out', out)
     assert run.returncode == 1, run.stderr
     assert 'ROS 2 cannot be imported' in run.stderr
     assert 'source /opt/ros/jazzy/setup.bash' in run.stderr
@@ -115,60 +109,33 @@ def test_without_ros_it_is_said_where_to_get_it(tmp_path, command):
 
 def test_offline_needs_no_ros(tmp_path):
     out = tmp_path / 'out'
-    run = subprocess.run(
-        [
-            sys.executable,
-            '-c',
-            WITHOUT_ROS,
-            'closed_loop',
-            '--offline',
-            '--duration',
-            '0.1',
-            '--out',
-            out,
-        ],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+    offline = ('closed_loop', '--offline', '--duration', 0.1, '--out', out)
+    run = finished(sys.executable, '-c', WITHOUT_ROS, *offline)
     assert run.returncode == 0, run.stderr
     assert (out / 'bag' / 'metadata.yaml').is_file()
 
 
 @pytest.mark.parametrize(
-    ('content', 'told'),
+    ('content', 'expected'),
     [
         ('sim_plant:\n  ros__parameters:\n    seed: [1,\n', 'params'),
         ('sim_plant:\n  ros__parameters:\n    sede: 1\n', 'sede: unknown parameter'),
     ],
     ids=['no YAML', 'unknown name'],
 )
-def test_a_node_says_what_is_wrong_with_its_file(tmp_path, content, told):
+def test_a_node_says_what_is_wrong_with_its_file(tmp_path, content, expected):
     pytest.importorskip('rclpy', reason='needs ROS 2')
     path = tmp_path / 'given.yaml'
     path.write_text(content)
-    run = subprocess.run(
-        [sys.executable, '-m', 'sim_plant.node', '--ros-args', '--params-file', path],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+    run = finished(*PLANT_NODE, '--params-file', path)
     assert run.returncode == 1
-    assert told in run.stderr
+    assert expected in run.stderr
     assert 'Traceback' not in run.stderr
 
 
 def test_a_node_says_which_argument_ros_does_not_know():
     pytest.importorskip('rclpy', reason='needs ROS 2')
-    run = subprocess.run(
-        [sys.executable, '-m', 'sim_plant.node', '--ros-args', '--param', 'seed:=1', '--sede'],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+    run = finished(*PLANT_NODE, '--param', 'seed:=1', '--sede')
     assert run.returncode == 1
     assert '--sede' in run.stderr
     assert 'Traceback' not in run.stderr
