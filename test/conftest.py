@@ -30,7 +30,7 @@ atexit.register(shutil.rmtree, _LOG_FOLDER, ignore_errors=True)
 _FIRST = (
     'test_closed_loop',
     'test_presets',
-    'test_montecarlo',
+    'test_monte_carlo',
     'test_benchmark',
     'test_bag_recorder',
     'test_replay',

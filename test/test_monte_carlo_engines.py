@@ -10,7 +10,7 @@ from contextlib import contextmanager, nullcontext
 
 import numpy as np
 import pytest
-from montecarlo_case import RUNS, same, study, whole
+from monte_carlo_case import RUNS, same, study, whole
 
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.monte_carlo import executors as engines

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from montecarlo_case import LOOP, STUDY, study, write
+from monte_carlo_case import LOOP, STUDY, study, write
 from scipy import stats
 
 from blf_dsc_controller.configuration.params_file import locate

@@ -12,7 +12,7 @@ import matplotlib.image
 import numpy as np
 import pyarrow.parquet
 import pytest
-from montecarlo_case import RUNS, study, whole
+from monte_carlo_case import RUNS, study, whole
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from montecarlo_case import LOOP, STUDY, study, whole
+from monte_carlo_case import LOOP, STUDY, study, whole
 
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.monte_carlo.report import plant_of_run

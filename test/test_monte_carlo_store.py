@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pyarrow.parquet
 import pytest
-from montecarlo_case import LOOP, RUNS, STUDY, same, study, whole, write
+from monte_carlo_case import LOOP, RUNS, STUDY, same, study, whole, write
 
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.errors import BlfDscError
