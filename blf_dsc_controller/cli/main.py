@@ -97,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     )
 
     def command(
-        name: str, handler: tuple[str, str], summary: str, about: str, example: str
+        name: str, module: str, summary: str, about: str, example: str
     ) -> argparse.ArgumentParser:
         one = commands.add_parser(
             name,
@@ -106,13 +106,13 @@ def _parser() -> argparse.ArgumentParser:
             epilog=f'Example:\n  blf_dsc {name} {example}',
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        one.set_defaults(handler=handler)
+        one.set_defaults(handler=(module, name.replace('-', '_')))
         return one
 
     _run_options(
         command(
             'run',
-            ('run', 'run'),
+            'run',
             'run the closed loop and draw what it did',
             'Run the simulated arm, the controller and the recorder over ROS 2, and draw what '
             'they did: a bag, pictures and summary.json in a new folder.',
@@ -122,7 +122,7 @@ def _parser() -> argparse.ArgumentParser:
     _replay_options(
         command(
             'replay',
-            ('replay', 'replay'),
+            'replay',
             'run a bag through the controller again and compare bit for bit',
             'Feed the joint states of a bag through the controller with the recorded '
             'configuration, and compare every output bit for bit. '
@@ -132,7 +132,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     report = command(
         'report',
-        ('bags', 'report'),
+        'bags',
         'show one or several bags on one HTML page',
         'Write one HTML page that shows a bag, or several over each other: plots to zoom into, '
         'events, configuration and the moving arm. It needs no network.',
@@ -142,7 +142,7 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument('--out', type=Path, default=Path('report.html'), help='file (report.html)')
     recover = command(
         'recover',
-        ('bags', 'recover'),
+        'bags',
         'make a clean bag of a damaged one',
         'Make a clean bag of one that was cut off or damaged, and list what was lost. '
         'The damaged bag is not touched.',
@@ -152,7 +152,7 @@ def _parser() -> argparse.ArgumentParser:
     recover.add_argument('--out', type=Path, help='new folder (BAG_recovered)')
     export = command(
         'export',
-        ('bags', 'export'),
+        'bags',
         'write a bag as a table, in CSV or Parquet',
         'Write the series of a bag as one table, a row for each joint state.',
         'run1/bag --out run1.csv',
@@ -161,7 +161,7 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument('--out', type=Path, required=True, help='FILE.csv or FILE.parquet')
     plot = command(
         'plot',
-        ('bags', 'plot'),
+        'bags',
         'draw a bag and summarise it',
         'Draw tracking.png and parameters.png of a bag and write summary.json.',
         'run1/bag --out pictures',
@@ -173,7 +173,7 @@ def _parser() -> argparse.ArgumentParser:
     _excite_options(
         command(
             'excite',
-            ('excite', 'excite'),
+            'excite',
             'find a reference that excites the learning',
             'Find the sum of sinusoids, of the period of the learning window, that excites the '
             'learning most within the limits of joints and torque, and write it as a preset.',
@@ -182,7 +182,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     paper = command(
         'paper',
-        ('studies', 'paper'),
+        'studies',
         "compare all laws in the paper's simulation",
         "Run the paper's simulation with every law, check its claims, and find where each law "
         'breaks; offline, on all cores.',
@@ -194,7 +194,7 @@ def _parser() -> argparse.ArgumentParser:
     _monte_carlo_options(
         command(
             'monte-carlo',
-            ('studies', 'monte_carlo'),
+            'studies',
             'run a study of many random plants',
             'Run thousands of closed loops with random plants, in parallel, and report how many '
             'kept the bound. Interrupted studies resume: start the same command again.',
