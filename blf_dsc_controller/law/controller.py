@@ -75,7 +75,7 @@ class Controller:
     def bound_at(self, t: float) -> np.ndarray:
         """Bound k(t) (n,) [rad] at a time [s] since the start."""
         barrier.update_bound(self.settings, self.signals, t)
-        return self.signals.bound.copy()
+        return np.array(self.signals.bound)
 
     def reference_at(self, t: float) -> np.ndarray:
         """Reference at a time [s] since the start: qr, dqr, ddqr (3, n)."""
@@ -119,7 +119,7 @@ class Controller:
 
     def save(self) -> np.ndarray:
         """Copy of the whole state."""
-        return self.state_vector.copy()
+        return np.array(self.state_vector)
 
     def restore(self, saved: np.ndarray) -> None:
         """Return to a saved state; the loop continues from there bit for bit."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from enum import StrEnum
+from enum import Enum
 from typing import Any, NamedTuple
 
 from blf_dsc_controller.errors import BlfDscError
@@ -17,8 +17,10 @@ from blf_dsc_controller.messages.topics import JOURNAL
 from blf_dsc_controller.messages.types import typestore
 
 
-class EventType(StrEnum):
+class EventType(str, Enum):
     """What happened, with the content of its event."""
+
+    __str__ = str.__str__
 
     CONFIGURE = 'configure'  # parameters: all of them by name
     ACTIVATE = 'activate'

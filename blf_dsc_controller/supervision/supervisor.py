@@ -7,7 +7,7 @@ The supervisor reads no clock: the same calls lead to the same stops.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from enum import Enum, StrEnum
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,10 @@ Vector = NDArray[np.float64]
 _NANO = 1e-9
 
 
-class Phase(StrEnum):
+class Phase(str, Enum):
     """What the controller is doing."""
+
+    __str__ = str.__str__
 
     INACTIVE = 'inactive'  # not in command: the safe torque, or on the ramp to it
     STARTING = 'starting'  # waiting for the first joint state
@@ -32,8 +34,10 @@ class Phase(StrEnum):
     SAFE_STOP = 'safe stop'  # the safe torque until the next reset or activation
 
 
-class Reason(StrEnum):
+class Reason(str, Enum):
     """Why the controller stopped."""
+
+    __str__ = str.__str__
 
     NONE = 'none'
     STATE_TIMEOUT = 'state timeout'
