@@ -113,6 +113,12 @@ def test_any_damage_is_survived(whole, tmp_path_factory, data):
     recovery = recover(damaged(folder / 'bag', content), folder / 'clean')
     written = set(read(whole.parent))
     assert set(read(recovery.path)) <= written
+    # Schemas and channels are in the first chunk and, again, behind the last one; a message without
+    # either has no topic.
+    (first, *_, last) = chunks(original)
+    defined = not any(first[0] <= place < first[1] for place in places)
+    if not defined and any(place >= last[1] for place in places):
+        return
     # A chunk is lost with itself alone; its neighbours' records in between may hide one more.
     hit = sum(any(at <= place < end for place in places) for at, end, _ in chunks(original))
     outside = sum(not any(a <= place < e for a, e, _ in chunks(original)) for place in places)
