@@ -23,13 +23,17 @@ _ROUNDS = 9
 _UPDATES = 2000
 _T = 1e-3  # s
 _NOISE = (1e-4, 0.05)  # rad, rad/s: beside the reference, so that every column is excited
+_ANY_RESIDUAL = 1e6  # N m: the states are noise, which no arm explains
 _ANY_EXCITATION = 1e-12
 """A threshold that every window passes: short ones and those of many columns, too."""
 
 
 def two_link(**changes: Any) -> ControllerConfig:
     """Recommended settings that learn from any window."""
-    values = {'learning.excitation_threshold': _ANY_EXCITATION}
+    values = {
+        'learning.excitation_threshold': _ANY_EXCITATION,
+        'learning.residual_floor': _ANY_RESIDUAL,
+    }
     return build(ControllerConfig, values | {k.replace('__', '.'): v for k, v in changes.items()})
 
 

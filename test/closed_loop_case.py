@@ -34,10 +34,13 @@ QUIET = (0.0, 0.0)
 
 
 def recommended(*, bias: bool = True, **changes) -> Settings:
-    """Settings of the default configuration, with changes; the knee follows the barrier's."""
+    """Settings of the default configuration, with changes; the knee follows the barrier's.
+
+    Without change detection, which is not the paper's: test_law_consistency.py is about it.
+    """
     config = ControllerConfig()
     config = replace(config, learning=replace(config.learning, bias=bias))
-    settings = settings_of_config(config)._replace(**changes)
+    settings = settings_of_config(config)._replace(**{'change_detection': 0} | changes)
     barriers = zip(settings.bound, settings.weight, settings.slope_limit, strict=True)
     return settings._replace(knee=np.array([barrier.knee(*each) for each in barriers]))
 

@@ -63,7 +63,9 @@ def excited_case(seed):
     random = np.random.default_rng(seed)
     for _ in range(settings.window):
         signals.row[:] = random.normal(size=signals.row.shape)
-        cursor = excitation.push_row(state.ring, cursor, state.running, state.fresh, signals.row)
+        cursor = excitation.push_row(
+            state.ring, cursor, state.running, state.fresh, signals.row, is_full=True
+        )
     return case
 
 
@@ -75,7 +77,7 @@ def excited():
 def settled_look(case, t):
     """The looks of a while: the first starts from no direction in particular."""
     for _ in range(50):
-        excitation.update_excitation(*case, t)
+        excitation.update_excitation(*case, t, 1e-3)
 
 
 @pytest.mark.parametrize('seed', range(5))

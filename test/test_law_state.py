@@ -102,11 +102,11 @@ def test_state_has_the_shapes_it_is_documented_with():
         {
             (1,): 'samples cursor rows latched latch_time lambda_min',
             (n,): 'alpha2 torque disturbance',
-            (m,): 'estimate b min_eigenvector',
+            (m,): 'estimate b solution anchor min_eigenvector',
             (n, p): 'momentum',
             (n, m): 'rest',
             (n, m + 1): 'filter1 filter2',
-            (m, m + 1): 'running fresh',
+            (m + 1, m + 1): 'running fresh',
             (m, m): 'Phi factor',
             (N, n, m + 1): 'ring',
         },

@@ -17,14 +17,17 @@ class Window:
 
     def __init__(self, n, m, length):
         self.ring = np.zeros((length, n, m + 1))
-        self.running, self.fresh, self.naive = np.zeros((3, m, m + 1))
+        self.running, self.fresh, self.naive = np.zeros((3, m + 1, m + 1))
         self.cursor = 0
         self.history = []
 
     def push(self, row):
         oldest = self.ring[self.cursor].copy()
         self.naive += terms(row) - terms(oldest)
-        self.cursor = excitation.push_row(self.ring, self.cursor, self.running, self.fresh, row)
+        is_full = len(self.history) == len(self.ring)
+        self.cursor = excitation.push_row(
+            self.ring, self.cursor, self.running, self.fresh, row, is_full
+        )
         self.history = [*self.history, row][-len(self.ring) :]
 
     def direct(self):
@@ -32,15 +35,15 @@ class Window:
         return sum(map(terms, self.history))
 
     def average(self):
-        m = len(self.running)
+        m = len(self.running) - 1
         Phi, b = np.full((m, m), np.nan), np.full(m, np.nan)
         excitation.average_window(self.running, len(self.history), Phi, b)
         return Phi, b
 
 
 def terms(row):
-    """X^T [X | u] (m, m + 1), of which the window keeps the upper triangle and the last column."""
-    return np.triu(sum(np.outer(joint[:-1], joint) for joint in row))
+    """[X | u]^T [X | u] (m + 1, m + 1), of which the window keeps the upper triangle."""
+    return np.triu(sum(np.outer(joint, joint) for joint in row))
 
 
 @examples(deadline=None, max_examples=40)

@@ -73,7 +73,7 @@ def test_every_number_is_the_same(bag):
         'commands': 2 * SAMPLES,
         'tracking_error': 6 * SAMPLES,
         'reference': 4 * SAMPLES,
-        'learning': 9 * SAMPLES,  # three parameters, two biases, two disturbances, two more
+        'learning': 10 * SAMPLES,  # three parameters, two biases, two disturbances, three more
         'monitor': 11 * 101,  # two ratios, two distances, five estimates, two more
     }
     assert [one.left_out for one in result.comparisons if one.left_out] == ['compute_time']
@@ -108,7 +108,7 @@ def test_the_learning_has_begun_in_that_bag(bag):
         (COMMANDS, -8, 'effort of joint2'),
         (TRACKING_ERROR, -8, 'effort of joint2'),
         (REFERENCE, -8 - 4, 'velocity of joint2'),  # behind it the empty effort
-        (LEARNING, -16, 'latched'),  # behind it compute_time, velocity and effort
+        (LEARNING, -24, 'latched'),  # behind it model_changes, compute_time, velocity and effort
     ],
 )
 def test_one_flipped_bit_is_found_and_named(entries, rewritten, topic, at, field):

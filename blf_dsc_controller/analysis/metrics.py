@@ -10,7 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.messages.topics import BIAS, COMPUTE_TIME, DISTURBANCE, LAMBDA_MIN, LATCHED
+from blf_dsc_controller.messages.topics import (
+    BIAS,
+    COMPUTE_TIME,
+    DISTURBANCE,
+    LAMBDA_MIN,
+    LATCHED,
+    MODEL_CHANGES,
+)
 from blf_dsc_controller.run import Floats, Run
 
 MOMENTS = (5, 10, 20, 40, 60)
@@ -18,7 +25,7 @@ MOMENTS = (5, 10, 20, 40, 60)
 
 _LEARNED = 0.01
 _TAIL = 10.0  # s
-_NO_PARAMETERS = (DISTURBANCE, BIAS, LAMBDA_MIN, LATCHED, COMPUTE_TIME)
+_NO_PARAMETERS = (DISTURBANCE, BIAS, LAMBDA_MIN, LATCHED, MODEL_CHANGES, COMPUTE_TIME)
 
 
 @dataclass(frozen=True)
@@ -63,6 +70,14 @@ def latch_time(run: Run) -> float | None:
         return None
     latched = np.flatnonzero(run.learning.column(LATCHED) > 0.5)
     return float(run.time_of(run.learning.stamp)[latched[0]]) if latched.size else None
+
+
+def change_times(run: Run) -> list[float]:
+    """Times [s] at which the controller found that the arm had changed."""
+    if run.learning is None or MODEL_CHANGES not in run.learning.names:
+        return []
+    rises = np.flatnonzero(np.diff(run.learning.column(MODEL_CHANGES), prepend=0.0) > 0.0)
+    return [float(t) for t in run.time_of(run.learning.stamp[rises])]
 
 
 def outside(run: Run) -> NDArray[np.bool_] | None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.analysis.metrics import latch_time, outside
+from blf_dsc_controller.analysis.metrics import change_times, latch_time, outside
 from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.sources import open_bag
@@ -98,6 +98,8 @@ def _events(run: Run) -> Iterator[Event]:
     latched, violated = latch_time(run), outside(run)
     if latched is not None:
         yield Event(latched, 'learning', 'the first window was excited enough: learning began')
+    for t in change_times(run):
+        yield Event(t, 'learning', 'the arm has changed: learning started anew')
     for column, reason in run.rejected.items():
         text = reason or f'{column} is not estimated: its column was rejected'
         yield Event(run.duration, 'learning', text)

@@ -11,7 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.analysis.metrics import Estimates, Metrics, estimates_of, measure
+from blf_dsc_controller.analysis.metrics import (
+    Estimates,
+    Metrics,
+    change_times,
+    estimates_of,
+    measure,
+)
 from blf_dsc_controller.messages.topics import COMPUTE_TIME, LATE_STEPS, LATENCY
 from blf_dsc_controller.run import Floats, Run, Series
 
@@ -78,6 +84,7 @@ def _learning(run: Run, estimates: Estimates, metrics: Metrics) -> Summary:
     learning: Summary = plain(
         {
             'latch_time_s': metrics.latch_time,
+            'model_changes_s': change_times(run),
             'relative_error_at_s': reached if is_known else None,
             'final_relative_error': metrics.final_parameter_error,
             'time_to_1_percent_s': metrics.time_to_1_percent,
@@ -153,6 +160,9 @@ def _sentences(summary: Summary) -> Iterator[str]:
 def _learning_lines(learning: Summary) -> Iterator[str]:
     latched = learning['latch_time_s']
     yield f'learning    {"never began" if latched is None else f"began at {latched:.3f} s"}'
+    if learning['model_changes_s']:
+        times = ', '.join(f'{t:.3f} s' for t in learning['model_changes_s'])
+        yield f'arm         changed at {times}: learning started anew'
     for column, reason in learning['rejected_columns'].items():
         yield f'rejected    {reason or f"{column}: see the log for the reason"}'
     if learning['final_relative_error'] is None:

@@ -77,6 +77,16 @@ class Learning:
     radius: float = positive(
         3.0, 'radius of the projection ball of the estimate', 'kg m^2', 'omega_a'
     )
+    change_detection: bool = _size(
+        True, 'discard the window when torques contradict it: payload, contact, a changed arm'
+    )
+    residual_floor: float = positive(
+        0.07, 'unmodelled torque (rms) of a joint that is not taken for a change of the arm', 'N m'
+    )
+    anchor_weight: float = non_negative(
+        0.1, 'pull to the estimate before a change, until the new window is full'
+    )
+    column_gain: float = positive(1.0, 'adaptation gain of the disturbance columns')
     interval: int = _size(
         10, 'samples between two eigenvalue checks of the excitation matrix', 'samples', at_least=1
     )

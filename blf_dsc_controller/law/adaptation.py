@@ -37,12 +37,18 @@ def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturat
     """Step theta^ and d^3 by `dt` [s]: (20), (30).
 
     While a torque is saturated the tracking error reflects the limit, not the parameters: then only
-    the prediction error, which uses the applied torque, adapts.
+    the prediction error, which uses the applied torque, adapts.  Where a full window is not
+    excited, as in standing still, H^T xi2 is correlated noise and P^ is held (`change_detection`).
     """
     prediction_error(settings, state, signals)
+    unexcited = (
+        settings.change_detection == 1
+        and state.rows[0] == settings.window
+        and state.lambda_min[0] < settings.sigma
+    )
     for j in range(settings.m):
         tracking = 0.0
-        if j < settings.p and not saturated:
+        if j < settings.p and not saturated and not unexcited:
             for i in range(settings.n):
                 tracking += signals.H[i, j] * signals.xi2[i]
             tracking += settings.Wc * state.estimate[j]

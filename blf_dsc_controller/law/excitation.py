@@ -14,7 +14,7 @@ from math import sqrt
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import called, inner
-from blf_dsc_controller.law import cholesky
+from blf_dsc_controller.law import cholesky, consistency
 from blf_dsc_controller.law.settings import BEST, Settings
 from blf_dsc_controller.law.state import Signals, State
 
@@ -24,24 +24,30 @@ _COLD = 60  # from any direction
 
 @inner
 def push_row(
-    ring: np.ndarray, cursor: int, running: np.ndarray, fresh: np.ndarray, row: np.ndarray
+    ring: np.ndarray,
+    cursor: int,
+    running: np.ndarray,
+    fresh: np.ndarray,
+    row: np.ndarray,
+    is_full: bool,
 ) -> int:
     """Replace the oldest row of the window by `row` and return the next cursor.
 
-    `ring` (N, n, m + 1) has the oldest row at `cursor` and zeros before it is full; `running` S and
-    `fresh` F (m, m + 1) are filled in the upper triangle and the last column; `row` is [X | u]
-    (n, m + 1).
+    `ring` (N, n, m + 1) has the oldest row at `cursor`, which counts once the window is full;
+    `running` S and `fresh` F (m + 1, m + 1), the sums of [X | u]^T [X | u], are filled in the upper
+    triangle; `row` is [X | u] (n, m + 1).
     """
     old = ring[cursor]
     n = row.shape[0]
     m = row.shape[1] - 1
-    for a in range(m):
+    keep = 1.0 if is_full else 0.0
+    for a in range(m + 1):
         for b in range(a, m + 1):
             new_term = 0.0
             old_term = 0.0
             for i in range(n):
                 new_term += row[i, a] * row[i, b]
-                old_term += old[i, a] * old[i, b]
+                old_term += keep * old[i, a] * old[i, b]
             running[a, b] += new_term - old_term
             fresh[a, b] += new_term
     for i in range(n):
@@ -50,7 +56,7 @@ def push_row(
     cursor += 1
     if cursor < ring.shape[0]:
         return cursor
-    for a in range(m):
+    for a in range(m + 1):
         for b in range(a, m + 1):
             running[a, b] = fresh[a, b]
             fresh[a, b] = 0.0
@@ -185,20 +191,45 @@ def reject_columns(settings: Settings, state: State, signals: Signals) -> None:
 
 
 @inner
-def update_excitation(settings: Settings, state: State, signals: Signals, t: float) -> None:
-    """Compute lambda_min of the window; latch it from tau_d + T_a on if it suffices (27)."""
-    learning = t >= settings.learning_start
+def readmit_columns(settings: Settings, state: State, signals: Signals) -> None:
+    """Check rejected columns again, once a window: a later one may tell them apart."""
+    rejected = 0.0
+    for j in range(settings.p, settings.m):
+        rejected += 1.0 - state.active[j]
+    if rejected == 0.0 or state.cursor[0] >= settings.interval:
+        return
+    reject_columns(settings, state, signals)
+
+
+@inner
+def update_excitation(
+    settings: Settings, state: State, signals: Signals, t: float, dt: float
+) -> None:
+    """Compute lambda_min of the window; latch it from tau_d + T_a on if it suffices (27).
+
+    After a change of the arm a window need not be full, but must have lasted T_a.
+    """
+    if state.rows[0] == 0.0:
+        return
+    settling_time = settings.learning_start - settings.window * dt
+    settled = state.rows[0] == settings.window or state.rows[0] * dt >= settling_time
+    learning = t >= settings.learning_start and settled
     if learning and state.columns_checked[0] == 0.0:
         reject_columns(settings, state, signals)
+    elif learning:
+        readmit_columns(settings, state, signals)
     value = window_excitation(settings, state, signals, _WARM)
     state.lambda_min[0] = value
     better = settings.latch != BEST or value > state.latched_lambda[0]
-    if learning and value >= settings.sigma and better:
-        for i in range(settings.m):
-            state.b[i] = signals.b[i]
-            for j in range(settings.m):
-                state.Phi[i, j] = signals.Phi[i, j]
-                state.factor[i, j] = signals.factor[i, j]
-        state.latched[0] = 1.0
-        state.latched_lambda[0] = value
-        state.latch_time[0] = t
+    if not (learning and value >= settings.sigma and better):
+        return
+    if settings.change_detection == 1 and not consistency.accept_window(settings, state, signals):
+        return
+    for i in range(settings.m):
+        state.b[i] = signals.b[i]
+        for j in range(settings.m):
+            state.Phi[i, j] = signals.Phi[i, j]
+            state.factor[i, j] = signals.factor[i, j]
+    state.latched[0] = 1.0
+    state.latched_lambda[0] = value
+    state.latch_time[0] = t

@@ -29,9 +29,6 @@ from blf_dsc_controller.law.settings import (
 )
 from blf_dsc_controller.reference.approach import plan_start, reference_of
 
-COLUMN_GAIN = 1.0
-"""Entry of Gamma for the disturbance columns: they do not act on the torque."""
-
 
 def model_of(config: ControllerConfig) -> ArmModel:
     """Model named by `model`, with the geometry known to the controller."""
@@ -86,6 +83,8 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         tones=len(learning.frequencies),
         truth_known=int(bool(truth.parameters)),
         feed_forward=int(truth.feed_forward),
+        # Lambda is a heuristic: its rows contradict each other on any arm.
+        change_detection=int(learning.change_detection and learning.prediction != 'lambda'),
         time_constant=config.surface.time_constant,
         boundary_layer=config.feedback.boundary_layer,
         eta=config.disturbance.leakage,
@@ -93,6 +92,8 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         rho=learning.regularization,
         sigma=learning.excitation_threshold,
         learning_start=learning.window + learning.settling_time,
+        residual_floor=learning.residual_floor,
+        anchor_weight=learning.anchor_weight,
         pole=learning.filter_pole,
         omega=learning.derivative_filter,
         coulomb_velocity=learning.coulomb_velocity,
@@ -113,7 +114,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         torque_limit=np.array(config.torque.limit),
         rate_limit=np.array(config.torque.rate_limit),
         true_disturbance=np.array((truth.constant, truth.amplitude, truth.frequency, truth.phase)),
-        Gamma=np.array(learning.adaptation_gain + (COLUMN_GAIN,) * columns),
+        Gamma=np.array(learning.adaptation_gain + (learning.column_gain,) * columns),
         initial_estimate=np.array(learning.initial_estimate + (0.0,) * columns),
         true_parameters=np.array(truth.parameters or (0.0,) * p),
         frequencies=np.array(learning.frequencies),
@@ -130,6 +131,7 @@ def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
         'd2': nothing,
         'gamma': nothing,
         'kappa': 0.0,
+        'change_detection': 0,
     }
     laws: dict[str, dict[str, Any]] = {
         'blf_dsc': {},

@@ -38,7 +38,7 @@ def rejected_columns(controller: Controller, names: Sequence[str]) -> tuple[Reje
     rejected = np.flatnonzero(state.active == 0.0)
     if controller.settings.kappa == 0.0 or state.columns_checked[0] == 0.0:
         return ()
-    upper = np.triu(state.running[:, :-1])
+    upper = np.triu(state.running[:-1, :-1])
     Phi = upper + np.triu(upper, 1).T
     kept = np.flatnonzero(state.active > 0.0)
     return tuple(_explained(Phi, int(column), kept, names) for column in rejected)

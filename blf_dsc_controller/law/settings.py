@@ -46,6 +46,7 @@ class Settings(NamedTuple):
     tones: int  # sine and cosine columns per joint, for as many frequencies
     truth_known: int  # 1: true_parameters and true_disturbance hold
     feed_forward: int  # 1: the true disturbance is compensated
+    change_detection: int  # 1: windows must be consistent (see `consistency`)
     time_constant: float  # lambda of (13), s
     boundary_layer: float  # b, rad/s
     eta: float  # leakage of (30)
@@ -53,6 +54,8 @@ class Settings(NamedTuple):
     rho: float  # regularisation of the Newton update
     sigma: float  # excitation threshold on lambda_min(Phi)
     learning_start: float  # tau_d + T_a, s
+    residual_floor: float  # unmodelled torque of a joint that is consistent, N m
+    anchor_weight: float  # pull to `anchor` while the window is empty
     pole: float  # of the regressor filter, rad/s
     omega: float  # of the differentiating filter (8), rad/s
     coulomb_velocity: float  # rad/s

@@ -23,6 +23,12 @@ class State(NamedTuple):
     lambda_min: Cell  # of Phi at the last check
     latched_lambda: Cell  # lambda_min of the latched window
     columns_checked: Cell  # 1 once the disturbance columns are accepted or rejected
+    residual: Cell  # mean square torque residual of the latched window, (N m)^2
+    least_residual: Cell  # the lowest of any full window, (N m)^2
+    recent_residual: Cell  # of the last rows to `solution`, (N m)^2
+    changes: Cell  # times that the arm was found to have changed
+    change_time: Cell  # of the last, s
+    contradiction: Cell  # `recent_residual` at the last change, (N m)^2
     alpha2: Annotated[Array, 'n']  # rad/s
     torque: Annotated[Array, 'n']  # torque commanded last, N m
     disturbance: Annotated[Array, 'n']  # d^3, N m
@@ -35,11 +41,13 @@ class State(NamedTuple):
     rest: Annotated[Array, 'n', 'm']  # [Yr | columns] of the last sample
     filter1: Annotated[Array, 'n', 'm + 1']  # first pole of the regressor filter
     filter2: Annotated[Array, 'n', 'm + 1']  # second pole
-    running: Annotated[Array, 'm', 'm + 1']  # S of the window
-    fresh: Annotated[Array, 'm', 'm + 1']  # F of the window
+    running: Annotated[Array, 'm + 1', 'm + 1']  # S of the window
+    fresh: Annotated[Array, 'm + 1', 'm + 1']  # F of the window
     Phi: Annotated[Array, 'm', 'm']  # latched Phi_e
     b: Annotated[Array, 'm']  # latched b_e
     factor: Annotated[Array, 'm', 'm']  # Cholesky factor of Phi_e + rho I
+    solution: Annotated[Array, 'm']  # of the latched window, (Phi_e + rho I)^-1 b_e
+    anchor: Annotated[Array, 'm']  # theta^ when the arm was found to have changed
     min_eigenvector: Annotated[Array, 'm']  # of Phi, a unit vector
     active: Annotated[Array, 'm']  # 0 where a disturbance column has been rejected
     ring: Annotated[Array, 'window', 'n', 'm + 1']  # the window's rows
@@ -89,6 +97,7 @@ class Sample(NamedTuple):
     lyapunov: Annotated[Array, 4]  # terms of (29): error, kinetic, parameters, disturbance; or NaN
     lambda_min: Cell  # of the present window's Phi
     latched: Cell  # 0 or 1
+    changes: Cell  # times that the arm was found to have changed
 
 
 state_of, state_size = view_of(State), size_of(State)

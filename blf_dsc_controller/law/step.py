@@ -15,6 +15,7 @@ from blf_dsc_controller.compiled.views import part
 from blf_dsc_controller.law import (
     adaptation,
     barrier,
+    consistency,
     excitation,
     prediction,
     saturation,
@@ -55,13 +56,16 @@ def update_window(
     prediction.form_row(settings, state, signals, dt, q, dq, applied)
     if state.samples[0] == 0.0:
         return
+    is_full = state.rows[0] == settings.window
     cursor = excitation.push_row(
-        state.ring, int(state.cursor[0]), state.running, state.fresh, signals.row
+        state.ring, int(state.cursor[0]), state.running, state.fresh, signals.row, is_full
     )
     state.cursor[0] = cursor
     state.rows[0] = min(state.rows[0] + 1.0, float(settings.window))
+    if settings.change_detection == 1:
+        consistency.detect_change(settings, state, signals, t, dt)
     if int(state.samples[0]) % settings.interval == 0:
-        excitation.update_excitation(settings, state, signals, t)
+        excitation.update_excitation(settings, state, signals, t, dt)
 
 
 @inner
@@ -80,6 +84,7 @@ def fill_sample(settings: Settings, state: State, signals: Signals, sample: Samp
         sample.estimate[j] = state.estimate[j] if state.active[j] != 0.0 else nan
     sample.lambda_min[0] = state.lambda_min[0]
     sample.latched[0] = state.latched[0]
+    sample.changes[0] = state.changes[0]
 
 
 @inner

@@ -45,6 +45,7 @@ class ControllerTelemetry:
             *disturbance_names(joints),
             topics.LAMBDA_MIN,
             topics.LATCHED,
+            topics.MODEL_CHANGES,
             topics.COMPUTE_TIME,
         )
         self._command = Float64MultiArrayEncoder(len(joints))
@@ -77,7 +78,8 @@ class ControllerTelemetry:
         values[m : m + n] = sample.disturbance
         values[m + n] = sample.lambda_min[0]
         values[m + n + 1] = sample.latched[0]
-        values[m + n + 2] = compute_time
+        values[m + n + 2] = sample.changes[0]
+        values[m + n + 3] = compute_time
         yield topics.LEARNING, self._learning.encode(stamp, values)
 
 

@@ -132,6 +132,7 @@ LYAPUNOV_TERMS = ('V barrier', 'V velocity', 'V parameters', 'V disturbance')  #
 LYAPUNOV_BOUND = 'V bound'  # of (32)
 LAMBDA_MIN = 'lambda_min'
 LATCHED = 'latched'
+MODEL_CHANGES = 'model_changes'
 COMPUTE_TIME = 'compute_time'
 LATENCY = 'latency'
 LATENESS = 'lateness'

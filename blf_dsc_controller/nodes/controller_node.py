@@ -48,7 +48,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._estimates = assembly.estimate_names(self.config)
         self._telemetry = ControllerTelemetry(joints, self._estimates)
         self._monitor: Monitor | None = None
-        self._columns_checked = False
+        self._learning_events = (0.0, 0.0, 0.0)  # columns checked, columns in use, model changes
         self._published_bound = np.zeros(len(joints))
         self._decoder = JointStateDecoder(joints, assembly.required_fields(self.config))
         self._pending: bytes | None = None
@@ -157,8 +157,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
         return guard.update(stamp, self._decoder.values), stamp
 
     def _publish_telemetry(self, guard: Guard, stamp: int) -> None:
-        if guard.controller.state.columns_checked[0] != self._columns_checked:
-            self._report_rejected_columns(guard)
+        state = guard.controller.state
+        events = (state.columns_checked[0], state.active.sum(), state.changes[0])
+        if events != self._learning_events:
+            self._report_learning(guard, events)
         if not self.config.telemetry.enabled:
             return
         sample = guard.controller.sample
@@ -173,12 +175,19 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if (guard.controller.samples - 1) % DECIMATION == 0:
             self._publish(self._monitor.message(stamp, sample, guard.ratio, sample.bound))
 
-    def _report_rejected_columns(self, guard: Guard) -> None:
-        self._columns_checked = bool(guard.controller.state.columns_checked[0])
-        self._status.rejected = rejected_columns(guard.controller, self._estimates)
-        for column in self._status.rejected:
-            self.get_logger().warning(f'{column}')
-        if self._status.rejected:
+    def _report_learning(self, guard: Guard, events: tuple[float, float, float]) -> None:
+        before, self._learning_events = self._learning_events, events
+        if events[2] > before[2]:
+            residual = guard.controller.state.contradiction[0] ** 0.5
+            self.get_logger().warning(
+                f'the arm has changed: torques differ by {residual:.3g} N m from those learned; '
+                'learning starts anew'
+            )
+        if events[:2] != before[:2]:
+            self._status.rejected = rejected_columns(guard.controller, self._estimates)
+            for column in self._status.rejected:
+                self.get_logger().warning(f'{column}')
+        if self._status.rejected or events[2] > before[2]:
             self._report()
 
     def _command(self, torque: np.ndarray) -> None:

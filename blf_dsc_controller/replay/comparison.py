@@ -25,6 +25,7 @@ from blf_dsc_controller.messages.topics import (
     LAMBDA_MIN,
     LATCHED,
     LEARNING,
+    MODEL_CHANGES,
     MONITOR,
     REFERENCE,
     TRACKING_ERROR,
@@ -88,6 +89,7 @@ def _expected(config: ControllerConfig, run: Rerun) -> dict[Topic, Columns]:
             **dict(zip(disturbance_names(joints), samples.disturbance.T, strict=True)),
             LAMBDA_MIN: samples.lambda_min[:, 0],
             LATCHED: samples.latched[:, 0],
+            MODEL_CHANGES: samples.changes[:, 0],
         },
         MONITOR: monitor,
     }

@@ -25,7 +25,7 @@ from blf_dsc_controller.law.settings import settings_of
 from blf_dsc_controller.law.state import Sample, sample_of, signals_of, state_of
 from blf_dsc_controller.law.step import step
 from blf_dsc_controller.messages.telemetry import disturbance_names
-from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LYAPUNOV_TERMS
+from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LYAPUNOV_TERMS, MODEL_CHANGES
 from blf_dsc_controller.run import Run, Series
 from blf_dsc_controller.simulation.metrics import (
     LoopMetrics,
@@ -66,7 +66,8 @@ class Record:
             name: self.samples[:, getattr(columns, name).astype(int)] for name in columns._fields
         }
         disturbances = disturbance_names(config.joints)
-        learned = [values[name] for name in ('estimate', 'disturbance', 'lambda_min', 'latched')]
+        figures = ('estimate', 'disturbance', 'lambda_min', 'latched', 'changes')
+        learned = [values[name] for name in figures]
         position, velocity, _ = np.split(self.measurements, 3, axis=1)
         true = (*names[: settings.p], *disturbances)
         monitor = Series(LYAPUNOV_TERMS, self.stamps, values['lyapunov'])
@@ -82,7 +83,9 @@ class Record:
             bound=values['bound'],
             torque_limit=np.broadcast_to(config.torque.limit, position.shape),
             learning=Series(
-                (*names, *disturbances, LAMBDA_MIN, LATCHED), self.stamps, np.hstack(learned)
+                (*names, *disturbances, LAMBDA_MIN, LATCHED, MODEL_CHANGES),
+                self.stamps,
+                np.hstack(learned),
             ),
             truth=Series(true, self.stamps, self.truths[:, : len(true)]),
             monitor=monitor if settings.truth_known else None,

@@ -19,7 +19,7 @@ from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.factory import COLUMN_GAIN, settings_of_config
+from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.settings import LINEAR
 
 Vector = NDArray[np.float64]
@@ -82,7 +82,7 @@ def problems(controller: Controller, config: ControllerConfig, t: float) -> Iter
             f'learning.radius: the estimate is at {norm:.4g} kg m^2 now, outside of a ball of '
             f'{learning.radius:g} kg m^2: choose a larger one'
         )
-    gain = max(*learning.adaptation_gain, COLUMN_GAIN if len(state.estimate) > p else 0.0)
+    gain = max(*learning.adaptation_gain, learning.column_gain if len(state.estimate) > p else 0.0)
     stretch = 1.0 if learning.update == 'newton' else float(np.linalg.norm(state.Phi, 2))
     step = learning.weight * gain * stretch * config.sample_time
     if state.latched[0] and step >= _STABLE:

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Consistency of the window: learn only from rows of one and the same arm.
+
+A window that spans a change of the arm (a payload, a touch) contradicts itself, yet it is excited;
+its least-squares solution is a mixture, and the Newton step would solve it exactly.  With the mean
+of u^T u beside Phi and b the residual of the solution is known,
+
+    r^2 = mean(u^T u) - b^T theta_LS   [(N m)^2],
+
+and a window is latched only if r^2 is at most four times the least of any full window.  Rows that
+contradict the latched solution (their mean square over 0.1 s is more than eight times r^2) mean
+that the arm has changed: window, filters and latch are dropped, and learning starts anew.  Until
+the new window is full it averages no disturbance out, so its solution is pulled to the estimate
+before the change, weakly excited directions most.
+"""
+
+import numpy as np
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.law import cholesky
+from blf_dsc_controller.law.settings import Settings
+from blf_dsc_controller.law.state import Signals, State
+
+_GATE = 4.0  # of mean squares: twice the torque
+_ALARM = 8.0  # likewise, more, for a solution extrapolates
+_MEMORY = 0.1  # s, over which the last rows are averaged
+
+
+@inner
+def explained(settings: Settings, residual: float) -> float:
+    """Mean square residual that noise and unmodelled torque explain, at least `residual`."""
+    floor = settings.n * settings.residual_floor * settings.residual_floor
+    return max(residual, floor)
+
+
+@inner
+def detect_change(settings: Settings, state: State, signals: Signals, t: float, dt: float) -> None:
+    """Compare this row with the latched solution; forget the window if the arm has changed."""
+    if state.latched[0] == 0.0:
+        return
+    square = 0.0
+    for i in range(settings.n):
+        error = -signals.row[i, settings.m]
+        for j in range(settings.m):
+            error += signals.row[i, j] * state.solution[j]
+        square += error * error
+    state.recent_residual[0] += min(1.0, dt / _MEMORY) * (square - state.recent_residual[0])
+    if state.recent_residual[0] > _ALARM * explained(settings, state.residual[0]):
+        state.changes[0] += 1.0
+        state.change_time[0] = t
+        state.contradiction[0] = state.recent_residual[0]
+        forget_window(settings, state)
+
+
+@inner
+def forget_window(settings: Settings, state: State) -> None:
+    """Empty the window, its filters and the latch; the estimate stays and becomes the anchor."""
+    state.latched[0] = 0.0
+    state.latched_lambda[0] = 0.0
+    state.recent_residual[0] = 0.0
+    state.rows[0] = 0.0
+    state.cursor[0] = 0.0
+    clear(state.running)
+    clear(state.fresh)
+    clear(state.filter1)
+    clear(state.filter2)
+    for j in range(settings.m):
+        state.anchor[j] = state.estimate[j]
+        state.min_eigenvector[j] = settings.m**-0.5
+
+
+@inner
+def clear(matrix: np.ndarray) -> None:
+    """Fill a matrix with zeros."""
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            matrix[i, j] = 0.0
+
+
+@inner
+def accept_window(settings: Settings, state: State, signals: Signals) -> bool:
+    """Whether the present window is consistent; if so its solution and residual are kept.
+
+    A window that is not full yet is pulled to the anchor: Phi + a I, b + a theta_anchor with a
+    falling to zero, in `signals`.
+    """
+    m = settings.m
+    residual = state.running[m, m] / state.rows[0]
+    solution = signals.work
+    for j in range(m):
+        solution[j] = signals.b[j]
+    cholesky.solve(signals.factor, solution)
+    for j in range(m):
+        residual -= signals.b[j] * solution[j]
+    residual = max(residual, 0.0)
+    missing = 1.0 - state.rows[0] / settings.window
+    if missing <= 0.0 and (state.least_residual[0] == 0.0 or residual < state.least_residual[0]):
+        state.least_residual[0] = residual
+    if residual > _GATE * explained(settings, state.least_residual[0]):
+        return False
+    if missing > 0.0:
+        pull = settings.anchor_weight * missing
+        for j in range(m):
+            signals.b[j] += pull * state.anchor[j]
+            signals.Phi[j, j] += pull
+            solution[j] = signals.b[j]
+        cholesky.factor(signals.Phi, settings.rho, signals.factor)
+        cholesky.solve(signals.factor, solution)
+    for j in range(m):
+        state.solution[j] = solution[j]
+    state.residual[0] = residual
+    return True

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Learning from consistent windows: the bound holds when the arm changes while it is learned."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from paper_case import NO_DISTURBANCE, configured
+
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.law.factory import begin, controller_of
+from sim_plant.plant import plant_of
+
+BOUND = 2e-3  # rad
+WINDOW = 2.0 * np.pi  # s
+OFF = {'learning.weight': 0.0}
+CHANGED = 20.0  # s
+
+
+class Run(NamedTuple):
+    """A loop whose plant changed; the first axis is the sample."""
+
+    t: np.ndarray  # s
+    xi1: np.ndarray  # (., 2) rad
+    error: np.ndarray  # (.,) |P^ - P| / |P|, P of the plant at that time
+    torque: np.ndarray  # (., 2) N m
+    changes: np.ndarray  # (.,) detected so far
+    controller: object
+
+    def largest(self, begin):
+        """Largest |xi1| of each joint (2,) from a time on [rad]."""
+        return np.abs(self.xi1[self.t >= begin]).max(axis=0)
+
+
+def run(changes, duration, *, preset='recommended', law=None, plant=None):
+    """Run a preset; `changes` are times [s] with the plant parameters that hold from then on."""
+    config = configured(preset, duration, law, plant)
+    controller, arm = controller_of(config.controller), plant_of(config.plant)
+    start = arm.measure()
+    begin(controller, config.controller, start[:2], start[2:4])
+    due = {round(1e3 * t): parameters for t, parameters in changes}
+    rows = []
+    for k in range(round(1e3 * duration) + 1):
+        if k in due:
+            changed = plant_of(change(config.plant, due[k]))
+            changed.restore(arm.save())
+            arm = changed
+        torque = controller.update((k * 1_000_000) * 1e-9, 1e-3, arm.measure()).copy()
+        P = arm.truth()[:3]
+        error = np.linalg.norm(controller.state.estimate[:3] - P) / np.linalg.norm(P)
+        rows.append((k * 1e-3, controller.sample.xi1.copy(), error, torque))
+        rows[-1] += (controller.state.changes[0],)
+        arm.step(torque)
+    return Run(*map(np.array, zip(*rows, strict=True)), controller)
+
+
+def push(joint, torque):
+    """Parameters of a plant that is pushed by a torque [N m] on a joint."""
+    constant = list(PlantConfig().disturbance.constant)
+    constant[joint] -= torque
+    return {'disturbance.constant': constant}
+
+
+PAYLOADS = [0.25, 0.3, 0.6, 0.65, 0.7, 0.75, 0.8, 1.0]  # kg, of 0.5: each broke the bound before
+
+
+@pytest.mark.parametrize('preset', ['recommended', 'noisy'])
+@pytest.mark.parametrize('m2', PAYLOADS)
+def test_bound_holds_when_the_mass_at_the_tip_changes(m2, preset):
+    changes = [(CHANGED, {'arm.m2': m2})]
+    learning = run(changes, CHANGED + 2.0 * WINDOW, preset=preset)
+    without = run(changes, CHANGED + 2.0 * WINDOW, preset=preset, law=OFF)
+
+    assert np.all(learning.largest(0.0) < BOUND)
+    assert np.all(learning.largest(CHANGED) <= 1.2 * without.largest(CHANGED))
+    assert learning.changes[-1] >= 1.0
+    assert learning.error[-1] < 0.01
+
+
+@pytest.mark.parametrize(
+    ('joint', 'torque', 'seconds'), [(1, 1.0, 3.0), (1, 2.0, 2.0), (0, 3.0, 3.0)]
+)
+def test_bound_holds_when_the_arm_is_pushed(joint, torque, seconds):
+    changes = [(CHANGED, push(joint, torque)), (CHANGED + seconds, push(joint, 0.0))]
+    learning = run(changes, CHANGED + seconds + 2.0 * WINDOW)
+    without = run(changes, CHANGED + seconds + 2.0 * WINDOW, law=OFF)
+
+    assert np.all(learning.largest(0.0) < BOUND)
+    assert np.all(learning.largest(CHANGED) <= 1.2 * without.largest(CHANGED))
+    assert learning.error[-1] < 0.01
+
+
+def test_bound_holds_over_ten_changes_in_a_row():
+    changes = [(10.0 + 5.0 * k, {'arm.m2': (0.75, 0.5)[k % 2]}) for k in range(10)]
+    learning = run(changes, 55.0 + 2.0 * WINDOW)
+
+    assert np.all(learning.largest(0.0) < BOUND)
+    assert np.all(learning.largest(10.0) < 0.6e-3)  # 0.57, 0.62 mrad without learning
+    assert learning.error[-1] < 0.01
+
+
+@pytest.mark.parametrize('preset', ['recommended', 'noisy', 'excitation', 'two_tone'])
+def test_no_change_is_found_where_there_is_none(preset):
+    assert run([], 30.0, preset=preset).changes[-1] == 0.0
+
+
+def test_without_a_change_nothing_is_different():
+    """Bit for bit: the consistency of the windows only decides which of them are latched."""
+    with_detection = run([], 20.0)
+    without = run([], 20.0, law={'learning.change_detection': False})
+    np.testing.assert_array_equal(with_detection.torque, without.torque)
+
+
+def test_residual_is_that_of_least_squares():
+    controller = run([], 8.0, plant=NO_DISTURBANCE | {'disturbance.viscous': [0.1, 0.1]}).controller
+    settings, state = controller.settings, controller.state
+    assert settings.change_detection == 1
+    rows = state.ring.reshape(-1, settings.m + 1)
+    _, squares, _, _ = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)
+    found = state.residual[0]
+    assert found == pytest.approx(squares[0] / settings.window, rel=0.05)  # of some rows ago
+
+
+def test_estimate_does_not_drift_while_the_arm_stands_still_with_noise():
+    """Before, the second parameter went from 0.16 to 0.48 kg m^2 in the first minute.
+
+    While the window fills the tracking error adapts; from the first full window on, which is not
+    excited, the estimate is held.
+    """
+    standing = run([], 60.0, preset='noisy', law={'reference.type': 'hold'})
+    assert np.ptp(standing.error[standing.t > WINDOW + 0.1]) == 0.0
+    assert np.all(standing.largest(1.0) < 0.5 * BOUND)
+
+
+def test_column_that_was_rejected_while_standing_still_returns():
+    """Hold for a while, then move: the first full window is half at rest and rejects the bias."""
+    law = {
+        'reference.type': 'waypoints',
+        'reference.times': [0.0, 10.0] + [10.0 + 1.5 * k for k in range(1, 25)],
+        'reference.points': [
+            *(2.293, 2.293, *(2.293 - 0.5 * (k % 2) for k in range(1, 25))),
+            *(1.696, 1.696, *(1.696 - 0.4 * (k // 2 % 2) for k in range(1, 25))),
+        ],
+    }
+    constant = {'disturbance.constant': [0.3, -0.2], 'disturbance.amplitude': [0.0, 0.0]}
+    moved = run([], 45.0, law=law, plant=constant)
+    assert np.all(moved.controller.state.active == 1.0)
+    assert moved.error[-1] < 0.01
+
+
+def test_a_window_after_a_change_need_not_be_full_and_stays_near_the_estimate_before():
+    learning = run([(CHANGED, {'arm.m2': 0.75})], CHANGED + 5.0)
+    state = learning.controller.state
+    assert state.latched[0] == 1.0
+    assert state.rows[0] < learning.controller.settings.window
+    free = run([(CHANGED, {'arm.m2': 0.75})], CHANGED + 5.0, law={'learning.anchor_weight': 0.0})
+    assert np.ptp(learning.controller.state.estimate - state.anchor) < np.ptp(
+        free.controller.state.estimate - state.anchor
+    )
+
+
+def test_replaced_configuration_keeps_the_detection_off_for_the_laws_without_composite_learning():
+    config = configured('comparison', 1.0)
+    assert controller_of(config.controller).settings.change_detection == 0
+    assert controller_of(replace(config.controller, law='blf_dsc')).settings.change_detection == 1
