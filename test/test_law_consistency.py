@@ -12,6 +12,7 @@ from paper_case import NO_DISTURBANCE, configured
 
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.law import excitation
 from blf_dsc_controller.law.factory import begin, controller_of
 from sim_plant.plant import plant_of
 
@@ -150,6 +151,18 @@ def test_column_that_was_rejected_while_standing_still_returns():
     moved = run([], 45.0, law=law, plant=constant)
     assert np.all(moved.controller.state.active == 1.0)
     assert moved.error[-1] < 0.01
+
+
+def test_columns_are_checked_again_after_a_window_that_excites_nothing():
+    """Or all columns would be back for ever, and learning never latch again."""
+    controller = run([], 8.0, law={'learning.frequencies': [1.0]}).controller
+    settings, state, signals = controller.settings, controller.state, controller.signals
+    assert state.columns_checked[0] == 1.0
+    assert state.active.min() == 0.0
+    state.running[:] = 0.0
+    state.cursor[0] = 0.0
+    excitation.readmit_columns(settings, state, signals)
+    assert state.columns_checked[0] == 0.0
 
 
 def test_a_window_after_a_change_need_not_be_full_and_stays_near_the_estimate_before():

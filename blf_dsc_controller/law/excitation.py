@@ -175,6 +175,7 @@ def reject_columns(settings: Settings, state: State, signals: Signals) -> None:
     for j in range(settings.p, settings.m):
         state.active[j] = 1.0
     if not parameters_excited:
+        state.columns_checked[0] = 0.0  # all are back, until a window is excited
         reset_direction(settings, state)
         return
     state.columns_checked[0] = 1.0
