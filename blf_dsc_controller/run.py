@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,14 @@ class Series:
         return values
 
 
+class Stop(NamedTuple):
+    """A safe stop of the controller."""
+
+    stamp: int  # ns, of the last joint state before it
+    reason: str
+    text: str  # with the figures
+
+
 @dataclass(frozen=True)
 class Run:
     """N samples of n joints, simulated, recorded or replayed; None or NaN where unknown."""
@@ -62,6 +71,7 @@ class Run:
     monitor: Series | None = None
     message_counts: Mapping[str, int] = field(default_factory=dict)
     rejected: Mapping[str, str] = field(default_factory=dict)  # disturbance columns, and why
+    stops: tuple[Stop, ...] = ()
 
     @property
     def time(self) -> Floats:
@@ -76,3 +86,8 @@ class Run:
     def time_of(self, stamp: Stamps) -> Floats:
         """Time since the first sample of any stamps [s]."""
         return np.asarray((stamp - self.stamp[0]) * 1e-9, dtype=np.float64)
+
+    @property
+    def timed_stops(self) -> list[tuple[float, Stop]]:
+        """Stops with their times [s]."""
+        return [((one.stamp - int(self.stamp[0])) * 1e-9, one) for one in self.stops]

@@ -52,6 +52,8 @@ def draw(run: Run, folder: Path) -> list[Path]:
     if metrics.held is not None:
         kept = 'held' if metrics.held else 'VIOLATED'
         title = f'Tracking over {run.duration:.4g} s: bound {kept}'
+    for time, stop in run.timed_stops[:1]:
+        title += f', stopped at {time:.3f} s ({stop.reason})'
     paths = [folder / 'tracking.png']
     draw_panels(paths[0], title, motion, len(run.joints), _SIZE)
     if parameters:
@@ -116,9 +118,9 @@ def _draw_panel(axes: Axes, panel: Panel, runs: Sequence[str], until: float) -> 
     for line in panel.lines:
         if line.colour:
             _draw_line(axes, line, until, label=line.name, color=line.colour, lw=1.2)
-    for mark in panel.marks:
+    for row, mark in enumerate(panel.marks):
         if mark.time <= until:
-            _draw_mark(axes, mark)
+            _draw_mark(axes, mark, row)
     if panel.log:
         axes.set_yscale('log')
     if panel.unit == '%':
@@ -140,7 +142,7 @@ def _draw_line(axes: Axes, line: Line, until: float, *, label: str, **style: Any
         axes.plot(time, -values, **style)
 
 
-def _draw_mark(axes: Axes, mark: Mark) -> None:
+def _draw_mark(axes: Axes, mark: Mark, row: int) -> None:
     if not mark.colour:
         axes.axvline(mark.time, color=INK, lw=1.1, ls=(0, (1, 2)), zorder=1)
         return
@@ -149,7 +151,7 @@ def _draw_mark(axes: Axes, mark: Mark) -> None:
     axes.annotate(
         mark.text,
         (mark.time, 1.0),
-        (4 if is_early else -4, -2),
+        (4 if is_early else -4, -2 - 12 * row),
         xycoords=axes.get_xaxis_transform(),
         textcoords='offset points',
         ha='left' if is_early else 'right',

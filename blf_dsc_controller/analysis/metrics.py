@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.messages.journal import OUTSIDE_BOUND
 from blf_dsc_controller.messages.topics import (
     BIAS,
     COMPUTE_TIME,
@@ -87,6 +88,22 @@ def outside(run: Run) -> NDArray[np.bool_] | None:
     return np.asarray(np.abs(run.error) >= run.bound)
 
 
+def first_violation(run: Run) -> tuple[float, str]:
+    """Time [s] at which a joint first left its bound, and the joint; NaN and empty if none did.
+
+    The sample that leads to the stop is not published with its error: the stop counts instead.
+    """
+    found = [
+        (time, next((joint for joint in run.joints if f'{joint!r}' in stop.text), ''))
+        for time, stop in run.timed_stops
+        if stop.reason == OUTSIDE_BOUND
+    ]
+    violated = outside(run)
+    for row, column in () if violated is None else np.argwhere(violated)[:1].tolist():
+        found.append((float(run.time[row]), run.joints[column]))
+    return min(found, default=(math.nan, ''))
+
+
 @dataclass(frozen=True)
 class Metrics:
     """Metrics of n joints; NaN for what is unknown or has not happened."""
@@ -109,16 +126,17 @@ class Metrics:
 
     @property
     def held(self) -> bool | None:
-        """Whether no sample left the bound, None if error or bound is unknown."""
-        return None if math.isnan(self.max_error_ratio) else math.isnan(self.first_violation)
+        """Whether no joint left its bound, None if error or bound is unknown."""
+        if not math.isnan(self.first_violation):
+            return False
+        return None if math.isnan(self.max_error_ratio) else True
 
 
 def measure(run: Run) -> Metrics:
     """Metrics of a run."""
     error, torque = run.error, run.torque
     step = float(run.time[1]) if run.stamp.size > 1 else math.nan
-    violated = outside(run)
-    first = np.argwhere(violated)[:1].tolist() if violated is not None else []
+    violation, joint = first_violation(run)
     latched = latch_time(run)
     estimates = estimates_of(run)
     learned = None if estimates is None else estimates.relative_error
@@ -138,8 +156,8 @@ def measure(run: Run) -> Metrics:
         _columns(_least, run.torque_limit, n),
         tuple(change / step for change in _columns(rms, np.diff(torque, axis=0), n)),
         math.nan if error is None or run.bound is None else _peak(error / run.bound),
-        float(run.time[first[0][0]]) if first else math.nan,
-        run.joints[first[0][1]] if first else '',
+        violation,
+        joint,
         math.nan if latched is None else latched,
         *learning,
     )

@@ -32,6 +32,7 @@ GROUPS = (
     'Monitors',
     'Timing',
 )
+_STOPPED = GROUPS[:3]
 _LEARNING = GROUPS[3:7]
 _LEAST = 1e-12  # J, the smallest value on a logarithmic axis
 _LEAST_ERROR = 1e-5  # %
@@ -80,9 +81,11 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
     for k, run in enumerate(runs):
         latched = latch_time(run)
         latch = () if latched is None else (Mark(latched, 'latch'),)
+        stops = [Mark(time, f'stop: {one.reason}', ALARM) for time, one in run.timed_stops]
         for panel in (*_motion(run), *_learning(run), *_monitors(run), *_timing(run)):
             before = found.get((panel.group, panel.title), replace(panel, lines=(), marks=()))
             marks = latch if panel.group in _LEARNING else panel.marks
+            marks = (*marks, *(stops if panel.group in _STOPPED else ()))
             found[panel.group, panel.title] = replace(
                 before,
                 lines=(*before.lines, *(line._replace(run=k) for line in panel.lines)),

@@ -22,7 +22,7 @@ _TAIL = 99.9  # percentile up to which a histogram is drawn
 _DIGITS = 7
 _RATE = 50.0  # pictures of the arm a second
 _MOST_PICTURES = 6000
-_ALARMING = ('violation', 'ERROR', 'lost')
+_ALARMING = ('violation', 'stop', 'ERROR', 'lost')
 
 
 def write_report(bags: Sequence[ReportedBag], path: Path) -> None:

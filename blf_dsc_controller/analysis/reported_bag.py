@@ -103,6 +103,8 @@ def _events(run: Run) -> Iterator[Event]:
     for column, reason in run.rejected.items():
         text = reason or f'{column} is not estimated: its column was rejected'
         yield Event(run.duration, 'learning', text)
+    for t, stop in run.timed_stops:
+        yield Event(t, 'stop', f'{stop.reason}: {stop.text}')
     if violated is not None:
         yield from _spells(run, violated, 'violation', 'outside of its bound')
     if run.torque_limit is not None:

@@ -49,6 +49,10 @@ def summarize(run: Run) -> Summary:
         'tracking': {
             'held': metrics.held,
             'first_violation': None if math.isnan(metrics.first_violation) else violated,
+            'stops': [
+                {'time_s': time, 'stamp_ns': stop.stamp, 'reason': stop.reason, 'text': stop.text}
+                for time, stop in run.timed_stops
+            ],
             'joints': {
                 joint: {
                     entry: plain(getattr(metrics, metric)[i])
@@ -148,7 +152,12 @@ def _sentences(summary: Summary) -> Iterator[str]:
         kept = f'VIOLATED, first by {first["joint"]} at {first["time_s"]:.3f} s'
     else:
         kept = 'unknown' if held is None else 'held by every joint'
+    stops = summary['tracking']['stops']
+    if stops and held:
+        kept += ' until the stop'
     yield f'bound       {kept}'
+    for stop in stops:
+        yield f'stopped     at {stop["time_s"]:.3f} s, {stop["reason"]}: {stop["text"]}'
     if summary['learning'] is not None:
         yield from _learning_lines(summary['learning'])
     if summary['timing'] is not None:

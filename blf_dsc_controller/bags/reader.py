@@ -7,7 +7,7 @@ A run as one table, a row for each joint state: for spreadsheets, pandas, MATLAB
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,8 +23,9 @@ from blf_dsc_controller.bags.content import (
 )
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.journal import EventType, decode
 from blf_dsc_controller.messages.types import typestore
-from blf_dsc_controller.run import Floats, Run, Series, Stamps
+from blf_dsc_controller.run import Floats, Run, Series, Stamps, Stop
 
 
 def read_run(path: str | Path, namespace: str = '') -> Run:
@@ -66,6 +67,7 @@ def read_run(path: str | Path, namespace: str = '') -> Run:
         monitor=_vector(content, topics.MONITOR),
         message_counts=content.message_counts,
         rejected=_rejected_columns(content, learning, namespace),
+        stops=tuple(_stops(content, int(states.stamp[0]))),
     )
 
 
@@ -141,6 +143,18 @@ def _rejected_columns(content: Content, learning: Series | None, namespace: str)
         if reasons:
             break
     return {column: reasons.get(column, '') for column in columns}
+
+
+def _stops(content: Content, first: int) -> Iterator[Stop]:
+    """Stops in the journal; one before the first state gets its stamp [ns]."""
+    journal = content.topics.get(topics.JOURNAL)
+    for raw in journal.raw if journal is not None else ():
+        try:
+            event = decode(raw)
+        except BlfDscError:  # another node's topic of that name
+            continue
+        if event.type is EventType.STOP:
+            yield Stop(max(event.stamp, first), event.content['reason'], event.content['text'])
 
 
 def table(run: Run) -> dict[str, Any]:

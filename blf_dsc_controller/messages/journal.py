@@ -16,6 +16,9 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import JOURNAL
 from blf_dsc_controller.messages.types import typestore
 
+OUTSIDE_BOUND = 'error past the bound'
+"""Reason of a stop after which the bound was not held."""
+
 
 class EventType(str, Enum):
     """What happened, with the content of its event."""

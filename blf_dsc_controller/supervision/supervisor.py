@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import LINEAR
+from blf_dsc_controller.messages.journal import OUTSIDE_BOUND
 from blf_dsc_controller.supervision.checks import is_valid_state
 from blf_dsc_controller.supervision.watchdogs import Overruns
 
@@ -52,7 +53,7 @@ class Reason(str, Enum):
     NOT_FINITE = 'measurement not finite'
     VELOCITY = 'velocity not plausible'
     START_REJECTED = 'start rejected'
-    OUTSIDE_BOUND = 'error past the bound'
+    OUTSIDE_BOUND = OUTSIDE_BOUND
     SATURATED = 'torque saturated'
     OVERRUN = 'loop overrun'
     ESTIMATE = 'estimate not finite'

@@ -25,8 +25,9 @@ function layoutOf(panel) {
       type: panel.log ? 'log' : 'linear', exponentformat: 'power'},
     shapes: panel.marks.map(([time, , colour]) => ({type: 'line', x0: time, x1: time, y0: 0,
       y1: 1, yref: 'paper', line: {color: colour, width: 1.2, dash: 'dot'}})),
-    annotations: panel.marks.map(([time, text, colour]) => ({x: time, y: 1, yref: 'paper',
-      yanchor: 'top', xanchor: 'left', text, showarrow: false, font: {size: 11, color: colour}})),
+    annotations: panel.marks.map(([time, text, colour], row) => ({x: time, y: 1, yref: 'paper',
+      yanchor: 'top', yshift: -13 * row, xanchor: 'left', text, showarrow: false,
+      font: {size: 11, color: colour}})),
   };
 }
 

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A safe stop is in the table, the summary, the pictures and the page, with its reason and time.
+
+The sample that leads to it is published without its error: only the journal shows what happened.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import synthetic_bag
+from fault_rig import JOINTS, Rig
+from synthetic_bag import MILLISECOND, START, Synthetic
+from test_analysis_figures import amount, pixels
+
+from blf_dsc_controller.analysis.figures import draw
+from blf_dsc_controller.analysis.panels import panels
+from blf_dsc_controller.analysis.reported_bag import read_bags
+from blf_dsc_controller.analysis.style import ALARM
+from blf_dsc_controller.analysis.summary import format_table, summarize
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.journal import Event, EventType
+from blf_dsc_controller.messages.topics import (
+    BOUND,
+    JOINT_STATES,
+    JOURNAL,
+    LEARNING,
+    REFERENCE,
+    TRACKING_ERROR,
+)
+from blf_dsc_controller.supervision.supervisor import Reason
+
+STOP_S = 2.345
+LATE = 40 * MILLISECOND  # from a stamp to its reception
+
+
+def stopped(folder, reason=Reason.OUTSIDE_BOUND):
+    """Bag of a run whose controller stops at `STOP_S`; its messages are received late."""
+    stop = START + round(STOP_S * 1e3) * MILLISECOND
+    text = "joint 'elbow' is +0.0023 rad from its reference: past 1 times its bound of 0.002 rad"
+    event = Event(2, EventType.STOP, stop, 1, 1, {'reason': reason, 'text': text})
+    messages = [
+        (topic, stamp + LATE, raw)
+        for topic, stamp, raw in Synthetic(4000).messages()
+        if topic not in (TRACKING_ERROR, REFERENCE, LEARNING) or stamp < stop
+    ]
+    messages.append((JOURNAL, stop + 2 * LATE, event.encode()))
+    return synthetic_bag.write(folder / 'bag', sorted(messages, key=lambda one: one[1]))
+
+
+def test_an_error_past_the_bound_is_a_violation_at_the_stamp_of_the_last_state(tmp_path):
+    run = read_run(stopped(tmp_path))
+    assert np.nanmax(np.abs(run.error)) < synthetic_bag.BOUND_RAD
+    tracking = summarize(run)['tracking']
+    assert tracking['held'] is False
+    assert tracking['first_violation'] == {'time_s': pytest.approx(STOP_S), 'joint': 'elbow'}
+    (stop,) = tracking['stops']
+    assert stop['time_s'] == pytest.approx(STOP_S)
+    assert stop['stamp_ns'] == START + 2345 * MILLISECOND
+    assert stop['reason'] == 'error past the bound'
+    table = format_table(summarize(run))
+    assert 'bound       VIOLATED, first by elbow at 2.345 s' in table
+    assert "stopped     at 2.345 s, error past the bound: joint 'elbow' is +0.0023 rad" in table
+    assert 'held' not in table
+
+
+def test_any_other_stop_limits_what_was_held(tmp_path):
+    summary = summarize(read_run(stopped(tmp_path, Reason.VELOCITY)))
+    assert summary['tracking']['held'] is True
+    table = format_table(summary)
+    assert 'bound       held by every joint until the stop' in table
+    assert 'stopped     at 2.345 s, velocity not plausible' in table
+
+
+def test_pictures_and_page_show_the_stop(tmp_path, capsys):
+    path = stopped(tmp_path)
+    run = read_run(path)
+    shown = [panel for panel in panels([run]) if panel.group in ('Motion', 'Tracking', 'Torque')]
+    assert len(shown) == 6
+    for panel in shown:
+        assert [(mark.text, mark.colour) for mark in panel.marks] == [
+            ('stop: error past the bound', ALARM)
+        ]
+        assert panel.marks[0].time == pytest.approx(STOP_S)
+    draw(run, tmp_path)
+    assert amount(pixels(tmp_path / 'tracking.png'), ALARM) > 100
+    (bag,) = read_bags([path])
+    (event,) = (event for event in bag.events if event.kind == 'stop')
+    assert event.time == pytest.approx(STOP_S)
+    assert event.text.startswith("error past the bound: joint 'elbow'")
+    pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
+    assert main(['report', str(path), '--out', str(tmp_path / 'page.html')]) == 0
+    page = (tmp_path / 'page.html').read_text()
+    assert 'bound       VIOLATED, first by elbow at 2.345 s' in page
+    assert 'held by every joint' not in page
+    assert main(['plot', str(path), '--out', str(tmp_path / 'plot')]) == 0
+    assert 'VIOLATED' in capsys.readouterr().out
+
+
+def test_a_guarded_loop_that_is_pushed_out_is_reported_so(tmp_path):
+    rig = Rig()
+    states, bound = JointStateEncoder(JOINTS), JointStateEncoder(JOINTS, ('position', 'effort'))
+    errors = JointStateEncoder(JOINTS)
+    limits = bound.encode(START, [0.002] * 2, (), [20.0] * 2)
+    messages = [(BOUND, START, limits)]
+    for k in range(400):
+        rig.push[:] = (60.0, 0.0) if k > 300 else (0.0, 0.0)
+        state = rig.state()
+        rig.step()
+        at = state.stamp
+        messages.append((JOINT_STATES, at, states.encode(at, state.q, state.dq, state.effort)))
+        if rig.guard.has_sample:
+            sample = rig.guard.controller.sample
+            raw = errors.encode(at, sample.xi1, sample.xi2, sample.torque)
+            messages.append((TRACKING_ERROR, at, raw))
+    events = rig.guard.journal.pending
+    messages += [(JOURNAL, max(event.stamp, START), event.encode()) for event in events]
+    assert rig.supervisor.reason is Reason.OUTSIDE_BOUND
+    run = read_run(synthetic_bag.write(tmp_path / 'bag', messages))
+    assert np.nanmax(np.abs(run.error)) < 0.002
+    tracking = summarize(run)['tracking']
+    assert tracking['held'] is False
+    assert tracking['first_violation']['joint'] == 'joint1'
+    assert 0.3 < tracking['first_violation']['time_s'] < 0.4
