@@ -125,6 +125,14 @@ def test_joints_have_names_of_their_own_and_the_arm_has_two(cls):
             'learning.radius: got 5 kg m^2, but learning.initial_estimate lies at 5 kg m^2',
         ),
         (
+            {
+                'law': 'model_based',
+                'truth.parameters': [1.0, 0.32, 0.4],
+                'learning.radius': 1.1,
+            },
+            'learning.radius: got 1.1 kg m^2, but truth.parameters lie at 1.12357 kg m^2',
+        ),
+        (
             {'learning.window': 0.009},
             'learning.window: got 0.009 s, which is 9 samples of 0.001 s: between 10 and',
         ),

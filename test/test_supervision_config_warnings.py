@@ -10,7 +10,12 @@ from paper_case import EXACT, NO_DISTURBANCE, P, configured, run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.supervision.config_warnings import config_warnings, reference_load
+from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.supervision.config_warnings import (
+    config_warnings,
+    reference_load,
+    windows_along,
+)
 
 BOUND = 0.002  # rad
 
@@ -70,7 +75,38 @@ def test_load_needs_the_torque_that_the_run_needs():
     config, torque = loop.controller, np.abs(run(loop).torque[1000:])
     load = reference_load(config, settings_of_config(config))
     np.testing.assert_allclose(load.torque, torque.max(axis=0), rtol=2e-3)
-    assert np.linalg.eigvalsh(load.excitation)[0] == pytest.approx(0.269, abs=5e-4)
+
+
+@pytest.mark.parametrize('preset', ['recommended', 'two_tone', 'excitation'])
+def test_excitation_is_that_of_the_controller_s_window(preset):
+    """With columns and filters; the loop's window is of the arm, within a milliradian of qr."""
+    loop = configured(preset, 14.0)
+    windows = windows_along(loop.controller, settings_of_config(loop.controller))
+    record = simulate(loop.controller, loop.plant)
+    least = np.linalg.eigvalsh(windows)[:, 0].max()
+    assert least == pytest.approx(record.sample(-1).lambda_min[0], rel=0.02)
+
+
+def test_a_column_that_will_be_rejected_is_announced():
+    """P alone is excited by 0.26, with the bias columns by 0.0056: between them one is rejected."""
+    for threshold, is_rejected in ((0.005, False), (0.05, True)):
+        changes = {'learning.excitation_threshold': threshold}
+        found = [one for one in warnings(changes) if 'a column will be rejected' in one]
+        assert bool(found) == is_rejected
+        estimate = run(configured('recommended', 8.0, changes)).estimate[-1]
+        assert np.isnan(estimate).any() == is_rejected
+
+
+def test_too_large_a_gain_of_the_columns_overflows_as_it_is_warned():
+    changes = {'learning.adaptation_gain': [0.02] * 3, 'learning.weight': 2100.0}
+    (warning,) = warnings(changes)
+    assert warning.startswith('learning.weight: kappa Gamma T is 2.1')
+    assert warnings(changes | {'learning.column_gain': 0.02}) == []
+    ends = []
+    for gain in (1.0, 0.02):
+        loop = run(configured('recommended', 8.0, changes | {'learning.column_gain': gain}))
+        ends.append(np.abs(loop.xi1).max() < BOUND)
+    assert ends == [False, True]
 
 
 def test_too_high_a_feedback_chatters_from_twice_the_inertia_s_rate_on():

@@ -157,6 +157,6 @@ class ControllerConfig(Sampled):
             *self.reference.problems(),
             *self.limits.problems(self.joints),
             *self.barrier.problems(self.joints),
-            *self.truth.problems(self.law, self.model, count),
+            *self.truth.problems(self.law, self.model, count, self.learning.radius),
             *self.learning.problems(self.sample_time, self.model, count),
         ]

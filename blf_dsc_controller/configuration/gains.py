@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 
@@ -144,11 +145,19 @@ class Truth:
     phase: PerJoint = _known((0.0, 0.0), 'phase of its sinusoid', 'rad')
     feed_forward: bool = _known(False, 'compensate the known disturbance; model_based always does')
 
-    def problems(self, law: str, model: str, count: int) -> list[str]:
-        """Check that the parameters fit the model, and are given if the law needs them."""
+    def problems(self, law: str, model: str, count: int, radius: float) -> list[str]:
+        """Check that the parameters fit the model and the ball, and are given if needed."""
         given = len(self.parameters)
         if law == 'model_based' and given == 0:
             return ['truth.parameters: got none, but the law model_based needs them']
+        norm = math.hypot(*self.parameters)
+        if law == 'model_based' and norm >= radius:
+            reason = (
+                f'learning.radius: got {radius:g} kg m^2, but truth.parameters lie at {norm:.6g} '
+                'kg m^2, and the law model_based would shrink them to the ball: the radius must be '
+                'larger'
+            )
+            return [reason]
         if given in (0, count):
             return []
         entries = counted(given, 'entry', 'entries')

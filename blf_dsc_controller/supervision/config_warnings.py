@@ -12,8 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.law.prediction import rows_along
 from blf_dsc_controller.law.settings import FILTERED, LINEAR, NEWTON, Settings
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
@@ -22,6 +24,9 @@ Floats = NDArray[np.float64]
 
 _POINTS = 400  # on the reference
 _LONGEST = 120.0  # s of it
+_FINE = 0.1  # time constants of the regressor's filter between two points of a window ...
+_WINDOW_POINTS = 400  # ... of which it has at least so many
+_WINDOWS = 8  # that begin within the length of one
 _MARGIN = 1.25  # of torque beyond what the reference needs
 _PERIODS = 0.02  # by which a window may miss a whole number of periods
 _CLOSE = 0.8  # of the bound
@@ -34,7 +39,6 @@ class ReferenceLoad(NamedTuple):
 
     torque: Floats  # largest magnitude (n,), N m
     rate: float  # largest eigenvalue of M^-1 K_p, 1/s
-    excitation: Floats  # mean of H^T H (p, p)
 
 
 def config_warnings(config: ControllerConfig, q: Floats | None = None) -> list[str]:
@@ -48,33 +52,66 @@ def config_warnings(config: ControllerConfig, q: Floats | None = None) -> list[s
     if settings.surface != LINEAR:
         found += _of_surface(config, settings)
         if settings.kappa > 0.0 and settings.Gamma.any():
-            found += [*_of_update(config, settings, load), *_of_window(config, settings, load)]
+            windows = windows_along(config, settings)
+            found += [
+                *_of_update(config, settings, windows),
+                *_of_window(config, settings, windows),
+            ]
     return found
 
 
 def reference_load(config: ControllerConfig, settings: Settings) -> ReferenceLoad:
     """Evaluate the dynamics along the reference, over its slowest period."""
     P = settings.initial_estimate[: settings.p]
-    frequencies = [w for w in config.reference.frequency if w > 0.0]
-    horizon = min(float(2.0 * np.pi / min(frequencies, default=1.0)), _LONGEST)
-    if config.reference.type == 'waypoints':
-        horizon = max(config.reference.times)
     H, Yp, Yr = np.zeros((3, settings.n, settings.p))
     torque, rate = np.zeros(settings.n), 0.0
-    excitation = np.zeros((settings.p, settings.p))
-    moments = np.linspace(0.0, horizon, _POINTS, endpoint=False)
+    moments = np.linspace(0.0, _horizon(config), _POINTS, endpoint=False)
     M = np.zeros((settings.n, settings.n))
     for q, dq, ddq in sampled(reference_of(config), moments):
         settings.model.regressor(q, dq, dq, ddq, H)
         torque = np.maximum(torque, np.abs(H @ P))
-        excitation += H.T @ H / _POINTS
         for i, unit in enumerate(np.eye(settings.n)):
             settings.model.momentum_regressor(q, unit, Yp, Yr)
             M[:, i] = Yp @ P
         if np.linalg.eigvalsh(M)[0] > 0.0:
             roots = np.linalg.eigvals(np.linalg.solve(M, np.diag(settings.Kp)))
             rate = max(rate, float(np.abs(roots).max()))
-    return ReferenceLoad(torque, rate, excitation)
+    return ReferenceLoad(torque, rate)
+
+
+def windows_along(config: ControllerConfig, settings: Settings) -> Floats:
+    """Phi (21) of windows along the reference, followed exactly: (k, m, m), filters included.
+
+    The first is full after tau_d + T_a, as in the controller; the last ends a slowest period later.
+    """
+    learning = config.learning
+    step = learning.window / max(_WINDOW_POINTS, learning.window * learning.filter_pole / _FINE)
+    step = max(step, config.sample_time)
+    window, start = round(learning.window / step), round(settings.learning_start / step)
+    times = np.arange(start + round(_horizon(config) / step) + 1) * step
+    rows = np.zeros((times.size, settings.n, settings.m))
+    motion = sampled(reference_of(config), times)
+    rows_along(settings.model, pack(settings), times, motion, rows)
+    if settings.prediction == FILTERED:
+        gain = 1.0 - np.exp(-learning.filter_pole * step)
+        first, second = np.zeros((2, settings.n, settings.m))
+        for row in rows:
+            first += gain * (row - first)
+            second += gain * (first - second)
+            row[:] = second
+    found = []
+    for end in range(start, times.size, max(1, window // _WINDOWS)):
+        X = rows[end - window + 1 : end + 1].reshape(-1, settings.m)
+        found.append(X.T @ X / window)
+    return np.array(found)
+
+
+def _horizon(config: ControllerConfig) -> float:
+    """Time [s] in which the reference does all that it does, at most `_LONGEST`."""
+    if config.reference.type == 'waypoints':
+        return min(max(config.reference.times), _LONGEST)
+    frequencies = [w for w in config.reference.frequency if w > 0.0]
+    return min(float(2.0 * np.pi / min(frequencies, default=1.0)), _LONGEST)
 
 
 def _of_start(config: ControllerConfig, q: Floats | None) -> Iterator[str]:
@@ -138,16 +175,19 @@ def _of_surface(config: ControllerConfig, settings: Settings) -> Iterator[str]:
             )
 
 
-def _of_update(config: ControllerConfig, settings: Settings, load: ReferenceLoad) -> Iterator[str]:
+def _of_update(config: ControllerConfig, settings: Settings, windows: Floats) -> Iterator[str]:
     T = config.sample_time
-    step, what = settings.kappa * float(settings.Gamma[: settings.p].max()) * T, 'kappa Gamma T'
+    rate, what = float(settings.Gamma.max()), 'kappa Gamma T'
     if settings.update != NEWTON:
-        step *= float(np.linalg.eigvalsh(load.excitation)[-1])
-        what = 'kappa Gamma lambda_max(Phi) T'
+        scale = np.sqrt(settings.Gamma)
+        rate = float(np.linalg.eigvalsh(windows * np.outer(scale, scale))[:, -1].max())
+        what = 'kappa lambda_max(Gamma Phi) T'
+    step = settings.kappa * rate * T
     if step > 1.0:
         yield (
             f'learning.weight: {what} is {step:.2g}: the estimate oversteps from 1 on and '
-            f'diverges at 2: lower learning.weight or learning.adaptation_gain'
+            f'diverges at 2: lower learning.weight, or learning.adaptation_gain and '
+            f'learning.column_gain'
         )
     if settings.eta * float(settings.gamma.max()) * T > 1.0:
         yield (
@@ -156,14 +196,24 @@ def _of_update(config: ControllerConfig, settings: Settings, load: ReferenceLoad
         )
 
 
-def _of_window(config: ControllerConfig, settings: Settings, load: ReferenceLoad) -> Iterator[str]:
+def _of_window(config: ControllerConfig, settings: Settings, windows: Floats) -> Iterator[str]:
     learning = config.learning
-    least = float(np.linalg.eigvalsh(load.excitation)[0])
-    if least < settings.sigma:
+    p = settings.p
+    alone, together = (
+        float(np.linalg.eigvalsh(Phi)[:, 0].max()) for Phi in (windows[:, :p, :p], windows)
+    )
+    if alone < settings.sigma:
         yield (
             f'learning.excitation_threshold: the reference excites the parameters by '
-            f'{least:.2g} at best, below the threshold of {settings.sigma:g}: nothing will be '
+            f'{alone:.2g} at best, below the threshold of {settings.sigma:g}: nothing will be '
             f'learned from the prediction error'
+        )
+    elif together < settings.sigma:
+        yield (
+            f'learning.excitation_threshold: the reference excites the parameters and disturbance '
+            f'columns together by {together:.2g} at best, below the threshold of '
+            f'{settings.sigma:g}: a column will be rejected, and what it should have found will '
+            f'be taken for parameters'
         )
     if config.reference.type == 'sinusoids':
         for frequency in config.reference.frequency:
