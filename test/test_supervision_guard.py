@@ -10,7 +10,7 @@ from plain_law import dynamics
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.supervision.safe_torque import Ramp, safe_torque
+from blf_dsc_controller.supervision.safe_torque import LastState, Ramp, safe_torque
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from blf_dsc_controller.supervision.watchdogs import Overruns, Silence
 
@@ -30,9 +30,9 @@ def weight(q):
 
 
 def safe(torque, q=Q, dq=DQ, estimate=P, **given):
-    return safe_torque(
-        Safety(torque=torque, damping=(2.0, 1.0)), settings(**given), q, dq, estimate
-    )
+    last = LastState(2)
+    last.take(1, np.concatenate((q, dq, np.zeros(2))))
+    return safe_torque(Safety(torque=torque, damping=(2.0, 1.0)), settings(**given), last, estimate)
 
 
 def test_each_safe_torque_is_what_its_name_says():

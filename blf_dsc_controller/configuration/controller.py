@@ -92,6 +92,9 @@ class Safety:
         0.0, 'ramp from the last torque to the safe torque after a fault; 0: at once', 's'
     )
     deactivation_ramp: float = non_negative(0.5, 'the same ramp when the node is deactivated', 's')
+    fade_time: float = positive(
+        0.5, 'time over which the safe torque fades to zero while no usable joint state comes', 's'
+    )
     keep_estimates: bool = parameter(
         True, 'keep the estimates when the node is activated again; a reset clears them'
     )

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from math import inf
 from time import perf_counter
 from typing import Any
 
@@ -30,7 +31,7 @@ from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.reference.limits import MotionError, limits_of
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, plan_trajectory
 from blf_dsc_controller.supervision import checks, retuning
-from blf_dsc_controller.supervision.safe_torque import Ramp, safe_torque
+from blf_dsc_controller.supervision.safe_torque import LastState, Ramp, safe_torque
 from blf_dsc_controller.supervision.supervisor import Phase, Reason, Supervisor, Verdict
 from blf_dsc_controller.supervision.velocity import Velocity
 from blf_dsc_controller.supervision.watchdogs import PERIOD, Silence
@@ -102,9 +103,7 @@ class Guard:
         self._kept = np.zeros(self.controller.settings.m + n)  # estimates of the last valid sample
         self._clean = True  # whether the window holds valid samples only
         self._resumable = False
-        self._measurement = np.zeros(3 * n)
-        self._q = self._measurement[:n]
-        self._dq = self._measurement[n : 2 * n]
+        self._last_state = LastState(n)
         self._keep()
         self.journal.note(EventType.CONFIGURE, parameters=flatten(config))
 
@@ -129,6 +128,7 @@ class Guard:
             self.controller.state.estimate[:] = self._kept[:m]
             self.controller.state.disturbance[:] = self._kept[m:]
         self._start_over()
+        self._silence.restart(self._steady())
 
     def deactivate(self) -> None:
         """Leave command: the torque goes to the safe one on its ramp."""
@@ -136,7 +136,7 @@ class Guard:
         was_running = self.supervisor.running
         self._clean = self._clean and self.supervisor.phase is not Phase.SAFE_STOP
         self.supervisor.enter(Phase.INACTIVE)
-        self._silence.restart()
+        self._silence.restart(self._steady())
         self._resumable = was_running
         if was_running:
             self._ramp.begin(self._torque, self.config.safety.deactivation_ramp)
@@ -179,7 +179,7 @@ class Guard:
         self._note(EventType.PARAMETERS, parameters=changed)
         if self.supervisor.running:
             t = self._time_of(self.last_stamp)
-            retuning.apply_bumpless(self.controller, config, t, self._measurement)
+            retuning.apply_bumpless(self.controller, config, t, self._last_state.measurement)
         else:
             retuning.apply(self.controller, config)
         self.config = config
@@ -230,13 +230,11 @@ class Guard:
         verdict = self.supervisor.check_state(self.config.safety, stamp, q, dq, effort)
         if verdict is Verdict.SKIP:
             return None
-        if verdict is Verdict.STOP:  # keep what the safe torque can use
-            if np.isfinite(q).all():
-                self._q[:] = q
-            plausible = np.abs(dq) <= self.config.safety.velocity_limit
-            self._dq[:] = np.where(plausible, dq, 0.0)
-            return self._safe(self.config.sample_time)
-        self._measurement[:] = measurement
+        if verdict is Verdict.STOP:
+            period, fastest = self.config.sample_time, self.config.safety.velocity_limit
+            self._last_state.salvage(stamp, q, dq, fastest, period)
+            return self._safe(period)
+        self._last_state.take(stamp, measurement)
         if self.supervisor.phase is Phase.STARTING and not self._start(stamp, q, dq):
             return self._safe(self.config.sample_time) if self.commanding else None
         return self._control(stamp, measurement)
@@ -250,7 +248,7 @@ class Guard:
             return None
         self._silence.restart(self._steady())
         self.supervisor.stop(_REASONS.get(type(error), Reason.BAD_MESSAGE), str(error))
-        return self._safe(self.config.sample_time)
+        return self._safe_without_state(self.config.sample_time)
 
     @property
     def next_watch(self) -> float:
@@ -268,10 +266,10 @@ class Guard:
     def time_out(self, text: str) -> Vector | None:
         """Return the torque of one watchdog period without a joint state."""
         self.has_sample = False
-        self._dq[:] = 0.0
-        self.supervisor.stop(Reason.STATE_TIMEOUT, text)
+        if self.supervisor.phase is not Phase.STARTING:  # which waits for a state
+            self.supervisor.stop(Reason.STATE_TIMEOUT, text)
         self.watchdog_torques += 1
-        return self._safe(PERIOD)
+        return self._safe_without_state(PERIOD)
 
     def end_silence(self) -> None:
         """Note how many torques the watchdog has commanded."""
@@ -283,7 +281,7 @@ class Guard:
         """Return the torque after an unexpected error."""
         self.has_sample = False
         self.supervisor.stop(Reason.FAILED, text)
-        return self._safe(self.config.sample_time)
+        return self._safe_without_state(self.config.sample_time)
 
     def release(self) -> None:
         """Note the end of the controller."""
@@ -361,13 +359,21 @@ class Guard:
         self._clean = self._resumable = False
         self._ramp.begin(self._torque, self.config.safety.stop_ramp)
 
+    def _safe_without_state(self, dt: float) -> Vector | None:
+        self._last_state.miss(dt)
+        return self._safe(dt)
+
     def _safe(self, dt: float) -> Vector | None:
-        """Safe torque, `dt` [s] further on the ramp; None while inactive from the beginning."""
-        if self.supervisor.phase is Phase.INACTIVE and not self.commanding:
+        """Safe torque, `dt` [s] further on the ramp.
+
+        None while no state has been seen, and while inactive from the beginning.
+        """
+        is_new = self.supervisor.phase is Phase.INACTIVE and not self.commanding
+        if is_new or self._last_state.age == inf:
             return None
         settings = self.controller.settings
         estimate = self._kept[: settings.m]
-        goal = safe_torque(self.config.safety, settings, self._q, self._dq, estimate)
+        goal = safe_torque(self.config.safety, settings, self._last_state, estimate)
         limit = settings.torque_limit
         self._torque[:] = np.clip(self._ramp.advance(goal, dt), -limit, limit)
         self.journal.commands += 1

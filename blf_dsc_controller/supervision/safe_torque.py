@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The safe torque, and the ramp to it from the last torque of the law."""
+"""The safe torque, what it knows of the arm, and the ramp to it from the last torque of the law."""
 
 from __future__ import annotations
+
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,26 +14,70 @@ from blf_dsc_controller.law.settings import Settings
 Vector = NDArray[np.float64]
 
 
-def safe_torque(
-    safety: Safety, settings: Settings, q: Vector, dq: Vector, estimate: Vector
-) -> Vector:
+class LastState:
+    """The last joint state that can be used.
+
+    Attributes:
+        measurement: [q, dq, applied torque] (3 n,) [rad, rad/s, N m].
+        q, dq: views on it; a velocity that is not known now is zero.
+        age: time without such a state [s]; infinite before the first.
+    """
+
+    def __init__(self, n: int) -> None:
+        self.measurement = np.zeros(3 * n)
+        self.q = self.measurement[:n]
+        self.dq = self.measurement[n : 2 * n]
+        self.age = inf
+        self._stamp = -1
+
+    def take(self, stamp: int, measurement: Vector) -> None:
+        """Take a valid state with its stamp [ns]."""
+        self.measurement[:] = measurement
+        self.age = 0.0
+        self._stamp = stamp
+
+    def salvage(
+        self, stamp: int, q: Vector, dq: Vector, velocity_limit: float, period: float
+    ) -> None:
+        """Take what can be used of any other state, `period` [s] after the last.
+
+        Positions that are not finite and a repeated stamp say nothing of where the arm is now.
+        """
+        if stamp == self._stamp or not np.isfinite(q).all():
+            self.miss(period)
+            return
+        self.q[:] = q
+        self.dq[:] = np.where(np.abs(dq) <= velocity_limit, dq, 0.0)
+        self.age = 0.0
+        self._stamp = stamp
+
+    def miss(self, period: float) -> None:
+        """Let `period` [s] pass without a state."""
+        self.dq[:] = 0.0
+        self.age += period
+
+
+def safe_torque(safety: Safety, settings: Settings, last: LastState, estimate: Vector) -> Vector:
     """Safe torque (n,) [N m], within the torque limit and always finite.
 
-    It is zero, damping -D dq, or damping with the gravity H(q, 0, 0, 0) P^, at the last valid
-    positions q (n,) [rad]; dq (n,) [rad/s] is zero if unknown.
+    It is zero, damping -D dq, or damping with the gravity H(q, 0, 0, 0) P^, and fades to zero
+    while no state comes.
     """
     torque = np.zeros(settings.n)
+    if last.age >= safety.fade_time:
+        return torque
     with np.errstate(over='ignore', invalid='ignore'):  # checked below
         if safety.torque != 'zero':
-            torque -= np.array(safety.damping) * dq
+            torque -= np.array(safety.damping) * last.dq
         if safety.torque == 'hold_gravity':
             rest = np.zeros(settings.n)
             H = np.zeros((settings.n, settings.p))
-            settings.model.regressor(q, rest, rest, rest, H)
+            settings.model.regressor(last.q, rest, rest, rest, H)
             torque += H @ estimate[: settings.p]
     if not np.isfinite(torque).all():
         return np.zeros(settings.n)
-    return np.clip(torque, -settings.torque_limit, settings.torque_limit)
+    limited = np.clip(torque, -settings.torque_limit, settings.torque_limit)
+    return limited * (1.0 - last.age / safety.fade_time)
 
 
 class Ramp:
