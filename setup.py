@@ -81,6 +81,7 @@ setup(
             'hypothesis',
             'coverage',
             'mujoco',
+            'pin',  # pinocchio, the oracle of the arm models: 400 MB
             'setuptools>=70.1',
             'pyarrow',
             'distributed',

@@ -1,0 +1,281 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The serial chain between two links of a URDF: placements, axes, limits and inertias.
+
+A body is what one joint moves: its link, with everything that hangs on it rigidly.  The rules:
+
+- Fixed joints are merged, those beyond the tip as well.
+- Joints that move but lie aside of the chain or beyond its tip, as a gripper's fingers, are held at
+  position 0 and their links merged; `Chain.held` names them.
+- A link without `<inertial>` weighs nothing, but each body must have a mass.
+- Continuous joints, and joints without `<limit>`, have infinite limits; so has an effort or a
+  velocity of 0.
+
+Not supported: `floating`, `planar` and `mimic` joints in the chain, and closed chains.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from math import cos, inf, isfinite, sin
+
+import numpy as np
+
+from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia, rotational_inertia
+from blf_dsc_controller.errors import BlfDscError
+
+MOVING = ('revolute', 'continuous', 'prismatic')
+
+
+Elements = Mapping[str, ET.Element]
+
+
+class UrdfError(BlfDscError):
+    """A URDF without a serial chain of the wanted joints, or one with impossible figures."""
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A moving joint, with the body that it moves.
+
+    Attributes:
+        placement: (4, 4) of its frame at position 0, in the frame of the joint before (of the first
+            joint: in the base).
+        axis: (3,) unit vector, in its own frame.
+        lower, upper: limits of the position [rad or m].
+        velocity, effort: limits [rad/s or m/s, N m or N].
+        link: the link that it moves; its frame is the joint's.
+        inertia: (10,) of the body in that frame, in the order of `inertia.INERTIA_NAMES`.
+    """
+
+    name: str
+    kind: str
+    placement: np.ndarray
+    axis: np.ndarray
+    lower: float
+    upper: float
+    velocity: float
+    effort: float
+    link: str
+    inertia: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """The joints from `base` to `tip`, and where the tip is (4, 4) in the last joint's frame."""
+
+    base: str
+    tip: str
+    joints: tuple[Joint, ...]
+    tip_placement: np.ndarray
+    held: tuple[str, ...]
+
+
+def read_chain(text: str, base: str, tip: str, joints: Sequence[str]) -> Chain:
+    """Serial chain of the moving `joints`, in order, between two links of a URDF's text.
+
+    Raises UrdfError with what was found and what to do about it.
+    """
+    links, elements = _parse(text)
+    path = _path(links, elements, base, tip)
+    _check_joints(path, elements, joints)
+    held: list[str] = []
+    chain: list[Joint] = []
+    frame = np.eye(4)
+    for element in path:
+        frame = frame @ _origin(element)
+        if element.get('type') != 'fixed':
+            J = _body(links, elements, _link(element, 'child'), joints, held)
+            chain.append(_joint(element, frame, J))
+            frame = np.eye(4)
+    return Chain(base, tip, tuple(chain), frame, tuple(held))
+
+
+def _path(links: Elements, elements: Elements, base: str, tip: str) -> list[ET.Element]:
+    """Joints from the base down to the tip."""
+    for role, link in (('base', base), ('tip', tip)):
+        if link not in links:
+            raise UrdfError(f'no link {link!r} for the {role}: the links are {_listed(links)}')
+    above = {_link(element, 'child'): element for element in elements.values()}
+    path: list[ET.Element] = []
+    link = tip
+    while link != base:
+        if link not in above or len(path) > len(elements):
+            raise UrdfError(
+                f'the way up from the tip {tip!r} ends at {link!r} without passing the base '
+                f'{base!r}: choose a tip that the base carries'
+            )
+        path.insert(0, above[link])
+        link = _link(path[0], 'parent')
+    return path
+
+
+def _body(
+    links: Elements, elements: Elements, link: str, joints: Sequence[str], held: list[str]
+) -> np.ndarray:
+    """Pseudo-inertia (4, 4) of a link and what hangs on it rigidly; notes the joints `held`."""
+    J = _link_inertia(links[link])
+    for name, element in elements.items():
+        if _link(element, 'parent') != link or name in joints:
+            continue
+        kind = element.get('type')
+        if kind in MOVING:
+            held.append(name)
+        elif kind != 'fixed':
+            raise UrdfError(f'joint {name!r} on {link!r} is {kind}: remove it from the URDF')
+        frame = _origin(element)
+        J = J + frame @ _body(links, elements, _link(element, 'child'), joints, held) @ frame.T
+    return J
+
+
+def _parse(text: str) -> tuple[Elements, Elements]:
+    """Links and joints of a URDF by name."""
+    expand = 'expand it first: `xacro FILE > robot.urdf` (of ROS, or by `pip install xacro`)'
+    try:
+        robot = ET.fromstring(text)  # noqa: S314 - as trusted as the robot that it describes
+    except ET.ParseError as error:
+        hint = f'; this looks like xacro, {expand}' if 'xacro:' in text else ''
+        raise UrdfError(f'not a URDF, which is XML: {error}{hint}') from error
+    for element in robot.iter():
+        if 'xacro' in element.tag or any('${' in value for value in element.attrib.values()):
+            raise UrdfError(f'<{element.tag}> is xacro and no URDF yet: {expand}')
+    if robot.tag != 'robot':
+        raise UrdfError(f'a URDF is a <robot>, and this is a <{robot.tag}>: give another file')
+    named = []
+    for tag in ('link', 'joint'):
+        elements = robot.findall(tag)
+        named.append({element.get('name', ''): element for element in elements})
+        if len(named[-1]) < len(elements):
+            raise UrdfError(f'each {tag} needs a name of its own; got {_listed(named[-1])}')
+    _check_tree(*named)
+    return named[0], named[1]
+
+
+def _check_tree(links: Elements, joints: Elements) -> None:
+    children = [_link(joint, 'child') for joint in joints.values()]
+    for name, joint in joints.items():
+        for role in ('parent', 'child'):
+            if _link(joint, role) not in links:
+                raise UrdfError(
+                    f'joint {name!r} has the {role} {_link(joint, role)!r}, and the links are '
+                    f'{_listed(links)}: correct its <{role}>'
+                )
+        if children.count(_link(joint, 'child')) > 1:
+            raise UrdfError(
+                f'link {_link(joint, "child")!r} has two joints above it: a closed chain is not '
+                'supported; open it by removing a joint'
+            )
+
+
+def _check_joints(path: Sequence[ET.Element], elements: Elements, joints: Sequence[str]) -> None:
+    for name in joints:
+        if name not in elements:
+            raise UrdfError(f'no joint {name!r} in the URDF: its joints are {_listed(elements)}')
+    for element in path:
+        name, kind = element.get('name', ''), element.get('type')
+        if kind not in (*MOVING, 'fixed'):
+            raise UrdfError(f'joint {name!r} is {kind}; expected fixed, {_listed(MOVING)}')
+        if element.find('mimic') is not None:
+            raise UrdfError(f'joint {name!r} mimics another: choose a base and a tip without it')
+    moving = [element.get('name') for element in path if element.get('type') != 'fixed']
+    if not moving or list(joints) != moving:
+        raise UrdfError(
+            f'the moving joints from base to tip are {_listed(moving)}, in this order; got '
+            f'{_listed(joints)}: name them so, or choose another base or tip'
+        )
+
+
+def _joint(element: ET.Element, placement: np.ndarray, J: np.ndarray) -> Joint:
+    name, kind = element.get('name', ''), element.get('type', '')
+    axis = _numbers(element.find('axis'), 'xyz', '1 0 0')
+    length = float(np.linalg.norm(axis))
+    if length < 1e-6:
+        raise UrdfError(f'the axis of joint {name!r} is zero: write a direction such as 0 0 1')
+    limit = element.find('limit')
+    lower, upper = -inf, inf
+    if kind != 'continuous' and limit is not None:
+        lower, upper = _number(limit, 'lower'), _number(limit, 'upper')
+        if lower >= upper:
+            raise UrdfError(
+                f'joint {name!r} can move from {lower:g} to {upper:g} only: correct its <limit>'
+            )
+    link = _link(element, 'child')
+    if J[3, 3] <= 0.0:
+        raise UrdfError(
+            f'link {link!r}, which joint {name!r} moves, has no mass, nor has what hangs on it: '
+            'write its <inertial>, if only roughly'
+        )
+    return Joint(
+        name=name,
+        kind=kind,
+        placement=placement,
+        axis=axis / length,
+        lower=lower,
+        upper=upper,
+        velocity=_number(limit, 'velocity') or inf,
+        effort=_number(limit, 'effort') or inf,
+        link=link,
+        inertia=inertia_of(J),
+    )
+
+
+def _link_inertia(link: ET.Element) -> np.ndarray:
+    """Pseudo-inertia (4, 4) of a link in its own frame."""
+    inertial = link.find('inertial')
+    if inertial is None:
+        return np.zeros((4, 4))
+    tensor = inertial.find('inertia')
+    entries = [_number(tensor, key) for key in ('ixx', 'ixy', 'iyy', 'ixz', 'iyz', 'izz')]
+    mass = _number(inertial.find('mass'), 'value')
+    J = pseudo_inertia(np.array([mass, 0.0, 0.0, 0.0, *entries]))
+    moments = np.linalg.eigvalsh(rotational_inertia(J))
+    if mass < 0.0 or moments[0] < -1e-9 * moments[-1]:
+        figures = _listed(f'{moment:.3g}' for moment in moments)
+        raise UrdfError(
+            f'link {link.get("name")!r} has a mass of {mass:g} kg and principal moments of inertia '
+            f'of {figures} kg m^2: none can be negative; correct its <inertial>'
+        )
+    frame = _origin(inertial)
+    moved: np.ndarray = frame @ J @ frame.T
+    return moved
+
+
+def _origin(element: ET.Element) -> np.ndarray:
+    """Placement (4, 4) by an <origin>: roll, pitch, yaw about fixed axes, then xyz."""
+    origin = element.find('origin')
+    frame = np.eye(4)
+    frame[:3, 3] = _numbers(origin, 'xyz', '0 0 0')
+    for k, angle in enumerate(_numbers(origin, 'rpy', '0 0 0')):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        turn = np.eye(3)
+        turn[i, i] = turn[j, j] = cos(angle)
+        turn[i, j], turn[j, i] = -sin(angle), sin(angle)
+        frame[:3, :3] = turn @ frame[:3, :3]
+    return frame
+
+
+def _link(joint: ET.Element, role: str) -> str:
+    element = joint.find(role)
+    return '' if element is None else element.get('link', '')
+
+
+def _number(element: ET.Element | None, key: str) -> float:
+    return float(_numbers(element, key, '0', 1)[0])
+
+
+def _numbers(element: ET.Element | None, key: str, default: str, count: int = 3) -> np.ndarray:
+    if element is None:
+        element = ET.Element('')
+    text = element.get(key, default)
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not all(map(isfinite, numbers)):
+        raise UrdfError(f'<{element.tag} {key}="{text}">: expected {count} finite number(s)')
+    return np.array(numbers)
+
+
+def _listed(names: Iterable[object]) -> str:
+    return ', '.join(map(str, names)) or 'none'

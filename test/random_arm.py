@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Random serial arms as URDFs, and the same arms as pinocchio reads them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio
+
+CONFIG = Path(__file__).parents[1] / 'config'
+PANDA = tuple(f'panda_joint{i}' for i in range(1, 8))
+UR5E = (
+    'shoulder_pan_joint',
+    'shoulder_lift_joint',
+    'elbow_joint',
+    'wrist_1_joint',
+    'wrist_2_joint',
+    'wrist_3_joint',
+)
+
+
+def words(numbers):
+    return ' '.join(repr(float(number)) for number in numbers)
+
+
+def link(name, random):
+    """A link with the inertia of a random cloud of points: a possible body, whatever it draws."""
+    if random is None:
+        return f'<link name="{name}" />'
+    points = random.normal(size=(5, 3)) * random.uniform(0.02, 0.2, 3)
+    mass = random.uniform(0.2, 4.0)
+    second = (points - points.mean(0)).T @ (points - points.mean(0)) * mass / 5.0
+    I = np.trace(second) * np.eye(3) - second
+    entries = zip(('ixx', 'ixy', 'ixz', 'iyy', 'iyz', 'izz'), I[np.triu_indices(3)], strict=True)
+    return (
+        f'<link name="{name}"><inertial>'
+        f'<origin xyz="{words(points.mean(0))}" rpy="{words(random.uniform(-3, 3, 3))}" />'
+        f'<mass value="{mass!r}" />'
+        f'<inertia {" ".join(f"""{key}="{float(value)!r}" """ for key, value in entries)} />'
+        '</inertial></link>'
+    )
+
+
+def joint(name, kind, parent, child, random):
+    xyz, rpy = words(random.uniform(-0.4, 0.4, 3)), words(random.uniform(-3.0, 3.0, 3))
+    return (
+        f'<joint name="{name}" type="{kind}"><origin xyz="{xyz}" rpy="{rpy}" />'
+        f'<parent link="{parent}" /><child link="{child}" />'
+        f'<axis xyz="{words(random.normal(size=3))}" />'
+        '<limit lower="-1.5" upper="2.5" velocity="2.0" effort="30.0" /></joint>'
+    )
+
+
+def random_urdf(n, seed):
+    """URDF of a chain from `base` to `tip` by joints j1 .. jn, of all kinds.
+
+    Between two joints and beyond the last are fixed joints, and masses hang aside.
+    """
+    random = np.random.default_rng(seed)
+    text, at = [link('base', random)], 'base'
+    for i in range(1, n + 1):
+        kind = random.choice(('revolute', 'continuous', 'prismatic'), p=(0.5, 0.2, 0.3))
+        text += [link(f'l{i}', random), joint(f'j{i}', kind, at, f'l{i}', random)]
+        text += [link(f'aside{i}', random), joint(f'a{i}', 'fixed', f'l{i}', f'aside{i}', random)]
+        text += [link(f'flange{i}', None), joint(f'f{i}', 'fixed', f'l{i}', f'flange{i}', random)]
+        at = f'flange{i}'
+    text += [link('tip', None), joint('tip_joint', 'fixed', at, 'tip', random)]
+    text += [link('tool', random), joint('tool_joint', 'fixed', 'tip', 'tool', random)]
+    random.shuffle(text)
+    return f'<robot name="arm">{"".join(text)}</robot>', tuple(f'j{i}' for i in range(1, n + 1))
+
+
+def pinocchio_model(text, joints):
+    """The arm of these joints; all others are held at 0."""
+    model = pinocchio.buildModelFromXML(text)
+    others = [model.getJointId(name) for name in model.names[1:] if name not in joints]
+    return pinocchio.buildReducedModel(model, others, pinocchio.neutral(model))
+
+
+def configuration(model, q):
+    """Configuration vector of pinocchio, which has cosine and sine of continuous joints."""
+    return pinocchio.integrate(model, pinocchio.neutral(model), q)

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The chain read from a URDF is pinocchio's, and what cannot work is rejected with a remedy."""
+
+from __future__ import annotations
+
+from math import inf
+
+import numpy as np
+import pinocchio
+import pytest
+from random_arm import CONFIG, PANDA, UR5E, configuration, pinocchio_model, random_urdf
+
+from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
+from blf_dsc_controller.arms.urdf import UrdfError, read_chain
+
+PANDA_TEXT = (CONFIG / 'panda.urdf').read_text()
+UR5E_TEXT = (CONFIG / 'ur5e.urdf').read_text()
+ARMS = (
+    (*random_urdf(1, 1), 'base', 'tip'),
+    (*random_urdf(4, 2), 'base', 'tip'),
+    (*random_urdf(7, 3), 'base', 'tip'),
+    (PANDA_TEXT, PANDA, 'panda_link0', 'panda_hand_tcp'),
+    (UR5E_TEXT, UR5E, 'world', 'tool0'),
+)
+
+
+@pytest.mark.parametrize(('text', 'joints', 'base', 'tip'), ARMS)
+def test_frames_axes_and_inertias_are_those_of_pinocchio(text, joints, base, tip):
+    chain = read_chain(text, base, tip, joints)
+    model = pinocchio_model(text, joints)
+    data = model.createData()
+    assert [one.name for one in chain.joints] == list(model.names[1:])
+    for i, one in enumerate(chain.joints):
+        theirs = model.inertias[i + 1].toDynamicParameters()
+        np.testing.assert_allclose(one.inertia, theirs, atol=1e-12)
+        np.testing.assert_allclose(
+            one.placement, model.jointPlacements[i + 1].homogeneous, atol=1e-12
+        )
+        q = configuration(model, np.eye(len(joints))[i])
+        twist = pinocchio.computeJointJacobian(model, data, q, i + 1).reshape(6, -1)[:, i]
+        own = twist[:3] if one.kind == 'prismatic' else twist[3:]
+        np.testing.assert_allclose(own, one.axis, atol=1e-12)
+    frame = model.frames[model.getFrameId(tip)]
+    np.testing.assert_allclose(chain.tip_placement, frame.placement.homogeneous, atol=1e-12)
+
+
+def test_limits_are_those_of_the_file():
+    first = read_chain(PANDA_TEXT, 'panda_link0', 'panda_hand_tcp', PANDA).joints[0]
+    assert (first.lower, first.upper) == (-2.8973, 2.8973)
+    assert (first.velocity, first.effort) == (2.175, 87.0)
+
+
+def test_limits_that_are_not_there_are_infinite():
+    text = '<limit lower="-2.8973" upper="2.8973" velocity="2.175" effort="87" />'
+    assert text in PANDA_TEXT
+    for changed in ('', '<limit effort="0" velocity="0" lower="-9" upper="9" />'):
+        one = read_chain(
+            PANDA_TEXT.replace(text, changed, 1), 'panda_link0', 'panda_link8', PANDA
+        ).joints[0]
+        assert (one.velocity, one.effort) == (inf, inf)
+        assert (one.lower, one.upper) == ((-9.0, 9.0) if changed else (-inf, inf))
+    continuous = PANDA_TEXT.replace(
+        '"panda_joint1" type="revolute"', '"panda_joint1" type="continuous"'
+    )
+    one = read_chain(continuous, 'panda_link0', 'panda_link8', PANDA).joints[0]
+    assert (one.lower, one.upper, one.effort) == (-inf, inf, 87.0)
+
+
+def test_a_gripper_is_carried_whatever_the_tip_and_its_fingers_are_named():
+    whole = read_chain(PANDA_TEXT, 'panda_link0', 'panda_hand_tcp', PANDA)
+    assert whole.held == ('panda_finger_joint1', 'panda_finger_joint2')
+    assert whole.joints[6].inertia[0] == pytest.approx(0.735522 + 0.73 + 2 * 0.015)
+    shorter = read_chain(PANDA_TEXT, 'panda_link0', 'panda_link7', PANDA)
+    np.testing.assert_allclose(shorter.joints[6].inertia, whole.joints[6].inertia)
+
+
+def test_a_chain_may_begin_and_end_inside_the_arm():
+    chain = read_chain(PANDA_TEXT, 'panda_link2', 'panda_link4', PANDA[2:4])
+    whole = read_chain(PANDA_TEXT, 'panda_link0', 'panda_hand_tcp', PANDA)
+    np.testing.assert_allclose(chain.joints[0].inertia, whole.joints[2].inertia)
+    # The wrist is then a rigid load.
+    assert chain.joints[1].inertia[0] == pytest.approx(sum(j.inertia[0] for j in whole.joints[3:]))
+
+
+def test_pseudo_inertia_is_positive_exactly_for_possible_bodies():
+    ten = read_chain(UR5E_TEXT, 'world', 'tool0', UR5E).joints[1].inertia
+    np.testing.assert_allclose(inertia_of(pseudo_inertia(ten)), ten, atol=1e-15)
+    assert np.linalg.eigvalsh(pseudo_inertia(ten))[0] > 0.0
+    ten[9] = 3.0 * ten[4] + 3.0 * ten[6]  # Izz > Ixx + Iyy
+    assert np.linalg.eigvalsh(pseudo_inertia(ten))[0] < 0.0
+
+
+def changed(old, new, count=-1):
+    assert old in PANDA_TEXT
+    return PANDA_TEXT.replace(old, new, count)
+
+
+LINK7 = PANDA_TEXT[PANDA_TEXT.index('<link name="panda_link7">') :]
+LINK7_INERTIAL = LINK7[LINK7.index('<inertial>') : LINK7.index('</inertial>')] + '</inertial>'
+WEIGHTLESS = changed(LINK7_INERTIAL, '').replace('<mass value="0.73" />', '<mass value="0" />')
+
+WRONG = {
+    'xacro that was not expanded': (
+        {'text': changed('<link name="panda_link8" />', '<link name="${name}_link8" />')},
+        'xacro FILE > robot.urdf',
+    ),
+    'xacro without its namespace': (
+        {'text': changed('<link name="panda_link8" />', '<xacro:hand />')},
+        'xacro FILE > robot.urdf',
+    ),
+    'a file that is no XML': ({'text': 'l1: 1.0'}, 'not a URDF, which is XML'),
+    'an SDF': ({'text': '<sdf />'}, 'this is a <sdf>'),
+    'an unknown tip': ({'tip': 'tool'}, "no link 'tool' for the tip: the links are panda_link0, "),
+    'an unknown base': ({'base': 'world'}, "no link 'world' for the base"),
+    'a tip that the base does not carry': (
+        {'base': 'panda_leftfinger', 'tip': 'panda_rightfinger'},
+        "ends at 'panda_link0' without passing",
+    ),
+    'an unknown joint': (
+        {'joints': ('elbow', *PANDA[1:])},
+        "no joint 'elbow' in the URDF: its joints are panda_joint1, ",
+    ),
+    'the wrong order': ({'joints': PANDA[::-1]}, 'panda_joint7, in this order; got panda_joint7'),
+    'a joint left out': ({'joints': PANDA[:6]}, 'panda_joint7, in this order'),
+    'a joint of another branch': (
+        {'joints': (*PANDA, 'panda_finger_joint1')},
+        'choose another base or tip',
+    ),
+    'no joint at all': ({'base': 'panda_hand', 'joints': ()}, 'are none'),
+    'a joint that mimics': (
+        {'text': changed('<axis xyz="0 0 1" />', '<mimic joint="j" /><axis xyz="0 0 1" />', 1)},
+        "'panda_joint1' mimics",
+    ),
+    'a floating joint': (
+        {'text': changed('"panda_joint1" type="revolute"', '"panda_joint1" type="floating"')},
+        "'panda_joint1' is floating; expected fixed, revolute",
+    ),
+    'a floating load': (
+        {'text': changed('finger_joint1" type="prismatic"', 'finger_joint1" type="floating"')},
+        "on 'panda_hand' is floating",
+    ),
+    'no mass': (
+        {
+            'text': WEIGHTLESS.replace('<mass value="0.015" />', '<mass value="0" />'),
+        },
+        "link 'panda_link7', which joint 'panda_joint7' moves, has no mass",
+    ),
+    'a negative mass': (
+        {'text': changed('<mass value="0.73" />', '<mass value="-0.73" />')},
+        "link 'panda_hand' has a mass of -0.73 kg",
+    ),
+    'a negative moment of inertia': (
+        {'text': changed('izz="0.0017"', 'izz="-0.0017"')},
+        'none can be negative',
+    ),
+    'no axis': ({'text': changed('<axis xyz="0 0 1" />', '<axis xyz="0 0 0" />')}, 'is zero'),
+    'no range': ({'text': changed('upper="2.8973"', 'upper="-3"')}, 'from -2.8973 to -3 only'),
+    'a word as a number': (
+        {'text': changed('<mass value="0.73" />', '<mass value="heavy" />')},
+        '<mass value="heavy">: expected 1 finite number',
+    ),
+    'an axis of two numbers': (
+        {'text': changed('<axis xyz="0 0 1" />', '<axis xyz="0 1" />')},
+        'expected 3 finite number',
+    ),
+    'two links of a name': (
+        {'text': changed('<link name="panda_link8" />', '<link name="panda_link7" />')},
+        'each link needs a name of its own',
+    ),
+    'a link that is not there': (
+        {'text': changed('<link name="panda_link8" />', '')},
+        "has the child 'panda_link8', and the links are",
+    ),
+    'a closed chain': (
+        {
+            'text': changed(
+                '<child link="panda_rightfinger" />', '<child link="panda_leftfinger" />'
+            )
+        },
+        "'panda_leftfinger' has two joints above it",
+    ),
+}
+
+
+@pytest.mark.parametrize('case', WRONG)
+def test_what_cannot_work_is_rejected_with_a_remedy(case):
+    changes, message = WRONG[case]
+    arguments = {'text': PANDA_TEXT, 'base': 'panda_link0', 'tip': 'panda_hand_tcp'}
+    with pytest.raises(UrdfError) as caught:
+        read_chain(**{**arguments, 'joints': PANDA, **changes})
+    assert message in str(caught.value)
+
+
+def test_an_expanded_file_may_still_name_the_xacro_namespace():
+    text = changed('<robot name', '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name')
+    assert len(read_chain(text, 'panda_link0', 'panda_hand_tcp', PANDA).joints) == 7
