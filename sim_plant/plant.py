@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.plant import PlantConfig
 from sim_plant.actuator import Drives
@@ -117,6 +118,12 @@ def parameters_of(config: PlantConfig) -> np.ndarray:
     P = np.zeros(PARAMETERS)
     parameters(arm_of(config), P)
     return P
+
+
+def parameters_by_name(config: PlantConfig, names: Sequence[str]) -> np.ndarray:
+    """True parameters in the order of a model's `names`; NaN if those are of other parameters."""
+    P = dict(zip(PARAMETER_NAMES, parameters_of(config).tolist(), strict=True))
+    return np.array([P[name] if set(names) == P.keys() else np.nan for name in names])
 
 
 def plant_of(config: PlantConfig) -> Plant:

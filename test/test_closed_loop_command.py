@@ -172,3 +172,17 @@ def test_real_time_reports_what_it_held(tmp_path):
         # Granted or denied, as this machine permits, but always logged.
         assert 'SCHED_FIFO priority 10' in output
         assert 'memory' in output
+
+
+def test_the_planar_chain_runs_over_ros_with_its_parameter_error(tmp_path):
+    text = (
+        'blf_dsc_controller:\n  ros__parameters:\n    model: planar_chain\n'
+        '    learning: {initial_estimate: [0.5, 0.2, 0.16]}\n'
+    )
+    (tmp_path / 'chain.yaml').write_text(text)
+    arguments = ('--config', tmp_path / 'chain.yaml', '--mode', 'lockstep', '--duration', 0.5)
+    run = closed_loop(*arguments, '--out', tmp_path / 'out')
+    assert run.returncode == 0, run.stderr
+    # That of the model two_link.
+    assert 'parameter error 41.89 %' in run.stderr
+    assert 'parameters  error end 41.9 %' in run.stdout

@@ -12,21 +12,24 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.messages.journal import OUTSIDE_BOUND
 from blf_dsc_controller.messages.topics import (
-    BIAS,
+    COLUMNS,
     COMPUTE_TIME,
     DISTURBANCE,
     LAMBDA_MIN,
     LATCHED,
     MODEL_CHANGES,
+    POSITION,
+    VELOCITY,
 )
-from blf_dsc_controller.run import Floats, Run
+from blf_dsc_controller.run import Floats, Run, Series
 
 MOMENTS = (5, 10, 20, 40, 60)
 """Times at which the parameter error is reported [s]."""
 
 _LEARNED = 0.01
 _TAIL = 10.0  # s
-_NO_PARAMETERS = (DISTURBANCE, BIAS, LAMBDA_MIN, LATCHED, MODEL_CHANGES, COMPUTE_TIME)
+_OTHERS = (LAMBDA_MIN, LATCHED, MODEL_CHANGES, COMPUTE_TIME)
+_NO_PARAMETERS = (*COLUMNS, DISTURBANCE, POSITION, VELOCITY, *_OTHERS)
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,8 @@ class Estimates:
     names: tuple[str, ...]
     time: Floats  # (m,) s since the first sample of the run
     estimate: Floats  # (m, p)
-    true: Floats | None  # (m, p)
+    true: Floats | None  # (m, p); None if unknown, or if the plant's parameters have other names
+    unlike: tuple[str, ...] = ()  # those names
 
     @property
     def relative_error(self) -> Floats | None:
@@ -50,19 +54,22 @@ class Estimates:
 def estimates_of(run: Run) -> Estimates | None:
     """Estimates of the model parameters, None if nothing was learned.
 
-    The parameters are those whose true values are known; if none are, all that is estimated beside
-    disturbances.
+    They are compared with the truth by name, and only if the plant has the same parameters.
     """
     if run.learning is None:
         return None
-    names = tuple(name for name in run.learning.names if not name.startswith(_NO_PARAMETERS))
-    known = () if run.truth is None else tuple(name for name in names if name in run.truth.names)
-    true = None
-    if run.truth is not None and known:
-        columns = [run.truth.names.index(name) for name in known]
-        true = run.truth.held(run.learning.stamp)[:, columns]
-    chosen = known or names
-    return Estimates(chosen, run.time_of(run.learning.stamp), run.learning.select(chosen), true)
+    names, at = _parameters(run.learning), run.time_of(run.learning.stamp)
+    estimate, truth = run.learning.select(names), run.truth
+    theirs = () if truth is None else _parameters(truth)
+    if truth is None or set(names) != set(theirs):
+        return Estimates(names, at, estimate, None, theirs)
+    columns = [truth.names.index(name) for name in names]
+    return Estimates(names, at, estimate, truth.held(run.learning.stamp)[:, columns])
+
+
+def _parameters(series: Series) -> tuple[str, ...]:
+    """Names of the parameters of an arm."""
+    return tuple(name for name in series.names if not name.startswith(_NO_PARAMETERS))
 
 
 def latch_time(run: Run) -> float | None:

@@ -95,6 +95,7 @@ def _learning(run: Run, estimates: Estimates, metrics: Metrics) -> Summary:
             'final_estimate': _named(estimates, estimates.estimate),
             'rejected_columns': {name: reason or None for name, reason in run.rejected.items()},
             'true': None if estimates.true is None else _named(estimates, estimates.true),
+            'true_parameters_of_other_names': list(estimates.unlike),
         }
     )
     return learning
@@ -174,6 +175,10 @@ def _learning_lines(learning: Summary) -> Iterator[str]:
         yield f'arm         changed at {times}: learning started anew'
     for column, reason in learning['rejected_columns'].items():
         yield f'rejected    {reason or f"{column}: see the log for the reason"}'
+    unlike = learning['true_parameters_of_other_names']
+    if unlike:
+        names, true = ', '.join(learning['final_estimate']), ', '.join(unlike)
+        yield f'parameters  no error: those of the model are {names}, those of the plant {true}'
     if learning['final_relative_error'] is None:
         return
     moments = [f'{moment} s {_percent(e)}' for moment, e in learning['relative_error_at_s'].items()]

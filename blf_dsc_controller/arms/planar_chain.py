@@ -8,7 +8,7 @@ In the absolute link angles phi_i = q1 + ... + qi, with w = phi' and mu_i the ma
 
 and the joint torques are tau_i = Q_i + ... + Q_n.  C_ij = P_ij sin(phi_i - phi_j) w_j is the
 Christoffel form, and stays so under the constant change of coordinates.  For n = 2 this is the arm
-of Section IV, its parameters in the order 11, 12, 22.
+of Section IV, with the names of its parameters in the order 11, 12, 22.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.compiled.jit import inner
 
 
@@ -30,6 +31,9 @@ class PlanarChain(NamedTuple):
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the P_ij, in the order of the regressor's columns."""
+        if self.n == 2:
+            P11, P22, P12 = PARAMETER_NAMES
+            return P11, P12, P22
         return tuple(f'P{i + 1}{j + 1}' for i in range(self.n) for j in range(i, self.n))
 
     @property

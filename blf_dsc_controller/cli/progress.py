@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 from blf_dsc_controller.configuration.plant import PlantConfig
-from sim_plant.plant import parameters_of
+from sim_plant.plant import parameters_by_name
 
 _FORMAT = '{desc} |{bar}| {n:.1f}/{total:g} s [{elapsed}<{remaining}]{postfix}'
 _LINE_PERIOD = 10.0  # s between two lines where there is no terminal to draw a bar on
@@ -23,8 +24,9 @@ class Progress:
     A bar on a terminal; elsewhere, such as in a log, a line now and then.
     """
 
-    def __init__(self, config: PlantConfig) -> None:
-        self._truth = parameters_of(config)
+    def __init__(self, config: PlantConfig, parameters: Sequence[str]) -> None:
+        """Begin at 0 s; `parameters` are the names of the estimates."""
+        self._truth = parameters_by_name(config, parameters)
         self._duration = config.duration
         self._line = ''
         self._due = time.monotonic() + _LINE_PERIOD
@@ -37,9 +39,11 @@ class Progress:
         )
 
     def show(self, elapsed: float, ratio: float, estimate: ArrayLike) -> None:
-        """Show the simulated time [s], the largest |xi1| / k_c so far, and P^ (3,)."""
+        """Show the simulated time [s], the largest |xi1| / k_c so far, and P^ (p,)."""
         error = np.linalg.norm(np.asarray(estimate) - self._truth) / np.linalg.norm(self._truth)
-        status = f'max|xi1|/bound {ratio:.2f}, parameter error {100 * error:.2f} %'
+        status = f'max|xi1|/bound {ratio:.2f}'
+        if np.isfinite(error):
+            status += f', parameter error {100 * error:.2f} %'
         self._bar.set_postfix_str(status, refresh=False)
         self._bar.update(min(elapsed, self._duration) - self._bar.n)
         self._line = f'closed loop {elapsed:.1f}/{self._duration:g} s, {status}'

@@ -26,7 +26,7 @@ from blf_dsc_controller.configuration.params_file import dump, load_loop, locate
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.controller import update
-from blf_dsc_controller.law.factory import estimate_names
+from blf_dsc_controller.law.factory import estimate_names, model_of
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.bag import write_bag
@@ -117,12 +117,13 @@ def _configuration(options: Namespace) -> LoopConfig:
 
 
 def _run_offline(config: LoopConfig, bag: Path) -> None:
-    progress = Progress(config.plant)
+    parameters = model_of(config.controller).parameter_names
+    progress = Progress(config.plant, parameters)
 
     def show(record: Record, rows: int) -> None:
         n = len(record.config.joints)
         errors = abs(record.samples[:rows, 2 * n : 3 * n] / record.samples[:rows, 6 * n : 7 * n])
-        estimate = record.sample(rows - 1).estimate[:3]
+        estimate = record.sample(rows - 1).estimate[: len(parameters)]
         progress.show(record.stamps[rows - 1] * 1e-9, errors.max(), estimate)
 
     with announced_compilation():
@@ -139,7 +140,7 @@ def _run_over_ros(config: LoopConfig, out: Path, domain: int | None) -> bool:
 
     if not is_compiled(update, *plant_kernels.KERNELS):
         _print_notice()
-    return run_session(config.plant, out, domain)
+    return run_session(config, out, domain)
 
 
 class _CompilationListener(event.Listener):  # type: ignore[misc]

@@ -20,11 +20,10 @@ import rclpy
 from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import JointState
 
-from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.cli.progress import Progress
-from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER
-from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, LoopConfig
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.law.factory import model_of
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.telemetry import DECIMATION
 from blf_dsc_controller.messages.topics import RATIO
@@ -46,7 +45,7 @@ _ROOM = 1_000_000  # bytes that a log needs at least
 _PR_SET_PDEATHSIG = 1
 
 
-def run_session(plant: PlantConfig, out: Path, domain: int | None) -> bool:
+def run_session(config: LoopConfig, out: Path, domain: int | None) -> bool:
     """Run the three nodes on `out/config.yaml` until the plant has ended.
 
     In a ROS domain of its own, unless one is given. Returns False if SIGINT or SIGTERM ended the
@@ -59,7 +58,7 @@ def run_session(plant: PlantConfig, out: Path, domain: int | None) -> bool:
         os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
         os.environ['ROS_LOG_DIR'] = str(logs / 'ros')
         try:
-            return _run_nodes(plant, out / 'config.yaml', logs)
+            return _run_nodes(config, out / 'config.yaml', logs)
         except NodeFailedError:
             if shutil.disk_usage(out).free < _ROOM:
                 print(f'there is no room left on the disk of {out}', file=sys.stderr)
@@ -138,13 +137,13 @@ class NodeProcess:
 class Monitor:
     """Shows the progress of the loop that runs in this process's ROS domain."""
 
-    def __init__(self, config: PlantConfig, interrupts: Sequence[int]) -> None:
+    def __init__(self, config: LoopConfig, interrupts: Sequence[int]) -> None:
+        plant = config.plant
         self._interrupts = interrupts
-        self.progress = Progress(config)
+        self._parameters = model_of(config.controller).parameter_names
+        self.progress = Progress(plant, self._parameters)
         self._start, self._elapsed = -1.0, 0.0
-        self._end = (
-            config.duration - DECIMATION * config.sample_time / 2 if config.duration else inf
-        )
+        self._end = plant.duration - DECIMATION * plant.sample_time / 2 if plant.duration else inf
         self._latest: JointState | None = None
         self._context = rclpy.Context()
         rclpy.init(context=self._context, signal_handler_options=rclpy.SignalHandlerOptions.NO)
@@ -172,7 +171,7 @@ class Monitor:
         values = dict(zip(message.name, message.position, strict=True))
         ratio = max(value for name, value in values.items() if name.startswith(RATIO))
         self._elapsed = stamp - self._start
-        self.progress.show(self._elapsed, ratio, [values[name] for name in PARAMETER_NAMES])
+        self.progress.show(self._elapsed, ratio, [values[name] for name in self._parameters])
         return True
 
     def __enter__(self) -> Monitor:
@@ -198,7 +197,7 @@ class Monitor:
         self._latest = message
 
 
-def _run_nodes(plant: PlantConfig, params_file: Path, logs: Path) -> bool:
+def _run_nodes(config: LoopConfig, params_file: Path, logs: Path) -> bool:
     nodes: list[NodeProcess] = []
     interrupts: list[int] = []
     remark = ''
@@ -210,7 +209,7 @@ def _run_nodes(plant: PlantConfig, params_file: Path, logs: Path) -> bool:
         try:
             for name in _MODULES:
                 nodes.append(NodeProcess(name, params_file, logs))  # noqa: PERF401 - those that started are stopped
-            remark = _monitor(plant, nodes, interrupts)
+            remark = _monitor(config, nodes, interrupts)
         finally:
             for node in reversed(nodes):
                 node.stop()
@@ -224,14 +223,14 @@ def _run_nodes(plant: PlantConfig, params_file: Path, logs: Path) -> bool:
     return not interrupts
 
 
-def _monitor(plant: PlantConfig, nodes: list[NodeProcess], interrupts: list[int]) -> str:
+def _monitor(config: LoopConfig, nodes: list[NodeProcess], interrupts: list[int]) -> str:
     """Show the progress until the plant ends or a signal comes; return a remark on the recorder.
 
     A loop that has begun continues without its recorder; its first message may come a little later.
     """
     recorder, *loop = nodes
     ended, warned = inf, False
-    with Monitor(plant, interrupts) as monitor:
+    with Monitor(config, interrupts) as monitor:
         while loop[-1].is_running and not interrupts:
             for node in loop:
                 node.check()

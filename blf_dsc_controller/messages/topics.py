@@ -122,7 +122,7 @@ TOPICS = (
 
 # In the vectors learning, truth, timing, monitor.
 DISTURBANCE = 'disturbance '  # followed by the joint
-BIAS = 'bias '  # followed by the joint: a constant torque that is learned
+COLUMNS = ('bias ', 'viscous ', 'coulomb ', 'sin ', 'cos ')  # beginnings of learned disturbances
 POSITION = 'position '  # followed by the joint
 VELOCITY = 'velocity '  # followed by the joint
 RATIO = 'max_error_ratio '  # followed by the joint: the largest |xi1| / k_c so far

@@ -11,7 +11,7 @@ import numpy as np
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import OutsideBarrierError
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.factory import begin, controller_of
+from blf_dsc_controller.law.factory import begin, controller_of, model_of
 from blf_dsc_controller.monte_carlo.study import Origin, Study, draw, origin_of, plant_of_draw
 from blf_dsc_controller.reference.limits import MotionError
 from blf_dsc_controller.simulation.loop import run_metrics
@@ -21,7 +21,7 @@ from blf_dsc_controller.simulation.metrics import (
     metrics_of,
     new_metrics,
 )
-from sim_plant.plant import parameters_of, plant_of, steps_of
+from sim_plant.plant import parameters_by_name, plant_of, steps_of
 
 KEPT = 'kept'
 VIOLATED = 'violated'
@@ -61,7 +61,7 @@ def warm_up(study: Study) -> None:
 
 def metrics_settings(study: Study, plant: PlantConfig) -> MetricsSettings:
     """Settings of the metrics of a run with this plant."""
-    P = parameters_of(plant)
+    P = parameters_by_name(plant, model_of(study.controller).parameter_names)
     limits = zip(study.controller.torque.limit, plant.actuator.torque_limit, strict=True)
     times = (study.settings.settled_after, *study.settings.moments)
     settled, *moments = (round(t / plant.sample_time) for t in times)

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.params_file import dumps
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
-from blf_dsc_controller.law.factory import estimate_names, model_of
+from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import EventType, Journal
@@ -62,7 +63,7 @@ def write_bag(
 
 
 def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, Message]]:
-    plant = PlantTelemetry(config.joints, model_of(config).parameter_names)
+    plant = PlantTelemetry(config.joints, PARAMETER_NAMES)
     controller = ControllerTelemetry(config.joints, estimate_names(config))
     monitor = Monitor(config.joints, estimate_names(config), record.controller.settings)
     limit = np.array(config.torque.limit)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
+from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.compiled.views import part, view
@@ -69,7 +70,7 @@ class Record:
         figures = ('estimate', 'disturbance', 'lambda_min', 'latched', 'changes')
         learned = [values[name] for name in figures]
         position, velocity, _ = np.split(self.measurements, 3, axis=1)
-        true = (*names[: settings.p], *disturbances)
+        true = (*PARAMETER_NAMES, *disturbances)
         monitor = Series(LYAPUNOV_TERMS, self.stamps, values['lyapunov'])
         return Run(
             joints=config.joints,
