@@ -18,7 +18,11 @@ class ConfigurationError(BlfDscError):
         super().__init__(f'{len(problems)} {count} with the configuration{where}:{lines}')
 
 
-class OutsideBarrierError(BlfDscError):
+class StartError(BlfDscError):
+    """The law cannot take the arm over as it moves now."""
+
+
+class OutsideBarrierError(StartError):
     """The tracking error of a joint is not inside its bound, where the law is not defined."""
 
     def __init__(self, joint: str, error: float, bound: float) -> None:
@@ -28,6 +32,20 @@ class OutsideBarrierError(BlfDscError):
         super().__init__(
             f'joint {joint!r} starts {error:+.6g} rad from the reference, outside its bound of '
             f'{bound:.6g} rad: start closer to the reference, or widen barrier.bound'
+        )
+
+
+class VelocityMismatchError(StartError):
+    """A joint differs too much from its reference in velocity: it would leave the bound."""
+
+    def __init__(self, joint: str, difference: float, limit: float) -> None:
+        self.joint = joint
+        self.difference = difference
+        self.limit = limit
+        super().__init__(
+            f'joint {joint!r} starts {difference:+.6g} rad/s faster than the reference, but only '
+            f'{limit:.6g} rad/s can be made up within its bound at limits.acceleration: start with '
+            'the velocity of the reference, or enable the approach (approach.enabled)'
         )
 
 

@@ -14,7 +14,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import Initial, PlantConfig
 from blf_dsc_controller.configuration.reference import Approach, Reference
 from blf_dsc_controller.configuration.schema import build, change
-from blf_dsc_controller.errors import ConfigurationError, OutsideBarrierError
+from blf_dsc_controller.errors import ConfigurationError, OutsideBarrierError, VelocityMismatchError
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
@@ -28,9 +28,9 @@ BOUND = 2e-3  # rad
 STARTS = PAPER + np.random.default_rng(7).uniform(-2.0, 2.0, (10, 2))
 
 
-def run(config, start, duration):
+def run(config, start, duration, velocity=(0.0, 0.0)):
     plant = replace(
-        PlantConfig(), initial=Initial(tuple(start), (0.0, 0.0)), duration=float(duration)
+        PlantConfig(), initial=Initial(tuple(start), velocity), duration=float(duration)
     )
     return simulate(config, plant)
 
@@ -68,6 +68,59 @@ def test_an_approach_may_begin_later():
     settled = begin(law, CONFIG, PAPER, STILL, 3.0)  # the paper's reference is 0.6 rad away then
     assert settled > 3.0
     np.testing.assert_allclose(law.reference_at(3.0), [PAPER, STILL, STILL], atol=1e-12)
+
+
+MOVING = {'reference.phase': [-np.pi / 2]}  # passes its middle at 0.3 rad/s at t = 0
+
+
+def test_a_start_at_rest_on_a_moving_reference_is_an_approach():
+    config = build(ControllerConfig, MOVING)
+    record = run(config, config.reference.offset, 4.0)
+    reached = np.abs(record.samples[:, 4:6]).max(axis=0)
+    np.testing.assert_array_less(reached, 0.5 * BOUND)
+    assert np.abs(record.samples[:, 8:10]).max() < 15.0  # 12 N m are gravity; the limit is 20
+    paper = sampled(reference_of(config), record.stamps * 1e-9)[:, 0]
+    np.testing.assert_allclose(record.samples[-1, :2], paper[-1], atol=1e-14)
+
+
+def test_without_approaches_a_start_that_is_too_slow_is_refused_with_the_velocities():
+    config = build(ControllerConfig, MOVING | {'approach.enabled': False})
+    law = controller_of(config)
+    offset, moving = np.array(config.reference.offset), np.full(2, 0.3)
+    with pytest.raises(VelocityMismatchError, match='starts -0'):
+        begin(law, config, offset, STILL)
+    assert begin(law, config, offset, moving) == 0.0
+    # v^2 / (2 a) = 0.9 bounds at a = 2 rad/s^2, from where there is a tenth of it left, or more.
+    slower = moving - np.sqrt(2.0 * 2.0 * 0.9 * BOUND)
+    assert begin(law, config, offset + 0.09 * BOUND, slower) == 0.0
+    with pytest.raises(VelocityMismatchError):
+        begin(law, config, offset + 0.11 * BOUND, slower)
+
+
+def test_an_arm_that_moves_is_stopped_before_it_is_held():
+    config = build(ControllerConfig, {'reference.type': 'hold'})
+    record = run(config, PAPER, 6.0, velocity=(0.5, -0.5))
+    np.testing.assert_array_equal(record.samples[-1, :2], PAPER)
+    assert np.abs(record.samples[:, 4:6]).max() < 0.5 * BOUND
+
+
+@pytest.mark.parametrize('velocity', ['measured', 'estimated'])
+@pytest.mark.parametrize('rest', [True, False])
+def test_activated_again_on_the_reference_the_law_takes_over_only_at_its_velocity(rest, velocity):
+    """Held by the brakes where the reference passes, the arm is led to it; moving, it goes on."""
+    rig = Rig({'safety.velocity': velocity, 'torque.limit': [40.0, 40.0]})
+    rig.step(1500)  # at 0.3 rad/s
+    rig.guard.deactivate()
+    if rest:
+        rig.plant.state[3:5] = 0.0
+    rig.step(1)
+    rig.guard.activate()
+    first = len(rig.commands)
+    rig.step(1500)
+    assert rig.guard.supervisor.running, rig.supervisor.text
+    assert rig.guard.ratio.max() < 0.6
+    assert (rig.guard.settled > 0.1) == rest
+    assert np.abs(rig.commands[first:]).max() < 15.0
 
 
 def test_hold_stays_where_the_arm_is():

@@ -93,7 +93,7 @@ def _not_writable(path: Path, error: OSError) -> BlfDscError:
 def _configuration(options: Namespace) -> LoopConfig:
     """Configuration of the three nodes, from the file and the options that override it.
 
-    Raises OutsideBarrierError or MotionError if the controller would reject the true start, and
+    Raises StartError or MotionError if the controller would reject the true start, and
     prints warnings.
     """
     chosen = {'duration': options.duration, 'mode': options.mode, 'seed': options.seed}

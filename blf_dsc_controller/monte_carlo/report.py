@@ -68,7 +68,7 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
     """Compute a run of the study again into the folder `out`: config.yaml, bag, figures, summary.
 
     Raises BlfDscError if the run has no results, or if they are not reproduced bit for bit;
-    OutsideBarrierError if the controller rejects its start.
+    StartError if the controller rejects its start.
     """
     results = store.results()
     if run not in results['run']:

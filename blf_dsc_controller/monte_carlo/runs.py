@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.errors import OutsideBarrierError
+from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import begin, controller_of, model_of
 from blf_dsc_controller.monte_carlo.study import Origin, Study, draw, origin_of, plant_of_draw
@@ -114,7 +114,7 @@ def _run(study: Study, index: int, controller: Controller, origin: Origin) -> Ro
     controller.reset()
     try:
         begin(controller, study.controller, q, dq)
-    except (OutsideBarrierError, MotionError):
+    except (StartError, MotionError):
         return row | _rejected_row(study, np.abs(q - origin.qr) / origin.bound)
     settings = metrics_settings(study, config)
     return row | metrics_row(study, run_metrics(controller, plant, steps_of(config) + 1, settings))

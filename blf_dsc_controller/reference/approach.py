@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.errors import OutsideBarrierError
+from blf_dsc_controller.errors import OutsideBarrierError, StartError, VelocityMismatchError
 from blf_dsc_controller.reference.limits import (
     MotionError,
     MotionLimits,
@@ -139,24 +139,50 @@ def check_start(
             raise OutsideBarrierError(joint, float(error), float(limit))
 
 
+def check_takeover(
+    config: ControllerConfig,
+    bound: np.ndarray,
+    q: np.ndarray,
+    dq: np.ndarray,
+    reference_vector: np.ndarray,
+    t: float = 0.0,
+) -> None:
+    """Check that the law can take over an arm at q (n,) [rad] with dq (n,) [rad/s] at time t [s].
+
+    A difference v in velocity carries the error |xi1| on by v^2 / (2 a) until it is made up at the
+    acceleration a of `limits`: that has to stay inside the bound k(t) (n,) [rad].
+
+    Raises:
+        OutsideBarrierError: an error is outside already.
+        VelocityMismatchError: an error would get there.
+    """
+    check_start(config.joints, q, bound, reference_vector, t)
+    qr, dqr, ddqr = np.zeros((3, q.size))
+    evaluate(reference_vector, t, qr, dqr, ddqr)
+    limits = np.sqrt(2.0 * np.array(config.limits.acceleration) * (bound - np.abs(q - qr)))
+    for joint, difference, limit in zip(config.joints, dq - dqr, limits, strict=True):
+        if not abs(difference) < limit:
+            raise VelocityMismatchError(joint, float(difference), float(limit))
+
+
 def plan_start(
     config: ControllerConfig, bound: np.ndarray, q: np.ndarray, dq: np.ndarray, t: float = 0.0
 ) -> Motion:
-    """Configured reference, with an approach to it if the arm is outside the bound.
+    """Configured reference, with an approach to it unless the law can take over at once.
 
     The arm is at q (n,) [rad] with dq (n,) [rad/s] at time t [s], when the bound is `bound` (n,)
     [rad].
 
     Raises:
-        OutsideBarrierError: the arm is outside the bound, and approach.enabled is false.
+        StartError: the law cannot take over (`check_takeover`), and approach.enabled is false.
         MotionError: no approach keeps the limits.
     """
-    if config.reference.type == 'hold':
-        return Motion(pack(q.size, [hold(q)]), t)
     vector = reference_of(config)
+    if config.reference.type == 'hold':
+        vector = pack(q.size, [hold(q)])
     try:
-        check_start(config.joints, q, bound, vector, t)
-    except OutsideBarrierError:
+        check_takeover(config, bound, q, dq, vector, t)
+    except StartError:
         if not config.approach.enabled:
             raise
         limits = limits_of(config)

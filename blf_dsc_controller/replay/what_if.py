@@ -69,7 +69,7 @@ def what_if(
     joints that have other names in the bag.
 
     Raises:
-        OutsideBarrierError: the first state is outside the bound, and approaches are disabled.
+        StartError: the law cannot take over in the first state, and approaches are disabled.
         MotionError: there is no approach within the limits.
         BlfDscError: the bag cannot be read, or it does not hold the applied torques.
     """

@@ -159,8 +159,8 @@ def simulate(
     number of rows that are filled.  `metrics` are packed `MetricsSettings` and the vector of
     `new_metrics`, which is updated.
 
-    Raises OutsideBarrierError if the arm starts outside the bound and approach.enabled is false,
-    and MotionError if there is no approach within the limits.
+    Raises StartError if the law cannot take over and approach.enabled is false, and MotionError if
+    there is no approach within the limits.
     """
     controller = controller_of(controller_config)
     plant = plant_of(plant_config)

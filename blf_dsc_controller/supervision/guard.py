@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import flatten
-from blf_dsc_controller.errors import BlfDscError, OutsideBarrierError
+from blf_dsc_controller.errors import BlfDscError, StartError
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.messages.cdr import (
     DuplicatedJointError,
@@ -28,6 +28,7 @@ from blf_dsc_controller.messages.cdr import (
     ShortArrayError,
 )
 from blf_dsc_controller.messages.journal import EventType, Journal
+from blf_dsc_controller.reference.approach import check_takeover
 from blf_dsc_controller.reference.limits import MotionError, limits_of
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, plan_trajectory
 from blf_dsc_controller.supervision import checks, retuning
@@ -146,6 +147,7 @@ class Guard:
         self._note(EventType.RESET)
         self._resumable = False
         self.controller.reset()
+        self._velocity.reset()
         self._keep()
         self._start_over()
 
@@ -205,7 +207,6 @@ class Guard:
         self.ratio[:] = 0.0
         self._clean = True
         self._silence.restart()
-        self._velocity.reset()
 
     def _keep(self) -> None:
         state = self.controller.state
@@ -293,17 +294,19 @@ class Guard:
         self.journal.messages += 1
 
     def _start(self, stamp: int, q: Vector, dq: Vector) -> bool:
-        """Resume along the running reference if it is within the bound, or else start at t = 0."""
+        """Resume along the running reference if the law can take over, or else start at t = 0."""
+        controller, t = self.controller, self._time_of(stamp)
         resumed = self._resumable and stamp > self.last_stamp
         if resumed:
             try:
-                self.controller.check_start(self.config.joints, q, self._time_of(stamp))
-            except OutsideBarrierError:
+                bound, reference = controller.bound_at(t), controller.reference_vector
+                check_takeover(self.config, bound, q, dq, reference, t)
+            except StartError:
                 resumed = False
         if not resumed:
             try:
-                self.settled = begin(self.controller, self.config, q, dq)
-            except (OutsideBarrierError, MotionError) as error:
+                self.settled = begin(controller, self.config, q, dq)
+            except (StartError, MotionError) as error:
                 self.start_error = error
                 self.supervisor.stop(Reason.START_REJECTED, str(error))
                 return False

@@ -26,7 +26,7 @@ class Velocity:
         """Overwrite dq (n,) [rad/s] by the difference quotient of q (n,) [rad]; stamp in ns."""
         if not self._estimated:
             return
-        if self._stamp < 0:
+        if self._stamp < 0 or stamp < self._stamp:
             self._dq[:] = 0.0
         elif stamp > self._stamp:
             self._dq[:] = (q - self._q) / ((stamp - self._stamp) * 1e-9)
