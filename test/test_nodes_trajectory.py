@@ -18,6 +18,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
+from blf_dsc_controller.nodes import process
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.supervisor import Phase
 
@@ -129,3 +130,74 @@ def test_the_moving_bound_is_published_each_sample_and_a_still_one_once(ros):
     published = np.array([one.position for one in bounds[:300]])
     np.testing.assert_allclose(published[:, 0], 0.002 + 0.018 * np.exp(-5.0 * t), rtol=1e-12)
     np.testing.assert_allclose(published[:, 1], 0.002 + 0.008 * np.exp(-5.0 * t), rtol=1e-12)
+
+
+def lasting(seconds):
+    sent = trajectory(JOINTS, np.zeros(2), duration=0.1)
+    sent.points[-1].time_from_start.sec = seconds
+    return sent
+
+
+@pytest.mark.parametrize('watchdog', ['on', 'off'])
+@pytest.mark.parametrize('seconds', [100_000, 2_000_000_000])
+def test_a_trajectory_of_years_is_rejected_and_the_loop_goes_on(ros, sender, seconds, watchdog):
+    arm, law = ros.loop(None, {'safety__watchdog': watchdog, 'safety__state_timeout': 60.0})
+    ros.run(arm, 20)
+    assert f'it takes {seconds:g} s, longer than 3600 s' in sender(law, lasting(seconds))
+    ros.run(arm, 20)
+    assert phase(law) is Phase.TRACKING
+
+
+def test_a_message_that_is_too_large_to_read_is_rejected(ros, sender):
+    arm, law = ros.loop()
+    ros.run(arm, 20)
+    sent = trajectory(JOINTS, np.zeros(2), duration=0.1)
+    sent.points *= 1000
+    assert 'bytes, more than 1000 points can have' in sender(law, sent)
+
+
+@pytest.mark.parametrize('watchdog', ['on', 'off'])
+def test_an_unexpected_error_while_planning_rejects_the_trajectory(
+    ros, sender, monkeypatch, watchdog
+):
+    def fail(*_):
+        raise MemoryError('no room')
+
+    monkeypatch.setattr('blf_dsc_controller.supervision.guard.plan_trajectory', fail)
+    arm, law = ros.loop(None, {'safety__watchdog': watchdog, 'safety__state_timeout': 60.0})
+    ros.run(arm, 20)
+    sent = trajectory(JOINTS, np.zeros(2), duration=0.1)
+    assert sender(law, sent) == 'trajectory rejected: MemoryError: no room'
+    ros.run(arm, 20)
+    assert phase(law) is Phase.TRACKING
+
+
+def test_a_trajectory_planned_aside_leads_on_without_a_jump(ros, sender):
+    references = ros.listen(topics.REFERENCE)
+    watched = {'safety__watchdog': 'on', 'safety__state_timeout': 60.0}
+    arm, law = ros.loop(None, BRISK | watched)
+    ros.run(arm, 20)
+    assert sender(law, trajectory(JOINTS, np.zeros(2), duration=3.0)) == ''
+    ros.run(arm, 1500)
+    velocities = np.array([one.velocity for one in references])
+    assert np.abs(np.diff(velocities, axis=0)).max() < 4.1e-3  # 4 rad/s^2 for a millisecond
+    assert law.guard.ratio.max() < 1.0
+
+
+def test_an_error_that_escapes_from_a_callback_is_a_safe_stop(ros):
+    commands = ros.listen(topics.COMMANDS)
+    arm, law = ros.loop()
+    ros.run(arm, 20)
+
+    def fail():
+        timer.cancel()
+        raise ZeroDivisionError('of the test')
+
+    timer = law.create_timer(0.0, fail)
+    while phase(law) is not Phase.SAFE_STOP:
+        process.spin_once(ros.executor, law)
+    assert law.stopped == 'ZeroDivisionError: of the test'
+    ros.until(lambda: not torques(commands)[-1].any())
+    assert ros.reset(law).success
+    ros.run(arm, 20)
+    assert phase(law) is not Phase.SAFE_STOP

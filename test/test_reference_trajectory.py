@@ -233,3 +233,18 @@ def test_all_problems_are_reported_at_once():
     with pytest.raises(TrajectoryError) as rejection:
         plan_trajectory(bad, PAPER, NOW, LIMITS)
     assert len(rejection.value.problems) == 4
+
+
+@pytest.mark.parametrize(
+    ('times', 'said'),
+    [
+        ((1.0, 2e9), 'it takes 2e+09 s, longer than 3600 s'),
+        ((3601.0,), 'it takes 3601 s, longer than 3600 s'),
+        (range(1, 1002), 'it has 1001 points, more than 1000'),
+    ],
+)
+def test_what_takes_too_long_to_plan_is_rejected(times, said):
+    points = tuple(TrajectoryPoint(float(t), (1.0, 1.0)) for t in times)
+    with pytest.raises(TrajectoryError, match='send it in pieces') as rejection:
+        plan_trajectory(Trajectory(JOINTS, points), PAPER, NOW, LIMITS)
+    assert said in str(rejection.value)

@@ -96,6 +96,10 @@ def eventful():
     point = TrajectoryPoint(0.4, (2.2, 1.6), (0.0, 0.0), (0.0, 0.0))
     rig.guard.follow(Trajectory(JOINTS, (point,)))
     rig.step(100)
+    plan = rig.guard.planner(Trajectory(JOINTS, (point,)), rig.guard.time + 0.02)()
+    rig.step(10)
+    rig.guard.adopt(plan)
+    rig.step(100)
     rig.guard.deactivate()
     rig.step(30)
     rig.wait(100)  # the watchdog commands while the controller is inactive, too
@@ -125,7 +129,7 @@ def test_the_watchdog_s_torques_replay_too(tmp_path):
         'safe stop (bad message)',
     ]
     assert [one.type for one in result.events].count(EventType.SILENCE) == 2
-    assert [one.type for one in result.events].count(EventType.TRAJECTORY) == 1
+    assert [one.type for one in result.events].count(EventType.TRAJECTORY) == 2
     assert compared(result)['commands'] == 2 * len(of(rig, COMMANDS))
     states = len(of(rig, JOINT_STATES))
     assert len(of(rig, COMMANDS)) > states + 10

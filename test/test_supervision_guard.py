@@ -10,6 +10,8 @@ from plain_law import dynamics
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
+from blf_dsc_controller.supervision.guard import LatePlanError
 from blf_dsc_controller.supervision.safe_torque import LastState, Ramp, safe_torque
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from blf_dsc_controller.supervision.watchdogs import Overruns, Silence
@@ -290,3 +292,38 @@ def test_an_update_that_would_diverge_is_rejected():
     assert problem.startswith('learning.weight: with the update gradient')
     gentle = {'learning.update': 'gradient', 'learning.weight': 2.0}
     assert rig.guard.problems(change(rig.guard.config, gentle)) == []
+
+
+def to(goal, seconds):
+    return Trajectory(('joint1', 'joint2'), (TrajectoryPoint(seconds, goal),))
+
+
+def test_a_plan_is_followed_from_its_time_on():
+    rig = Rig()
+    rig.step(100)
+    plan = rig.guard.planner(to((2.1, 1.5), 1.0), rig.guard.time + 0.03)()
+    before = rig.guard.controller.reference_at(plan.at)
+    rig.step(20)
+    rig.guard.adopt(plan)
+    np.testing.assert_allclose(rig.guard.controller.reference_at(plan.at), before, atol=1e-12)
+    rig.step(1200)
+    np.testing.assert_allclose(rig.guard.controller.reference_at(rig.guard.time)[0], (2.1, 1.5))
+    assert rig.supervisor.phase is Phase.TRACKING
+
+
+def test_a_plan_that_comes_too_late_is_not_followed():
+    rig = Rig()
+    rig.step(100)
+    plan = rig.guard.planner(to((2.1, 1.5), 1.0), rig.guard.time + 0.03)()
+    rig.step(31)
+    with pytest.raises(LatePlanError):
+        rig.guard.adopt(plan)
+
+
+def test_a_plan_from_another_reference_is_not_followed():
+    rig = Rig()
+    rig.step(100)
+    plan = rig.guard.planner(to((2.1, 1.5), 1.0), rig.guard.time + 0.03)()
+    rig.guard.follow(to((2.0, 1.4), 1.0))
+    with pytest.raises(TrajectoryError, match='replaced while it was planned'):
+        rig.guard.adopt(plan)

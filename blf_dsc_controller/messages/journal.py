@@ -28,7 +28,7 @@ class EventType(str, Enum):
     CONFIGURE = 'configure'  # parameters: all of them by name
     ACTIVATE = 'activate'
     START = 'start'  # the law takes the first joint state; resumed: along the running reference
-    TRAJECTORY = 'trajectory'  # joints, points, begin: the accepted `Request`
+    TRAJECTORY = 'trajectory'  # joints, points, begin: as it was sent; at: followed from then on
     PARAMETERS = 'parameters'  # parameters: the changed ones by name
     STOP = 'stop'  # reason, text
     SILENCE = 'silence'  # torques: commanded by the watchdog before the next message

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+import traceback
 from functools import partial
 from typing import Any
 
@@ -79,7 +80,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.get_logger().warning(warning)
         outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
         if self.connect(outputs, topics.JOINT_STATES, self._on_joint_state):
-            self._status.trajectories = TrajectoryInput(self, lambda: self.guard)
+            self._status.trajectories = TrajectoryInput(
+                self, len(self.config.joints), lambda: self.guard
+            )
         self._report()
 
     def activate(self) -> None:
@@ -134,16 +137,29 @@ class ControllerNode(LoopNode[ControllerConfig]):
             if not self._observed:
                 self._pending = raw
                 return
+        if self._status.trajectories is not None:
+            self._status.trajectories.poll(guard)
         try:
             torque, stamp = self._torque_for(guard, raw)
         except Exception as error:  # noqa: BLE001 - whatever it is, the arm needs a torque
-            self.get_logger().fatal(f'{type(error).__name__}: {error}')
-            torque, stamp = guard.fail(f'{type(error).__name__}: {error}'), 0
+            self.survive(error)
+            return
         if torque is not None:
             self._command(torque)
         if guard.has_sample:
             self._publish_telemetry(guard, stamp)
         self._report_if_changed(guard)
+
+    def survive(self, error: Exception) -> bool:
+        """Make a safe stop after an unexpected error, instead of leaving the arm without torque."""
+        if self.guard is None:
+            return False
+        self.get_logger().fatal(''.join(traceback.format_exception(error)))
+        torque = self.guard.fail(f'{type(error).__name__}: {error}')
+        if torque is not None:
+            self._command(torque)
+        self._report_if_changed(self.guard)
+        return True
 
     def _torque_for(self, guard: Guard, raw: bytes) -> tuple[np.ndarray | None, int]:
         try:

@@ -63,6 +63,10 @@ class ManagedNode(LifecycleNode):
     def close(self) -> None:
         """Save and release what must not be lost, while ROS is still up."""
 
+    def survive(self, error: Exception) -> bool:  # noqa: ARG002
+        """Whether the node goes on after an error that has escaped from one of its callbacks."""
+        return False
+
     @property
     def state_label(self) -> str:
         """State of the node: unconfigured, inactive, active or finalized."""

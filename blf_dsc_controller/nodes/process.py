@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import rclpy
 from rclpy.duration import Duration
@@ -51,6 +51,10 @@ class PlainNode(Node):
     def close(self) -> None:
         """Save and release what must not be lost, while ROS is still up."""
 
+    def survive(self, error: Exception) -> bool:  # noqa: ARG002
+        """Whether the node goes on after an error that has escaped from one of its callbacks."""
+        return False
+
 
 Runnable: TypeAlias = 'PlainNode | ManagedNode'
 
@@ -72,7 +76,7 @@ def run(make_node: Callable[[], Runnable]) -> int:
         node = make_node()
         executor.add_node(node)
         while not (signals or node.finished):
-            executor.spin_once(timeout_sec=_POLL)
+            spin_once(executor, node)
         executor.remove_node(node)
         if node.failure is not None:
             raise node.failure
@@ -88,6 +92,17 @@ def run(make_node: Callable[[], Runnable]) -> int:
         print(problem, file=sys.stderr)  # noqa: T201
         return 1
     return 0
+
+
+def spin_once(executor: Any, node: Runnable) -> None:
+    """Wait for work and do it; an error that escapes is raised unless the node survives it."""
+    try:
+        executor.spin_once(timeout_sec=_POLL)
+    except RCLError:
+        raise
+    except Exception as error:
+        if not node.survive(error):
+            raise
 
 
 def _close(node: Runnable) -> None:

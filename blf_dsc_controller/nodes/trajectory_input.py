@@ -3,27 +3,46 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
-from typing import Any
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, NamedTuple
 
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 from trajectory_msgs.msg import JointTrajectory
 
 from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.topics import JOINT_TRAJECTORY
 from blf_dsc_controller.nodes.endpoints import qos_profile
 from blf_dsc_controller.reference.trajectory import (
+    MOST_POINTS,
     Trajectory,
     TrajectoryError,
     TrajectoryPoint,
 )
-from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.guard import Guard, LatePlanError, Plan
 
 _NANO = 1e-9
+_POINT_SIZE = 32  # bytes per joint of a point with all its fields, which begin with 8 bytes each
+_LEAD = 0.02  # s from now on in which a trajectory is planned, at first
+_LONGEST_LEAD = 2.0
+_SWITCH_INTERVAL = 1e-4  # s after which the thread that plans makes way for the loop
+
+
+class _Job(NamedTuple):
+    """A trajectory that is being planned."""
+
+    raw: bytes
+    lead: float  # s
+    plan: Future[Plan]
 
 
 class TrajectoryInput:
     """Hands trajectories to the guard, between two samples.
+
+    In lock-step the plant waits while one is planned.  Otherwise it is planned in a thread, for a
+    moment that is a little ahead, and further ahead if planning takes longer.
 
     Attributes:
         accepted: number of trajectories that are or were followed.
@@ -31,15 +50,19 @@ class TrajectoryInput:
         reason: of the last rejection.
     """
 
-    def __init__(self, node: Node, guard: Callable[[], Guard | None]) -> None:
-        """Subscribe; `guard` returns None while the node is not configured."""
+    def __init__(self, node: Node, joints: int, guard: Callable[[], Guard | None]) -> None:
+        """Subscribe for so many joints; `guard` returns None while the node is not configured."""
         self.accepted = 0
         self.rejected = 0
         self.reason = ''
         self._log = node.get_logger()
+        self._largest = MOST_POINTS * _POINT_SIZE * (joints + 2)
         self._guard = guard
+        self._thread = ThreadPoolExecutor(1, 'trajectories')
+        self._job: _Job | None = None
+        sys.setswitchinterval(_SWITCH_INTERVAL)
         name, quality = JOINT_TRAJECTORY.name, qos_profile(JOINT_TRAJECTORY.requested)
-        node.create_subscription(JointTrajectory, name, self._on_trajectory, quality)
+        node.create_subscription(JointTrajectory, name, self._on_trajectory, quality, raw=True)
 
     @property
     def values(self) -> dict[str, str]:
@@ -50,27 +73,65 @@ class TrajectoryInput:
             'last rejection': self.reason or 'none',
         }
 
-    def _on_trajectory(self, message: JointTrajectory) -> None:
-        guard = self._guard()
-        if guard is None:
-            self._reject('trajectory rejected: the controller is not configured')
+    def poll(self, guard: Guard) -> None:
+        """Follow the trajectory whose plan is ready, if there is one."""
+        job = self._job
+        if job is None or not job.plan.done():
             return
+        self._job = None
         try:
-            guard.follow(_trajectory(message, guard.start_stamp))
-        except TrajectoryError as error:
-            self._reject(str(error))
+            self._adopt(guard, job.plan.result())
+        except LatePlanError as error:
+            if job.lead > _LONGEST_LEAD:
+                self._reject(error)
+            else:
+                self._submit(guard, job.raw, 2.0 * job.lead)
+        except Exception as error:  # noqa: BLE001 - the present reference goes on
+            self._reject(error)
+
+    def _on_trajectory(self, raw: bytes) -> None:
+        try:
+            self._take(self._guard(), raw)
+        except Exception as error:  # noqa: BLE001 - the present reference goes on
+            self._reject(error)
+
+    def _take(self, guard: Guard | None, raw: bytes) -> None:
+        if guard is None:
+            raise TrajectoryError(['the controller is not configured'])
+        if len(raw) > self._largest:
+            problem = f'it has {len(raw)} bytes, more than {MOST_POINTS} points can have'
+            raise TrajectoryError([f'{problem}: send it in pieces'])
+        if not guard.watching:
+            self._adopt(guard, guard.planner(_trajectory(raw, guard.start_stamp))())
             return
+        if self._job is not None:
+            self._reject(TrajectoryError(['another one came while it was planned']))
+        self._submit(guard, raw, _LEAD)
+
+    def _submit(self, guard: Guard, raw: bytes, lead: float) -> None:
+        start, at = guard.start_stamp, guard.time + lead
+
+        def plan() -> Plan:
+            return guard.planner(_trajectory(raw, start), at)()
+
+        self._job = _Job(raw, lead, self._thread.submit(plan))
+
+    def _adopt(self, guard: Guard, plan: Plan) -> None:
+        guard.adopt(plan)
         self.accepted += 1
-        self._log.info(f'following a trajectory of {len(message.points)} points')
+        self._log.info(f'following a trajectory of {len(plan.trajectory.points)} points')
 
-    def _reject(self, reason: str) -> None:
+    def _reject(self, error: Exception) -> None:
         self.rejected += 1
-        self.reason = reason
-        self._log.warning(reason)
+        self.reason = f'{error}'
+        if not isinstance(error, TrajectoryError):
+            self.reason = f'trajectory rejected: {type(error).__name__}: {error}'
+        self._log.warning(self.reason)
 
 
-def _trajectory(message: JointTrajectory, start_stamp: int) -> Trajectory:
+def _trajectory(raw: bytes, start_stamp: int) -> Trajectory:
     """Trajectory of a message, in times since the controller's start; stamp 0 begins at once."""
+    message: Any = deserialize_message(raw, JointTrajectory)
     points = tuple(
         TrajectoryPoint(
             _nanoseconds(point.time_from_start) * _NANO,

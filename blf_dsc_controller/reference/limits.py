@@ -13,6 +13,7 @@ from blf_dsc_controller.reference.terms import sampled
 
 _PERIOD = 0.005  # s, between two samples that are checked
 _LEAST = 200  # samples, for short motions
+_MOST = 1_000_000  # samples, for very long ones
 _ROUNDING = 1e-9  # relative, for motions that just reach a limit
 
 
@@ -76,7 +77,8 @@ def limits_of(config: ControllerConfig) -> MotionLimits:
 
 def check_times(begin: float, end: float) -> np.ndarray:
     """Times from `begin` to `end` [s], close enough to catch the largest velocity of a motion."""
-    return np.linspace(begin, end, max(_LEAST, 1 + int((end - begin) / _PERIOD)))
+    count = 1 + (end - begin) / _PERIOD
+    return np.linspace(begin, end, int(min(max(_LEAST, count), _MOST)))
 
 
 def worst_violation(

@@ -11,7 +11,8 @@ Interpolated as by joint_trajectory_controller, except where that would jump:
 point is reached from the position, velocity and acceleration of the present reference when the
 trajectory begins.  If the first point is at the beginning itself, the trajectory is blended into
 the present reference as fast as the limits allow.  Points in the past are skipped.  The last point
-is held.
+is held.  What is longer than `LONGEST`, or has more than `MOST_POINTS`, is rejected: planning takes
+less than a second.
 """
 
 from __future__ import annotations
@@ -37,6 +38,10 @@ from blf_dsc_controller.reference.polynomials import (
     quintics,
 )
 from blf_dsc_controller.reference.terms import Term, pack, sampled, unpack
+
+MOST_POINTS = 1000
+LONGEST = 3600.0
+"""Time [s] from its beginning to its last point, at most."""
 
 _FIELDS = ('positions', 'velocities', 'accelerations')
 
@@ -150,6 +155,9 @@ def _from_state(present: np.ndarray, t0: float, times: np.ndarray, points: np.nd
 
 def _problems(trajectory: Trajectory, joints: tuple[str, ...], now: float) -> list[str]:
     """Everything that is wrong with a trajectory before its motion is computed."""
+    count = len(trajectory.points)
+    if count > MOST_POINTS:
+        return [f'it has {count} points, more than {MOST_POINTS}: send it in pieces']
     problems = [*_joint_problems(trajectory.joints, joints), *_point_problems(trajectory)]
     return problems or list(_time_problems(trajectory, now))
 
@@ -198,6 +206,8 @@ def _problems_of(point: TrajectoryPoint, count: int) -> Iterator[str]:
 
 def _time_problems(trajectory: Trajectory, now: float) -> Iterator[str]:
     points = trajectory.points
+    if points[-1].time > LONGEST:
+        yield f'it takes {points[-1].time:g} s, longer than {LONGEST:g} s: send it in pieces'
     if points[0].time < 0.0:
         yield f'point 1 is {-points[0].time:g} s before the beginning'
     for number, (before, after) in enumerate(pairwise(points), start=2):

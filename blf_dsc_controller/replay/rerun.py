@@ -281,7 +281,8 @@ class Rerun:
             guard.release()
         elif event.type is EventType.TRAJECTORY:
             points = tuple(TrajectoryPoint(**point) for point in content['points'])
-            guard.follow(Trajectory(tuple(content['joints']), points, content['begin']))
+            trajectory = Trajectory(tuple(content['joints']), points, content['begin'])
+            guard.follow(trajectory, content['at'])
         elif event.type is EventType.PARAMETERS:
             guard.retune(change(guard.config, content['parameters']))
         elif event.type is EventType.SILENCE:

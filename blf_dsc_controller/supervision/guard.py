@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from math import inf
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from blf_dsc_controller.messages.cdr import (
     ShortArrayError,
 )
 from blf_dsc_controller.messages.journal import EventType, Journal
-from blf_dsc_controller.reference.approach import check_takeover
+from blf_dsc_controller.reference.approach import Motion, check_takeover
 from blf_dsc_controller.reference.limits import MotionError, limits_of
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, plan_trajectory
 from blf_dsc_controller.supervision import checks, retuning
@@ -46,6 +46,22 @@ _REASONS: dict[type[MessageError], Reason] = {
     DuplicatedJointError: Reason.JOINT_DUPLICATED,
     ShortArrayError: Reason.FIELD_MISSING,
 }
+
+
+class Plan(NamedTuple):
+    """A planned trajectory."""
+
+    trajectory: Trajectory
+    at: float  # s since the start, from which on it has an effect
+    before: Vector  # packed reference that it continues
+    motion: Motion
+
+
+class LatePlanError(TrajectoryError):
+    """The time from which on a trajectory was to be followed has passed while it was planned."""
+
+    def __init__(self, at: float, now: float) -> None:
+        super().__init__([f'it was to begin at {at:.6g} s and was planned at {now:.6g} s'])
 
 
 class Guard:
@@ -113,6 +129,11 @@ class Guard:
         """Whether a torque has been commanded since the controller was configured."""
         return self.journal.commands > 0
 
+    @property
+    def time(self) -> float:
+        """Time of the last sample of the law [s]."""
+        return self._time_of(self.last_stamp)
+
     # From here on: what the operator does.
 
     def activate(self) -> None:
@@ -151,28 +172,57 @@ class Guard:
         self._keep()
         self._start_over()
 
-    def follow(self, trajectory: Trajectory) -> None:
-        """Follow another trajectory from the next sample on.
+    def follow(self, trajectory: Trajectory, at: float | None = None) -> None:
+        """Follow another trajectory from the time `at` [s] on, by default at once.
 
         Raises:
             TrajectoryError: it cannot be followed; the present reference goes on.
         """
-        supervisor = self.supervisor
-        if not supervisor.running:
-            why = supervisor.text or supervisor.phase
-            raise TrajectoryError([f'the controller is not in command: {why}'])
-        now = self._time_of(self.last_stamp)
-        vector, limits = self.controller.reference_vector, limits_of(self.config)
-        motion = plan_trajectory(trajectory, vector, now, limits)
+        self.adopt(self.planner(trajectory, at)())
+
+    def planner(self, trajectory: Trajectory, at: float | None = None) -> Callable[[], Plan]:
+        """Return what plans a trajectory, in any thread, for `adopt` until the time `at` [s].
+
+        Both raise TrajectoryError.
+        """
+        self._check_in_command()
+        before, limits = self.controller.reference_vector, limits_of(self.config)
+        start = self.time if at is None else at
+        return lambda: Plan(
+            trajectory, start, before, plan_trajectory(trajectory, before, start, limits)
+        )
+
+    def adopt(self, plan: Plan) -> None:
+        """Follow a planned trajectory.
+
+        Raises:
+            TrajectoryError: it does not continue the present reference, which goes on.
+        """
+        self._check_in_command()
+        if plan.before is not self.controller.reference_vector:
+            raise TrajectoryError(
+                ['the reference was replaced while it was planned: send it again']
+            )
+        if plan.at < self.time:
+            raise LatePlanError(plan.at, self.time)
+        trajectory, motion = plan.trajectory, plan.motion
         self._note(
             EventType.TRAJECTORY,
             joints=trajectory.joints,
             points=[point._asdict() for point in trajectory.points],
             begin=trajectory.begin,
+            at=plan.at,
         )
         self.controller.reference_vector = motion.vector
         self.settled = motion.settled
-        supervisor.enter(Phase.APPROACHING if motion.settled > now else Phase.TRACKING)
+        is_settled = motion.settled <= self.time
+        self.supervisor.enter(Phase.TRACKING if is_settled else Phase.APPROACHING)
+
+    def _check_in_command(self) -> None:
+        supervisor = self.supervisor
+        if not supervisor.running:
+            why = supervisor.text or supervisor.phase
+            raise TrajectoryError([f'the controller is not in command: {why}'])
 
     def retune(self, config: ControllerConfig) -> None:
         """Put a configuration in force, between two samples."""
@@ -180,8 +230,9 @@ class Guard:
         changed = {key: value for key, value in flatten(config).items() if value != before[key]}
         self._note(EventType.PARAMETERS, parameters=changed)
         if self.supervisor.running:
-            t = self._time_of(self.last_stamp)
-            retuning.apply_bumpless(self.controller, config, t, self._last_state.measurement)
+            retuning.apply_bumpless(
+                self.controller, config, self.time, self._last_state.measurement
+            )
         else:
             retuning.apply(self.controller, config)
         self.config = config
@@ -190,7 +241,7 @@ class Guard:
         """Why a configuration cannot be put in force now; empty if it can."""
         if not self.supervisor.running:
             return []
-        return list(retuning.problems(self.controller, config, self._time_of(self.last_stamp)))
+        return list(retuning.problems(self.controller, config, self.time))
 
     def _note(self, event: EventType, **content: Any) -> None:
         self.end_silence()
