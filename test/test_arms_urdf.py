@@ -66,6 +66,15 @@ def test_limits_that_are_not_there_are_infinite():
     assert (one.lower, one.upper, one.effort) == (-inf, inf, 87.0)
 
 
+def test_friction_is_that_of_the_file_or_none():
+    text = changed(
+        '<axis xyz="0 0 1" />', '<axis xyz="0 0 1" /><dynamics damping="3" friction="2" />', 1
+    )
+    first, second = read_chain(text, 'panda_link0', 'panda_link8', PANDA).joints[:2]
+    assert (first.damping, first.friction) == (3.0, 2.0)
+    assert (second.damping, second.friction) == (0.0, 0.0)
+
+
 def test_a_gripper_is_carried_whatever_the_tip_and_its_fingers_are_named():
     whole = read_chain(PANDA_TEXT, 'panda_link0', 'panda_hand_tcp', PANDA)
     assert whole.held == ('panda_finger_joint1', 'panda_finger_joint2')

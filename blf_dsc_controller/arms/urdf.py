@@ -45,6 +45,7 @@ class Joint:
         axis: (3,) unit vector, in its own frame.
         lower, upper: limits of the position [rad or m].
         velocity, effort: limits [rad/s or m/s, N m or N].
+        damping, friction: of `<dynamics>`: viscous [N m s/rad or N s/m], Coulomb [N m or N].
         link: the link that it moves; its frame is the joint's.
         inertia: (10,) of the body in that frame, in the order of `inertia.INERTIA_NAMES`.
     """
@@ -57,6 +58,8 @@ class Joint:
     upper: float
     velocity: float
     effort: float
+    damping: float
+    friction: float
     link: str
     inertia: np.ndarray
 
@@ -70,6 +73,11 @@ class Chain:
     joints: tuple[Joint, ...]
     tip_placement: np.ndarray
     held: tuple[str, ...]
+
+    @property
+    def inertias(self) -> np.ndarray:
+        """Ten of each body (n, 10)."""
+        return np.array([joint.inertia for joint in self.joints])
 
 
 def read_chain(text: str, base: str, tip: str, joints: Sequence[str]) -> Chain:
@@ -200,6 +208,7 @@ def _joint(element: ET.Element, placement: np.ndarray, J: np.ndarray) -> Joint:
             raise UrdfError(
                 f'joint {name!r} can move from {lower:g} to {upper:g} only: correct its <limit>'
             )
+    dynamics = element.find('dynamics')
     link = _link(element, 'child')
     if J[3, 3] <= 0.0:
         raise UrdfError(
@@ -215,6 +224,8 @@ def _joint(element: ET.Element, placement: np.ndarray, J: np.ndarray) -> Joint:
         upper=upper,
         velocity=_number(limit, 'velocity') or inf,
         effort=_number(limit, 'effort') or inf,
+        damping=_number(dynamics, 'damping'),
+        friction=_number(dynamics, 'friction'),
         link=link,
         inertia=inertia_of(J),
     )

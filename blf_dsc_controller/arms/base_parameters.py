@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The base parameters of a chain: which combinations of its inertias torques can show.
+
+Of the columns of the full regressor Y (ten for each body and a rotor for each joint), a largest set
+of independent ones Y_B is kept; the others are Y_D = Y_B X, so that Y phi = Y_B K phi, where K has
+unit columns for B and X for D (Gautier, Numerical calculation of the base inertial parameters of
+robots, 1991).  The columns are tried from the base to the tip, so that what a body has in common
+with the bodies before it is counted with those; this is the usual grouping.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from blf_dsc_controller.arms.serial_chain import ROTOR, SerialChain, serial_chain
+from blf_dsc_controller.arms.urdf import Chain
+
+_DEPENDENT = 1e-6  # of a column of order 1; roundings of pi / 2 in URDFs are some 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class BaseParameters:
+    """The parameters P of a chain.
+
+    Attributes:
+        model: the arm whose regressors multiply P; its names are those of the columns kept.
+        K: (p, 11 n), P of all inertias: per body its ten and its rotor.
+        combinations: (p,) each as a sum, such as 'Izz2 + Iyy3 + 0.1 m4'.
+    """
+
+    model: SerialChain
+    K: np.ndarray
+    combinations: tuple[str, ...]
+
+    def of(self, inertias: np.ndarray, rotors: np.ndarray) -> np.ndarray:
+        """P (p,) of the ten of each body (n, 10) and the rotor inertias (n,) [kg m^2, or kg]."""
+        P: np.ndarray = self.K @ np.column_stack((inertias, rotors)).ravel()
+        return P
+
+
+def base_parameters(
+    chain: Chain, gravity: tuple[float, float, float] = (0.0, 0.0, -9.81), *, rotors: bool = True
+) -> BaseParameters:
+    """Base parameters of a chain; gravity [m/s^2] in its base, rotor inertias if wanted."""
+    full = serial_chain(chain, gravity)
+    Y = _stacked_regressor(full)
+    order = np.array([k for k in range(full.p) if rotors or k % (ROTOR + 1) != ROTOR])
+    pivots = np.abs(np.diag(np.linalg.qr(Y[:, order], mode='r')))
+    kept = order[pivots > _DEPENDENT]
+    # Rounded, so that every machine's linear algebra gives the same.
+    K: np.ndarray = np.linalg.lstsq(Y[:, kept], Y, rcond=None)[0].round(12)
+    K[np.abs(K) < _DEPENDENT] = 0.0
+    if not rotors:
+        K[:, ROTOR :: ROTOR + 1] = 0.0
+    columns = [(int(k) // (ROTOR + 1), int(k) % (ROTOR + 1)) for k in kept]
+    sums = tuple(_sum(row, int(k), full.parameter_names) for row, k in zip(K, kept, strict=True))
+    return BaseParameters(serial_chain(chain, gravity, columns), K, sums)
+
+
+def _stacked_regressor(full: SerialChain) -> np.ndarray:
+    """Rows of H at random motions, twice as many as columns."""
+    random = np.random.default_rng(0)
+    blocks = np.zeros((2 * (ROTOR + 1), full.n, full.p))
+    for H in blocks:
+        q = random.uniform(-np.pi, np.pi, full.n)
+        dq, v, a = random.normal(size=(3, full.n))
+        full.regressor(q, dq, v, a, H)
+    return blocks.reshape(-1, full.p)
+
+
+def _sum(row: np.ndarray, own: int, names: tuple[str, ...]) -> str:
+    text = names[own]
+    for k in np.flatnonzero(row):
+        if k != own:
+            factor = '' if abs(abs(row[k]) - 1.0) < _DEPENDENT else f'{abs(row[k]):.4g} '
+            text += f' {"-" if row[k] < 0.0 else "+"} {factor}{names[k]}'
+    return text
