@@ -11,6 +11,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
+from rclpy.serialization import serialize_message
 from ros_rig import torques
 from sent_trajectory import JOINTS, SECOND, inputs, send, trajectory, two_tones
 
@@ -18,6 +19,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.cdr import MessageError, joint_trajectory
 from blf_dsc_controller.nodes import process
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.supervisor import Phase
@@ -154,6 +156,23 @@ def test_a_message_that_is_too_large_to_read_is_rejected(ros, sender):
     sent = trajectory(JOINTS, np.zeros(2), duration=0.1)
     sent.points *= 1000
     assert 'bytes, more than 1000 points can have' in sender(law, sent)
+
+
+@pytest.mark.parametrize('fields', [1, 2, 3])
+def test_a_trajectory_is_read_as_rclpy_reads_it(fields):
+    sent = trajectory(JOINTS, np.zeros(2), duration=0.2, fields=fields, stamp=5 * SECOND + 7)
+    sent.header.frame_id = 'base'
+    sent.points[0].effort = [1.0, 2.0, 3.0]
+    raw = serialize_message(sent)
+    read = joint_trajectory(raw)
+    assert (read.stamp, read.names) == (5 * SECOND + 7, JOINTS)
+    for (time, arrays), point in zip(read.points, sent.points, strict=True):
+        given = (point.positions, point.velocities, point.accelerations, point.effort)
+        assert arrays == [tuple(one) for one in given]
+        assert time == point.time_from_start.sec * SECOND + point.time_from_start.nanosec
+    for end in range(0, len(raw) // 2, 7):
+        with pytest.raises(MessageError):
+            joint_trajectory(raw[:end])
 
 
 @pytest.mark.parametrize('watchdog', ['on', 'off'])

@@ -88,6 +88,30 @@ def array_layout(raw: bytes | bytearray) -> Layout:
     return Layout(cursor.byte_order, (), (cursor.doubles(),))
 
 
+class TrajectoryContent(NamedTuple):
+    """Content of a trajectory_msgs/JointTrajectory."""
+
+    stamp: int  # ns
+    names: tuple[str, ...]
+    points: tuple[tuple[int, list[tuple[float, ...]]], ...]  # ns from the start, the four arrays
+
+
+def joint_trajectory(raw: bytes) -> TrajectoryContent:
+    """Read a trajectory_msgs/JointTrajectory; MessageError as above.
+
+    rclpy would keep all other threads waiting, for 10 ms with a thousand points.
+    """
+    cursor = _Cursor(raw)
+    stamp = cursor.time()
+    cursor.text()
+    names = tuple(cursor.text() for _ in range(cursor.unsigned()))
+    points = []
+    for _ in range(cursor.unsigned()):
+        arrays = [cursor.values() for _ in range(4)]
+        points.append((cursor.time(), arrays))
+    return TrajectoryContent(stamp, names, tuple(points))
+
+
 class _Cursor:
     """Steps over the fields of one serialised message."""
 
@@ -107,6 +131,11 @@ class _Cursor:
         self._align(4)
         return int(unpack_from(self.byte_order + 'I', self._raw, self._take(4))[0])
 
+    def time(self) -> int:
+        self._align(4)
+        seconds, nanoseconds = unpack_from(self.byte_order + 'iI', self._raw, self._take(8))
+        return int(seconds * NANOSECONDS + nanoseconds)
+
     def text(self) -> str:
         length = self.unsigned()
         start = self._take(length)
@@ -118,6 +147,10 @@ class _Cursor:
         if size:
             self._align(8)
         return Doubles(size_offset, self._take(8 * size), size)
+
+    def values(self) -> tuple[float, ...]:
+        array = self.doubles()
+        return unpack_from(f'{self.byte_order}{array.size}d', self._raw, array.offset)
 
     def _align(self, size: int) -> None:
         self._offset += -(self._offset - ORIGIN) % size

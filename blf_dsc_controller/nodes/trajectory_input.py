@@ -6,13 +6,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
 from trajectory_msgs.msg import JointTrajectory
 
-from blf_dsc_controller.messages.cdr import NANOSECONDS
+from blf_dsc_controller.messages.cdr import joint_trajectory
 from blf_dsc_controller.messages.topics import JOINT_TRAJECTORY
 from blf_dsc_controller.nodes.endpoints import qos_profile
 from blf_dsc_controller.reference.trajectory import (
@@ -131,21 +130,7 @@ class TrajectoryInput:
 
 def _trajectory(raw: bytes, start_stamp: int) -> Trajectory:
     """Trajectory of a message, in times since the controller's start; stamp 0 begins at once."""
-    message: Any = deserialize_message(raw, JointTrajectory)
-    points = tuple(
-        TrajectoryPoint(
-            _nanoseconds(point.time_from_start) * _NANO,
-            tuple(point.positions),
-            tuple(point.velocities),
-            tuple(point.accelerations),
-            tuple(point.effort),
-        )
-        for point in message.points
-    )
-    stamp = _nanoseconds(message.header.stamp)
+    stamp, names, points = joint_trajectory(raw)
     begin = (stamp - start_stamp) * _NANO if stamp else None
-    return Trajectory(tuple(message.joint_names), points, begin)
-
-
-def _nanoseconds(time: Any) -> int:
-    return int(time.sec) * NANOSECONDS + int(time.nanosec)
+    own = (TrajectoryPoint(time * _NANO, *arrays) for time, arrays in points)
+    return Trajectory(names, tuple(own), begin)
