@@ -72,6 +72,7 @@ class Run:
     message_counts: Mapping[str, int] = field(default_factory=dict)
     rejected: Mapping[str, str] = field(default_factory=dict)  # disturbance columns, and why
     stops: tuple[Stop, ...] = ()
+    learns: bool = True  # from the prediction error; false for a law that does not use it
 
     @property
     def time(self) -> Floats:

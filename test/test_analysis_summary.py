@@ -15,6 +15,7 @@ from synthetic_bag import BOUND_RAD, JOINTS, LATCH_S, LIMIT_NM, PARAMETERS, TRUE
 from blf_dsc_controller.analysis.summary import format_table, summarize, write_summary
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.messages.topics import BOUND, JOINT_STATES, LEARNING, TRUTH
+from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 
 SAMPLES = 10_000
@@ -145,6 +146,28 @@ def test_the_table_shows_the_summary(run):
     ):
         assert words in table
     assert max(map(len, table.splitlines())) <= 120
+
+
+@pytest.mark.parametrize('source', ['simulation', 'bag'])
+@pytest.mark.parametrize(
+    ('changes', 'line'),
+    [
+        ({}, 'began at 0.6'),
+        ({'learning.weight': 0.0}, 'not used by this law'),
+        ({'law': 'slotine_li'}, 'not used by this law'),
+    ],
+)
+def test_learning_begins_only_in_a_law_that_learns(changes, line, source, tmp_path):
+    config = recorded_run.loop_config(**changes)
+    record = simulate(config.controller, config.plant)
+    run = record.run()
+    if source == 'bag':
+        write_bag(tmp_path / 'bag', record, config.controller, 'none')
+        run = read_run(tmp_path / 'bag')
+    assert run.learning.column('latched')[-1] == 1.0
+    summary = summarize(run)
+    assert f'learning    {line}' in format_table(summary)
+    assert (summary['learning']['latch_time_s'] is None) == bool(changes)
 
 
 def test_the_table_shows_a_violation_and_leaves_out_the_unknown(run):

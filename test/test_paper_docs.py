@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from paper_case import configured, run
+from paper_case import P, configured, run
 
 from blf_dsc_controller.configuration.nodes import known_names
 from blf_dsc_controller.configuration.params_file import locate
@@ -63,6 +63,27 @@ def test_table_of_the_laws_is_that_of_the_presets():
         np.testing.assert_allclose([*largest, *typical], np.array(figures, float), rtol=0.01)
         if learned:
             assert 100 * loop.parameter_error[-1] == pytest.approx(float(learned), rel=0.1)
+
+
+def phased(preset, phase):
+    """Relative parameter error after a minute, with the sinusoid of the disturbance at a phase."""
+    arm = {'disturbance.phase': [phase, phase]}
+    return run(configured(preset, 60.0, arm=arm)).parameter_error[-1]
+
+
+def test_the_parameter_error_depends_on_the_phase_of_the_disturbance_as_the_pages_say():
+    """0.1 cos t N m on both joints looks like 0.1 / 0.6 kg m^2 of the second parameter."""
+    assert phased('recommended', np.pi / 2) == pytest.approx(
+        0.1 / 0.6 / np.linalg.norm(P), abs=1e-3
+    )
+    assert phased('recommended', 17.0) == pytest.approx(0.143, abs=5e-4)
+    for phase in (0.0, np.pi / 2, 17.0):
+        assert phased('two_tone', phase) < 5e-5
+        assert 0.004 < phased('excitation', phase) < 0.008
+    for page in ('README.md', 'doc/theory.md', 'doc/comparison.md'):
+        text = ' '.join((ROOT / page).read_text().split())
+        assert '14.8 %' in text
+        assert 'below 0.005 %' in text
 
 
 def test_figures_of_the_pages_are_those_of_the_runs():

@@ -74,7 +74,7 @@ def _parameters(series: Series) -> tuple[str, ...]:
 
 def latch_time(run: Run) -> float | None:
     """Time at which learning began [s], None if it never did or is not recorded."""
-    if run.learning is None or LATCHED not in run.learning.names:
+    if not run.learns or run.learning is None or LATCHED not in run.learning.names:
         return None
     latched = np.flatnonzero(run.learning.column(LATCHED) > 0.5)
     return float(run.time_of(run.learning.stamp)[latched[0]]) if latched.size else None

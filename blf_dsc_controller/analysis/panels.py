@@ -186,6 +186,7 @@ def _learning(run: Run) -> Iterator[Panel]:
 def _monitors(run: Run) -> Iterator[Panel]:
     latched = latch_time(run)
     note = 'learning never began' if latched is None else f'learning from {latched:.4g} s on'
+    note = note if run.learns else 'not used by this law'
     excitation = [
         line._replace(values=np.where(line.values > 0.0, line.values, np.nan))  # 0: no update yet
         for series in (run.learning, run.monitor)

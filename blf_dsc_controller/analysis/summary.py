@@ -87,6 +87,7 @@ def _learning(run: Run, estimates: Estimates, metrics: Metrics) -> Summary:
     is_known = estimates.true is not None
     learning: Summary = plain(
         {
+            'used': run.learns,
             'latch_time_s': metrics.latch_time,
             'model_changes_s': change_times(run),
             'relative_error_at_s': reached if is_known else None,
@@ -169,7 +170,8 @@ def _sentences(summary: Summary) -> Iterator[str]:
 
 def _learning_lines(learning: Summary) -> Iterator[str]:
     latched = learning['latch_time_s']
-    yield f'learning    {"never began" if latched is None else f"began at {latched:.3f} s"}'
+    begun = 'never began' if latched is None else f'began at {latched:.3f} s'
+    yield f'learning    {begun if learning["used"] else "not used by this law"}'
     if learning['model_changes_s']:
         times = ', '.join(f'{t:.3f} s' for t in learning['model_changes_s'])
         yield f'arm         changed at {times}: learning started anew'

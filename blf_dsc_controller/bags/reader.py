@@ -7,7 +7,8 @@ A run as one table, a row for each joint state: for spreadsheets, pandas, MATLAB
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +24,7 @@ from blf_dsc_controller.bags.content import (
 )
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.journal import EventType, decode
+from blf_dsc_controller.messages.journal import Event, EventType, decode
 from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Floats, Run, Series, Stamps, Stop
 
@@ -44,6 +45,7 @@ def read_run(path: str | Path, namespace: str = '') -> Run:
     states = _decode(content.topics[topics.JOINT_STATES], joints)
     errors = _optional(content, topics.TRACKING_ERROR, joints)
     references = _optional(content, topics.REFERENCE, joints)
+    events = list(_events(content))
     bounds = _optional(content, topics.BOUND, joints)
     learning = _vector(content, topics.LEARNING)
     reference = None if references is None else references.position.exact(states.stamp)
@@ -67,7 +69,8 @@ def read_run(path: str | Path, namespace: str = '') -> Run:
         monitor=_vector(content, topics.MONITOR),
         message_counts=content.message_counts,
         rejected=_rejected_columns(content, learning, namespace),
-        stops=tuple(_stops(content, int(states.stamp[0]))),
+        stops=tuple(_stops(events, int(states.stamp[0]))),
+        learns=_learns(events),
     )
 
 
@@ -145,16 +148,27 @@ def _rejected_columns(content: Content, learning: Series | None, namespace: str)
     return {column: reasons.get(column, '') for column in columns}
 
 
-def _stops(content: Content, first: int) -> Iterator[Stop]:
-    """Stops in the journal; one before the first state gets its stamp [ns]."""
+def _events(content: Content) -> Iterator[Event]:
+    """Events of the journal; messages of another node's topic of that name are left out."""
     journal = content.topics.get(topics.JOURNAL)
     for raw in journal.raw if journal is not None else ():
-        try:
-            event = decode(raw)
-        except BlfDscError:  # another node's topic of that name
-            continue
+        with suppress(BlfDscError):
+            yield decode(raw)
+
+
+def _stops(events: Iterable[Event], first: int) -> Iterator[Stop]:
+    """Stops in the journal; one before the first state gets its stamp [ns]."""
+    for event in events:
         if event.type is EventType.STOP:
             yield Stop(max(event.stamp, first), event.content['reason'], event.content['text'])
+
+
+def _learns(events: Iterable[Event]) -> bool:
+    """Whether the law ever used the prediction error; true if the journal does not tell."""
+    known = [event.content.get('parameters', {}) for event in events]
+    laws = {one['law'] for one in known if 'law' in one}
+    weights = [one['learning.weight'] for one in known if 'learning.weight' in one]
+    return laws <= {'blf_dsc'} and any(weights or [1.0])
 
 
 def table(run: Run) -> dict[str, Any]:

@@ -90,6 +90,7 @@ class Record:
             ),
             truth=Series(true, self.stamps, self.truths[:, : len(true)]),
             monitor=monitor if settings.truth_known else None,
+            learns=config.law == 'blf_dsc' and config.learning.weight > 0.0,
             rejected={one.column: f'{one}' for one in rejected_columns(self.controller, names)},
         )
 
