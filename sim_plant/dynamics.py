@@ -16,7 +16,6 @@ import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.compiled.views import part
 
 PARAMETERS = 3
 
@@ -49,6 +48,23 @@ def parameters(arm: PointMassArm, out: np.ndarray) -> None:
     out[0] = (arm.m1 + arm.m2) * arm.l1**2
     out[1] = arm.m2 * arm.l2**2
     out[2] = arm.m2 * arm.l1 * arm.l2
+
+
+@inner
+def loaded(arm: PointMassArm, payload: float) -> PointMassArm:
+    """Return the arm with a point mass [kg] at its tip."""
+    return PointMassArm(arm.l1, arm.l2, arm.m1, arm.m2 + payload, arm.g)
+
+
+@inner
+def tip(arm: PointMassArm, q: np.ndarray, position: np.ndarray, jacobian: np.ndarray) -> None:
+    """Write the position (3,) [m] of the tip and its Jacobian (3, n) [m/rad]."""
+    x1, z1 = arm.l1 * cos(q[0]), arm.l1 * sin(q[0])
+    x2, z2 = arm.l2 * cos(q[0] + q[1]), arm.l2 * sin(q[0] + q[1])
+    position[0], position[1], position[2] = x1 + x2, 0.0, z1 + z2
+    jacobian[0, 0], jacobian[0, 1] = -z1 - z2, -z2
+    jacobian[1, 0], jacobian[1, 1] = 0.0, 0.0
+    jacobian[2, 0], jacobian[2, 1] = x1 + x2, x2
 
 
 @inner
@@ -87,23 +103,3 @@ def acceleration(
     determinant = m11 * m22 - m12 * m12
     ddq[0] = (m22 * f1 - m12 * f2) / determinant
     ddq[1] = (m11 * f2 - m12 * f1) / determinant
-
-
-@inner
-def state_derivative(
-    arm: PointMassArm,
-    disturbance: JointDisturbance,
-    t: float,
-    x: np.ndarray,
-    torque: np.ndarray,
-    dx: np.ndarray,
-) -> None:
-    """Write dx/dt = [dq, ddq] (2n,) of x = [q, dq] (2n,)."""
-    n = torque.size
-    q, dq = part(x, 0, (n,)), part(x, n, (n,))
-    velocity, net_torque = part(dx, 0, (n,)), part(dx, n, (n,))
-    disturbance_torque(disturbance, t, dq, net_torque)
-    for i in range(n):
-        velocity[i] = dq[i]
-        net_torque[i] = torque[i] - net_torque[i]
-    acceleration(arm, q, dq, net_torque, net_torque)  # in place

@@ -12,7 +12,7 @@ import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from sim_plant.dynamics import JointDisturbance, PointMassArm, state_derivative
+from sim_plant.motion import Motion, state_derivative
 
 RK4 = 0
 DOPRI5 = 1
@@ -48,8 +48,7 @@ def _explicit_step(
     a: np.ndarray,
     b: np.ndarray,
     c: np.ndarray,
-    arm: PointMassArm,
-    disturbance: JointDisturbance,
+    motion: Motion,
     t: float,
     h: float,
     torque: np.ndarray,
@@ -63,7 +62,7 @@ def _explicit_step(
             for j in range(stage):
                 slope += a[stage, j] * k[j, i]
             point[i] = x[i] + h * slope
-        state_derivative(arm, disturbance, t + c[stage] * h, point, torque, k[stage])
+        state_derivative(motion, t + c[stage] * h, point, torque, k[stage])
     for i in range(x.size):
         slope = 0.0
         for j in range(b.size):
@@ -74,8 +73,7 @@ def _explicit_step(
 @inner
 def integrate(
     method: int,
-    arm: PointMassArm,
-    disturbance: JointDisturbance,
+    motion: Motion,
     t: float,
     h: float,
     torque: np.ndarray,
@@ -84,6 +82,6 @@ def integrate(
 ) -> None:
     """Advance x = [q, dq] (2n,) in place from t to t + h [s] under a held torque (n,) [N m]."""
     if method == RK4:
-        _explicit_step(_RK4_A, _RK4_B, _RK4_C, arm, disturbance, t, h, torque, x, stages)
+        _explicit_step(_RK4_A, _RK4_B, _RK4_C, motion, t, h, torque, x, stages)
     else:
-        _explicit_step(_DOPRI5_A, _DOPRI5_B, _DOPRI5_C, arm, disturbance, t, h, torque, x, stages)
+        _explicit_step(_DOPRI5_A, _DOPRI5_B, _DOPRI5_C, motion, t, h, torque, x, stages)

@@ -14,14 +14,11 @@ from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
 from blf_dsc_controller.compiled.views import part, view
 from sim_plant.actuator import Drives, DriveState, actuate
-from sim_plant.dynamics import (
-    PARAMETERS,
-    JointDisturbance,
-    PointMassArm,
-    disturbance_torque,
-    parameters,
-)
+from sim_plant.contact import Contact, TipState, Wall
+from sim_plant.dynamics import PARAMETERS, JointDisturbance, PointMassArm, loaded, parameters
+from sim_plant.events import Acting, Events, Load, update_acting
 from sim_plant.integrator import Stages, integrate
+from sim_plant.motion import Motion, disturbing_torque
 from sim_plant.sensors import EncoderReading, Encoders, draw, is_noisy, sense
 
 
@@ -31,10 +28,14 @@ class PlantSettings(NamedTuple):
     n: int
     period_ns: int
     integrator: int  # RK4 or DOPRI5
+    events: int  # how many
     arm: PointMassArm
     encoders: Encoders
     disturbance: JointDisturbance
     drives: Drives
+    load: Load
+    wall: Wall
+    schedule: Events
 
 
 class PlantState(NamedTuple):
@@ -45,6 +46,8 @@ class PlantState(NamedTuple):
     reading: EncoderReading
     drives: DriveState
     stages: Stages
+    acting: Acting
+    tip: TipState
 
 
 settings_of = view_of(PlantSettings)
@@ -56,6 +59,26 @@ def plant_views(settings: np.ndarray, state: np.ndarray) -> tuple[PlantSettings,
     """Views of both vectors, not reference-counted."""
     plant = settings_of(view(settings))
     return plant, state_of(view(state), plant)
+
+
+@inner
+def update_motion(plant: PlantSettings, now: PlantState) -> Motion:
+    """Return the equation of motion of this sample."""
+    acting, disturbance = now.acting, plant.disturbance
+    update_acting(disturbance, plant.load, plant.schedule, now.sample[0], acting)
+    return Motion(
+        loaded(plant.arm, acting.payload[0]),
+        JointDisturbance(
+            acting.constant,
+            disturbance.amplitude,
+            disturbance.frequency,
+            disturbance.phase,
+            acting.viscous,
+            acting.coulomb,
+            disturbance.coulomb_velocity,
+        ),
+        Contact(acting.force, plant.wall, now.tip),
+    )
 
 
 @inner
@@ -74,8 +97,11 @@ def observe(plant: PlantSettings, now: PlantState, measurement: np.ndarray) -> N
     """
     n = plant.n
     if now.reading.sample[0] != now.sample[0]:
+        update_motion(plant, now)
         q, dq = part(now.x, 0, (n,)), part(now.x, n, (n,))
-        sense(plant.encoders, int(now.sample[0]), plant.period_ns * 1e-9, q, dq, now.reading)
+        offset = now.acting.offset
+        period = plant.period_ns * 1e-9
+        sense(plant.encoders, int(now.sample[0]), period, q, dq, offset, now.reading)
     for i in range(n):
         measurement[i] = now.reading.position[i]
         measurement[n + i] = now.reading.velocity[i]
@@ -88,8 +114,7 @@ def step(plant: PlantSettings, now: PlantState, command: np.ndarray) -> None:
     actuate(plant.drives, int(now.sample[0]), command, now.drives)
     integrate(
         plant.integrator,
-        plant.arm,
-        plant.disturbance,
+        update_motion(plant, now),
         now.sample[0] * plant.period_ns * 1e-9,
         plant.period_ns * 1e-9,
         now.drives.applied,
@@ -100,13 +125,19 @@ def step(plant: PlantSettings, now: PlantState, command: np.ndarray) -> None:
 
 
 @inner
+def true_parameters(plant: PlantSettings, now: PlantState, out: np.ndarray) -> None:
+    """Write P (3,) of this sample, with the payload in it."""
+    parameters(update_motion(plant, now).arm, out)
+
+
+@inner
 def truth(plant: PlantSettings, now: PlantState, out: np.ndarray) -> None:
     """Write what no sensor measures, [P, tau_dist, q, dq] (3 + 3n,) of this sample."""
     n = plant.n
     t = now.sample[0] * plant.period_ns * 1e-9
-    parameters(plant.arm, out)
-    dq = part(now.x, n, (n,))
-    disturbance_torque(plant.disturbance, t, dq, part(out, PARAMETERS, (n,)))
+    true_parameters(plant, now, out)
+    q, dq = part(now.x, 0, (n,)), part(now.x, n, (n,))
+    disturbing_torque(update_motion(plant, now), t, q, dq, part(out, PARAMETERS, (n,)))
     for i in range(2 * n):
         out[PARAMETERS + n + i] = now.x[i]
 

@@ -6,12 +6,16 @@ as the machine allows. Real time takes a step each sample time of the steady clo
 last torque where the new one is late, and publishes how late; a torque older than
 `actuator.command_timeout` is not applied. In both the arm is braked until the first torque comes.
 
+Load, wall, events, disturbance and encoder offsets can change while it runs, from the next sample
+on; `~/changes` says from which, so that an event at that time repeats the run.
+
 A reset takes the arm back to its start, which no real arm does by itself: therefore this node also
 resets the controller, if there is one, before it sends the first state.
 """
 
 from __future__ import annotations
 
+import json
 import sys
 from functools import partial
 from typing import Any
@@ -23,6 +27,7 @@ from std_msgs.msg import String
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.arms.two_link_geometry import urdf
 from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import Value, flatten
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder
@@ -34,7 +39,7 @@ from blf_dsc_controller.nodes.lifecycle import LoopNode
 from sim_plant import kernels as plant_kernels
 from sim_plant.command_input import Latency, TorqueInput
 from sim_plant.handshake import Handshake
-from sim_plant.plant import Plant, plant_of, steps_of
+from sim_plant.plant import Plant, plant_of, settings_of, steps_of
 
 LOCKSTEP_START = 1_000_000_000
 """First stamp in lock-step [ns]: a zero stamp says 'not set' in ROS."""
@@ -64,6 +69,8 @@ class PlantNode(LoopNode[PlantConfig]):
         self._diagnostics = DiagnosticsPublisher(self, joints)
         self._step_timer: Timer | None = None
         self._start_stamp = LOCKSTEP_START
+        self._changed: dict[str, Value] = {}
+        self._changes = create_publisher(self, topics.CHANGES)
         self._handshake = Handshake(self, self._now)
         self.plant: Plant
         self._rest()
@@ -89,6 +96,7 @@ class PlantNode(LoopNode[PlantConfig]):
         """Put the arm at its start; create its topics the first time."""
         process.log_compilation(self.get_logger(), *plant_kernels.KERNELS)
         self.plant = plant_of(self.config)
+        self._changed.clear()
         self.plant.measure()
         self.plant.truth()
         self.plant.step(np.zeros(len(self.config.joints)))
@@ -128,6 +136,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self._start_stamp = self.stamp + _BETWEEN_RUNS
         self._rest()
         self.plant.reset()
+        self._apply_changes()
         self.input.restart()
         self._handshake.begin(reset=True)
         return 'the arm is at its start, braked until the first torque comes'
@@ -221,6 +230,7 @@ class PlantNode(LoopNode[PlantConfig]):
             if self._stale:
                 self.input.torque[:] = 0.0
             self.plant.step(self.input.torque)
+        self._apply_changes()
         self._publish_state()
         if self._stale and not was_stale:
             self.get_logger().error('the torque is too old and not applied any more')
@@ -249,7 +259,18 @@ class PlantNode(LoopNode[PlantConfig]):
             self._publish(self._telemetry.clock(stamp))
 
     def _reconfigure(self, config: PlantConfig) -> None:
+        before = flatten(self.config)
+        self._changed |= {k: v for k, v in flatten(config).items() if v != before[k]}
         self.config = config
+
+    def _apply_changes(self) -> None:
+        """Let changed parameters take effect at the present sample, which nobody has seen yet."""
+        if not self._changed:
+            return
+        self.plant.change(settings_of(self.config))
+        content = {'stamp': self.stamp, 'parameters': self._changed}
+        self._changes.publish(String(data=json.dumps(content)))
+        self._changed = {}
 
     def _report(self) -> None:
         """Publish diagnostics; the level depends on what happened since the last report."""

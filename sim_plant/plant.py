@@ -13,7 +13,9 @@ from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.plant import PlantConfig
 from sim_plant.actuator import Drives
-from sim_plant.dynamics import PARAMETERS, JointDisturbance, PointMassArm, parameters
+from sim_plant.contact import Wall
+from sim_plant.dynamics import PARAMETERS, JointDisturbance, PointMassArm
+from sim_plant.events import Events, Load
 from sim_plant.integrator import INTEGRATORS
 from sim_plant.kernels import (
     PlantSettings,
@@ -50,7 +52,7 @@ class Plant:
         self._noisy = is_noisy(settings.encoders)
         self._now = state_of(self.state, settings)
         self._now.x[:] = np.concatenate((position, velocity))
-        self._now.reading.sample[0] = -1.0
+        self._now.reading.sample[0] = self._now.acting.sample[0] = -1.0
         self._initial = self.state.copy()
         self._measurement = np.zeros(3 * self.joints)
         self._truth = np.zeros(PARAMETERS + 3 * self.joints)
@@ -81,6 +83,11 @@ class Plant:
     def step(self, torque: np.ndarray) -> None:
         """Apply the commanded torque (n,) [N m] and advance to the next sample."""
         step_plant(self.settings, self.state, torque)
+
+    def change(self, settings: PlantSettings) -> None:
+        """Continue with other settings of as many joints and the same period and delay."""
+        self.settings = pack(settings)
+        self._now.acting.sample[0] = -1.0
 
     def hold(self) -> None:
         """Stay at rest and without torque for one sample: the brakes are on."""
@@ -113,27 +120,34 @@ def arm_of(config: PlantConfig) -> PointMassArm:
     return PointMassArm(*vars(config.arm).values())
 
 
-def parameters_of(config: PlantConfig) -> np.ndarray:
-    """True parameters P (3,) [kg m^2] of a configured arm."""
-    P = np.zeros(PARAMETERS)
-    parameters(arm_of(config), P)
-    return P
+def parameters_of(config: PlantConfig, t: float = 0.0) -> np.ndarray:
+    """True parameters P (3,) [kg m^2] of a configured arm, with its payload at time t [s]."""
+    plant = plant_of(config)
+    plant.state[0] = round(t / config.sample_time)
+    return plant.truth()[:PARAMETERS]
 
 
-def parameters_by_name(config: PlantConfig, names: Sequence[str]) -> np.ndarray:
-    """True parameters in the order of a model's `names`; NaN if those are of other parameters."""
-    P = dict(zip(PARAMETER_NAMES, parameters_of(config).tolist(), strict=True))
-    return np.array([P[name] if set(names) == P.keys() else np.nan for name in names])
+def parameter_order(names: Sequence[str]) -> np.ndarray:
+    """Place of each of a model's parameters in P; -1 for all if the model has other ones."""
+    known = set(names) == set(PARAMETER_NAMES)
+    return np.array([PARAMETER_NAMES.index(name) if known else -1 for name in names])
 
 
 def plant_of(config: PlantConfig) -> Plant:
     """Plant of a configuration, at sample 0."""
+    start = config.initial
+    return Plant(settings_of(config), start.position, start.velocity, config.seed)
+
+
+def settings_of(config: PlantConfig) -> PlantSettings:
+    """Settings of a configured plant."""
     n = len(config.joints)
-    sensor, actuator = config.sensor, config.actuator
-    settings = PlantSettings(
+    sensor, actuator, load, wall = config.sensor, config.actuator, config.load, config.wall
+    return PlantSettings(
         n=n,
         period_ns=config.sample_time_ns,
         integrator=INTEGRATORS[config.integrator],
+        events=len(config.events.begin),
         arm=arm_of(config),
         encoders=Encoders(
             sensor.position_noise,
@@ -145,8 +159,37 @@ def plant_of(config: PlantConfig) -> Plant:
             **{name: np.full(n, value) for name, value in vars(config.disturbance).items()}
         ),
         drives=Drives(np.array(actuator.torque_limit), actuator.delay),
+        load=Load(load.payload, *map(np.array, (load.torque, load.force, sensor.offset))),
+        wall=Wall(
+            np.array(wall.point),
+            np.array(wall.normal) / np.linalg.norm(wall.normal),
+            wall.stiffness,
+            wall.damping,
+        ),
+        schedule=_schedule_of(config),
     )
-    return Plant(settings, config.initial.position, config.initial.velocity, config.seed)
+
+
+def _schedule_of(config: PlantConfig) -> Events:
+    """Events with their times in samples, and zeros for what is left out."""
+    events, count, n = config.events, len(config.events.begin), len(config.joints)
+
+    def values(name: str, *shape: int) -> np.ndarray:
+        given = getattr(events, name)
+        return np.reshape(given, (count, *shape)) if given else np.zeros((count, *shape))
+
+    def samples(times: np.ndarray) -> np.ndarray:
+        return np.rint(times / config.sample_time)
+
+    begin, duration = values('begin'), values('duration')
+    return Events(
+        begin=samples(begin),
+        end=np.where(duration > 0.0, samples(begin + duration), np.inf),
+        ramp=samples(values('ramp')),
+        payload=values('payload'),
+        force=values('force', 3),
+        **{name: values(name, n) for name in ('torque', 'viscous', 'coulomb', 'offset')},
+    )
 
 
 def steps_of(config: PlantConfig) -> int:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Encoder readings of the true state: white noise, quantisation, and a velocity.
+"""Encoder readings of the true state: offset, white noise, quantisation, and a velocity.
 
 The velocity is either measured, with noise of its own, or differenced from the measured positions.
 Noise comes from one seeded generator, so the same seed repeats a run exactly.
@@ -68,9 +68,10 @@ def sense(
     period: float,
     q: np.ndarray,
     dq: np.ndarray,
+    offset: np.ndarray,
     reading: EncoderReading,
 ) -> None:
-    """Write the reading of this sample, with the noise that is in it.
+    """Write the reading of this sample, with the offset (n,) [rad] and the noise that are in it.
 
     A differenced velocity spans the samples since the last reading, `period` seconds each; the
     first reading has no predecessor and gets the true velocity.
@@ -79,7 +80,8 @@ def sense(
     first = reading.sample[0] < 0
     span = (sample - reading.sample[0]) * period
     for i in range(n):
-        position = quantised(q[i] + encoders.position_noise * reading.noise[i], encoders.resolution)
+        position = q[i] + offset[i] + encoders.position_noise * reading.noise[i]
+        position = quantised(position, encoders.resolution)
         if encoders.velocity_source == MEASURED:
             reading.velocity[i] = dq[i] + encoders.velocity_noise * reading.noise[n + i]
         elif first:

@@ -4,9 +4,12 @@
 import numpy as np
 
 from sim_plant.actuator import Drives
+from sim_plant.contact import Contact, TipState, Wall
 from sim_plant.dynamics import JointDisturbance, PointMassArm
+from sim_plant.events import Events, Load
 from sim_plant.integrator import DOPRI5
 from sim_plant.kernels import PlantSettings
+from sim_plant.motion import Motion
 from sim_plant.plant import Plant
 from sim_plant.sensors import MEASURED, Encoders
 
@@ -46,6 +49,17 @@ def rough_disturbance():
     )
 
 
+NOWHERE = Wall(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0)
+UNLOADED = Load(0.0, *(np.zeros(size) for size in (2, 3, 2)))
+UNEVENTFUL = Events(*np.zeros((4, 0)), *(np.zeros((0, size)) for size in (2, 3, 2, 2, 2)))
+
+
+def motion(arm=ARM, load=None, force=(0.0, 0.0, 0.0), wall=NOWHERE):
+    """Equation of motion of an arm, with a disturbance, and a force at its tip."""
+    tip = TipState(np.zeros(3), np.zeros((3, 2)), np.zeros(3))
+    return Motion(arm, load or disturbance(), Contact(np.array(force), wall, tip))
+
+
 def settings(
     *,
     period_ns=1_000_000,
@@ -63,10 +77,14 @@ def settings(
         n=2,
         period_ns=period_ns,
         integrator=integrator,
+        events=0,
         arm=ARM,
         encoders=Encoders(position_noise, velocity_noise, resolution, velocity_source),
         disturbance=disturbance() if load is None else load,
         drives=Drives(np.array(torque_limit), delay),
+        load=UNLOADED,
+        wall=NOWHERE,
+        schedule=UNEVENTFUL,
     )
 
 

@@ -3,11 +3,11 @@
 
 import numpy as np
 import pytest
-from plants import ARM, PERIOD, START, commands, disturbance, energies, rough_disturbance
+from plants import ARM, PERIOD, START, commands, disturbance, energies, motion, rough_disturbance
 from scipy.integrate import RK45, simpson, solve_ivp
 
-from sim_plant.dynamics import state_derivative
 from sim_plant.integrator import DOPRI5, RK4, Stages, integrate
+from sim_plant.motion import state_derivative
 
 STAGES = Stages(np.empty(4), np.empty((6, 4)))
 INITIAL = np.array([*START, 0.5, -1.0])
@@ -15,7 +15,7 @@ TORQUE = np.array([-6.0, -2.0])
 
 
 def advance(method, load, t, h, torque, x):
-    integrate(method, ARM, load, t, h, torque, x, STAGES)
+    integrate(method, motion(load=load), t, h, torque, x, STAGES)
 
 
 def states(method, load, torque, h, steps):
@@ -33,7 +33,7 @@ def slope(load, torque):
 
     def evaluate(t, x):
         dx = np.empty(4)
-        state_derivative(ARM, load, t, x, torque, dx)
+        state_derivative(motion(load=load), t, x, torque, dx)
         return dx
 
     return evaluate

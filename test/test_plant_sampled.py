@@ -11,7 +11,7 @@ import numba
 import numpy as np
 import pytest
 from numba.core.runtime import _nrt_python, rtsys
-from plants import ARM, START, commands, plant, rough_disturbance, run
+from plants import START, commands, motion, plant, rough_disturbance, run
 
 from blf_dsc_controller.compiled.jit import kernel
 from sim_plant.integrator import DOPRI5, RK4, Stages, integrate
@@ -69,7 +69,9 @@ def test_a_sample_begins_when_whole_nanoseconds_say():
     x, stages = np.array([*START, 0.0, 0.0]), Stages(np.empty(4), np.empty((6, 4)))
     for k, torque in enumerate(commands(100)):
         arm.step(torque)
-        integrate(DOPRI5, ARM, load, (k * period_ns) * 1e-9, period_ns * 1e-9, torque, x, stages)
+        integrate(
+            DOPRI5, motion(load=load), (k * period_ns) * 1e-9, period_ns * 1e-9, torque, x, stages
+        )
     assert (arm.truth()[5:] == x).all()
 
 

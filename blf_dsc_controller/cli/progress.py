@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 from blf_dsc_controller.configuration.plant import PlantConfig
-from sim_plant.plant import parameters_by_name
+from sim_plant.plant import parameter_order, parameters_of
 
 _FORMAT = '{desc} |{bar}| {n:.1f}/{total:g} s [{elapsed}<{remaining}]{postfix}'
 _LINE_PERIOD = 10.0  # s between two lines where there is no terminal to draw a bar on
@@ -26,8 +26,8 @@ class Progress:
 
     def __init__(self, config: PlantConfig, parameters: Sequence[str]) -> None:
         """Begin at 0 s; `parameters` are the names of the estimates."""
-        self._truth = parameters_by_name(config, parameters)
-        self._duration = config.duration
+        self._order = parameter_order(parameters)
+        self._config = config
         self._line = ''
         self._due = time.monotonic() + _LINE_PERIOD
         self._bar = tqdm(
@@ -40,13 +40,14 @@ class Progress:
 
     def show(self, elapsed: float, ratio: float, estimate: ArrayLike) -> None:
         """Show the simulated time [s], the largest |xi1| / k_c so far, and P^ (p,)."""
-        error = np.linalg.norm(np.asarray(estimate) - self._truth) / np.linalg.norm(self._truth)
+        P = parameters_of(self._config, elapsed)[self._order]
+        error = np.linalg.norm(np.asarray(estimate) - P) / np.linalg.norm(P)
         status = f'max|xi1|/bound {ratio:.2f}'
-        if np.isfinite(error):
+        if np.all(self._order >= 0):
             status += f', parameter error {100 * error:.2f} %'
         self._bar.set_postfix_str(status, refresh=False)
-        self._bar.update(min(elapsed, self._duration) - self._bar.n)
-        self._line = f'closed loop {elapsed:.1f}/{self._duration:g} s, {status}'
+        self._bar.update(min(elapsed, self._config.duration) - self._bar.n)
+        self._line = f'closed loop {elapsed:.1f}/{self._config.duration:g} s, {status}'
         if time.monotonic() >= self._due:
             self._print_line()
 

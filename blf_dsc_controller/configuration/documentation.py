@@ -47,10 +47,12 @@ def parameter_page() -> str:
 
 
 def _row(one: Parameter) -> str:
-    lengths = [name for name in one.length if name != 'joints']
+    number = next((f'{length} entries' for length in one.length if length.isdigit()), '')
+    lengths = [name for name in one.length if name != 'joints' and not name.isdigit()]
     if 'joints' in one.length and lengths:
         lengths.insert(0, 'joint')
-    each = 'one entry per ' + ' and '.join(lengths) if lengths else ''
+    each = f'{number or "one entry"} per {" and ".join(lengths)}' if lengths else number
+    each += ', or none' if one.omittable else ''
     cells = (
         f'`{one.name}`',
         one.symbol,

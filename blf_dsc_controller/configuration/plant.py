@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the simulated plant: arm, disturbance, sensors, actuators, and its clock."""
+"""Parameters of the simulated plant: arm, disturbance, sensors, actuators, events, its clock."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from blf_dsc_controller.configuration.common import (
     autostart,
     joint_problems,
 )
-from blf_dsc_controller.configuration.schema import parameter, positive
+from blf_dsc_controller.configuration.events import Events, Load, Wall
+from blf_dsc_controller.configuration.schema import non_negative, parameter, positive
 
 _fixed = partial(parameter, read_only='the plant is built once, when the node starts')
 
@@ -46,16 +47,14 @@ class PlantDisturbance:
              + viscous*dq + coulomb*tanh(dq/coulomb_velocity)
     """
 
-    constant: PerJoint = _fixed((0.1, 0.1), 'constant part', 'N m')
-    amplitude: PerJoint = _fixed((0.1, 0.1), 'amplitude of the sinusoid', 'N m')
-    frequency: PerJoint = _fixed(
-        (1.0, 1.0), 'angular frequency of the sinusoid', 'rad/s', at_least=0.0
-    )
-    phase: PerJoint = _fixed((0.0, 0.0), 'phase of the sinusoid', 'rad')
-    viscous: PerJoint = _fixed((0.0, 0.0), 'viscous friction', 'N m s/rad', at_least=0.0)
-    coulomb: PerJoint = _fixed((0.0, 0.0), 'Coulomb friction', 'N m', at_least=0.0)
-    coulomb_velocity: float = _fixed(
-        0.01, 'velocity scale of the sign change of Coulomb friction', 'rad/s', above=0.0
+    constant: PerJoint = parameter((0.1, 0.1), 'constant part', 'N m')
+    amplitude: PerJoint = parameter((0.1, 0.1), 'amplitude of the sinusoid', 'N m')
+    frequency: PerJoint = non_negative((1.0, 1.0), 'angular frequency of the sinusoid', 'rad/s')
+    phase: PerJoint = parameter((0.0, 0.0), 'phase of the sinusoid', 'rad')
+    viscous: PerJoint = non_negative((0.0, 0.0), 'viscous friction', 'N m s/rad')
+    coulomb: PerJoint = non_negative((0.0, 0.0), 'Coulomb friction', 'N m')
+    coulomb_velocity: float = positive(
+        0.01, 'velocity scale of the sign change of Coulomb friction', 'rad/s'
     )
 
 
@@ -73,6 +72,7 @@ class Sensor:
     velocity: Literal['measured', 'differenced'] = _fixed(
         'measured', 'velocity from its own sensor, or the difference of two measured positions'
     )
+    offset: PerJoint = parameter((0.0, 0.0), 'measured position less the true one', 'rad')
 
 
 @dataclass(frozen=True)
@@ -130,12 +130,15 @@ class PlantConfig(Sampled):
     disturbance: PlantDisturbance = PlantDisturbance()
     sensor: Sensor = Sensor()
     actuator: Actuator = Actuator()
+    load: Load = Load()
+    wall: Wall = Wall()
+    events: Events = Events()
     realtime: Realtime = field(default_factory=Realtime)
 
     def problems(self) -> list[str]:
         """Check the joints, the sample time, and the duration against it."""
         problems = joint_problems(self.joints, 'the simulated arm', 2)
-        problems += self.sample_time_problems()
+        problems += self.sample_time_problems() + self.wall.problems()
         if 0.0 < self.duration < self.sample_time:
             problems.append(
                 f'duration: got {self.duration:g} s, shorter than one sample of '

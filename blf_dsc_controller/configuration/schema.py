@@ -63,8 +63,10 @@ class Parameter:
     """A parameter of a node: what it means and which values are valid.
 
     Ranges and choices apply to each entry of an array. `read_only` is the reason why the parameter
-    cannot change while the node runs; empty: it can. The last three are known from the field of the
-    dataclass: `length` names the parameters whose lengths multiply to the length of this array.
+    cannot change while the node runs; empty: it can. An array that is `omittable` may be empty
+    whatever its length is otherwise. The last three are known from the field of the dataclass:
+    `length` names the parameters whose lengths multiply to the length of this array; a number among
+    them is a length itself.
     """
 
     default: Value
@@ -77,6 +79,7 @@ class Parameter:
     below: float | None = None
     choices: tuple[str, ...] = ()
     may_be_empty: bool = False
+    omittable: bool = False
     read_only: str = ''
     name: str = ''
     kind: Kind = Kind.DOUBLE
@@ -97,7 +100,7 @@ class Parameter:
             entries: list[Any] = list(given) if self.kind.is_array else [given]  # type: ignore[call-overload]
             if not all(_is(entry, self.kind.element) for entry in entries):
                 found = [self._type_mismatch(given) + _remedy(entries, self.kind.element)]
-            elif not entries and not self.may_be_empty:
+            elif not entries and not (self.may_be_empty or self.omittable):
                 found = ['got an empty list, but at least one entry is needed']
             else:
                 found = list(self._range_problems(entries))
@@ -233,13 +236,15 @@ def _assemble(cls: type[Config], values: Mapping[str, Value], prefix: str) -> Co
 
 
 def _length_problems(one: Parameter, values: Mapping[str, Any]) -> Iterator[str]:
-    if not one.length or any(name not in values for name in (one.name, *one.length)):
+    named = [name for name in one.length if not name.isdigit()]
+    if not one.length or any(name not in values for name in (one.name, *named)):
         return
-    counts = [len(values[name]) for name in one.length]
+    counts = [int(name) if name.isdigit() else len(values[name]) for name in one.length]
     length, needed = len(values[one.name]), math.prod(counts)
-    if length != needed:
+    if length != needed and not (one.omittable and length == 0):
         factors = ' times '.join(
-            f'{count} of {name}' for count, name in zip(counts, one.length, strict=True)
+            name if name.isdigit() else f'{count} of {name}'
+            for count, name in zip(counts, one.length, strict=True)
         )
         entries = counted(length, 'entry', 'entries')
         yield f'{one.name}: got {entries}, but {needed} are needed ({factors})'

@@ -93,6 +93,8 @@ ROBOT_DESCRIPTION = Topic(
     PLANT, 'robot_description', 'std_msgs/msg/String', LATCHED_QUALITY, LATCHED_QUALITY
 )
 """The URDF; not in TOPICS, since the offline writer does not write it."""
+CHANGES = Topic(PLANT, '~/changes', 'std_msgs/msg/String', HISTORY, HISTORY)
+"""Parameters of the plant changed while it runs, as JSON: `stamp` of their first sample [ns]."""
 JOINT_TRAJECTORY = Topic(
     CONTROLLER,
     '~/joint_trajectory',

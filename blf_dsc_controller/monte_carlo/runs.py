@@ -21,7 +21,8 @@ from blf_dsc_controller.simulation.metrics import (
     metrics_of,
     new_metrics,
 )
-from sim_plant.plant import parameters_by_name, plant_of, steps_of
+from sim_plant.dynamics import PARAMETERS
+from sim_plant.plant import parameter_order, plant_of, steps_of
 
 KEPT = 'kept'
 VIOLATED = 'violated'
@@ -61,17 +62,18 @@ def warm_up(study: Study) -> None:
 
 def metrics_settings(study: Study, plant: PlantConfig) -> MetricsSettings:
     """Settings of the metrics of a run with this plant."""
-    P = parameters_by_name(plant, model_of(study.controller).parameter_names)
+    order = parameter_order(model_of(study.controller).parameter_names)
     limits = zip(study.controller.torque.limit, plant.actuator.torque_limit, strict=True)
     times = (study.settings.settled_after, *study.settings.moments)
     settled, *moments = (round(t / plant.sample_time) for t in times)
     return MetricsSettings(
         n=len(plant.joints),
-        p=P.size,
+        p=order.size,
+        true=PARAMETERS,
         moments=len(moments) + 1,
         settled=settled,
         limit=np.array([min(law, motor or law) for law, motor in limits]),
-        P=P,
+        order=order,
         samples=np.array([*moments, steps_of(plant)]),
     )
 

@@ -40,7 +40,7 @@ from sim_plant import kernels as plants
 from sim_plant.plant import Plant, plant_of, steps_of
 
 _CHUNK = 1000  # samples between two reports of progress
-_NO_METRICS = MetricsSettings(0, 0, 0, 0, *np.zeros((3, 0)))
+_NO_METRICS = MetricsSettings(0, 0, 0, 0, 0, *np.zeros((3, 0)))
 
 
 @dataclass(frozen=True)
@@ -141,6 +141,7 @@ def run_loop(
             fill_energies(law, law_state, law_signals, part(measurement, 0, (law.n,)), sample)
         if chosen.n > 0:
             if found.finite[0] == 1.0:
+                plants.true_parameters(plant, now, found.P)
                 update_metrics(chosen, found, t, measurement, sample)
             elif truths is None:
                 return

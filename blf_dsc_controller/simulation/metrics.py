@@ -17,11 +17,12 @@ class MetricsSettings(NamedTuple):
     """Limits and moments of the metrics of a run."""
 
     n: int
-    p: int
+    p: int  # parameters of the model
+    true: int  # parameters of the plant
     moments: int
     settled: int  # first sample of the rms error
     limit: Annotated[Array, 'n']  # N m, torque at which a joint is saturated; 0: none
-    P: Annotated[Array, 'p']  # kg m^2, true parameters
+    order: Annotated[Array, 'p']  # place of each in those of the plant; -1: it has others
     samples: Annotated[Array, 'moments']  # at which the parameter error is kept
 
 
@@ -38,6 +39,7 @@ class LoopMetrics(NamedTuple):
     squares: Annotated[Array, 'n']  # rad^2, sum of xi1^2 of the settled samples
     peak: Annotated[Array, 'n']  # N m, max |applied torque|
     error: Annotated[Array, 'moments']  # |P^ - P| / |P|, or NaN
+    P: Annotated[Array, 'true']  # kg m^2, of the plant at the present sample
 
 
 metrics_settings_of = view_of(MetricsSettings)
@@ -64,13 +66,14 @@ def is_finite(vector: np.ndarray) -> bool:
 
 
 @inner
-def relative_error(estimate: np.ndarray, P: np.ndarray) -> float:
-    """|P^ - P| / |P|."""
+def relative_error(estimate: np.ndarray, P: np.ndarray, order: np.ndarray) -> float:
+    """|P^ - P| / |P|; NaN if the parameters are not those of the plant."""
     difference = 0.0
     size = 0.0
-    for j in range(P.size):
-        difference += (estimate[j] - P[j]) ** 2
-        size += P[j] ** 2
+    for j in range(order.size):
+        true = P[int(order[j])] if order[j] >= 0.0 else nan
+        difference += (estimate[j] - true) ** 2
+        size += true**2
     return sqrt(difference) / sqrt(size)
 
 
@@ -97,7 +100,10 @@ def update_metrics(
     measurement: np.ndarray,
     sample: Sample,
 ) -> None:
-    """Update the metrics with the sample of time t [s]; a sample that is not finite ends them."""
+    """Update the metrics, the true parameters in them, with the sample of time t [s].
+
+    A sample that is not finite ends them.
+    """
     if not (is_finite(measurement) and is_finite(sample.torque)):
         metrics.finite[0] = 0.0
         if isnan(metrics.violation[0]):
@@ -116,5 +122,5 @@ def update_metrics(
         metrics.latch[0] = t
     for j in range(settings.moments):
         if settings.samples[j] == metrics.samples[0]:
-            metrics.error[j] = relative_error(sample.estimate, settings.P)
+            metrics.error[j] = relative_error(sample.estimate, metrics.P, settings.order)
     metrics.samples[0] += 1.0

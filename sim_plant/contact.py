@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Forces at the tip as torques of the joints: a push, and a wall that the tip runs into.
+
+Vectors are in the frame of the base: x to the right, z upwards.  A force f at the tip loads the
+joints with J^T f, J the Jacobian of the tip's position.
+"""
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
+from sim_plant.dynamics import PointMassArm, tip
+
+
+class Wall(NamedTuple):
+    """A plane that pushes the tip along its unit normal."""
+
+    point: Annotated[Array, '3']  # m
+    normal: Annotated[Array, '3']
+    stiffness: float  # N/m; 0: no wall
+    damping: float  # N s/m
+
+
+class TipState(NamedTuple):
+    """Working memory: the tip of the arm."""
+
+    position: Annotated[Array, '3']  # m
+    jacobian: Annotated[Array, '3', 'n']  # m/rad
+    force: Annotated[Array, '3']  # N
+
+
+class Contact(NamedTuple):
+    """What pushes the tip."""
+
+    push: np.ndarray  # (3,) N
+    wall: Wall
+    tip: TipState
+
+
+@inner
+def wall_force(wall: Wall, position: np.ndarray, velocity: np.ndarray) -> float:
+    """Force [N] along the normal on a tip at a position [m], (3,) with a velocity [m/s]: never < 0.
+
+    Kelvin and Voigt: k depth + d d(depth)/dt, inside the wall only.
+    """
+    depth = 0.0
+    speed = 0.0
+    for i in range(3):
+        depth += wall.normal[i] * (wall.point[i] - position[i])
+        speed -= wall.normal[i] * velocity[i]
+    if depth <= 0.0:
+        return 0.0
+    return max(0.0, wall.stiffness * depth + wall.damping * speed)
+
+
+@inner
+def subtract_contact_torque(
+    arm: PointMassArm, contact: Contact, q: np.ndarray, dq: np.ndarray, torque: np.ndarray
+) -> None:
+    """Subtract J^T f (n,) [N m] of the force at the tip from a torque, in place."""
+    push, wall, state = contact
+    is_pushed = push[0] != 0.0 or push[1] != 0.0 or push[2] != 0.0
+    if not is_pushed and wall.stiffness == 0.0:
+        return
+    tip(arm, q, state.position, state.jacobian)
+    force = state.force
+    if wall.stiffness > 0.0:
+        for i in range(3):  # the velocity of the tip, for now
+            force[i] = 0.0
+            for j in range(dq.size):
+                force[i] += state.jacobian[i, j] * dq[j]
+        size = wall_force(wall, state.position, force)
+        for i in range(3):
+            force[i] = push[i] + size * wall.normal[i]
+    else:
+        force[:] = push
+    for j in range(torque.size):
+        for i in range(3):
+            torque[j] -= state.jacobian[i, j] * force[i]

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What acts on the arm in a sample: the standing load, and the events that are on.
+
+It is held over the sample, and independent of the kind of arm.
+"""
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array, Cell
+from sim_plant.dynamics import JointDisturbance
+
+
+class Load(NamedTuple):
+    """What acts all the time."""
+
+    payload: float  # kg, point mass at the tip
+    torque: Annotated[Array, 'n']  # N m, pushes the joints
+    force: Annotated[Array, '3']  # N, pushes the tip, in the frame of the base
+    offset: Annotated[Array, 'n']  # rad, measured position less the true one
+
+
+class Events(NamedTuple):
+    """What each event adds to the load and to the friction; times are counted in samples."""
+
+    begin: Annotated[Array, 'events']
+    end: Annotated[Array, 'events']  # infinite: it stays
+    ramp: Annotated[Array, 'events']
+    payload: Annotated[Array, 'events']
+    torque: Annotated[Array, 'events', 'n']
+    force: Annotated[Array, 'events', '3']
+    viscous: Annotated[Array, 'events', 'n']
+    coulomb: Annotated[Array, 'events', 'n']
+    offset: Annotated[Array, 'events', 'n']
+
+
+class Acting(NamedTuple):
+    """The sum of all in one sample."""
+
+    sample: Cell  # of this sum; -1: none yet
+    payload: Cell  # kg
+    force: Annotated[Array, '3']  # N
+    offset: Annotated[Array, 'n']  # rad
+    constant: Annotated[Array, 'n']  # N m, of the disturbance, less what pushes the joints
+    viscous: Annotated[Array, 'n']  # N m s/rad, not below zero
+    coulomb: Annotated[Array, 'n']  # N m, not below zero
+
+
+@inner
+def come(sample: float, at: float, ramp: float) -> float:
+    """Fraction, from 0 to 1, of what comes at one sample and takes `ramp` more for it."""
+    if sample < at:
+        return 0.0
+    if sample >= at + ramp:
+        return 1.0
+    return (sample - at) / ramp
+
+
+@inner
+def add(total: np.ndarray, fraction: float, one: np.ndarray) -> None:
+    """Add a fraction of a vector to another."""
+    for i in range(total.size):
+        total[i] += fraction * one[i]
+
+
+@inner
+def update_acting(
+    disturbance: JointDisturbance, load: Load, events: Events, sample: float, acting: Acting
+) -> None:
+    """Sum up what acts in a sample, unless that is known already."""
+    if acting.sample[0] == sample:
+        return
+    acting.sample[0] = sample
+    acting.payload[0] = load.payload
+    acting.force[:] = load.force
+    acting.offset[:] = load.offset
+    acting.constant[:] = disturbance.constant
+    acting.viscous[:] = disturbance.viscous
+    acting.coulomb[:] = disturbance.coulomb
+    add(acting.constant, -1.0, load.torque)
+    for e in range(events.begin.size):
+        fraction = come(sample, events.begin[e], events.ramp[e])
+        fraction -= come(sample, events.end[e], events.ramp[e])
+        if fraction != 0.0:
+            acting.payload[0] += fraction * events.payload[e]
+            add(acting.force, fraction, events.force[e])
+            add(acting.offset, fraction, events.offset[e])
+            add(acting.constant, -fraction, events.torque[e])
+            add(acting.viscous, fraction, events.viscous[e])
+            add(acting.coulomb, fraction, events.coulomb[e])
+    for i in range(acting.viscous.size):
+        acting.viscous[i] = max(acting.viscous[i], 0.0)
+        acting.coulomb[i] = max(acting.coulomb[i], 0.0)

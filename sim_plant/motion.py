@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The equation of motion of an arm under a torque, a disturbance, and what pushes its tip."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.views import part
+from sim_plant.contact import Contact, subtract_contact_torque
+from sim_plant.dynamics import JointDisturbance, PointMassArm, acceleration, disturbance_torque
+
+
+class Motion(NamedTuple):
+    """What determines the acceleration beside the torque of the motors."""
+
+    arm: PointMassArm
+    disturbance: JointDisturbance
+    contact: Contact
+
+
+@inner
+def disturbing_torque(
+    motion: Motion, t: float, q: np.ndarray, dq: np.ndarray, out: np.ndarray
+) -> None:
+    """Write tau_dist (n,) [N m] at time t [s], contact included."""
+    disturbance_torque(motion.disturbance, t, dq, out)
+    subtract_contact_torque(motion.arm, motion.contact, q, dq, out)
+
+
+@inner
+def state_derivative(
+    motion: Motion, t: float, x: np.ndarray, torque: np.ndarray, dx: np.ndarray
+) -> None:
+    """Write dx/dt = [dq, ddq] (2n,) of x = [q, dq] (2n,)."""
+    n = torque.size
+    q, dq = part(x, 0, (n,)), part(x, n, (n,))
+    velocity, net_torque = part(dx, 0, (n,)), part(dx, n, (n,))
+    disturbing_torque(motion, t, q, dq, net_torque)
+    for i in range(n):
+        velocity[i] = dq[i]
+        net_torque[i] = torque[i] - net_torque[i]
+    acceleration(motion.arm, q, dq, net_torque, net_torque)  # in place

@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Payloads, pushes, friction, encoder offsets and a wall: what they do to the simulated arm."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from plants import ARM, NOWHERE, commands, motion
+from plants import run as measurements
+
+from blf_dsc_controller.arms.two_link_geometry import points
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.errors import ConfigurationError
+from sim_plant.contact import wall_force
+from sim_plant.dynamics import tip
+from sim_plant.motion import disturbing_torque
+from sim_plant.plant import plant_of, settings_of
+
+SAMPLES = 40
+AT = 13  # sample at which the arm changes
+ALL_KINDS = {
+    'events.begin': [0.005, 0.015],
+    'events.duration': [0.02, 0.0],
+    'events.ramp': [0.004, 0.003],
+    'events.payload': [0.3, 0.2],
+    'events.force': [3.0, 0.0, -2.0, 0.0, 1.0, 4.0],
+    'events.torque': [1.0, -2.0, 0.5, 0.0],
+    'events.viscous': [0.1, 0.2, 0.0, 0.3],
+    'events.coulomb': [0.0, 0.2, 0.1, 0.0],
+    'events.offset': [1e-4, 0.0, -2e-4, 1e-4],
+    'wall.point': [-1.0, 0.0, 0.1],
+    'wall.stiffness': 300.0,
+    'wall.damping': 3.0,
+}
+
+
+def truths(config, samples=SAMPLES):
+    """Truths (samples, 9) under the usual torques."""
+    arm = plant_of(config)
+    rows = np.empty((samples, 9))
+    for row, torque in zip(rows, commands(samples), strict=True):
+        row[:] = arm.truth()
+        arm.step(torque)
+    return rows
+
+
+@pytest.mark.parametrize(
+    ('events', 'lasting'),
+    [
+        ({'payload': [0.25]}, {'arm.m2': 0.75}),
+        ({'payload': [0.25]}, {'load.payload': 0.25}),
+        ({'torque': [2.0, -1.0]}, {'disturbance.constant': [-1.9, 1.1]}),
+        ({'torque': [2.0, -1.0]}, {'load.torque': [2.0, -1.0]}),
+        ({'force': [1.0, 0.0, -2.0]}, {'load.force': [1.0, 0.0, -2.0]}),
+        ({'viscous': [0.1, 0.2]}, {'disturbance.viscous': [0.1, 0.2]}),
+        ({'coulomb': [0.1, 0.2]}, {'disturbance.coulomb': [0.1, 0.2]}),
+        ({'offset': [1e-3, -1e-3]}, {'sensor.offset': [1e-3, -1e-3]}),
+    ],
+)
+def test_an_event_is_a_change_of_the_plant_at_its_time(events, lasting):
+    given = {f'events.{name}': value for name, value in events.items()}
+    config = build(PlantConfig, {'events.begin': [AT * 1e-3], **given})
+    scheduled, changed = plant_of(config), plant_of(PlantConfig())
+    torques = commands(SAMPLES)
+    before = measurements(scheduled, torques[:AT]), measurements(changed, torques[:AT])
+    changed.change(settings_of(change(PlantConfig(), lasting)))
+    after = measurements(scheduled, torques[AT:]), measurements(changed, torques[AT:])
+
+    np.testing.assert_array_equal(*before)
+    np.testing.assert_array_equal(*after)
+    np.testing.assert_array_equal(scheduled.truth(), changed.truth())
+    unchanged = plant_of(PlantConfig())
+    assert np.any(measurements(unchanged, torques)[AT:] != after[0])
+
+
+def test_a_payload_comes_and_goes_within_its_ramp_and_the_truth_follows():
+    events = {'begin': [0.01], 'duration': [0.02], 'ramp': [0.004], 'payload': [0.5]}
+    config = build(PlantConfig, {f'events.{name}': value for name, value in events.items()})
+    m2_l2_squared = truths(config)[:, 1]
+    k = np.arange(SAMPLES)
+    present = np.clip((k - 10) / 4, 0.0, 1.0) - np.clip((k - 30) / 4, 0.0, 1.0)
+    np.testing.assert_allclose(m2_l2_squared, (0.5 + 0.5 * present) * 0.8**2, rtol=1e-14)
+
+
+def test_events_add_up_in_any_order():
+    config = build(PlantConfig, ALL_KINDS)
+    count = len(config.events.begin)
+    turned = {
+        name: np.reshape(value, (count, -1))[::-1].ravel().tolist()
+        for name, value in ALL_KINDS.items()
+        if name.startswith('events.')
+    }
+    np.testing.assert_allclose(truths(change(config, turned)), truths(config), rtol=1e-12)
+
+
+def test_friction_does_not_fall_below_zero():
+    less = {'events.begin': [0.0], 'events.viscous': [-1.0, -0.1]}
+    config = build(PlantConfig, {'disturbance.viscous': [0.3, 0.3], **less})
+    same = build(PlantConfig, {'disturbance.viscous': [0.0, 0.3 - 0.1]})
+    np.testing.assert_array_equal(truths(config), truths(same))
+
+
+def test_an_offset_is_measured_and_moves_nothing():
+    config = build(PlantConfig, {'sensor.offset': [0.01, -0.02]})
+    arm, true = plant_of(config), plant_of(PlantConfig())
+    torques = commands(SAMPLES)
+    read, expected = measurements(arm, torques), measurements(true, torques)
+    np.testing.assert_allclose(read[:, :2] - expected[:, :2], [[0.01, -0.02]] * SAMPLES, rtol=1e-12)
+    np.testing.assert_array_equal(arm.truth(), true.truth())
+
+
+@pytest.mark.parametrize('q', np.random.default_rng(0).uniform(-3.0, 3.0, (5, 2)))
+def test_a_force_at_the_tip_does_the_work_of_its_joint_torques(q):
+    """J^T f, the gradient of the work f . x of a constant force."""
+    force, step = np.array([1.0, -2.0, 3.0]), 1e-6
+
+    def work(angles):
+        return force @ points(ARM.l1, ARM.l2, angles)[2]
+
+    slope = [(work(q + d) - work(q - d)) / (2 * step) for d in step * np.eye(2)]
+    load = np.empty(2)
+    disturbing_torque(motion(force=force), 0.0, q, np.zeros(2), load)
+    np.testing.assert_allclose(-load, slope, atol=1e-8)
+
+    position, jacobian = np.empty(3), np.empty((3, 2))
+    tip(ARM, q, position, jacobian)
+    np.testing.assert_allclose(position, points(ARM.l1, ARM.l2, q)[2], rtol=1e-14)
+    np.testing.assert_allclose(force @ jacobian, -load, rtol=1e-12)
+
+
+def test_a_wall_pushes_inside_and_never_pulls():
+    wall = NOWHERE._replace(normal=np.array([0.0, 0.0, 1.0]), stiffness=100.0, damping=5.0)
+    rest, leaving = np.zeros(3), np.array([0.0, 0.0, 3.0])
+    inside, outside = np.array([7.0, 0.0, -0.1]), np.array([7.0, 0.0, 0.1])
+    assert wall_force(wall, inside, rest) == pytest.approx(10.0)
+    assert wall_force(wall, inside, -leaving) == pytest.approx(25.0)
+    assert wall_force(wall, inside, leaving) == 0.0
+    assert wall_force(wall, outside, -leaving) == 0.0
+
+
+def test_an_arm_that_falls_on_a_floor_comes_to_rest_in_it():
+    """Without motors the weight of both links then rests on the floor, and friction has no say."""
+    floor = {'wall.point': [0.0, 0.0, -0.5], 'wall.normal': [0.0, 0.0, 2.0]}
+    config = build(
+        PlantConfig,
+        {
+            **floor,
+            'wall.stiffness': 1000.0,
+            'wall.damping': 50.0,
+            'disturbance.amplitude': [0.0, 0.0],
+            'disturbance.constant': [0.0, 0.0],
+            'disturbance.viscous': [2.0, 2.0],
+            'initial.position': [-0.4, 0.8],
+        },
+    )
+    arm = plant_of(config)
+    for _ in range(20_000):
+        arm.step(np.zeros(2))
+    _, _, _, load1, load2, q1, q2, dq1, dq2 = arm.truth()
+    assert max(abs(dq1), abs(dq2)) < 1e-6
+    elbow, end = points(1.0, 0.8, (q1, q2))[1:]
+    force = 1000.0 * (-0.5 - end[2])
+    assert force > 1.0
+    assert -load2 == pytest.approx(force * (end[0] - elbow[0]), rel=1e-9)
+    assert -load1 == pytest.approx(force * end[0], rel=1e-9)
+    assert force * end[0] == pytest.approx(9.8 * 0.5 * (elbow[0] + end[0]), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('given', 'problem'),
+    [
+        ({'events.payload': [0.1]}, 'events.payload: got 1 entry, but 0 are needed'),
+        (
+            {'events.begin': [1.0], 'events.force': [1.0, 2.0]},
+            r'events.force: got 2 entries, but 3 are needed \(1 of events.begin times 3\)',
+        ),
+        ({'load.force': [1.0]}, r'load.force: got 1 entry, but 3 are needed \(3\)'),
+        ({'load.payload': -0.1}, 'load.payload: got -0.1, but it must be at least 0 kg'),
+        ({'wall.normal': [0.0, 0.0, 0.0]}, 'wall.normal: got .* a direction is needed'),
+    ],
+)
+def test_events_that_cannot_be_are_rejected(given, problem):
+    with pytest.raises(ConfigurationError, match=problem):
+        build(PlantConfig, given)
