@@ -26,11 +26,10 @@ from blf_dsc_controller.arms.inertia import INERTIA_NAMES, INERTIA_UNITS
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array, pack, view_of
+from blf_dsc_controller.compiled.vectors import Vector, cross, dot, plus
 
 ROTOR = len(INERTIA_NAMES)
 """Entry of a column after the ten."""
-
-Vector = tuple[float, float, float]
 
 # Rows of `Bodies.motions`; after them, S and S' of each joint.
 VELOCITY, REFERENCE, ACCELERATION, GRAVITY, AXES = range(5)
@@ -203,18 +202,6 @@ def fill_regressors(
 
 
 @inner
-def cross(a: Vector, b: Vector) -> Vector:
-    """Cross product."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@inner
-def dot(a: Vector, b: Vector) -> float:
-    """Scalar product."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@inner
 def angular(motion: np.ndarray) -> Vector:
     """Angular part of a motion (6,)."""
     return motion[0], motion[1], motion[2]
@@ -251,8 +238,7 @@ def advance(bodies: Bodies, i: int, q: float, dq: float, v: float, a: float) -> 
     for row in range(own):
         motion = motions[row]
         w, u = angular(motion), linear(motion)
-        arm = cross(w, origin)
-        u = (u[0] + arm[0], u[1] + arm[1], u[2] + arm[2])
+        u = plus(u, cross(w, origin))
         motion[0], motion[3] = dot(column0, w), dot(column0, u)
         motion[1], motion[4] = dot(column1, w), dot(column1, u)
         motion[2], motion[5] = dot(column2, w), dot(column2, u)
@@ -288,8 +274,7 @@ def add_torque(bodies: Bodies, i: int, a: float, H: np.ndarray) -> None:
     w, u = angular(motions[VELOCITY]), linear(motions[VELOCITY])
     reference = angular(motions[REFERENCE])
     alpha, A = angular(motions[ACCELERATION]), linear(motions[ACCELERATION])
-    drift = cross(reference, u)
-    A = (A[0] + drift[0], A[1] + drift[1], A[2] + drift[2])
+    A = plus(A, cross(reference, u))
     for j in range(i + 1):
         torque_products(motions[AXES + 2 * j], alpha, A, w, reference, products)
         products[ROTOR] = a if j == i else 0.0

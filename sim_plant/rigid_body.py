@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Any serial chain of rigid bodies: where it is, and how it accelerates.
+
+By Newton and Euler in the base's frame, independently of the controller's regressor, so that each
+checks the other.  The bias C dq + G is the torque of the motion without acceleration; a column of M
+is the torque of a unit acceleration of one joint, which moves all bodies beyond it as one:
+
+    (M(q) + rotors) ddq + C(q, dq) dq + G(q) = torque + J(q)^T force
+
+(Featherstone, Rigid Body Dynamics Algorithms, 2008, chapters 5 and 6.)
+"""
+
+from __future__ import annotations
+
+from math import cos, sin
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.arms.inertia import pseudo_inertia, rotational_inertia
+from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.compiled.vectors import (
+    Vector,
+    cross,
+    dot,
+    plus,
+    product,
+    put,
+    times,
+    vector,
+)
+from blf_dsc_controller.law import cholesky
+
+
+class RigidBodies(NamedTuple):
+    """Geometry and inertias of a chain of n bodies, each in the frame of its joint."""
+
+    n: int
+    gravity: Annotated[Array, 3]  # m/s^2, in the base
+    rotation: Annotated[Array, 'n', 3, 3]  # of a joint's frame at q = 0, to the body before
+    offset: Annotated[Array, 'n', 3]  # of its origin in the body before, m
+    axis: Annotated[Array, 'n', 3]
+    prismatic: Annotated[Array, 'n']  # 1: the joint slides, 0: it turns
+    mass: Annotated[Array, 'n']  # kg
+    moment: Annotated[Array, 'n', 3]  # kg m, mass times centre of mass
+    inertia: Annotated[Array, 'n', 3, 3]  # kg m^2, about the frame's origin
+    rotor: Annotated[Array, 'n']  # kg m^2, or kg, reflected to the joint
+    tip: Annotated[Array, 3]  # m, in the last body
+
+
+class Motion(NamedTuple):
+    """Where the bodies are in the base's frame, and how they move; entry 0 of each is the base."""
+
+    rotation: Annotated[Array, 'n + 1', 3, 3]
+    origin: Annotated[Array, 'n + 1', 3]  # m
+    axis: Annotated[Array, 'n + 1', 3]
+    turning: Annotated[Array, 'n + 1', 3]  # rad/s
+    velocity: Annotated[Array, 'n + 1', 3]  # of the origin, m/s
+    turning_rate: Annotated[Array, 'n + 1', 3]  # rad/s^2, without ddq
+    bias: Annotated[Array, 'n + 1', 3]  # acceleration of the origin without ddq and gravity, m/s^2
+    tip: Annotated[Array, 3]  # m
+    tip_velocity: Annotated[Array, 3]  # m/s
+    # Of all bodies from one on, about its origin: working memory.
+    mass: Annotated[Array, 'n + 1']
+    moment: Annotated[Array, 'n + 1', 3]
+    inertia: Annotated[Array, 'n + 1', 3, 3]
+    force: Annotated[Array, 'n + 1', 3]
+    torque: Annotated[Array, 'n + 1', 3]
+    M: Annotated[Array, 'n', 'n']
+    factor: Annotated[Array, 'n', 'n']
+
+
+def rigid_bodies(
+    chain: Chain, gravity: tuple[float, float, float], inertias: np.ndarray, rotors: np.ndarray
+) -> RigidBodies:
+    """Bodies with the geometry of a chain and these inertias (n, 10) and rotors (n,)."""
+    tensors = [pseudo_inertia(inertia) for inertia in inertias]
+    return RigidBodies(
+        n=len(chain.joints),
+        gravity=np.array(gravity),
+        rotation=np.array([joint.placement[:3, :3] for joint in chain.joints]),
+        offset=np.array([joint.placement[:3, 3] for joint in chain.joints]),
+        axis=np.array([joint.axis for joint in chain.joints]),
+        prismatic=np.array([float(joint.kind == 'prismatic') for joint in chain.joints]),
+        mass=inertias[:, 0].copy(),
+        moment=inertias[:, 1:4].copy(),
+        inertia=np.array([rotational_inertia(J) for J in tensors]),
+        rotor=np.array(rotors),
+        tip=chain.tip_placement[:3, 3].copy(),
+    )
+
+
+@inner
+def locate(arm: RigidBodies, q: np.ndarray, dq: np.ndarray, now: Motion) -> None:
+    """Write where the bodies and the tip are at q (n,), and how they move at dq (n,)."""
+    for r in range(3):
+        for c in range(3):
+            now.rotation[0, r, c] = 1.0 if r == c else 0.0
+        now.origin[0, r] = now.turning[0, r] = now.velocity[0, r] = 0.0
+        now.turning_rate[0, r] = now.bias[0, r] = 0.0
+    for i in range(arm.n):
+        before, R = now.rotation[i], now.rotation[i + 1]
+        for c in range(3):
+            column = product(before, vector(arm.rotation[i, :, c]))
+            for r in range(3):
+                R[r, c] = column[r]
+        axis = product(R, vector(arm.axis[i]))
+        lever = product(before, vector(arm.offset[i]))
+        slides, turns = arm.prismatic[i], 1.0 - arm.prismatic[i]
+        turn(R, axis, turns * q[i])
+        lever = plus(lever, times(slides * q[i], axis))
+        own = times(dq[i], axis)
+        w, dw = vector(now.turning[i]), vector(now.turning_rate[i])
+        swept, speed = cross(w, own), cross(w, lever)
+        put(axis, now.axis[i + 1])
+        put(plus(vector(now.origin[i]), lever), now.origin[i + 1])
+        put(plus(w, times(turns, own)), now.turning[i + 1])
+        put(plus(dw, times(turns, swept)), now.turning_rate[i + 1])
+        velocity = plus(vector(now.velocity[i]), plus(speed, times(slides, own)))
+        put(velocity, now.velocity[i + 1])
+        bias = plus(vector(now.bias[i]), plus(cross(dw, lever), cross(w, speed)))
+        put(plus(bias, times(2.0 * slides, swept)), now.bias[i + 1])
+    lever = product(now.rotation[arm.n], vector(arm.tip))
+    put(plus(vector(now.origin[arm.n]), lever), now.tip)
+    speed = cross(vector(now.turning[arm.n]), lever)
+    put(plus(vector(now.velocity[arm.n]), speed), now.tip_velocity)
+
+
+@inner
+def turn(R: np.ndarray, axis: Vector, angle: float) -> None:
+    """Turn the columns of R (3, 3) about a unit vector by an angle [rad]."""
+    c, s = cos(angle), sin(angle)
+    for k in range(3):
+        column = vector(R[:, k])
+        turned = plus(times(c, column), times(s, cross(axis, column)))
+        turned = plus(turned, times((1.0 - c) * dot(axis, column), axis))
+        for r in range(3):
+            R[r, k] = turned[r]
+
+
+@inner
+def acceleration(
+    arm: RigidBodies, now: Motion, torque: np.ndarray, force: np.ndarray, ddq: np.ndarray
+) -> None:
+    """Write ddq (n,) where `locate` left the arm; it may be the torque's own vector.
+
+    `torque` (n,) [N m, or N] is that of the joints, `force` (3,) [N] acts on the tip, in the base.
+    """
+    add_up(arm, now, force)
+    for j in range(arm.n):
+        ddq[j] = torque[j] - along_joint(
+            arm, now, j, vector(now.force[j + 1]), vector(now.torque[j + 1])
+        )
+    fill_inertia(arm, now)
+    cholesky.factor(now.M, 0.0, now.factor)
+    cholesky.solve(now.factor, ddq)
+
+
+@inner
+def add_up(arm: RigidBodies, now: Motion, force: np.ndarray) -> None:
+    """From the tip to the base, add up inertias, and forces and moments of the bias."""
+    n = arm.n
+    lever = product(now.rotation[n], vector(arm.tip))
+    F = times(-1.0, vector(force))
+    N = cross(lever, F)
+    for i in range(n, 0, -1):
+        R = now.rotation[i]
+        m = arm.mass[i - 1]
+        h = product(R, vector(arm.moment[i - 1]))
+        I = now.inertia[i]
+        rotate(R, arm.inertia[i - 1], I)
+        w, dw = vector(now.turning[i]), vector(now.turning_rate[i])
+        a = plus(vector(now.bias[i]), times(-1.0, vector(arm.gravity)))
+        F = plus(F, plus(times(m, a), plus(cross(dw, h), cross(w, cross(w, h)))))
+        N = plus(N, plus(cross(h, a), plus(product(I, dw), cross(w, product(I, w)))))
+        put(F, now.force[i])
+        put(N, now.torque[i])
+        if i < n:
+            lever = plus(vector(now.origin[i + 1]), times(-1.0, vector(now.origin[i])))
+            beyond, M = vector(now.moment[i + 1]), now.mass[i + 1]
+            add_inertia(now.inertia[i + 1], beyond, M, lever, I)
+            h = plus(h, plus(beyond, times(M, lever)))
+            m += M
+        now.mass[i] = m
+        put(h, now.moment[i])
+        lever = plus(vector(now.origin[i]), times(-1.0, vector(now.origin[i - 1])))
+        N = plus(N, cross(lever, F))
+
+
+@inner
+def rotate(R: np.ndarray, A: np.ndarray, out: np.ndarray) -> None:
+    """Write R A R^T (3, 3)."""
+    for r in range(3):
+        row = vector(R[r])
+        half = (dot(row, vector(A[0])), dot(row, vector(A[1])), dot(row, vector(A[2])))
+        for c in range(3):
+            out[r, c] = dot(half, vector(R[c]))
+
+
+@inner
+def add_inertia(I: np.ndarray, h: Vector, m: float, lever: Vector, out: np.ndarray) -> None:
+    """Add the inertia I (3, 3) of a mass m with the moment h, all about a point at `lever`."""
+    sphere = 2.0 * dot(h, lever) + m * dot(lever, lever)
+    for r in range(3):
+        for c in range(3):
+            products = h[r] * lever[c] + lever[r] * h[c] + m * lever[r] * lever[c]
+            out[r, c] += I[r, c] - products + (sphere if r == c else 0.0)
+
+
+@inner
+def fill_inertia(arm: RigidBodies, now: Motion) -> None:
+    """Fill M (n, n) with the inertia of the joints and their rotors."""
+    for j in range(arm.n):
+        axis, h = vector(now.axis[j + 1]), vector(now.moment[j + 1])
+        if arm.prismatic[j] == 1.0:
+            F, N = times(now.mass[j + 1], axis), cross(h, axis)
+        else:
+            F, N = cross(axis, h), product(now.inertia[j + 1], axis)
+        for i in range(j, -1, -1):
+            now.M[i, j] = now.M[j, i] = along_joint(arm, now, i, F, N)
+            lever = plus(vector(now.origin[i + 1]), times(-1.0, vector(now.origin[i])))
+            N = plus(N, cross(lever, F))
+        now.M[j, j] += arm.rotor[j]
+
+
+@inner
+def along_joint(arm: RigidBodies, now: Motion, i: int, F: Vector, N: Vector) -> float:
+    """Torque of joint i [N m], or its force [N], of a force F and a moment N about its origin."""
+    axis = vector(now.axis[i + 1])
+    return dot(axis, F) if arm.prismatic[i] == 1.0 else dot(axis, N)
