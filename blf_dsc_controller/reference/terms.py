@@ -72,7 +72,9 @@ def spline_term(knots: np.ndarray, coefficients: np.ndarray) -> Term:
 def pack(n: int, terms: Sequence[Term]) -> np.ndarray:
     """Vector of a reference for n joints; `unpack` is the inverse."""
     packed = [
-        np.array((term.code, _HEAD + term.content.size, term.begin, term.fade, *term.content))
+        np.concatenate(
+            ((term.code, _HEAD + term.content.size, term.begin, term.fade), term.content)
+        )
         for term in terms
     ]
     return np.concatenate([np.array((n, len(terms)), dtype=np.float64), *packed])
