@@ -10,11 +10,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+LARGEST = 1e4
+"""Torque [N m] of a command, at most; a step with 1e6 N m takes the arm out of all numbers."""
+
 
 class TorqueInput:
     """The last valid `torque` (n,) [N m] of the n joints, and what was rejected.
 
-    `wrong_length` and `not_finite` count the rejected commands by cause, `problem` describes the
+    `wrong_length` and `impossible` count the rejected commands by cause, `problem` describes the
     last one; `stale_steps` counts the steps for which the torque was too old.
     """
 
@@ -23,14 +26,14 @@ class TorqueInput:
         self.torque = np.zeros(len(joints))
         self.problem = ''
         self.wrong_length = 0
-        self.not_finite = 0
+        self.impossible = 0
         self.stale_steps = 0
         self._taken_at = 0
 
     @property
     def rejected(self) -> int:
         """Number of rejected commands."""
-        return self.wrong_length + self.not_finite
+        return self.wrong_length + self.impossible
 
     def take(self, size: int, torque: NDArray[np.float64], sample: int) -> bool:
         """Take a command of `size` values, `torque` (n,), at a sample of the plant.
@@ -41,11 +44,14 @@ class TorqueInput:
             self.wrong_length += 1
             self.problem = f'command rejected: {size} values, {self.torque.size} expected'
             return False
-        finite = np.isfinite(torque)
-        if not finite.all():
-            self.not_finite += 1
-            names = ', '.join(np.array(self._joints)[~finite])
-            self.problem = f'command rejected: not finite: {torque} (for {names})'
+        possible = np.abs(torque) <= LARGEST
+        if not possible.all():
+            self.impossible += 1
+            names = ', '.join(np.array(self._joints)[~possible])
+            self.problem = (
+                f'command rejected: {torque} N m (for {names}): '
+                f'not finite, or more than {LARGEST:g} N m, which no joint has'
+            )
             return False
         self.torque[:] = torque
         self._taken_at = sample

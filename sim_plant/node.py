@@ -276,7 +276,7 @@ class PlantNode(LoopNode[PlantConfig]):
         """Publish diagnostics; the level depends on what happened since the last report."""
         values = {
             'commands of a wrong length': self.input.wrong_length,
-            'commands that were not finite': self.input.not_finite,
+            'commands that were not finite or too large': self.input.impossible,
             'steps with a torque that was too old': self.input.stale_steps,
             'late steps': self.latency.late_steps,
         }

@@ -33,7 +33,11 @@ def started(ros, **values):
     return node, heard, send
 
 
-@pytest.mark.parametrize('wrong', [(1.0,), (1.0, 2.0, 3.0), (1.0, np.nan), (np.inf, 0.0)], ids=str)
+@pytest.mark.parametrize(
+    'wrong',
+    [(1.0,), (1.0, 2.0, 3.0), (1.0, np.nan), (np.inf, 0.0), (1e300, 1.0), (0.0, -2e4)],
+    ids=str,
+)
 def test_a_command_that_will_not_do_moves_nothing_and_is_counted(ros, wrong):
     node, heard, send = started(ros)
     send(TORQUE)

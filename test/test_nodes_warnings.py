@@ -60,3 +60,15 @@ def test_config_warnings_are_logged_before_the_first_state(ros):
     log = listen(ros, Log, '/rosout', KEPT)
     ros.add(ControllerNode, {'learning.window': 5.0}, namespace='warned')
     ros.until(lambda: any('learning.window: 5 s' in one.msg for one in log))
+
+
+def test_stamps_that_switch_the_watchdog_off_are_warned_of_once(ros):
+    log = listen(ros, Log, '/rosout', KEPT)
+    ros.add(ControllerNode, namespace='unwatched')
+    arm = ros.add(PlantNode, {'mode': 'lockstep', 'duration': 0.1}, namespace='unwatched')
+
+    def warned():
+        return [one.msg for one in log if 'a silence is not noticed' in one.msg]
+
+    ros.until(lambda: arm.finished and warned())
+    assert len(warned()) == 1

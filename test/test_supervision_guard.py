@@ -150,6 +150,40 @@ def test_activated_again_at_once_the_torque_goes_on_where_it_was():
     assert rig.guard.ratio.max() < 0.5
 
 
+@pytest.mark.parametrize('again', ['activate', 'reset'])
+def test_the_rate_limit_binds_from_the_torque_before_an_activation(again):
+    """The safe torque is zero, gravity takes 12 N m: it comes at the rate that is allowed."""
+    rate = np.array([1000.0, 300.0])
+    rig = Rig({'torque.rate_limit': rate.tolist(), 'safety.deactivation_ramp': 0.0})
+    rig.step(200)
+    rig.guard.deactivate()
+    rig.step(1)
+    assert not rig.commands[-1].any()
+    rig.guard.activate() if again == 'activate' else rig.guard.reset()
+    rig.step(20)
+    steps = np.abs(np.diff(rig.commands[-21:], axis=0))
+    assert (steps <= rate * 1e-3 * (1.0 + 1e-12)).all()
+    np.testing.assert_allclose(steps[0], rate * 1e-3)
+    assert rig.guard.controller.state.rate_cuts.min() >= 1.0
+    # The law learns from what was commanded.
+    np.testing.assert_array_equal(rig.guard.controller.state.torque, rig.commands[-1])
+
+
+@pytest.mark.parametrize(
+    ('watchdog', 'late', 'told'),
+    [('auto', 61.0, True), ('auto', 59.0, False), ('auto', -61.0, True), ('on', 61.0, False)],
+)
+def test_stamps_that_switch_the_watchdog_off_are_told(watchdog, late, told):
+    rig = Rig({'safety.watchdog': watchdog}, live=True)
+    rig.base -= int(late * 1e9)
+    rig.step(2)
+    assert rig.supervisor.phase is Phase.TRACKING
+    said = rig.guard.unwatched
+    assert (f'{late:.4g} s behind' in said if late > 0 else 'ahead of' in said) == told
+    rig.wait(100)
+    assert (rig.supervisor.reason is Reason.STATE_TIMEOUT) == (not told)
+
+
 @pytest.mark.parametrize('keep', [True, False])
 def test_estimates_are_kept_or_forgotten_as_configured(keep):
     rig = Rig({'safety.keep_estimates': keep})

@@ -53,6 +53,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._published_bound = np.zeros(len(joints))
         self._decoder = JointStateDecoder(joints, assembly.required_fields(self.config))
         self._pending: bytes | None = None
+        self._warned_at = -1  # stamp of the start that was warned of
         self._observed = self._started = False
         self._status = ControllerStatus(self, joints)
         parameters.on_change(self, ControllerConfig, self._retune, self._problems)
@@ -253,6 +254,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
         supervisor = guard.supervisor
         if supervisor.phase is Phase.SAFE_STOP:
             self.get_logger().fatal(f'{self.config.safety.torque} torque: {supervisor.text}')
+        if guard.unwatched and guard.start_stamp != self._warned_at:
+            self._warned_at = guard.start_stamp
+            self.get_logger().warning(guard.unwatched)
         self._started = self._started or supervisor.running
         if guard.start_error is not None and self.config.autostart and not self._started:
             self.failure, self.finished = guard.start_error, True

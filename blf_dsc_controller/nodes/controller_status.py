@@ -102,7 +102,7 @@ class ControllerStatus:
             'states missed': supervisor.overruns.count,
             'samples with a torque at its limit': supervisor.saturated,
             'messages for other joints': guard.foreign,
-            'watchdog on the steady clock': 'on' if guard.watching else 'off',
+            'watchdog on the steady clock': _watchdog(guard),
             **self._cuts(guard),
             **(self.trajectories.values if self.trajectories else {}),
         }
@@ -143,3 +143,8 @@ class ControllerStatus:
             columns = ', '.join(one.column for one in self.rejected)
             return self._diagnostics.status('learning', WARN, f'not estimated: {columns}', values)
         return self._diagnostics.status('learning', OK, learning, values)
+
+
+def _watchdog(guard: Guard) -> str:
+    off = f'off: {guard.unwatched}' if guard.unwatched else 'off'
+    return 'on' if guard.watching else off

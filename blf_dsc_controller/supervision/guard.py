@@ -21,6 +21,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError, StartError
 from blf_dsc_controller.law.factory import begin, controller_of
+from blf_dsc_controller.law.saturation import RATE_CUT
 from blf_dsc_controller.messages.cdr import (
     DuplicatedJointError,
     MessageError,
@@ -84,6 +85,7 @@ class Guard:
         settled: end of the approach or of a mixed-in trajectory [s].
         compute_time: of the last sample [s].
         watching: whether a silence on the steady clock leads to a stop.
+        unwatched: why it does not although safety.watchdog is `auto`; empty if it does.
         watchdog_torques: commanded by the watchdog since the last message.
     """
 
@@ -109,6 +111,7 @@ class Guard:
         self.settled = 0.0
         self.compute_time = 0.0
         self.watching = False
+        self.unwatched = ''
         self.watchdog_torques = 0
         self._steady = steady
         self._wall = wall
@@ -365,8 +368,16 @@ class Guard:
         self.journal.note(EventType.START, resumed=resumed)
         self.last_stamp = stamp - self.config.sample_time_ns
         watchdog = self.config.safety.watchdog
-        is_live = abs(self._wall() - stamp) < _SAME_CLOCK
+        behind = self._wall() - stamp
+        is_live = abs(behind) < _SAME_CLOCK
         self.watching = watchdog == 'on' or (watchdog == 'auto' and is_live)
+        self.unwatched = ''
+        if watchdog == 'auto' and not is_live:
+            where = f'{abs(behind) * _NANO:.4g} s {"behind" if behind > 0 else "ahead of"}'
+            self.unwatched = (
+                f"the stamps of the joint states are {where} this computer's clock: a silence is "
+                'not noticed; for an arm set safety.watchdog to on, for a simulation to off'
+            )
         self.supervisor.enter(Phase.APPROACHING)
         return True
 
@@ -378,6 +389,8 @@ class Guard:
         before = perf_counter()
         torque = self.controller.update(t, dt, measurement)
         self.compute_time = perf_counter() - before
+        if self.controller.samples == 1 and self.commanding:
+            self._limit_first_torque(torque, dt)
         self.last_stamp = stamp
         if not self._is_valid_sample(dt):
             return self._safe(self.config.sample_time)
@@ -385,6 +398,18 @@ class Guard:
         self.has_sample = True
         self.journal.commands += 1
         return self._torque
+
+    def _limit_first_torque(self, torque: Vector, dt: float) -> None:
+        """Limit the rate from the last torque, which the law does not know in its first sample."""
+        controller = self.controller
+        rate, top = controller.settings.rate_limit, controller.settings.torque_limit
+        step = np.where(rate > 0.0, rate * dt, inf)
+        slowed = np.clip(torque, self._torque - step, self._torque + step)
+        limited = np.clip(slowed, -top, top)
+        cut = limited != torque
+        controller.state.rate_cuts[cut] += 1.0
+        controller.sample.cuts[cut] += RATE_CUT
+        torque[:] = controller.state.torque[:] = limited
 
     def _is_valid_sample(self, dt: float) -> bool:
         controller, safety = self.controller, self.config.safety
