@@ -10,7 +10,8 @@ from numba import njit
 from random_arm import CONFIG, PANDA, UR5E, configuration, pinocchio_model, random_urdf
 
 import blf_dsc_controller.arms.model  # noqa: F401 - lets kernels call the methods
-from blf_dsc_controller.arms.serial_chain import ROTOR, serial_chain
+from blf_dsc_controller.arms.chain_kernels import ROTOR
+from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import read_chain
 
 # The base stands on a floor, hangs on a wall, or leans.

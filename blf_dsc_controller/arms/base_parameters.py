@@ -14,7 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from blf_dsc_controller.arms.serial_chain import ROTOR, SerialChain, serial_chain
+from blf_dsc_controller.arms.chain_kernels import ROTOR
+from blf_dsc_controller.arms.serial_chain import SerialChain, serial_chain
 from blf_dsc_controller.arms.urdf import Chain
 
 _DEPENDENT = 1e-6  # of a column of order 1; roundings of pi / 2 in URDFs are some 1e-10

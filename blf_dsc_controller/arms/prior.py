@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far the inertias of a URDF are off, as a covariance: the scale of what is learned.
+"""How far the inertias of a URDF may be off: the scale and the directions of what is learned.
 
 Each body by itself, in terms of its pseudo-inertia: its mass with all that goes with it, where its
 centre of mass is, and how its mass is spread around that.  The last body carries a payload, too.
@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from blf_dsc_controller.arms.base_parameters import BaseParameters
-from blf_dsc_controller.arms.inertia import INERTIA_NAMES, inertia_of, pseudo_inertia
+from blf_dsc_controller.arms.chain_kernels import ROTOR
+from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.urdf import Chain
 
 LINKS = 0.3
@@ -22,29 +23,44 @@ CENTRE = 0.01
 PAYLOAD_SIZE = 0.05
 """Extent of a payload, and standard deviation of its centre of mass from the tip [m]."""
 
+FORMS = ('base', 'payload', 'scale')
+"""What is learned: all base parameters, the load on the last body, or one factor for each body."""
 
-def prior_covariance(
-    chain: Chain, parameters: BaseParameters, payload: float, rotors: np.ndarray
+
+def prior_factor(
+    chain: Chain, parameters: BaseParameters, form: str, payload: float, rotors: np.ndarray
 ) -> np.ndarray:
-    """Covariance (p, p) of the base parameters about those of the URDF.
+    """Factor L (p, r) of P = P0 + L theta, where theta (r,) has mean zero and covariance one.
 
-    `payload` is what the arm is rated for [kg], `rotors` (n,) are the standard deviations of the
-    rotor inertias [kg m^2, or kg], which no URDF tells.
+    P0 are the base parameters of the URDF, `payload` is what the arm is rated for [kg], and
+    `rotors` (n,) are the standard deviations of the rotor inertias [kg m^2, or kg], which no URDF
+    tells.  Of the form `base`, L is lower triangular and r = p; of `payload`, r = 10 + n; of
+    `scale`, r = 2 n, rotors last.
     """
     n = len(chain.joints)
-    rotor = len(INERTIA_NAMES)
-    covariance = np.zeros((n, rotor + 1, n, rotor + 1))
+    blocks: list[tuple[int, np.ndarray]] = []  # of a body, directions (11, k) of its entries
     for i, joint in enumerate(chain.joints):
-        A = _deviations(pseudo_inertia(joint.inertia), LINKS, CENTRE)
-        covariance[i, :rotor, i, :rotor] = A @ A.T
-        covariance[i, rotor, i, rotor] = rotors[i] ** 2
-    load = payload * np.diag((*(PAYLOAD_SIZE**2,) * 3, 1.0))
-    tip = chain.tip_placement
-    A = _deviations(tip @ load @ tip.T, 1.0, PAYLOAD_SIZE)
-    covariance[-1, :rotor, -1, :rotor] += A @ A.T
-    full = covariance.reshape(n * (rotor + 1), -1)
-    of_base: np.ndarray = parameters.K @ full @ parameters.K.T
-    return of_base
+        if form == 'base':
+            J = pseudo_inertia(joint.inertia)
+            blocks.append((i, _of_ten(_deviations(J, LINKS, CENTRE))))
+        elif form == 'scale':
+            blocks.append((i, _of_ten(LINKS * joint.inertia[:, None])))
+    if form != 'scale':
+        load = payload * np.diag((*(PAYLOAD_SIZE**2,) * 3, 1.0))
+        J = chain.tip_placement @ load @ chain.tip_placement.T
+        blocks.append((n - 1, _of_ten(_deviations(J, 1.0, PAYLOAD_SIZE))))
+    blocks += [(i, rotors[i] * np.eye(ROTOR + 1)[:, ROTOR:]) for i in range(n)]
+    K = parameters.K.reshape(-1, n, ROTOR + 1)
+    L = np.column_stack([K[:, i] @ block for i, block in blocks])
+    if form == 'base':  # Cholesky's factor of L L^T, without squaring the rounding
+        R = np.linalg.qr(L.T, mode='r')
+        return np.transpose(R * np.copysign(1.0, np.diag(R))[:, None])
+    return L
+
+
+def _of_ten(directions: np.ndarray) -> np.ndarray:
+    """Directions (10, k) of the ten as (11, k), with the rotor."""
+    return np.vstack((directions, np.zeros((1, directions.shape[1]))))
 
 
 def _deviations(J: np.ndarray, share: float, centre: float) -> np.ndarray:
