@@ -15,6 +15,7 @@ LOOP = """\
 sim_plant:
   ros__parameters:
     duration: 0.3
+    events: {begin: [0.0, 0.2], duration: [0.1, 0.0]}
 blf_dsc_controller:
   ros__parameters:
     approach: {enabled: false}
@@ -36,6 +37,9 @@ monte_carlo:
       actuator.delay: integers(0, 3)
       initial.error: uniform(-0.9, 0.9)
       initial.velocity_error: normal(0.0, 0.02)
+      events.begin: ["uniform(0.05, 0.1)", "choice(0.2)"]
+      events.payload: uniform(0.0, 0.2)
+      events.torque: ["uniform(-0.5, 0.5)", "choice(0.0)", "uniform(-0.5, 0.5)", "choice(0.0)"]
 """
 
 

@@ -34,13 +34,13 @@ def plainly(a_study, run):
     error = np.abs(record.samples[:, names.xi1])
     torque = np.abs(record.samples[:, names.torque])
     estimate = record.samples[:, names.estimate][:, :3]
-    P = record.truths[0, :3]
+    P = record.truths[:, :3]
     outside = np.flatnonzero((error >= 0.002).any(axis=1))
     latched = np.flatnonzero(record.samples[:, names.latched[0]])
     limit = np.array(a_study.controller.torque.limit)
     motors = np.array(a_study.plant.actuator.torque_limit)
     limit[motors > 0.0] = np.minimum(limit, motors)[motors > 0.0]
-    distance = np.linalg.norm(estimate - P, axis=1) / np.linalg.norm(P)
+    distance = np.linalg.norm(estimate - P, axis=1) / np.linalg.norm(P, axis=1)
     figures = {
         'first_violation_s': t[outside[0]] if outside.size else np.nan,
         'latch_time_s': t[latched[0]] if latched.size else np.nan,

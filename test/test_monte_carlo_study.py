@@ -67,12 +67,12 @@ def test_preset_is_a_study_of_ten_thousand_runs():
 @pytest.mark.parametrize(
     ('before', 'after', 'expected'),
     [
-        ('arm.m2', 'arm.m3', r'line 15: vary.arm.m3: unknown parameter.* mean arm.m[12]\?'),
+        ('arm.m2', 'arm.m3', r'line 16: vary.arm.m3: unknown parameter.* mean arm.m[12]\?'),
         ('arm.m2', 'initial.position', r'vary.initial.position: unknown parameter'),
         (
             'uniform(0.3',
             'unifrm(0.3',
-            r"line 15: vary.arm.m2: got 'unifrm\(0.3, 0.7\)', but",
+            r"line 16: vary.arm.m2: got 'unifrm\(0.3, 0.7\)', but",
         ),
         (
             'uniform(0.3, 0.7)',
@@ -91,9 +91,13 @@ def test_preset_is_a_study_of_ten_thousand_runs():
         ('integers(0, 3)', 'uniform(0.0, 3.0)', r'delay: got .*: integers\(low, high\), choice'),
         ('integers(0, 3)', 'integers(0.5, 3)', r'delay: .* an integer is expected between'),
         ('choice(measured,', 'choice(guessed,', r"velocity: .* got 'guessed', but it must be one"),
-        ('uniform(-0.2, 0.2)', '["uniform(0, 1)"]', r'got 1 distributions, but there are 2 joints'),
-        ('runs: 24', 'runs: 0', r'line 10: runs: got 0, but it must be at least 1'),
-        ('runs: 24', 'rums: 24', r'line 10: rums: .* did you mean runs\?'),
+        (
+            'uniform(-0.2, 0.2)',
+            '["uniform(0, 1)"]',
+            r'got 1 distributions, .* 2 entries \(joint1, joint2\)',
+        ),
+        ('runs: 24', 'runs: 0', r'line 11: runs: got 0, but it must be at least 1'),
+        ('runs: 24', 'rums: 24', r'line 11: rums: .* did you mean runs\?'),
         ('[0.1, 0.25]', '[0.1, 0.4]', r'moments: got 0.4 s at entry 2, but a run ends at 0.3 s'),
         ('[0.1, 0.25]', '[0.1, 0.1]', r'moments: 0.1 s is there more than once'),
         ('after: 0.2', 'after: 0.3', r'settled_after: got 0.3 s, but a run ends at 0.3 s'),
@@ -159,6 +163,32 @@ def test_draws_become_the_plant_of_the_run(tmp_path):
     np.testing.assert_allclose(plant.initial.position, start, rtol=1e-12)
     velocity = [values[f'plant.initial.velocity_error.joint{i}'] for i in (1, 2)]
     np.testing.assert_allclose(plant.initial.velocity, velocity, atol=1e-15)
+
+
+def test_events_are_drawn_entry_by_entry(tmp_path):
+    a_study = study(tmp_path)
+    values = drawn_values(a_study, 3)
+    origin = origin_of(controller_of(a_study.controller))
+    events = plant_of_draw(a_study, draw(a_study, 3), origin).events
+    assert events.begin == (values['plant.events.begin.1'], 0.2)
+    assert events.duration == (0.1, 0.0)
+    assert events.payload == (values['plant.events.payload.1'], values['plant.events.payload.2'])
+    assert events.torque[0] == values['plant.events.torque.1.joint1'] != 0.0
+    assert events.torque[2] == values['plant.events.torque.2.joint1'] != events.torque[0]
+    assert (events.torque[1], events.torque[3]) == (0.0, 0.0)
+
+
+def test_events_leave_the_other_draws_as_they_were(tmp_path):
+    without = [line for line in (LOOP + STUDY).splitlines() if 'events' not in line]
+    before = drawn_values(study(tmp_path, '\n'.join(without)), 3)
+    assert len(before) == 10
+    assert before.items() <= drawn_values(study(tmp_path), 3).items()
+
+
+def test_events_vary_only_where_there_are_some(tmp_path):
+    text = '\n'.join(line for line in LOOP.splitlines() if 'events' not in line)
+    with pytest.raises(ConfigurationError, match=r'events.payload: .* no events: give events.beg'):
+        study(tmp_path, f'{text}\n{STUDY}')
 
 
 def test_start_as_configured_where_it_does_not_vary(tmp_path):

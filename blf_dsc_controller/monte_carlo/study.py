@@ -100,7 +100,7 @@ class Study:
         return values | {f'{_NODE}.{_VARY}{name}': text for name, text in self.varied().items()}
 
     def varied(self) -> dict[str, str | tuple[str, ...]]:
-        """Distributions as they are written: a list for a parameter of each joint."""
+        """Distributions as they are written: a list for a parameter that is one."""
         texts: dict[str, str | tuple[str, ...]] = {}
         for one in self.variations:
             text = str(one.distribution)
@@ -128,7 +128,9 @@ def load_study(path: str | Path, overrides: Mapping[str, object] | None = None) 
         settings = build(MonteCarloConfig, {**others, **(overrides or {})})
     except ConfigurationError as error:
         own += error.problems
-    variations, found = read_variations(varied, loop.plant.joints if loop else ('joint1', 'joint2'))
+    if loop is None:  # how many events there are is unknown
+        varied = {name: one for name, one in varied.items() if not name.startswith('events.')}
+    variations, found = read_variations(varied, loop.plant if loop else PlantConfig())
     own += [f'{_VARY}{problem}' for problem in found]
     if loop and settings:
         own += settings.duration_problems(loop.plant.duration)
@@ -195,7 +197,7 @@ def draw(study: Study, index: int) -> Draw:
     sequence = np.random.SeedSequence(study.settings.seed, spawn_key=(index,))
     rng = np.random.Generator(np.random.PCG64(sequence))
     seed = int(rng.integers(2**62))
-    numbers = rng.random(slots(len(study.plant.joints))).tolist()
+    numbers = rng.random(slots(study.plant)).tolist()
     values = tuple(one.distribution.at(numbers[one.slot]) for one in study.variations)
     return Draw(index, seed, values)
 
@@ -212,13 +214,7 @@ def plant_of_draw(study: Study, drawn: Draw, origin: Origin) -> PlantConfig:
     for one, value in zip(study.variations, drawn.values, strict=True):
         group, _, field = one.name.partition('.')
         section = changes.setdefault(group, {})
-        if one.entry < 0:
-            section[field] = value
-        else:
-            before = section.get(field, getattr(getattr(study.plant, group), field, None))
-            entries = list(before or [0.0] * len(study.plant.joints))
-            entries[one.entry] = value
-            section[field] = tuple(entries)
+        section[field] = value if one.entry < 0 else (*section.get(field, ()), value)
     relative = changes.pop('initial', {})
     start: dict[str, Any] = {}
     if 'error' in relative:

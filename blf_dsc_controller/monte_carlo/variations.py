@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
+import operator
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import cast
+from typing import Annotated, cast
 
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import (
@@ -49,6 +51,7 @@ _CALL = re.compile(r'\s*(\w+)\s*\((.*)\)\s*')
 _NAMES = {Kind.DOUBLE: 'a number', Kind.INTEGER: 'an integer', Kind.STRING: 'a word'}
 _NORMAL = NormalDist()
 _GROUPS = ('arm.', 'disturbance.', 'sensor.', 'actuator.')
+_LAST = ('sensor.offset', 'load.', 'wall.', 'events.')  # the draws of the others stay as they were
 _REALTIME = ('actuator.command_timeout', 'actuator.without_command')
 
 
@@ -124,11 +127,11 @@ def _argument(word: str, kind: Kind) -> Value:
 class RelativeStart:
     """Start of a run relative to the reference."""
 
-    error: tuple[float, ...] = parameter(
-        (), 'fraction of the bound', above=-1.0, below=1.0, length=('joints',)
+    error: Annotated[tuple[float, ...], 'joints'] = parameter(
+        (), 'fraction of the bound', above=-1.0, below=1.0
     )
-    velocity_error: tuple[float, ...] = parameter(
-        (), 'velocity error', unit='rad/s', length=('joints',)
+    velocity_error: Annotated[tuple[float, ...], 'joints'] = parameter(
+        (), 'velocity error', unit='rad/s'
     )
 
 
@@ -137,7 +140,7 @@ class Variation:
     """One number that is drawn for each run."""
 
     name: str  # of the parameter
-    entry: int  # index of the joint; -1: the parameter is no list
+    entry: int  # index in the list; -1: the parameter is no list
     column: str  # name in the results
     slot: int  # index of its random number among those of a run
     distribution: Distribution
@@ -147,25 +150,51 @@ class Variation:
 def variable_parameters() -> Mapping[str, Parameter]:
     """Every parameter that may vary, by name."""
     start = parameters(RelativeStart)
-    found = [one for one in parameters(PlantConfig) if one.name.startswith(_GROUPS)]
+    plant = parameters(PlantConfig)
+    last = [one for one in plant if one.name.startswith(_LAST)]
+    found = [one for one in plant if one.name.startswith(_GROUPS) and one not in last]
     found += [dataclasses.replace(one, name=f'initial.{one.name}') for one in start]
+    found += last
     return {
         one.name: one for one in found if one.name not in _REALTIME and one.kind.element in FORMS
     }
 
 
-@functools.cache
-def slots(joints: int) -> int:
+def entries(one: Parameter, plant: PlantConfig) -> tuple[str, ...]:
+    """Name of each entry of a parameter that is a list, by joint or number; else none."""
+    if not one.kind.is_array:
+        return ()
+    if not one.length:
+        return _numbers(len(operator.attrgetter(one.name)(plant)))
+    each: list[Sequence[str]] = []
+    for name in one.length:
+        if name == 'joints':
+            each.append(plant.joints)
+        else:
+            count = int(name) if name.isdigit() else len(operator.attrgetter(name)(plant))
+            each.append(_numbers(count))
+    return tuple('.'.join(names) for names in itertools.product(*each))
+
+
+def _numbers(count: int) -> tuple[str, ...]:
+    return tuple(f'{number}' for number in range(1, count + 1))
+
+
+def slots(plant: PlantConfig) -> int:
     """Random numbers that a run draws: one for each that may vary, whether it does or not."""
-    return sum(joints if one.kind.is_array else 1 for one in variable_parameters().values())
+    return sum(_slots(one, plant) for one in variable_parameters().values())
+
+
+def _slots(one: Parameter, plant: PlantConfig) -> int:
+    return len(entries(one, plant)) if one.kind.is_array else 1
 
 
 def read_variations(
-    given: Mapping[str, object], joints: tuple[str, ...]
+    given: Mapping[str, object], plant: PlantConfig
 ) -> tuple[tuple[Variation, ...], list[str]]:
     """Variations in the order of the plant's parameters, and the problems with them.
 
-    Each name has a distribution; a parameter of each joint takes a list of them as well.
+    Each name has a distribution; a parameter that is a list takes a list of them as well.
     """
     known = variable_parameters()
     problems = [unknown(name, known) for name in given if name not in known]
@@ -174,27 +203,29 @@ def read_variations(
     for name, one in known.items():
         if name in given:
             try:
-                found += _variations_of(one, given[name], joints, slot)
+                found += _variations_of(one, given[name], entries(one, plant), slot)
             except ValueError as error:
                 problems.append(f'{name}: {error}')
-        slot += len(joints) if one.kind.is_array else 1
+        slot += _slots(one, plant)
     return tuple(found), problems
 
 
 def _variations_of(
-    one: Parameter, given: object, joints: tuple[str, ...], slot: int
+    one: Parameter, given: object, names: tuple[str, ...], slot: int
 ) -> list[Variation]:
     if not one.kind.is_array:
         return [Variation(one.name, -1, f'plant.{one.name}', slot, _distribution(one, given))]
-    each = list(given) if isinstance(given, (list, tuple)) else [given] * len(joints)
-    if len(each) != len(joints):
+    if not names:
+        raise ValueError('got a distribution, but there are no events: give events.begin')
+    each = list(given) if isinstance(given, (list, tuple)) else [given] * len(names)
+    if len(each) != len(names):
         raise ValueError(
-            f'got {len(each)} distributions, but there are {len(joints)} joints: '
-            'give one for each joint, or a single one for all'
+            f'got {len(each)} distributions, but there are {len(names)} entries '
+            f'({", ".join(names)}): give one for each, or a single one for all'
         )
     return [
-        Variation(one.name, i, f'plant.{one.name}.{joint}', slot + i, _distribution(one, text))
-        for i, (joint, text) in enumerate(zip(joints, each, strict=True))
+        Variation(one.name, i, f'plant.{one.name}.{name}', slot + i, _distribution(one, text))
+        for i, (name, text) in enumerate(zip(names, each, strict=True))
     ]
 
 
