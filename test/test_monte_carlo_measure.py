@@ -10,7 +10,7 @@ from monte_carlo_case import LOOP, STUDY, study, whole
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.monte_carlo.report import plant_of_run
 from blf_dsc_controller.monte_carlo.runs import run_chunk
-from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.loop import simulate_law
 
 LIMITS = 'blf_dsc_controller:\n  ros__parameters:\n'
 WEAK = LOOP.replace(LIMITS, LIMITS + '    torque: {limit: [8.0, 20.0]}\n')
@@ -28,7 +28,7 @@ UNSTABLE = LOOP.replace(
 def plainly(a_study, run):
     """Figures of a run from its whole record, as their definitions say."""
     plant = plant_of_run(a_study, run)
-    record = simulate(a_study.controller, plant)
+    record = simulate_law(a_study.controller, plant)
     names = sample_of(np.arange(record.samples.shape[1]), record.controller.settings)
     t = record.stamps * 1e-9
     error = np.abs(record.samples[:, names.xi1])

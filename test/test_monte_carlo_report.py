@@ -21,7 +21,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.monte_carlo.report import plant_of_run, reproduce, write_report
 from blf_dsc_controller.monte_carlo.statistics import influence, summarize, worst_first
 from blf_dsc_controller.monte_carlo.store import Span, Store
-from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.loop import simulate_law
 
 
 @pytest.fixture(scope='module')
@@ -107,7 +107,7 @@ def test_worst_ten_are_reproduced_by_the_commands_of_the_report(store, tmp_path,
     # The run is an ordinary configuration too.
     loop = load_loop(out / 'config.yaml')
     assert loop.plant == plant_of_run(store.study, run)
-    again = simulate(loop.controller, loop.plant)
+    again = simulate_law(loop.controller, loop.plant)
     np.testing.assert_array_equal(again.measurements[:, :2], bag.position)
     # It does not overwrite.
     assert main(arguments) == 1

@@ -20,7 +20,7 @@ from blf_dsc_controller.paper.claims import FAILS, HOLDS, ONLY_IF, verdict
 from blf_dsc_controller.paper.report import kept_bounds
 from blf_dsc_controller.paper.results import Results
 from blf_dsc_controller.run import Run, Series
-from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.loop import simulate_law
 
 BOUND = np.array([0.002, 0.004])
 TRUE = np.array([3.0, 4.0])
@@ -167,7 +167,7 @@ def test_kept_configurations_are_those_that_ran(report):
     """One of a sweep, run again from its file, gives the number of the report."""
     name = case_name('delay', 'comparison', 1.0)
     loop = load_loop(report / 'configurations' / f'{name.replace(" ", "_")}.yaml')
-    again = measure(simulate(loop.controller, loop.plant).run())
+    again = measure(simulate_law(loop.controller, loop.plant).run())
     metrics = json.loads((report / 'metrics.json').read_text(encoding='utf-8'))
     assert metrics[name]['max_error_ratio'] == again.max_error_ratio
     assert loop.plant.actuator.delay == 1

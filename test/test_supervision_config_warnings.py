@@ -10,7 +10,7 @@ from paper_case import EXACT, NO_DISTURBANCE, P, configured, run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.loop import simulate_law
 from blf_dsc_controller.supervision.config_warnings import (
     config_warnings,
     reference_load,
@@ -82,7 +82,7 @@ def test_excitation_is_that_of_the_controller_s_window(preset):
     """With columns and filters; the loop's window is of the arm, within a milliradian of qr."""
     loop = configured(preset, 14.0)
     windows = windows_along(loop.controller, settings_of_config(loop.controller))
-    record = simulate(loop.controller, loop.plant)
+    record = simulate_law(loop.controller, loop.plant)
     least = np.linalg.eigvalsh(windows)[:, 0].max()
     assert least == pytest.approx(record.sample(-1).lambda_min[0], rel=0.02)
 

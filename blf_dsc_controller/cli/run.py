@@ -30,7 +30,8 @@ from blf_dsc_controller.law.factory import estimate_names, model_of
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import Record, simulate
+from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.record import Record
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from sim_plant import kernels as plant_kernels
 
@@ -123,8 +124,8 @@ def _run_offline(config: LoopConfig, bag: Path) -> None:
     def show(record: Record, rows: int) -> None:
         n = len(record.config.joints)
         errors = abs(record.samples[:rows, 2 * n : 3 * n] / record.samples[:rows, 6 * n : 7 * n])
-        estimate = record.sample(rows - 1).estimate[: len(parameters)]
-        progress.show(record.stamps[rows - 1] * 1e-9, errors.max(), estimate)
+        estimate = record.controller.state.estimate[: len(parameters)]
+        progress.show(record.stamps[rows - 1] * 1e-9, np.nanmax(errors), estimate)
 
     with announced_compilation():
         record = simulate(config.controller, config.plant, show)

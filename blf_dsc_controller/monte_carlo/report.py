@@ -23,7 +23,7 @@ from blf_dsc_controller.monte_carlo.statistics import Summary, summarize
 from blf_dsc_controller.monte_carlo.store import Store, differences
 from blf_dsc_controller.monte_carlo.study import Study, draw, origin_of, plant_of_draw
 from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.loop import simulate_law
 from blf_dsc_controller.simulation.metrics import metrics_of, new_metrics
 
 _QUANTILES = ('min', 'median', 'p95', 'p99', 'max')
@@ -78,7 +78,7 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
     dump(out / 'config.yaml', {PLANT: plant, CONTROLLER: study.controller})
     settings = metrics_settings(study, plant)
     metrics = new_metrics(settings)
-    record = simulate(study.controller, plant, metrics=(pack(settings), metrics))
+    record = simulate_law(study.controller, plant, metrics=(pack(settings), metrics))
     write_bag(out / 'bag', record, study.controller, 'none')
     recorded = read_run(out / 'bag')
     summary = summarize_run(recorded)

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from blf_dsc_controller.analysis.metrics import Metrics, measure
 from blf_dsc_controller.paper.cases import CASES, SWEEPS, Case, case_name
 from blf_dsc_controller.run import Run
-from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.loop import simulate_law
 
 
 class Results(NamedTuple):
@@ -32,7 +32,7 @@ def run_case(case: Case) -> tuple[Metrics, Run | None]:
     """Simulate a case; the run is returned where it is kept."""
     loop = case.loop()
     with np.errstate(all='ignore'):  # a run that diverges has metrics too
-        run = simulate(loop.controller, loop.plant).run()
+        run = simulate_law(loop.controller, loop.plant).run()
         return measure(run), run if case.keep_run else None
 
 

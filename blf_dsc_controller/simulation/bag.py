@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,11 +14,9 @@ from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.params_file import dumps
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.messages.telemetry import (
     DECIMATION,
     ControllerTelemetry,
@@ -26,10 +25,7 @@ from blf_dsc_controller.messages.telemetry import (
     PlantTelemetry,
     encode_rejected_columns,
 )
-from blf_dsc_controller.simulation.loop import Record
-
-START = 1_000_000_000
-"""Stamp of the first sample [ns], as in lock-step."""
+from blf_dsc_controller.simulation.record import START, Record
 
 
 def write_bag(
@@ -67,26 +63,27 @@ def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, M
     controller = ControllerTelemetry(config.joints, estimate_names(config))
     monitor = Monitor(config.joints, estimate_names(config), record.controller.settings)
     limit = np.array(config.torque.limit)
-    journal = Journal()
-    journal.note(EventType.CONFIGURE, parameters=flatten(config))
-    journal.note(EventType.ACTIVATE)
-    journal.stamp, journal.messages = START, 1
-    journal.note(EventType.START, resumed=False)
-    for event in journal.pending:
-        yield START, (topics.JOURNAL, event.encode())
+    events = deque(record.journal.pending)
     ratio = np.zeros(len(record.config.joints))
     bound = np.zeros(len(record.config.joints))
     for row, elapsed in enumerate(record.stamps.tolist()):
         stamp = START + elapsed
         sample = record.sample(row)
-        np.maximum(ratio, np.abs(sample.xi1) / sample.bound, out=ratio)
+        while events and events[0].messages <= row:
+            yield stamp, (topics.JOURNAL, events.popleft().encode())
         if not np.array_equal(sample.bound, bound):
             bound = sample.bound
             yield stamp, controller.bound(stamp, bound, limit)
         yield stamp, plant.joint_states(stamp, record.measurements[row])
         yield stamp, controller.command(sample.torque)
+        if row % DECIMATION == 0:
+            yield stamp, plant.truth(stamp, record.truths[row])
+        if np.isnan(sample.qr[0]):  # stopped
+            continue
+        np.maximum(ratio, np.abs(sample.xi1) / sample.bound, out=ratio)
         for message in controller.sample(stamp, sample, float('nan')):
             yield stamp, message
         if row % DECIMATION == 0:
-            yield stamp, plant.truth(stamp, record.truths[row])
             yield stamp, monitor.message(stamp, sample, ratio, bound)
+    for event in events:
+        yield START + int(record.stamps[-1]), (topics.JOURNAL, event.encode())

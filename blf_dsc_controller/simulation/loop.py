@@ -1,33 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """The closed loop without ROS: the kernels that the nodes run, in one compiled loop.
 
-A lock-step run over ROS and an offline run of the same configuration agree bit for bit.
+A lock-step run over ROS and an offline run of the same configuration agree bit for bit, stops and
+safe torques included: the compiled loop runs as long as its checks find nothing to object to.  A
+chunk of samples in which they do is run again, sample by sample, by the guard of the node, and so
+is all that follows a stop.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
-from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.compiled.views import part, view
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.factory import begin, controller_of, estimate_names
+from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.law.lyapunov import fill_energies
-from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.law.settings import settings_of
-from blf_dsc_controller.law.state import Sample, sample_of, signals_of, state_of
+from blf_dsc_controller.law.state import sample_of, signals_of, state_of
 from blf_dsc_controller.law.step import step
-from blf_dsc_controller.messages.telemetry import disturbance_names
-from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LYAPUNOV_TERMS, MODEL_CHANGES
-from blf_dsc_controller.run import Run, Series
+from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.simulation.metrics import (
     LoopMetrics,
     MetricsSettings,
@@ -36,63 +35,16 @@ from blf_dsc_controller.simulation.metrics import (
     new_metrics,
     update_metrics,
 )
+from blf_dsc_controller.simulation.record import START, Record, new_record
+from blf_dsc_controller.supervision.checks import SUSPECT, check_sample, is_valid_state
+from blf_dsc_controller.supervision.guard import Guard
 from sim_plant import kernels as plants
 from sim_plant.plant import Plant, plant_of, steps_of
 
-_CHUNK = 1000  # samples between two reports of progress
-_NO_METRICS = MetricsSettings(0, 0, 0, 0, 0, *np.zeros((3, 0)))
-
-
-@dataclass(frozen=True)
-class Record:
-    """All samples of a run, a row each."""
-
-    stamps: np.ndarray  # (k,) ns, since the start
-    measurements: np.ndarray  # (k, 3 n) [q, dq, applied torque of the last interval]
-    samples: np.ndarray  # (k, s) rows of `law.state.Sample`
-    truths: np.ndarray  # (k, p + 3 n) [P, tau_dist, q, dq]
-    config: ControllerConfig
-    controller: Controller  # after the run
-
-    def sample(self, row: int) -> Sample:
-        """Names for one row of `samples`."""
-        return sample_of(self.samples[row], self.controller.settings)
-
-    def run(self) -> Run:
-        """All samples as a `Run`, with the truth and, where the law knows it, the terms of (29)."""
-        config = self.config
-        settings, names = self.controller.settings, estimate_names(config)
-        columns = sample_of(np.arange(self.samples.shape[1], dtype=np.float64), settings)
-        values = {
-            name: self.samples[:, getattr(columns, name).astype(int)] for name in columns._fields
-        }
-        disturbances = disturbance_names(config.joints)
-        figures = ('estimate', 'disturbance', 'lambda_min', 'latched', 'changes')
-        learned = [values[name] for name in figures]
-        position, velocity, _ = np.split(self.measurements, 3, axis=1)
-        true = (*PARAMETER_NAMES, *disturbances)
-        monitor = Series(LYAPUNOV_TERMS, self.stamps, values['lyapunov'])
-        return Run(
-            joints=config.joints,
-            stamp=self.stamps,
-            received=self.stamps,
-            position=position,
-            velocity=velocity,
-            torque=values['torque'],
-            reference=values['qr'],
-            error=values['xi1'],
-            bound=values['bound'],
-            torque_limit=np.broadcast_to(config.torque.limit, position.shape),
-            learning=Series(
-                (*names, *disturbances, LAMBDA_MIN, LATCHED, MODEL_CHANGES),
-                self.stamps,
-                np.hstack(learned),
-            ),
-            truth=Series(true, self.stamps, self.truths[:, : len(true)]),
-            monitor=monitor if settings.truth_known else None,
-            learns=config.law == 'blf_dsc' and config.learning.weight > 0.0,
-            rejected={one.column: f'{one}' for one in rejected_columns(self.controller, names)},
-        )
+_CHUNK = 1000  # samples; the guard takes some 20 ms for them
+_NOTHING = MetricsSettings(0, 0, 0, 0, 0, *np.zeros((3, 0)))
+_NO_METRICS = pack(_NOTHING), new_metrics(_NOTHING)
+_NO_CHECKS = np.zeros(2), np.zeros(0), np.zeros(0)
 
 
 @kernel
@@ -113,8 +65,15 @@ def run_loop(
     truths: np.ndarray | None,
     metrics_settings: np.ndarray,
     metrics: np.ndarray,
-) -> None:
+    limits: np.ndarray,
+    ratio: np.ndarray,
+    kept: np.ndarray,
+) -> bool:
     """Run the samples from number `first` to `last`; at the end, the torque is not applied.
+
+    With `limits` (velocity [rad/s], error as a multiple of the bound) each sample is checked as by
+    `supervision.guard`, with its `ratio` and `kept`; the first to object to ends this, and False is
+    returned.  A velocity of 0 is no check.
 
     Without `truths`, `measurements` and `samples` have one row, which each sample overwrites, there
     are no energies, and a number that is not finite ends the run; numba compiles this apart.
@@ -135,56 +94,126 @@ def run_loop(
         t = (k * plant.period_ns) * 1e-9
         plants.draw_noise(plant, now, rng)
         plants.observe(plant, now, measurement)
+        q, dq = part(measurement, 0, (law.n,)), part(measurement, law.n, (law.n,))
+        if limits[0] > 0.0 and not is_valid_state(q, dq, limits[0]):
+            return False
         step(law, reference_view, law_state, law_signals, t, dt, measurement, sample)
         if truths is not None:
             plants.truth(plant, now, view(truths)[row])
-            fill_energies(law, law_state, law_signals, part(measurement, 0, (law.n,)), sample)
+            fill_energies(law, law_state, law_signals, q, sample)
+        if limits[0] > 0.0:
+            flags = check_sample(settings, state, signals, rows[row], limits[1], ratio, kept)
+            if flags & SUSPECT:
+                return False
         if chosen.n > 0:
             if found.finite[0] == 1.0:
                 plants.true_parameters(plant, now, found.P)
                 update_metrics(chosen, found, t, measurement, sample)
             elif truths is None:
-                return
+                return True
         if not (is_end and k == last):
             plants.step(plant, now, sample.torque)
+    return True
 
 
 def simulate(
     controller_config: ControllerConfig,
     plant_config: PlantConfig,
     progress: Callable[[Record, int], None] | None = None,
-    metrics: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Record:
     """Run both configurations against each other for `duration` and return every sample.
 
     The plant's duration must not be 0.  `progress` is called now and then with the record and the
-    number of rows that are filled.  `metrics` are packed `MetricsSettings` and the vector of
+    number of rows that are filled.
+
+    Raises StartError if the law cannot take over and approach.enabled is false, and MotionError if
+    there is no approach within the limits.
+    """
+    guard = Guard(controller_config, lambda: 0, lambda: 0)
+    guard.activate()
+    plant = plant_of(plant_config)
+    rows = steps_of(plant_config) + 1
+    record = new_record(controller_config, guard.controller, plant, rows, guard.journal)
+    _run_guarded(guard, plant, record, range(1))
+    if guard.start_error is not None:
+        raise guard.start_error
+    for first in range(1, rows, _CHUNK):
+        chunk = range(first, min(first + _CHUNK, rows))
+        if not _run_compiled(guard, plant, record, chunk):
+            _run_guarded(guard, plant, record, chunk)
+        if progress is not None:
+            progress(record, chunk.stop)
+    return record
+
+
+def _run_compiled(guard: Guard, plant: Plant, record: Record, chunk: range) -> bool:
+    """Run a chunk of samples without a stop; False, with nothing changed, if there is to be one."""
+    safety, controller = guard.config.safety, guard.controller
+    if not guard.supervisor.running or safety.velocity != 'measured':
+        return False
+    checks = (np.array((safety.velocity_limit, safety.error_ratio)), *guard.checked)
+    before = controller.save(), plant.save(), [array.copy() for array in guard.checked]
+    rows = slice(chunk.start, chunk.stop)
+    arrays = record.measurements[rows], record.samples[rows], record.truths[rows]
+    samples = chunk.start, chunk.stop - 1, chunk.stop == record.stamps.size
+    if _run_samples(controller, plant, samples, arrays, _NO_METRICS, checks):
+        last = chunk.stop - 1
+        guard.advance(START + int(record.stamps[last]), record.measurements[last], len(chunk))
+        return True
+    controller.restore(before[0])
+    plant.restore(before[1])
+    for array, saved in zip(guard.checked, before[2], strict=True):
+        array[:] = saved
+    return False
+
+
+def _run_guarded(guard: Guard, plant: Plant, record: Record, chunk: range) -> None:
+    """Run a chunk of samples as the nodes do."""
+    settings = guard.controller.settings
+    for row in chunk:
+        measurement = plant.measure()
+        record.measurements[row] = measurement
+        record.truths[row] = plant.truth()
+        torque = guard.update(START + int(record.stamps[row]), measurement)
+        if torque is None:
+            return
+        if guard.has_sample:
+            record.samples[row] = guard.controller.sample_vector
+        else:
+            record.samples[row] = np.nan
+            sample = sample_of(record.samples[row], settings)
+            sample.torque[:] = torque
+            sample.bound[:] = record.sample(row - 1).bound
+        if row + 1 < record.stamps.size:
+            plant.step(torque)
+
+
+def simulate_law(
+    controller_config: ControllerConfig,
+    plant_config: PlantConfig,
+    metrics: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Record:
+    """Run the law alone, past every limit of its supervisor, and return every sample.
+
+    The plant's duration must not be 0.  `metrics` are packed `MetricsSettings` and the vector of
     `new_metrics`, which is updated.
 
     Raises StartError if the law cannot take over and approach.enabled is false, and MotionError if
     there is no approach within the limits.
     """
-    controller = controller_of(controller_config)
-    plant = plant_of(plant_config)
+    controller, plant = controller_of(controller_config), plant_of(plant_config)
     n = controller.settings.n
     measurement = plant.measure()
     begin(controller, controller_config, measurement[:n], measurement[n : 2 * n])
-    rows = steps_of(plant_config) + 1
-    record = Record(
-        stamps=np.arange(rows, dtype=np.int64) * plant.period_ns,
-        measurements=np.zeros((rows, 3 * n)),
-        samples=np.zeros((rows, controller.sample_vector.size)),
-        truths=np.zeros((rows, plant.truth().size)),
-        config=controller_config,
-        controller=controller,
-    )
-    metrics = metrics or (pack(_NO_METRICS), new_metrics(_NO_METRICS))
-    for first in range(0, rows, _CHUNK):
-        chunk = slice(first, min(first + _CHUNK, rows))
-        arrays = (record.measurements[chunk], record.samples[chunk], record.truths[chunk])
-        _run(controller, plant, (first, chunk.stop - 1, chunk.stop == rows), arrays, metrics)
-        if progress is not None:
-            progress(record, chunk.stop)
+    journal = Journal()
+    journal.note(EventType.CONFIGURE, parameters=flatten(controller_config))
+    journal.note(EventType.ACTIVATE)
+    journal.stamp, journal.messages = START, 1
+    journal.note(EventType.START, resumed=False)
+    record = new_record(controller_config, controller, plant, steps_of(plant_config) + 1, journal)
+    rows = record.stamps.size
+    arrays = (record.measurements, record.samples, record.truths)
+    _run_samples(controller, plant, (0, rows - 1, True), arrays, metrics or _NO_METRICS)
     return record
 
 
@@ -194,18 +223,20 @@ def run_metrics(
     """Run so many samples, with a controller that has begun, and return the metrics alone."""
     metrics = new_metrics(settings)
     arrays = (np.zeros((1, 3 * plant.joints)), controller.sample_vector.reshape(1, -1), None)
-    _run(controller, plant, (0, samples - 1, True), arrays, (pack(settings), metrics))
+    _run_samples(controller, plant, (0, samples - 1, True), arrays, (pack(settings), metrics))
     return metrics_of(metrics, settings)
 
 
-def _run(
+def _run_samples(
     controller: Controller,
     plant: Plant,
     samples: tuple[int, int, bool],
     arrays: tuple[np.ndarray, np.ndarray, np.ndarray | None],
     metrics: tuple[np.ndarray, np.ndarray],
-) -> None:
-    run_loop(
+    checks: tuple[np.ndarray, np.ndarray, np.ndarray] = _NO_CHECKS,
+) -> bool:
+    """Call `run_loop`: first, last, is_end; measurements, samples, truths; the rest as there."""
+    return run_loop(
         plant.settings,
         plant.state,
         plant.rng,
@@ -217,4 +248,5 @@ def _run(
         *samples,
         *arrays,
         *metrics,
+        *checks,
     )

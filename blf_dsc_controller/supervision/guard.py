@@ -137,6 +137,11 @@ class Guard:
         """Time of the last sample of the law [s]."""
         return self._time_of(self.last_stamp)
 
+    @property
+    def checked(self) -> tuple[Vector, Vector]:
+        """What `checks.check_sample` updates."""
+        return self.ratio, self._kept
+
     # From here on: what the operator does.
 
     def activate(self) -> None:
@@ -293,6 +298,22 @@ class Guard:
         if self.supervisor.phase is Phase.STARTING and not self._start(stamp, q, dq):
             return self._safe(self.config.sample_time) if self.commanding else None
         return self._control(stamp, measurement)
+
+    def advance(self, stamp: int, measurement: Vector, count: int) -> None:
+        """Go on to the state of a stamp [ns], the last of `count` that the law has used.
+
+        There was nothing to object to in their samples, and they have updated `checked`.
+        """
+        self.journal.stamp = stamp
+        self.journal.messages += count
+        self.journal.commands += count
+        self.has_sample = True
+        self.last_stamp = stamp
+        self._last_state.take(stamp, measurement)
+        self._torque[:] = self.controller.state.torque
+        self.supervisor.advance(stamp)
+        if self.supervisor.phase is Phase.APPROACHING and self.time >= self.settled:
+            self.supervisor.enter(Phase.TRACKING)
 
     def reject(self, error: MessageError) -> Vector | None:
         """Return the torque for an unreadable message, None if it is for another arm."""

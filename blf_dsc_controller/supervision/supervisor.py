@@ -149,6 +149,11 @@ class Supervisor:
         self._last_stamp = stamp
         return verdict
 
+    def advance(self, stamp: int) -> None:
+        """Take all states up to a stamp [ns] for checked, and their torques for below the limit."""
+        self._last_stamp = stamp
+        self.saturated_time = 0.0
+
     def _is_next(self, stamp: int) -> bool:
         """Whether a stamp is one sample after the last, with nothing to count."""
         shortest, longest = self._one_sample

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All samples of a run without ROS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.factory import estimate_names
+from blf_dsc_controller.law.rejected_columns import rejected_columns
+from blf_dsc_controller.law.state import Sample, sample_of
+from blf_dsc_controller.messages.journal import EventType, Journal
+from blf_dsc_controller.messages.telemetry import disturbance_names
+from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LYAPUNOV_TERMS, MODEL_CHANGES
+from blf_dsc_controller.run import Run, Series, Stop
+from sim_plant.plant import Plant
+
+START = 1_000_000_000
+"""Stamp of the first sample [ns], as in lock-step."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """All samples of a run, a row each."""
+
+    stamps: np.ndarray  # (k,) ns, since the start
+    measurements: np.ndarray  # (k, 3 n) [q, dq, applied torque of the last interval]
+    samples: np.ndarray  # (k, s) rows of `law.state.Sample`; NaN but for bound, torque after a stop
+    truths: np.ndarray  # (k, p + 3 n) [P, tau_dist, q, dq]
+    config: ControllerConfig
+    controller: Controller  # after the run
+    journal: Journal  # events of the run, their stamps from `START` on
+
+    def sample(self, row: int) -> Sample:
+        """Names for one row of `samples`."""
+        return sample_of(self.samples[row], self.controller.settings)
+
+    def run(self) -> Run:
+        """All samples as a `Run`, with the truth and, where the law knows it, the terms of (29)."""
+        config = self.config
+        settings, names = self.controller.settings, estimate_names(config)
+        columns = sample_of(np.arange(self.samples.shape[1], dtype=np.float64), settings)
+        values = {
+            name: self.samples[:, getattr(columns, name).astype(int)] for name in columns._fields
+        }
+        disturbances = disturbance_names(config.joints)
+        figures = ('estimate', 'disturbance', 'lambda_min', 'latched', 'changes')
+        used = ~np.isnan(values['qr'][:, 0])  # by the law
+        learned = [values[name][used] for name in figures]
+        position, velocity, _ = np.split(self.measurements, 3, axis=1)
+        true = (*PARAMETER_NAMES, *disturbances)
+        monitor = Series(LYAPUNOV_TERMS, self.stamps[used], values['lyapunov'][used])
+        return Run(
+            joints=config.joints,
+            stamp=self.stamps,
+            received=self.stamps,
+            position=position,
+            velocity=velocity,
+            torque=values['torque'],
+            reference=values['qr'],
+            error=values['xi1'],
+            bound=values['bound'],
+            torque_limit=np.broadcast_to(config.torque.limit, position.shape),
+            learning=Series(
+                (*names, *disturbances, LAMBDA_MIN, LATCHED, MODEL_CHANGES),
+                self.stamps[used],
+                np.hstack(learned),
+            ),
+            truth=Series(true, self.stamps, self.truths[:, : len(true)]),
+            monitor=monitor if settings.truth_known else None,
+            stops=tuple(
+                Stop(event.stamp - START, f'{event.content["reason"]}', event.content['text'])
+                for event in self.journal.pending
+                if event.type is EventType.STOP
+            ),
+            learns=config.law == 'blf_dsc' and config.learning.weight > 0.0,
+            rejected={one.column: f'{one}' for one in rejected_columns(self.controller, names)},
+        )
+
+
+def new_record(
+    config: ControllerConfig, controller: Controller, plant: Plant, rows: int, journal: Journal
+) -> Record:
+    """Record of so many samples, to be filled."""
+    return Record(
+        stamps=np.arange(rows, dtype=np.int64) * plant.period_ns,
+        measurements=np.zeros((rows, 3 * plant.joints)),
+        samples=np.zeros((rows, controller.sample_vector.size)),
+        truths=np.zeros((rows, plant.truth().size)),
+        config=config,
+        controller=controller,
+        journal=journal,
+    )

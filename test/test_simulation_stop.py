@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An offline run stops as the node does: at the same sample, for the same reason, same torques."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.analysis.summary import summarize
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.replay.verify import verify
+from blf_dsc_controller.simulation.bag import write_bag
+from blf_dsc_controller.simulation.loop import simulate, simulate_law
+from blf_dsc_controller.simulation.record import START
+from blf_dsc_controller.supervision.supervisor import Phase
+
+HELD = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.05}
+NOISY = {'sensor.position_noise': 1e-6, 'sensor.velocity': 'differenced', 'seed': 3}
+WEAK = {'torque.limit': [9.0, 3.2]}  # gravity alone takes 9.7 N m
+GOES_ON = 'goes on'
+CASES = {
+    'error past the bound': WEAK | HELD,
+    'torque saturated': WEAK | HELD | {'safety.error_ratio': 0.0, 'safety.saturation_time': 0.01},
+    'velocity not plausible': {'safety.velocity_limit': 0.25},
+    GOES_ON: {'torque.limit': [10.5, 20.0]},  # saturated for some samples, and tracking goes on
+    f'{GOES_ON} with an estimated velocity': {'safety.velocity': 'estimated'},
+}
+
+
+def run(given, simulation=simulate, duration=2.5):
+    plant = build(PlantConfig, {'duration': duration} | NOISY)
+    return simulation(build(ControllerConfig, given), plant)
+
+
+@pytest.mark.parametrize(('reason', 'given'), CASES.items(), ids=lambda one: str(one)[:30])
+def test_stop_and_torques_are_those_of_the_node_bit_for_bit(ros, reason, given):
+    from ros_rig import torques
+
+    from blf_dsc_controller.messages import topics
+
+    record = run(given)
+    commands = ros.listen(topics.COMMANDS)
+    arm, law = ros.loop({'duration': 2.5} | NOISY, given)
+    ros.until(lambda: arm.finished and len(commands) >= 2501)
+    np.testing.assert_array_equal(torques(commands)[:2501], record.run().torque)
+    supervisor = law.guard.supervisor
+    if reason.startswith(GOES_ON):
+        assert (supervisor.phase, record.run().stops) == (Phase.TRACKING, ())
+        return
+    (stop,) = record.run().stops
+    assert (stop.reason, stop.text) == (supervisor.reason, supervisor.text)
+    assert stop.reason == reason
+
+
+@pytest.mark.parametrize('reason', ['error past the bound', 'velocity not plausible'])
+def test_the_bag_of_a_stopped_run_replays_and_says_so(tmp_path, reason):
+    given = CASES[reason]
+    record = run(given)
+    write_bag(tmp_path / 'bag', record, record.config, 'none')
+    result = verify(tmp_path / 'bag')
+    assert (result.difference, result.remarks) == (None, ())
+    assert result.turns == ['activate', f'safe stop ({reason})']
+    recorded = read_run(tmp_path / 'bag')
+    (stop,) = recorded.stops
+    assert stop.reason == reason
+    simulated = record.run()
+    assert simulated.timed_stops[0][0] == recorded.timed_stops[0][0]
+    for field in ('position', 'torque', 'reference', 'error', 'bound'):
+        np.testing.assert_array_equal(getattr(simulated, field), getattr(recorded, field))
+    told = [summarize(one)['tracking'] for one in (simulated, recorded)]
+    stamps = [one['stops'][0].pop('stamp_ns') for one in told]
+    assert told[0] == told[1]
+    assert stamps[1] - stamps[0] == START
+
+
+def test_the_law_alone_goes_on_past_every_limit():
+    stopped, alone = run(CASES['error past the bound']), run(WEAK, simulate_law)
+    (row,) = np.flatnonzero(stopped.stamps == stopped.run().stops[0].stamp)
+    assert 0 < row < 100
+    np.testing.assert_array_equal(stopped.samples[:row], alone.samples[:row])
+    assert np.isfinite(alone.samples[row:, :10]).all()
+    assert np.isnan(stopped.samples[row:, :6]).all()
+
+
+def test_nothing_is_lost_where_the_compiled_loop_hands_over():
+    """A run in chunks, of which the first is run by the guard, is the run of the law alone."""
+    given = CASES[GOES_ON]
+    cut = run(given).run()
+    assert not cut.stops
+    np.testing.assert_array_equal(cut.torque, run(given, simulate_law).run().torque)
+    assert (np.abs(cut.torque[:1000]) == given['torque.limit']).any()
+    assert not (np.abs(cut.torque[1001:2000]) == given['torque.limit']).any()
