@@ -233,7 +233,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self._apply_changes()
         self._publish_state()
         if self._stale and not was_stale:
-            self.get_logger().error('the torque is too old and not applied any more')
+            self.get_logger().error('the torque is too old and is no longer applied')
             self._report()
 
     def _is_over(self) -> bool:

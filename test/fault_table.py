@@ -47,7 +47,7 @@ class Outcome(NamedTuple):
     last: np.ndarray  # commanded before it
     error: float  # largest |xi1| / k_c since, where tracking went on
     recovered: bool
-    rejected: int  # commands that the plant passed over
+    rejected: int  # commands that the plant ignored
 
 
 def run(fault: Fault, rig: Rig | None = None) -> Outcome:
@@ -349,7 +349,7 @@ FAULTS = (
     Fault('position of joint2 is infinite', spoil('q', 1, INF), R.NOT_FINITE),
     Fault('velocity of joint1 is NaN', spoil('dq', 0, NAN), R.NOT_FINITE),
     Fault('velocity of joint2 is minus infinity', spoil('dq', 1, -INF), R.NOT_FINITE),
-    Fault('effort is NaN, and nobody asks for it', spoil('effort', 0, NAN), R.NONE),
+    Fault('effort is NaN, and is not used', spoil('effort', 0, NAN), R.NONE),
     Fault(
         'effort is NaN, and is learned from',
         spoil('effort', 0, NAN),
@@ -480,7 +480,7 @@ def rows() -> Iterator[str]:
     for fault in FAULTS:
         outcome = run(fault)
         stopped = outcome.noticed >= 0
-        noticed = f'{outcome.noticed}' if stopped else 'passed over'
+        noticed = f'{outcome.noticed}' if stopped else 'tolerated'
         largest = f'{np.abs(outcome.after).max():.3g}'
         recovered = 'yes' if outcome.recovered else 'NO'
         yield f'| {fault.name} | {noticed} | {outcome.reason} | {largest} | {recovered} |\n'
@@ -492,11 +492,11 @@ PREFACE = """\
 What the controller does when something breaks: each row is run by
 `test/test_supervision_faults.py`, in a loop of 1 kHz with the recommended settings,
 and this page is made by `python test/fault_table.py
-doc/faults.md`. *Noticed* counts the samples from the fault to the safe stop; a fault that is passed
-over does no harm, and tracking goes on within the bound. *Torque* is the largest commanded from
+doc/faults.md`. *Detected* counts the samples from the fault to the safe stop; a fault that is
+tolerated does no harm: tracking continues within the bound. *Torque* is the largest commanded from
 then on. A stop lasts until `~/reset`, after which the loop runs again.
 
-| fault | noticed after | reason | torque [N m] | runs after reset |
+| fault | detected after | reason | torque [N m] | runs after reset |
 | --- | --- | --- | --- | --- |
 """
 

@@ -80,6 +80,6 @@ def test_other_names_give_no_error_but_the_reason(tmp_path):
     assert learning['true'] is None
     assert list(learning['final_estimate']) == ['mass 1', 'mass 2', 'm2*l1*l2']
     table = format_table(summarize(run))
-    assert 'parameters  no error: those of the model are mass 1, mass 2, m2*l1*l2, ' in table
-    assert 'those of the plant (m1+m2)*l1^2, m2*l2^2, m2*l1*l2' in table
+    assert 'parameters  not comparable: the model has mass 1, mass 2, m2*l1*l2, ' in table
+    assert 'the plant (m1+m2)*l1^2, m2*l2^2, m2*l1*l2' in table
     draw(run, tmp_path)

@@ -63,7 +63,7 @@ def test_events_are_violations_saturation_and_the_latch(folder):
     events = {(event.kind, round(event.time, 3)): event.text for event in bag.events}
     assert events == {
         ('violation', 1.234): 'shoulder outside of its bound for 1 samples',
-        ('learning', 1.5): 'the first window was excited enough: learning began',
+        ('learning', 1.5): 'first excited window: learning began',
         ('saturation', 2.0): 'elbow at its torque limit for 10 samples',
     }
 

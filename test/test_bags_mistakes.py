@@ -153,7 +153,7 @@ def test_an_empty_bag(rewritten, all_say, tmp_path, capsys):
     path = rewritten([])
     all_say(path, f'{path} is empty: it holds no message')
     assert main(['recover', str(path), '--out', str(tmp_path / 'clean')]) == 0
-    assert 'nothing was lost' in capsys.readouterr().out
+    assert 'none of the recorded messages was lost' in capsys.readouterr().out
 
 
 def test_a_bag_whose_metadata_promises_what_is_not_there(copy, entries, all_say, tmp_path):
@@ -202,8 +202,8 @@ def test_joint_states_that_name_no_joint(readers, tmp_path, capsys):
 @pytest.mark.parametrize(
     ('here', 'there', 'words'),
     [
-        ('version: 9', 'version: 99', 'its format is version 99 of rosbag2, and up to 9 is known'),
-        ('identifier: mcap', 'identifier: tape', "its storage is 'tape', and only mcap and sqlite"),
+        ('version: 9', 'version: 99', 'its rosbag2 version is 99, but only versions up to 9 are'),
+        ('identifier: mcap', 'identifier: tape', "its storage is 'tape', but only mcap and sqlit"),
         ('rosbag2_bagfile_information', 'other', 'its metadata.yaml does not describe a bag'),
     ],
 )
@@ -211,9 +211,9 @@ def test_a_bag_of_another_format(copy, all_say, here, there, words, tmp_path, ca
     text = (copy / METADATA).read_text()
     assert here in text
     (copy / METADATA).write_text(text.replace(here, there))
-    all_say(copy, words, f'to save what is whole: bag_recover {copy}')
+    all_say(copy, words, f'to save the undamaged part: bag_recover {copy}')
     assert main(['recover', str(copy), '--out', str(tmp_path / 'clean')]) == 0
-    assert 'nothing was lost' in capsys.readouterr().out
+    assert 'none of the recorded messages was lost' in capsys.readouterr().out
 
 
 def test_a_configuration_that_is_damaged(entries, readers, tmp_path, capsys):

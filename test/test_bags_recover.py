@@ -183,7 +183,7 @@ def test_a_whole_bag_has_lost_nothing(whole, tmp_path, capsys):
     assert recovery.is_whole
     assert read(recovery.path) == read(whole.parent)
     assert main(['recover', str(whole.parent), '--out', str(tmp_path / 'again')]) == 0
-    assert 'nothing was lost' in capsys.readouterr().out
+    assert 'none of the recorded messages was lost' in capsys.readouterr().out
 
 
 def test_lost_messages_are_recorded_in_the_clean_bag_too(tmp_path, capsys):
@@ -233,6 +233,6 @@ def test_the_command_tells_what_was_lost_in_words(plain, tmp_path, capsys):
     folder = damaged(tmp_path / 'bag', plain.read_bytes()[: chunks(plain.read_bytes())[-1][0]])
     assert main(['recover', str(folder)]) == 0
     said = capsys.readouterr().out
-    assert 'bag_0.mcap: the recording was not ended; it ends at 1734000000.024000001 s' in said
+    assert 'bag_0.mcap: the recording was not closed; it ends at 1734000000.024000001 s' in said
     assert 'missing' not in said
     assert f'wrote {tmp_path / "bag_recovered"}' in said

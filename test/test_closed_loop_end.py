@@ -50,7 +50,7 @@ def test_a_node_that_is_killed_ends_the_others_and_is_named(running):
     code, _, errors = running.end()
     assert code == 1
     assert 'blf_dsc run: blf_dsc_controller was ended by SIGKILL' in errors
-    assert f'what was recorded until then is in {running.out / "bag"}' in errors
+    assert f'the recording up to then is in {running.out / "bag"}' in errors
     assert 'Traceback' not in errors
     running.wait_for_children()
     assert whole(running.out / 'bag') > 100
@@ -80,10 +80,10 @@ def test_a_full_disk_ends_the_recording_and_not_the_loop(tmp_path, mode, duratio
         recorded = closed_loop(*run, disk / 'out')
         assert recorded.returncode == 1
         said = recorded.stderr
-        assert 'bag_recorder has ended: the loop goes on and is not recorded' in said
-        assert 'bag_recorder ended with exit code 1 while the loop went on without it' in said
+        assert 'bag_recorder has ended: the loop continues unrecorded' in said
+        assert 'bag_recorder ended with exit code 1 while the loop continued without it' in said
         assert said.count('the disk is full') == 1
-        assert f'what was recorded until then is in {disk / "out" / "bag"}' in said
+        assert f'the recording up to then is in {disk / "out" / "bag"}' in said
         assert 'Traceback' not in said
         assert at_the_end(said).startswith(f'closed loop {duration}.0/{duration} s, ')
         bag = disk / 'out' / 'bag'

@@ -86,7 +86,11 @@ def test_preset_is_a_study_of_ten_thousand_runs():
         ('uniform(0.3, 0.7)', 'normal(0.3, -0.1)', r'a deviation cannot be below 0'),
         ('loguniform(1.0e-6', 'loguniform(0.0', r'loguniform distribution begins above 0'),
         # Four deviations below the mean there would be no mass.
-        ('uniform(0.3, 0.7)', 'normal(0.4, 0.1)', r'can give what is not allowed: got .*above 0'),
+        (
+            'uniform(0.3, 0.7)',
+            'normal(0.4, 0.1)',
+            r'can give values that are not allowed: got .*above 0',
+        ),
         ('uniform(-0.9, 0.9)', 'uniform(-1.0, 0.9)', r'initial.error: .* above -1 and below 1'),
         ('integers(0, 3)', 'uniform(0.0, 3.0)', r'delay: got .*: integers\(low, high\), choice'),
         ('integers(0, 3)', 'integers(0.5, 3)', r'delay: .* an integer is expected between'),
@@ -99,7 +103,7 @@ def test_preset_is_a_study_of_ten_thousand_runs():
         ('runs: 24', 'runs: 0', r'line 11: runs: got 0, but it must be at least 1'),
         ('runs: 24', 'rums: 24', r'line 11: rums: .* did you mean runs\?'),
         ('[0.1, 0.25]', '[0.1, 0.4]', r'moments: got 0.4 s at entry 2, but a run ends at 0.3 s'),
-        ('[0.1, 0.25]', '[0.1, 0.1]', r'moments: 0.1 s is there more than once'),
+        ('[0.1, 0.25]', '[0.1, 0.1]', r'moments: 0.1 s is repeated'),
         ('after: 0.2', 'after: 0.3', r'settled_after: got 0.3 s, but a run ends at 0.3 s'),
         ('duration: 0.3', 'duration: 0.0', r'sim_plant.duration: got 0 s, but every run must end'),
         ('duration: 0.3', 'duraton: 0.3', r'line 3: duraton: .* did you mean duration\?'),

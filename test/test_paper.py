@@ -155,7 +155,7 @@ def test_verdicts_follow_from_the_runs_of_the_report(report):
     by_words = {row['says']: row['verdict'] for row in rows(report / 'claims.csv')}
     assert len(by_words) >= 11
     assert by_words['The reference does not fully excite the system.'] == FAILS
-    assert by_words['With everything known V falls for ever.'] == ONLY_IF
+    assert by_words['With everything known V decreases for all time.'] == ONLY_IF
     assert by_words['It is superior in tracking and in estimation.'] == ONLY_IF
     assert by_words['The proposed controller always stays within the boundaries.'] == HOLDS
     for row in rows(report / 'claims.csv'):

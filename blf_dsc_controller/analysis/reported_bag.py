@@ -97,9 +97,9 @@ def _read(path: Path, name: str, namespace: str) -> ReportedBag:
 def _events(run: Run) -> Iterator[Event]:
     latched, violated = latch_time(run), outside(run)
     if latched is not None:
-        yield Event(latched, 'learning', 'the first window was excited enough: learning began')
+        yield Event(latched, 'learning', 'first excited window: learning began')
     for t in change_times(run):
-        yield Event(t, 'learning', 'the arm has changed: learning started anew')
+        yield Event(t, 'learning', 'the arm has changed: learning restarted')
     for column, reason in run.rejected.items():
         text = reason or f'{column} is not estimated: its column was rejected'
         yield Event(run.duration, 'learning', text)
@@ -122,7 +122,7 @@ def _spells(run: Run, holds: np.ndarray, kind: str, what: str) -> Iterator[Event
         if begins.size > _MOST_OF_A_KIND:
             more = begins.size - _MOST_OF_A_KIND
             at = float(run.time[begins[_MOST_OF_A_KIND]])
-            yield Event(at, kind, f'{joint}: {more} more spells, which are left out here')
+            yield Event(at, kind, f'{joint}: {more} more intervals, not listed')
 
 
 def _diagnosed(path: Path, run: Run) -> Iterator[Event]:

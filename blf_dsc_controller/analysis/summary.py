@@ -174,13 +174,13 @@ def _learning_lines(learning: Summary) -> Iterator[str]:
     yield f'learning    {begun if learning["used"] else "not used by this law"}'
     if learning['model_changes_s']:
         times = ', '.join(f'{t:.3f} s' for t in learning['model_changes_s'])
-        yield f'arm         changed at {times}: learning started anew'
+        yield f'arm         changed at {times}: learning restarted'
     for column, reason in learning['rejected_columns'].items():
         yield f'rejected    {reason or f"{column}: see the log for the reason"}'
     unlike = learning['true_parameters_of_other_names']
     if unlike:
         names, true = ', '.join(learning['final_estimate']), ', '.join(unlike)
-        yield f'parameters  no error: those of the model are {names}, those of the plant {true}'
+        yield f'parameters  not comparable: the model has {names}, the plant {true}'
     if learning['final_relative_error'] is None:
         return
     moments = [f'{moment} s {_percent(e)}' for moment, e in learning['relative_error_at_s'].items()]

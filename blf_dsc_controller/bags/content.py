@@ -43,7 +43,7 @@ class UnreadableMessageError(BagError):
         reason = str(error)
         if isinstance(error, MissingJointError):
             reason = (
-                f'{error.fact}: the bag is of another robot, or has other names for its joints, '
+                f'{error.fact}: the bag is from another robot, or its joints have other names, '
                 f'as in bag_replay --config FILE --map {error.joint}=ITS_NAME'
             )
         super().__init__(f'message {index + 1} of {topic} cannot be read: {reason}')
@@ -169,7 +169,7 @@ def _find(topic: Topic, held: list[tuple[str, str]], namespace: str, names: Name
         if len(fitting) > 1:
             raise BagError(
                 f'the bag has {len(fitting)} topics that could be {topic.relative!r}: '
-                f'{", ".join(fitting)}; name the namespace of the one robot to look at'
+                f'{", ".join(fitting)}; select the robot by its namespace'
             )
         if fitting:
             return fitting[0]
@@ -238,7 +238,7 @@ def joint_names(messages: TopicMessages) -> tuple[str, ...]:
     """Names in the first of some joint states; UnreadableMessageError if there are none."""
     names = next(_decoded(messages, joint_state_layout)).names
     if not names:
-        unnamed = MessageError('it names no joint, so its values cannot be told apart')
+        unnamed = MessageError('it names no joint, so its values cannot be assigned to joints')
         raise UnreadableMessageError(messages.name, 0, unnamed)
     return names
 

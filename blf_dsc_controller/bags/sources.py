@@ -93,13 +93,13 @@ def _reason(path: Path, error: Exception) -> str:
         is_mcap = any(path.glob('*.mcap'))
         if not metadata.exists():
             if not is_mcap:
-                return 'the folder has no metadata.yaml: it is no bag'
+                return 'the folder has no metadata.yaml: it is not a bag'
             return (
-                'the folder has no metadata.yaml; was the recording ended before it was complete? '
-                f'Make a clean bag of it: bag_recover {path}'
+                'the folder has no metadata.yaml; was the recording interrupted? '
+                f'Recover it: bag_recover {path}'
             )
         text = _other_format(metadata) or text
-    return f'{text}; to save what is whole: bag_recover {path}' if is_mcap else text
+    return f'{text}; to save the undamaged part: bag_recover {path}' if is_mcap else text
 
 
 def _other_format(metadata: Path) -> str:
@@ -110,7 +110,7 @@ def _other_format(metadata: Path) -> str:
     except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError):
         return 'its metadata.yaml does not describe a bag'
     if isinstance(version, int) and version > _NEWEST:
-        return f'its format is version {version} of rosbag2, and up to {_NEWEST} is known here'
+        return f'its rosbag2 version is {version}, but only versions up to {_NEWEST} are supported'
     if storage not in _STORAGES:
-        return f'its storage is {storage!r}, and only {" and ".join(_STORAGES)} are known here'
+        return f'its storage is {storage!r}, but only {" and ".join(_STORAGES)} are supported'
     return ''

@@ -60,11 +60,11 @@ def _losses(recovery: recovering.Recovery) -> Iterator[str]:
             else f'it ends at {recovering.format_time(last)}'
         )
         yield (
-            f'{name}: the recording was not ended; {after}. What came later is not in the file: '
+            f'{name}: the recording was not closed; {after}. What came later is not in the file: '
             'at most 0.1 s if the recorder was killed'
         )
     if recovery.unknown:
         yield f'LOST {recovery.unknown} messages of topics whose name or type is unknown'
     if recovery.is_whole:
-        yield 'nothing was lost of what had been recorded'
+        yield 'none of the recorded messages was lost'
     yield f'wrote {recovery.path}'

@@ -113,9 +113,9 @@ def _parser() -> argparse.ArgumentParser:
         command(
             'run',
             'run',
-            'run the closed loop and draw what it did',
-            'Run the simulated arm, the controller and the recorder over ROS 2, and draw what '
-            'they did: a bag, pictures and summary.json in a new folder.',
+            'run the closed loop and plot the results',
+            'Run the simulated arm, the controller and the recorder over ROS 2, and leave a '
+            'bag, pictures and summary.json in a new folder.',
             '--config noisy --duration 30 --mode realtime --out first',
         )
     )
@@ -215,7 +215,7 @@ def _run_options(parser: argparse.ArgumentParser) -> None:
     option('--mode', choices=('realtime', 'lockstep'), help='of the plant (as configured)')
     option('--seed', type=int, help='of the sensor noise (as configured)')
     option('--offline', action='store_true', help='without ROS: no processes, no topics')
-    option('--domain', type=int, help='ROS domain (one that is free)')
+    option('--domain', type=int, help='ROS domain (a free one)')
     option('--out', type=Path, help='new folder (closed_loop, closed_loop-2, ...)')
 
 
@@ -259,10 +259,13 @@ def _excite_options(parser: argparse.ArgumentParser) -> None:
         help='parameters P for computing the torque (learning.initial_estimate)',
     )
     option(
-        '--torque-fraction', type=float, default=0.8, help='of the torque limit to stay below (0.8)'
+        '--torque-fraction',
+        type=float,
+        default=0.8,
+        help='fraction of the torque limit to stay below (0.8)',
     )
     option('--harmonics', type=int, default=2, help='of the window (2)')
-    option('--starts', type=int, default=8, help='searches, of which the best counts (8)')
+    option('--starts', type=int, default=8, help='number of searches; the best result is kept (8)')
     option('--seed', type=int, default=0, help='of the starts (0)')
 
 
@@ -275,9 +278,9 @@ def _monte_carlo_options(parser: argparse.ArgumentParser) -> None:
         '--engine',
         choices=('processes', 'threads', 'dask', 'mpi'),
         default='processes',
-        help='what computes the runs (processes)',
+        help='engine that computes the runs (processes)',
     )
-    option('--workers', type=_positive, help='number of workers (the cores there are)')
+    option('--workers', type=_positive, help='number of workers (one per core)')
     option('--address', default='', help='scheduler of a dask cluster (a local one)')
     option('--chunk', type=_positive, help='runs handed to a worker at a time')
     option('--report', type=Path, metavar='DIR', help='only report the study in this folder')

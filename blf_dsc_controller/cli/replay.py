@@ -111,12 +111,14 @@ def _verification(result: Verification) -> Iterator[str]:
         return
     commands = [one for one in result.comparisons if one.topic.endswith(COMMANDS.leaf)]
     is_whole = not any(one.left_out for one in commands)
-    compared = 'all outputs' if is_whole else 'what could be compared, which is not all'
+    compared = (
+        'all outputs' if is_whole else 'everything that could be compared, but not all outputs'
+    )
     yield f'bit-equal: {compared}'
 
 
 def _open_loop(found: WhatIf, config: ControllerConfig) -> Iterator[str]:
-    yield 'OPEN LOOP: the arm moved under the recorded torques and does not feel these'
+    yield 'OPEN LOOP: the arm moved under the recorded torques, not under these'
     yield f'recorded torque: {found.source}'
     for i, joint in enumerate(config.joints):
         known = found.difference[np.isfinite(found.difference[:, i]), i]

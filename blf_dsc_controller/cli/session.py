@@ -61,9 +61,9 @@ def run_session(config: LoopConfig, out: Path, domain: int | None) -> bool:
             return _run_nodes(config, out / 'config.yaml', logs)
         except NodeFailedError:
             if shutil.disk_usage(out).free < _ROOM:
-                print(f'there is no room left on the disk of {out}', file=sys.stderr)
+                print(f'no space left on the disk of {out}', file=sys.stderr)
             if (out / 'bag' / 'metadata.yaml').exists():
-                print(f'what was recorded until then is in {out / "bag"}', file=sys.stderr)
+                print(f'the recording up to then is in {out / "bag"}', file=sys.stderr)
             raise
 
 
@@ -79,7 +79,7 @@ def own_domain() -> Iterator[int]:
                 continue
             yield domain
             return
-    raise BlfDscError(f'{len(_DOMAINS)} runs are going on at once: name a ROS domain by --domain')
+    raise BlfDscError(f'{len(_DOMAINS)} runs are active: choose a ROS domain with --domain')
 
 
 class NodeFailedError(BlfDscError):
@@ -239,12 +239,12 @@ def _monitor(config: LoopConfig, nodes: list[NodeProcess], interrupts: list[int]
                 if monitor.has_begun and not warned:
                     warned = True
                     monitor.progress.write(
-                        f'{recorder.name} has ended: the loop goes on and is not recorded'
+                        f'{recorder.name} has ended: the loop continues unrecorded'
                     )
                 if not monitor.has_begun and time.monotonic() > ended + _FIRST_SIGN:
                     recorder.check()
             monitor.wait(0.1)
-    return '' if recorder.is_running else ' while the loop went on without it'
+    return '' if recorder.is_running else ' while the loop continued without it'
 
 
 def _die_with_parent() -> None:

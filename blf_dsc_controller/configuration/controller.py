@@ -27,7 +27,7 @@ from blf_dsc_controller.configuration.learning import Learning
 from blf_dsc_controller.configuration.reference import Approach, MotionLimits, Reference
 from blf_dsc_controller.configuration.schema import non_negative, parameter, positive
 
-_size = partial(parameter, read_only='it sizes the state of the law')
+_size = partial(parameter, read_only='it sets the size of the state of the law')
 _WINDOW = 'the data in the excitation window depend on it'
 _TOPICS = 'topics are created once, when the node starts'
 

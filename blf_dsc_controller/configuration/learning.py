@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from blf_dsc_controller.configuration.schema import counted, non_negative, parameter, positive
 
-_size = partial(parameter, read_only='it sizes the memory of the learning')
+_size = partial(parameter, read_only='it sets the memory size of the learning')
 _in_window = partial(parameter, read_only='the data in the excitation window depend on it')
 _at_start = partial(parameter, read_only='it has no effect later')
 

@@ -32,7 +32,10 @@ class RecorderConfig:
     topics: tuple[str, ...] = _of_bag((), 'topics to record; empty: all', may_be_empty=True)
     compression: Literal['none', 'zstd'] = _of_bag('none', 'compression of the chunks of the bag')
     queue_depth: int = _of_bag(
-        100_000, 'messages of a topic that can wait while the disk is busy', 'messages', at_least=1
+        100_000,
+        'messages of a topic that are buffered while the disk is busy',
+        'messages',
+        at_least=1,
     )
     split_size: float = _of_bag(
         0.0, 'size at which the bag continues in a new file; 0: never', 'MB', at_least=0.0
@@ -41,7 +44,10 @@ class RecorderConfig:
         0.0, 'duration at which the bag continues in a new file; 0: never', 's', at_least=0.0
     )
     ring: float = _of_bag(
-        0.0, 'keep only this last time, and write it on ~/trigger; 0: write all', 's', at_least=0.0
+        0.0,
+        'keep only this much time in memory, and write it on ~/trigger; 0: write all',
+        's',
+        at_least=0.0,
     )
 
     def problems(self) -> list[str]:

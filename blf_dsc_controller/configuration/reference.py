@@ -65,7 +65,7 @@ class Approach:
     """Motion to the reference from a start outside the bound; the bound applies along it."""
 
     enabled: bool = parameter(
-        True, 'lead an arm that starts outside the bound to the reference; false: do not start'
+        True, 'guide an arm that starts outside the bound to the reference; false: do not start'
     )
     longest: float = positive(30.0, 'longest duration of the approach', 's')
 

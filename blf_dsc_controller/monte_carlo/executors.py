@@ -140,7 +140,7 @@ def compute(
                 raise BlfDscError(
                     f'{in_a_row} times in a row all workers were lost before any finished a chunk '
                     f'({error}); {len(waiting)} chunks are left. Is there enough memory? Start the '
-                    'same command again to resume: what is done is kept'
+                    'same command again to resume: finished runs are kept'
                 ) from error
             warn(f'a worker was lost: {len(waiting)} chunks are left, and go to new workers')
 

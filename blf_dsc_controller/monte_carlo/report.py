@@ -89,8 +89,8 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
     different = differences({name: results[name][row] for name in here}, here)
     if different:
         raise BlfDscError(
-            f'run {run} is not what it was: was it computed on another kind of machine, or by '
-            f'another version?{different}'
+            f'run {run} differs from the stored one: was it computed on another kind of machine, '
+            f'or by another version?{different}'
         )
     return summary
 

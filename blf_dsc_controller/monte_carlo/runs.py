@@ -32,7 +32,7 @@ OUTCOMES = {
     KEPT: 'inside the bound to the end',
     VIOLATED: 'outside at some sample',
     DIVERGED: 'a number became infinite or NaN',
-    REJECTED: 'measured outside at the start, where the controller does not begin',
+    REJECTED: 'measured outside the bound at the start, where the controller refuses to start',
 }
 """What can become of a run."""
 

@@ -88,8 +88,7 @@ class Store:
                 raise FileNotFoundError
         except (OSError, ValueError):
             raise BlfDscError(
-                f'{folder} exists already, holds no study and is not written into: '
-                'choose another folder'
+                f'{folder} exists already and holds no study: choose another folder'
                 if os.path.lexists(folder)
                 else f'{folder} does not exist: it should be the folder of a study'
             ) from None
@@ -180,7 +179,7 @@ class Store:
             if problem:
                 raise BlfDscError(
                     f'{path} cannot be read ({problem}): remove it and start the study again, '
-                    'which computes these runs anew'
+                    'which computes these runs again'
                 )
         whole = pa.concat_tables(tables).sort_by('run')
         return {name: np.asarray(whole[name].to_numpy()) for name in whole.column_names}

@@ -63,7 +63,7 @@ class MonteCarloConfig:
     def duration_problems(self, duration: float) -> list[str]:
         """Problems with what is measured after the end of a run of this duration [s]."""
         if duration == 0.0:
-            return ['sim_plant.duration: got 0 s, but every run must end: give its time']
+            return ['sim_plant.duration: got 0 s, but every run must end: give its duration']
         problems = [
             f'moments: got {moment:g} s at entry {entry}, but a run ends at {duration:g} s'
             for entry, moment in enumerate(self.moments, 1)
@@ -74,7 +74,7 @@ class MonteCarloConfig:
                 f'settled_after: got {self.settled_after:g} s, but a run ends at {duration:g} s'
             )
         repeated = sorted({moment for moment in self.moments if self.moments.count(moment) > 1})
-        return problems + [f'moments: {moment:g} s is there more than once' for moment in repeated]
+        return problems + [f'moments: {moment:g} s is repeated' for moment in repeated]
 
 
 @dataclass(frozen=True)

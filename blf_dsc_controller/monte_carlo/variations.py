@@ -236,5 +236,5 @@ def _distribution(one: Parameter, text: object) -> Distribution:
     for value in distribution.extremes:
         for problem in scalar.problems(value):
             reason = problem.removeprefix(f'{one.name}: ')
-            raise ValueError(f'{distribution} can give what is not allowed: {reason}')
+            raise ValueError(f'{distribution} can give values that are not allowed: {reason}')
     return distribution

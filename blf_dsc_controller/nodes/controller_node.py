@@ -125,7 +125,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.guard.reset()
         self.failure = None
         self._report()
-        return 'everything learned is forgotten: starting with the next state'
+        return 'estimates cleared: starting with the next state'
 
     # The loop.
 
@@ -169,7 +169,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             foreign = guard.foreign
             torque = guard.reject(error)
             if guard.foreign != foreign:
-                self.get_logger().warning(f'passed over: {error}', throttle_duration_sec=10.0)
+                self.get_logger().warning(f'ignored: {error}', throttle_duration_sec=10.0)
             return torque, 0
         return guard.update(stamp, self._decoder.values), stamp
 
@@ -198,7 +198,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             residual = guard.controller.state.contradiction[0] ** 0.5
             self.get_logger().warning(
                 f'the arm has changed: torques differ by {residual:.3g} N m from those learned; '
-                'learning starts anew'
+                'learning restarts'
             )
         if events[:2] != before[:2]:
             self._status.rejected = rejected_columns(guard.controller, self._estimates)

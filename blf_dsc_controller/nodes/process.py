@@ -81,7 +81,7 @@ def run(make_node: Callable[[], Runnable]) -> int:
         if node.failure is not None:
             raise node.failure
     except UnknownROSArgsError as error:
-        problem = f'arguments after --ros-args that ROS does not know: {error}'
+        problem = f'unknown arguments after --ros-args: {error}'
     except (BlfDscError, RCLError, OSError) as error:
         problem = str(error)
     finally:
@@ -109,7 +109,7 @@ def _close(node: Runnable) -> None:
     try:
         node.close()
     except OSError as error:  # such as a full disk, already reported if it ended the node
-        print(f'{node.get_name()} could not end in order: {error}', file=sys.stderr)  # noqa: T201
+        print(f'{node.get_name()} could not shut down cleanly: {error}', file=sys.stderr)  # noqa: T201
     node.destroy_node()
 
 
@@ -120,7 +120,7 @@ def drain(publishers: Iterable[Publisher]) -> None:
         left = max(0.0, deadline - time.monotonic())
         if not publisher.wait_for_all_acked(Duration(seconds=left)):
             get_logger('end').warning(
-                f'{publisher.topic_name}: the last messages have not reached every subscriber'
+                f'{publisher.topic_name}: the last messages did not reach every subscriber'
             )
 
 

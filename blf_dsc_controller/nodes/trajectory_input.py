@@ -104,7 +104,7 @@ class TrajectoryInput:
             self._adopt(guard, guard.planner(_trajectory(raw, guard.start_stamp))())
             return
         if self._job is not None:
-            self._reject(TrajectoryError(['another one came while it was planned']))
+            self._reject(TrajectoryError(['a newer one arrived while it was being planned']))
         self._submit(guard, raw, _LEAD)
 
     def _submit(self, guard: Guard, raw: bytes, lead: float) -> None:

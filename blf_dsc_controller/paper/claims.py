@@ -138,7 +138,7 @@ def _of_section_3(results: Results) -> Iterator[Claim]:
     lag = _lag(results)
     yield Claim(
         'III-A, (17)',
-        'With everything known V falls for ever.',
+        'With everything known V decreases for all time.',
         f'V falls in {last + 1 - rises} of {last + 1} samples, by a factor of {V[0] / floor:.2g}, '
         f'to the floor that the lag of the surface filter leaves: |xi1| up to {1e6 * lag:.2g} µrad',
         verdict(rises == 0, lag == 0.0),

@@ -67,7 +67,7 @@ def draw_pairs(results: Results, folder: Path) -> Iterator[tuple[Path, str]]:
 def draw_robustness(results: Results, folder: Path) -> list[Path]:
     """Draw the largest error and the parameter error of every sweep; return both paths."""
     tracking, learning = folder / 'robustness_tracking.png', folder / 'robustness_learning.png'
-    title = 'Largest error, in units of the bound: above the red line it was left'
+    title = 'Largest error, in units of the bound: above the red line the bound was left'
     _draw_sweeps(title, results, lambda one: min(one.max_error_ratio, _BROKEN), _ratio, tracking)
     title = 'Parameter error over the last ten of 30 s'
     _draw_sweeps(title, results, lambda one: one.tail_parameter_error, _learning, learning)

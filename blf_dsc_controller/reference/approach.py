@@ -72,7 +72,7 @@ def blend(before: Sequence[Term], target: Term, t0: float, limits: MotionLimits)
     found = worst_violation(pack(n, [target]), check_times(t0, t0 + limits.longest), limits)
     if found is not None:
         raise MotionError(
-            f'the reference goes past the limits of the arm: {found}; ask for less, or raise '
+            f'the reference exceeds the limits of the arm: {found}; ask for less, or raise '
             f'{found.parameters}',
             found,
         )

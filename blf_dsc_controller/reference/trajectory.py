@@ -219,8 +219,8 @@ def _time_problems(trajectory: Trajectory, now: float) -> Iterator[str]:
     begin = trajectory.begin
     if begin is not None and begin + points[-1].time < now:
         yield (
-            f'all of it lies in the past: it ends {now - begin - points[-1].time:.6g} s ago; '
-            'stamp it with the time it is to begin, or with 0 for at once'
+            f'it lies entirely in the past: it ended {now - begin - points[-1].time:.6g} s ago; '
+            'stamp it with its start time, or with 0 to start immediately'
         )
     for joint, velocity in zip(trajectory.joints, points[-1].velocities, strict=False):
         if velocity != 0.0:

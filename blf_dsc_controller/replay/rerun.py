@@ -171,7 +171,7 @@ class Rerun:
             if is_it and (k >= end or stamps[k + 1 : k + 2] != [event.stamp]):
                 return k, False
         if self._numbers:
-            self.end = f'the state of stamp {event.stamp} ns came but is not in the bag'
+            self.end = f'the state with stamp {event.stamp} ns was received but is not in the bag'
         return self._position, False
 
     def _seen(self, k: int) -> int:
@@ -210,13 +210,13 @@ class Rerun:
             torque = guard.reject(self._came.errors[k])
             self._command(guard.journal.stamp, torque, is_exact=is_exact)
         elif self._in_command and stamp > self._lost:
-            self.end = f'the state of stamp {self._lost} ns was used but is not in the bag'
+            self.end = f'the state with stamp {self._lost} ns was used but is not in the bag'
         else:
             is_due = self._in_command and stamp > self._last and stamp in (self._sampled or ())
             torque = guard.update(stamp, self._came.measurement[k])
             if guard.has_sample:
                 if stamp <= self._last:
-                    self.end = f'the stamps begin again with {stamp} ns'
+                    self.end = f'the stamps restart at {stamp} ns'
                     return
                 self._sample(k, stamp)
             self._command(stamp, torque, is_exact=is_exact)

@@ -111,7 +111,7 @@ def _remarks(context: Context, end: str) -> Iterator[str]:
     if end:
         yield f'{end}: the replay ends there'
     for topic, what in context.losses.items():
-        yield f'the recorder did not get all of {topic}: {what}'
+        yield f'the recorder missed messages of {topic}: {what}'
     if context.version != __version__:
         yield (
             f'recorded by version {context.version or "unknown"} and replayed by {__version__}: '

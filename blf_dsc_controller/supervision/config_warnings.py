@@ -122,7 +122,7 @@ def _of_start(config: ControllerConfig, q: Floats | None) -> Iterator[str]:
         if _CLOSE * bound <= abs(error) < bound:
             yield (
                 f'barrier.bound: {joint} starts {error:+.4g} rad from the reference, close to its '
-                f'bound of {bound:g} rad: the first error of the estimate may carry it out'
+                f'bound of {bound:g} rad: the first error of the estimate may push it outside'
             )
 
 
@@ -130,23 +130,23 @@ def _of_torque(config: ControllerConfig, settings: Settings, load: ReferenceLoad
     for joint, need, limit in zip(config.joints, load.torque, config.torque.limit, strict=True):
         if limit < _MARGIN * need:
             yield (
-                f'torque.limit: {joint} is given {limit:g} N m, but by learning.initial_estimate '
-                f'the reference alone needs up to {need:.3g} N m: no bound can be kept with less '
-                f'than that, and a quarter more is wanted for errors and disturbances'
+                f'torque.limit: {joint} has {limit:g} N m, but with learning.initial_estimate the '
+                f'reference alone needs up to {need:.3g} N m: no bound can be kept with less, and '
+                f'a quarter more is recommended for errors and disturbances'
             )
     product = load.rate * config.sample_time
     if product > 1.0:
         yield (
-            f'feedback.gain: K_p over the inertia is {load.rate:.3g} 1/s by '
-            f'learning.initial_estimate, {product:.2g} of a sample time of '
-            f'{config.sample_time:g} s: from 1 on the sampled loop has little left for a delay, '
-            f'and from 2 on it chatters between the limits: lower the gain or the sample time'
+            f'feedback.gain: K_p over the inertia is {load.rate:.3g} 1/s with '
+            f'learning.initial_estimate, {product:.2g} times the inverse of the sample time of '
+            f'{config.sample_time:g} s: above 1 the sampled loop has little margin for delays, and '
+            f'above 2 it chatters between the limits: lower the gain or the sample time'
         )
     fraction = float(np.max(settings.gamma * config.sample_time / np.maximum(settings.Kp, 1e-12)))
     if fraction > 0.5:
         yield (
-            f'disturbance.gain: the disturbance estimate takes up {fraction:.2g} of the velocity '
-            f'feedback in each sample, more than half: it will oscillate against feedback.gain'
+            f'disturbance.gain: in each sample the disturbance estimate absorbs {fraction:.2g} of '
+            f'the velocity feedback, more than half: it will oscillate against feedback.gain'
         )
 
 
@@ -156,21 +156,20 @@ def _of_surface(config: ControllerConfig, settings: Settings) -> Iterator[str]:
     if filtering < T:
         yield (
             f'surface.time_constant: {filtering:g} s is shorter than the sample time of {T:g} s: '
-            f'alpha2 then repeats every error of the measurement, and its derivative goes into '
-            f'the torque'
+            f'alpha2 then follows the measurement noise, and its derivative enters the torque'
         )
     if filtering * rate > 1.0:
         yield (
-            f'surface.gain, surface.mu: K/2 + mu is {rate:.3g} 1/s, of which the filter of '
-            f'{filtering:g} s can follow a quarter of {1.0 / filtering:.3g} without ringing: '
-            f'lower surface.time_constant or the gains'
+            f'surface.gain, surface.mu: K/2 + mu is {rate:.3g} 1/s, but the filter of '
+            f'{filtering:g} s follows only {0.25 / filtering:.3g} 1/s without ringing: lower '
+            f'surface.time_constant or the gains'
         )
     stiff = settings.slope_limit * T / np.maximum(settings.Kp, 1e-12)
     for joint, ratio in zip(config.joints, stiff, strict=True):
         if ratio > 2.0:
             yield (
-                f'barrier.slope_limit: past the knee of its barrier {joint} is pushed back by '
-                f'{ratio:.2g} times its error in a sample, and from 2 on to the other side: lower '
+                f'barrier.slope_limit: past the knee of its barrier {joint} is corrected by '
+                f'{ratio:.2g} times its error in one sample, and above 2 the error grows: lower '
                 f'barrier.slope_limit below 2 feedback.gain / sample_time'
             )
 
@@ -185,14 +184,14 @@ def _of_update(config: ControllerConfig, settings: Settings, windows: Floats) ->
     step = settings.kappa * rate * T
     if step > 1.0:
         yield (
-            f'learning.weight: {what} is {step:.2g}: the estimate oversteps from 1 on and '
-            f'diverges at 2: lower learning.weight, or learning.adaptation_gain and '
+            f'learning.weight: {what} is {step:.2g}: the estimate overshoots above 1 and '
+            f'diverges above 2: lower learning.weight, or learning.adaptation_gain and '
             f'learning.column_gain'
         )
     if settings.eta * float(settings.gamma.max()) * T > 1.0:
         yield (
-            'disturbance.leakage: eta gamma T is above 1: the disturbance estimate is thrown '
-            'about by its own leakage'
+            'disturbance.leakage: eta gamma T is above 1: the leakage makes the disturbance '
+            'estimate oscillate'
         )
 
 
@@ -212,8 +211,8 @@ def _of_window(config: ControllerConfig, settings: Settings, windows: Floats) ->
         yield (
             f'learning.excitation_threshold: the reference excites the parameters and disturbance '
             f'columns together by {together:.2g} at best, below the threshold of '
-            f'{settings.sigma:g}: a column will be rejected, and what it should have found will '
-            f'be taken for parameters'
+            f'{settings.sigma:g}: a column will be rejected, and the disturbance that it '
+            f'describes will be attributed to the parameters'
         )
     if config.reference.type == 'sinusoids':
         for frequency in config.reference.frequency:
@@ -221,13 +220,14 @@ def _of_window(config: ControllerConfig, settings: Settings, windows: Floats) ->
             if frequency > 0.0 and abs(periods - round(periods)) > _PERIODS:
                 yield (
                     f'learning.window: {learning.window:g} s are {periods:.3g} periods of the '
-                    f"reference's {frequency:g} rad/s: only over whole periods does a disturbance "
-                    f'of that period average out'
+                    f"reference's {frequency:g} rad/s: a disturbance of that period "
+                    f'averages out only over whole periods'
                 )
     filtered = settings.prediction == FILTERED
     pole = learning.filter_pole if filtered else learning.derivative_filter
     if learning.settling_time * pole < (_FILTERED if filtered else _SETTLED):
         yield (
             f'learning.settling_time: {learning.settling_time:g} s are too short for the filters '
-            f'of the prediction error ({pole:g} rad/s): the start stays in the first windows'
+            f'of the prediction error ({pole:g} rad/s): the initial transient is still in the '
+            f'first windows'
         )

@@ -145,7 +145,7 @@ class Supervisor:
         if not is_valid_state(q, dq, safety.velocity_limit):
             return self._stop_by_values(safety, q, dq)
         if effort is not None and not np.isfinite(effort).all():
-            return self.stop(Reason.NOT_FINITE, f'the efforts that learning uses are {effort}')
+            return self.stop(Reason.NOT_FINITE, f'the efforts used for learning are {effort}')
         self._last_stamp = stamp
         return verdict
 
@@ -167,7 +167,8 @@ class Supervisor:
     def _check_stamp(self, safety: Safety, stamp: int) -> Verdict:
         if stamp <= 0:
             return self.stop(
-                Reason.STAMP_MISSING, f'a joint state has the stamp {stamp} ns, which is not a time'
+                Reason.STAMP_MISSING,
+                f'a joint state has the stamp {stamp} ns, which is not a valid time',
             )
         if self._last_stamp < 0:
             return Verdict.USE
@@ -254,7 +255,7 @@ class Supervisor:
         if self.saturated_time <= safety.saturation_time:
             return
         text = (
-            f'joint {self._joints[worst]!r} needs {demand[worst]:+.4g} N m and has had '
-            f'only its limit of {limit[worst]:g} N m for {self.saturated_time:.4g} s'
+            f'joint {self._joints[worst]!r} needs {demand[worst]:+.4g} N m and has been at '
+            f'its limit of {limit[worst]:g} N m for {self.saturated_time:.4g} s'
         )
         self.stop(Reason.SATURATED, text)
