@@ -164,3 +164,45 @@ def test_law_looks_once_an_interval_and_not_before_learning_may_start():
     first = np.ceil(settings.learning_start / 7e-3) * 7e-3
     assert t[0] == latch_time[0] == pytest.approx(first)
     np.testing.assert_allclose(np.unique(np.diff(np.unique(latch_time))), 7e-3, rtol=1e-9)
+
+
+def window_of(eigenvalues, vectors, **changes):
+    """Case whose window has these eigenvalues, for orthonormal columns `vectors`."""
+    case = arbitrary(3, sigma=1.0, **changes)
+    state, m = case.state, case.settings.m
+    state.rows[0] = case.settings.window
+    state.running[:] = 0.0
+    state.running[:m, :m] = case.settings.window * (vectors * eigenvalues) @ vectors.T
+    state.active[:] = 1.0
+    return case
+
+
+def basis(first, second):
+    """Orthonormal columns, the first two in the span of these directions."""
+    rest = np.random.default_rng(0).normal(size=(len(first), len(first) - 2))
+    return np.linalg.qr(np.column_stack((first, second, rest)))[0]
+
+
+def test_a_look_improves_the_direction_by_four_iterations():
+    """tan of the angle to the minimum eigenvector falls by lambda_1 / lambda_2 in each."""
+    eye = np.eye(7)
+    vectors = basis(eye[0] + eye[5], eye[1] - eye[2])
+    case = window_of([1.0, 2.0, *[9.0] * 5], vectors, learning_start=1e9)
+    case.state.min_eigenvector[:] = (vectors[:, 0] + vectors[:, 1]) / np.sqrt(2.0)
+    excitation.update_excitation(*case, 0.0, 1e-3)
+    tangent = ((1.0 + case.settings.rho) / (2.0 + case.settings.rho)) ** 4
+    expected = 1.0 + tangent**2 / (1.0 + tangent**2)
+    assert case.state.lambda_min[0] == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize('missing', [1e-4, -1e-4])
+def test_a_column_is_judged_by_the_eigenvalue_however_the_iteration_starts(missing):
+    """The start is next to the wrong eigenvector, whose eigenvalue is only a fifth larger."""
+    p, m = 4, 7
+    ones, columns = np.ones(m), np.eye(m)[p] - np.eye(m)[p + 1]
+    least = 1.0 - missing  # sigma is 1
+    vectors = basis(columns + 0.02 * ones, ones)
+    case = window_of([least, 1.2 * least, *[9.0] * 5], vectors, rho=1e-5)
+    excitation.reject_columns(*case)
+    assert case.state.columns_checked[0] == 1.0
+    assert (case.state.active[p:].sum() < 3.0) == (missing > 0.0)

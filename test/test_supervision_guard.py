@@ -212,6 +212,35 @@ def test_after_a_fault_estimates_are_kept_from_before_it_and_the_window_is_not()
     assert rig.guard.controller.state.rows[0] == 0.0
 
 
+def test_after_a_fault_only_the_estimates_from_before_it_are_kept():
+    """The window may hold what led to the fault: nothing else of the state survives."""
+    rig = Rig({'learning.window': 0.1, 'learning.settling_time': 0.0})
+    rig.step(200)
+    controller = rig.guard.controller
+    estimate, disturbance = controller.state.estimate.copy(), controller.state.disturbance.copy()
+    assert controller.state.rows[0] == 100.0
+    rig.deliver(b'')
+    rig.guard.deactivate()
+    rig.guard.activate()
+    kept = controller.save()
+    controller.reset()
+    controller.state.estimate[:] = estimate
+    controller.state.disturbance[:] = disturbance
+    np.testing.assert_array_equal(kept, controller.state_vector)
+
+
+def test_activated_again_the_surface_filter_starts_where_the_arm_is():
+    """On the law's first sample alpha2 = beta2: not the one of a motion long past."""
+    rig = Rig()
+    rig.step(1500)
+    rig.guard.deactivate()
+    rig.plant.state[3:5] = 0.0
+    rig.guard.activate()
+    assert rig.guard.controller.samples == 0
+    rig.step(1)
+    assert np.abs(rig.guard.controller.sample.xi2).max() < 1e-3  # rad/s; it was at 0.3 rad/s
+
+
 def test_a_reset_forgets():
     rig = Rig()
     rig.step(200)

@@ -164,7 +164,6 @@ class Guard:
         """Leave command: the torque goes to the safe one on its ramp."""
         self._note(EventType.DEACTIVATE)
         was_running = self.supervisor.running
-        self._clean = self._clean and self.supervisor.phase is not Phase.SAFE_STOP
         self.supervisor.enter(Phase.INACTIVE)
         self._silence.restart(self._steady())
         self._resumable = was_running
