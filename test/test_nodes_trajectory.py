@@ -182,7 +182,7 @@ def test_an_unexpected_error_while_planning_rejects_the_trajectory(
     def fail(*_):
         raise MemoryError('no room')
 
-    monkeypatch.setattr('blf_dsc_controller.supervision.guard.plan_trajectory', fail)
+    monkeypatch.setattr('blf_dsc_controller.supervision.planning.plan_trajectory', fail)
     arm, law = ros.loop(None, {'safety__watchdog': watchdog, 'safety__state_timeout': 60.0})
     ros.run(arm, 20)
     sent = trajectory(JOINTS, np.zeros(2), duration=0.1)

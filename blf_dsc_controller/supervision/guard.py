@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from math import inf
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,6 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError, StartError
 from blf_dsc_controller.law.factory import begin, controller_of
-from blf_dsc_controller.law.saturation import RATE_CUT
 from blf_dsc_controller.messages.cdr import (
     DuplicatedJointError,
     MessageError,
@@ -29,40 +29,29 @@ from blf_dsc_controller.messages.cdr import (
     ShortArrayError,
 )
 from blf_dsc_controller.messages.journal import EventType, Journal
-from blf_dsc_controller.reference.approach import Motion, check_takeover
+from blf_dsc_controller.reference.approach import check_takeover
 from blf_dsc_controller.reference.limits import MotionError, limits_of
-from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, plan_trajectory
+from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError
 from blf_dsc_controller.supervision import checks, retuning
-from blf_dsc_controller.supervision.safe_torque import LastState, Ramp, safe_torque
+from blf_dsc_controller.supervision.planning import Plan, plan
+from blf_dsc_controller.supervision.safe_torque import (
+    LastState,
+    Ramp,
+    limit_first_torque,
+    safe_torque,
+)
 from blf_dsc_controller.supervision.supervisor import Phase, Reason, Supervisor, Verdict
 from blf_dsc_controller.supervision.velocity import Velocity
-from blf_dsc_controller.supervision.watchdogs import PERIOD, Silence
+from blf_dsc_controller.supervision.watchdogs import PERIOD, Silence, why_unwatched
 
 Vector = NDArray[np.float64]
 _NANO = 1e-9
-_SAME_CLOCK = 60 * 1_000_000_000  # ns that a live stamp may differ from this computer's time
 
 _REASONS: dict[type[MessageError], Reason] = {
     MissingJointError: Reason.JOINT_MISSING,
     DuplicatedJointError: Reason.JOINT_DUPLICATED,
     ShortArrayError: Reason.FIELD_MISSING,
 }
-
-
-class Plan(NamedTuple):
-    """A planned trajectory."""
-
-    trajectory: Trajectory
-    at: float  # s since the start, from which on it has an effect
-    before: Vector  # packed reference that it continues
-    motion: Motion
-
-
-class LatePlanError(TrajectoryError):
-    """The time from which on a trajectory was to be followed has passed while it was planned."""
-
-    def __init__(self, at: float, now: float) -> None:
-        super().__init__([f'it was to begin at {at:.6g} s and was planned at {now:.6g} s'])
 
 
 class Guard:
@@ -195,31 +184,18 @@ class Guard:
         self._check_in_command()
         before, limits = self.controller.reference_vector, limits_of(self.config)
         start = self.time if at is None else at
-        return lambda: Plan(
-            trajectory, start, before, plan_trajectory(trajectory, before, start, limits)
-        )
+        return partial(plan, trajectory, before, start, limits)
 
-    def adopt(self, plan: Plan) -> None:
+    def adopt(self, planned: Plan) -> None:
         """Follow a planned trajectory.
 
         Raises:
             TrajectoryError: it does not continue the present reference, which goes on.
         """
         self._check_in_command()
-        if plan.before is not self.controller.reference_vector:
-            raise TrajectoryError(
-                ['the reference was replaced while it was planned: send it again']
-            )
-        if plan.at < self.time:
-            raise LatePlanError(plan.at, self.time)
-        trajectory, motion = plan.trajectory, plan.motion
-        self._note(
-            EventType.TRAJECTORY,
-            joints=trajectory.joints,
-            points=[point._asdict() for point in trajectory.points],
-            begin=trajectory.begin,
-            at=plan.at,
-        )
+        planned.check(self.controller.reference_vector, self.time)
+        self._note(EventType.TRAJECTORY, **planned.content)
+        motion = planned.motion
         self.controller.reference_vector = motion.vector
         self.settled = motion.settled
         is_settled = motion.settled <= self.time
@@ -388,16 +364,8 @@ class Guard:
         self.journal.note(EventType.START, resumed=resumed)
         self.last_stamp = stamp - self.config.sample_time_ns
         watchdog = self.config.safety.watchdog
-        behind = self._wall() - stamp
-        is_live = abs(behind) < _SAME_CLOCK
-        self.watching = watchdog == 'on' or (watchdog == 'auto' and is_live)
-        self.unwatched = ''
-        if watchdog == 'auto' and not is_live:
-            where = f'{abs(behind) * _NANO:.4g} s {"behind" if behind > 0 else "ahead of"}'
-            self.unwatched = (
-                f"the stamps of the joint states are {where} this computer's clock: a silence is "
-                'not noticed; for an arm set safety.watchdog to on, for a simulation to off'
-            )
+        self.unwatched = why_unwatched(stamp, self._wall()) if watchdog == 'auto' else ''
+        self.watching = watchdog != 'off' and not self.unwatched
         self.supervisor.enter(Phase.APPROACHING)
         return True
 
@@ -410,7 +378,7 @@ class Guard:
         torque = self.controller.update(t, dt, measurement)
         self.compute_time = perf_counter() - before
         if self.controller.samples == 1 and self.commanding:
-            self._limit_first_torque(torque, dt)
+            limit_first_torque(self.controller, self._torque, dt)
         self.last_stamp = stamp
         if not self._is_valid_sample(dt):
             return self._safe(self.config.sample_time)
@@ -418,18 +386,6 @@ class Guard:
         self.has_sample = True
         self.journal.commands += 1
         return self._torque
-
-    def _limit_first_torque(self, torque: Vector, dt: float) -> None:
-        """Limit the rate from the last torque, which the law does not know in its first sample."""
-        controller = self.controller
-        rate, top = controller.settings.rate_limit, controller.settings.torque_limit
-        step = np.where(rate > 0.0, rate * dt, inf)
-        slowed = np.clip(torque, self._torque - step, self._torque + step)
-        limited = np.clip(slowed, -top, top)
-        cut = limited != torque
-        controller.state.rate_cuts[cut] += 1.0
-        controller.sample.cuts[cut] += RATE_CUT
-        torque[:] = controller.state.torque[:] = limited
 
     def _is_valid_sample(self, dt: float) -> bool:
         controller, safety = self.controller, self.config.safety

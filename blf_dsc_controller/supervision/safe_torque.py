@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The safe torque, what it knows of the arm, and the ramp to it from the last torque of the law."""
+"""The safe torque, what it knows of the arm, the ramp to it from the law, and the way back."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import Safety
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.saturation import RATE_CUT
 from blf_dsc_controller.law.settings import Settings
 
 Vector = NDArray[np.float64]
@@ -100,3 +102,18 @@ class Ramp:
         if self._elapsed >= self._duration:
             return goal
         return self._start + self._elapsed / self._duration * (goal - self._start)
+
+
+def limit_first_torque(controller: Controller, last: Vector, dt: float) -> None:
+    """Limit the rate of the law's first torque, `dt` [s] after the torque `last` (n,) [N m].
+
+    The law does not know that one.
+    """
+    settings, state, sample = controller.settings, controller.state, controller.sample
+    step = np.where(settings.rate_limit > 0.0, settings.rate_limit * dt, inf)
+    slowed = np.clip(sample.torque, last - step, last + step)
+    limited = np.clip(slowed, -settings.torque_limit, settings.torque_limit)
+    cut = limited != sample.torque
+    state.rate_cuts[cut] += 1.0
+    sample.cuts[cut] += RATE_CUT
+    sample.torque[:] = state.torque[:] = limited

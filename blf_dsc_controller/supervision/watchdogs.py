@@ -1,13 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watchdogs over many samples: missed states and silence."""
+"""Watchdogs over many samples: missed states, silence, and whether it can be noticed."""
 
 from __future__ import annotations
 
 PERIOD = 0.008
 """Time [s] between two checks of the steady clock during a silence."""
 
+_SAME_CLOCK = 60.0  # s that a live stamp may differ from this computer's time
 _MARGIN = 0.001  # s past the limit, for a state that is on its way
 _NANO = 1e-9
+
+
+def why_unwatched(stamp: int, wall: int) -> str:
+    """Why the steady clock is no measure of a silence: the stamp [ns] is of no clock like `wall`.
+
+    Empty if it is.
+    """
+    behind = (wall - stamp) * _NANO
+    if abs(behind) < _SAME_CLOCK:
+        return ''
+    where = f'{abs(behind):.4g} s {"behind" if behind > 0.0 else "ahead of"}'
+    return (
+        f"the stamps of the joint states are {where} this computer's clock: a silence is not "
+        'noticed; for an arm set safety.watchdog to on, for a simulation to off'
+    )
 
 
 class Overruns:
