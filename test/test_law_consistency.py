@@ -8,73 +8,52 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from changes import BOUND, CHANGED, OFF, PAYLOADS, PUSHES, WINDOW, payload, push
 from paper_case import NO_DISTURBANCE, configured
 
-from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.analysis.metrics import estimates_of
 from blf_dsc_controller.law import excitation
-from blf_dsc_controller.law.factory import begin, controller_of
-from sim_plant.plant import plant_of
-
-BOUND = 2e-3  # rad
-WINDOW = 2.0 * np.pi  # s
-OFF = {'learning.weight': 0.0}
-CHANGED = 20.0  # s
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.messages.topics import MODEL_CHANGES
+from blf_dsc_controller.simulation.loop import simulate
 
 
-class Run(NamedTuple):
-    """A loop whose plant changed; the first axis is the sample."""
+class Loop(NamedTuple):
+    """A loop whose plant may have changed; the first axis is the sample."""
 
     t: np.ndarray  # s
     xi1: np.ndarray  # (., 2) rad
     error: np.ndarray  # (.,) |P^ - P| / |P|, P of the plant at that time
     torque: np.ndarray  # (., 2) N m
     changes: np.ndarray  # (.,) detected so far
-    controller: object
+    controller: Controller
 
     def largest(self, begin):
         """Largest |xi1| of each joint (2,) from a time on [rad]."""
         return np.abs(self.xi1[self.t >= begin]).max(axis=0)
 
 
-def run(changes, duration, *, preset='recommended', law=None, plant=None):
-    """Run a preset; `changes` are times [s] with the plant parameters that hold from then on."""
+def run(duration, plant=None, *, preset='recommended', law=None):
+    """Run a preset with changed parameters of the plant, events among them, and of the law."""
     config = configured(preset, duration, law, plant)
-    controller, arm = controller_of(config.controller), plant_of(config.plant)
-    start = arm.measure()
-    begin(controller, config.controller, start[:2], start[2:4])
-    due = {round(1e3 * t): parameters for t, parameters in changes}
-    rows = []
-    for k in range(round(1e3 * duration) + 1):
-        if k in due:
-            changed = plant_of(change(config.plant, due[k]))
-            changed.restore(arm.save())
-            arm = changed
-        torque = controller.update((k * 1_000_000) * 1e-9, 1e-3, arm.measure()).copy()
-        P = arm.truth()[:3]
-        error = np.linalg.norm(controller.state.estimate[:3] - P) / np.linalg.norm(P)
-        rows.append((k * 1e-3, controller.sample.xi1.copy(), error, torque))
-        rows[-1] += (controller.state.changes[0],)
-        arm.step(torque)
-    return Run(*map(np.array, zip(*rows, strict=True)), controller)
-
-
-def push(joint, torque):
-    """Parameters of a plant that is pushed by a torque [N m] on a joint."""
-    constant = list(PlantConfig().disturbance.constant)
-    constant[joint] -= torque
-    return {'disturbance.constant': constant}
-
-
-PAYLOADS = [0.25, 0.3, 0.6, 0.65, 0.7, 0.75, 0.8, 1.0]  # kg, of 0.5: each broke the bound before
+    record = simulate(config.controller, config.plant)
+    found = record.run()
+    return Loop(
+        found.time,
+        found.error,
+        estimates_of(found).relative_error,
+        found.torque,
+        found.learning.column(MODEL_CHANGES),
+        record.controller,
+    )
 
 
 @pytest.mark.parametrize('preset', ['recommended', 'noisy'])
 @pytest.mark.parametrize('m2', PAYLOADS)
 def test_bound_holds_when_the_mass_at_the_tip_changes(m2, preset):
-    changes = [(CHANGED, {'arm.m2': m2})]
-    learning = run(changes, CHANGED + 2.0 * WINDOW, preset=preset)
-    without = run(changes, CHANGED + 2.0 * WINDOW, preset=preset, law=OFF)
+    learning = run(CHANGED + 2.0 * WINDOW, payload(m2), preset=preset)
+    without = run(CHANGED + 2.0 * WINDOW, payload(m2), preset=preset, law=OFF)
 
     assert np.all(learning.largest(0.0) < BOUND)
     assert np.all(learning.largest(CHANGED) <= 1.2 * without.largest(CHANGED))
@@ -82,13 +61,11 @@ def test_bound_holds_when_the_mass_at_the_tip_changes(m2, preset):
     assert learning.error[-1] < 0.01
 
 
-@pytest.mark.parametrize(
-    ('joint', 'torque', 'seconds'), [(1, 1.0, 3.0), (1, 2.0, 2.0), (0, 3.0, 3.0)]
-)
+@pytest.mark.parametrize(('joint', 'torque', 'seconds'), PUSHES)
 def test_bound_holds_when_the_arm_is_pushed(joint, torque, seconds):
-    changes = [(CHANGED, push(joint, torque)), (CHANGED + seconds, push(joint, 0.0))]
-    learning = run(changes, CHANGED + seconds + 2.0 * WINDOW)
-    without = run(changes, CHANGED + seconds + 2.0 * WINDOW, law=OFF)
+    pushed = push(joint, torque, seconds)
+    learning = run(CHANGED + seconds + 2.0 * WINDOW, pushed)
+    without = run(CHANGED + seconds + 2.0 * WINDOW, pushed, law=OFF)
 
     assert np.all(learning.largest(0.0) < BOUND)
     assert np.all(learning.largest(CHANGED) <= 1.2 * without.largest(CHANGED))
@@ -96,8 +73,10 @@ def test_bound_holds_when_the_arm_is_pushed(joint, torque, seconds):
 
 
 def test_bound_holds_over_ten_changes_in_a_row():
-    changes = [(10.0 + 5.0 * k, {'arm.m2': (0.75, 0.5)[k % 2]}) for k in range(10)]
-    learning = run(changes, 55.0 + 2.0 * WINDOW)
+    """Five times picked up and put down again after 5 s."""
+    begin = [10.0, 20.0, 30.0, 40.0, 50.0]
+    events = {'events.begin': begin, 'events.duration': [5.0] * 5, 'events.payload': [0.25] * 5}
+    learning = run(55.0 + 2.0 * WINDOW, events)
 
     assert np.all(learning.largest(0.0) < BOUND)
     assert np.all(learning.largest(10.0) < 0.6e-3)  # 0.57, 0.62 mrad without learning
@@ -106,18 +85,18 @@ def test_bound_holds_over_ten_changes_in_a_row():
 
 @pytest.mark.parametrize('preset', ['recommended', 'noisy', 'excitation', 'two_tone'])
 def test_no_change_is_found_where_there_is_none(preset):
-    assert run([], 30.0, preset=preset).changes[-1] == 0.0
+    assert run(30.0, preset=preset).changes[-1] == 0.0
 
 
 def test_without_a_change_nothing_is_different():
     """Bit for bit: the consistency of the windows only decides which of them are latched."""
-    with_detection = run([], 20.0)
-    without = run([], 20.0, law={'learning.change_detection': False})
+    with_detection = run(20.0)
+    without = run(20.0, law={'learning.change_detection': False})
     np.testing.assert_array_equal(with_detection.torque, without.torque)
 
 
 def test_residual_is_that_of_least_squares():
-    controller = run([], 8.0, plant=NO_DISTURBANCE | {'disturbance.viscous': [0.1, 0.1]}).controller
+    controller = run(8.0, NO_DISTURBANCE | {'disturbance.viscous': [0.1, 0.1]}).controller
     settings, state = controller.settings, controller.state
     assert settings.change_detection == 1
     rows = state.ring.reshape(-1, settings.m + 1)
@@ -132,7 +111,7 @@ def test_estimate_does_not_drift_while_the_arm_stands_still_with_noise():
     While the window fills the tracking error adapts; from the first full window on, which is not
     excited, the estimate is held.
     """
-    standing = run([], 60.0, preset='noisy', law={'reference.type': 'hold'})
+    standing = run(60.0, preset='noisy', law={'reference.type': 'hold'})
     assert np.ptp(standing.error[standing.t > WINDOW + 0.1]) == 0.0
     assert np.all(standing.largest(1.0) < 0.5 * BOUND)
 
@@ -148,14 +127,14 @@ def test_column_that_was_rejected_while_standing_still_returns():
         ],
     }
     constant = {'disturbance.constant': [0.3, -0.2], 'disturbance.amplitude': [0.0, 0.0]}
-    moved = run([], 45.0, law=law, plant=constant)
+    moved = run(45.0, constant, law=law)
     assert np.all(moved.controller.state.active == 1.0)
     assert moved.error[-1] < 0.01
 
 
 def test_columns_are_checked_again_after_a_window_that_excites_nothing():
     """Or all columns would be back for ever, and learning never latch again."""
-    controller = run([], 8.0, law={'learning.frequencies': [1.0]}).controller
+    controller = run(8.0, law={'learning.frequencies': [1.0]}).controller
     settings, state, signals = controller.settings, controller.state, controller.signals
     assert state.columns_checked[0] == 1.0
     assert state.active.min() == 0.0
@@ -166,11 +145,11 @@ def test_columns_are_checked_again_after_a_window_that_excites_nothing():
 
 
 def test_a_window_after_a_change_need_not_be_full_and_stays_near_the_estimate_before():
-    learning = run([(CHANGED, {'arm.m2': 0.75})], CHANGED + 5.0)
+    learning = run(CHANGED + 5.0, payload(0.75))
     state = learning.controller.state
     assert state.latched[0] == 1.0
     assert state.rows[0] < learning.controller.settings.window
-    free = run([(CHANGED, {'arm.m2': 0.75})], CHANGED + 5.0, law={'learning.anchor_weight': 0.0})
+    free = run(CHANGED + 5.0, payload(0.75), law={'learning.anchor_weight': 0.0})
     assert np.ptp(learning.controller.state.estimate - state.anchor) < np.ptp(
         free.controller.state.estimate - state.anchor
     )

@@ -29,7 +29,7 @@ ALL_KINDS = {
     'events.viscous': [0.1, 0.2, 0.0, 0.3],
     'events.coulomb': [0.0, 0.2, 0.1, 0.0],
     'events.offset': [1e-4, 0.0, -2e-4, 1e-4],
-    'wall.point': [-1.0, 0.0, 0.1],
+    'wall.point': [-1.0, 0.0, 0.16],
     'wall.stiffness': 300.0,
     'wall.damping': 3.0,
 }
