@@ -66,9 +66,9 @@ test: $(READY) ## Run the tests (TESTS=test/test_x.py for some, WORKERS=0 in one
 	@PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(RUN) -m pytest -p xdist -p _hypothesis_pytestplugin \
 	    -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(TESTS)
 
-test-long: $(READY) ## Kill the recorder ten times within a minute; record a minute in real time
+test-long: $(READY) ## Kill the recorder ten times within a minute; record a minute; change arms
 	@LONG_TESTS=1 $(RUN) -m pytest -rP test/test_bag_recorder_killed.py \
-	    test/test_bag_recorder_beside_loop.py
+	    test/test_bag_recorder_beside_loop.py test/test_changed_arm.py
 
 test-browser: $(READY) ## Open the page of bag_report in a headless Chromium, if there is one
 	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_analysis_report_page.py

@@ -34,3 +34,48 @@ def push(joint, torque, seconds, begin=CHANGED):
         'events.duration': [seconds],
         'events.torque': torques,
     }
+
+
+def several(*events):
+    """Parameters of a plant with all of these events, given by name without `events.`."""
+    names = {name for event in events for name in event}
+    return {
+        f'events.{name}': [
+            value
+            for event in events
+            for value in np.ravel(event.get(name, [0.0, 0.0] if name == 'torque' else 0.0)).tolist()
+        ]
+        for name in sorted(names)
+    }
+
+
+ROWS = {
+    **{f'payload to {m2} kg': payload(m2) for m2 in (0.65, 0.7, 0.75, 0.8, 1.0)},
+    'payload to 0.75 kg at 8 s': payload(0.75, begin=8.0),
+    **{
+        f'release from {m2} kg': several({'begin': 10.0, 'duration': 10.0, 'payload': m2 - 0.5})
+        for m2 in (0.75, 1.0)
+    },
+    **{f'push {row}': push(*row) for row in PUSHES},
+    **{
+        f'payload to 0.75 kg within {ramp} s': payload(0.75) | {'events.ramp': [ramp]}
+        for ramp in (0.5, 2.0)
+    },
+    'five payloads of 5 s': several(
+        *({'begin': 10.0 * k, 'duration': 5.0, 'payload': 0.25} for k in range(1, 6))
+    ),
+    'payload, then pushes': several(
+        {'begin': CHANGED, 'payload': 0.3},
+        {'begin': CHANGED + 5.0, 'duration': 2.0, 'torque': [2.0, 0.0]},
+        {'begin': CHANGED + 9.0, 'duration': 2.0, 'torque': [0.0, -1.0]},
+    ),
+}
+"""By name; two windows are left from the last change to `end_of`."""
+
+
+def end_of(row):
+    """Time of the last change of a row, and two windows more [s], in whole samples."""
+    begin = np.array(row['events.begin'])
+    duration = np.array(row.get('events.duration', 0.0 * begin))
+    ramp = np.array(row.get('events.ramp', 0.0 * begin))
+    return round(float(np.max(begin + duration + ramp)) + 2.0 * WINDOW, 3)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,16 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
 
 from plain_law import dynamics
+from plants import commands
+from plants import run as measurements
 from ros_rig import RosRig
+from test_plant_events import ALL_KINDS
 
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.supervision.supervisor import Phase
+from sim_plant.plant import plant_of
 
 EXAMPLE = Path(__file__).parents[1] / 'examples/mujoco_plant/mujoco_plant.py'
 P = np.array([1.0, 0.32, 0.4])  # (m1+m2) l1^2, m2 l2^2, m2 l1 l2 of arm.xml
@@ -25,7 +32,7 @@ P = np.array([1.0, 0.32, 0.4])  # (m1+m2) l1^2, m2 l2^2, m2 l1 l2 of arm.xml
 @pytest.fixture(scope='module')
 def example():
     spec = importlib.util.spec_from_file_location('mujoco_plant', EXAMPLE)
-    module = importlib.util.module_from_spec(spec)
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
@@ -46,6 +53,41 @@ def test_its_arm_has_the_inertia_and_the_weight_that_the_model_says(example):
         np.testing.assert_allclose(theirs, ours, atol=1e-8)  # the masses have 1e-9 kg m^2
         np.testing.assert_allclose(data.qfrc_bias, weight, atol=1e-8)
     assert example.COMMANDED == ('joint1', 'joint2')
+
+
+@pytest.mark.parametrize(
+    ('kind', 'tolerance'),  # rad, after 0.2 s
+    [
+        ('payload', 1e-5),
+        ('force', 1e-5),
+        ('torque', 1e-5),
+        ('viscous', 1e-5),
+        ('offset', 1e-5),
+        ('wall', 1e-4),  # its force is held over a sample here
+        ('coulomb', 1.3e-3),  # dry friction here, smoothed by tanh there
+    ],
+)
+def test_events_move_it_as_they_move_the_simulated_plant(example, kind, tolerance):
+    names = ('events.begin', 'events.duration', 'events.ramp', f'events.{kind}', f'{kind}.')
+    given = {name: value for name, value in ALL_KINDS.items() if name.startswith(names)}
+    ours, without = (simulated_angles(one) for one in (given, {}))
+    theirs = angles_of(example.MujocoArm(build(example.MujocoConfig, given)))
+    np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=tolerance)
+    assert np.abs(ours - without).max() > 3.0 * tolerance
+
+
+def simulated_angles(given):
+    """Measured angles (200, 2) of the simulated plant under the usual torques."""
+    return measurements(plant_of(build(PlantConfig, given)), commands(200))[:, :2]
+
+
+def angles_of(arm):
+    """Measured angles (200, 2) of the MuJoCo arm under the same torques."""
+    rows = []
+    for torque in commands(200):
+        rows.append(arm.measure()[0])
+        arm.step(torque)
+    return np.array(rows)
 
 
 def test_the_controller_keeps_the_bound_and_learns_the_parameters(example):

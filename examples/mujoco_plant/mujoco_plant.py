@@ -3,7 +3,6 @@
 
 It publishes `joint_states` with the joints in another order than the controller's and a gripper
 among them, and takes a step for each torque on `blf_dsc_controller/commands` (lock-step).
-
 Payloads, pushes, friction, encoder offsets and the wall are parameters, those of `sim_plant`.
 """
 
@@ -35,7 +34,7 @@ REPEAT = 1.0  # s, for a state that nobody has answered
 
 @dataclass(frozen=True)
 class MujocoConfig:
-    """What the arm goes through; it can change while it runs."""
+    """What happens to the arm; it can change while it runs."""
 
     joints: tuple[str, ...] = parameter(COMMANDED, 'names of the joints', read_only='of the model')
     load: Load = field(default_factory=Load)
@@ -43,99 +42,103 @@ class MujocoConfig:
     events: Events = field(default_factory=Events)
 
 
+class MujocoArm:
+    """The arm and what happens to it; all arrays are in the order of `COMMANDED`."""
+
+    def __init__(self, config: MujocoConfig) -> None:
+        self.config = config
+        self.model = mujoco.MjModel.from_xml_path(str(Path(__file__).with_name('arm.xml')))
+        self.data = mujoco.MjData(self.model)
+        self.data.qpos[:] = [START[name] for name in COMMANDED]
+        self._mass = self.model.body('link2').mass[0]
+        self._torque = np.zeros(2)
+
+    def measure(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Measured angles [rad], velocities [rad/s], torques applied last [N m], (2,) each."""
+        return self.data.qpos + self._sum('offset', 2), self.data.qvel.copy(), self._torque
+
+    def step(self, torque: np.ndarray) -> None:
+        """Take a step with this torque (2,) [N m] and what else acts at its start."""
+        load, data = self.config.load, self.data
+        tip = self.model.body('link2')
+        tip.mass[0] = self._mass + load.payload + self._sum('payload', 1)[0]
+        self.model.dof_damping[:] = np.maximum(self._sum('viscous', 2), 0.0)
+        self.model.dof_frictionloss[:] = np.maximum(self._sum('coulomb', 2), 0.0)
+        force = load.force + self._sum('force', 3) + self._wall_force(tip.id)
+        data.body('link2').xfrc_applied[:3] = force
+        disturbance = 0.1 + 0.1 * np.sin(data.time)  # N m, on each joint
+        data.qfrc_applied[:] = load.torque + self._sum('torque', 2) - disturbance
+        data.ctrl[:] = self._torque = torque
+        mujoco.mj_step(self.model, data)
+
+    def _sum(self, name: str, size: int) -> np.ndarray:
+        """Sum (size,) of an effect of the events that are on."""
+        events = self.config.events
+        if not getattr(events, name):
+            return np.zeros(size)
+        begin, none = np.array(events.begin), (0.0,) * len(events.begin)
+        duration, ramp = np.array(events.duration or none), np.array(events.ramp or none)
+        since = self.data.time - begin + 1e-9  # s, past the rounding of the time
+        after = np.where(duration > 0.0, since - duration, -np.inf)
+        ramp = np.maximum(ramp, 1e-12)
+        present = np.clip(since / ramp, 0.0, 1.0) - np.clip(after / ramp, 0.0, 1.0)
+        return np.asarray(present @ np.reshape(getattr(events, name), (begin.size, size)))
+
+    def _wall_force(self, tip: int) -> np.ndarray:
+        """Force (3,) [N] of the wall at the tip, the centre of mass of the last link."""
+        wall = self.config.wall
+        if wall.stiffness == 0.0:
+            return np.zeros(3)
+        mujoco.mj_forward(self.model, self.data)
+        normal = np.array(wall.normal) / np.linalg.norm(wall.normal)
+        velocity = np.zeros(6)  # angular, linear
+        mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_BODY, tip, velocity, 0)
+        depth = normal @ (wall.point - self.data.xipos[tip])
+        force = wall.stiffness * depth - wall.damping * (normal @ velocity[3:])
+        return np.asarray(max(force, 0.0) * normal if depth > 0.0 else np.zeros(3))
+
+
 class MujocoPlant(Node):
-    """Simulated arm.
+    """The arm as a node.
 
     Attributes:
-        data: state of the simulation.
+        arm: the simulated arm.
         steps: taken so far.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__('mujoco_plant', **options)
-        self.model = mujoco.MjModel.from_xml_path(str(Path(__file__).with_name('arm.xml')))
-        self.data = mujoco.MjData(self.model)
-        self.config = parameters.declare(self, MujocoConfig)
+        self.arm = MujocoArm(parameters.declare(self, MujocoConfig))
         parameters.on_change(self, MujocoConfig, self._reconfigure)
-        self._mass = self.model.body('link2').mass[0]
         self.steps = 0
-        for name, angle in START.items():
-            self.data.joint(name).qpos[0] = angle
-        self._torque = dict.fromkeys(COMMANDED, 0.0)
         self._states = self.create_publisher(JointState, 'joint_states', 1)
         self.create_subscription(
             Float64MultiArray, 'blf_dsc_controller/commands', self._on_command, 1
         )
         self._unanswered = self.create_timer(REPEAT, self._publish)
 
+    def _reconfigure(self, config: MujocoConfig) -> None:
+        self.arm.config = config
+
     def _on_command(self, message: Float64MultiArray) -> None:
         torque = np.array(message.data)
         if torque.shape != (len(COMMANDED),) or not np.isfinite(torque).all():
             self.get_logger().error(f'command rejected: {list(message.data)}')
             return
-        push = self._load() - 0.1 - 0.1 * np.sin(self.data.time)  # N m, with the disturbance
-        for name, value, pushed in zip(COMMANDED, torque, push, strict=True):
-            self._torque[name] = float(value)
-            self.data.actuator(name).ctrl[0] = value
-            self.data.joint(name).qfrc_applied[0] = pushed
-        mujoco.mj_step(self.model, self.data)
+        self.arm.step(torque)
         self.steps += 1
         self._unanswered.reset()
         self._publish()
 
-    def _reconfigure(self, config: MujocoConfig) -> None:
-        self.config = config
-
-    def _sum(self, name: str, *shape: int) -> np.ndarray:
-        """Sum over the events that are on of one of their effects, of this shape."""
-        events = self.config.events
-        given = getattr(events, name)
-        if not given:
-            return np.zeros(shape)
-        begin = np.array(events.begin)
-        duration = np.array(events.duration or (0.0,) * begin.size)
-        ramp = np.array(events.ramp or (0.0,) * begin.size)
-        since = self.data.time - begin + 1e-9  # s, a rounded sample time
-        until = np.where(duration > 0.0, since - duration, -np.inf)
-        steps = np.maximum(ramp, 1e-12)
-        fraction = np.clip(since / steps, 0.0, 1.0) - np.clip(until / steps, 0.0, 1.0)
-        return np.tensordot(fraction, np.reshape(given, (begin.size, *shape)), 1)
-
-    def _load(self) -> np.ndarray:
-        """Apply what acts in this step and return the torque (2,) [N m] that pushes the joints."""
-        load, n = self.config.load, len(COMMANDED)
-        tip = self.model.body('link2')
-        tip.mass[0] = self._mass + load.payload + float(self._sum('payload'))
-        friction = zip(COMMANDED, self._sum('viscous', n), self._sum('coulomb', n), strict=True)
-        for name, viscous, coulomb in friction:
-            self.model.joint(name).damping[0] = max(viscous, 0.0)
-            self.model.joint(name).frictionloss[0] = max(coulomb, 0.0)
-        force = np.array(load.force) + self._sum('force', 3)
-        if self.config.wall.stiffness > 0.0:
-            force += self._wall_force(tip.id)
-        self.data.body('link2').xfrc_applied[:3] = force
-        return np.asarray(load.torque + self._sum('torque', n))
-
-    def _wall_force(self, tip: int) -> np.ndarray:
-        """Force (3,) [N] of the wall at the tip, the centre of mass of the last link."""
-        wall = self.config.wall
-        mujoco.mj_forward(self.model, self.data)
-        normal = np.array(wall.normal) / np.linalg.norm(wall.normal)
-        velocity = np.zeros(6)  # angular, linear
-        mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_BODY, tip, velocity, 0)
-        depth = normal @ (np.array(wall.point) - self.data.xipos[tip])
-        force = wall.stiffness * depth - wall.damping * (normal @ velocity[3:])
-        return np.asarray(max(force, 0.0) * normal if depth > 0.0 else np.zeros(3))
-
     def _publish(self) -> None:
-        nanoseconds = round((FIRST_STAMP + self.data.time) * 1e9)
+        nanoseconds = round((FIRST_STAMP + self.arm.data.time) * 1e9)
         message = JointState(name=list(NAMES))
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 10**9)
-        simulated = [name if name in START else None for name in NAMES]
-        offset = dict(zip(COMMANDED, self._sum('offset', len(COMMANDED)), strict=True))
-        message.position = [self.data.joint(n).qpos[0] + offset[n] if n else 0.0 for n in simulated]
-        message.velocity = [self.data.joint(n).qvel[0] if n else 0.0 for n in simulated]
-        message.effort = [self._torque[n] if n else 0.0 for n in simulated]
+        for name, values in zip(
+            ('position', 'velocity', 'effort'), self.arm.measure(), strict=True
+        ):
+            of = dict(zip(COMMANDED, values.tolist(), strict=True))
+            setattr(message, name, [of.get(joint, 0.0) for joint in NAMES])
         self._states.publish(message)
 
 

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arms that change while they are learned, over ROS: the package's plant and the one in MuJoCo.
+
+The bound holds, the largest error is not above 1.2 times that without learning, and two windows
+after the last change the parameters are known again.  `make test-long` runs all rows, the suite
+one of them; `test_law_consistency.py` has them without ROS.
+"""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+
+from changes import BOUND, OFF, ROWS, end_of
+from ros_rig import simulated_torques, torques
+from test_mujoco_plant import example  # noqa: F401 - a fixture
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.simulation.loop import simulate
+from sim_plant.node import PlantNode
+from sim_plant.plant import parameters_of
+
+QUIET = {'telemetry.enabled': False}
+OBSERVED = {'wait_for_subscribers': 1}
+SHOWN = ROWS if os.environ.get('LONG_TESTS') else ['payload to 0.75 kg at 8 s']
+
+
+@pytest.mark.parametrize('name', SHOWN)
+def test_bound_holds_in_lockstep_and_learning_costs_nothing(ros, name):
+    plant = {**ROWS[name], 'duration': end_of(ROWS[name])}
+    commands = ros.listen(topics.COMMANDS)
+    ros.listen(topics.JOINT_STATES, raw=True)
+    ros.listen(topics.TRUTH, raw=True)
+    arm = ros.add(PlantNode, {'mode': 'lockstep', **OBSERVED, **plant})
+    ros.add(ControllerNode, OBSERVED | QUIET)
+    ros.until(lambda: arm.finished and len(commands) > 1e3 * plant['duration'])
+    np.testing.assert_array_equal(torques(commands), simulated_torques(plant))
+
+    learning, without = (offline(plant, law) for law in ({}, OFF))
+    largest = np.abs(learning.error).max(axis=0)
+    assert np.all(largest < BOUND)
+    assert np.all(largest <= 1.2 * np.abs(without.error).max(axis=0))
+    assert_learned(learning.learning.values[-1], plant)
+
+
+@pytest.mark.parametrize('name', SHOWN)
+def test_bound_holds_with_mujoco_and_learning_costs_nothing(ros, example, name):  # noqa: F811
+    without, _ = with_mujoco(ros, example, ROWS[name], OFF)
+    largest, estimate = with_mujoco(ros, example, ROWS[name], {})
+    assert np.all(largest < 1.0)
+    assert np.all(largest <= 1.2 * without)
+    assert_learned(estimate, ROWS[name])
+
+
+def with_mujoco(ros, example, row, law):  # noqa: F811
+    """Largest |xi1| / k_c (2,) of a row with MuJoCo, and the estimate at its end."""
+    controller = ros.add(ControllerNode, QUIET | law)
+    arm = ros.add(example.MujocoPlant, row)
+    steps = round(1e3 * end_of(row))
+    ros.until(lambda: arm.steps >= steps or controller.stopped)
+    assert not controller.stopped
+    ros.kill(arm)
+    ros.kill(controller)
+    return controller.guard.ratio, controller.controller.state.estimate
+
+
+def offline(plant, law):
+    """Run of these parameters without ROS."""
+    return simulate(build(ControllerConfig, law), build(PlantConfig, plant)).run()
+
+
+def assert_learned(estimate, plant):
+    """Whether the parameters at the end of a row are known to 1 %."""
+    P = parameters_of(build(PlantConfig, plant), end_of(plant))
+    assert np.linalg.norm(estimate[:3] - P) < 0.01 * np.linalg.norm(P)
