@@ -104,7 +104,7 @@ def write_ros1(path, messages):
 def test_shuffled_joints_and_two_more_replay_to_the_same_torques(run, tmp_path, storage, torque):
     path = write(tmp_path / 'bag', foreign(run, torque), storage)
     found = what_if(path, CONFIG, names=NameMap.parse(MAP))
-    np.testing.assert_array_equal(found.samples.torque, run[2].samples.torque)
+    np.testing.assert_array_equal(found.run.torque, run[2].run.torque)
     np.testing.assert_array_equal(found.applied, run[2].applied)
 
 
@@ -121,7 +121,7 @@ def test_bags_of_earlier_releases_are_read(run, tmp_path, version):
 def test_a_bag_of_ros_1_is_read(run, tmp_path):
     path = write_ros1(tmp_path / 'run.bag', foreign(run))
     found = what_if(path, CONFIG, names=NameMap.parse(MAP))
-    np.testing.assert_array_equal(found.samples.torque, run[2].samples.torque)
+    np.testing.assert_array_equal(found.run.torque, run[2].run.torque)
 
 
 def test_without_commands_the_effort_is_the_torque(run, tmp_path):

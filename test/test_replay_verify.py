@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 import recorded_run
 
+from blf_dsc_controller.analysis.summary import summarize
 from blf_dsc_controller.bags.content import (
     UnreadableMessageError,
     decode_joint_states,
     read_content,
 )
 from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
@@ -249,17 +251,30 @@ def test_another_configuration_runs_in_open_loop(bag):
     stiffer = replace(config, feedback=replace(config.feedback, gain=(70.0, 20.0)))
     found = what_if(bag, stiffer)
     # By (28) alone, as long as nothing is adapted: at the first sample the gain times xi2.
-    expected = -10.0 * found.samples.xi2[0, 0]
+    recorded = read_content(bag).topics[TRACKING_ERROR]
+    _, errors = decode_joint_states(recorded, config.joints, ('velocity',))
+    expected = -10.0 * errors[0, 1, 0]
     assert found.difference[0, 0] == pytest.approx(expected, rel=1e-9)
     assert found.difference[0, 1] == 0.0
     assert found.error_ratio == pytest.approx(same.error_ratio)
 
 
+def test_a_replay_is_a_run_with_the_figures_of_its_bag(bag):
+    config = recorded_run.loop_config().controller
+    replayed, recorded = what_if(bag, config).run, read_run(bag)
+    for part in ('tracking', 'learning'):
+        mine, theirs = (
+            summarize(one)[part] for one in (replace(replayed, truth=recorded.truth), recorded)
+        )
+        assert mine == theirs
+    assert set(replayed.learning.names) <= set(recorded.learning.names)
+
+
 def test_open_loop_learns_from_the_torques_that_acted(bag):
     config = recorded_run.loop_config().controller
     softer = replace(config, feedback=replace(config.feedback, gain=(6.0, 2.0)))
-    estimate = what_if(bag, softer).samples.estimate
-    own = what_if(bag, config).samples.estimate
+    estimate = what_if(bag, softer).run.learning.values
+    own = what_if(bag, config).run.learning.values
     # The window is of the same arm under the same torques, so both find the same parameters.
     assert estimate[-1, :3] == pytest.approx(own[-1, :3], rel=0.05)
 

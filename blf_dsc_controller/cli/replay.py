@@ -18,7 +18,6 @@ from blf_dsc_controller.configuration.params_file import load, locate
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.messages.topics import COMMANDS
 from blf_dsc_controller.replay.identify import identify
-from blf_dsc_controller.replay.states import States
 from blf_dsc_controller.replay.verify import Verification, verify
 from blf_dsc_controller.replay.what_if import WhatIf, what_if
 
@@ -39,12 +38,14 @@ def replay(options: Namespace) -> int:
         _identify(options, config)
     elif config is None:
         result = verify(options.bag, options.namespace)
-        _print_speed(result.states, perf_counter() - begin)
+        states = result.states
+        _print_speed(states.stamp.size, states.duration, perf_counter() - begin)
         print('\n'.join(_verification(result)))
         return 0 if result.difference is None else DIFFERENT
     else:
         found = what_if(options.bag, config, options.namespace, NameMap.parse(options.map))
-        _print_speed(found.states, perf_counter() - begin)
+        run = found.run
+        _print_speed(run.stamp.size, run.duration, perf_counter() - begin)
         print('\n'.join(_open_loop(found, config)))
     return 0
 
@@ -81,12 +82,8 @@ def _identify(options: Namespace, config: ControllerConfig | None) -> None:
     )
 
 
-def _print_speed(states: States, took: float) -> None:
-    seconds = states.duration
-    print(
-        f'{states.stamp.size} samples, {seconds:.3f} s in {took:.2f} s: '
-        f'{seconds / took:.0f}x real time'
-    )
+def _print_speed(samples: int, seconds: float, took: float) -> None:
+    print(f'{samples} samples, {seconds:.3f} s in {took:.2f} s: {seconds / took:.0f}x real time')
 
 
 def _verification(result: Verification) -> Iterator[str]:
@@ -128,7 +125,7 @@ def _open_loop(found: WhatIf, config: ControllerConfig) -> Iterator[str]:
             if known.size
             else 'cannot be compared: no torque was recorded'
         )
-        at_limit = np.mean(np.abs(found.samples.torque[:, i]) >= config.torque.limit[i])
+        at_limit = np.mean(np.abs(found.run.torque[:, i]) >= config.torque.limit[i])
         yield (
             f'{joint}: torque {difference}; at its limit {100 * at_limit:.3g} % of the time; '
             f'max |xi1| / bound {found.error_ratio[i]:.3g}'

@@ -16,16 +16,12 @@ from blf_dsc_controller.bags.content import (
     decode_joint_states,
 )
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.messages.cdr import joint_state_layout
 from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS
-from blf_dsc_controller.messages.telemetry import disturbance_names
+from blf_dsc_controller.messages.samples import learning_of
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
-    LAMBDA_MIN,
-    LATCHED,
     LEARNING,
-    MODEL_CHANGES,
     MONITOR,
     REFERENCE,
     TRACKING_ERROR,
@@ -72,6 +68,7 @@ def compare(
 def _expected(config: ControllerConfig, run: Rerun) -> dict[Topic, Columns]:
     """Columns of every topic with a stamp over the replayed samples; NaN between two messages."""
     joints, samples = config.joints, run.samples
+    learning = learning_of(config, run.states.stamp, samples)
     errors = {'position': samples.xi1, 'velocity': samples.xi2, 'effort': samples.torque}
     monitor: dict[str, Floats] = {}
     if run.monitored:
@@ -84,13 +81,7 @@ def _expected(config: ControllerConfig, run: Rerun) -> dict[Topic, Columns]:
     return {
         TRACKING_ERROR: _of_joints(joints, errors),
         REFERENCE: _of_joints(joints, {'position': samples.qr, 'velocity': samples.dqr}),
-        LEARNING: {
-            **dict(zip(estimate_names(config), samples.estimate.T, strict=True)),
-            **dict(zip(disturbance_names(joints), samples.disturbance.T, strict=True)),
-            LAMBDA_MIN: samples.lambda_min[:, 0],
-            LATCHED: samples.latched[:, 0],
-            MODEL_CHANGES: samples.changes[:, 0],
-        },
+        LEARNING: dict(zip(learning.names, learning.values.T, strict=True)),
         MONITOR: monitor,
     }
 

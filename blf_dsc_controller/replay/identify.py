@@ -60,13 +60,13 @@ def identify(
         reference=replace(config.reference, type='hold'),
         safety=replace(config.safety, velocity='measured'),
     )
-    run = what_if(path, held, namespace, names)
-    states, rows, active = run.states, run.rows, run.active
+    found = what_if(path, held, namespace, names)
+    run, rows, active = found.run, found.rows, found.active
     settings = settings_of_config(config)
     window, start = settings.window, round(settings.learning_start / config.sample_time)
     if rows.shape[0] < start + 1:
         reason = (
-            f'{path} holds {states.duration:.3g} s, which is too short for a window of '
+            f'{path} holds {run.duration:.3g} s, which is too short for a window of '
             f'{config.learning.window:.3g} s and the settling time of the filters: record longer, '
             'or reduce learning.window'
         )
@@ -81,10 +81,10 @@ def identify(
         deviation=deviation,
         excitation=excitation,
         threshold=config.learning.excitation_threshold,
-        begin=float(states.time[end - window]),
-        end=float(states.time[end - 1]),
+        begin=float(run.time[end - window]),
+        end=float(run.time[end - 1]),
         residual=residual,
-        source=run.source,
+        source=found.source,
     )
 
 

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import estimate_names
-from blf_dsc_controller.law.settings import Settings
-from blf_dsc_controller.law.state import Sample, sample_of
+from blf_dsc_controller.law.state import Sample
 from blf_dsc_controller.messages.journal import Event, EventType
+from blf_dsc_controller.messages.samples import columns_of
 from blf_dsc_controller.messages.telemetry import DECIMATION, Monitor
 from blf_dsc_controller.messages.topics import FOREVER, TRACKING_ERROR
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
@@ -60,12 +60,6 @@ class Commands(NamedTuple):
     of_law: NDArray[np.bool_]  # (M,) torques of the law; the others are safe torques
     exact: NDArray[np.bool_]  # (M,) whether the same states led to it as in the recorded run
     number: NDArray[np.intp]  # (M,) of the recorded command
-
-
-def columns_of(rows: Floats, settings: Settings) -> Sample:
-    """Columns by name of packed samples (N, s): their places are found on a row of indices."""
-    places = sample_of(np.arange(rows.shape[1], dtype=np.float64), settings)
-    return Sample(*(rows[:, part.astype(np.intp)] for part in places))
 
 
 class Rerun:

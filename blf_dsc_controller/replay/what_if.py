@@ -27,13 +27,12 @@ from blf_dsc_controller.bags.content import (
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import begin, controller_of
-from blf_dsc_controller.law.state import Sample
 from blf_dsc_controller.messages.cdr import joint_state_layout
 from blf_dsc_controller.messages.codecs import columns_of as places_of
+from blf_dsc_controller.messages.samples import columns_of, run_of
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE, JOINT_STATES, TRACKING_ERROR
-from blf_dsc_controller.replay.rerun import columns_of
 from blf_dsc_controller.replay.states import States, law_states
-from blf_dsc_controller.run import Floats, Series, Stamps
+from blf_dsc_controller.run import Floats, Run, Series, Stamps
 from blf_dsc_controller.supervision.velocity import Velocity
 
 _NANO = 1e-9
@@ -42,22 +41,17 @@ _NANO = 1e-9
 class WhatIf(NamedTuple):
     """Torques of another configuration beside the applied ones."""
 
-    states: States  # that the law used
-    samples: Sample  # columns of the law's telemetry samples, each (N, its length)
+    run: Run  # over the states that the law used, with its own torques
     rows: Floats  # of the window's regression in each sample, [X | u] (N, n, m + 1)
     active: Floats  # which disturbance columns are estimated at the end (m,)
     applied: Floats  # torque from each state to the next (N, n), N m; NaN where unknown
     source: str  # topic that it comes from
+    error_ratio: Floats  # largest |xi1| / k_c of each joint (n,), against this reference
 
     @property
     def difference(self) -> Floats:
         """Torque of this configuration less the applied one (N, n) [N m]."""
-        return np.asarray(self.samples.torque - self.applied)
-
-    @property
-    def error_ratio(self) -> Floats:
-        """Largest |xi1| / k_c of each joint (n,), against the reference of this configuration."""
-        return np.asarray((np.abs(self.samples.xi1) / self.samples.bound).max(axis=0))
+        return np.asarray(self.run.torque - self.applied)
 
 
 def what_if(
@@ -96,8 +90,10 @@ def what_if(
         samples[k] = controller.sample_vector
         rows[k] = controller.signals.row
         last = stamp
+    run = run_of(config, controller, states.stamp, states.measurement, samples)
     columns = columns_of(samples, controller.settings)
-    return WhatIf(states, columns, rows, controller.state.active.copy(), applied, source)
+    ratio = (np.abs(columns.xi1) / columns.bound).max(axis=0)
+    return WhatIf(run, rows, controller.state.active.copy(), applied, source, ratio)
 
 
 def _applied_torque(

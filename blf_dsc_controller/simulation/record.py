@@ -3,19 +3,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.factory import estimate_names
-from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.law.state import Sample, sample_of
 from blf_dsc_controller.messages.journal import EventType, Journal
+from blf_dsc_controller.messages.samples import run_of
 from blf_dsc_controller.messages.telemetry import disturbance_names
-from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LYAPUNOV_TERMS, MODEL_CHANGES
 from blf_dsc_controller.run import Run, Series, Stop
 from sim_plant.plant import Plant
 
@@ -42,43 +40,16 @@ class Record:
     def run(self) -> Run:
         """All samples as a `Run`, with the truth and, where the law knows it, the terms of (29)."""
         config = self.config
-        settings, names = self.controller.settings, estimate_names(config)
-        columns = sample_of(np.arange(self.samples.shape[1], dtype=np.float64), settings)
-        values = {
-            name: self.samples[:, getattr(columns, name).astype(int)] for name in columns._fields
-        }
-        disturbances = disturbance_names(config.joints)
-        figures = ('estimate', 'disturbance', 'lambda_min', 'latched', 'changes')
-        used = ~np.isnan(values['qr'][:, 0])  # by the law
-        learned = [values[name][used] for name in figures]
-        position, velocity, _ = np.split(self.measurements, 3, axis=1)
-        true = (*PARAMETER_NAMES, *disturbances)
-        monitor = Series(LYAPUNOV_TERMS, self.stamps[used], values['lyapunov'][used])
-        return Run(
-            joints=config.joints,
-            stamp=self.stamps,
-            received=self.stamps,
-            position=position,
-            velocity=velocity,
-            torque=values['torque'],
-            reference=values['qr'],
-            error=values['xi1'],
-            bound=values['bound'],
-            torque_limit=np.broadcast_to(config.torque.limit, position.shape),
-            learning=Series(
-                (*names, *disturbances, LAMBDA_MIN, LATCHED, MODEL_CHANGES),
-                self.stamps[used],
-                np.hstack(learned),
-            ),
+        run = run_of(config, self.controller, self.stamps, self.measurements, self.samples)
+        true = (*PARAMETER_NAMES, *disturbance_names(config.joints))
+        return replace(
+            run,
             truth=Series(true, self.stamps, self.truths[:, : len(true)]),
-            monitor=monitor if settings.truth_known else None,
             stops=tuple(
                 Stop(event.stamp - START, f'{event.content["reason"]}', event.content['text'])
                 for event in self.journal.pending
                 if event.type is EventType.STOP
             ),
-            learns=config.law == 'blf_dsc' and config.learning.weight > 0.0,
-            rejected={one.column: f'{one}' for one in rejected_columns(self.controller, names)},
         )
 
 

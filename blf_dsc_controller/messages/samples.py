@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The samples of a law, a packed row each, by name: as columns, and as a `Run`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.factory import estimate_names
+from blf_dsc_controller.law.rejected_columns import rejected_columns
+from blf_dsc_controller.law.settings import Settings
+from blf_dsc_controller.law.state import Sample, sample_of
+from blf_dsc_controller.messages.telemetry import disturbance_names
+from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LYAPUNOV_TERMS, MODEL_CHANGES
+from blf_dsc_controller.run import Floats, Run, Series, Stamps
+
+
+def columns_of(rows: Floats, settings: Settings) -> Sample:
+    """Columns by name of packed samples (N, s): their places are found on a row of indices."""
+    places = sample_of(np.arange(rows.shape[1], dtype=np.float64), settings)
+    return Sample(*(rows[:, part.astype(np.intp)] for part in places))
+
+
+def learning_of(config: ControllerConfig, stamps: Stamps, samples: Sample) -> Series:
+    """What the law learned, under the names of `~/learning`."""
+    names = (*estimate_names(config), *disturbance_names(config.joints))
+    values = (samples.estimate, samples.disturbance)
+    figures = (samples.lambda_min, samples.latched, samples.changes)
+    return Series(
+        (*names, LAMBDA_MIN, LATCHED, MODEL_CHANGES), stamps, np.hstack((*values, *figures))
+    )
+
+
+def run_of(
+    config: ControllerConfig,
+    controller: Controller,
+    stamps: Stamps,
+    measurements: Floats,
+    rows: Floats,
+) -> Run:
+    """Run of a controller, from its stamps (N,) [ns], measurements (N, 3 n) and samples (N, s).
+
+    Rows of states that the law did not use are NaN but for bound and torque.
+    """
+    samples = columns_of(rows, controller.settings)
+    used = ~np.isnan(samples.qr[:, 0])
+    position, velocity, _ = np.split(measurements, 3, axis=1)
+    monitor = Series(LYAPUNOV_TERMS, stamps[used], samples.lyapunov[used])
+    rejected = rejected_columns(controller, estimate_names(config))
+    return Run(
+        joints=config.joints,
+        stamp=stamps,
+        received=stamps,
+        position=position,
+        velocity=velocity,
+        torque=samples.torque,
+        reference=samples.qr,
+        error=samples.xi1,
+        bound=samples.bound,
+        torque_limit=np.broadcast_to(config.torque.limit, position.shape),
+        learning=learning_of(config, stamps[used], Sample(*(part[used] for part in samples))),
+        monitor=monitor if controller.settings.truth_known else None,
+        learns=config.law == 'blf_dsc' and config.learning.weight > 0.0,
+        rejected={one.column: f'{one}' for one in rejected},
+    )
