@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 import signal
 import sys
@@ -75,6 +76,9 @@ def run(make_node: Callable[[], Runnable]) -> int:
         executor = EventsExecutor()
         node = make_node()
         executor.add_node(node)
+        # What is loaded now stays: looking through it again would hold up the loop for 0.1 s.
+        gc.collect()
+        gc.freeze()
         while not (signals or node.finished):
             spin_once(executor, node)
         executor.remove_node(node)
