@@ -58,4 +58,4 @@ def test_every_message_of_a_loop_in_real_time_is_in_the_bag(tmp_path):
     assert len({len(recorded[topic.resolved]) for topic in answered}) == 1
     # Nor did the last ones get lost, of which no later number would tell.
     for node in (topics.PLANT, topics.CONTROLLER):
-        assert 'not reached every' not in (tmp_path / 'out' / 'logs' / f'{node}.log').read_text()
+        assert 'not reach every' not in (tmp_path / 'out' / 'logs' / f'{node}.log').read_text()

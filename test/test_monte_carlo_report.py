@@ -120,7 +120,7 @@ def test_run_that_is_not_what_it_was_is_reported(store, tmp_path):
     results['max_error_ratio.joint2'] = np.nextafter(results['max_error_ratio.joint2'], 2.0)
     other.keep(Span(0, RUNS), results)
     (tmp_path / 'run').mkdir()
-    with pytest.raises(BlfDscError, match=r'run 4 is not .*\n.*max_error_ratio.joint2'):
+    with pytest.raises(BlfDscError, match=r'run 4 differs .*\n.*max_error_ratio.joint2'):
         reproduce(other, 4, tmp_path / 'run')
 
 

@@ -82,7 +82,7 @@ def test_a_parameter_describes_itself(start):
     assert bound.additional_constraints == 'above 0; as many entries as joints'
     window = node.describe_parameter('learning.window')
     assert window.read_only
-    assert 'fixed at the start: it sizes the memory' in window.additional_constraints
+    assert 'fixed at the start: it sets the memory size' in window.additional_constraints
     (limits,) = node.describe_parameter('sample_time').floating_point_range
     assert (limits.from_value, limits.to_value) == (1e-5, 1.0)
     (limits,) = node.describe_parameter('realtime.priority').integer_range

@@ -194,7 +194,7 @@ BAD = {
     'equal times': (trajectory(times=(1.0, 1.0, 2.0)), 'point 2 is at 1 s, not after'),
     'falling times': (trajectory(times=(1.0, 2.0, 1.5)), 'point 3 is at 1.5 s, not after'),
     'negative time': (trajectory(times=(-1.0, 1.0, 2.0)), 'point 1 is 1 s before the beginning'),
-    'all in the past': (trajectory(begin=-0.5), 'it ends 0.3 s ago'),
+    'all in the past': (trajectory(begin=-0.5), 'it ended 0.3 s ago'),
     'moving at the end': (
         trajectory((GOALS, SPEEDS[::-1])),
         'it ends with shoulder at 0.2 rad/s, but the last point is held',
