@@ -39,7 +39,7 @@ LATE = 40 * MILLISECOND  # from a stamp to its reception
 def stopped(folder, reason=Reason.OUTSIDE_BOUND):
     """Bag of a run whose controller stops at `STOP_S`; its messages are received late."""
     stop = START + round(STOP_S * 1e3) * MILLISECOND
-    text = "joint 'elbow' is +0.0023 rad from its reference: past 1 times its bound of 0.002 rad"
+    text = "joint 'elbow' is +0.0023 rad from its reference: past its bound of 0.002 rad"
     event = Event(2, EventType.STOP, stop, 1, 1, {'reason': reason, 'text': text})
     messages = [
         (topic, stamp + LATE, raw)

@@ -158,4 +158,5 @@ def _draw_mark(axes: Axes, mark: Mark, row: int) -> None:
         va='top',
         fontsize=9.5,
         color=mark.colour,
+        bbox={'facecolor': 'white', 'edgecolor': 'none', 'alpha': 0.8, 'pad': 1.0},
     )

@@ -241,9 +241,10 @@ class Supervisor:
         worst = int(np.argmax(ratio))
         if ratio[worst] < safety.error_ratio:
             return
+        share = '' if safety.error_ratio == 1.0 else f'{safety.error_ratio:g} times '
         text = (
             f'joint {self._joints[worst]!r} is {xi1[worst]:+.6g} rad from its reference: '
-            f'past {safety.error_ratio:g} times its bound of {bound[worst]:.6g} rad'
+            f'past {share}its bound of {bound[worst]:.6g} rad'
         )
         self.stop(Reason.OUTSIDE_BOUND, text)
 
