@@ -54,7 +54,9 @@ def preset() -> Study:
     study = load_study(locate('monte_carlo'))
     plant = replace(study.plant, duration=_DURATION)
     settings = replace(study.settings, settled_after=0.8 * _DURATION, moments=())
-    return replace(study, plant=plant, settings=settings)
+    learning = replace(study.controller.learning, change_detection=False)  # the reference has none
+    controller = replace(study.controller, learning=learning)
+    return replace(study, controller=controller, plant=plant, settings=settings)
 
 
 def disagreement(study: Study) -> float:

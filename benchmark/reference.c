@@ -159,7 +159,7 @@ static void look(const settings *s, loop *x, double t)
 
 static void adapt(const settings *s, loop *x, double H[N][P], const double xi2[N], int saturated)
 {
-    double rate[M] = {0.0}, square = 0.0, outward = 0.0, metric = 0.0;
+    double rate[M] = {0.0}, by_tracking[M], square = 0.0, outward = 0.0, metric = 0.0;
     if (x->latched) {
         for (int i = 0; i < M; i++) {
             rate[i] = x->b[i];
@@ -171,6 +171,7 @@ static void adapt(const settings *s, loop *x, double H[N][P], const double xi2[N
         double tracking = 0.0;
         if (j < P && !saturated)
             for (int i = 0; i < N; i++) tracking += H[i][j] * xi2[i];
+        by_tracking[j] = x->theta[j] - s->T * s->Gamma[j] * tracking;
         rate[j] = s->Gamma[j] * (s->kappa * rate[j] - tracking);
     }
     for (int j = 0; j < P; j++) {
@@ -187,6 +188,9 @@ static void adapt(const settings *s, loop *x, double H[N][P], const double xi2[N
         for (int j = 0; j < P; j++) x->theta[j] *= s->radius / sqrt(square);
     if (!saturated)
         for (int i = 0; i < N; i++) x->d3[i] -= s->T * s->gamma[i] * xi2[i];
+    if (x->latched)
+        for (int i = 0; i < N; i++)
+            for (int j = 0; j < P; j++) x->d3[i] -= H[i][j] * (x->theta[j] - by_tracking[j]);
 }
 
 static void control(const settings *s, loop *x, double t, double xi1[N])

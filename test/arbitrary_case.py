@@ -48,6 +48,7 @@ def arbitrary_settings(random: np.random.Generator, n: int, p: int, **changes) -
         'sigma': 1e-9,
         'learning_start': 0.0,
         'change_detection': 0,
+        'bumpless': 0,
         'radius': 1e3,
     }
     return settings._replace(**arrays | case | changes)

@@ -117,10 +117,12 @@ class PlainLaw:
             if self.newton:
                 eps = np.linalg.solve(Phi + g.rho * np.eye(g.m), eps)
             v += g.kappa * eps
+        tracking = np.zeros(g.m)
         if not saturated:
-            v[:3] -= H.T @ xi2
+            tracking[:3] = -H.T @ xi2
             self.d3 = self.d3 - dt * g.gamma * (xi2 + g.eta * self.d3)
-        v *= g.Gamma
+        v = g.Gamma * (v + tracking)
+        by_tracking = self.theta + dt * g.Gamma * tracking
         w = self.theta[:3].copy()
         if w @ w >= g.radius**2 * (1.0 - 1e-12) and w @ v[:3] > 0.0:
             v[:3] -= g.Gamma[:3] * w * (w @ v[:3]) / (w @ (g.Gamma[:3] * w))
@@ -130,6 +132,8 @@ class PlainLaw:
             # Nearest point of the ball: the multiplier that ends the way out on the sphere.
             out = lambda nu: np.linalg.norm(w / (1.0 + nu * gain)) - g.radius  # noqa: E731
             self.theta[:3] = w / (1.0 + brentq(out, 0.0, 1e9, xtol=1e-18) * gain)
+        if g.bumpless and self.latched is not None:
+            self.d3 = self.d3 - H @ (self.theta - by_tracking)[:3]
 
     def update(self, t, dt, qr, dqr, measurement):
         """Torque (28) for a measurement; `tau`, what went out last, is the caller's to set."""

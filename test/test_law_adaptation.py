@@ -28,7 +28,7 @@ def case(seed, n, p, *, latched=True, update='newton', **changes):
 def tracking_part(settings, signals):
     """-Gamma H^T xi2 on the parameters, nothing on the columns."""
     rate = np.zeros(settings.m)
-    rate[: settings.p] = -signals.H.T @ signals.xi2
+    rate[: settings.p] = -signals.H[:, : settings.p].T @ signals.xi2
     return settings.Gamma * rate
 
 
@@ -82,6 +82,20 @@ def test_at_a_torque_limit_only_the_prediction_error_teaches(n, p):
 
     np.testing.assert_allclose(estimate, expected, rtol=0.0, atol=1e-12)
     np.testing.assert_array_equal(disturbance, d3)
+
+
+@pytest.mark.parametrize('saturated', [False, True])
+def test_learning_leaves_the_torque_as_it_is(saturated):
+    """Only the tracking error changes H theta^ + d^3 (`bumpless`)."""
+    settings, state, signals = random_case = case(5, 3, 4, bumpless=1, eta=0.0)
+    change = signals.H @ tracking_part(settings, signals) - settings.gamma * signals.xi2
+    expected = signals.H @ state.estimate + state.disturbance + DT * change * (not saturated)
+    learned = signals.H @ prediction_part(settings, state)
+
+    estimate, disturbance = estimates_after(*random_case, saturated=saturated)
+
+    assert np.abs(learned).min() > 0.1
+    np.testing.assert_allclose(signals.H @ estimate + disturbance, expected, atol=1e-12)
 
 
 def test_newton_converges_at_one_rate_in_every_direction_and_gradient_does_not():

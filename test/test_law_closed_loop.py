@@ -87,7 +87,7 @@ def lyapunov_function(law, measurement):
 @pytest.mark.parametrize('kappa', [0.0, 100.0], ids=['tracking alone', 'learning too'])
 def test_lyapunov_function_falls_from_sample_to_sample(kappa):
     """(31), (32) without a disturbance; before the latch at 6.8 s both cases are the same."""
-    law = controller(recommended(kappa=kappa, gamma=np.full(2, 1.0), bias=False))
+    law = controller(recommended(kappa=kappa, gamma=np.full(2, 1.0), bias=False, bumpless=0))
     arm = plant(constant=(0.0, 0.0), amplitude=(0.0, 0.0))
     V = np.array([lyapunov_function(law, s.measurement) for s in closed_loop(law, arm, 10.0)])
 

@@ -47,8 +47,9 @@ def derivative(t, y):
     M, C, G = dynamics(TRUE, R, q, dq)
     ddq = np.linalg.solve(M, torque - C @ dq - G - 0.1 - 0.1 * np.sin(t))
     eps = np.linalg.solve(PHI + RHO * np.eye(3), PHI @ (TRUE - estimate))
-    update = GAMMA * (KAPPA * eps - H.T @ xi2)
-    return np.concatenate([dq, ddq, dalpha2, update, -GAMMA3 * xi2])
+    learned = GAMMA * KAPPA * eps
+    update = learned - GAMMA * H.T @ xi2
+    return np.concatenate([dq, ddq, dalpha2, update, -GAMMA3 * xi2 - H @ learned])
 
 
 @cache

@@ -120,8 +120,8 @@ def test_signals_have_the_shapes_they_are_documented_with():
         signals_of(np.zeros(signals_size(settings)), settings),
         {
             (n,): 'qr dqr ddqr xi1 beta2 dalpha2 xi2 demand torque',
-            (n, p): 'H momentum',
-            (n, m): 'rest',
+            (n, p): 'momentum',
+            (n, m): 'H rest',
             (n, m + 1): 'row',
             (m, m): 'Phi factor',
             (m,): 'b rate work',

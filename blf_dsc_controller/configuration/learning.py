@@ -77,6 +77,9 @@ class Learning:
     radius: float = positive(
         3.0, 'radius of the projection ball of the estimate', 'kg m^2', 'omega_a'
     )
+    bumpless: bool = parameter(
+        True, 'let the disturbance estimate yield what the prediction error adds to the torque'
+    )
     change_detection: bool = _size(
         True, 'discard the window when torques contradict it: payload, contact, a changed arm'
     )

@@ -4,10 +4,17 @@
     eps = b_e - Phi_e theta^                                theta^ = [P^; d^], the current one
     theta^' = Proj( -Gamma (H^T xi2 - kappa W eps) )        W = I, or (Phi_e + rho I)^-1 (newton)
 
+    d^3' = -gamma (xi2 + eta d^3) - H (theta^' + Gamma H^T xi2)
+
 (20) prints + kappa eps, which drives P^ to the projection ball as soon as learning starts.
 H^T xi2, with the leakage W_c P^ of the comparison law (35), acts on P^ alone.  With Newton's W
 every excited direction converges at the rate Gamma kappa; the gradient's rates are spread as the
 eigenvalues of Phi_e.
+
+(30) lacks the last term.  As long as the estimate is wrong, d^3 makes up for it; the prediction
+error then corrects the estimate within milliseconds but d^3 follows within seconds, and their sum
+is wrong in between.  With the term (`bumpless`) learning does not change the torque H P^ + d^3,
+and d^3 is left with the disturbance.
 """
 
 from blf_dsc_controller.compiled.jit import inner
@@ -33,6 +40,14 @@ def prediction_error(settings: Settings, state: State, signals: Signals) -> None
 
 
 @inner
+def hand_over(settings: Settings, state: State, signals: Signals) -> None:
+    """Take off d^3 what the estimate differs from `signals.work`, that by the tracking error."""
+    for j in range(settings.m):
+        for i in range(settings.n):
+            state.disturbance[i] -= signals.H[i, j] * (state.estimate[j] - signals.work[j])
+
+
+@inner
 def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturated: bool) -> None:
     """Step theta^ and d^3 by `dt` [s]: (20), (30).
 
@@ -52,6 +67,7 @@ def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturat
             for i in range(settings.n):
                 tracking += signals.H[i, j] * signals.xi2[i]
             tracking += settings.Wc * state.estimate[j]
+        signals.work[j] = state.estimate[j] - dt * settings.Gamma[j] * tracking
         signals.rate[j] = settings.Gamma[j] * (settings.kappa * signals.rate[j] - tracking)
     p = settings.p
     parameters = part(state.estimate, 0, (p,))
@@ -65,3 +81,5 @@ def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturat
             state.disturbance[i] -= (
                 dt * settings.gamma[i] * (signals.xi2[i] + settings.eta * state.disturbance[i])
             )
+    if settings.bumpless == 1 and state.latched[0] == 1.0:
+        hand_over(settings, state, signals)

@@ -11,7 +11,8 @@ and a window is latched only if r^2 is at most four times the least of any full 
 contradict the latched solution (their mean square over 0.1 s is more than eight times r^2) mean
 that the arm has changed: window, filters and latch are dropped, and learning starts anew.  Until
 the new window is full it averages no disturbance out, so its solution is pulled to the estimate
-before the change, weakly excited directions most.
+before the change, weakly excited directions most; likewise a full window whose residual is unusual,
+to the solution a window ago.
 """
 
 import numpy as np
@@ -23,6 +24,8 @@ from blf_dsc_controller.law.state import Signals, State
 
 _GATE = 4.0  # of mean squares: twice the torque
 _ALARM = 8.0  # likewise, more, for a solution extrapolates
+_USUAL = 1.25  # times the least residual, which varies with the motion
+_DOUBT = 3.0  # pull of the anchor for each (N m)^2 above, 1/(kg m^2)^2
 _MEMORY = 0.1  # s, over which the last rows are averaged
 
 
@@ -57,6 +60,7 @@ def forget_window(settings: Settings, state: State) -> None:
     """Empty the window, its filters and the latch; the estimate stays and becomes the anchor."""
     state.latched[0] = 0.0
     state.latched_lambda[0] = 0.0
+    state.best_lambda[0] = 0.0
     state.recent_residual[0] = 0.0
     state.rows[0] = 0.0
     state.cursor[0] = 0.0
@@ -81,8 +85,8 @@ def clear(matrix: np.ndarray) -> None:
 def accept_window(settings: Settings, state: State, signals: Signals) -> bool:
     """Whether the present window is consistent; if so its solution and residual are kept.
 
-    A window that is not full yet is pulled to the anchor: Phi + a I, b + a theta_anchor with a
-    falling to zero, in `signals`.
+    A window that is not full, or whose residual is more than usual, is pulled to the anchor:
+    Phi + a I, b + a theta_anchor, in `signals`.
     """
     m = settings.m
     residual = state.running[m, m] / state.rows[0]
@@ -94,12 +98,14 @@ def accept_window(settings: Settings, state: State, signals: Signals) -> bool:
         residual -= signals.b[j] * solution[j]
     residual = max(residual, 0.0)
     missing = 1.0 - state.rows[0] / settings.window
+    is_first = state.latched[0] == 0.0
     if missing <= 0.0 and (state.least_residual[0] == 0.0 or residual < state.least_residual[0]):
         state.least_residual[0] = residual
     if residual > _GATE * explained(settings, state.least_residual[0]):
         return False
-    if missing > 0.0:
-        pull = settings.anchor_weight * missing
+    doubt = _DOUBT * max(0.0, residual - _USUAL * state.least_residual[0])
+    pull = settings.anchor_weight * missing + doubt
+    if pull > 0.0:
         for j in range(m):
             signals.b[j] += pull * state.anchor[j]
             signals.Phi[j, j] += pull
@@ -109,4 +115,7 @@ def accept_window(settings: Settings, state: State, signals: Signals) -> bool:
     for j in range(m):
         state.solution[j] = solution[j]
     state.residual[0] = residual
+    if missing <= 0.0 and (is_first or state.cursor[0] < settings.interval):
+        for j in range(m):
+            state.anchor[j] = solution[j]
     return True

@@ -91,6 +91,7 @@ class Controller:
         """Return to the initial state: estimates P^(0), filters and window empty."""
         self.state_vector.fill(0.0)
         self.state.estimate[:] = self.settings.initial_estimate
+        self.state.anchor[:] = self.settings.initial_estimate
         self.state.min_eigenvector.fill(self.settings.m**-0.5)
         self.state.active.fill(1.0)
 

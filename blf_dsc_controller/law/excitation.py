@@ -20,6 +20,8 @@ from blf_dsc_controller.law.state import Signals, State
 
 _WARM = 4  # inverse iterations from the previous direction
 _COLD = 60  # from any direction
+_COMPARABLE = 0.95  # of the best lambda_min
+_FORGETTING = 0.1  # of the best lambda_min in the time of a window
 
 
 @inner
@@ -203,6 +205,18 @@ def readmit_columns(settings: Settings, state: State, signals: Signals) -> None:
 
 
 @inner
+def is_preferred(settings: Settings, state: State, value: float) -> bool:
+    """Whether a window of this lambda_min may replace the latched one.
+
+    When the reference stops, `last` (27) would end on the weakest window above the threshold.  A
+    weaker window only has less information, unless the latched one is old or contradicted.
+    """
+    if settings.latch == BEST:
+        return value > state.latched_lambda[0]
+    return settings.change_detection == 0 or value >= _COMPARABLE * state.best_lambda[0]
+
+
+@inner
 def update_excitation(
     settings: Settings, state: State, signals: Signals, t: float, dt: float
 ) -> None:
@@ -221,8 +235,8 @@ def update_excitation(
         readmit_columns(settings, state, signals)
     value = window_excitation(settings, state, signals, _WARM)
     state.lambda_min[0] = value
-    better = settings.latch != BEST or value > state.latched_lambda[0]
-    if not (learning and value >= settings.sigma and better):
+    state.best_lambda[0] *= 1.0 - _FORGETTING * settings.interval / settings.window
+    if not (learning and value >= settings.sigma and is_preferred(settings, state, value)):
         return
     if settings.change_detection == 1 and not consistency.accept_window(settings, state, signals):
         return
@@ -233,4 +247,6 @@ def update_excitation(
             state.factor[i, j] = signals.factor[i, j]
     state.latched[0] = 1.0
     state.latched_lambda[0] = value
+    if state.rows[0] == settings.window:
+        state.best_lambda[0] = max(value, state.best_lambda[0])
     state.latch_time[0] = t

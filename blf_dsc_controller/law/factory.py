@@ -83,6 +83,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         tones=len(learning.frequencies),
         truth_known=int(bool(truth.parameters)),
         feed_forward=int(truth.feed_forward),
+        bumpless=int(learning.bumpless),
         # Lambda is a heuristic: its rows contradict each other on any arm.
         change_detection=int(learning.change_detection and learning.prediction != 'lambda'),
         time_constant=config.surface.time_constant,
@@ -131,6 +132,7 @@ def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
         'd2': nothing,
         'gamma': nothing,
         'kappa': 0.0,
+        'bumpless': 0,
         'change_detection': 0,
     }
     laws: dict[str, dict[str, Any]] = {

@@ -46,6 +46,7 @@ class Settings(NamedTuple):
     tones: int  # sine and cosine columns per joint, for as many frequencies
     truth_known: int  # 1: true_parameters and true_disturbance hold
     feed_forward: int  # 1: the true disturbance is compensated
+    bumpless: int  # 1: d^3 yields what the prediction error adds to the torque
     change_detection: int  # 1: windows must be consistent (see `consistency`)
     time_constant: float  # lambda of (13), s
     boundary_layer: float  # b, rad/s

@@ -22,6 +22,7 @@ class State(NamedTuple):
     latch_time: Cell  # T_e, s
     lambda_min: Cell  # of Phi at the last check
     latched_lambda: Cell  # lambda_min of the latched window
+    best_lambda: Cell  # the largest of a full window since the last change
     columns_checked: Cell  # 1 once the disturbance columns are accepted or rejected
     residual: Cell  # mean square torque residual of the latched window, (N m)^2
     least_residual: Cell  # the lowest of any full window, (N m)^2
@@ -47,7 +48,7 @@ class State(NamedTuple):
     b: Annotated[Array, 'm']  # latched b_e
     factor: Annotated[Array, 'm', 'm']  # Cholesky factor of Phi_e + rho I
     solution: Annotated[Array, 'm']  # of the latched window, (Phi_e + rho I)^-1 b_e
-    anchor: Annotated[Array, 'm']  # theta^ when the arm was found to have changed
+    anchor: Annotated[Array, 'm']  # theta^ that windows of little information are pulled to
     min_eigenvector: Annotated[Array, 'm']  # of Phi, a unit vector
     active: Annotated[Array, 'm']  # 0 where a disturbance column has been rejected
     ring: Annotated[Array, 'window', 'n', 'm + 1']  # the window's rows
@@ -71,7 +72,7 @@ class Signals(NamedTuple):
     bound: Annotated[Array, 'n']  # k(t), rad
     knee: Annotated[Array, 'n']  # knee of the barrier of that bound, rad
     narrowing: Annotated[Array, 'n']  # k'/k, 1/s
-    H: Annotated[Array, 'n', 'p']
+    H: Annotated[Array, 'n', 'm']  # [H | columns that are compensated]
     momentum: Annotated[Array, 'n', 'p']  # Yp
     rest: Annotated[Array, 'n', 'm']  # [Yr | columns]
     row: Annotated[Array, 'n', 'm + 1']  # filtered [X | u]
@@ -79,7 +80,7 @@ class Signals(NamedTuple):
     b: Annotated[Array, 'm']
     factor: Annotated[Array, 'm', 'm']
     rate: Annotated[Array, 'm']  # theta^' [1/s]
-    work: Annotated[Array, 'm']  # scratch of the inverse iteration
+    work: Annotated[Array, 'm']  # scratch
 
 
 class Sample(NamedTuple):
@@ -90,7 +91,7 @@ class Sample(NamedTuple):
     xi1: Annotated[Array, 'n']  # rad
     xi2: Annotated[Array, 'n']  # rad/s
     torque: Annotated[Array, 'n']  # commanded, after the limit, N m
-    disturbance: Annotated[Array, 'n']  # d^3, N m
+    disturbance: Annotated[Array, 'n']  # d^3 and the learned friction, N m
     bound: Annotated[Array, 'n']  # k(t), rad
     cuts: Annotated[Array, 'n']  # 0, or LEVEL_CUT + RATE_CUT as the torque was cut in this sample
     estimate: Annotated[Array, 'm']  # theta^; NaN for a disturbance column that has been rejected

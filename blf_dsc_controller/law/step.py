@@ -78,6 +78,8 @@ def fill_sample(settings: Settings, state: State, signals: Signals, sample: Samp
         sample.xi2[i] = signals.xi2[i]
         sample.torque[i] = signals.torque[i]
         sample.disturbance[i] = state.disturbance[i]
+        for j in range(settings.p, settings.m):
+            sample.disturbance[i] += signals.H[i, j] * state.estimate[j]
         sample.bound[i] = signals.bound[i]
         sample.cuts[i] = signals.cuts[i]
     for j in range(settings.m):
@@ -114,6 +116,7 @@ def step(
     barrier.update_bound(settings, signals, t)
     surface.compute_errors(settings, state, signals, dt, q, dq)
     compute_regressors(settings, state, signals, q, dq)
+    prediction.fill_compensation(settings, signals)
     update_window(settings, state, signals, t, dt, q, dq, applied)
     torque.compute_demand(settings, state, signals)
     saturated = saturation.saturate(settings, state, signals, dt)

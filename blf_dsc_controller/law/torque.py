@@ -55,6 +55,6 @@ def compute_demand(settings: Settings, state: State, signals: Signals) -> None:
         torque = feedback(settings, signals, i) + state.disturbance[i]
         if settings.feed_forward == 1:
             torque += signals.known[i]
-        for j in range(settings.p):
+        for j in range(settings.m):
             torque += signals.H[i, j] * state.estimate[j]
         signals.demand[i] = torque
