@@ -154,7 +154,10 @@ def acceleration(
             arm, now, j, vector(now.force[j + 1]), vector(now.torque[j + 1])
         )
     fill_inertia(arm, now)
-    cholesky.factor(now.M, 0.0, now.factor)
+    for i in range(arm.n):
+        for j in range(i + 1):
+            now.factor[i, j] = now.M[i, j]
+    cholesky.factor(now.factor)
     cholesky.solve(now.factor, ddq)
 
 

@@ -49,6 +49,9 @@ def arbitrary_settings(random: np.random.Generator, n: int, p: int, **changes) -
         'learning_start': 0.0,
         'change_detection': 0,
         'bumpless': 0,
+        'information': np.eye(p + n),
+        'variance': np.ones(p + n),
+        'damping_rate': 0.0,
         'radius': 1e3,
     }
     return settings._replace(**arrays | case | changes)

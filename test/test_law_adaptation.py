@@ -20,7 +20,8 @@ def case(seed, n, p, *, latched=True, update='newton', **changes):
     settings, state, signals = arbitrary(seed, n, p, update=UPDATES.index(update), **changes)
     rows = np.random.default_rng(seed).normal(size=(40, settings.m))
     state.Phi[:] = rows.T @ rows / len(rows)
-    cholesky.factor(state.Phi, settings.rho, state.factor)
+    state.factor[:] = state.Phi + settings.rho * np.eye(settings.m)
+    cholesky.factor(state.factor)
     state.latched[0] = latched
     return settings, state, signals
 
@@ -106,7 +107,8 @@ def test_newton_converges_at_one_rate_in_every_direction_and_gradient_does_not()
             3, 2, 3, update=update, rho=1e-12, Gamma=np.full(5, 2.0), kappa=2.0
         )
         state.Phi[:] = np.diag([1e-2, 0.1, 1.0, 10.0, 100.0])
-        cholesky.factor(state.Phi, settings.rho, state.factor)
+        state.factor[:] = state.Phi + settings.rho * np.eye(settings.m)
+        cholesky.factor(state.factor)
         state.b[:] = 0.0  # the truth is zero
         state.estimate[:] = 1.0
         signals.xi2[:] = 0.0

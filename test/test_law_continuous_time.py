@@ -75,7 +75,8 @@ def sampled(dt):
     law.state.latched[0] = 1.0
     law.state.Phi[:] = PHI
     law.state.b[:] = PHI @ TRUE
-    cholesky.factor(law.state.Phi, RHO, law.state.factor)
+    law.state.factor[:] = PHI + RHO * np.eye(3)
+    cholesky.factor(law.state.factor)
     arm = plant(sample_time=dt)
     q, estimate = [], []
     each = round(END / dt / (MOMENTS.size - 1))

@@ -47,7 +47,8 @@ def test_erratum_2_both_integrals_carry_the_same_factor():
 
     def rest_point(Phi):
         law.state.Phi[:] = Phi
-        cholesky.factor(law.state.Phi, settings.rho, law.state.factor)
+        law.state.factor[:] = law.state.Phi + settings.rho * np.eye(settings.m)
+        cholesky.factor(law.state.factor)
         law.signals.xi2[:] = 0.0
         for _ in range(2000):
             adaptation.adapt(settings, law.state, law.signals, 1e-3, False)  # noqa: FBT003

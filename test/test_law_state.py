@@ -119,10 +119,11 @@ def test_signals_have_the_shapes_they_are_documented_with():
     assert_shapes(
         signals_of(np.zeros(signals_size(settings)), settings),
         {
-            (n,): 'qr dqr ddqr xi1 beta2 dalpha2 xi2 demand torque',
+            (n,): 'qr dqr ddqr xi1 beta2 dalpha2 xi2 demand torque unit',
             (n, p): 'momentum',
             (n, m): 'H rest',
             (n, m + 1): 'row',
+            (n, n): 'inertia',
             (m, m): 'Phi factor',
             (m,): 'b rate work',
         },

@@ -65,7 +65,9 @@ def test_torque_and_estimates_are_the_written_law_s_over_a_closed_loop(gains, ar
 
 def test_recommended_gains_give_the_written_law_s_torque_up_to_the_conditioning():
     """With rho = 1e-5 the same 1e-16 of the window's terms comes out 1e7 times as large."""
-    np.testing.assert_array_less(differences(quick(**SHORT | {'rho': 1e-5, 'sigma': 5e-6}), plant()), 1e-8)
+    np.testing.assert_array_less(
+        differences(quick(**SHORT | {'rho': 1e-5, 'sigma': 5e-6}), plant()), 1e-8
+    )
 
 
 def test_torque_never_exceeds_its_limit_and_the_demand_is_told():

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-from blf_dsc_controller.law import excitation
+from blf_dsc_controller.law import window
 
 
 class Window:
@@ -25,7 +25,7 @@ class Window:
         oldest = self.ring[self.cursor].copy()
         self.naive += terms(row) - terms(oldest)
         is_full = len(self.history) == len(self.ring)
-        self.cursor = excitation.push_row(
+        self.cursor = window.push_row(
             self.ring, self.cursor, self.running, self.fresh, row, is_full
         )
         self.history = [*self.history, row][-len(self.ring) :]
@@ -37,7 +37,7 @@ class Window:
     def average(self):
         m = len(self.running) - 1
         Phi, b = np.full((m, m), np.nan), np.full(m, np.nan)
-        excitation.average_window(self.running, len(self.history), Phi, b)
+        window.average_window(self.running, len(self.history), Phi, b)
         return Phi, b
 
 

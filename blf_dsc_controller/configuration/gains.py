@@ -76,6 +76,9 @@ class Feedback:
     """Feedback terms of the law (28)."""
 
     gain: PerJoint = non_negative((60.0, 20.0), 'gain on the velocity error', 'N m s/rad', 'K_p')
+    damping_rate: float = non_negative(
+        0.0, 'rate of damping by the inertia of learning.initial_estimate', '1/s', 'omega_v'
+    )
     damping: PerJoint = non_negative(
         (0.0, 0.0), 'gain of the robust term d2 |xi1| sat(xi2/b)', 'N m/rad', 'd2'
     )

@@ -89,6 +89,15 @@ class Learning:
     anchor_weight: float = non_negative(
         0.1, 'pull to the estimate before a change, until the new window is full'
     )
+    prior_weight: float = non_negative(
+        0.0, 'pull to the initial estimate, for arms whose parameters are not all excited'
+    )
+    motion_scale: float = non_negative(
+        0.0, 'velocity of the reference below which a joint counts less; 0: none', 'rad/s'
+    )
+    row_interval: int = _size(
+        1, 'samples between two rows of the excitation window', 'samples', at_least=1
+    )
     column_gain: float = positive(1.0, 'adaptation gain of the disturbance columns')
     interval: int = _size(
         10, 'samples between two eigenvalue checks of the excitation matrix', 'samples', at_least=1

@@ -66,7 +66,7 @@ def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturat
         if j < settings.p and not saturated and not unexcited:
             for i in range(settings.n):
                 tracking += signals.H[i, j] * signals.xi2[i]
-            tracking += settings.Wc * state.estimate[j]
+            tracking = settings.variance[j] * tracking + settings.Wc * state.estimate[j]
         signals.work[j] = state.estimate[j] - dt * settings.Gamma[j] * tracking
         signals.rate[j] = settings.Gamma[j] * (settings.kappa * signals.rate[j] - tracking)
     p = settings.p

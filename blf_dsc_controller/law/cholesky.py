@@ -7,31 +7,36 @@ import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
 
+_ROUNDING = 1e-14  # of a diagonal entry
+_TINY = 1e-300
+
 
 @inner
-def factor(A: np.ndarray, shift: float, L: np.ndarray) -> None:
-    """Fill lower L (m x m) with the factor of A + shift I, its diagonal inverted for `solve`.
+def factor(L: np.ndarray) -> bool:
+    """Replace the lower triangle of a matrix A (m, m) by its factor, for `solve`: whether A > 0.
 
-    A is symmetric >= 0 and shift > 0.  A pivot that rounding makes smaller than `shift` is taken as
-    `shift`, which it is at least in exact arithmetic, so the factor exists for every excitation
-    matrix, singular ones included.
+    The diagonal is kept inverted.  A pivot lost to rounding is replaced by the level of rounding,
+    so that every excitation matrix with its regularization has a factor.
     """
-    m = A.shape[0]
-    for j in range(m):
-        pivot = A[j, j] + shift
+    is_positive = True
+    for j in range(L.shape[0]):
+        least = _ROUNDING * abs(L[j, j]) + _TINY
+        pivot = L[j, j]
         for k in range(j):
             pivot -= L[j, k] * L[j, k]
-        L[j, j] = 1.0 / sqrt(max(pivot, shift))
-        for i in range(j + 1, m):
-            value = A[i, j]
+        is_positive = is_positive and pivot > least
+        L[j, j] = 1.0 / sqrt(max(pivot, least))
+        for i in range(j + 1, L.shape[0]):
+            value = L[i, j]
             for k in range(j):
                 value -= L[i, k] * L[j, k]
             L[i, j] = value * L[j, j]
+    return is_positive
 
 
 @inner
 def solve(L: np.ndarray, x: np.ndarray) -> None:
-    """Solve (A + shift I) y = x with the factor L of `factor`, leaving y in x (m,)."""
+    """Solve A y = x with the L of `factor`, leaving y in x (m,)."""
     m = x.size
     for i in range(m):
         value = x[i]

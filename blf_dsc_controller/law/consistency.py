@@ -18,7 +18,7 @@ to the solution a window ago.
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law import cholesky
+from blf_dsc_controller.law import cholesky, window
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Signals, State
 
@@ -26,6 +26,7 @@ _GATE = 4.0  # of mean squares: twice the torque
 _ALARM = 8.0  # likewise, more, for a solution extrapolates
 _USUAL = 1.25  # times the least residual, which varies with the motion
 _DOUBT = 3.0  # pull of the anchor for each (N m)^2 above, 1/(kg m^2)^2
+_LEAST_INERTIA = 0.1  # of the initial estimate's
 _MEMORY = 0.1  # s, over which the last rows are averaged
 
 
@@ -82,21 +83,49 @@ def clear(matrix: np.ndarray) -> None:
 
 
 @inner
-def accept_window(settings: Settings, state: State, signals: Signals) -> bool:
-    """Whether the present window is consistent; if so its solution and residual are kept.
+def window_residual(running: np.ndarray, theta: np.ndarray) -> float:
+    """Sum of |u - X theta|^2 over the window, from its sums of [X | u]^T [X | u]."""
+    m = theta.size
+    total = running[m, m]
+    for i in range(m):
+        product = -2.0 * running[i, m] + running[i, i] * theta[i]
+        for j in range(i + 1, m):
+            product += 2.0 * running[i, j] * theta[j]
+        total += theta[i] * product
+    return max(float(total), 0.0)
+
+
+@inner
+def is_physical(settings: Settings, signals: Signals, q: np.ndarray, theta: np.ndarray) -> bool:
+    """Whether M(q) of theta (m,) is positive definite, with a tenth of that of P^(0) to spare.
+
+    Overwrites Yp and Yr of `signals`.
+    """
+    for k in range(settings.n):
+        for i in range(settings.n):
+            signals.unit[i] = 1.0 if i == k else 0.0
+        settings.model.momentum_regressor(q, signals.unit, signals.momentum, signals.rest)
+        for i in range(k, settings.n):
+            signals.inertia[i, k] = 0.0
+            for j in range(settings.p):
+                parameter = theta[j] - _LEAST_INERTIA * settings.initial_estimate[j]
+                signals.inertia[i, k] += signals.momentum[i, j] * parameter
+    return cholesky.factor(signals.inertia)
+
+
+@inner
+def accept_window(settings: Settings, state: State, signals: Signals, q: np.ndarray) -> bool:
+    """Whether the window is consistent and its solution physical; if so it is kept.
 
     A window that is not full, or whose residual is more than usual, is pulled to the anchor:
     Phi + a I, b + a theta_anchor, in `signals`.
     """
     m = settings.m
-    residual = state.running[m, m] / state.rows[0]
     solution = signals.work
     for j in range(m):
         solution[j] = signals.b[j]
     cholesky.solve(signals.factor, solution)
-    for j in range(m):
-        residual -= signals.b[j] * solution[j]
-    residual = max(residual, 0.0)
+    residual = window_residual(state.running, solution) / state.rows[0]
     missing = 1.0 - state.rows[0] / settings.window
     is_first = state.latched[0] == 0.0
     if missing <= 0.0 and (state.least_residual[0] == 0.0 or residual < state.least_residual[0]):
@@ -106,16 +135,17 @@ def accept_window(settings: Settings, state: State, signals: Signals) -> bool:
     doubt = _DOUBT * max(0.0, residual - _USUAL * state.least_residual[0])
     pull = settings.anchor_weight * missing + doubt
     if pull > 0.0:
+        window.pull_to(state.anchor, pull, settings.information, signals.Phi, signals.b)
+        window.regularized_factor(signals.Phi, settings.rho, settings.information, signals.factor)
         for j in range(m):
-            signals.b[j] += pull * state.anchor[j]
-            signals.Phi[j, j] += pull
             solution[j] = signals.b[j]
-        cholesky.factor(signals.Phi, settings.rho, signals.factor)
         cholesky.solve(signals.factor, solution)
+    if not is_physical(settings, signals, q, solution):
+        return False
     for j in range(m):
         state.solution[j] = solution[j]
     state.residual[0] = residual
-    if missing <= 0.0 and (is_first or state.cursor[0] < settings.interval):
+    if missing <= 0.0 and (is_first or window.is_at_start(settings, state)):
         for j in range(m):
             state.anchor[j] = solution[j]
     return True

@@ -23,7 +23,7 @@ as far as each block is configured.  (22)-(24) instead subtract the estimate d^3
 which hides the parameter error.
 """
 
-from math import cos, exp, sin, tanh
+from math import cos, exp, sin, sqrt, tanh
 
 import numpy as np
 
@@ -83,12 +83,18 @@ def fill_compensation(settings: Settings, signals: Signals) -> None:
 def filter_row(
     settings: Settings, state: State, signals: Signals, dt: float, torque: np.ndarray
 ) -> None:
-    """Pass [X | u] of the last interval through both poles, leaving it in `signals.row`."""
+    """Pass [X | u] of the last interval through both poles, leaving it in `signals.row`.
+
+    Rows of a joint that hardly moves count less: its stiction would be taken for gravity.
+    """
     gain = surface.filter_gain(1.0 / settings.pole, dt)
     p = settings.p
     m = settings.m
     row = signals.row
     for i in range(settings.n):
+        weight = 1.0
+        if settings.motion_scale > 0.0:
+            weight = abs(signals.dqr[i]) / sqrt(signals.dqr[i] ** 2 + settings.motion_scale**2)
         for j in range(m):
             row[i, j] = 0.5 * (signals.rest[i, j] + state.rest[i, j])
         for j in range(p):
@@ -97,7 +103,7 @@ def filter_row(
         for j in range(m + 1):
             state.filter1[i, j] += gain * (row[i, j] - state.filter1[i, j])
             state.filter2[i, j] += gain * (state.filter1[i, j] - state.filter2[i, j])
-            row[i, j] = state.filter2[i, j]
+            row[i, j] = weight * state.filter2[i, j]
 
 
 @inner

@@ -38,7 +38,8 @@ class Settings(NamedTuple):
     latch: int
     update: int
     torque_source: int
-    window: int  # N, samples in tau_d
+    window: int  # N, rows in tau_d
+    row_interval: int  # samples between two rows of the window
     interval: int  # samples between two checks of the excitation
     bias: int  # 1: a constant column per joint
     viscous: int  # 1: a column dq_i per joint
@@ -57,6 +58,9 @@ class Settings(NamedTuple):
     learning_start: float  # tau_d + T_a, s
     residual_floor: float  # unmodelled torque of a joint that is consistent, N m
     anchor_weight: float  # pull to `anchor` while the window is empty
+    prior_weight: float  # pull to `initial_estimate`, always
+    motion_scale: float  # reference velocity below which rows count less, rad/s; 0: none
+    damping_rate: float  # omega_v, of the damping by the initial estimate's inertia, 1/s
     pole: float  # of the regressor filter, rad/s
     omega: float  # of the differentiating filter (8), rad/s
     coulomb_velocity: float  # rad/s
@@ -79,6 +83,8 @@ class Settings(NamedTuple):
     true_disturbance: Annotated[Array, 4, 'n']  # constant, then amplitude, frequency, phase
     Gamma: Annotated[Array, 'm']  # diagonal of the adaptation gain
     initial_estimate: Annotated[Array, 'm']  # P^(0), zeros for the columns
+    information: Annotated[Array, 'm', 'm']  # R, inverse covariance of the prior of theta
+    variance: Annotated[Array, 'm']  # diagonal of R^-1
     true_parameters: Annotated[Array, 'p']
     frequencies: Annotated[Array, 'tones']  # of the sine and cosine columns, rad/s
 

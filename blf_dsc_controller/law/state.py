@@ -79,6 +79,8 @@ class Signals(NamedTuple):
     Phi: Annotated[Array, 'm', 'm']  # of the present window
     b: Annotated[Array, 'm']
     factor: Annotated[Array, 'm', 'm']
+    inertia: Annotated[Array, 'n', 'n']  # M^(q) less its least admissible, or its factor
+    unit: Annotated[Array, 'n']  # scratch
     rate: Annotated[Array, 'm']  # theta^' [1/s]
     work: Annotated[Array, 'm']  # scratch
 

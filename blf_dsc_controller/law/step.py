@@ -21,6 +21,7 @@ from blf_dsc_controller.law import (
     saturation,
     surface,
     torque,
+    window,
 )
 from blf_dsc_controller.law.settings import EFFORT, FILTERED, Settings
 from blf_dsc_controller.law.state import Sample, Signals, State
@@ -56,16 +57,17 @@ def update_window(
     prediction.form_row(settings, state, signals, dt, q, dq, applied)
     if state.samples[0] == 0.0:
         return
-    is_full = state.rows[0] == settings.window
-    cursor = excitation.push_row(
-        state.ring, int(state.cursor[0]), state.running, state.fresh, signals.row, is_full
-    )
-    state.cursor[0] = cursor
-    state.rows[0] = min(state.rows[0] + 1.0, float(settings.window))
+    if int(state.samples[0]) % settings.row_interval == 0:
+        is_full = state.rows[0] == settings.window
+        cursor = window.push_row(
+            state.ring, int(state.cursor[0]), state.running, state.fresh, signals.row, is_full
+        )
+        state.cursor[0] = cursor
+        state.rows[0] = min(state.rows[0] + 1.0, float(settings.window))
     if settings.change_detection == 1:
         consistency.detect_change(settings, state, signals, t, dt)
     if int(state.samples[0]) % settings.interval == 0:
-        excitation.update_excitation(settings, state, signals, t, dt)
+        excitation.update_excitation(settings, state, signals, t, dt, q)
 
 
 @inner
@@ -118,7 +120,7 @@ def step(
     compute_regressors(settings, state, signals, q, dq)
     prediction.fill_compensation(settings, signals)
     update_window(settings, state, signals, t, dt, q, dq, applied)
-    torque.compute_demand(settings, state, signals)
+    torque.compute_demand(settings, state, signals, q)
     saturated = saturation.saturate(settings, state, signals, dt)
     adaptation.adapt(settings, state, signals, dt, saturated)
     surface.filter_step(settings, state, signals, dt)

@@ -4,10 +4,14 @@
     tau = -dV/dxi1 - d2 |xi1| sat(xi2/b) - K_p xi2 + H(q, dq, alpha2, alpha2') P^ + d^3        (28)
     tau = -w z1 - mu_bar sat(z2/b) - K_p z2 + H P^                                             (35)
 
-(28) prints the robust term with sgn; sat is its smooth stand-in.
+(28) prints the robust term with sgn; sat is its smooth stand-in.  Where the joints' inertias are
+known roughly, the damping may follow them: - omega_v M(q, P^(0)) xi2 beside - K_p xi2 dampens every
+direction at the same rate.
 """
 
 from math import sin
+
+import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law import barrier
@@ -49,10 +53,20 @@ def feedback(settings: Settings, signals: Signals, i: int) -> float:
 
 
 @inner
-def compute_demand(settings: Settings, state: State, signals: Signals) -> None:
-    """Compute the torque (28) or (35) before saturation, `signals.demand` (n,) [N m]."""
+def compute_demand(settings: Settings, state: State, signals: Signals, q: np.ndarray) -> None:
+    """Compute the torque (28) or (35) before saturation, `signals.demand` (n,) [N m].
+
+    Overwrites Yp and Yr of `signals` where the damping is that of the initial estimate.
+    """
+    damped = settings.damping_rate > 0.0
+    if damped:
+        settings.model.momentum_regressor(q, signals.xi2, signals.momentum, signals.rest)
     for i in range(settings.n):
         torque = feedback(settings, signals, i) + state.disturbance[i]
+        if damped:
+            for j in range(settings.p):
+                inertia = signals.momentum[i, j] * settings.initial_estimate[j]
+                torque -= settings.damping_rate * inertia
         if settings.feed_forward == 1:
             torque += signals.known[i]
         for j in range(settings.m):

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sliding window (21), (22): its sums, and lambda_min of its Phi.
+
+The window's sums of X^T [X | u] take constant time and do not drift.  A running sum that adds the
+new and subtracts the old term accumulates one rounding error a sample.  Beside the running sum S
+the window keeps F, the sum of what was written since the ring last wrapped; at the wrap F is the
+exact content of the ring and replaces S.
+
+Eigenvalues are relative to the information R of the prior, by which parameters of different units
+compare: Phi x = lambda R x.
+"""
+
+from math import sqrt
+
+import numpy as np
+
+from blf_dsc_controller.compiled.jit import called, inner
+from blf_dsc_controller.law import cholesky
+from blf_dsc_controller.law.settings import Settings
+from blf_dsc_controller.law.state import Signals, State
+
+
+@inner
+def push_row(
+    ring: np.ndarray,
+    cursor: int,
+    running: np.ndarray,
+    fresh: np.ndarray,
+    row: np.ndarray,
+    is_full: bool,
+) -> int:
+    """Replace the oldest row of the window by `row` and return the next cursor.
+
+    `ring` (N, n, m + 1) has the oldest row at `cursor`, which counts once the window is full;
+    `running` S and `fresh` F (m + 1, m + 1), the sums of [X | u]^T [X | u], are filled in the upper
+    triangle; `row` is [X | u] (n, m + 1).
+    """
+    old = ring[cursor]
+    n = row.shape[0]
+    m = row.shape[1] - 1
+    keep = 1.0 if is_full else 0.0
+    for a in range(m + 1):
+        for b in range(a, m + 1):
+            new_term = 0.0
+            old_term = 0.0
+            for i in range(n):
+                new_term += row[i, a] * row[i, b]
+                old_term += keep * old[i, a] * old[i, b]
+            running[a, b] += new_term - old_term
+            fresh[a, b] += new_term
+    for i in range(n):
+        for a in range(m + 1):
+            old[i, a] = row[i, a]
+    cursor += 1
+    if cursor < ring.shape[0]:
+        return cursor
+    for a in range(m + 1):
+        for b in range(a, m + 1):
+            running[a, b] = fresh[a, b]
+            fresh[a, b] = 0.0
+    return 0
+
+
+@inner
+def average_window(running: np.ndarray, samples: int, Phi: np.ndarray, b: np.ndarray) -> None:
+    """Fill Phi (m, m) and b (m,), the means (21) and (22) over the window."""
+    m = Phi.shape[0]
+    for i in range(m):
+        b[i] = running[i, m] / samples
+        for j in range(i, m):
+            Phi[i, j] = running[i, j] / samples
+            Phi[j, i] = Phi[i, j]
+
+
+@inner
+def pull_to(
+    target: np.ndarray, weight: float, information: np.ndarray, Phi: np.ndarray, b: np.ndarray
+) -> None:
+    """Add `weight` times the information R on theta = target (m,):  Phi + a R,  b + a R target."""
+    for i in range(b.size):
+        for j in range(b.size):
+            Phi[i, j] += weight * information[i, j]
+            b[i] += weight * information[i, j] * target[j]
+
+
+@inner
+def regularized_factor(
+    Phi: np.ndarray, rho: float, information: np.ndarray, factor: np.ndarray
+) -> None:
+    """Fill `factor` with the Cholesky factor of Phi + rho R."""
+    for i in range(Phi.shape[0]):
+        for j in range(i + 1):
+            factor[i, j] = Phi[i, j] + rho * information[i, j]
+    cholesky.factor(factor)
+
+
+@inner
+def weigh(information: np.ndarray, x: np.ndarray, out: np.ndarray) -> float:
+    """Write R x (m,); returns x^T R x."""
+    square = 0.0
+    for i in range(x.size):
+        out[i] = 0.0
+        for j in range(x.size):
+            out[i] += information[i, j] * x[j]
+        square += x[i] * out[i]
+    return square
+
+
+@inner
+def min_eigenvector(
+    Phi: np.ndarray,
+    information: np.ndarray,
+    factor: np.ndarray,
+    direction: np.ndarray,
+    work: np.ndarray,
+    iterations: int,
+) -> float:
+    """lambda_min(Phi) relative to R by inverse iteration, which improves `direction`.
+
+    The direction x is the eigenvector of Phi x = lambda R x with x^T R x = 1.
+
+    From a warm start a few iterations suffice (the error of the Rayleigh quotient is the square of
+    the direction's), at a fixed cost and without the m^3 of an eigenvalue decomposition.
+
+    `factor` is the Cholesky factor of Phi + rho R, `work` (m,) scratch.
+    """
+    m = direction.size
+    weigh(information, direction, work)
+    for _ in range(iterations):
+        for i in range(m):
+            direction[i] = work[i]
+        cholesky.solve(factor, direction)
+        shrink = 1.0 / sqrt(weigh(information, direction, work))
+        for i in range(m):
+            direction[i] *= shrink
+            work[i] *= shrink
+    quotient = 0.0
+    for i in range(m):
+        work[i] = 0.0
+        for j in range(m):
+            work[i] += Phi[i, j] * direction[j]
+        quotient += direction[i] * work[i]
+    return quotient
+
+
+@inner
+def remove_rejected(active: np.ndarray, Phi: np.ndarray, b: np.ndarray) -> None:
+    """Remove the rejected columns from Phi theta = b: theta_j = 0 instead."""
+    for i in range(active.size):
+        if active[i] == 0.0:
+            for j in range(active.size):
+                Phi[i, j] = 0.0
+                Phi[j, i] = 0.0
+            Phi[i, i] = 1.0
+            b[i] = 0.0
+
+
+@called
+def min_eigenvalue(
+    running: np.ndarray,
+    samples: int,
+    active: np.ndarray,
+    prior: np.ndarray,
+    prior_weight: float,
+    rho: float,
+    information: np.ndarray,
+    Phi: np.ndarray,
+    b: np.ndarray,
+    factor: np.ndarray,
+    direction: np.ndarray,
+    work: np.ndarray,
+    iterations: int,
+) -> float:
+    """lambda_min of the present window's Phi, which is computed with b and its factor."""
+    average_window(running, samples, Phi, b)
+    if prior_weight > 0.0:
+        pull_to(prior, prior_weight, information, Phi, b)
+    remove_rejected(active, Phi, b)
+    regularized_factor(Phi, rho, information, factor)
+    return min_eigenvector(Phi, information, factor, direction, work, iterations)
+
+
+@inner
+def excitation(settings: Settings, state: State, signals: Signals, iterations: int) -> float:
+    """lambda_min of the present window's Phi, which is left in `signals` with b and its factor."""
+    return min_eigenvalue(
+        state.running,
+        int(state.rows[0]),
+        state.active,
+        settings.initial_estimate,
+        settings.prior_weight,
+        settings.rho,
+        settings.information,
+        signals.Phi,
+        signals.b,
+        signals.factor,
+        state.min_eigenvector,
+        signals.work,
+        iterations,
+    )
+
+
+@inner
+def is_at_start(settings: Settings, state: State) -> bool:
+    """Whether the ring has wrapped since the last check: true once a window."""
+    return bool(state.cursor[0] * settings.row_interval < settings.interval)
