@@ -193,7 +193,7 @@ def test_a_look_improves_the_direction_by_four_iterations():
     vectors = basis(eye[0] + eye[5], eye[1] - eye[2])
     case = window_of([1.0, 2.0, *[9.0] * 5], vectors, learning_start=1e9)
     case.state.min_eigenvector[:] = (vectors[:, 0] + vectors[:, 1]) / np.sqrt(2.0)
-    excitation.update_excitation(*case, 0.0, 1e-3)
+    excitation.update_excitation(*case, 0.0, 1e-3, np.zeros(case.settings.n))
     tangent = ((1.0 + case.settings.rho) / (2.0 + case.settings.rho)) ** 4
     expected = 1.0 + tangent**2 / (1.0 + tangent**2)
     assert case.state.lambda_min[0] == pytest.approx(expected, rel=1e-12)

@@ -75,8 +75,8 @@ def is_preferred(settings: Settings, state: State, value: float) -> bool:
     weaker window only has less information, unless the latched one is old or contradicted.
     """
     if settings.latch == BEST:
-        return value > state.latched_lambda[0]
-    return settings.change_detection == 0 or value >= _COMPARABLE * state.best_lambda[0]
+        return bool(value > state.latched_lambda[0])
+    return bool(settings.change_detection == 0 or value >= _COMPARABLE * state.best_lambda[0])
 
 
 @inner
