@@ -41,7 +41,7 @@ PIP_FAILED := { echo 'The installation failed: see above. It needs a package ind
   'set HTTPS_PROXY, for a mirror PIP_INDEX_URL, without a network PIP_FIND_LINKS and' \
   'PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
 
-.PHONY: help venv demo paper test test-long test-browser test-nightly soak lint clean bench
+.PHONY: help venv demo paper changes test test-long test-browser test-nightly soak lint clean bench
 
 help: ## List what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' Makefile
@@ -75,6 +75,9 @@ test-browser: $(READY) ## Open the page of bag_report in a headless Chromium, if
 
 test-nightly: $(READY) ## Run ten thousand examples of each property of the nodes
 	@BLF_DSC_EXAMPLES=10000 $(RUN) -m pytest -q test/test_nodes_properties.py
+
+changes: $(READY) ## Change ten thousand arms at random, with and without learning, into out/changes
+	@$(RUN) benchmark/changes.py
 
 bench: $(BENCH_READY) ## Measure everything side by side, into benchmark/RESULTS.md (GROUPS=offline)
 	@$(RUN) benchmark/run.py $(GROUPS)
