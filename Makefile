@@ -77,7 +77,7 @@ test-nightly: $(READY) ## Run ten thousand examples of each property of the node
 	@BLF_DSC_EXAMPLES=10000 $(RUN) -m pytest -q test/test_nodes_properties.py
 
 changes: $(READY) ## Change ten thousand arms at random, with and without learning, into out/changes
-	@$(RUN) benchmark/changes.py
+	@$(RUN) benchmark/changing_arms.py
 
 bench: $(BENCH_READY) ## Measure everything side by side, into benchmark/RESULTS.md (GROUPS=offline)
 	@$(RUN) benchmark/run.py $(GROUPS)

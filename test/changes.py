@@ -12,8 +12,8 @@ BOUND = 2e-3  # rad
 WINDOW = 2.0 * np.pi  # s
 OFF = {'learning.weight': 0.0}
 CHANGED = 20.0  # s
+LATCH = 0.45e-3  # rad, about the error at the first latch of a run without changes
 
-PAYLOADS = [0.25, 0.3, 0.6, 0.65, 0.7, 0.75, 0.8, 1.0]  # kg, mass at the tip, 0.5 before
 PUSHES = [(1, 1.0, 3.0), (1, 2.0, 2.0), (0, 3.0, 3.0)]  # joint, N m, s
 
 
@@ -50,7 +50,7 @@ def several(*events):
 
 
 ROWS = {
-    **{f'payload to {m2} kg': payload(m2) for m2 in (0.65, 0.7, 0.75, 0.8, 1.0)},
+    **{f'payload to {m2} kg': payload(m2) for m2 in (0.6, 0.65, 0.7, 0.75, 0.8, 1.0)},
     'payload to 0.75 kg at 8 s': payload(0.75, begin=8.0),
     **{
         f'release from {m2} kg': several({'begin': 10.0, 'duration': 10.0, 'payload': m2 - 0.5})
@@ -71,6 +71,16 @@ ROWS = {
     ),
 }
 """By name; two windows are left from the last change to `end_of`."""
+
+LIGHTER = {f'release to {m2} kg': payload(m2) for m2 in (0.25, 0.3)}
+"""The same with another arm, which is no event."""
+
+
+def begin_of(row):
+    """Time of the first change of a row after its start [s]."""
+    begin = np.array(row['events.begin'])
+    times = np.concatenate([begin, begin + row.get('events.duration', 0.0 * begin)])
+    return float(times[times > 0.0].min())
 
 
 def end_of(row):

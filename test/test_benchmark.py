@@ -145,3 +145,31 @@ def test_contestant_that_does_not_answer_is_not_waited_for_for_ever():
     harness = importlib.import_module('harness')
     with pytest.raises(harness.ContestantError, match=r'waited 0\.1 s for a torque in vain'):
         harness.wait_for(lambda: False, 'a torque', timeout=0.1)
+
+
+def test_changes_are_the_same_with_and_without_learning_and_differences_are_named(tmp_path):
+    changes = importlib.import_module('changing_arms')
+    config = tmp_path / 'short.yaml'
+    text = changes.PRESET.read_text()
+    config.write_text(text.replace('duration: 50.0', 'duration: 11.0').replace('9.9, 30.0', '9.9'))
+    changes.main(['--config', str(config), '--runs', '3', '--out', str(tmp_path / 'out')])
+    written = (tmp_path / 'out/changes.txt').read_text()
+    assert 'with learning: 3 of 3 runs kept the bound' in written
+    assert (tmp_path / 'out/changes.png').stat().st_size > 10_000
+
+    results = {
+        name: changes.Store(tmp_path / 'out' / name).results()
+        for name in (changes.WITH, changes.WITHOUT)
+    }
+    for name, values in results['with'].items():
+        if name.startswith('plant.'):
+            assert (values == results['without'][name]).all()
+    assert (
+        results['with']['parameter_error.end'] != results['without']['parameter_error.end']
+    ).all()
+
+    results['with']['outcome'][1] = 'violated'
+    study = changes.studies(config, {'runs': 3})['with']
+    written = changes.report(study, results, tmp_path)
+    assert 'kept only without learning: 1\n  run 1: begin.1 ' in written
+    assert f'--reproduce {tmp_path / "with"} 1\n' in written

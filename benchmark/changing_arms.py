@@ -67,7 +67,7 @@ def report(study: Study, results: dict[str, Columns], folder: Path) -> str:
         lines.append(f'kept only {name} learning: {len(runs)}')
         for run in runs:
             drawn = [
-                f'{one.name.removeprefix("events.")} {results[name][one.column][run]:.4g}'
+                f'{one.column.removeprefix("plant.events.")} {results[name][one.column][run]:.4g}'
                 for one in study.variations
                 if one.distribution.name != 'choice'
             ]
