@@ -11,8 +11,9 @@ from launch_ros.actions import Node
 
 from blf_dsc_controller.arms.two_link_geometry import urdf
 from blf_dsc_controller.configuration.nodes import PLANT
-from blf_dsc_controller.configuration.params_file import load, locate, share_folder
+from blf_dsc_controller.configuration.params_file import load, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.share import share_folder
 
 PACKAGE = 'blf_dsc_controller'
 

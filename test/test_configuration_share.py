@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from blf_dsc_controller.configuration import params_file
-from blf_dsc_controller.configuration.params_file import locate, share_folder
+from blf_dsc_controller.configuration import share
+from blf_dsc_controller.configuration.params_file import locate
+from blf_dsc_controller.configuration.share import share_folder
 from blf_dsc_controller.errors import BlfDscError
 
 
@@ -35,7 +36,7 @@ def elsewhere(tmp_path, monkeypatch):
     (here / 'config' / 'recommended.yaml').touch()
     (here / 'recommended.yaml').touch()
     monkeypatch.chdir(here)
-    monkeypatch.setattr(params_file, '_CHECKOUT', tmp_path / 'no_checkout')
+    monkeypatch.setattr(share, '_CHECKOUT', tmp_path / 'no_checkout')
     monkeypatch.delenv('AMENT_PREFIX_PATH', raising=False)
     monkeypatch.setattr(
         sysconfig, 'get_path', lambda _name, scheme: str(tmp_path / f'python_{scheme}')
@@ -75,7 +76,7 @@ def test_source_tree_counts_before_an_installation(tmp_path, monkeypatch):
     checkout = tmp_path / 'checkout'
     (checkout / 'config').mkdir(parents=True)
     (checkout / 'setup.py').touch()
-    monkeypatch.setattr(params_file, '_CHECKOUT', checkout)
+    monkeypatch.setattr(share, '_CHECKOUT', checkout)
     assert share_folder() == checkout
 
 

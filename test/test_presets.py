@@ -11,7 +11,8 @@ import pytest
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.params_file import load_loop, share_folder
+from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.share import share_folder
 
 PRESETS = sorted(path.stem for path in (share_folder() / 'config').glob('*.yaml'))
 LAW = {'comparison': 'backstepping', 'comparison_detuned': 'backstepping'} | {

@@ -100,6 +100,26 @@ def read_chain(text: str, base: str, tip: str, joints: Sequence[str]) -> Chain:
     return Chain(base, tip, tuple(chain), frame, tuple(held))
 
 
+def chain_joints(
+    text: str, base: str, tip: str, joints: Sequence[str]
+) -> tuple[str, str, tuple[str, ...]]:
+    """Base, tip and moving joints between them, each as given or else as the URDF has it.
+
+    An empty base is the root, an empty tip the link of the last joint; no joints are all that move.
+    """
+    links, elements = _parse(text)
+    moved = {_link(element, 'child') for element in elements.values()}
+    base = base or next(link for link in links if link not in moved)
+    if not tip and not joints:
+        raise UrdfError('neither a tip nor joints were given: set robot.tip')
+    if not tip and joints[-1] not in elements:
+        raise UrdfError(f'no joint {joints[-1]!r} in the URDF: its joints are {_listed(elements)}')
+    tip = tip or _link(elements[joints[-1]], 'child')
+    path = _path(links, elements, base, tip)
+    moving = tuple(str(e.get('name')) for e in path if e.get('type') != 'fixed')
+    return base, tip, tuple(joints) or moving
+
+
 def _path(links: Elements, elements: Elements, base: str, tip: str) -> list[ET.Element]:
     """Joints from the base down to the tip."""
     for role, link in (('base', base), ('tip', tip)):

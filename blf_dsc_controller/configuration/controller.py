@@ -25,6 +25,7 @@ from blf_dsc_controller.configuration.gains import (
 )
 from blf_dsc_controller.configuration.learning import Learning
 from blf_dsc_controller.configuration.reference import Approach, MotionLimits, Reference
+from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.configuration.schema import non_negative, parameter, positive
 
 _size = partial(parameter, read_only='it sets the size of the state of the law')
@@ -135,6 +136,7 @@ class ControllerConfig(Sampled):
     )
     autostart: bool = autostart()
     arm: ArmGeometry = ArmGeometry()
+    robot: Robot = Robot()
     reference: Reference = field(default_factory=Reference)
     approach: Approach = field(default_factory=Approach)
     limits: MotionLimits = field(default_factory=MotionLimits)

@@ -5,9 +5,7 @@ from __future__ import annotations
 
 import difflib
 import json
-import sysconfig
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -22,7 +20,8 @@ from blf_dsc_controller.configuration.nodes import (
 )
 from blf_dsc_controller.configuration.ros_yaml import Section, parse
 from blf_dsc_controller.configuration.schema import build, flatten, parameters, unknown
-from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.configuration.share import share_folder
+from blf_dsc_controller.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -30,28 +29,6 @@ if TYPE_CHECKING:
     from blf_dsc_controller.configuration.schema import Value
 
 Config = TypeVar('Config')
-
-_PACKAGE = 'blf_dsc_controller'
-_CHECKOUT = Path(__file__).resolve().parents[2]
-
-
-def share_folder() -> Path:
-    """Return the folder that holds `config/` and `launch/`, whatever the current folder is.
-
-    The source tree comes first if the code runs from one: an editable install leaves the files
-    there. Then the ament index (colcon), then the data folders of this Python (pip).
-
-    Raises BlfDscError with the places searched if it is in none of them.
-    """
-    searched = []
-    for folder in _candidates():
-        if (folder / 'config').is_dir():
-            return folder
-        searched.append(f'\n  - {folder / "config"}')
-    raise BlfDscError(
-        f'the data files of {_PACKAGE} were not found: install the package again. '
-        f'Searched:{"".join(searched)}'
-    )
 
 
 def locate(given: str | Path) -> Path:
@@ -156,17 +133,6 @@ def format_value(value: Value) -> str:
         mantissa, exponent, power = repr(value).partition('e')
         return mantissa + ('' if '.' in mantissa or not exponent else '.0') + exponent + power
     return json.dumps(value, ensure_ascii=False)
-
-
-def _candidates() -> Iterator[Path]:
-    if (_CHECKOUT / 'setup.py').is_file():
-        yield _CHECKOUT
-    with suppress(ImportError, LookupError, OSError):  # no ROS, index, or package in it
-        from ament_index_python.packages import get_package_share_directory
-
-        yield Path(get_package_share_directory(_PACKAGE))
-    for scheme in (sysconfig.get_default_scheme(), sysconfig.get_preferred_scheme('user')):
-        yield Path(sysconfig.get_path('data', scheme), 'share', _PACKAGE)
 
 
 def _load(

@@ -15,6 +15,7 @@ from blf_dsc_controller.configuration.common import (
     joint_problems,
 )
 from blf_dsc_controller.configuration.events import Events, Load, Wall
+from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.configuration.schema import non_negative, parameter, positive
 
 _fixed = partial(parameter, read_only='the plant is built once, when the node starts')
@@ -126,6 +127,7 @@ class PlantConfig(Sampled):
         'dopri5', 'fixed-step method for one sample: Dormand-Prince 5 or Runge-Kutta 4'
     )
     arm: PlantArm = PlantArm()
+    robot: Robot = Robot()
     initial: Initial = Initial()
     disturbance: PlantDisturbance = PlantDisturbance()
     sensor: Sensor = Sensor()

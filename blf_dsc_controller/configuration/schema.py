@@ -3,7 +3,8 @@
 
 Each field is declared with `parameter`, or is itself such a dataclass: a group, whose parameters
 have dotted names (`arm.l1`). The method `problems()` of a configuration, if it has one, checks
-parameters against each other.
+parameters against each other; its class method `defaults(given)` replaces defaults by what follows
+from the parameters that are given.
 """
 
 from __future__ import annotations
@@ -170,10 +171,11 @@ def build(cls: type[Config], given: Mapping[str, object], source: str = '') -> C
     each value is valid by itself, those between parameters.
     """
     known = {one.name: one for one in parameters(cls)}
+    derived = _derived_defaults(cls, given, source)
     problems = [unknown(name, known) for name in given if name not in known]
     values: dict[str, Any] = {}
     for name, one in known.items():
-        value = given.get(name, one.default)
+        value = given.get(name, derived.get(name, one.default))
         found = one.problems(value) if name in given else []
         problems += found
         if not found:
@@ -186,6 +188,20 @@ def build(cls: type[Config], given: Mapping[str, object], source: str = '') -> C
         if not problems:
             return config
     raise ConfigurationError(problems, source)
+
+
+def _derived_defaults(
+    cls: type[Any], given: Mapping[str, object], source: str
+) -> Mapping[str, Value]:
+    """Return the defaults that depend on what is given, such as the gains for an arm."""
+    derive = getattr(cls, 'defaults', None)
+    if derive is None:
+        return {}
+    try:
+        found: Mapping[str, Value] = derive(given)
+    except ConfigurationError as error:
+        raise ConfigurationError(error.problems, source) from error
+    return found
 
 
 def change(config: Config, given: Mapping[str, object], source: str = '') -> Config:

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The arm of a URDF: where it is, which joints, and what a URDF does not tell."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any
+
+import numpy as np
+
+from blf_dsc_controller.arms.urdf import Chain, chain_joints, read_chain
+from blf_dsc_controller.configuration.schema import parameter
+from blf_dsc_controller.configuration.share import resolve
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+
+_fixed = partial(parameter, read_only='the arm is built once, when the node starts')
+
+_DRIVE_ACCELERATION = 400.0  # rad/s^2, of a drive alone at its rated torque
+
+
+@dataclass(frozen=True)
+class Robot:
+    """Arm from a URDF, for the model `urdf`."""
+
+    urdf: str = _fixed(
+        '', 'URDF: a file, package://name/path, a file of config/, or its text; empty: no URDF'
+    )
+    base: str = _fixed('', 'link that stands still; empty: the root')
+    tip: str = _fixed('', 'link at the end, where payloads are; empty: that of the last joint')
+    gravity: Annotated[tuple[float, ...], '3'] = _fixed(
+        (0.0, 0.0, -9.81), 'gravity in the base: (0, 0, 9.81) hangs from the ceiling', 'm/s^2', 'g'
+    )
+    payload: float = _fixed(3.0, 'mass that the arm is rated to carry', 'kg', at_least=0.0)
+    rotor_inertia: Annotated[tuple[float, ...], 'joints'] = _fixed(
+        (),
+        'inertia of each drive, reflected to its joint; empty: from its effort',
+        'kg m^2',
+        at_least=0.0,
+        omittable=True,
+    )
+
+    @property
+    def text(self) -> str:
+        """URDF as text; raises BlfDscError if it cannot be read."""
+        return read_urdf(self.urdf)
+
+    def chain(self, joints: tuple[str, ...]) -> Chain:
+        """Serial chain of the joints; raises BlfDscError if there is none."""
+        return chain_of(self.text, self.base, self.tip, joints)
+
+    def rotors(self, chain: Chain) -> np.ndarray:
+        """Inertias of the drives (n,) [kg m^2]: as given, or rated torque / 400 rad/s^2."""
+        if self.rotor_inertia:
+            return np.array(self.rotor_inertia)
+        efforts = [joint.effort for joint in chain.joints]
+        return np.array([e / _DRIVE_ACCELERATION if math.isfinite(e) else 0.0 for e in efforts])
+
+
+def read_urdf(given: str) -> str:
+    """Text of a URDF given as a file, a resource or itself."""
+    if given.lstrip().startswith('<'):
+        return given
+    try:
+        return resolve(given).read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError) as error:
+        raise BlfDscError(f'{given!r} cannot be read: {error}') from error
+
+
+@functools.lru_cache(maxsize=16)
+def chain_of(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain:
+    """`read_chain`, where an empty base is the root and an empty tip what the last joint moves."""
+    base, tip, found = chain_joints(text, base, tip, joints)
+    return read_chain(text, base, tip, found)
+
+
+def given_robot(given: Mapping[str, Any], joints: object) -> tuple[Robot, Chain]:
+    """Robot and chain of parameters by dotted name, which are not validated yet.
+
+    Raises ConfigurationError with what is wrong with the URDF.
+    """
+    names = ('urdf', 'base', 'tip', 'gravity', 'payload', 'rotor_inertia')
+    values = {name: given[f'robot.{name}'] for name in names if f'robot.{name}' in given}
+    robot = Robot(**values)
+    wanted = tuple(joints) if isinstance(joints, (list, tuple)) else ()
+    try:
+        return robot, robot.chain(wanted)
+    except BlfDscError as error:
+        raise ConfigurationError([f'robot.urdf: {error}']) from error

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The data files of this package and of others, in a sourced ROS and without one."""
+
+from __future__ import annotations
+
+import sysconfig
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from blf_dsc_controller.errors import BlfDscError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+_PACKAGE = 'blf_dsc_controller'
+_CHECKOUT = Path(__file__).resolve().parents[2]
+
+
+def share_folder() -> Path:
+    """Return the folder that holds `config/` and `launch/`, whatever the current folder is.
+
+    The source tree comes first if the code runs from one: an editable install leaves the files
+    there. Then the ament index (colcon), then the data folders of this Python (pip).
+
+    Raises BlfDscError with the places searched if it is in none of them.
+    """
+    searched = []
+    for folder in _candidates():
+        if (folder / 'config').is_dir():
+            return folder
+        searched.append(f'\n  - {folder / "config"}')
+    raise BlfDscError(
+        f'the data files of {_PACKAGE} were not found: install the package again. '
+        f'Searched:{"".join(searched)}'
+    )
+
+
+def resolve(url: str) -> Path:
+    """Return the path of a file, or of a resource as `package://name/path`.
+
+    A path that is not there is looked up in `config/` of this package. Raises BlfDscError where
+    there is none, or no package of that name.
+    """
+    if url.startswith('package://'):
+        name, _, rest = url.removeprefix('package://').partition('/')
+        return _share_of(name) / rest
+    path = Path(url).expanduser()
+    own = share_folder() / 'config' / url
+    if path.is_file() or not own.is_file():
+        return path
+    return own
+
+
+def _share_of(package: str) -> Path:
+    if package == _PACKAGE:
+        return share_folder()
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        return Path(get_package_share_directory(package))
+    except (ImportError, LookupError) as error:
+        raise BlfDscError(
+            f'package {package!r} was not found: source the workspace that has it, or give a path'
+        ) from error
+
+
+def _candidates() -> Iterator[Path]:
+    if (_CHECKOUT / 'setup.py').is_file():
+        yield _CHECKOUT
+    with suppress(ImportError, LookupError, OSError):  # no ROS, index, or package in it
+        from ament_index_python.packages import get_package_share_directory
+
+        yield Path(get_package_share_directory(_PACKAGE))
+    for scheme in (sysconfig.get_default_scheme(), sysconfig.get_preferred_scheme('user')):
+        yield Path(sysconfig.get_path('data', scheme), 'share', _PACKAGE)
