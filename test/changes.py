@@ -12,7 +12,7 @@ BOUND = 2e-3  # rad
 WINDOW = 2.0 * np.pi  # s
 OFF = {'learning.weight': 0.0}
 CHANGED = 20.0  # s
-LATCH = 0.45e-3  # rad, about the error at the first latch of a run without changes
+GENTLE = 0.25e-3  # rad, a quarter of the largest error of a run without changes, or less
 
 PUSHES = [(1, 1.0, 3.0), (1, 2.0, 2.0), (0, 3.0, 3.0)]  # joint, N m, s
 

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import recorded_run
 import synthetic_bag
-from synthetic_bag import JOINTS, Synthetic
+from synthetic_bag import JOINTS, START, Synthetic
 
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.analysis.report import arm, plots, write_report
 from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.messages.topics import JOINT_STATES
+from blf_dsc_controller.messages.topics import CHANGES, JOINT_STATES
+from blf_dsc_controller.messages.types import typestore
 
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 
@@ -30,7 +31,10 @@ def folder(tmp_path_factory):
     made = Synthetic(4000)
     made.error[1234, 0] = -0.005  # one sample far outside
     made.torque[2000:2010, 1] = 20.0  # ten at the limit
-    synthetic_bag.write(path / 'synthetic', made.messages(with_timing=True))
+    pushed = json.dumps({'stamp': START + 2_500_000_000, 'parameters': {'load.torque': [1.0, 0.0]}})
+    message = typestore().types[CHANGES.type](data=pushed)
+    change = (CHANGES, START, bytes(typestore().serialize_cdr(message, CHANGES.type)))
+    synthetic_bag.write(path / 'synthetic', [*made.messages(with_timing=True), change])
     return path
 
 
@@ -58,13 +62,14 @@ def test_a_peak_of_one_sample_is_not_thinned_away(folder):
     assert set(bound['y']) == {2.0}
 
 
-def test_events_are_violations_saturation_and_the_latch(folder):
+def test_events_are_violations_saturation_the_latch_and_changes_of_the_plant(folder):
     (bag,) = read_bags([folder / 'synthetic'])
     events = {(event.kind, round(event.time, 3)): event.text for event in bag.events}
     assert events == {
         ('violation', 1.234): 'shoulder outside of its bound for 1 samples',
         ('learning', 1.5): 'first excited window: learning began',
         ('saturation', 2.0): 'elbow at its torque limit for 10 samples',
+        ('plant', 2.5): 'load.torque: [1.0, 0.0]',
     }
 
 

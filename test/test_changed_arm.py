@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arms that change while they are learned, over ROS: the package's plant and the one in MuJoCo.
 
-The bound holds, the largest error is not above 1.2 times that without learning (or that of a first
-latch), and two windows after the last change the parameters are known again.  `make test-long` runs
-all rows, the suite one of them; `test_law_consistency.py` has them without ROS.
+The bound holds, the largest error is not above 1.2 times that without learning (nor, after gentle
+changes, above 0.25 mrad), and two windows after the last change the parameters are known again.
+`make test-long` runs all rows, the suite one; `test_law_consistency.py` has them without ROS.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from changes import BOUND, LATCH, OFF, ROWS, begin_of, end_of
+from changes import BOUND, GENTLE, OFF, ROWS, begin_of, end_of
 from ros_rig import simulated_torques, torques
 from test_mujoco_plant import example  # noqa: F401 - a fixture
 
@@ -48,7 +48,7 @@ def test_bound_holds_in_lockstep_and_learning_costs_nothing(ros, name):
     assert np.all(np.abs(learning.error) < BOUND)
     changed = learning.time >= begin_of(plant)
     largest, allowed = (np.abs(one.error[changed]).max(axis=0) for one in (learning, without))
-    assert np.all(largest <= np.maximum(1.2 * allowed, LATCH))
+    assert np.all(largest <= np.maximum(1.2 * allowed, GENTLE))
     assert_learned(learning.learning.values[-1], plant)
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.configuration.ros_yaml import parse
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.messages.topics import DIAGNOSTICS
+from blf_dsc_controller.messages.topics import CHANGES, DIAGNOSTICS
 from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Run
 
@@ -79,7 +80,7 @@ def _read(path: Path, name: str, namespace: str) -> ReportedBag:
     keys = (f'arm.l{i + 1}' for i in range(len(run.joints)))
     lengths = [entries.get(key, entries.get('arm.l1', 1.0)) for key in keys]
     lost = (Event(0.0, 'lost', f'{topic}: {text}') for topic, text in context.losses.items())
-    events = (*_events(run), *_diagnosed(path, run), *lost)
+    events = (*_events(run), *_diagnosed(path, run), *_changed(path, run, namespace), *lost)
     return ReportedBag(
         name,
         run,
@@ -141,6 +142,20 @@ def _diagnosed(path: Path, run: Run) -> Iterator[Event]:
                     shown[status.name] = now
                     level = _LEVELS[min(now[0], len(_LEVELS) - 1)]
                     yield Event(time, level, f'{status.name}: {now[1]}')
+
+
+def _changed(path: Path, run: Run, namespace: str) -> Iterator[Event]:
+    """Each change of the simulated plant's parameters while it ran."""
+    name = f'/{namespace.strip("/")}'.rstrip('/') + CHANGES.resolved
+    with open_bag(path) as bag:
+        if (name, CHANGES.type) not in bag.held:
+            return
+        for _, _, raw in bag.messages({name}):
+            message: Any = typestore().deserialize_cdr(raw, CHANGES.type)
+            content = json.loads(message.data)
+            time = (content['stamp'] - int(run.stamp[0])) * 1e-9
+            for parameter, value in content['parameters'].items():
+                yield Event(time, 'plant', f'{parameter}: {_shown(value)}')
 
 
 def _shown(value: object) -> str:
