@@ -11,7 +11,7 @@ import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from sim_plant.dynamics import PointMassArm, tip
+from sim_plant.arm import Arm
 
 
 class Wall(NamedTuple):
@@ -57,14 +57,14 @@ def wall_force(wall: Wall, position: np.ndarray, velocity: np.ndarray) -> float:
 
 @inner
 def subtract_contact_torque(
-    arm: PointMassArm, contact: Contact, q: np.ndarray, dq: np.ndarray, torque: np.ndarray
+    arm: Arm, contact: Contact, q: np.ndarray, dq: np.ndarray, torque: np.ndarray
 ) -> None:
     """Subtract J^T f (n,) [N m] of the force at the tip from a torque, in place."""
     push, wall, state = contact
     is_pushed = push[0] != 0.0 or push[1] != 0.0 or push[2] != 0.0
     if not is_pushed and wall.stiffness == 0.0:
         return
-    tip(arm, q, state.position, state.jacobian)
+    arm.fill_tip(q, state.position, state.jacobian)
     force = state.force
     if wall.stiffness > 0.0:
         for i in range(3):  # the velocity of the tip, for now

@@ -17,8 +17,6 @@ import numpy as np
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 
-PARAMETERS = 3
-
 
 class PointMassArm(NamedTuple):
     """Lengths, masses and gravity; l2, m1 and m2 are unknown to the controller."""
@@ -28,6 +26,35 @@ class PointMassArm(NamedTuple):
     m1: float  # kg
     m2: float  # kg
     g: float  # m/s^2
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return 2
+
+    @property
+    def p(self) -> int:
+        """Number of parameters."""
+        return 3
+
+    def fill_parameters(self, payload: float, P: np.ndarray) -> None:
+        """`parameters` with a payload [kg]."""
+        parameters(loaded(self, payload), P)
+
+    def fill_tip(self, q: np.ndarray, position: np.ndarray, jacobian: np.ndarray) -> None:
+        """`tip`."""
+        tip(self, q, position, jacobian)
+
+    def accelerate(
+        self,
+        payload: float,
+        q: np.ndarray,
+        dq: np.ndarray,
+        torque: np.ndarray,
+        ddq: np.ndarray,
+    ) -> None:
+        """`acceleration` with a payload [kg]."""
+        acceleration(loaded(self, payload), q, dq, torque, ddq)
 
 
 class JointDisturbance(NamedTuple):

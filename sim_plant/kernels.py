@@ -14,8 +14,9 @@ from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
 from blf_dsc_controller.compiled.views import part, view
 from sim_plant.actuator import Drives, DriveState, actuate
+from sim_plant.arm import Arm
 from sim_plant.contact import Contact, TipState, Wall
-from sim_plant.dynamics import PARAMETERS, JointDisturbance, PointMassArm, loaded, parameters
+from sim_plant.dynamics import JointDisturbance
 from sim_plant.events import Acting, Events, Load, update_acting
 from sim_plant.integrator import Stages, integrate
 from sim_plant.motion import Motion, disturbing_torque
@@ -23,13 +24,17 @@ from sim_plant.sensors import EncoderReading, Encoders, draw, is_noisy, sense
 
 
 class PlantSettings(NamedTuple):
-    """Everything that defines a plant except its seed and its initial state."""
+    """Everything that defines a plant except its seed and its initial state.
 
+    The arm is passed to kernels as it is, everything else in one vector.
+    """
+
+    arm: Arm
     n: int
+    p: int  # parameters of the arm
     period_ns: int
     integrator: int  # RK4 or DOPRI5
     events: int  # how many
-    arm: PointMassArm
     encoders: Encoders
     disturbance: JointDisturbance
     drives: Drives
@@ -55,9 +60,11 @@ state_of, state_size = view_of(PlantState), size_of(PlantState)
 
 
 @inner
-def plant_views(settings: np.ndarray, state: np.ndarray) -> tuple[PlantSettings, PlantState]:
+def plant_views(
+    arm: Arm, settings: np.ndarray, state: np.ndarray
+) -> tuple[PlantSettings, PlantState]:
     """Views of both vectors, not reference-counted."""
-    plant = settings_of(view(settings))
+    plant = settings_of(view(settings), arm)
     return plant, state_of(view(state), plant)
 
 
@@ -67,7 +74,8 @@ def update_motion(plant: PlantSettings, now: PlantState) -> Motion:
     acting, disturbance = now.acting, plant.disturbance
     update_acting(disturbance, plant.load, plant.schedule, now.sample[0], acting)
     return Motion(
-        loaded(plant.arm, acting.payload[0]),
+        plant.arm,
+        acting.payload[0],
         JointDisturbance(
             acting.constant,
             disturbance.amplitude,
@@ -126,40 +134,43 @@ def step(plant: PlantSettings, now: PlantState, command: np.ndarray) -> None:
 
 @inner
 def true_parameters(plant: PlantSettings, now: PlantState, out: np.ndarray) -> None:
-    """Write P (3,) of this sample, with the payload in it."""
-    parameters(update_motion(plant, now).arm, out)
+    """Write P (p,) of this sample, with the payload in it."""
+    motion = update_motion(plant, now)
+    motion.arm.fill_parameters(motion.payload, out)
 
 
 @inner
 def truth(plant: PlantSettings, now: PlantState, out: np.ndarray) -> None:
-    """Write what no sensor measures, [P, tau_dist, q, dq] (3 + 3n,) of this sample."""
+    """Write what no sensor measures, [P, tau_dist, q, dq] (p + 3n,) of this sample."""
     n = plant.n
     t = now.sample[0] * plant.period_ns * 1e-9
     true_parameters(plant, now, out)
     q, dq = part(now.x, 0, (n,)), part(now.x, n, (n,))
-    disturbing_torque(update_motion(plant, now), t, q, dq, part(out, PARAMETERS, (n,)))
+    disturbing_torque(update_motion(plant, now), t, q, dq, part(out, plant.p, (n,)))
     for i in range(2 * n):
-        out[PARAMETERS + n + i] = now.x[i]
+        out[plant.p + n + i] = now.x[i]
 
 
 @kernel
-def observe_plant(settings: np.ndarray, state: np.ndarray, measurement: np.ndarray) -> None:
+def observe_plant(
+    arm: Arm, settings: np.ndarray, state: np.ndarray, measurement: np.ndarray
+) -> None:
     """`observe` of packed vectors."""
-    plant, now = plant_views(settings, state)
+    plant, now = plant_views(arm, settings, state)
     observe(plant, now, measurement)
 
 
 @kernel
-def step_plant(settings: np.ndarray, state: np.ndarray, command: np.ndarray) -> None:
+def step_plant(arm: Arm, settings: np.ndarray, state: np.ndarray, command: np.ndarray) -> None:
     """`step` of packed vectors."""
-    plant, now = plant_views(settings, state)
+    plant, now = plant_views(arm, settings, state)
     step(plant, now, command)
 
 
 @kernel
-def plant_truth(settings: np.ndarray, state: np.ndarray, out: np.ndarray) -> None:
+def plant_truth(arm: Arm, settings: np.ndarray, state: np.ndarray, out: np.ndarray) -> None:
     """`truth` of packed vectors."""
-    plant, now = plant_views(settings, state)
+    plant, now = plant_views(arm, settings, state)
     truth(plant, now, out)
 
 

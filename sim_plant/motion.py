@@ -7,14 +7,16 @@ import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.views import part
+from sim_plant.arm import Arm
 from sim_plant.contact import Contact, subtract_contact_torque
-from sim_plant.dynamics import JointDisturbance, PointMassArm, acceleration, disturbance_torque
+from sim_plant.dynamics import JointDisturbance, disturbance_torque
 
 
 class Motion(NamedTuple):
     """What determines the acceleration beside the torque of the motors."""
 
-    arm: PointMassArm
+    arm: Arm
+    payload: float  # kg
     disturbance: JointDisturbance
     contact: Contact
 
@@ -40,4 +42,4 @@ def state_derivative(
     for i in range(n):
         velocity[i] = dq[i]
         net_torque[i] = torque[i] - net_torque[i]
-    acceleration(motion.arm, q, dq, net_torque, net_torque)  # in place
+    motion.arm.accelerate(motion.payload, q, dq, net_torque, net_torque)  # in place

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.plant import PlantConfig
 from sim_plant.actuator import Drives
+from sim_plant.arms import arm_of, parameter_names_of
 from sim_plant.contact import Wall
-from sim_plant.dynamics import PARAMETERS, JointDisturbance, PointMassArm
+from sim_plant.dynamics import JointDisturbance
 from sim_plant.events import Events, Load
 from sim_plant.integrator import INTEGRATORS
 from sim_plant.kernels import (
@@ -45,6 +45,7 @@ class Plant:
     def __init__(
         self, settings: PlantSettings, position: ArrayLike, velocity: ArrayLike, seed: int = 0
     ) -> None:
+        self.arm = settings.arm
         self.settings = pack(settings)
         self.joints = settings.n
         self.period_ns = settings.period_ns
@@ -55,7 +56,7 @@ class Plant:
         self._now.reading.sample[0] = self._now.acting.sample[0] = -1.0
         self._initial = self.state.copy()
         self._measurement = np.zeros(3 * self.joints)
-        self._truth = np.zeros(PARAMETERS + 3 * self.joints)
+        self._truth = np.zeros(settings.p + 3 * self.joints)
         self._seed = seed
         self.rng = generator(seed)
 
@@ -77,15 +78,16 @@ class Plant:
         """
         if self._noisy and self._now.reading.sample[0] != self.sample:
             self.rng.standard_normal(out=self._now.reading.noise)
-        observe_plant(self.settings, self.state, self._measurement)
+        observe_plant(self.arm, self.settings, self.state, self._measurement)
         return self._measurement
 
     def step(self, torque: np.ndarray) -> None:
         """Apply the commanded torque (n,) [N m] and advance to the next sample."""
-        step_plant(self.settings, self.state, torque)
+        step_plant(self.arm, self.settings, self.state, torque)
 
     def change(self, settings: PlantSettings) -> None:
         """Continue with other settings of as many joints and the same period and delay."""
+        self.arm = settings.arm
         self.settings = pack(settings)
         self._now.acting.sample[0] = -1.0
 
@@ -96,8 +98,8 @@ class Plant:
         self._now.sample[0] += 1.0
 
     def truth(self) -> np.ndarray:
-        """[P, tau_dist, q, dq] (3 + 3n,) of this sample: a view, overwritten by the next call."""
-        plant_truth(self.settings, self.state, self._truth)
+        """[P, tau_dist, q, dq] (p + 3n,) of this sample: a view, overwritten by the next call."""
+        plant_truth(self.arm, self.settings, self.state, self._truth)
         return self._truth
 
     def reset(self) -> None:
@@ -115,22 +117,18 @@ class Plant:
         self.rng.bit_generator.state = saved.generator
 
 
-def arm_of(config: PlantConfig) -> PointMassArm:
-    """Arm of a configuration."""
-    return PointMassArm(*vars(config.arm).values())
-
-
 def parameters_of(config: PlantConfig, t: float = 0.0) -> np.ndarray:
-    """True parameters P (3,) [kg m^2] of a configured arm, with its payload at time t [s]."""
+    """True parameters P (p,) of a configured arm, with its payload at time t [s]."""
     plant = plant_of(config)
     plant.state[0] = round(t / config.sample_time)
-    return plant.truth()[:PARAMETERS]
+    return plant.truth()[: plant.arm.p]
 
 
-def parameter_order(names: Sequence[str]) -> np.ndarray:
+def parameter_order(names: Sequence[str], config: PlantConfig) -> np.ndarray:
     """Place of each of a model's parameters in P; -1 for all if the model has other ones."""
-    known = set(names) == set(PARAMETER_NAMES)
-    return np.array([PARAMETER_NAMES.index(name) if known else -1 for name in names])
+    true = parameter_names_of(config)
+    known = set(names) == set(true)
+    return np.array([true.index(name) if known else -1 for name in names])
 
 
 def plant_of(config: PlantConfig) -> Plant:
@@ -141,14 +139,15 @@ def plant_of(config: PlantConfig) -> Plant:
 
 def settings_of(config: PlantConfig) -> PlantSettings:
     """Settings of a configured plant."""
-    n = len(config.joints)
+    arm, n = arm_of(config), len(config.joints)
     sensor, actuator, load, wall = config.sensor, config.actuator, config.load, config.wall
     return PlantSettings(
+        arm=arm,
         n=n,
+        p=arm.p,
         period_ns=config.sample_time_ns,
         integrator=INTEGRATORS[config.integrator],
         events=len(config.events.begin),
-        arm=arm_of(config),
         encoders=Encoders(
             sensor.position_noise,
             sensor.velocity_noise,

@@ -5,7 +5,7 @@ By Newton and Euler in the base's frame, independently of the controller's regre
 checks the other.  The bias C dq + G is the torque of the motion without acceleration; a column of M
 is the torque of a unit acceleration of one joint, which moves all bodies beyond it as one:
 
-    (M(q) + rotors) ddq + C(q, dq) dq + G(q) = torque + J(q)^T force
+    (M(q) + rotors) ddq + C(q, dq) dq + G(q) = torque
 
 (Featherstone, Rigid Body Dynamics Algorithms, 2008, chapters 5 and 6.)
 """
@@ -60,8 +60,6 @@ class Motion(NamedTuple):
     velocity: Annotated[Array, 'n + 1', 3]  # of the origin, m/s
     turning_rate: Annotated[Array, 'n + 1', 3]  # rad/s^2, without ddq
     bias: Annotated[Array, 'n + 1', 3]  # acceleration of the origin without ddq and gravity, m/s^2
-    tip: Annotated[Array, 3]  # m
-    tip_velocity: Annotated[Array, 3]  # m/s
     # Of all bodies from one on, about its origin: working memory.
     mass: Annotated[Array, 'n + 1']
     moment: Annotated[Array, 'n + 1', 3]
@@ -73,7 +71,7 @@ class Motion(NamedTuple):
 
 
 def rigid_bodies(
-    chain: Chain, gravity: tuple[float, float, float], inertias: np.ndarray, rotors: np.ndarray
+    chain: Chain, gravity: tuple[float, ...], inertias: np.ndarray, rotors: np.ndarray
 ) -> RigidBodies:
     """Bodies with the geometry of a chain and these inertias (n, 10) and rotors (n,)."""
     tensors = [pseudo_inertia(inertia) for inertia in inertias]
@@ -94,7 +92,7 @@ def rigid_bodies(
 
 @inner
 def locate(arm: RigidBodies, q: np.ndarray, dq: np.ndarray, now: Motion) -> None:
-    """Write where the bodies and the tip are at q (n,), and how they move at dq (n,)."""
+    """Write where the bodies are at q (n,), and how they move at dq (n,)."""
     for r in range(3):
         for c in range(3):
             now.rotation[0, r, c] = 1.0 if r == c else 0.0
@@ -122,10 +120,6 @@ def locate(arm: RigidBodies, q: np.ndarray, dq: np.ndarray, now: Motion) -> None
         put(velocity, now.velocity[i + 1])
         bias = plus(vector(now.bias[i]), plus(cross(dw, lever), cross(w, speed)))
         put(plus(bias, times(2.0 * slides, swept)), now.bias[i + 1])
-    lever = product(now.rotation[arm.n], vector(arm.tip))
-    put(plus(vector(now.origin[arm.n]), lever), now.tip)
-    speed = cross(vector(now.turning[arm.n]), lever)
-    put(plus(vector(now.velocity[arm.n]), speed), now.tip_velocity)
 
 
 @inner
@@ -141,14 +135,28 @@ def turn(R: np.ndarray, axis: Vector, angle: float) -> None:
 
 
 @inner
-def acceleration(
-    arm: RigidBodies, now: Motion, torque: np.ndarray, force: np.ndarray, ddq: np.ndarray
-) -> None:
-    """Write ddq (n,) where `locate` left the arm; it may be the torque's own vector.
+def tip(arm: RigidBodies, now: Motion, position: np.ndarray, jacobian: np.ndarray) -> None:
+    """Write the tip (3,) [m] where `locate` left it, and its Jacobian (3, n) [m/rad, or 1]."""
+    lever = product(now.rotation[arm.n], vector(arm.tip))
+    end = plus(vector(now.origin[arm.n]), lever)
+    put(end, position)
+    for j in range(arm.n):
+        axis = vector(now.axis[j + 1])
+        if arm.prismatic[j] == 0.0:
+            axis = cross(axis, plus(end, times(-1.0, vector(now.origin[j + 1]))))
+        for r in range(3):
+            jacobian[r, j] = axis[r]
 
-    `torque` (n,) [N m, or N] is that of the joints, `force` (3,) [N] acts on the tip, in the base.
+
+@inner
+def acceleration(
+    arm: RigidBodies, now: Motion, payload: float, torque: np.ndarray, ddq: np.ndarray
+) -> None:
+    """Write ddq (n,) where `locate` left the arm, with a point mass [kg] at its tip.
+
+    It may be the vector of the joints' `torque` (n,) [N m, or N].
     """
-    add_up(arm, now, force)
+    add_up(arm, now, payload)
     for j in range(arm.n):
         ddq[j] = torque[j] - along_joint(
             arm, now, j, vector(now.force[j + 1]), vector(now.torque[j + 1])
@@ -162,18 +170,21 @@ def acceleration(
 
 
 @inner
-def add_up(arm: RigidBodies, now: Motion, force: np.ndarray) -> None:
+def add_up(arm: RigidBodies, now: Motion, payload: float) -> None:
     """From the tip to the base, add up inertias, and forces and moments of the bias."""
     n = arm.n
-    lever = product(now.rotation[n], vector(arm.tip))
-    F = times(-1.0, vector(force))
-    N = cross(lever, F)
+    F = N = (0.0, 0.0, 0.0)
     for i in range(n, 0, -1):
         R = now.rotation[i]
         m = arm.mass[i - 1]
         h = product(R, vector(arm.moment[i - 1]))
         I = now.inertia[i]
         rotate(R, arm.inertia[i - 1], I)
+        if i == n:
+            lever = product(R, vector(arm.tip))
+            h = plus(h, times(payload, lever))
+            m += payload
+            add_point(payload, lever, I)
         w, dw = vector(now.turning[i]), vector(now.turning_rate[i])
         a = plus(vector(now.bias[i]), times(-1.0, vector(arm.gravity)))
         F = plus(F, plus(times(m, a), plus(cross(dw, h), cross(w, cross(w, h)))))
@@ -210,6 +221,15 @@ def add_inertia(I: np.ndarray, h: Vector, m: float, lever: Vector, out: np.ndarr
         for c in range(3):
             products = h[r] * lever[c] + lever[r] * h[c] + m * lever[r] * lever[c]
             out[r, c] += I[r, c] - products + (sphere if r == c else 0.0)
+
+
+@inner
+def add_point(m: float, lever: Vector, out: np.ndarray) -> None:
+    """Add the inertia (3, 3) of a point mass."""
+    for r in range(3):
+        for c in range(3):
+            sphere = dot(lever, lever) if r == c else 0.0
+            out[r, c] += m * (sphere - lever[r] * lever[c])
 
 
 @inner

@@ -57,7 +57,7 @@ UNEVENTFUL = Events(*np.zeros((4, 0)), *(np.zeros((0, size)) for size in (2, 3, 
 def motion(arm=ARM, load=None, force=(0.0, 0.0, 0.0), wall=NOWHERE):
     """Equation of motion of an arm, with a disturbance, and a force at its tip."""
     tip = TipState(np.zeros(3), np.zeros((3, 2)), np.zeros(3))
-    return Motion(arm, load or disturbance(), Contact(np.array(force), wall, tip))
+    return Motion(arm, 0.0, load or disturbance(), Contact(np.array(force), wall, tip))
 
 
 def settings(
@@ -74,11 +74,12 @@ def settings(
 ):
     """Settings of the arm of Section IV at 1 kHz."""
     return PlantSettings(
+        arm=ARM,
         n=2,
+        p=3,
         period_ns=period_ns,
         integrator=integrator,
         events=0,
-        arm=ARM,
         encoders=Encoders(position_noise, velocity_noise, resolution, velocity_source),
         disturbance=disturbance() if load is None else load,
         drives=Drives(np.array(torque_limit), delay),

@@ -13,7 +13,7 @@ from random_arm import CONFIG, PANDA, UR5E, configuration, pinocchio_model, rand
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.compiled.layout import size_of, view_of
-from sim_plant.rigid_body import Motion, acceleration, locate, rigid_bodies
+from sim_plant.rigid_body import Motion, acceleration, locate, rigid_bodies, tip
 
 LEANING = (1.0, -3.0, 5.0)
 ARMS = {
@@ -36,7 +36,6 @@ class Case:
         self.n = len(joints)
         random = np.random.default_rng(self.n)
         self.q, self.dq, self.torque = random.normal(size=(3, self.n))
-        self.force = random.normal(size=3)
         self.rotors = random.uniform(0.01, 0.3, self.n)
         self.arm = rigid_bodies(self.chain, gravity, self.chain.inertias, self.rotors)
         self.now = motion_of(np.full(motion_size(self.arm), np.nan), self.arm)
@@ -46,10 +45,10 @@ class Case:
         self.data = self.model.createData()
         self.theirs = configuration(self.model, self.q)
 
-    def acceleration(self, q, dq, torque, force):
-        ddq = np.array(torque)
-        locate(self.arm, q, dq, self.now)
-        acceleration(self.arm, self.now, ddq, force, ddq)  # in place
+    def acceleration(self, payload=0.0):
+        ddq = self.torque.copy()
+        locate(self.arm, self.q, self.dq, self.now)
+        acceleration(self.arm, self.now, payload, ddq, ddq)  # in place
         return ddq
 
     def jacobian(self):
@@ -66,33 +65,32 @@ def case(request):
 
 
 def test_acceleration_is_that_of_the_articulated_body_algorithm(case):
-    for force in (np.zeros(3), case.force):
-        torque = case.torque + case.jacobian().T @ force
-        expected = pinocchio.aba(case.model, case.data, case.theirs, case.dq, torque)
-        ours = case.acceleration(case.q, case.dq, case.torque, force)
-        np.testing.assert_allclose(ours, expected, rtol=1e-10, atol=1e-10)
+    expected = pinocchio.aba(case.model, case.data, case.theirs, case.dq, case.torque)
+    np.testing.assert_allclose(case.acceleration(), expected, rtol=1e-10, atol=1e-10)
 
 
 def test_tip_and_bodies_are_where_pinocchio_has_them(case):
     locate(case.arm, case.q, case.dq, case.now)
     pinocchio.framesForwardKinematics(case.model, case.data, case.theirs)
-    tip = case.data.oMf[case.model.getFrameId(case.tip)].translation
-    np.testing.assert_allclose(case.now.tip, tip, atol=1e-12)
-    np.testing.assert_allclose(case.now.tip_velocity, case.jacobian() @ case.dq, atol=1e-12)
+    position, jacobian = np.zeros(3), np.zeros((3, case.n))
+    tip(case.arm, case.now, position, jacobian)
+    expected = case.data.oMf[case.model.getFrameId(case.tip)].translation
+    np.testing.assert_allclose(position, expected, atol=1e-12)
+    np.testing.assert_allclose(jacobian, case.jacobian(), atol=1e-12)
     for i in range(case.n + 1):
         np.testing.assert_allclose(case.now.origin[i], case.data.oMi[i].translation, atol=1e-12)
         np.testing.assert_allclose(case.now.rotation[i], case.data.oMi[i].rotation, atol=1e-12)
 
 
 def test_inertia_is_that_of_pinocchio(case):
-    case.acceleration(case.q, case.dq, case.torque, case.force)
+    case.acceleration()
     M = pinocchio.crba(case.model, case.data, case.theirs)
     np.testing.assert_allclose(case.now.M, M, atol=1e-12)
 
 
 def test_the_controllers_regressor_gives_the_torque_back(case):
     """H(q, dq, dq, ddq) P = torque, by two derivations that share nothing but the geometry."""
-    ddq = case.acceleration(case.q, case.dq, case.torque, np.zeros(3))
+    ddq = case.acceleration()
     model = serial_chain(case.chain, LEANING)
     H = np.zeros((case.n, model.p))
     model.regressor(case.q, case.dq, case.dq, ddq, H)
@@ -103,18 +101,15 @@ def test_the_controllers_regressor_gives_the_torque_back(case):
 def test_other_inertias_and_a_load_are_felt():
     """A truth that is not the URDF's: links 20 % heavier, 2 kg at the tip."""
     case = Case('panda')
-    point = np.append(case.chain.tip_placement[:3, 3], 1.0)
+    point = case.chain.tip_placement[:3, 3]
     inertias = 1.2 * case.chain.inertias
-    load = pinocchio.Inertia(2.0, point[:3], np.zeros((3, 3)))
-    inertias[-1] += load.toDynamicParameters()
     case.arm = rigid_bodies(case.chain, LEANING, inertias, case.rotors)
     for i in range(case.n):
         heavier = 1.2 * case.chain.inertias[i]
         case.model.inertias[i + 1] = pinocchio.Inertia.FromDynamicParameters(heavier)
-    case.model.inertias[case.n] += load
+    case.model.inertias[case.n] += pinocchio.Inertia(2.0, point, np.zeros((3, 3)))
     expected = pinocchio.aba(case.model, case.data, case.theirs, case.dq, case.torque)
-    ours = case.acceleration(case.q, case.dq, case.torque, np.zeros(3))
-    np.testing.assert_allclose(ours, expected, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(case.acceleration(2.0), expected, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize('name', ['four', 'ur5e'])
@@ -132,21 +127,19 @@ def test_mujoco_reads_the_same_arm_from_the_urdf(name):
     data.qpos[order], data.qvel[order] = case.q, case.dq
     data.qfrc_applied[order] = case.torque
     mujoco.mj_forward(model, data)
-    ours = case.acceleration(case.q, case.dq, case.torque, np.zeros(3))
-    np.testing.assert_allclose(ours, data.qacc[order], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(case.acceleration(), data.qacc[order], rtol=1e-9, atol=1e-9)
 
 
 @njit(error_model='numpy')
-def compiled(arm, vector, q, dq, torque, force, ddq):
+def compiled(arm, vector, q, dq, torque, ddq):
     now = motion_of(vector, arm)
     locate(arm, q, dq, now)
-    acceleration(arm, now, torque, force, ddq)
+    acceleration(arm, now, 2.0, torque, ddq)
 
 
 def test_kernels_compute_what_python_does():
     case = Case('four')
     ddq = np.zeros(case.n)
     vector = np.zeros(motion_size(case.arm))
-    compiled(case.arm, vector, case.q, case.dq, case.torque, case.force, ddq)
-    expected = case.acceleration(case.q, case.dq, case.torque, case.force)
-    np.testing.assert_array_equal(ddq, expected)
+    compiled(case.arm, vector, case.q, case.dq, case.torque, ddq)
+    np.testing.assert_array_equal(ddq, case.acceleration(2.0))

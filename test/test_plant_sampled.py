@@ -34,8 +34,8 @@ def full_plant(**changes):
 
 
 @kernel
-def compiled_run(settings, state, rng, torques, rows):
-    plant, now = plant_views(settings, state)
+def compiled_run(arm, settings, state, rng, torques, rows):
+    plant, now = plant_views(arm, settings, state)
     for k in range(len(torques)):
         draw_noise(plant, now, rng)
         observe(plant, now, rows[k])
@@ -49,7 +49,7 @@ def test_a_compiled_loop_and_python_calls_give_the_same_bits(source, integrator,
     changes = {'velocity_source': source, 'integrator': integrator, 'position_noise': noise}
     arm, other = (full_plant(seed=11, **changes) for _ in range(2))
     rows = np.empty((300, 6))
-    compiled_run(other.settings, other.state, other.rng, commands(300), rows)
+    compiled_run(other.arm, other.settings, other.state, other.rng, commands(300), rows)
     assert (run(arm, commands(300)) == rows).all()
     assert (arm.state == other.state).all()
     assert arm.rng.bit_generator.state == other.rng.bit_generator.state
@@ -58,7 +58,7 @@ def test_a_compiled_loop_and_python_calls_give_the_same_bits(source, integrator,
 def test_without_noise_a_compiled_loop_draws_nothing():
     arm = plant()
     before = arm.rng.bit_generator.state
-    compiled_run(arm.settings, arm.state, arm.rng, commands(10), np.empty((10, 6)))
+    compiled_run(arm.arm, arm.settings, arm.state, arm.rng, commands(10), np.empty((10, 6)))
     assert arm.rng.bit_generator.state == before
 
 
@@ -128,7 +128,7 @@ def test_a_step_allocates_nothing():
     def allocations(samples):
         torques, rows = commands(samples), np.empty((samples, 6))
         before = rtsys.get_allocation_stats()
-        compiled_run(arm.settings, arm.state, arm.rng, torques, rows)
+        compiled_run(arm.arm, arm.settings, arm.state, arm.rng, torques, rows)
         return rtsys.get_allocation_stats().mi_alloc - before.mi_alloc
 
     counting = _nrt_python.memsys_stats_enabled()

@@ -9,16 +9,14 @@ in a file of its own and its name into `arm_model` and into the choices of the p
 
 from __future__ import annotations
 
-from inspect import signature
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numba.core.types.containers import BaseNamedTuple
-from numba.extending import overload_method
 
 from blf_dsc_controller.arms.planar_chain import PlanarChain
+from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.arms.two_link import TwoLink
-from blf_dsc_controller.compiled.jit import INLINED
+from blf_dsc_controller.compiled.jit import compile_methods
 
 
 class ArmModel(Protocol):
@@ -68,15 +66,6 @@ def arm_model(name: str, n: int, l1: float, gravity: float) -> ArmModel:
     return PlanarChain(n, r) if name == 'planar_chain' else TwoLink(r)
 
 
-def _compile_method(name: str) -> None:
-    """Let kernels call this method of every named tuple that has it."""
-
-    def chosen(self: Any, *_arguments: Any) -> Any:
-        return getattr(self.instance_class, name, None)
-
-    chosen.__signature__ = signature(getattr(ArmModel, name))  # type: ignore[attr-defined]
-    overload_method(BaseNamedTuple, name, strict=False, jit_options=INLINED)(chosen)
-
-
-for _method in ('regressor', 'momentum_regressor', 'regressors'):
-    _compile_method(_method)
+compile_methods(
+    ArmModel, ('regressor', 'momentum_regressor', 'regressors'), TwoLink, PlanarChain, SerialChain
+)

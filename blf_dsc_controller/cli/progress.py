@@ -26,7 +26,7 @@ class Progress:
 
     def __init__(self, config: PlantConfig, parameters: Sequence[str]) -> None:
         """Begin at 0 s; `parameters` are the names of the estimates."""
-        self._order = parameter_order(parameters)
+        self._order = parameter_order(parameters, config)
         self._config = config
         self._line = ''
         self._due = time.monotonic() + _LINE_PERIOD

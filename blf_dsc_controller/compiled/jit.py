@@ -17,14 +17,15 @@ import inspect
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import config
-from numba.extending import register_jitable
+from numba.core.types.containers import BaseNamedTuple
+from numba.extending import overload_method, register_jitable
 
 F = TypeVar('F', bound=Callable[..., object])
 
@@ -35,6 +36,7 @@ _PACKAGES = ('blf_dsc_controller.', 'sim_plant.')
 _ROOM = Path(__file__).resolve().parents[1]
 # Layouts and arm models reach a kernel through the types of its arguments.
 _IN_EVERY_KERNEL = (*_ROOM.glob('compiled/*.py'), *_ROOM.glob('arms/*.py'))
+_METHODS: dict[str, list[Callable[..., object]]] = {}  # by name, see `compile_methods`
 
 
 def dependencies(function: Callable[..., object]) -> tuple[set[Path], set[str]]:
@@ -63,6 +65,7 @@ def _globals_of(function: FunctionType) -> Iterator[tuple[str, object]]:
     for name in names:
         value = function.__globals__.get(name)
         yield name, value
+        yield from ((name, method) for method in _METHODS.get(name, ()))
         if isinstance(value, ModuleType) and value.__name__.startswith(_PACKAGES):
             for attribute in names:
                 yield f'{value.__name__}.{attribute}', getattr(value, attribute, None)
@@ -126,6 +129,24 @@ def called(function: F) -> F:
     """Let kernels call `function` without inlining it: for large ones, which compile faster so."""
     register_jitable(**INLINED | {'forceinline': False})(function)
     return function
+
+
+def compile_methods(interface: type, names: Sequence[str], *types: type) -> None:
+    """Let kernels call these methods of named tuples: of the type at hand, and of no other.
+
+    `interface` declares them, `types` implement them: a kernel depends on the files of all.
+    """
+    for name in names:
+        _METHODS.setdefault(name, []).extend(getattr(one, name) for one in types)
+        _compile_method(name, inspect.signature(getattr(interface, name)))
+
+
+def _compile_method(name: str, signature: inspect.Signature) -> None:
+    def chosen(self: Any, *_arguments: Any) -> Any:
+        return getattr(self.instance_class, name, None)
+
+    chosen.__signature__ = signature  # type: ignore[attr-defined]
+    overload_method(BaseNamedTuple, name, strict=False, jit_options=INLINED)(chosen)
 
 
 def kernel(function: F) -> F:

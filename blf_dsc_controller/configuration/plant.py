@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 from blf_dsc_controller.configuration.common import (
     PerJoint,
@@ -15,8 +17,14 @@ from blf_dsc_controller.configuration.common import (
     joint_problems,
 )
 from blf_dsc_controller.configuration.events import Events, Load, Wall
-from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.configuration.schema import non_negative, parameter, positive
+from blf_dsc_controller.configuration.robot import Robot, given_robot
+from blf_dsc_controller.configuration.schema import (
+    Value,
+    non_negative,
+    parameter,
+    parameters,
+    positive,
+)
 
 _fixed = partial(parameter, read_only='the plant is built once, when the node starts')
 
@@ -137,9 +145,30 @@ class PlantConfig(Sampled):
     events: Events = Events()
     realtime: Realtime = field(default_factory=Realtime)
 
+    @classmethod
+    def defaults(cls, given: Mapping[str, Any]) -> dict[str, Value]:
+        """Of the arm of a URDF: its joints, limits and friction, at rest in mid-range."""
+        if not given.get('robot.urdf'):
+            return {}
+        joints = given_robot(given, given.get('joints'))[1].joints
+        middles = [(joint.lower + joint.upper) / 2.0 for joint in joints]
+        zero = (0.0,) * len(joints)
+        return {
+            **{one.name: zero for one in parameters(cls) if one.length == ('joints',)},
+            'robot.rotor_inertia': (),
+            'joints': tuple(joint.name for joint in joints),
+            'initial.position': tuple(q if math.isfinite(q) else 0.0 for q in middles),
+            'disturbance.viscous': tuple(joint.damping for joint in joints),
+            'disturbance.coulomb': tuple(joint.friction for joint in joints),
+            'actuator.torque_limit': tuple(
+                joint.effort if math.isfinite(joint.effort) else 0.0 for joint in joints
+            ),
+        }
+
     def problems(self) -> list[str]:
         """Check the joints, the sample time, and the duration against it."""
-        problems = joint_problems(self.joints, 'the simulated arm', 2)
+        needed = None if self.robot.urdf else 2
+        problems = joint_problems(self.joints, 'the simulated arm', needed)
         problems += self.sample_time_problems() + self.wall.problems()
         if 0.0 < self.duration < self.sample_time:
             problems.append(

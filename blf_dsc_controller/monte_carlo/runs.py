@@ -21,7 +21,7 @@ from blf_dsc_controller.simulation.metrics import (
     metrics_of,
     new_metrics,
 )
-from sim_plant.dynamics import PARAMETERS
+from sim_plant.arms import parameter_names_of
 from sim_plant.plant import parameter_order, plant_of, steps_of
 
 KEPT = 'kept'
@@ -62,14 +62,14 @@ def warm_up(study: Study) -> None:
 
 def metrics_settings(study: Study, plant: PlantConfig) -> MetricsSettings:
     """Settings of the metrics of a run with this plant."""
-    order = parameter_order(model_of(study.controller).parameter_names)
+    order = parameter_order(model_of(study.controller).parameter_names, plant)
     limits = zip(study.controller.torque.limit, plant.actuator.torque_limit, strict=True)
     times = (study.settings.settled_after, *study.settings.moments)
     settled, *moments = (round(t / plant.sample_time) for t in times)
     return MetricsSettings(
         n=len(plant.joints),
         p=order.size,
-        true=PARAMETERS,
+        true=len(parameter_names_of(plant)),
         moments=len(moments) + 1,
         settled=settled,
         limit=np.array([min(law, motor or law) for law, motor in limits]),

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.params_file import dumps
@@ -59,7 +58,7 @@ def write_bag(
 
 
 def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, Message]]:
-    plant = PlantTelemetry(config.joints, PARAMETER_NAMES)
+    plant = PlantTelemetry(config.joints, record.parameters)
     controller = ControllerTelemetry(config.joints, estimate_names(config))
     monitor = Monitor(config.joints, estimate_names(config), record.controller.settings)
     limit = np.array(config.torque.limit)

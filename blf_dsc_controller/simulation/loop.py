@@ -39,6 +39,8 @@ from blf_dsc_controller.simulation.record import START, Record, new_record
 from blf_dsc_controller.supervision.checks import SUSPECT, check_sample, is_valid_state
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant import kernels as plants
+from sim_plant.arm import Arm
+from sim_plant.arms import parameter_names_of
 from sim_plant.plant import Plant, plant_of, steps_of
 
 _CHUNK = 1000  # samples; the guard takes some 20 ms for them
@@ -49,6 +51,7 @@ _NO_CHECKS = np.zeros(2), np.zeros(0), np.zeros(0)
 
 @kernel
 def run_loop(
+    arm: Arm,
     plant_settings: np.ndarray,
     plant_state: np.ndarray,
     rng: np.random.Generator,
@@ -82,7 +85,7 @@ def run_loop(
     law = settings_of(settings, model)
     law_state = state_of(state, law)
     law_signals = signals_of(signals, law)
-    plant, now = plants.plant_views(plant_settings, plant_state)
+    plant, now = plants.plant_views(arm, plant_settings, plant_state)
     reference_view, measured = view(reference), view(measurements)
     rows = view(samples)
     chosen = metrics_settings_of(view(metrics_settings))
@@ -133,7 +136,8 @@ def simulate(
     guard.activate()
     plant = plant_of(plant_config)
     rows = steps_of(plant_config) + 1
-    record = new_record(controller_config, guard.controller, plant, rows, guard.journal)
+    true = parameter_names_of(plant_config)
+    record = new_record(controller_config, guard.controller, plant, true, rows, guard.journal)
     _run_guarded(guard, plant, record, range(1))
     if guard.start_error is not None:
         raise guard.start_error
@@ -210,8 +214,9 @@ def simulate_law(
     journal.note(EventType.ACTIVATE)
     journal.stamp, journal.messages = START, 1
     journal.note(EventType.START, resumed=False)
-    record = new_record(controller_config, controller, plant, steps_of(plant_config) + 1, journal)
-    rows = record.stamps.size
+    rows = steps_of(plant_config) + 1
+    true = parameter_names_of(plant_config)
+    record = new_record(controller_config, controller, plant, true, rows, journal)
     arrays = (record.measurements, record.samples, record.truths)
     _run_samples(controller, plant, (0, rows - 1, True), arrays, metrics or _NO_METRICS)
     return record
@@ -237,6 +242,7 @@ def _run_samples(
 ) -> bool:
     """Call `run_loop`: first, last, is_end; measurements, samples, truths; the rest as there."""
     return run_loop(
+        plant.arm,
         plant.settings,
         plant.state,
         plant.rng,

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.state import Sample, sample_of
@@ -29,6 +28,7 @@ class Record:
     measurements: np.ndarray  # (k, 3 n) [q, dq, applied torque of the last interval]
     samples: np.ndarray  # (k, s) rows of `law.state.Sample`; NaN but for bound, torque after a stop
     truths: np.ndarray  # (k, p + 3 n) [P, tau_dist, q, dq]
+    parameters: tuple[str, ...]  # names of the entries of P
     config: ControllerConfig
     controller: Controller  # after the run
     journal: Journal  # events of the run, their stamps from `START` on
@@ -41,7 +41,7 @@ class Record:
         """All samples as a `Run`, with the truth and, where the law knows it, the terms of (29)."""
         config = self.config
         run = run_of(config, self.controller, self.stamps, self.measurements, self.samples)
-        true = (*PARAMETER_NAMES, *disturbance_names(config.joints))
+        true = (*self.parameters, *disturbance_names(config.joints))
         return replace(
             run,
             truth=Series(true, self.stamps, self.truths[:, : len(true)]),
@@ -54,14 +54,20 @@ class Record:
 
 
 def new_record(
-    config: ControllerConfig, controller: Controller, plant: Plant, rows: int, journal: Journal
+    config: ControllerConfig,
+    controller: Controller,
+    plant: Plant,
+    parameters: tuple[str, ...],
+    rows: int,
+    journal: Journal,
 ) -> Record:
-    """Record of so many samples, to be filled."""
+    """Record of so many samples, to be filled; `parameters` are the names of the plant's."""
     return Record(
         stamps=np.arange(rows, dtype=np.int64) * plant.period_ns,
         measurements=np.zeros((rows, 3 * plant.joints)),
         samples=np.zeros((rows, controller.sample_vector.size)),
         truths=np.zeros((rows, plant.truth().size)),
+        parameters=parameters,
         config=config,
         controller=controller,
         journal=journal,

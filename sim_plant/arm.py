@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The interface between the plant and the mechanics of an arm of n joints.
+
+An arm is a `NamedTuple` of numbers and arrays with the methods of `Arm`.  Kernels call them as
+Python does: those of the type that they are given are compiled into them, and of no other arm.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from blf_dsc_controller.compiled.jit import compile_methods
+from sim_plant.dynamics import PointMassArm
+from sim_plant.rigid_arm import RigidArm
+
+
+class Arm(Protocol):
+    """An arm that may carry a payload, a point mass [kg] at its tip."""
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+
+    @property
+    def p(self) -> int:
+        """Number of parameters P."""
+
+    def fill_parameters(self, payload: float, P: np.ndarray) -> None:
+        """Write the parameters P (p,) that the controller estimates."""
+
+    def fill_tip(self, q: np.ndarray, position: np.ndarray, jacobian: np.ndarray) -> None:
+        """Write the position (3,) [m] of the tip in the base, and its Jacobian (3, n) [m/rad]."""
+
+    def accelerate(
+        self,
+        payload: float,
+        q: np.ndarray,
+        dq: np.ndarray,
+        torque: np.ndarray,
+        ddq: np.ndarray,
+    ) -> None:
+        """Write ddq (n,) [rad/s^2] of M ddq + C dq + G = torque; it may be the torque's vector."""
+
+
+compile_methods(Arm, ('fill_parameters', 'fill_tip', 'accelerate'), PointMassArm, RigidArm)

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The arm that a configuration describes: two point masses, or the arm of a URDF."""
+
+from __future__ import annotations
+
+import functools
+
+from blf_dsc_controller.arms.base_parameters import BaseParameters, base_parameters
+from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
+from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.configuration.plant import PlantConfig
+from sim_plant.arm import Arm
+from sim_plant.dynamics import PointMassArm
+from sim_plant.rigid_arm import rigid_arm
+
+
+def arm_of(config: PlantConfig) -> Arm:
+    """Arm of a configuration."""
+    robot = config.robot
+    if not robot.urdf:
+        return PointMassArm(*vars(config.arm).values())
+    chain = robot.chain(config.joints)
+    parameters = _base_parameters(chain, robot.gravity)
+    return rigid_arm(chain, robot.gravity, chain.inertias, robot.rotors(chain), parameters)
+
+
+def parameter_names_of(config: PlantConfig) -> tuple[str, ...]:
+    """Names of the true parameters P of a configured arm."""
+    robot = config.robot
+    if not robot.urdf:
+        return PARAMETER_NAMES
+    return _base_parameters(robot.chain(config.joints), robot.gravity).model.parameter_names
+
+
+@functools.lru_cache(maxsize=4)
+def _base_parameters(chain: Chain, gravity: tuple[float, float, float]) -> BaseParameters:
+    return base_parameters(chain, gravity)

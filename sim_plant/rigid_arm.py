@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An arm of any serial chain, with a payload at its tip: an `Arm`."""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.arms.base_parameters import BaseParameters
+from blf_dsc_controller.arms.inertia import inertia_of
+from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.compiled.jit import called
+from blf_dsc_controller.compiled.layout import Array, pack, size_of, view_of
+from sim_plant.rigid_body import Motion, RigidBodies, acceleration, locate, rigid_bodies, tip
+
+motion_of, motion_size = view_of(Motion), size_of(Motion)
+
+
+class Content(NamedTuple):
+    """What an arm is."""
+
+    n: int
+    p: int
+    bodies: RigidBodies
+    P: Annotated[Array, 'p']  # without payload
+    P_payload: Annotated[Array, 'p']  # of 1 kg at the tip
+    rest: Annotated[Array, 'n']  # velocities of an arm that stands still
+
+
+content_of = view_of(Content)
+
+
+class RigidArm(NamedTuple):
+    """It holds its working memory: two threads need one each."""
+
+    n: int
+    p: int
+    content: np.ndarray  # Content
+    memory: np.ndarray  # Motion
+
+    def fill_parameters(self, payload: float, P: np.ndarray) -> None:
+        """Write the base parameters P (p,) with a payload [kg]."""
+        content = content_of(self.content)
+        for k in range(self.p):
+            P[k] = content.P[k] + payload * content.P_payload[k]
+
+    def fill_tip(self, q: np.ndarray, position: np.ndarray, jacobian: np.ndarray) -> None:
+        """`rigid_body.tip` at q (n,)."""
+        fill_tip(self.content, self.memory, q, position, jacobian)
+
+    def accelerate(
+        self,
+        payload: float,
+        q: np.ndarray,
+        dq: np.ndarray,
+        torque: np.ndarray,
+        ddq: np.ndarray,
+    ) -> None:
+        """`rigid_body.acceleration` with a payload [kg] at q, dq (n,)."""
+        accelerate(self.content, self.memory, payload, q, dq, torque, ddq)
+
+
+@called
+def fill_tip(
+    vector: np.ndarray,
+    memory: np.ndarray,
+    q: np.ndarray,
+    position: np.ndarray,
+    jacobian: np.ndarray,
+) -> None:
+    """`RigidArm.fill_tip`."""
+    content = content_of(vector)
+    now = motion_of(memory, content.bodies)
+    locate(content.bodies, q, content.rest, now)
+    tip(content.bodies, now, position, jacobian)
+
+
+@called
+def accelerate(
+    vector: np.ndarray,
+    memory: np.ndarray,
+    payload: float,
+    q: np.ndarray,
+    dq: np.ndarray,
+    torque: np.ndarray,
+    ddq: np.ndarray,
+) -> None:
+    """`RigidArm.accelerate`."""
+    bodies = content_of(vector).bodies
+    now = motion_of(memory, bodies)
+    locate(bodies, q, dq, now)
+    acceleration(bodies, now, payload, torque, ddq)
+
+
+def rigid_arm(
+    chain: Chain,
+    gravity: tuple[float, ...],
+    inertias: np.ndarray,
+    rotors: np.ndarray,
+    parameters: BaseParameters,
+) -> RigidArm:
+    """Arm with the geometry of a chain, these inertias (n, 10) and rotors (n,) [kg m^2, or kg]."""
+    bodies = rigid_bodies(chain, gravity, inertias, rotors)
+    point = np.append(bodies.tip, 1.0)
+    payload = np.zeros_like(inertias)
+    payload[-1] = inertia_of(np.outer(point, point))
+    P = parameters.of(inertias, rotors)
+    content = Content(
+        n=bodies.n,
+        p=P.size,
+        bodies=bodies,
+        P=P,
+        P_payload=parameters.of(payload, np.zeros(bodies.n)),
+        rest=np.zeros(bodies.n),
+    )
+    return RigidArm(bodies.n, P.size, pack(content), np.zeros(motion_size(bodies)))

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sampled plant of a URDF's arm: mechanics, events, and what its configuration follows from."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pinocchio
+import pytest
+from random_arm import PANDA, random_urdf
+
+from blf_dsc_controller.arms.base_parameters import base_parameters
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.errors import ConfigurationError
+from sim_plant.plant import parameters_of, plant_of
+
+PANDA_GIVEN = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
+FREE = {'disturbance.viscous': [0.0] * 7, 'disturbance.coulomb': [0.0] * 7}
+
+
+def panda(**given):
+    return build(
+        PlantConfig,
+        {**PANDA_GIVEN, **{name.replace('__', '.'): value for name, value in given.items()}},
+    )
+
+
+def swinging_torques(samples):
+    """Torques (samples, 7) that hold the arm up roughly and swing it."""
+    t = 1e-3 * np.arange(samples)[:, None]
+    amplitude = np.array([20.0, 10.0, 10.0, 10.0, 2.0, 2.0, 1.0])
+    return amplitude * np.sin(2.0 * np.pi * t * np.linspace(1.0, 2.0, 7))
+
+
+def test_a_urdf_is_all_that_is_needed():
+    config = panda()
+    assert config.joints == tuple(PANDA)
+    assert config.initial.position == pytest.approx((0, 0, 0, -1.5708, 0, 1.8675, 0), abs=1e-9)
+    assert config.initial.velocity == config.disturbance.amplitude == (0.0,) * 7
+    assert config.actuator.torque_limit == (87.0,) * 4 + (12.0,) * 3
+    assert change(config, {'seed': 3}).joints == config.joints
+
+
+def test_what_is_given_comes_before_what_the_urdf_says():
+    config = panda(actuator__torque_limit=[50.0] * 7, initial__position=[0.1] * 7)
+    assert config.actuator.torque_limit == (50.0,) * 7
+    assert config.initial.position == (0.1,) * 7
+
+
+@pytest.mark.parametrize(
+    ('given', 'problem'),
+    [
+        ({'robot.urdf': 'panda.urdf'}, 'robot.urdf: neither a tip nor joints were given'),
+        (PANDA_GIVEN | {'joints': ['panda_joint1']}, 'the moving joints from base to tip are'),
+        (PANDA_GIVEN | {'load.torque': [1.0]}, 'load.torque: got 1 entry, but 7 are needed'),
+    ],
+)
+def test_a_configuration_that_does_not_fit_the_urdf_is_rejected(given, problem):
+    with pytest.raises(ConfigurationError, match=problem):
+        build(PlantConfig, given)
+
+
+class InMujoco:
+    """The arm of a URDF in MuJoCo, its fingers stuck, with its own integrator of order 4."""
+
+    def __init__(self, config, payload=0.0):
+        spec = mujoco.MjSpec.from_string(config.robot.text)
+        spec.compiler.boundmass = spec.compiler.boundinertia = 0.0
+        for joint in spec.joints:
+            if joint.name not in config.joints:
+                spec.delete(joint)
+        tip = spec.body(config.robot.tip)
+        if payload:
+            ball = tip.add_body()
+            ball.mass, ball.inertia, ball.explicitinertial = payload, [1e-12] * 3, True
+        self.model = spec.compile()
+        self.model.opt.timestep = config.sample_time
+        self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+        self.model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
+        self.model.opt.gravity[:] = config.robot.gravity
+        self.model.dof_damping[:] = config.disturbance.viscous
+        self.model.dof_armature[:] = config.robot.rotors(config.robot.chain(config.joints))
+        self.data = mujoco.MjData(self.model)
+        self.put(config.initial.position, config.initial.velocity)
+
+    def put(self, q, dq):
+        self.data.qpos[:], self.data.qvel[:] = q, dq
+        mujoco.mj_forward(self.model, self.data)
+
+    def energy(self, q, dq):
+        self.put(q, dq)
+        return self.data.energy.sum()
+
+    def step(self, torque):
+        self.data.qfrc_applied[:] = torque
+        mujoco.mj_step(self.model, self.data)
+
+
+def states(config, torques):
+    """True q, dq (samples + 1, 14) under these torques."""
+    arm = plant_of(config)
+    rows = [arm.truth()[-14:].copy()]
+    for torque in torques:
+        arm.step(torque)
+        rows.append(arm.truth()[-14:].copy())
+    return np.array(rows)
+
+
+def test_an_arm_without_friction_and_torque_keeps_its_energy():
+    config = panda(**{**FREE, 'load.payload': 1.5})
+    rows = states(config, np.zeros((500, 7)))
+    theirs = InMujoco(config, payload=1.5)
+    energies = [theirs.energy(row[:7], row[7:]) for row in rows]
+    kinetic = energies[0] - [theirs.energy(row[:7], np.zeros(7)) for row in rows][-1]
+    assert kinetic > 10.0  # J, it has fallen
+    np.testing.assert_allclose(energies, energies[0], rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize('payload', [0.0, 2.0])
+def test_it_moves_as_in_mujoco(payload):
+    config = panda(**{'disturbance.viscous': [0.5] * 7, 'load.payload': payload})
+    torques = swinging_torques(500)
+    rows = states(config, torques)
+    theirs = InMujoco(config, payload)
+    for torque in torques:
+        theirs.step(torque)
+    moved = np.abs(rows[-1, :7] - rows[0, :7])
+    assert moved.max() > 0.5
+    ends = np.concatenate((theirs.data.qpos, theirs.data.qvel))
+    np.testing.assert_allclose(rows[-1], ends, rtol=0.0, atol=1e-6)
+
+
+def test_the_truth_has_the_base_parameters_with_the_payload():
+    config = panda(**{'events.begin': [0.5], 'events.payload': [2.0]})
+    chain = config.robot.chain(config.joints)
+    base, rotors = base_parameters(chain), config.robot.rotors(chain)
+    np.testing.assert_array_equal(parameters_of(config, 0.4), base.of(chain.inertias, rotors))
+    loaded = chain.inertias.copy()
+    point = chain.tip_placement[:3, 3]
+    loaded[-1] += pinocchio.Inertia(2.0, point, np.zeros((3, 3))).toDynamicParameters()
+    np.testing.assert_allclose(parameters_of(config, 0.6), base.of(loaded, rotors), rtol=1e-12)
+
+
+def test_events_on_seven_joints_are_changes_of_the_plant_at_their_time():
+    """A push of the tip is the torque of its Jacobian; friction, torques and offsets add up."""
+    names = ('force', 'torque', 'viscous', 'coulomb', 'offset')
+    values = ([3.0, -2.0, 5.0], *(np.linspace(low, 2.0 * low, 7) for low in (2.0, 1.0, 0.5, 1e-3)))
+    given = {f'events.{name}': list(value) for name, value in zip(names, values, strict=True)}
+    arm = plant_of(panda(**{'events.begin': [0.1], **given}))
+    push = arm.truth().copy()
+    for torque in swinging_torques(101):
+        push = arm.truth().copy()
+        arm.step(torque)
+    P = arm.arm.p
+    q, dq = push[P + 7 : P + 14], push[P + 14 :]
+    position, jacobian = np.zeros(3), np.zeros((3, 7))
+    arm.arm.fill_tip(q, position, jacobian)
+    expected = -values[1] + values[2] * dq + values[3] * np.tanh(dq / 0.01) - values[0] @ jacobian
+    np.testing.assert_allclose(push[P : P + 7], expected, rtol=1e-12)
+    measured = arm.measure()[:7] - arm.truth()[-14:-7]
+    np.testing.assert_allclose(measured, values[4], atol=1e-12)
+
+
+def test_a_wall_pushes_the_tip_back():
+    floor = {'wall.point': [0.0, 0.0, 0.3], 'wall.stiffness': 2e4, 'wall.damping': 200.0}
+    arm = plant_of(panda(**{'disturbance.viscous': [20.0] * 7, **floor}))
+    for _ in range(2000):
+        arm.step(np.zeros(7))
+    torque, q, dq = arm.truth()[arm.arm.p :].reshape(3, 7).copy()
+    position, jacobian = np.zeros(3), np.zeros((3, 7))
+    arm.arm.fill_tip(q, position, jacobian)
+    force = 2e4 * (0.3 - position[2]) - 200.0 * jacobian[2] @ dq
+    assert 0.25 < position[2] < 0.3
+    assert force > 10.0  # N
+    np.testing.assert_allclose(20.0 * dq - torque, force * jacobian[2], rtol=1e-9, atol=1e-9)
+
+
+def test_two_plants_of_a_urdf_do_not_disturb_each_other_and_repeat():
+    torques = swinging_torques(50)
+    one, other = plant_of(panda()), plant_of(panda(**{'load.payload': 1.0}))
+    rows = []
+    for torque in torques:
+        one.step(torque)
+        other.step(torque)
+        rows.append(one.measure().copy())
+    one.reset()
+    for torque, row in zip(torques, rows, strict=True):
+        one.step(torque)
+        np.testing.assert_array_equal(one.measure(), row)
+
+
+def test_any_chain_will_do():
+    """Four joints, which turn or slide."""
+    text, joints = random_urdf(4, 23)
+    config = build(PlantConfig, {'robot.urdf': text, 'robot.tip': 'tip'})
+    assert config.joints == joints
+    assert any(joint.kind == 'prismatic' for joint in config.robot.chain(joints).joints)
+    arm = plant_of(config)
+    arm.step(np.zeros(4))
+    assert np.isfinite(arm.truth()).all()
