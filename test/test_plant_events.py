@@ -50,6 +50,7 @@ def truths(config, samples=SAMPLES):
     [
         ({'payload': [0.25]}, {'arm.m2': 0.75}),
         ({'payload': [0.25]}, {'load.payload': 0.25}),
+        ({'payload': [0.25]}, {'events.begin': [0.0, 0.0], 'events.payload': [0.125, 0.125]}),
         ({'torque': [2.0, -1.0]}, {'disturbance.constant': [-1.9, 1.1]}),
         ({'torque': [2.0, -1.0]}, {'load.torque': [2.0, -1.0]}),
         ({'force': [1.0, 0.0, -2.0]}, {'load.force': [1.0, 0.0, -2.0]}),
