@@ -23,7 +23,6 @@ _ROUNDS = 9
 _UPDATES = 2000
 _T = 1e-3  # s
 _NOISE = (1e-4, 0.05)  # rad, rad/s: beside the reference, so that every column is excited
-_ANY_RESIDUAL = 1e6  # N m: the states are noise, which no arm explains
 _ANY_EXCITATION = 1e-12
 """A threshold that every window passes: short ones and those of many columns, too."""
 
@@ -32,7 +31,7 @@ def two_link(**changes: Any) -> ControllerConfig:
     """Recommended settings that learn from any window."""
     values = {
         'learning.excitation_threshold': _ANY_EXCITATION,
-        'learning.residual_floor': _ANY_RESIDUAL,
+        'learning.change_detection': False,  # the states are noise, which no arm explains
     }
     return build(ControllerConfig, values | {k.replace('__', '.'): v for k, v in changes.items()})
 
@@ -42,7 +41,7 @@ def chain(n: int, **changes: Any) -> ControllerConfig:
     default: Mapping[str, Any] = flatten(ControllerConfig())
     values: dict[str, Any] = {'model': 'planar_chain', 'joints': [f'joint{i}' for i in range(n)]}
     for one in parameters(ControllerConfig):
-        if one.length == ('joints',):
+        if one.length == ('joints',) and default[one.name]:
             values[one.name] = [default[one.name][0]] * n
     p = n * (n + 1) // 2
     values |= {

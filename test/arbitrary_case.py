@@ -52,6 +52,7 @@ def arbitrary_settings(random: np.random.Generator, n: int, p: int, **changes) -
         'information': np.eye(p + n),
         'variance': np.ones(p + n),
         'damping_rate': 0.0,
+        'row_weight': np.ones(n),
         'radius': 1e3,
     }
     return settings._replace(**arrays | case | changes)

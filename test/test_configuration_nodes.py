@@ -55,7 +55,7 @@ def test_the_noisy_preset_changes_sensors_and_delay_alone():
 
 
 def test_models_and_choices_are_those_of_the_law():
-    assert MODELS == {'two_link': 2, 'planar_chain': None}
+    assert MODELS == {'two_link': 2, 'planar_chain': None, 'urdf': None}
     for name, n in (('two_link', 2), *(('planar_chain', n) for n in (1, 2, 7))):
         model = arm_model(name, n, l1=1.0, gravity=9.8)
         assert model.n == n

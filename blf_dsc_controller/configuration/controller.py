@@ -5,8 +5,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+from blf_dsc_controller.configuration.arm_defaults import controller_defaults
 from blf_dsc_controller.configuration.common import (
     PerJoint,
     Realtime,
@@ -28,13 +29,18 @@ from blf_dsc_controller.configuration.reference import Approach, MotionLimits, R
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.configuration.schema import non_negative, parameter, positive
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from blf_dsc_controller.configuration.schema import Value
+
 _size = partial(parameter, read_only='it sets the size of the state of the law')
 _WINDOW = 'the data in the excitation window depend on it'
 _TOPICS = 'topics are created once, when the node starts'
 
 LAWS = ('blf_dsc', 'model_based', 'backstepping', 'slotine_li')
 
-MODELS: dict[str, int | None] = {'two_link': 2, 'planar_chain': None}
+MODELS: dict[str, int | None] = {'two_link': 2, 'planar_chain': None, 'urdf': None}
 """Number of joints of each model of the arm; None: any number."""
 
 
@@ -152,10 +158,17 @@ class ControllerConfig(Sampled):
     telemetry: Telemetry = Telemetry()
     realtime: Realtime = field(default_factory=Realtime)
 
+    @classmethod
+    def defaults(cls, given: Mapping[str, Any]) -> Mapping[str, Value]:
+        """Return gains and limits for the arm of a URDF; those of the two-link arm are declared."""
+        return controller_defaults(given) if given.get('model') == 'urdf' else {}
+
     def problems(self) -> list[str]:
         """Check parameters against each other, and joints and estimates against the model."""
         needed = MODELS[self.model]
         count = parameter_count(needed or len(self.joints))
+        if self.model == 'urdf':
+            count = len(self.learning.initial_estimate)
         return [
             *joint_problems(self.joints, f'model {self.model}', needed),
             *self.sample_time_problems(),

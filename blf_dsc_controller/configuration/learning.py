@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Literal
 
+from blf_dsc_controller.configuration.common import PerJoint
 from blf_dsc_controller.configuration.schema import counted, non_negative, parameter, positive
 
 _size = partial(parameter, read_only='it sets the memory size of the learning')
@@ -83,8 +84,10 @@ class Learning:
     change_detection: bool = _size(
         True, 'discard the window when torques contradict it: payload, contact, a changed arm'
     )
-    residual_floor: float = positive(
-        0.07, 'unmodelled torque (rms) of a joint that is not taken for a change of the arm', 'N m'
+    residual_floor: PerJoint = positive(
+        (0.07, 0.07),
+        'unmodelled torque (rms) of a joint that is not taken for a change of the arm',
+        'N m',
     )
     anchor_weight: float = non_negative(
         0.1, 'pull to the estimate before a change, until the new window is full'

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from blf_dsc_controller.arms.urdf import Chain, chain_joints, read_chain
 from blf_dsc_controller.configuration.schema import parameter
 from blf_dsc_controller.configuration.share import resolve
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+
+if TYPE_CHECKING:
+    from blf_dsc_controller.arms.base_parameters import BaseParameters
 
 _fixed = partial(parameter, read_only='the arm is built once, when the node starts')
 
@@ -34,11 +37,32 @@ class Robot:
     gravity: Annotated[tuple[float, ...], '3'] = _fixed(
         (0.0, 0.0, -9.81), 'gravity in the base: (0, 0, 9.81) hangs from the ceiling', 'm/s^2', 'g'
     )
+    lag: float = _fixed(
+        0.005,
+        'delay of measured velocities and applied torques, beside the sampling',
+        's',
+        at_least=0.0,
+    )
     payload: float = _fixed(3.0, 'mass that the arm is rated to carry', 'kg', at_least=0.0)
     rotor_inertia: Annotated[tuple[float, ...], 'joints'] = _fixed(
         (),
         'inertia of each drive, reflected to its joint; empty: from its effort',
         'kg m^2',
+        at_least=0.0,
+        omittable=True,
+    )
+
+    viscous: Annotated[tuple[float, ...], 'joints'] = _fixed(
+        (),
+        'viscous friction to start from; empty: damping of the URDF',
+        'N m s/rad',
+        at_least=0.0,
+        omittable=True,
+    )
+    coulomb: Annotated[tuple[float, ...], 'joints'] = _fixed(
+        (),
+        'Coulomb friction to start from; empty: friction of the URDF',
+        'N m',
         at_least=0.0,
         omittable=True,
     )
@@ -51,6 +75,13 @@ class Robot:
     def chain(self, joints: tuple[str, ...]) -> Chain:
         """Serial chain of the joints; raises BlfDscError if there is none."""
         return chain_of(self.text, self.base, self.tip, joints)
+
+    def friction(self, chain: Chain) -> dict[str, tuple[float, ...]]:
+        """Friction of each joint to start from, by the name of its column."""
+        return {
+            'viscous': self.viscous or tuple(joint.damping for joint in chain.joints),
+            'coulomb': self.coulomb or tuple(joint.friction for joint in chain.joints),
+        }
 
     def rotors(self, chain: Chain) -> np.ndarray:
         """Inertias of the drives (n,) [kg m^2]: as given, or rated torque / 400 rad/s^2."""
@@ -77,12 +108,25 @@ def chain_of(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain:
     return read_chain(text, base, tip, found)
 
 
+def parameters_of(robot: Robot, chain: Chain) -> BaseParameters:
+    """Parameters of the arm that torques can show, with the rotors."""
+    gravity = (robot.gravity[0], robot.gravity[1], robot.gravity[2])
+    return _parameters_of(chain, gravity)
+
+
+@functools.lru_cache(maxsize=16)
+def _parameters_of(chain: Chain, gravity: tuple[float, float, float]) -> BaseParameters:
+    from blf_dsc_controller.arms.base_parameters import base_parameters  # compiles
+
+    return base_parameters(chain, gravity)
+
+
 def given_robot(given: Mapping[str, Any], joints: object) -> tuple[Robot, Chain]:
     """Robot and chain of parameters by dotted name, which are not validated yet.
 
     Raises ConfigurationError with what is wrong with the URDF.
     """
-    names = ('urdf', 'base', 'tip', 'gravity', 'payload', 'rotor_inertia')
+    names = ('urdf', 'base', 'tip', 'gravity', 'lag', 'payload', 'rotor_inertia')
     values = {name: given[f'robot.{name}'] for name in names if f'robot.{name}' in given}
     robot = Robot(**values)
     wanted = tuple(joints) if isinstance(joints, (list, tuple)) else ()

@@ -59,7 +59,7 @@ def _share_of(package: str) -> Path:
         from ament_index_python.packages import get_package_share_directory
 
         return Path(get_package_share_directory(package))
-    except (ImportError, LookupError) as error:
+    except (ImportError, LookupError, OSError) as error:
         raise BlfDscError(
             f'package {package!r} was not found: source the workspace that has it, or give a path'
         ) from error

@@ -33,8 +33,7 @@ _MEMORY = 0.1  # s, over which the last rows are averaged
 @inner
 def explained(settings: Settings, residual: float) -> float:
     """Mean square residual that noise and unmodelled torque explain, at least `residual`."""
-    floor = settings.n * settings.residual_floor * settings.residual_floor
-    return max(residual, floor)
+    return max(residual, settings.residual_floor)
 
 
 @inner

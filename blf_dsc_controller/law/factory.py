@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel, arm_model
+from blf_dsc_controller.arms.prior import prior_factor
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import (
@@ -29,9 +31,16 @@ from blf_dsc_controller.law.settings import (
 )
 from blf_dsc_controller.reference.approach import plan_start, reference_of
 
+_ROTORS = 0.5  # deviation of a drive's inertia, of its value
+_FRICTION = 0.05  # deviation of friction, of the rated torque
+
 
 def model_of(config: ControllerConfig) -> ArmModel:
     """Model named by `model`, with the geometry known to the controller."""
+    if config.model == 'urdf':
+        robot = config.robot
+        model = parameters_of(robot, robot.chain(config.joints)).model
+        return model._replace(vector=model.vector.copy())  # its working memory
     return arm_model(config.model, len(config.joints), config.arm.l1, config.arm.gravity)
 
 
@@ -47,6 +56,38 @@ def column_names(config: ControllerConfig) -> tuple[str, ...]:
 def estimate_names(config: ControllerConfig) -> tuple[str, ...]:
     """Name of each entry of theta^: the model's parameters, then the disturbance columns."""
     return model_of(config).parameter_names + column_names(config)
+
+
+def initial_columns(config: ControllerConfig) -> tuple[float, ...]:
+    """Initial estimate of each disturbance column: the friction of a URDF, else zero."""
+    known: dict[str, tuple[float, ...]] = {}
+    if config.model == 'urdf':
+        known = config.robot.friction(config.robot.chain(config.joints))
+    zeros = (0.0,) * len(config.joints)
+    blocks = [name.rsplit(' ', 1)[0] for name in column_names(config)[:: len(config.joints)]]
+    return tuple(value for block in blocks for value in known.get(block, zeros))
+
+
+def prior_covariance(config: ControllerConfig) -> np.ndarray:
+    """Covariance (m, m) of the prior of theta: one for the planar arms, of a URDF its deviations.
+
+    Drives may be off by half, friction columns by a twentieth of the rated torque.
+    """
+    columns = column_names(config)
+    if config.model != 'urdf':
+        return np.eye(len(model_of(config).parameter_names) + len(columns))
+    robot, chain = config.robot, config.robot.chain(config.joints)
+    L = prior_factor(
+        chain, parameters_of(robot, chain), 'base', robot.payload, _ROTORS * robot.rotors(chain)
+    )
+    covariance = np.zeros((len(L) + len(columns),) * 2)
+    covariance[: len(L), : len(L)] = L @ L.T
+    limits = zip(config.torque.limit, config.limits.velocity, strict=True)
+    friction = np.array([(_FRICTION * t, _FRICTION * t / v) for t, v in limits])
+    for k, name in enumerate(columns, len(L)):
+        joint = config.joints.index(name.rsplit(' ', 1)[-1])
+        covariance[k, k] = friction[joint, int(name.startswith('viscous'))] ** 2
+    return covariance
 
 
 def required_fields(config: ControllerConfig) -> tuple[str, ...]:
@@ -65,6 +106,9 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     per_joint = zip(
         config.barrier.bound, config.barrier.weight, config.barrier.slope_limit, strict=True
     )
+    floor = np.array(learning.residual_floor)
+    least = float(floor.min())
+    covariance = prior_covariance(config)
     settings = Settings(
         model=model,
         n=model.n,
@@ -94,9 +138,9 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         rho=learning.regularization,
         sigma=learning.excitation_threshold,
         learning_start=learning.window + learning.settling_time,
-        residual_floor=learning.residual_floor,
+        residual_floor=model.n * least * least,
         anchor_weight=learning.anchor_weight,
-        prior_weight=learning.prior_weight,
+        prior_weight=learning.prior_weight * least * least,
         motion_scale=learning.motion_scale,
         damping_rate=config.feedback.damping_rate,
         pole=learning.filter_pole,
@@ -116,13 +160,14 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         d2=np.array(config.feedback.damping),
         mu_bar=np.zeros(model.n),
         gamma=np.array(config.disturbance.gain),
+        row_weight=least / floor,
         torque_limit=np.array(config.torque.limit),
         rate_limit=np.array(config.torque.rate_limit),
         true_disturbance=np.array((truth.constant, truth.amplitude, truth.frequency, truth.phase)),
         Gamma=np.array(learning.adaptation_gain + (learning.column_gain,) * columns),
-        initial_estimate=np.array(learning.initial_estimate + (0.0,) * columns),
-        information=np.eye(p + columns),
-        variance=np.ones(p + columns),
+        initial_estimate=np.array(learning.initial_estimate + initial_columns(config)),
+        information=np.linalg.inv(covariance),
+        variance=np.diag(covariance).copy(),
         true_parameters=np.array(truth.parameters or (0.0,) * p),
         frequencies=np.array(learning.frequencies),
     )

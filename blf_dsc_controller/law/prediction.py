@@ -92,9 +92,9 @@ def filter_row(
     m = settings.m
     row = signals.row
     for i in range(settings.n):
-        weight = 1.0
+        weight = settings.row_weight[i]
         if settings.motion_scale > 0.0:
-            weight = abs(signals.dqr[i]) / sqrt(signals.dqr[i] ** 2 + settings.motion_scale**2)
+            weight *= abs(signals.dqr[i]) / sqrt(signals.dqr[i] ** 2 + settings.motion_scale**2)
         for j in range(m):
             row[i, j] = 0.5 * (signals.rest[i, j] + state.rest[i, j])
         for j in range(p):

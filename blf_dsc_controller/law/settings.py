@@ -56,7 +56,7 @@ class Settings(NamedTuple):
     rho: float  # regularisation of the Newton update
     sigma: float  # excitation threshold on lambda_min(Phi)
     learning_start: float  # tau_d + T_a, s
-    residual_floor: float  # unmodelled torque of a joint that is consistent, N m
+    residual_floor: float  # mean square residual that noise and unmodelled torque explain, (N m)^2
     anchor_weight: float  # pull to `anchor` while the window is empty
     prior_weight: float  # pull to `initial_estimate`, always
     motion_scale: float  # reference velocity below which rows count less, rad/s; 0: none
@@ -78,6 +78,7 @@ class Settings(NamedTuple):
     d2: Annotated[Array, 'n']  # N m/rad
     mu_bar: Annotated[Array, 'n']  # N m
     gamma: Annotated[Array, 'n']  # gain of (30)
+    row_weight: Annotated[Array, 'n']  # of the rows of a joint: the less, the more is unmodelled
     torque_limit: Annotated[Array, 'n']  # N m
     rate_limit: Annotated[Array, 'n']  # N m/s; 0: none
     true_disturbance: Annotated[Array, 4, 'n']  # constant, then amplitude, frequency, phase

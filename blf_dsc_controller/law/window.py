@@ -78,9 +78,10 @@ def pull_to(
 ) -> None:
     """Add `weight` times the information R on theta = target (m,):  Phi + a R,  b + a R target."""
     for i in range(b.size):
+        pull = weight * target[i]
         for j in range(b.size):
             Phi[i, j] += weight * information[i, j]
-            b[i] += weight * information[i, j] * target[j]
+            b[j] += pull * information[i, j]
 
 
 @inner
@@ -97,11 +98,13 @@ def regularized_factor(
 @inner
 def weigh(information: np.ndarray, x: np.ndarray, out: np.ndarray) -> float:
     """Write R x (m,); returns x^T R x."""
-    square = 0.0
     for i in range(x.size):
         out[i] = 0.0
-        for j in range(x.size):
-            out[i] += information[i, j] * x[j]
+    for j in range(x.size):  # R is symmetric: by rows, which are contiguous
+        for i in range(x.size):
+            out[i] += information[j, i] * x[j]
+    square = 0.0
+    for i in range(x.size):
         square += x[i] * out[i]
     return square
 
@@ -134,13 +137,7 @@ def min_eigenvector(
         for i in range(m):
             direction[i] *= shrink
             work[i] *= shrink
-    quotient = 0.0
-    for i in range(m):
-        work[i] = 0.0
-        for j in range(m):
-            work[i] += Phi[i, j] * direction[j]
-        quotient += direction[i] * work[i]
-    return quotient
+    return weigh(Phi, direction, work)
 
 
 @inner

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The controller of an arm from its URDF: what follows from the file, and the law with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from random_arm import CONFIG, random_urdf
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.law.factory import (
+    controller_of,
+    estimate_names,
+    prior_covariance,
+    settings_of_config,
+)
+
+ARM = {'model': 'urdf', 'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
+
+
+def panda(**changes):
+    return build(ControllerConfig, ARM | {k.replace('__', '.'): v for k, v in changes.items()})
+
+
+def test_an_arm_needs_no_more_than_its_urdf_and_its_tip():
+    config = panda()
+
+    assert config.joints == tuple(f'panda_joint{i}' for i in range(1, 8))
+    assert config.torque.limit == (87.0,) * 4 + (12.0,) * 3
+    assert config.limits.position_upper[3] == pytest.approx(-0.0698)
+    assert config.safety.torque == 'hold_gravity'
+    names = estimate_names(config)
+    assert len(names) == 48 + 14
+    assert {'m*cx7', 'rotor7', 'viscous panda_joint1', 'coulomb panda_joint7'} <= set(names)
+
+
+def test_what_is_given_counts_and_the_rest_follows():
+    config = panda(barrier__bound=[0.01] * 7, robot__lag=0.002)
+    assert config.barrier.bound == (0.01,) * 7
+    assert config.feedback.damping_rate == pytest.approx(
+        panda().feedback.damping_rate * 6.5e-3 / 3.5e-3
+    )
+    assert change(config, {'feedback.damping_rate': 5.0}).feedback.damping_rate == 5.0
+
+
+def test_text_of_a_urdf_is_as_good_as_its_file():
+    file = CONFIG / 'panda.urdf'
+    assert panda(robot__urdf=file.read_text()).learning == panda(robot__urdf=str(file)).learning
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        ({'robot.urdf': 'nowhere.urdf'}, 'robot.urdf: .*nowhere.urdf.* cannot be read'),
+        ({'robot.tip': 'hand'}, "robot.urdf: no link 'hand' for the tip"),
+        ({'robot.tip': ''}, 'robot.urdf: neither a tip nor joints'),
+        ({'joints': ['a', 'b']}, "robot.urdf: no joint 'a' in the URDF"),
+        ({'robot.urdf': 'package://no_such/arm.urdf'}, "package 'no_such' was not found"),
+        ({'barrier.bound': [0.01] * 2}, 'barrier.bound: got 2 entries, but 7 are needed'),
+    ],
+)
+def test_what_is_wrong_with_an_arm_is_said(changes, message):
+    with pytest.raises(ConfigurationError, match=message):
+        build(ControllerConfig, ARM | changes)
+
+
+def test_prior_covers_the_deviations_of_links_drives_and_friction():
+    config = panda()
+    names, covariance = estimate_names(config), prior_covariance(config)
+    deviation = dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
+
+    assert np.linalg.eigvalsh(covariance)[0] > 0.0
+    assert deviation['rotor7'] >= 0.5 * 12.0 / 400.0
+    assert deviation['coulomb panda_joint1'] == pytest.approx(0.05 * 87.0)
+    np.testing.assert_allclose(
+        settings_of_config(config).information @ covariance, np.eye(62), atol=1e-5
+    )
+
+
+def test_gravity_is_compensated_with_the_initial_estimate():
+    """At rest on the reference the torque is G of the URDF, whatever the gains."""
+    config = panda(robot__gravity=[0.0, -9.81, 0.0])
+    law = controller_of(config)
+    q = np.array(config.reference.offset)
+    chain = config.robot.chain(config.joints)
+    base = parameters_of(config.robot, chain)
+    H = np.zeros((7, base.model.p))
+    base.model.regressor(q, np.zeros(7), np.zeros(7), np.zeros(7), H)
+
+    torque = law.update(0.0, 1e-3, np.concatenate((q, np.zeros(14))))
+
+    gravity = H @ base.of(chain.inertias, config.robot.rotors(chain))
+    assert np.abs(gravity).max() > 5.0
+    np.testing.assert_allclose(torque, gravity, atol=0.02)  # P^(0) has four digits
+
+
+def test_prismatic_joints_and_a_third_arm_need_nothing_else():
+    given = {'model': 'urdf', 'robot.urdf': random_urdf(4, seed=3), 'robot.tip': 'tip'}
+    config = build(ControllerConfig, given)
+    assert config.joints == ('j1', 'j2', 'j3', 'j4')
+    assert np.all(np.isfinite(settings_of_config(config).information))
