@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The path of a commanded torque to the joint: a delay, then a limit."""
+"""The path of a commanded torque to the joint: a delay, a limit, a lag, and noise."""
 
+from math import exp
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -10,16 +11,24 @@ from blf_dsc_controller.compiled.layout import Array
 
 
 class Drives(NamedTuple):
-    """Torque limit and input delay."""
+    """What the drives of all joints are like.
+
+    The lag follows the held command exactly; the torque applied in a sample is its mean over it.
+    """
 
     torque_limit: Annotated[Array, 'n']  # N m, 0 = none
     delay: int  # samples
+    decay: float  # of the lag in a sample, exp(-T / time constant); 0: no lag
+    mean_decay: float  # its mean over the sample
+    noise: float  # standard deviation, of the torque
 
 
 class DriveState(NamedTuple):
-    """The torque applied last, and a ring of those still delayed."""
+    """The torque applied last, that at the end of its sample, and a ring of those still delayed."""
 
     applied: Annotated[Array, 'n']  # N m
+    motor: Annotated[Array, 'n']  # N m
+    noise: Annotated[Array, 'n']  # standard normal
     ring: Annotated[Array, 'drives.delay', 'n']  # N m
 
 
@@ -43,4 +52,19 @@ def actuate(drives: Drives, sample: int, command: np.ndarray, state: DriveState)
             slot = sample % drives.delay
             torque = state.ring[slot, i]
             state.ring[slot, i] = command[i]
-        state.applied[i] = limited(torque, drives.torque_limit[i])
+        torque = limited(torque, drives.torque_limit[i])
+        if drives.decay > 0.0:
+            lacking = state.motor[i] - torque
+            state.motor[i] = torque + drives.decay * lacking
+            torque += drives.mean_decay * lacking
+        if drives.noise > 0.0:
+            torque *= 1.0 + drives.noise * state.noise[i]
+        state.applied[i] = torque
+
+
+def lag(time_constant: float, period: float) -> tuple[float, float]:
+    """Return decay and mean decay in a period [s] of a lag with a time constant [s]; 0: no lag."""
+    if time_constant == 0.0:
+        return 0.0, 0.0
+    decay = exp(-period / time_constant)
+    return decay, time_constant / period * (1.0 - decay)

@@ -5,10 +5,14 @@ from __future__ import annotations
 
 import functools
 
+import numpy as np
+
 from blf_dsc_controller.arms.base_parameters import BaseParameters, base_parameters
+from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.truth import Truth
 from sim_plant.arm import Arm
 from sim_plant.dynamics import PointMassArm
 from sim_plant.rigid_arm import rigid_arm
@@ -21,7 +25,19 @@ def arm_of(config: PlantConfig) -> Arm:
         return PointMassArm(*vars(config.arm).values())
     chain = robot.chain(config.joints)
     parameters = _base_parameters(chain, robot.gravity)
-    return rigid_arm(chain, robot.gravity, chain.inertias, robot.rotors(chain), parameters)
+    rotors = config.truth.rotor_factor * robot.rotors(chain)
+    return rigid_arm(chain, robot.gravity, true_inertias(chain, config.truth), rotors, parameters)
+
+
+def true_inertias(chain: Chain, truth: Truth) -> np.ndarray:
+    """Ten of each body (n, 10), with the mass distribution of the URDF scaled and shifted."""
+    moved = np.eye(4)
+    inertias = np.empty((len(chain.joints), 10))
+    for i, (factor, shift) in enumerate(zip(*truth.changes(len(inertias)), strict=True)):
+        moved[:3, 3] = shift
+        J = pseudo_inertia(chain.joints[i].inertia)
+        inertias[i] = inertia_of(factor * (moved @ J @ moved.T))
+    return inertias
 
 
 def parameter_names_of(config: PlantConfig) -> tuple[str, ...]:

@@ -4,18 +4,17 @@
 Derived from the Lagrangian, independently of the controller's regressor, so that each checks the
 other.  Joint 1 is measured from the horizontal, joint 2 from link 1:
 
-    M(q) ddq + C(q, dq) dq + G(q) + tau_dist(t, dq) = torque,    (33), (34)
+    M(q) ddq + C(q, dq) dq + G(q) = torque,    (33), (34)
 
 with G the gradient of the potential: its first term has cos q1, where (34) prints cos q2.
 """
 
-from math import cos, sin, tanh
-from typing import Annotated, NamedTuple
+from math import cos, sin
+from typing import NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.layout import Array
 
 
 class PointMassArm(NamedTuple):
@@ -57,18 +56,6 @@ class PointMassArm(NamedTuple):
         acceleration(loaded(self, payload), q, dq, torque, ddq)
 
 
-class JointDisturbance(NamedTuple):
-    """Disturbance of each joint: constant, sinusoid, viscous and Coulomb friction."""
-
-    constant: Annotated[Array, 'n']  # N m
-    amplitude: Annotated[Array, 'n']  # N m
-    frequency: Annotated[Array, 'n']  # rad/s
-    phase: Annotated[Array, 'n']  # rad
-    viscous: Annotated[Array, 'n']  # N m s/rad
-    coulomb: Annotated[Array, 'n']  # N m
-    coulomb_velocity: Annotated[Array, 'n']  # rad/s, where Coulomb friction reaches three quarters
-
-
 @inner
 def parameters(arm: PointMassArm, out: np.ndarray) -> None:
     """Write the parameters P (3,) [kg m^2] that the controller estimates."""
@@ -92,24 +79,6 @@ def tip(arm: PointMassArm, q: np.ndarray, position: np.ndarray, jacobian: np.nda
     jacobian[0, 0], jacobian[0, 1] = -z1 - z2, -z2
     jacobian[1, 0], jacobian[1, 1] = 0.0, 0.0
     jacobian[2, 0], jacobian[2, 1] = x1 + x2, x2
-
-
-@inner
-def disturbance_torque(
-    disturbance: JointDisturbance, t: float, dq: np.ndarray, out: np.ndarray
-) -> None:
-    """Write tau_dist (n,) [N m] at time t [s].
-
-    Friction has the sign of the velocity; Coulomb friction is smoothed by tanh, so that a fixed
-    step keeps its order.
-    """
-    for i in range(dq.size):
-        angle = disturbance.frequency[i] * t + disturbance.phase[i]
-        torque = disturbance.constant[i] + disturbance.amplitude[i] * sin(angle)
-        torque += disturbance.viscous[i] * dq[i]
-        if disturbance.coulomb[i] != 0.0:
-            torque += disturbance.coulomb[i] * tanh(dq[i] / disturbance.coulomb_velocity[i])
-        out[i] = torque
 
 
 @inner

@@ -10,7 +10,7 @@ import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
-from sim_plant.dynamics import JointDisturbance
+from sim_plant.disturbance import JointDisturbance
 
 
 class Load(NamedTuple):

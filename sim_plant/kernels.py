@@ -16,7 +16,7 @@ from blf_dsc_controller.compiled.views import part, view
 from sim_plant.actuator import Drives, DriveState, actuate
 from sim_plant.arm import Arm
 from sim_plant.contact import Contact, TipState, Wall
-from sim_plant.dynamics import JointDisturbance
+from sim_plant.disturbance import JointDisturbance
 from sim_plant.events import Acting, Events, Load, update_acting
 from sim_plant.integrator import Stages, integrate
 from sim_plant.motion import Motion, disturbing_torque
@@ -84,6 +84,10 @@ def update_motion(plant: PlantSettings, now: PlantState) -> Motion:
             acting.viscous,
             acting.coulomb,
             disturbance.coulomb_velocity,
+            disturbance.stribeck,
+            disturbance.stribeck_velocity,
+            disturbance.ripple,
+            disturbance.ripple_frequency,
         ),
         Contact(acting.force, plant.wall, now.tip),
     )
@@ -91,9 +95,12 @@ def update_motion(plant: PlantSettings, now: PlantState) -> Motion:
 
 @inner
 def draw_noise(plant: PlantSettings, now: PlantState, rng: np.random.Generator) -> None:
-    """Draw the noise of the next reading, if the encoders have any and the sample is unread."""
-    if is_noisy(plant.encoders) and now.reading.sample[0] != now.sample[0]:
-        draw(rng, now.reading.noise)
+    """Draw the noise of the next sample, of encoders and drives that have any, if it is unread."""
+    if now.reading.sample[0] != now.sample[0]:
+        if is_noisy(plant.encoders):
+            draw(rng, now.reading.noise)
+        if plant.drives.noise > 0.0:
+            draw(rng, now.drives.noise)
 
 
 @inner

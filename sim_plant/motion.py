@@ -9,7 +9,7 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.views import part
 from sim_plant.arm import Arm
 from sim_plant.contact import Contact, subtract_contact_torque
-from sim_plant.dynamics import JointDisturbance, disturbance_torque
+from sim_plant.disturbance import JointDisturbance, disturbance_torque
 
 
 class Motion(NamedTuple):
@@ -26,7 +26,7 @@ def disturbing_torque(
     motion: Motion, t: float, q: np.ndarray, dq: np.ndarray, out: np.ndarray
 ) -> None:
     """Write tau_dist (n,) [N m] at time t [s], contact included."""
-    disturbance_torque(motion.disturbance, t, dq, out)
+    disturbance_torque(motion.disturbance, t, q, dq, out)
     subtract_contact_torque(motion.arm, motion.contact, q, dq, out)
 
 

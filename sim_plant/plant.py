@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.plant import PlantConfig
-from sim_plant.actuator import Drives
+from sim_plant.actuator import Drives, lag
 from sim_plant.arms import arm_of, parameter_names_of
 from sim_plant.contact import Wall
-from sim_plant.dynamics import JointDisturbance
+from sim_plant.disturbance import JointDisturbance
 from sim_plant.events import Events, Load
 from sim_plant.integrator import INTEGRATORS
 from sim_plant.kernels import (
@@ -50,8 +50,9 @@ class Plant:
         self.joints = settings.n
         self.period_ns = settings.period_ns
         self.state = np.zeros(state_size(settings))
-        self._noisy = is_noisy(settings.encoders)
         self._now = state_of(self.state, settings)
+        self._noises = [self._now.reading.noise] if is_noisy(settings.encoders) else []
+        self._noises += [self._now.drives.noise] if settings.drives.noise > 0.0 else []
         self._now.x[:] = np.concatenate((position, velocity))
         self._now.reading.sample[0] = self._now.acting.sample[0] = -1.0
         self._initial = self.state.copy()
@@ -76,8 +77,9 @@ class Plant:
         The noise is drawn here and not by a kernel, which would draw the same numbers: passing a
         generator to compiled code costs more than the rest of the call.
         """
-        if self._noisy and self._now.reading.sample[0] != self.sample:
-            self.rng.standard_normal(out=self._now.reading.noise)
+        if self._noises and self._now.reading.sample[0] != self.sample:
+            for noise in self._noises:
+                self.rng.standard_normal(out=noise)
         observe_plant(self.arm, self.settings, self.state, self._measurement)
         return self._measurement
 
@@ -94,7 +96,7 @@ class Plant:
     def hold(self) -> None:
         """Stay at rest and without torque for one sample: the brakes are on."""
         self._now.x[self.joints :] = 0.0
-        self._now.drives.applied[:] = 0.0
+        self._now.drives.applied[:] = self._now.drives.motor[:] = 0.0
         self._now.sample[0] += 1.0
 
     def truth(self) -> np.ndarray:
@@ -153,11 +155,15 @@ def settings_of(config: PlantConfig) -> PlantSettings:
             sensor.velocity_noise,
             sensor.resolution,
             VELOCITY_SOURCES[sensor.velocity],
+            sensor.velocity_pole,
         ),
-        disturbance=JointDisturbance(
-            **{name: np.full(n, value) for name, value in vars(config.disturbance).items()}
+        disturbance=_disturbance_of(config),
+        drives=Drives(
+            np.array(actuator.torque_limit),
+            actuator.delay,
+            *lag(actuator.time_constant, config.sample_time),
+            actuator.torque_noise,
         ),
-        drives=Drives(np.array(actuator.torque_limit), actuator.delay),
         load=Load(load.payload, *map(np.array, (load.torque, load.force, sensor.offset))),
         wall=Wall(
             np.array(wall.point),
@@ -166,6 +172,23 @@ def settings_of(config: PlantConfig) -> PlantSettings:
             wall.damping,
         ),
         schedule=_schedule_of(config),
+    )
+
+
+def _disturbance_of(config: PlantConfig) -> JointDisturbance:
+    given, actuator = config.disturbance, config.actuator
+    return JointDisturbance(
+        constant=np.array(given.constant),
+        amplitude=np.array(given.amplitude),
+        frequency=np.array(given.frequency),
+        phase=np.array(given.phase),
+        viscous=np.array(given.viscous),
+        coulomb=np.array(given.coulomb),
+        coulomb_velocity=np.full(len(config.joints), given.coulomb_velocity),
+        stribeck=given.stribeck,
+        stribeck_velocity=given.stribeck_velocity,
+        ripple=actuator.ripple * np.array(actuator.torque_limit),
+        ripple_frequency=actuator.ripple_cycles,
     )
 
 

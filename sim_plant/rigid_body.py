@@ -57,7 +57,6 @@ class Motion(NamedTuple):
     origin: Annotated[Array, 'n + 1', 3]  # m
     axis: Annotated[Array, 'n + 1', 3]
     turning: Annotated[Array, 'n + 1', 3]  # rad/s
-    velocity: Annotated[Array, 'n + 1', 3]  # of the origin, m/s
     turning_rate: Annotated[Array, 'n + 1', 3]  # rad/s^2, without ddq
     bias: Annotated[Array, 'n + 1', 3]  # acceleration of the origin without ddq and gravity, m/s^2
     # Of all bodies from one on, about its origin: working memory.
@@ -96,7 +95,7 @@ def locate(arm: RigidBodies, q: np.ndarray, dq: np.ndarray, now: Motion) -> None
     for r in range(3):
         for c in range(3):
             now.rotation[0, r, c] = 1.0 if r == c else 0.0
-        now.origin[0, r] = now.turning[0, r] = now.velocity[0, r] = 0.0
+        now.origin[0, r] = now.turning[0, r] = 0.0
         now.turning_rate[0, r] = now.bias[0, r] = 0.0
     for i in range(arm.n):
         before, R = now.rotation[i], now.rotation[i + 1]
@@ -116,8 +115,6 @@ def locate(arm: RigidBodies, q: np.ndarray, dq: np.ndarray, now: Motion) -> None
         put(plus(vector(now.origin[i]), lever), now.origin[i + 1])
         put(plus(w, times(turns, own)), now.turning[i + 1])
         put(plus(dw, times(turns, swept)), now.turning_rate[i + 1])
-        velocity = plus(vector(now.velocity[i]), plus(speed, times(slides, own)))
-        put(velocity, now.velocity[i + 1])
         bias = plus(vector(now.bias[i]), plus(cross(dw, lever), cross(w, speed)))
         put(plus(bias, times(2.0 * slides, swept)), now.bias[i + 1])
 

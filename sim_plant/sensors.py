@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Encoder readings of the true state: offset, white noise, quantisation, and a velocity.
 
-The velocity is either measured, with noise of its own, or differenced from the measured positions.
+The velocity is either measured, with noise of its own, or differenced from the measured positions;
+a low-pass filter may follow.
 Noise comes from one seeded generator, so the same seed repeats a run exactly.
 """
 
+from math import exp
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -24,6 +26,7 @@ class Encoders(NamedTuple):
     velocity_noise: float  # rad/s, standard deviation; not used when differenced
     resolution: float  # rad, 0 = none
     velocity_source: int  # MEASURED or DIFFERENCED
+    velocity_pole: float  # rad/s, 0 = no filter
 
 
 class EncoderReading(NamedTuple):
@@ -79,14 +82,19 @@ def sense(
     n = q.size
     first = reading.sample[0] < 0
     span = (sample - reading.sample[0]) * period
+    filters = encoders.velocity_pole > 0.0 and not first
+    old = exp(-encoders.velocity_pole * span) if filters else 0.0
     for i in range(n):
         position = q[i] + offset[i] + encoders.position_noise * reading.noise[i]
         position = quantised(position, encoders.resolution)
         if encoders.velocity_source == MEASURED:
-            reading.velocity[i] = dq[i] + encoders.velocity_noise * reading.noise[n + i]
+            velocity = dq[i] + encoders.velocity_noise * reading.noise[n + i]
         elif first:
-            reading.velocity[i] = dq[i]
+            velocity = dq[i]
         else:
-            reading.velocity[i] = (position - reading.position[i]) / span
+            velocity = (position - reading.position[i]) / span
+        if filters:
+            velocity += old * (reading.velocity[i] - velocity)
+        reading.velocity[i] = velocity
         reading.position[i] = position
     reading.sample[0] = sample

@@ -3,9 +3,10 @@
 
 import numpy as np
 
-from sim_plant.actuator import Drives
+from sim_plant.actuator import Drives, lag
 from sim_plant.contact import Contact, TipState, Wall
-from sim_plant.dynamics import JointDisturbance, PointMassArm
+from sim_plant.disturbance import JointDisturbance
+from sim_plant.dynamics import PointMassArm
 from sim_plant.events import Events, Load
 from sim_plant.integrator import DOPRI5
 from sim_plant.kernels import PlantSettings
@@ -32,8 +33,10 @@ def energies(arm, q, dq):
 def disturbance(**terms):
     """Disturbance of two joints, none unless asked for; each term for both, or one by one."""
     none = dict.fromkeys(JointDisturbance._fields, 0.0) | {'frequency': 1.0}
-    terms = none | {'coulomb_velocity': 0.01} | terms
-    return JointDisturbance(**{name: np.full(2, value, float) for name, value in terms.items()})
+    terms = none | {'coulomb_velocity': 0.01, 'stribeck_velocity': 0.1} | terms
+    scalars = ('stribeck', 'stribeck_velocity', 'ripple_frequency')
+    each = {name: np.full(2, value, float) for name, value in terms.items()}
+    return JointDisturbance(**each | {name: float(terms[name]) for name in scalars})
 
 
 def rough_disturbance():
@@ -69,8 +72,11 @@ def settings(
     velocity_noise=0.0,
     resolution=0.0,
     velocity_source=MEASURED,
+    velocity_pole=0.0,
     torque_limit=(0.0, 0.0),
     delay=0,
+    time_constant=0.0,
+    torque_noise=0.0,
 ):
     """Settings of the arm of Section IV at 1 kHz."""
     return PlantSettings(
@@ -80,9 +86,13 @@ def settings(
         period_ns=period_ns,
         integrator=integrator,
         events=0,
-        encoders=Encoders(position_noise, velocity_noise, resolution, velocity_source),
+        encoders=Encoders(
+            position_noise, velocity_noise, resolution, velocity_source, velocity_pole
+        ),
         disturbance=disturbance() if load is None else load,
-        drives=Drives(np.array(torque_limit), delay),
+        drives=Drives(
+            np.array(torque_limit), delay, *lag(time_constant, period_ns * 1e-9), torque_noise
+        ),
         load=UNLOADED,
         wall=NOWHERE,
         schedule=UNEVENTFUL,

@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from plants import commands, plant, run
+from plants import START, commands, plant, run
 
 SAMPLES = 40
 
@@ -39,3 +39,31 @@ def test_a_limit_of_zero_is_none():
     effort = run(plant(torque_limit=(0.0, 7.0)), torques)[1:, 4:]
     assert (effort[:, 0] == torques[:-1, 0]).all()
     assert (np.abs(effort[:, 1]) == 7.0).all()
+
+
+def test_a_lagging_drive_answers_a_step_as_a_first_order_lag():
+    """Of the limited torque; a sample has its mean."""
+    tau, step = 2e-3, np.array([4.0, -9.0])
+    effort = run(plant(time_constant=tau, torque_limit=(0.0, 6.0)), np.tile(step, (20, 1)))[1:, 4:]
+    t = 1e-3 * np.arange(20)
+    mean = np.diff(t + tau * np.exp(-t / tau)) / 1e-3
+    np.testing.assert_allclose(effort, mean[:, None] * [4.0, -6.0], rtol=1e-12)
+
+
+def test_a_noisy_drive_errs_by_a_fraction_of_its_torque_and_repeats():
+    torques = np.tile([5.0, -2.0], (4000, 1))
+    effort = run(plant(torque_noise=0.01, seed=4), torques)
+    error = effort[1:, 4:] / torques[1:] - 1.0
+    np.testing.assert_allclose(error.std(axis=0), 0.01, rtol=0.05)
+    assert abs(np.corrcoef(error.T)[0, 1]) < 0.07
+    np.testing.assert_array_equal(effort, run(plant(torque_noise=0.01, seed=4), torques))
+
+
+def test_noise_of_the_drives_leaves_that_of_the_encoders_in_order():
+    """Both come from one generator: first the reading, then the drives."""
+    arm = plant(position_noise=1e-5, torque_noise=0.01, seed=4)
+    arm.measure()
+    drawn = np.random.Generator(np.random.PCG64(np.random.SeedSequence(4))).standard_normal(6)
+    np.testing.assert_array_equal(arm.measure()[:2], np.array(START) + 1e-5 * drawn[:2])
+    arm.step(np.array([1.0, 2.0]))
+    np.testing.assert_array_equal(arm.measure()[4:], [1.0, 2.0] * (1.0 + 0.01 * drawn[4:]))

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from plants import disturbance, plant, rough_disturbance
 
-from sim_plant.dynamics import disturbance_torque
+from sim_plant.disturbance import disturbance_torque
 
 
-def torque(vector, t, dq):
+def torque(vector, t, dq, q=(0.3, -0.4)):
     out = np.empty(2)
-    disturbance_torque(vector, t, np.array(dq, dtype=float), out)
+    disturbance_torque(vector, t, np.array(q), np.array(dq, dtype=float), out)
     return out
 
 
@@ -32,6 +32,23 @@ def test_coulomb_friction_is_full_and_against_the_motion_well_above_its_velocity
     # tanh(20) is 1 to the last bit
     assert torque(friction, 0.0, [0.2, -0.2]).tolist() == [0.3, -0.5]
     assert torque(friction, 0.0, [0.0, 0.0]).tolist() == [0.0, 0.0]
+
+
+def test_a_joint_that_breaks_away_rubs_more():
+    friction = disturbance(coulomb=[0.3, 0.5], stribeck=0.5, stribeck_velocity=0.1)
+    sliding, creeping = torque(friction, 0.0, [1.0, -1.0]), torque(friction, 0.0, [0.05, -0.05])
+    assert sliding == pytest.approx([0.3, -0.5], rel=1e-12)
+    rise = (1.0 + 0.5 * np.exp(-0.25)) * np.tanh(5.0)
+    assert creeping == pytest.approx([0.3 * rise, -0.5 * rise], rel=1e-12)
+
+
+def test_ripple_goes_round_with_the_joint():
+    ripple = disturbance(ripple=[0.2, 0.4], ripple_frequency=20.0)
+    turn = 2.0 * np.pi / 20.0
+    q = np.array([0.3 * turn, -0.25 * turn])
+    here = torque(ripple, 0.0, [0.0, 0.0], q)
+    assert here == pytest.approx([0.2 * np.sin(0.6 * np.pi), -0.4], rel=1e-12)
+    assert torque(ripple, 5.0, [1.0, 1.0], q + turn) == pytest.approx(here, abs=1e-12)
 
 
 def test_friction_takes_energy_out_of_the_arm():

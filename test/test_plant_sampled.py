@@ -24,13 +24,19 @@ EVERYTHING = {
     'resolution': 1e-5,
     'torque_limit': (8.0, 3.0),
     'delay': 2,
+    'time_constant': 2e-3,
+    'torque_noise': 0.01,
+    'velocity_pole': 400.0,
 }
 REPOSITORY = Path(__file__).parents[1]
 
 
 def full_plant(**changes):
     """A plant with every imperfection there is."""
-    return plant(load=rough_disturbance(), **{**EVERYTHING, **changes})
+    load = rough_disturbance()._replace(
+        stribeck=0.5, ripple=np.array([0.1, 0.05]), ripple_frequency=20.0
+    )
+    return plant(load=load, **{**EVERYTHING, **changes})
 
 
 @kernel

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from plants import PERIOD, commands, plant, run
 
-from sim_plant.sensors import DIFFERENCED, draw, generator
+from sim_plant.sensors import DIFFERENCED, MEASURED, draw, generator
 
 
 def true_states(samples, **changes):
@@ -75,6 +75,17 @@ def test_a_differenced_velocity_is_that_of_the_positions_read():
     read = run(arm, commands(50))
     assert read[0, 2:4].tolist() == [0.4, -0.3]
     assert read[1:, 2:4] == pytest.approx(np.diff(read[:, :2], axis=0) / PERIOD, rel=1e-13)
+
+
+@pytest.mark.parametrize('source', [MEASURED, DIFFERENCED])
+def test_a_filtered_velocity_is_the_step_response_of_its_pole(source):
+    options = {'velocity_source': source, 'position_noise': 1e-5, 'velocity_noise': 1e-3}
+    raw = run(plant(**options), commands(30))[:, 2:4]
+    read = run(plant(velocity_pole=400.0, **options), commands(30))[:, 2:4]
+    expected = raw.copy()
+    for k in range(1, 30):
+        expected[k] = raw[k] + np.exp(-0.4) * (expected[k - 1] - raw[k])
+    np.testing.assert_allclose(read, expected, rtol=1e-13)
 
 
 def test_a_differenced_velocity_spans_the_samples_that_nobody_read():

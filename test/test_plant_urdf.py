@@ -10,9 +10,11 @@ import pytest
 from random_arm import PANDA, random_urdf
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
+from blf_dsc_controller.arms.inertia import pseudo_inertia
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError
+from sim_plant.arms import true_inertias
 from sim_plant.plant import parameters_of, plant_of
 
 PANDA_GIVEN = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
@@ -53,6 +55,8 @@ def test_what_is_given_comes_before_what_the_urdf_says():
     [
         ({'robot.urdf': 'panda.urdf'}, 'robot.urdf: neither a tip nor joints were given'),
         (PANDA_GIVEN | {'joints': ['panda_joint1']}, 'the moving joints from base to tip are'),
+        ({'truth.mass_factor': 1.1}, 'truth: it changes the arm of a URDF: give robot.urdf'),
+        ({'actuator.ripple': 0.1}, 'actuator.ripple: .* give actuator.torque_limit'),
         (PANDA_GIVEN | {'load.torque': [1.0]}, 'load.torque: got 1 entry, but 7 are needed'),
     ],
 )
@@ -137,11 +141,48 @@ def test_the_truth_has_the_base_parameters_with_the_payload():
     config = panda(**{'events.begin': [0.5], 'events.payload': [2.0]})
     chain = config.robot.chain(config.joints)
     base, rotors = base_parameters(chain), config.robot.rotors(chain)
-    np.testing.assert_array_equal(parameters_of(config, 0.4), base.of(chain.inertias, rotors))
+    expected = base.of(chain.inertias, rotors)
+    np.testing.assert_allclose(parameters_of(config, 0.4), expected, rtol=1e-12)
     loaded = chain.inertias.copy()
     point = chain.tip_placement[:3, 3]
     loaded[-1] += pinocchio.Inertia(2.0, point, np.zeros((3, 3))).toDynamicParameters()
     np.testing.assert_allclose(parameters_of(config, 0.6), base.of(loaded, rotors), rtol=1e-12)
+
+
+def test_a_truth_by_factors_scales_every_body():
+    config = panda(truth__mass_factor=1.3, truth__rotor_factor=1.2)
+    chain = config.robot.chain(config.joints)
+    expected = base_parameters(chain).of(1.3 * chain.inertias, 1.2 * config.robot.rotors(chain))
+    np.testing.assert_allclose(parameters_of(config), expected, rtol=1e-12, atol=1e-15)
+
+
+def test_a_truth_by_seed_deviates_as_it_says_and_stays_possible():
+    config = panda(truth__mass_deviation=0.3, truth__centre_deviation=0.01)
+    chain = config.robot.chain(config.joints)
+    masses, shifts = [], []
+    for seed in range(100):
+        inertias = true_inertias(chain, change(config, {'truth.seed': seed}).truth)
+        masses.append(inertias[:, 0] / chain.inertias[:, 0] - 1.0)
+        centres = (one[:, 1:4] / one[:, :1] for one in (inertias, chain.inertias))
+        shifts.append(np.subtract(*centres))
+        for true, ours in zip(inertias, chain.inertias, strict=True):
+            least, expected = (np.linalg.eigvalsh(pseudo_inertia(one))[0] for one in (true, ours))
+            assert least > -1e-12 * abs(expected)
+    assert 0.29 < np.max(masses) < 0.3
+    assert -0.3 < np.min(masses) < -0.29
+    assert 0.0099 < np.max(np.abs(shifts)) < 0.01
+    assert abs(np.mean(masses)) < 0.03
+    again = true_inertias(chain, change(config, {'truth.seed': 99}).truth)
+    np.testing.assert_array_equal(again[:, 0] / chain.inertias[:, 0] - 1.0, masses[-1])
+
+
+def test_a_shifted_body_is_the_same_body_elsewhere():
+    """Its inertia about its centre of mass does not change, only where that is."""
+    config = panda(truth__centre_deviation=0.01, truth__seed=1)
+    chain = config.robot.chain(config.joints)
+    for true, ours in zip(true_inertias(chain, config.truth), chain.inertias, strict=True):
+        here, there = (pinocchio.Inertia.FromDynamicParameters(one) for one in (true, ours))
+        np.testing.assert_allclose(here.inertia, there.inertia, atol=1e-12)
 
 
 def test_events_on_seven_joints_are_changes_of_the_plant_at_their_time():

@@ -25,6 +25,7 @@ from blf_dsc_controller.configuration.schema import (
     parameters,
     positive,
 )
+from blf_dsc_controller.configuration.truth import Truth
 
 _fixed = partial(parameter, read_only='the plant is built once, when the node starts')
 
@@ -52,8 +53,9 @@ class Initial:
 class PlantDisturbance:
     """Torque that opposes each joint, `tau_dist` in the equation of motion.
 
-    tau_dist = constant + amplitude*sin(frequency*t + phase)
-             + viscous*dq + coulomb*tanh(dq/coulomb_velocity)
+    tau_dist = constant + amplitude*sin(frequency*t + phase) + viscous*dq
+             + coulomb*(1 + stribeck*exp(-(dq/stribeck_velocity)^2))*tanh(dq/coulomb_velocity)
+             + the ripple of the actuator
     """
 
     constant: PerJoint = parameter((0.1, 0.1), 'constant part', 'N m')
@@ -65,6 +67,10 @@ class PlantDisturbance:
     coulomb_velocity: float = positive(
         0.01, 'velocity scale of the sign change of Coulomb friction', 'rad/s'
     )
+    stribeck: float = non_negative(
+        0.0, 'friction of a joint that breaks away, above the Coulomb friction as a fraction of it'
+    )
+    stribeck_velocity: float = positive(0.1, 'velocity scale at which this has faded', 'rad/s')
 
 
 @dataclass(frozen=True)
@@ -81,6 +87,9 @@ class Sensor:
     velocity: Literal['measured', 'differenced'] = _fixed(
         'measured', 'velocity from its own sensor, or the difference of two measured positions'
     )
+    velocity_pole: float = _fixed(
+        0.0, 'pole of the low-pass filter on the velocity; 0: none', 'rad/s', at_least=0.0
+    )
     offset: PerJoint = parameter((0.0, 0.0), 'measured position less the true one', 'rad')
 
 
@@ -92,6 +101,18 @@ class Actuator:
         (0.0, 0.0), 'rated joint torque; 0: no limit', 'N m', at_least=0.0
     )
     delay: int = _fixed(0, 'delay of the torque', 'samples', at_least=0, at_most=1000)
+    time_constant: float = _fixed(
+        0.0, 'lag of first order between the limited torque and the joint', 's', at_least=0.0
+    )
+    torque_noise: float = _fixed(
+        0.0, 'standard deviation of the torque, as a fraction of it', at_least=0.0
+    )
+    ripple: float = _fixed(
+        0.0, 'amplitude of the torque ripple, as a fraction of the rated torque', at_least=0.0
+    )
+    ripple_cycles: float = _fixed(
+        20.0, 'periods of the ripple in a turn of the joint, or in a metre', above=0.0
+    )
     command_timeout: float = positive(
         0.05, 'age above which a torque is not applied, in real time only', 's'
     )
@@ -136,6 +157,7 @@ class PlantConfig(Sampled):
     )
     arm: PlantArm = PlantArm()
     robot: Robot = Robot()
+    truth: Truth = Truth()
     initial: Initial = Initial()
     disturbance: PlantDisturbance = PlantDisturbance()
     sensor: Sensor = Sensor()
@@ -170,6 +192,12 @@ class PlantConfig(Sampled):
         needed = None if self.robot.urdf else 2
         problems = joint_problems(self.joints, 'the simulated arm', needed)
         problems += self.sample_time_problems() + self.wall.problems()
+        if self.truth != Truth() and not self.robot.urdf:
+            problems.append('truth: it changes the arm of a URDF: give robot.urdf, or change arm')
+        if self.actuator.ripple > 0.0 and not all(self.actuator.torque_limit):
+            problems.append(
+                'actuator.ripple: it is a fraction of the rated torque: give actuator.torque_limit'
+            )
         if 0.0 < self.duration < self.sample_time:
             problems.append(
                 f'duration: got {self.duration:g} s, shorter than one sample of '

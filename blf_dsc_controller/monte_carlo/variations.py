@@ -51,7 +51,18 @@ _CALL = re.compile(r'\s*(\w+)\s*\((.*)\)\s*')
 _NAMES = {Kind.DOUBLE: 'a number', Kind.INTEGER: 'an integer', Kind.STRING: 'a word'}
 _NORMAL = NormalDist()
 _GROUPS = ('arm.', 'disturbance.', 'sensor.', 'actuator.')
-_LAST = ('sensor.offset', 'load.', 'wall.', 'events.')  # the draws of the others stay as they were
+# In the order in which they came to be, so that the draws of the others stay as they were.
+_LATER = (
+    ('sensor.offset', 'load.', 'wall.', 'events.'),
+    (
+        'disturbance.stribeck',
+        'sensor.velocity_pole',
+        'actuator.time_constant',
+        'actuator.torque_noise',
+        'actuator.ripple',
+        'truth.',
+    ),
+)
 _REALTIME = ('actuator.command_timeout', 'actuator.without_command')
 
 
@@ -151,10 +162,10 @@ def variable_parameters() -> Mapping[str, Parameter]:
     """Every parameter that may vary, by name."""
     start = parameters(RelativeStart)
     plant = parameters(PlantConfig)
-    last = [one for one in plant if one.name.startswith(_LAST)]
-    found = [one for one in plant if one.name.startswith(_GROUPS) and one not in last]
+    later = [one for names in _LATER for one in plant if one.name.startswith(names)]
+    found = [one for one in plant if one.name.startswith(_GROUPS) and one not in later]
     found += [dataclasses.replace(one, name=f'initial.{one.name}') for one in start]
-    found += last
+    found += later
     return {
         one.name: one for one in found if one.name not in _REALTIME and one.kind.element in FORMS
     }
