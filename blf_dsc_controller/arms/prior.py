@@ -42,13 +42,13 @@ def prior_factor(
     for i, joint in enumerate(chain.joints):
         if form == 'base':
             J = pseudo_inertia(joint.inertia)
-            blocks.append((i, _of_ten(_deviations(J, LINKS, CENTRE))))
+            blocks.append((i, _of_ten(deviations(J, LINKS, CENTRE))))
         elif form == 'scale':
             blocks.append((i, _of_ten(LINKS * joint.inertia[:, None])))
     if form != 'scale':
         load = payload * np.diag((*(PAYLOAD_SIZE**2,) * 3, 1.0))
         J = chain.tip_placement @ load @ chain.tip_placement.T
-        blocks.append((n - 1, _of_ten(_deviations(J, 1.0, PAYLOAD_SIZE))))
+        blocks.append((n - 1, _of_ten(deviations(J, 1.0, PAYLOAD_SIZE))))
     blocks += [(i, rotors[i] * np.eye(ROTOR + 1)[:, ROTOR:]) for i in range(n)]
     K = parameters.K.reshape(-1, n, ROTOR + 1)
     L = np.column_stack([K[:, i] @ block for i, block in blocks])
@@ -63,7 +63,7 @@ def _of_ten(directions: np.ndarray) -> np.ndarray:
     return np.vstack((directions, np.zeros((1, directions.shape[1]))))
 
 
-def _deviations(J: np.ndarray, share: float, centre: float) -> np.ndarray:
+def deviations(J: np.ndarray, share: float, centre: float) -> np.ndarray:
     """One standard deviation of the ten (10, 10) along each of ten independent directions.
 
     `share` is that of the mass and of the spread, `centre` that of the centre of mass [m].

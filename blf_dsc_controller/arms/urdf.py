@@ -120,6 +120,31 @@ def chain_joints(
     return base, tip, tuple(joints) or moving
 
 
+def moving_joints(text: str) -> tuple[str, ...]:
+    """Names of all joints of a URDF that move."""
+    return tuple(name for name, one in _parse(text)[1].items() if one.get('type') in MOVING)
+
+
+def attached(
+    text: str, link: str, joints: Sequence[str], *, moves: bool = False
+) -> tuple[list[str], np.ndarray]:
+    """Links fixed to a link, and the pseudo-inertia (4, 4) of those that are held at position 0.
+
+    `joints` are those of the chain; the pseudo-inertia is in the frame of the link.
+    """
+    links, elements = _parse(text)
+    names: list[str] = []
+    J = np.zeros((4, 4))
+    for name, element in elements.items():
+        if _link(element, 'parent') == link and name not in joints:
+            child, frame = _link(element, 'child'), _origin(element)
+            is_held = moves or element.get('type') != 'fixed'
+            beyond, held = attached(text, child, joints, moves=is_held)
+            names += beyond if is_held else [child, *beyond]
+            J += frame @ (held + is_held * _link_inertia(links[child])) @ frame.T
+    return names, J
+
+
 def _path(links: Elements, elements: Elements, base: str, tip: str) -> list[ET.Element]:
     """Joints from the base down to the tip."""
     for role, link in (('base', base), ('tip', tip)):

@@ -106,13 +106,13 @@ def _solve(rows: Floats, active: Floats, rho: float) -> tuple[Floats, Floats, fl
     theta = np.linalg.solve(Phi + rho * np.eye(len(b)), b)
     left = (X @ theta).reshape(u.shape) - u
     variance = float(np.sum(left**2)) / max(left.size - len(b), 1)
-    covariance = variance * _correlation_length(left) * np.linalg.inv(samples * Phi)
+    covariance = variance * correlation_length(left) * np.linalg.inv(samples * Phi)
     estimate, deviation = np.full((2, active.size), np.nan)
     estimate[kept], deviation[kept] = theta, np.sqrt(np.diag(covariance))
     return estimate, deviation, float(np.linalg.eigvalsh(Phi)[0]), float(np.sqrt(np.mean(left**2)))
 
 
-def _correlation_length(left: Floats) -> float:
+def correlation_length(left: Floats) -> float:
     """In samples: 1 + 2 sum of the autocorrelation up to its first zero."""
     size = 2 ** int(np.ceil(np.log2(2 * left.shape[0])))
     spectrum = np.abs(np.fft.rfft(left, size, axis=0)) ** 2

@@ -70,7 +70,7 @@ def what_if(
     content = read_content(path, namespace, names)
     joints = names.joints_of(config.joints)
     states = law_states(content, joints)
-    applied, source = _applied_torque(path, content, states, joints)
+    applied, source = applied_torque(path, content, states, joints)
     config = replace(config, learning=replace(config.learning, torque_source='effort'))
     controller = controller_of(config)
     n, m = len(joints), controller.settings.m
@@ -96,7 +96,7 @@ def what_if(
     return WhatIf(run, rows, controller.state.active.copy(), applied, source, ratio)
 
 
-def _applied_torque(
+def applied_torque(
     path: Path, content: Content, states: States, joints: Sequence[str]
 ) -> tuple[Floats, str]:
     """Torque from each of the n joints' states to the next (N, n) [N m], and its topic.

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A URDF with other inertias and frictions; every other byte of it stays.
+
+The inertia of a body is written into the link that its joint moves, and the links fixed to that
+lose theirs.  Links that joints of their own move, as a gripper's fingers, keep theirs.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+from xml.parsers import expat
+
+import numpy as np
+
+from blf_dsc_controller.arms.inertia import pseudo_inertia, rotational_inertia
+from blf_dsc_controller.arms.urdf import Chain, attached
+from blf_dsc_controller.run import Floats
+
+
+def corrected_urdf(
+    text: str, chain: Chain, inertias: Floats, viscous: Floats, coulomb: Floats, note: str
+) -> str:
+    """Text of the URDF with inertias (n, 10) of the bodies and friction (n,) of the joints.
+
+    `note` is a comment at its end.
+    """
+    joints = [joint.name for joint in chain.joints]
+    parts: dict[tuple[str, str], str] = {}  # of links and joints by name
+    for joint, inertia, damping, friction in zip(
+        chain.joints, inertias, viscous, coulomb, strict=True
+    ):
+        fixed, held = attached(text, joint.link, joints)
+        parts |= {('link', name): '' for name in fixed}
+        parts['link', joint.link] = _inertial(pseudo_inertia(inertia) - held)
+        numbers = f'damping="{damping:.12g}" friction="{friction:.12g}"'
+        parts['joint', joint.name] = f'<dynamics {numbers} />'
+    raw = text.encode()
+    for begin, end, part in sorted(_edits(raw, parts, note), reverse=True):
+        raw = raw[:begin] + part.encode() + raw[end:]
+    return raw.decode()
+
+
+def _inertial(J: Floats) -> str:
+    """`<inertial>` of a pseudo-inertia (4, 4), along the link's axes about its centre of mass."""
+    mass = J[3, 3]
+    centre = J[:3, 3] / mass
+    T = np.eye(4)
+    T[:3, 3] = -centre
+    I = rotational_inertia(T @ J @ T.T)
+    entries = {'ixx': (0, 0), 'ixy': (0, 1), 'ixz': (0, 2), 'iyy': (1, 1), 'iyz': (1, 2)}
+    tensor = ' '.join(f'{key}="{I[at]:.12g}"' for key, at in (entries | {'izz': (2, 2)}).items())
+    xyz = ' '.join(f'{x:.12g}' for x in centre)
+    return (
+        f'<inertial>\n      <origin xyz="{xyz}" rpy="0 0 0" />\n'
+        f'      <mass value="{mass:.12g}" />\n      <inertia {tensor} />\n    </inertial>'
+    )
+
+
+_TAG = re.compile(rb'<(?:[^>"\']|"[^"]*"|\'[^\']*\')*>')
+_PART = {'link': 'inertial', 'joint': 'dynamics'}
+
+
+class _Element(NamedTuple):
+    """Where an element is: bytes of its first tag and of its last, the same if it has only one."""
+
+    opening: tuple[int, int]
+    closing: tuple[int, int]
+
+
+def _edits(
+    raw: bytes, parts: Mapping[tuple[str, str], str], note: str
+) -> Iterator[tuple[int, int, str]]:
+    """Bytes from and to, and what takes their place."""
+    elements = _elements(raw)
+    for (kind, name), part in parts.items():
+        owner = elements[kind, name, '']
+        old = elements.get((kind, name, _PART[kind]))
+        if old is not None:
+            yield old.opening[0], old.closing[1], part
+        elif part and owner.opening == owner.closing:
+            yield owner.opening[1] - 2, owner.opening[1], f'>\n    {part}\n  </{kind}>'
+        elif part:
+            yield owner.closing[0], owner.closing[0], f'  {part}\n  '
+    end = elements['robot', '', ''].closing[0]
+    yield end, end, f'<!--\n{note.replace("--", "- -")}\n-->\n'
+
+
+def _elements(raw: bytes) -> dict[tuple[str, str, str], _Element]:
+    """Elements of a URDF by tag and name of a link or joint, and the tag of a part of it."""
+    found: dict[tuple[str, str, str], _Element] = {}
+    stack: list[tuple[str, str, tuple[int, int]]] = []
+    parser = expat.ParserCreate('utf-8')
+
+    def begin(tag: str, attributes: dict[str, str]) -> None:
+        at = parser.CurrentByteIndex
+        match = _TAG.match(raw, at)
+        end = at if match is None else match.end()
+        stack.append((tag, attributes.get('name', ''), (at, end)))
+
+    def end(_: str) -> None:
+        at = parser.CurrentByteIndex
+        tag, name, opening = stack[-1]
+        closing = opening if at == opening[1] else (at, raw.index(b'>', at) + 1)
+        if len(stack) == 1:
+            found[tag, '', ''] = _Element(opening, closing)
+        elif len(stack) == 2:
+            found[tag, name, ''] = _Element(opening, closing)
+        elif len(stack) == 3:
+            found[stack[1][0], stack[1][1], tag] = _Element(opening, closing)
+        stack.pop()
+
+    parser.StartElementHandler, parser.EndElementHandler = begin, end
+    parser.Parse(raw, True)  # noqa: FBT003 - it has no name there
+    return found

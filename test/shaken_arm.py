@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arms that are moved about, as bags of joint states with efforts."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from random_arm import CONFIG, PANDA
+
+from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
+from blf_dsc_controller.arms.urdf import read_chain
+from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.compiled.layout import size_of, view_of
+from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.topics import JOINT_STATE
+from sim_plant.rigid_body import Motion, acceleration, locate, rigid_bodies
+
+PANDA_TEXT = (CONFIG / 'panda.urdf').read_text()
+PANDA_CHAIN = read_chain(PANDA_TEXT, 'panda_link0', 'panda_hand_tcp', PANDA)
+GRAVITY = (0.0, 0.0, -9.81)
+PERIOD = 0.001  # s
+
+motion_of, motion_size = view_of(Motion), size_of(Motion)
+
+
+class Truth(NamedTuple):
+    """What a URDF does not tell: n bodies, rotors and frictions."""
+
+    inertias: np.ndarray  # (n, 10)
+    rotors: np.ndarray  # (n,) kg m^2
+    viscous: np.ndarray  # (n,) N m s/rad
+    coulomb: np.ndarray  # (n,) N m
+
+
+def changed(chain, random, share=0.3, centre=0.01):
+    """Inertias (n, 10) with other masses and spreads by a share, and other centres of mass [m]."""
+    bodies = []
+    for joint in chain.joints:
+        T = np.eye(4)
+        T[:3, 3] = centre * random.normal(size=3)
+        J = T @ pseudo_inertia(joint.inertia) @ T.T
+        bodies.append(inertia_of(np.exp(share * random.normal()) * J))
+    return np.array(bodies)
+
+
+def truth_of(chain, seed):
+    random = np.random.default_rng(seed)
+    efforts = np.array([min(joint.effort, 100.0) for joint in chain.joints])
+    return Truth(
+        changed(chain, random),
+        efforts / 400.0 * random.uniform(0.5, 1.5, efforts.size),
+        0.02 * efforts * random.uniform(0.5, 1.5, efforts.size),
+        0.02 * efforts * random.uniform(0.5, 1.5, efforts.size),
+    )
+
+
+class Reference(NamedTuple):
+    """Sums of sinusoids: offset + sum amplitude sin(frequency t + phase)."""
+
+    offset: np.ndarray  # (n,) rad
+    amplitude: np.ndarray  # (k, n) rad
+    frequency: np.ndarray  # (k, n) rad/s
+    phase: np.ndarray  # (k, n) rad
+
+    def at(self, t):
+        """Position and velocity (2, n) at a time [s]."""
+        angle = self.frequency * t + self.phase
+        swing = self.frequency * self.amplitude * np.cos(angle)
+        return np.array([self.offset + (self.amplitude * np.sin(angle)).sum(0), swing.sum(0)])
+
+
+def reference_of(chain, seed, tones=3):
+    random = np.random.default_rng(seed)
+    n = len(chain.joints)
+    limits = np.clip([(joint.lower, joint.upper) for joint in chain.joints], -2.0, 2.0)
+    amplitude = random.uniform(0.5, 1.0, (tones, n))
+    amplitude *= 0.35 * np.ptp(limits, axis=1) / amplitude.sum(0)
+    frequency = random.uniform(0.5, 4.0, (tones, n))
+    return Reference(limits.mean(1), amplitude, frequency, random.uniform(0.0, 6.3, (tones, n)))
+
+
+@njit(error_model='numpy')
+def _shake(arm, vector, viscous, coulomb, motion, q, gains, states):
+    """Follow (N, 2, n) by PD from rest at q, torques held over a period; fill states (N, 3, n)."""
+    now = motion_of(vector, arm)
+    n, force = q.size, np.zeros(3)
+    dq = motion[0, 1].copy()
+    k1, torque = np.zeros((4, 2, n)), np.zeros(n)
+    for k in range(motion.shape[0]):
+        states[k, 0], states[k, 1], states[k, 2] = q, dq, torque
+        for i in range(n):
+            torque[i] = gains[i] * (
+                30.0 * (motion[k, 0, i] - q[i]) + 3.0 * (motion[k, 1, i] - dq[i])
+            )
+        for stage in range(4):
+            size = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
+            before = k1[stage - 1]
+            qs, dqs = q + size * PERIOD * before[0], dq + size * PERIOD * before[1]
+            locate(arm, qs, dqs, now)
+            ddq = torque - viscous * dqs - coulomb * np.tanh(dqs / 0.005)
+            acceleration(arm, now, ddq, force, ddq)
+            k1[stage, 0], k1[stage, 1] = dqs, ddq
+        mean = (k1[0] + 2.0 * k1[1] + 2.0 * k1[2] + k1[3]) / 6.0
+        q, dq = q + PERIOD * mean[0], dq + PERIOD * mean[1]
+
+
+def shake(chain, truth, reference, duration):
+    """States (N, 3, n) of our own plant: position, velocity, torque of the period before."""
+    arm = rigid_bodies(chain, GRAVITY, truth.inertias, truth.rotors)
+    times = np.arange(round(duration / PERIOD)) * PERIOD
+    motion = np.array([reference.at(t) for t in times])
+    gains = np.array([min(joint.effort, 100.0) for joint in chain.joints]) / 4.0
+    states = np.zeros((times.size, 3, len(chain.joints)))
+    vector = np.zeros(motion_size(arm))
+    arguments = truth.viscous, truth.coulomb, motion, motion[0, 0].copy(), gains, states
+    _shake(arm, vector, *arguments)
+    return states
+
+
+def measured(states, seed, encoder=2.0 * np.pi / 2**20, noise=0.01):
+    """The states as an encoder and a torque sensor with noise (of the rms torque) see them."""
+    random = np.random.default_rng(seed)
+    seen = states.copy()
+    seen[:, 0] = np.round(states[:, 0] / encoder) * encoder
+    torque = states[:, 2]
+    seen[:, 2] += noise * np.sqrt(np.mean(torque**2, axis=0)) * random.normal(size=torque.shape)
+    return seen
+
+
+def write_states(path, joints, states, *, period=PERIOD, topic='/joint_states', fields=None):
+    """Write states (N, 3, n) as a bag."""
+    fields = fields or ('position', 'velocity', 'effort')
+    encoder = JointStateEncoder(joints, fields)
+    with BagWriter(path, flush_interval=None) as bag:
+        handle = bag.add_topic(topic, JOINT_STATE, [])
+        for k, state in enumerate(states):
+            stamp = 1_000_000_000 + round(k * period * 1e9)
+            values = [
+                state[i] if field in fields else ()
+                for i, field in enumerate(('position', 'velocity', 'effort'))
+            ]
+            bag.write(handle, bytes(encoder.encode(stamp, *values)), stamp)
+    return path

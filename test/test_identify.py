@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An arm is identified from bags of our plant and of MuJoCo, with honest confidence."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pinocchio
+import pytest
+from random_arm import PANDA, pinocchio_model
+from shaken_arm import (
+    GRAVITY,
+    PANDA_CHAIN,
+    PANDA_TEXT,
+    PERIOD,
+    measured,
+    reference_of,
+    shake,
+    truth_of,
+    write_states,
+)
+
+from blf_dsc_controller.arms.inertia import pseudo_inertia
+from blf_dsc_controller.arms.urdf import read_chain
+from blf_dsc_controller.bags.content import NameMap
+from blf_dsc_controller.bags.sources import BagError
+from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
+from blf_dsc_controller.identification.identify import identify_arm, identify_bag
+from blf_dsc_controller.identification.prior import columns_of
+from blf_dsc_controller.identification.recording import Recording, read_recording
+from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.topics import JOINT_STATE
+
+ROBOT = Robot(urdf=PANDA_TEXT)
+TRUTH = truth_of(PANDA_CHAIN, 1)
+
+
+def model_of(text, rotors):
+    model = pinocchio_model(text, PANDA)
+    model.armature[:] = rotors
+    return model
+
+
+def torques(model, seed=77):
+    """Of a motion that no bag has, by pinocchio."""
+    data, reference, h = model.createData(), reference_of(PANDA_CHAIN, seed), 1e-4
+    rows = []
+    for t in np.arange(0.0, 20.0, 0.05):
+        q, dq = reference.at(t)
+        ddq = (reference.at(t + h)[1] - reference.at(t - h)[1]) / (2.0 * h)
+        rows.append(pinocchio.rnea(model, data, q, dq, ddq))
+    return np.array(rows)
+
+
+def text_of(truth):
+    """The true arm as a URDF."""
+    return corrected_urdf(
+        PANDA_TEXT, PANDA_CHAIN, truth.inertias, truth.viscous, truth.coulomb, 'true'
+    )
+
+
+def unseen_error(text, rotors):
+    """Of the torques of an unseen motion, of their norm."""
+    expected = torques(model_of(text_of(TRUTH), TRUTH.rotors))
+    return np.linalg.norm(torques(model_of(text, rotors)) - expected) / np.linalg.norm(expected)
+
+
+def corrected(found):
+    _, viscous, coulomb, _ = found.joint_terms
+    return corrected_urdf(PANDA_TEXT, found.chain, found.inertias, viscous, coulomb, 'note')
+
+
+def recording_of(states, joints=PANDA):
+    gap = np.zeros(len(states), dtype=bool)
+    return Recording(joints, PERIOD, states[:, 0], states[:, 2], gap, 'made up')
+
+
+@pytest.fixture(scope='module')
+def states():
+    """A minute of our own plant, of an encoder of 20 bit and a torque sensor of 1 % noise."""
+    return measured(shake(PANDA_CHAIN, TRUTH, reference_of(PANDA_CHAIN, 2), 60.0), 3)
+
+
+@pytest.fixture(scope='module')
+def bag(states, tmp_path_factory):
+    return write_states(tmp_path_factory.mktemp('identify') / 'bag', PANDA, states)
+
+
+@pytest.fixture(scope='module')
+def found(bag):
+    return identify_bag(bag, ROBOT)
+
+
+def is_physical(text):
+    """Each body, and in it each link of its own."""
+    chain = read_chain(text, 'panda_link0', 'panda_hand_tcp', PANDA)
+    return all(np.linalg.eigvalsh(pseudo_inertia(ten))[0] > 0.0 for ten in chain.inertias)
+
+
+def test_an_unseen_motion_takes_the_torques_of_the_corrected_urdf(found):
+    assert unseen_error(PANDA_TEXT, np.zeros(7)) > 0.1
+    text = corrected(found)
+    assert unseen_error(text, found.joint_terms[0]) < 0.005
+    assert is_physical(text)
+    assert mujoco.MjModel.from_xml_string(text).nq == 9  # loads, the fingers as well
+
+
+def test_the_part_held_back_is_predicted_but_for_its_noise(found):
+    share = found.errors / found.torque
+    assert (share[2] < 0.005).all()  # 1 % noise, averaged over windows of 200 samples
+    assert (share[0] > 0.1).all()
+    assert found.held_back[0] == pytest.approx(48.0, abs=0.2)
+
+
+def test_friction_and_rotors_are_those_of_the_truth(found):
+    rotors, viscous, coulomb, offset = found.joint_terms
+    np.testing.assert_allclose(viscous, TRUTH.viscous, rtol=0.01)
+    np.testing.assert_allclose(coulomb, TRUTH.coulomb, rtol=0.01)
+    # Of the first joint only the sum with its link's inertia is seen.
+    np.testing.assert_allclose(rotors[1:], TRUTH.rotors[1:], rtol=0.02)
+    assert (np.abs(offset) < 0.03).all()
+
+
+def test_the_torque_of_a_period_is_found_half_of_it_late(found):
+    assert found.values[-1] == pytest.approx(0.5 * PERIOD, abs=0.2 * PERIOD)
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say():
+    """Of arms drawn as the prior says, and of other noise and motions; 95 % intervals."""
+    inside = []
+    for seed in range(6):
+        truth = truth_of(PANDA_CHAIN, 10 + seed)
+        motion = shake(PANDA_CHAIN, truth, reference_of(PANDA_CHAIN, 20 + seed), 20.0)
+        found = identify_arm(recording_of(measured(motion, seed)), ROBOT)
+        true = np.concatenate((truth.inertias.ravel(), truth.rotors, truth.viscous, truth.coulomb))
+        G = columns_of(found.parameters, 7)[:-8, :-8]  # without offsets and delay
+        at = slice(0, true.size)
+        deviation = np.sqrt(np.diag(G @ found.covariance[at, at] @ G.T))
+        inside.append(np.abs(G @ (found.values[at] - true)) < 1.96 * deviation)
+        masses = np.arange(0, 70, 10)
+        off = np.abs(found.values[masses] - true[masses])
+        inside.append(off < 1.96 * np.sqrt(np.diag(found.covariance)[masses]))
+    # 450 intervals, of one arm correlated: a few percent less would be chance; the bounds and the
+    # correlation lengths are on the careful side.
+    assert 0.92 < np.mean(np.concatenate(inside)) <= 1.0
+
+
+def test_a_simulation_of_somebody_else_is_identified(tmp_path):
+    """MuJoCo: another integrator, true stiction, efforts of the same instant as positions."""
+    model = mujoco.MjModel.from_xml_string(text_of(TRUTH))
+    model.opt.timestep = PERIOD
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    model.dof_armature[:7] = TRUTH.rotors
+    model.dof_armature[7:] = 1e3  # fingers that stay where they are
+    data, reference = mujoco.MjData(model), reference_of(PANDA_CHAIN, 5)
+    data.qpos[:7], data.qvel[:7] = reference.at(0.0)
+    states = np.zeros((30_000, 3, 7))
+    gains = np.array([87.0] * 4 + [12.0] * 3) / 4.0
+    for k, state in enumerate(states):
+        q, dq = reference.at(k * PERIOD)
+        feedback = 30.0 * (q - data.qpos[:7]) + 3.0 * (dq - data.qvel[:7])
+        data.qfrc_applied[:7] = gains * feedback
+        state[:] = data.qpos[:7], data.qvel[:7], data.qfrc_applied[:7]
+        mujoco.mj_step(model, data)
+    found = identify_bag(write_states(tmp_path / 'bag', PANDA, measured(states, 4)), ROBOT)
+    text = corrected(found)
+    assert unseen_error(text, found.joint_terms[0]) < 0.005
+    assert is_physical(text)
+
+
+def test_two_joints_that_hardly_move_leave_the_rest_to_the_urdf():
+    reference = reference_of(PANDA_CHAIN, 6)
+    amplitude = np.zeros_like(reference.amplitude)
+    amplitude[0, [1, 3]] = 0.1
+    states = shake(PANDA_CHAIN, TRUTH, reference._replace(amplitude=amplitude), 20.0)
+    found = identify_arm(recording_of(measured(states, 3)), ROBOT)
+    assert is_physical(corrected(found))
+    G = columns_of(found.parameters, 7)
+    prior, posterior = (np.diag(G @ C @ G.T) for C in (found.prior_covariance, found.covariance))
+    shown = dict(zip(found.parameters.combinations, posterior < 0.5 * prior, strict=False))
+    assert not any(shown[name] for name in ('Izz7', 'Ixx7 - Iyy7', 'rotor7'))
+    gravity_of_joint_4 = next(name for name in shown if name.startswith('m*cx4'))
+    assert shown[gravity_of_joint_4]
+    assert {PANDA[0], PANDA[2], PANDA[4], PANDA[6]} <= set(found.still)
+
+
+def test_the_command_writes_the_urdf_and_the_table(bag, tmp_path, capsys):
+    urdf, out = tmp_path / 'robot.urdf', tmp_path / 'corrected.urdf'
+    urdf.write_text(PANDA_TEXT)
+    call = ['identify', str(bag), '--urdf', str(urdf), '--out', str(out)]
+    assert main(call) == 0
+    said = capsys.readouterr().out
+    for word in ('panda_link7', 'rotor inertia', 'Izz1 + rotor1 + Iyy2', 'held back', 'ms after'):
+        assert word in said
+    assert 'NOT SHOWN' not in said
+    assert is_physical(out.read_text())
+    assert main(call) == 1
+    assert 'exists already' in capsys.readouterr().err
+
+
+def test_other_publishers_names_and_orders_are_found(states, tmp_path):
+    """A gripper on the same topic, joints in another order and one of another name."""
+    theirs = ('elbow' if name == 'panda_joint4' else name for name in PANDA[::-1])
+    arm, hand = JointStateEncoder(tuple(theirs)), JointStateEncoder(('panda_finger_joint1',))
+    with BagWriter(tmp_path / 'bag', flush_interval=None) as bag:
+        handle = bag.add_topic('/franka/joint_states', JOINT_STATE, [])
+        for k, state in enumerate(states[:8000]):
+            stamp = 1_000_000_000 + 1_000_000 * k
+            bag.write(handle, bytes(arm.encode(stamp, *state[:, ::-1])), stamp)
+            bag.write(handle, bytes(hand.encode(stamp, [0.0], [0.0], [0.0])), stamp)
+    names = NameMap.parse(['panda_joint4=elbow'])
+    got = read_recording(tmp_path / 'bag', PANDA_TEXT, names=names)
+    assert got.joints == PANDA
+    assert got.source == 'effort of /franka/joint_states'
+    np.testing.assert_allclose(got.q, states[: len(got.q), 0], atol=1e-12)
+    np.testing.assert_allclose(got.torque, states[: len(got.q), 2], atol=1e-12)
+
+
+def test_lost_states_do_not_bend_the_result(states, found, tmp_path):
+    with_gaps = states.copy()
+    with_gaps[10_000:12_000] = np.nan  # neither positions nor torques
+    with_gaps[30_000:30_050, 2] = np.nan
+    bag = write_states(tmp_path / 'bag', PANDA, with_gaps)
+    other = identify_bag(bag, ROBOT)
+    assert unseen_error(corrected(other), other.joint_terms[0]) < 0.005
+    np.testing.assert_allclose(other.joint_terms[1], found.joint_terms[1], rtol=0.01)
+
+
+def rejected(tmp_path, states, fields=None, joints=PANDA, **options):
+    bag = write_states(tmp_path / 'bag', joints, states, fields=fields, **options)
+    with pytest.raises(BlfDscError) as error:
+        identify_bag(bag, ROBOT)
+    return str(error.value)
+
+
+def test_a_bag_without_efforts_is_rejected(states, tmp_path):
+    said = rejected(tmp_path, states[:8000], ('position', 'velocity'))
+    assert 'does not hold the torques' in said
+
+
+def test_a_bag_of_zero_efforts_is_rejected(states, tmp_path):
+    assert 'are zero' in rejected(tmp_path, states[:8000] * [[1.0], [1.0], [0.0]])
+
+
+def test_a_bag_of_another_robot_is_rejected(states, tmp_path):
+    others = tuple(f'ur_{i}' for i in range(7))
+    assert 'no joint of the URDF' in rejected(tmp_path, states[:8000], joints=others)
+
+
+def test_a_bag_without_a_joint_in_between_is_rejected(states, tmp_path):
+    joints = tuple(name.replace('panda_joint4', 'elbow') for name in PANDA)
+    assert "joint 'panda_joint4' is not in" in rejected(tmp_path, states[:8000], joints=joints)
+
+
+def test_a_short_bag_is_rejected(states, tmp_path):
+    assert 'the bag holds 2 s' in rejected(tmp_path, states[:2001])
+
+
+def test_a_slow_bag_is_rejected(states, tmp_path):
+    assert 'at least one in 0.02 s' in rejected(tmp_path, states[:8000], period=0.1)
+
+
+def test_an_arm_at_rest_is_rejected(states, tmp_path):
+    still = np.repeat(states[:1], 8000, axis=0)
+    still[:, 2] += 1.0
+    assert 'no joint moves' in rejected(tmp_path, still)
+
+
+def test_stamps_that_stand_still_are_rejected(states, tmp_path):
+    with pytest.raises(BagError, match='a stamp of its own'):
+        read_recording(write_states(tmp_path / 'b', PANDA, states[:99], period=0.0), PANDA_TEXT)
+
+
+def test_gravity_is_that_of_the_mounting(states):
+    """The same motion, as if the arm hung from the ceiling: it cannot be explained."""
+    hanging = Robot(urdf=PANDA_TEXT, gravity=(0.0, 0.0, 9.81))
+    wrong = identify_arm(recording_of(states), hanging)
+    assert np.linalg.norm(wrong.errors[2]) > 0.1 * np.linalg.norm(wrong.torque)
+    assert ROBOT.gravity == GRAVITY
