@@ -85,7 +85,7 @@ def reference_of(chain, seed, tones=3):
 def _shake(arm, vector, viscous, coulomb, motion, q, gains, states):
     """Follow (N, 2, n) by PD from rest at q, torques held over a period; fill states (N, 3, n)."""
     now = motion_of(vector, arm)
-    n, force = q.size, np.zeros(3)
+    n = q.size
     dq = motion[0, 1].copy()
     k1, torque = np.zeros((4, 2, n)), np.zeros(n)
     for k in range(motion.shape[0]):
@@ -100,7 +100,7 @@ def _shake(arm, vector, viscous, coulomb, motion, q, gains, states):
             qs, dqs = q + size * PERIOD * before[0], dq + size * PERIOD * before[1]
             locate(arm, qs, dqs, now)
             ddq = torque - viscous * dqs - coulomb * np.tanh(dqs / 0.005)
-            acceleration(arm, now, ddq, force, ddq)
+            acceleration(arm, now, 0.0, ddq, ddq)
             k1[stage, 0], k1[stage, 1] = dqs, ddq
         mean = (k1[0] + 2.0 * k1[1] + 2.0 * k1[2] + k1[3]) / 6.0
         q, dq = q + PERIOD * mean[0], dq + PERIOD * mean[1]
