@@ -98,7 +98,7 @@ def test_gravity_is_compensated_with_the_initial_estimate():
 
 
 def test_prismatic_joints_and_a_third_arm_need_nothing_else():
-    given = {'model': 'urdf', 'robot.urdf': random_urdf(4, seed=3), 'robot.tip': 'tip'}
+    given = {'model': 'urdf', 'robot.urdf': random_urdf(4, seed=3)[0], 'robot.tip': 'tip'}
     config = build(ControllerConfig, given)
     assert config.joints == ('j1', 'j2', 'j3', 'j4')
     assert np.all(np.isfinite(settings_of_config(config).information))
