@@ -69,7 +69,7 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
         'limits.position_lower': _listed(lower),
         'limits.position_upper': _listed(upper),
         'limits.velocity': _listed(_SLOW * velocity),
-        'limits.acceleration': _listed(2.0 * _SLOW * velocity),
+        'limits.acceleration': _listed(4.0 * _SLOW * velocity),
         'learning.initial_estimate': _listed(P0),
         'learning.adaptation_gain': (0.5,) * P0.size,
         'learning.radius': 10.0 * float(np.linalg.norm(P0)),

@@ -161,7 +161,9 @@ class ControllerConfig(Sampled):
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> Mapping[str, Value]:
         """Return gains and limits for the arm of a URDF; those of the two-link arm are declared."""
-        return controller_defaults(given) if given.get('model') == 'urdf' else {}
+        if given.get('model', 'urdf' if given.get('robot.urdf') else '') != 'urdf':
+            return {}
+        return {'model': 'urdf', **controller_defaults(given)}
 
     def problems(self) -> list[str]:
         """Check parameters against each other, and joints and estimates against the model."""
