@@ -52,7 +52,8 @@ def test_its_arm_has_the_inertia_and_the_weight_that_the_model_says(example):
         ours, _, weight = dynamics(P, 9.8, q, (0.0, 0.0))
         np.testing.assert_allclose(theirs, ours, atol=1e-8)  # the masses have 1e-9 kg m^2
         np.testing.assert_allclose(data.qfrc_bias, weight, atol=1e-8)
-    assert example.COMMANDED == ('joint1', 'joint2')
+    assert example.MujocoArm(PlantConfig()).config.joints == ('joint1', 'joint2')
+    assert [model.joint(k).name for k in range(model.njnt)] == ['joint1', 'joint2']
 
 
 @pytest.mark.parametrize(
@@ -71,7 +72,7 @@ def test_events_move_it_as_they_move_the_simulated_plant(example, kind, toleranc
     names = ('events.begin', 'events.duration', 'events.ramp', f'events.{kind}', f'{kind}.')
     given = {name: value for name, value in ALL_KINDS.items() if name.startswith(names)}
     ours, without = (simulated_angles(one) for one in (given, {}))
-    theirs = angles_of(example.MujocoArm(build(example.MujocoConfig, given)))
+    theirs = angles_of(example.MujocoArm(build(PlantConfig, given)))
     np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=tolerance)
     assert np.abs(ours - without).max() > 3.0 * tolerance
 
@@ -83,11 +84,74 @@ def simulated_angles(given):
 
 def angles_of(arm):
     """Measured angles (200, 2) of the MuJoCo arm under the same torques."""
+    return measured(arm, commands(200))[:, :2]
+
+
+def measured(arm, torques):
+    """Measurements (samples, 3 n) of either arm under these torques."""
     rows = []
-    for torque in commands(200):
-        rows.append(arm.measure()[0])
+    for torque in torques:
+        rows.append(np.concatenate(arm.measure(), axis=None))
         arm.step(torque)
     return np.array(rows)
+
+
+URDFS = {
+    'panda': {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'},
+    'ur5e': {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0', 'robot.gravity': [1.0, 3.0, 9.0]},
+}
+REAL = {
+    'truth.mass_deviation': 0.3,
+    'truth.centre_deviation': 0.01,
+    'truth.rotor_factor': 1.3,
+    'sensor.velocity': 'differenced',
+    'sensor.velocity_pole': 400.0,
+    'sensor.resolution': 2 * np.pi / 2**20,
+    'actuator.delay': 1,
+    'actuator.time_constant': 2e-3,
+    'actuator.torque_noise': 0.01,
+    'load.payload': 0.5,
+    'events.begin': [0.1],
+    'events.payload': [1.0],
+    'events.force': [5.0, -3.0, 10.0],
+}
+
+
+@pytest.mark.parametrize('name', URDFS)
+def test_the_arm_of_a_urdf_moves_as_in_the_simulated_plant(example, name):
+    """Truth, sensors, drives and events included."""
+    given = URDFS[name] | REAL
+    n = len(build(PlantConfig, given).joints)
+    given['disturbance.viscous'] = [1.0] * n
+    theirs, ours = (swung(make, given) for make in (example.MujocoArm, plant_of))
+    np.testing.assert_allclose(theirs[:, :n], ours[:, :n], rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(theirs[:, n : 2 * n], ours[:, n : 2 * n], rtol=0.0, atol=1e-2)
+    np.testing.assert_array_equal(theirs[:, 2 * n :], ours[:, 2 * n :])
+    assert np.abs(ours - swung(plant_of, URDFS[name]))[:, :n].max() > 0.05
+
+
+@pytest.mark.parametrize(
+    ('given', 'tolerance'),  # rad, after 0.3 s
+    [
+        ({'actuator.ripple': 0.01}, 4e-4),  # held over a sample here
+        ({'disturbance.stribeck': 0.5, 'disturbance.coulomb': [1.0] * 7}, 4e-3),  # dry here
+    ],
+)
+def test_ripple_and_the_friction_of_breaking_away_are_those_of_the_simulated_plant(
+    example, given, tolerance
+):
+    _, *others = given.items()
+    without = URDFS['panda'] | dict(others)
+    theirs, ours = (swung(make, without | given) for make in (example.MujocoArm, plant_of))
+    np.testing.assert_allclose(theirs[:, :7], ours[:, :7], rtol=0.0, atol=tolerance)
+    assert np.abs(ours - swung(plant_of, without))[:, :7].max() > 3.0 * tolerance
+
+
+def swung(make, given):
+    """Measurements (300, 3 n) of an arm whose joints all swing."""
+    config = build(PlantConfig, given)
+    t = 1e-3 * np.arange(300)[:, None]
+    return measured(make(config), 0.1 * np.sin(20.0 * t) * config.actuator.torque_limit)
 
 
 def test_the_controller_keeps_the_bound_and_learns_the_parameters(example):

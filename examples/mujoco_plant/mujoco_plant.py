@@ -3,13 +3,13 @@
 
 It publishes `joint_states` with the joints in another order than the controller's and a gripper
 among them, and takes a step for each torque on `blf_dsc_controller/commands` (lock-step).
-Payloads, pushes, friction, encoder offsets and the wall are parameters, those of `sim_plant`.
+Its parameters are those of `sim_plant`; the arm is that of arm.xml or, read by MuJoCo, of a URDF.
+Encoders and drives are those of `sim_plant`, all mechanics are MuJoCo's.
 """
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,55 +21,113 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from blf_dsc_controller.configuration.events import Events, Load, Wall
-from blf_dsc_controller.configuration.schema import parameter
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.nodes import parameters
+from sim_plant.actuator import DriveState, actuate
+from sim_plant.plant import settings_of
+from sim_plant.sensors import EncoderReading, generator, is_noisy, sense
 
-NAMES = ('joint2', 'gripper', 'joint1')  # of the message; the gripper is not simulated
-COMMANDED = ('joint1', 'joint2')  # order of the torques: the controller's parameter `joints`
-START = {'joint1': 2.293, 'joint2': 1.696}  # rad
 FIRST_STAMP = 1.0  # s
 REPEAT = 1.0  # s, for a state that nobody has answered
+TIP = 'link2'  # of arm.xml: a point mass at the tip
+PAYLOAD = 'payload of mujoco_plant'  # the same in a URDF, without mass
 
 
-@dataclass(frozen=True)
-class MujocoConfig:
-    """What happens to the arm; it can change while it runs."""
+def model_of(config: PlantConfig) -> mujoco.MjModel:
+    """The arm in MuJoCo, with its drives."""
+    if not config.robot.urdf:
+        return mujoco.MjModel.from_xml_path(str(Path(__file__).with_name('arm.xml')))
+    chain = config.robot.chain(config.joints)
+    spec = mujoco.MjSpec.from_string(config.robot.text)
+    spec.compiler.boundmass = spec.compiler.boundinertia = 0.0
+    spec.compiler.fusestatic = False
+    for unused in (*spec.geoms, *spec.meshes):
+        spec.delete(unused)
+    for joint in spec.joints:
+        if joint.name not in config.joints:  # fingers and the like stand still
+            spec.delete(joint)
+    spec.body(chain.tip).add_body(name=PAYLOAD)
+    model = spec.compile()
+    model.opt.timestep = config.sample_time
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    model.opt.gravity[:] = config.robot.gravity
+    model.dof_armature[:] = config.truth.rotor_factor * config.robot.rotors(chain)
+    _apply_truth(config, model)
+    return model
 
-    joints: tuple[str, ...] = parameter(COMMANDED, 'names of the joints', read_only='of the model')
-    load: Load = field(default_factory=Load)
-    wall: Wall = field(default_factory=Wall)
-    events: Events = field(default_factory=Events)
+
+def _apply_truth(config: PlantConfig, model: mujoco.MjModel) -> None:
+    """Scale and shift the masses of all that a joint moves; a shift is along its body's axes."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    for joint, factor, shift in zip(
+        config.joints, *config.truth.changes(len(config.joints)), strict=True
+    ):
+        moved = model.joint(joint).bodyid[0]
+        for body in np.flatnonzero((model.body_weldid == moved) & (model.body_mass > 0.0)):
+            own, carrier = (data.xmat[each].reshape(3, 3) for each in (body, moved))
+            model.body_mass[body] *= factor
+            model.body_inertia[body] *= factor
+            model.body_ipos[body] += own.T @ carrier @ shift
+    mujoco.mj_setConst(model, data)
 
 
 class MujocoArm:
-    """The arm and what happens to it; all arrays are in the order of `COMMANDED`."""
+    """The arm and what happens to it; all arrays are in the order of the parameter `joints`."""
 
-    def __init__(self, config: MujocoConfig) -> None:
+    def __init__(self, config: PlantConfig) -> None:
         self.config = config
-        self.model = mujoco.MjModel.from_xml_path(str(Path(__file__).with_name('arm.xml')))
+        self.n = len(config.joints)
+        self.model = model_of(config)
         self.data = mujoco.MjData(self.model)
-        self.data.qpos[:] = [START[name] for name in COMMANDED]
-        self._mass = self.model.body('link2').mass[0]
-        self._torque = np.zeros(2)
+        self.data.qpos[:] = config.initial.position
+        self.data.qvel[:] = config.initial.velocity
+        self._tip = self.model.body(PAYLOAD if config.robot.urdf else TIP)
+        self._mass = self._tip.mass[0]
+        self._sample = 0
+        self._noise = generator(config.seed)
+        self._settings = settings_of(config)
+        self._reading = EncoderReading(-np.ones(1), *np.zeros((1, 2 * self.n)), *self._zeros(2))
+        ring = self._zeros(config.actuator.delay)
+        self._drives = DriveState(*self._zeros(3), ring)
+
+    def _zeros(self, rows: int) -> np.ndarray:
+        return np.zeros((rows, self.n))
 
     def measure(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Measured angles [rad], velocities [rad/s], torques applied last [N m], (2,) each."""
-        return self.data.qpos + self._sum('offset', 2), self.data.qvel.copy(), self._torque
+        """Measured angles [rad], velocities [rad/s], torques applied last [N m], (n,) each."""
+        reading = self._reading
+        if reading.sample[0] != self._sample:
+            if is_noisy(self._settings.encoders):
+                self._noise.standard_normal(out=reading.noise)
+            if self.config.actuator.torque_noise > 0.0:
+                self._noise.standard_normal(out=self._drives.noise)
+            offset = self.config.sensor.offset + self._sum('offset', self.n)
+            state = self.data.qpos, self.data.qvel, offset
+            period = self.config.sample_time
+            sense(self._settings.encoders, self._sample, period, *state, reading)
+        return reading.position, reading.velocity, self._drives.applied
 
     def step(self, torque: np.ndarray) -> None:
-        """Take a step with this torque (2,) [N m] and what else acts at its start."""
-        load, data = self.config.load, self.data
-        tip = self.model.body('link2')
-        tip.mass[0] = self._mass + load.payload + self._sum('payload', 1)[0]
-        self.model.dof_damping[:] = np.maximum(self._sum('viscous', 2), 0.0)
-        self.model.dof_frictionloss[:] = np.maximum(self._sum('coulomb', 2), 0.0)
-        force = load.force + self._sum('force', 3) + self._wall_force(tip.id)
-        data.body('link2').xfrc_applied[:3] = force
-        disturbance = 0.1 + 0.1 * np.sin(data.time)  # N m, on each joint
-        data.qfrc_applied[:] = load.torque + self._sum('torque', 2) - disturbance
-        data.ctrl[:] = self._torque = torque
+        """Take a step with this torque (n,) [N m] and what else acts at its start."""
+        load, friction, data = self.config.load, self.config.disturbance, self.data
+        self._tip.mass[0] = self._mass + load.payload + self._sum('payload', 1)[0]
+        viscous = friction.viscous + self._sum('viscous', self.n)
+        coulomb = np.maximum(friction.coulomb + self._sum('coulomb', self.n), 0.0)
+        speed = data.qvel / friction.stribeck_velocity
+        self.model.dof_damping[:] = np.maximum(viscous, 0.0)
+        self.model.dof_frictionloss[:] = coulomb * (1.0 + friction.stribeck * np.exp(-(speed**2)))
+        force = load.force + self._sum('force', 3) + self._wall_force(self._tip.id)
+        data.xfrc_applied[self._tip.id, :3] = force
+        phase = np.multiply(friction.frequency, data.time) + friction.phase
+        disturbance = friction.constant + friction.amplitude * np.sin(phase)
+        ripple = self._settings.disturbance.ripple
+        disturbance += ripple * np.sin(self.config.actuator.ripple_cycles * data.qpos)
+        actuate(self._settings.drives, self._sample, torque, self._drives)
+        pushed = load.torque + self._sum('torque', self.n) - disturbance
+        data.qfrc_applied[:] = self._drives.applied + pushed
         mujoco.mj_step(self.model, data)
+        self._sample += 1
 
     def _sum(self, name: str, size: int) -> np.ndarray:
         """Sum (size,) of an effect of the events that are on."""
@@ -108,21 +166,23 @@ class MujocoPlant(Node):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('mujoco_plant', **options)
-        self.arm = MujocoArm(parameters.declare(self, MujocoConfig))
-        parameters.on_change(self, MujocoConfig, self._reconfigure)
+        self.arm = MujocoArm(parameters.declare(self, PlantConfig))
+        parameters.on_change(self, PlantConfig, self._reconfigure)
         self.steps = 0
+        joints = self.arm.config.joints
+        self._names = (*joints[:0:-1], 'gripper', joints[0])  # the gripper is not simulated
         self._states = self.create_publisher(JointState, 'joint_states', 1)
         self.create_subscription(
             Float64MultiArray, 'blf_dsc_controller/commands', self._on_command, 1
         )
         self._unanswered = self.create_timer(REPEAT, self._publish)
 
-    def _reconfigure(self, config: MujocoConfig) -> None:
+    def _reconfigure(self, config: PlantConfig) -> None:
         self.arm.config = config
 
     def _on_command(self, message: Float64MultiArray) -> None:
         torque = np.array(message.data)
-        if torque.shape != (len(COMMANDED),) or not np.isfinite(torque).all():
+        if torque.shape != (self.arm.n,) or not np.isfinite(torque).all():
             self.get_logger().error(f'command rejected: {list(message.data)}')
             return
         self.arm.step(torque)
@@ -132,13 +192,13 @@ class MujocoPlant(Node):
 
     def _publish(self) -> None:
         nanoseconds = round((FIRST_STAMP + self.arm.data.time) * 1e9)
-        message = JointState(name=list(NAMES))
+        message = JointState(name=list(self._names))
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 10**9)
         for name, values in zip(
             ('position', 'velocity', 'effort'), self.arm.measure(), strict=True
         ):
-            of = dict(zip(COMMANDED, values.tolist(), strict=True))
-            setattr(message, name, [of.get(joint, 0.0) for joint in NAMES])
+            of = dict(zip(self.arm.config.joints, values.tolist(), strict=True))
+            setattr(message, name, [of.get(joint, 0.0) for joint in self._names])
         self._states.publish(message)
 
 
