@@ -32,8 +32,8 @@ from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.identify import identify_arm, identify_bag
 from blf_dsc_controller.identification.prior import columns_of
 from blf_dsc_controller.identification.recording import Recording, read_recording
-from blf_dsc_controller.messages.codecs import JointStateEncoder
-from blf_dsc_controller.messages.topics import JOINT_STATE
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE
 
 ROBOT = Robot(urdf=PANDA_TEXT)
 TRUTH = truth_of(PANDA_CHAIN, 1)
@@ -194,7 +194,13 @@ def test_the_command_writes_the_urdf_and_the_table(bag, tmp_path, capsys):
     call = ['identify', str(bag), '--urdf', str(urdf), '--out', str(out)]
     assert main(call) == 0
     said = capsys.readouterr().out
-    for word in ('panda_link7', 'rotor inertia', 'Izz1 + rotor1 + Iyy2', 'held back', 'ms after'):
+    for word in (
+        'panda_link7',
+        'rotor inertia',
+        'Izz1 + rotor1 + Iyy2',
+        'held back',
+        'delay of the torques',
+    ):
         assert word in said
     assert 'NOT SHOWN' not in said
     assert is_physical(out.read_text())
@@ -217,6 +223,20 @@ def test_other_publishers_names_and_orders_are_found(states, tmp_path):
     assert got.joints == PANDA
     assert got.source == 'effort of /franka/joint_states'
     np.testing.assert_allclose(got.q, states[: len(got.q), 0], atol=1e-12)
+    np.testing.assert_allclose(got.torque, states[: len(got.q), 2], atol=1e-12)
+
+
+def test_commands_stand_in_for_efforts(states, tmp_path):
+    q, commands = JointStateEncoder(PANDA, ('position', 'velocity')), Float64MultiArrayEncoder(7)
+    with BagWriter(tmp_path / 'bag', flush_interval=None) as bag:
+        handle = bag.add_topic('/joint_states', JOINT_STATE, [])
+        other = bag.add_topic('/arm/commands', COMMANDS.type, [])
+        for k, state in enumerate(states[:8000]):
+            stamp = 1_000_000_000 + 1_000_000 * k
+            bag.write(handle, bytes(q.encode(stamp, state[0], state[1])), stamp)
+            bag.write(other, bytes(commands.encode(state[2])), stamp + 1000)
+    got = read_recording(tmp_path / 'bag', PANDA_TEXT)
+    assert got.source == '/arm/commands'
     np.testing.assert_allclose(got.torque, states[: len(got.q), 2], atol=1e-12)
 
 

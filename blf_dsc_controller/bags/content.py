@@ -43,8 +43,8 @@ class UnreadableMessageError(BagError):
         reason = str(error)
         if isinstance(error, MissingJointError):
             reason = (
-                f'{error.fact}: the bag is from another robot, or its joints have other names, '
-                f'as in bag_replay --config FILE --map {error.joint}=ITS_NAME'
+                f'{error.fact}: the bag is from another robot, or its joints have other names: '
+                f'--map {error.joint}=ITS_NAME, of replay --config and of identify'
             )
         super().__init__(f'message {index + 1} of {topic} cannot be read: {reason}')
 

@@ -78,7 +78,7 @@ def _joints(found: Identified) -> Iterator[str]:
         )
         yield f'{name:{width}}' + ''.join(f'  {term:24}' for term in terms).rstrip()
     delay, s = found.values[-1], _TWO_SIDED * np.sqrt(found.covariance[-1, -1])
-    yield f'torques recorded {1e3 * delay:.2f} +- {1e3 * s:.2g} ms after the positions'
+    yield f'delay of the torques against the positions: {1e3 * delay:.2f} +- {1e3 * s:.2g} ms'
 
 
 def _base(found: Identified) -> Iterator[str]:

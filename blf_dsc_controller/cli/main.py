@@ -221,14 +221,14 @@ def _namespace(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--namespace', default='', help='of the robot, if a bag holds several')
 
 
-def _map(parser: argparse.ArgumentParser) -> None:
+def _map(parser: argparse.ArgumentParser, when: str = '') -> None:
     parser.add_argument(
         '--map',
         action='append',
         default=[],
         metavar='OURS=THEIRS',
         help='name of a topic or a joint in the bag, such as commands=/arm/torque or '
-        'joint1=shoulder',
+        f'joint1=shoulder{when}',
     )
 
 
@@ -248,7 +248,7 @@ def _replay_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--config', help='parameter file or preset: what it would have commanded (open loop)'
     )
-    _map(parser)
+    _map(parser, '; with --config or --learn')
     _namespace(parser)
     parser.add_argument(
         '--learn',

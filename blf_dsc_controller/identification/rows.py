@@ -38,7 +38,7 @@ class Rows(NamedTuple):
     time: Floats  # (R,) of their centres, s
     X: Floats  # (R, n, m)
     weight: Floats  # (R, n) of each row, at most 1
-    speed: Floats  # (n,) largest of each joint, rad/s or m/s
+    speed: Floats  # (n,) of each joint, exceeded in a twentieth of the time, rad/s or m/s
     torque: Floats  # (N, n) at all samples
     g: Floats  # (L,) with sum 1
     slope: Floats  # (L,) g' in 1/s, likewise
@@ -85,7 +85,7 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
         time=(starts + 0.5 * (length - 1)) * h,
         X=X,
         weight=np.empty(0),
-        speed=np.abs(dq[~covered]).max(axis=0, initial=0.0),
+        speed=np.percentile(np.abs(dq[~covered]), 95.0, axis=0),
         torque=recording.torque,
         g=g,
         slope=slope,
