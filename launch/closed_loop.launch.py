@@ -9,11 +9,11 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from blf_dsc_controller.arms.two_link_geometry import urdf
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.params_file import load, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.share import share_folder
+from sim_plant.arms import urdf_of
 
 PACKAGE = 'blf_dsc_controller'
 
@@ -88,9 +88,7 @@ def nodes(context: LaunchContext) -> list[Node]:
 
 def view(namespace: str, config: str) -> list[Node]:
     """RViz, and what turns the arm's states into frames for it; both are packages of their own."""
-    plant = load(config, PLANT, PlantConfig)
-    arm, limits = plant.arm, plant.actuator.torque_limit
-    text = urdf(PLANT, plant.joints, (arm.l1, arm.l2), (arm.m1, arm.m2), limits)
+    text = urdf_of(load(config, PLANT, PlantConfig))
     return [
         Node(
             package='robot_state_publisher',

@@ -10,7 +10,9 @@ import numpy as np
 from blf_dsc_controller.arms.base_parameters import BaseParameters, base_parameters
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
+from blf_dsc_controller.arms.two_link_geometry import urdf
 from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.truth import Truth
 from sim_plant.arm import Arm
@@ -46,6 +48,14 @@ def parameter_names_of(config: PlantConfig) -> tuple[str, ...]:
     if not robot.urdf:
         return PARAMETER_NAMES
     return _base_parameters(robot.chain(config.joints), robot.gravity).model.parameter_names
+
+
+def urdf_of(config: PlantConfig) -> str:
+    """URDF of a configured arm."""
+    if config.robot.urdf:
+        return config.robot.text
+    arm, limits = config.arm, config.actuator.torque_limit
+    return urdf(PLANT, config.joints, (arm.l1, arm.l2), (arm.m1, arm.m2), limits)
 
 
 @functools.lru_cache(maxsize=4)

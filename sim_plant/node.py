@@ -24,7 +24,6 @@ import numpy as np
 from rclpy.timer import Timer
 from std_msgs.msg import String
 
-from blf_dsc_controller.arms.two_link_geometry import urdf
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import Value, flatten
 from blf_dsc_controller.messages import topics
@@ -36,7 +35,7 @@ from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, Diagnos
 from blf_dsc_controller.nodes.endpoints import create_publisher, create_steady_timer
 from blf_dsc_controller.nodes.lifecycle import LoopNode
 from sim_plant import kernels as plant_kernels
-from sim_plant.arms import parameter_names_of
+from sim_plant.arms import parameter_names_of, urdf_of
 from sim_plant.command_input import Latency, TorqueInput
 from sim_plant.handshake import Handshake
 from sim_plant.plant import Plant, plant_of, settings_of, steps_of
@@ -109,12 +108,7 @@ class PlantNode(LoopNode[PlantConfig]):
             self._publish_description()
 
     def _publish_description(self) -> None:
-        arm, limits = self.config.arm, self.config.actuator.torque_limit
-        text = (
-            self.config.robot.text
-            if self.config.robot.urdf
-            else urdf(topics.PLANT, self.config.joints, (arm.l1, arm.l2), (arm.m1, arm.m2), limits)
-        )
+        text = urdf_of(self.config)
         create_publisher(self, topics.ROBOT_DESCRIPTION).publish(String(data=text))
 
     def activate(self) -> None:

@@ -122,6 +122,20 @@ def test_markers_show_reference_bound_and_torque(ros):
     assert {marker.header.frame_id for marker in heard[-1].markers} == {'base_link'}
 
 
+def test_markers_of_a_urdf_are_in_its_frames(ros):
+    heard = []
+    ros.tester.create_subscription(MarkerArray, 'arm_markers/markers', heard.append, 10)
+    given = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
+    ros.add(MarkersNode, given, period=0.02)
+    ros.add(PlantNode, given, mode='lockstep')
+    ros.until(lambda: heard)
+    arrows = [marker for marker in heard[-1].markers if marker.ns == 'torque']
+    assert len(arrows) == 7
+    assert {arrow.header.frame_id for arrow in arrows} == {'panda_link0'}
+    shoulder = arrows[1].points[0]
+    np.testing.assert_allclose((shoulder.x, shoulder.y, shoulder.z), (0.0, 0.0, 0.333), atol=1e-9)
+
+
 def test_the_policy_grants_each_node_what_it_has_and_nothing_else(tmp_path):
     """In a process of its own: rcl publishes /rosout once for all nodes of a name in a process."""
     live = tmp_path / 'policy.xml'

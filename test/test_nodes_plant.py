@@ -11,9 +11,12 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from ros_rig import states
 
 from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
+from blf_dsc_controller.messages.telemetry import disturbance_names
+from sim_plant.arms import parameter_names_of
 from sim_plant.node import PlantNode
 from sim_plant.plant import plant_of
 
@@ -54,6 +57,29 @@ def test_a_command_that_will_not_do_moves_nothing_and_is_counted(ros, wrong):
     _, measured = states(heard)
     np.testing.assert_array_equal(measured[2].ravel(), alone.measure())
     assert node.input.rejected == 1
+
+
+def test_the_arm_of_a_urdf_is_simulated_described_and_its_truth_named(ros):
+    description, truth = ros.listen(topics.ROBOT_DESCRIPTION), ros.listen(topics.TRUTH)
+    given = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp', 'truth.mass_factor': 1.2}
+    _, heard, send = started(ros, **given)
+    torque = np.linspace(5.0, 1.0, 7)
+    for count in range(2, 12):
+        send(torque)
+        ros.until(lambda k=count: len(heard) == k)
+    ros.until(lambda: description and len(truth) == 2)
+
+    config = build(PlantConfig, given)
+    alone = plant_of(config)
+    for _ in range(10):
+        alone.measure()
+        alone.step(torque)
+    _, measured = states(heard, config.joints)
+    np.testing.assert_array_equal(measured[-1].ravel(), alone.measure())
+    assert description[0].data == config.robot.text
+    names = (*parameter_names_of(config), *disturbance_names(config.joints))
+    assert tuple(truth[-1].name[: len(names)]) == names
+    np.testing.assert_array_equal(truth[-1].position, alone.truth())
 
 
 def test_the_brake_holds_until_the_first_torque(ros):

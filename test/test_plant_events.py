@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plants import ARM, NOWHERE, commands, motion
+from plants import ARM, NOWHERE, commands, motion, points
 from plants import run as measurements
 
-from blf_dsc_controller.arms.two_link_geometry import points
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two-link arm in space, in the vertical x-z plane: positions of its links, and its URDF.
+"""The two-link arm in space, in the vertical x-z plane: its URDF.
 
 URDF turns joints counterclockwise about their axis, and q1 counts from the horizontal upwards: from
 x to z, which is about -y.
@@ -8,10 +8,7 @@ x to z, which is about -y.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import cos, sin, sqrt
 from xml.sax.saxutils import quoteattr
-
-Point = tuple[float, float, float]
 
 # The inertia of a point mass: most readers reject zero.
 _LINK = """\
@@ -40,23 +37,14 @@ _JOINT = """\
     <axis xyz="0 -1 0" />
 {limit}  </joint>
 """
-
-
-def points(l1: float, l2: float, q: Sequence[float]) -> tuple[Point, Point, Point]:
-    """Base, elbow and tip [m] at the joint positions q [rad]."""
-    elbow = (l1 * cos(q[0]), 0.0, l1 * sin(q[0]))
-    angle = q[0] + q[1]
-    tip = (elbow[0] + l2 * cos(angle), 0.0, elbow[2] + l2 * sin(angle))
-    return (0.0, 0.0, 0.0), elbow, tip
-
-
-def tip_radius(l1: float, l2: float, q2: float, bound: Sequence[float]) -> float:
-    """Largest distance [m] of the tip from its reference while both joints keep their bounds.
-
-    To first order: joint 1 swings the tip about the base, joint 2 about the elbow.
-    """
-    reach = sqrt(l1 * l1 + l2 * l2 + 2.0 * l1 * l2 * cos(q2))
-    return reach * bound[0] + l2 * bound[1]
+_TIP = """\
+  <link name="tip" />
+  <joint name="tip_joint" type="fixed">
+    <parent link="link2" />
+    <child link="tip" />
+    <origin xyz="{x:.17g} 0 0" />
+  </joint>
+"""
 
 
 def urdf(
@@ -66,7 +54,7 @@ def urdf(
     masses: Sequence[float],
     effort: Sequence[float],
 ) -> str:
-    """URDF of a robot of this name.
+    """URDF of a robot of this name, whose tip is the link `tip`.
 
     Lengths [m], masses [kg] at the ends of the links, torque limits [N m] of the joints, 0 for
     none.
@@ -83,4 +71,4 @@ def urdf(
     ):
         line = f'    <limit effort="{limit:g}" velocity="1000" />\n' if limit > 0.0 else ''
         text += _JOINT.format(name=quoteattr(joint), parent=parent, number=number, x=x, limit=line)
-    return text + '</robot>'
+    return text + _TIP.format(x=lengths[1]) + '</robot>'

@@ -5,12 +5,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from blf_dsc_controller.arms.two_link_geometry import urdf
+from blf_dsc_controller.arms.urdf import Chain, read_chain
 from blf_dsc_controller.configuration.common import joint_problems
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import parameter, parameters
+from blf_dsc_controller.configuration.robot import Robot, given_robot
+from blf_dsc_controller.configuration.schema import Value, parameter, parameters
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -74,10 +77,29 @@ class MarkersConfig:
     period: float = _of_markers(0.1, 'time between two updates of the markers', 's', above=0.0)
     torque_scale: float = _of_markers(0.05, 'arrow length per torque', 'm/(N m)', above=0.0)
     arm: DrawnArm = DrawnArm()
+    robot: Robot = Robot()
+
+    @classmethod
+    def defaults(cls, given: Mapping[str, Any]) -> dict[str, Value]:
+        """Of the arm of a URDF: its joints, and its base as the frame."""
+        if not given.get('robot.urdf'):
+            return {}
+        chain = given_robot(given, given.get('joints'))[1]
+        return {'joints': tuple(joint.name for joint in chain.joints), 'frame': chain.base}
+
+    @property
+    def chain(self) -> Chain:
+        """The arm to draw."""
+        if self.robot.urdf:
+            return self.robot.chain(self.joints)
+        lengths = self.arm.l1, self.arm.l2
+        text = urdf(MARKERS, self.joints, lengths, (1.0, 1.0), (0.0, 0.0))
+        return read_chain(text, 'base_link', 'tip', self.joints)
 
     def problems(self) -> list[str]:
         """Check the joints."""
-        return joint_problems(self.joints, 'the arm of the markers', 2)
+        needed = None if self.robot.urdf else 2
+        return joint_problems(self.joints, 'the arm of the markers', needed)
 
 
 NODES: Mapping[str, type[PlantConfig | ControllerConfig | RecorderConfig | MarkersConfig]] = {

@@ -15,7 +15,7 @@ from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from blf_dsc_controller.arms.two_link_geometry import points, tip_radius
+from blf_dsc_controller.arms.chain_geometry import skeleton, tip_radius
 from blf_dsc_controller.configuration.nodes import MarkersConfig
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.cdr import MessageError
@@ -40,6 +40,7 @@ class MarkersNode(PlainNode):
         super().__init__(NAME, **options)
         self._config = declare(self, MarkersConfig)
         joints = self._config.joints
+        self._chain = self._config.chain
         watched = (topics.JOINT_STATES, topics.REFERENCE, topics.BOUND)
         self._decoders = [JointStateDecoder(joints, required=('position',)) for _ in watched]
         self._raw_subscriptions = RawSubscriptions(
@@ -70,16 +71,16 @@ class MarkersNode(PlainNode):
             self._markers.publish(MarkerArray(markers=markers))
 
     def _torques(self, q: np.ndarray, torque: np.ndarray) -> list[Marker]:
-        """Arrows along the axes, -y for a positive torque."""
+        """Arrows along the axes."""
         if not (np.isfinite(q).all() and np.isfinite(torque).all()):
             return []
         arrows = []
-        joints = points(self._config.arm.l1, self._config.arm.l2, q.tolist())[:2]
-        for number, (at, value) in enumerate(zip(joints, torque.tolist(), strict=True)):
+        corners, axes = skeleton(self._chain, q)
+        lengths = self._config.torque_scale * torque[:, None] * axes
+        for number, (at, along) in enumerate(zip(corners[1:-1], lengths, strict=True)):
             arrow = self._marker('torque', number, Marker.ARROW, _TORQUE)
             arrow.scale.x, arrow.scale.y, arrow.scale.z = _WIDTH, 3 * _WIDTH, 3 * _WIDTH
-            tip = (at[0], -value * self._config.torque_scale, at[2])
-            arrow.points = [_point(at), _point(tip)]
+            arrow.points = [_point(at), _point(at + along)]
             arrows.append(arrow)
         return arrows
 
@@ -87,8 +88,7 @@ class MarkersNode(PlainNode):
         """The arm where it should be, and a ball that its tip stays in."""
         if not np.isfinite(q).all():
             return []
-        l1, l2 = self._config.arm.l1, self._config.arm.l2
-        corners = points(l1, l2, q.tolist())
+        corners = skeleton(self._chain, q)[0]
         ghost = self._marker('reference', 0, Marker.LINE_STRIP, _GHOST)
         ghost.scale.x = _WIDTH
         ghost.points = [_point(corner) for corner in corners]
@@ -96,7 +96,7 @@ class MarkersNode(PlainNode):
             return [ghost]
         ball = self._marker('bound', 0, Marker.SPHERE, _BOUND)
         ball.pose.position = _point(corners[-1])
-        diameter = 2.0 * tip_radius(l1, l2, float(q[1]), bound.tolist())
+        diameter = 2.0 * tip_radius(self._chain, q, bound)
         ball.scale.x = ball.scale.y = ball.scale.z = diameter
         return [ghost, ball]
 
@@ -107,8 +107,9 @@ class MarkersNode(PlainNode):
         return marker
 
 
-def _point(at: tuple[float, float, float]) -> Point:
-    return Point(x=at[0], y=at[1], z=at[2])
+def _point(at: np.ndarray) -> Point:
+    x, y, z = at.tolist()
+    return Point(x=x, y=y, z=z)
 
 
 main = partial(run, MarkersNode)

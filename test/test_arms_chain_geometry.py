@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joints, axes and tip of a chain as pinocchio has them, and how far the tip can be off."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio
+from plants import points
+from random_arm import configuration, pinocchio_model, random_urdf
+
+from blf_dsc_controller.arms.chain_geometry import skeleton, tip_radius
+from blf_dsc_controller.arms.urdf import read_chain
+from blf_dsc_controller.configuration.nodes import MarkersConfig
+
+
+def test_corners_and_axes_are_those_of_pinocchio():
+    text, joints = random_urdf(6, 5)
+    chain = read_chain(text, 'base', 'tip', joints)
+    assert {joint.kind for joint in chain.joints} >= {'revolute', 'prismatic'}
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, 6)
+    corners, axes = skeleton(chain, q)
+    model = pinocchio_model(text, joints)
+    data = model.createData()
+    pinocchio.framesForwardKinematics(model, data, configuration(model, q))
+    np.testing.assert_array_equal(corners[0], np.zeros(3))
+    for i, joint in enumerate(chain.joints):
+        np.testing.assert_allclose(corners[i + 1], data.oMi[i + 1].translation, atol=1e-12)
+        np.testing.assert_allclose(axes[i], data.oMi[i + 1].rotation @ joint.axis, atol=1e-12)
+    tip = data.oMf[model.getFrameId('tip')].translation
+    np.testing.assert_allclose(corners[-1], tip, atol=1e-12)
+
+
+def test_no_error_within_the_bounds_takes_the_tip_further():
+    """And one error does, if all joints move the tip the same way: a straight planar arm."""
+    text, joints = random_urdf(6, 5)
+    chain = read_chain(text, 'base', 'tip', joints)
+    random = np.random.default_rng(0)
+    q, bound = random.uniform(-1.0, 1.0, 6), random.uniform(1e-6, 2e-6, 6)
+    tip = skeleton(chain, q)[0][-1]
+    errors = random.choice((-1.0, 1.0), (64, 6)) * bound
+    off = [np.linalg.norm(skeleton(chain, q + error)[0][-1] - tip) for error in errors]
+    assert 0.3 * tip_radius(chain, q, bound) < max(off) < tip_radius(chain, q, bound)
+
+    planar = MarkersConfig().chain
+    straight, both = np.array([0.4, 0.0]), np.array([1e-6, 2e-6])
+    off = skeleton(planar, straight + both)[0][-1] - skeleton(planar, straight)[0][-1]
+    np.testing.assert_allclose(np.linalg.norm(off), tip_radius(planar, straight, both), rtol=1e-5)
+
+
+def test_the_arm_that_is_drawn_without_a_urdf_is_that_of_section_iv():
+    corners, axes = skeleton(MarkersConfig().chain, np.array([0.7, -1.9]))
+    np.testing.assert_allclose(corners[1:], points(1.0, 0.8, (0.7, -1.9)), atol=1e-15)
+    np.testing.assert_allclose(axes, [[0.0, -1.0, 0.0]] * 2, atol=1e-15)
