@@ -88,18 +88,20 @@ def nodes(context: LaunchContext) -> list[Node]:
 
 def view(namespace: str, config: str) -> list[Node]:
     """RViz, and what turns the arm's states into frames for it; both are packages of their own."""
-    text = urdf_of(load(config, PLANT, PlantConfig))
+    plant = load(config, PLANT, PlantConfig)
+    robot = plant.robot
+    frame = robot.chain(plant.joints).base if robot.urdf else 'base_link'
     return [
         Node(
             package='robot_state_publisher',
             executable='robot_state_publisher',
             namespace=namespace,
-            parameters=[{'robot_description': text}],
+            parameters=[{'robot_description': urdf_of(plant)}],
         ),
         Node(
             package='rviz2',
             executable='rviz2',
             namespace=namespace,
-            arguments=['-d', str(share_folder() / 'config' / 'arm.rviz')],
+            arguments=['-d', str(share_folder() / 'config' / 'arm.rviz'), '-f', frame],
         ),
     ]

@@ -170,7 +170,8 @@ def test_a_truth_by_seed_deviates_as_it_says_and_stays_possible():
             assert least > -1e-12 * abs(expected)
     assert 0.29 < np.max(masses) < 0.3
     assert -0.3 < np.min(masses) < -0.29
-    assert 0.0099 < np.max(np.abs(shifts)) < 0.01
+    assert 0.0099 < np.max(shifts) < 0.01
+    assert -0.01 < np.min(shifts) < -0.0099
     assert abs(np.mean(masses)) < 0.03
     again = true_inertias(chain, change(config, {'truth.seed': 99}).truth)
     np.testing.assert_array_equal(again[:, 0] / chain.inertias[:, 0] - 1.0, masses[-1])
