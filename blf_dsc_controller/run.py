@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -51,6 +51,16 @@ class Stop(NamedTuple):
     text: str  # with the figures
 
 
+@dataclass(frozen=True, eq=False)
+class LearnedArm:
+    """What gives the estimates of an arm one scale, where they are kg beside kg m^2."""
+
+    units: Mapping[str, str]  # of each estimate by name
+    deviations: Mapping[str, float]  # standard deviations of their prior, in these units
+    regressor: Callable[[Floats, Floats, Floats, Floats, Floats], None]
+    """Fills H (n, p) of (q, dq, v, a), (n,) each: H P = M(q) a + C(q, dq) v + G(q) [N m]."""
+
+
 @dataclass(frozen=True)
 class Run:
     """N samples of n joints, simulated, recorded or replayed; None or NaN where unknown."""
@@ -72,6 +82,7 @@ class Run:
     message_counts: Mapping[str, int] = field(default_factory=dict)
     rejected: Mapping[str, str] = field(default_factory=dict)  # disturbance columns, and why
     stops: tuple[Stop, ...] = ()
+    arm: LearnedArm | None = None  # of a URDF
     learns: bool = True  # from the prediction error; false for a law that does not use it
 
     @property

@@ -17,8 +17,8 @@ from matplotlib.colors import to_hex, to_rgb
 from synthetic_bag import Synthetic
 
 from blf_dsc_controller.analysis.figures import draw
-from blf_dsc_controller.analysis.panels import envelope
 from blf_dsc_controller.analysis.style import COLOURS, formula
+from blf_dsc_controller.analysis.thinning import envelope
 from blf_dsc_controller.bags.reader import read_run
 
 

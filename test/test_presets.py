@@ -20,7 +20,7 @@ LAW = {'comparison': 'backstepping', 'comparison_detuned': 'backstepping'} | {
 }
 
 # Each law is drawn once, and the paper's set; the others have the same panels.
-DRAWN = {'recommended', 'paper', 'comparison', 'model_based', 'slotine_li'}
+DRAWN = {'recommended', 'paper', 'comparison', 'model_based', 'slotine_li', 'panda'}
 
 
 def offline(preset, out, duration):
@@ -41,6 +41,9 @@ def test_preset_runs_by_name_and_is_kept_as_it_ran(preset, tmp_path, capsys, mon
     held = preset != 'comparison_detuned'
     assert summary['tracking']['held'] is held
     assert ('held by every joint' in printed) is held
+    of_urdf = preset in {'panda', 'ur5e'}
+    assert ('torque error of the learned model' in printed) is of_urdf
+    assert ('final_torque_error' in summary['learning']) is of_urdf
 
 
 def test_offline_run_warns_of_a_refused_column_and_what_it_is_like(tmp_path, capsys):

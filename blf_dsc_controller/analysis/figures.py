@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 
 from blf_dsc_controller.analysis.metrics import measure
-from blf_dsc_controller.analysis.panels import Line, Mark, Panel, panels, thin
+from blf_dsc_controller.analysis.panels import Line, Mark, Panel, panels
 from blf_dsc_controller.analysis.style import (
     COLOURS,
     GREEN,
@@ -23,14 +23,19 @@ from blf_dsc_controller.analysis.style import (
     Picture,
     formula,
     head,
+    head_of_column,
 )
+from blf_dsc_controller.analysis.thinning import thin
 from blf_dsc_controller.messages.topics import DISTURBANCE
 from blf_dsc_controller.run import Run
 
 _SIZE = (6.2, 2.6)  # inches
+_LOW = (4.3, 1.75)
+_ABREAST = 3  # joints in columns; more of them in rows
 _HIGH = (6.2, 3.2)
 _ALONE = {'Torque': ORANGE, 'Excitation': GREEN}  # colour of one line
 _WIDE = {'Motion': (3.2, 0.55), 'Estimates': (2.4, 0.75)}  # width and opacity
+_FLAT, _DECADE = 2.0, 10.0
 _WIDTHS_UPON_EACH_OTHER = (5.0, 2.4)
 
 
@@ -55,13 +60,21 @@ def draw(run: Run, folder: Path) -> list[Path]:
     for time, stop in run.timed_stops[:1]:
         title += f', stopped at {time:.3f} s ({stop.reason})'
     paths = [folder / 'tracking.png']
-    draw_panels(paths[0], title, motion, len(run.joints), _SIZE)
+    n = len(run.joints)
+    if n <= _ABREAST:
+        draw_panels(paths[0], title, motion, n, _SIZE)
+    else:
+        rows = [panel for i in range(n) for panel in motion[i::n]]
+        draw_panels(paths[0], title, rows, len(motion) // n, _LOW, legend_above=True)
     if parameters:
         title, error = 'Learning', metrics.final_parameter_error
         if not math.isnan(error):
-            title += f': relative parameter error {100 * error:.2g} % at the end'
-        shown = [_overlaid('estimates', [panel for panel in parameters if not panel.log])]
-        shown += [panel for panel in parameters if panel.log]
+            what = 'relative parameter error' if run.arm is None else 'torque error'
+            title += f': {what} {100 * error:.2g} % at the end'
+        shown = parameters
+        if run.arm is None:
+            shown = [_overlaid('estimates', [panel for panel in parameters if not panel.log])]
+            shown += [panel for panel in parameters if panel.log]
         shown += [_overlaid('disturbance estimates', disturbances)] if disturbances else []
         paths.append(folder / 'parameters.png')
         draw_panels(paths[-1], title, [*shown, *excitation], 2, _HIGH)
@@ -90,15 +103,24 @@ def draw_panels(
     size: tuple[float, float],
     runs: Sequence[str] = (),
     until: float = math.inf,
+    *,
+    legend_above: bool = False,
 ) -> None:
     """Draw panels of this size [inches] row by row, up to a time [s].
 
-    `runs` are the names of several runs, which the legends then show.
+    `runs` are the names of several runs, which the legends then show. Where each column has one
+    legend, it is above the first row.
     """
     columns = min(columns, len(shown))
     picture = Picture(-(-len(shown) // columns), columns, title, size)
-    for axes, panel in zip(picture.axes.flat, shown, strict=False):
+    for k, (axes, panel) in enumerate(zip(picture.axes.flat, shown, strict=False)):
         _draw_panel(axes, panel, runs, until)
+        title = formula(panel.title) if panel.group == 'Parameters' else panel.title
+        title += panel.note and f': {panel.note}'
+        if legend_above:
+            head_of_column(axes, title, first=k < columns)
+        else:
+            head(axes, title)
     for axes in picture.axes.flat[len(shown) :]:
         axes.set_visible(False)
     picture.save(path)
@@ -122,12 +144,18 @@ def _draw_panel(axes: Axes, panel: Panel, runs: Sequence[str], until: float) -> 
         if mark.time <= until:
             _draw_mark(axes, mark, row)
     if panel.log:
-        axes.set_yscale('log')
+        _set_logarithmic(axes)
     if panel.unit == '%':
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g} %'))
     axes.set_ylabel(panel.symbol or f'[{panel.unit}]')
-    title = formula(panel.title) if panel.group == 'Parameters' else panel.title
-    head(axes, title + (panel.note and f': {panel.note}'))
+
+
+def _set_logarithmic(axes: Axes) -> None:
+    """Set a logarithmic axis, over two decades where there is next to nothing to see."""
+    axes.set_yscale('log')
+    low, high = axes.get_ylim()
+    if high < _FLAT * low:
+        axes.set_ylim(low / _DECADE, high * _DECADE)
 
 
 def _draw_line(axes: Axes, line: Line, until: float, *, label: str, **style: Any) -> None:

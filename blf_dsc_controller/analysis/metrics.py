@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +22,13 @@ from blf_dsc_controller.messages.topics import (
     POSITION,
     VELOCITY,
 )
-from blf_dsc_controller.run import Floats, Run, Series
+from blf_dsc_controller.run import Floats, LearnedArm, Run
 
 MOMENTS = (5, 10, 20, 40, 60)
 """Times at which the parameter error is reported [s]."""
 
 _LEARNED = 0.01
+_POSTURES = 400  # of the reference, where torques are compared
 _TAIL = 10.0  # s
 _OTHERS = (LAMBDA_MIN, LATCHED, MODEL_CHANGES, COMPUTE_TIME)
 _NO_PARAMETERS = (*COLUMNS, DISTURBANCE, POSITION, VELOCITY, *_OTHERS)
@@ -41,14 +43,19 @@ class Estimates:
     estimate: Floats  # (m, p)
     true: Floats | None  # (m, p); None if unknown, or if the plant's parameters have other names
     unlike: tuple[str, ...] = ()  # those names
+    torques: Floats | None = None  # (k, p) rows of H along the reference, for an arm of a URDF
 
     @property
     def relative_error(self) -> Floats | None:
-        """|P^ - P| / |P|, (m,)."""
+        """|P^ - P| / |P|, (m,); of the torques H P^ and H P, where P has no unit of its own."""
         if self.true is None:
             return None
-        error = np.linalg.norm(self.estimate - self.true, axis=1)
-        return np.asarray(error / np.linalg.norm(self.true, axis=1))
+        R: Any = np.eye(len(self.names))
+        if self.torques is not None:
+            R = np.linalg.qr(self.torques, 'r')
+        error = np.linalg.norm((self.estimate - self.true) @ R.T, axis=1)
+        with np.errstate(invalid='ignore'):  # no motion, no torques: unknown
+            return np.asarray(error / np.linalg.norm(self.true @ R.T, axis=1))
 
 
 def estimates_of(run: Run) -> Estimates | None:
@@ -58,18 +65,40 @@ def estimates_of(run: Run) -> Estimates | None:
     """
     if run.learning is None:
         return None
-    names, at = _parameters(run.learning), run.time_of(run.learning.stamp)
+    names, at = _parameters(run.learning.names), run.time_of(run.learning.stamp)
     estimate, truth = run.learning.select(names), run.truth
-    theirs = () if truth is None else _parameters(truth)
+    is_known = run.arm is not None and _parameters(run.arm.units) == names
+    torques = _torques(run, run.arm, len(names)) if run.arm and is_known else None
+    theirs = () if truth is None else _parameters(truth.names)
     if truth is None or set(names) != set(theirs):
-        return Estimates(names, at, estimate, None, theirs)
+        return Estimates(names, at, estimate, None, theirs, torques)
     columns = [truth.names.index(name) for name in names]
-    return Estimates(names, at, estimate, truth.held(run.learning.stamp)[:, columns])
+    true = truth.held(run.learning.stamp)[:, columns]
+    return Estimates(names, at, estimate, true, (), torques)
 
 
-def _parameters(series: Series) -> tuple[str, ...]:
-    """Names of the parameters of an arm."""
-    return tuple(name for name in series.names if not name.startswith(_NO_PARAMETERS))
+def _torques(run: Run, arm: LearnedArm, p: int) -> Floats:
+    """Rows of H(q, dq, dq, ddq) (k n, p) along the reference, or the motion without one.
+
+    Differences of three samples are the derivatives.
+    """
+    q = run.position if run.reference is None else run.reference
+    middle = np.arange(1, q.shape[0] - 1)
+    known = middle[np.isfinite(q[:-2] + q[1:-1] + q[2:]).all(axis=1)]
+    rows = known[np.linspace(0, known.size - 1, min(_POSTURES, known.size)).astype(int)]
+    after, before = (np.diff(run.time)[rows + k, np.newaxis] for k in (0, -1))
+    forward, backward = (q[rows + 1] - q[rows]) / after, (q[rows] - q[rows - 1]) / before
+    dq = (after * backward + before * forward) / (after + before)
+    ddq = 2.0 * (forward - backward) / (after + before)
+    H = np.zeros((rows.size, len(run.joints), p))
+    for k in range(rows.size):
+        arm.regressor(q[rows[k]], dq[k], dq[k], ddq[k], H[k])
+    return H.reshape(-1, p)
+
+
+def _parameters(names: Iterable[str]) -> tuple[str, ...]:
+    """Those names that are parameters of an arm."""
+    return tuple(name for name in names if not name.startswith(_NO_PARAMETERS))
 
 
 def latch_time(run: Run) -> float | None:
@@ -86,6 +115,15 @@ def change_times(run: Run) -> list[float]:
         return []
     rises = np.flatnonzero(np.diff(run.learning.column(MODEL_CHANGES), prepend=0.0) > 0.0)
     return [float(t) for t in run.time_of(run.learning.stamp[rises])]
+
+
+def true_change_times(run: Run) -> list[float]:
+    """Times [s] at which the true parameters of the plant changed, as by a payload."""
+    if run.truth is None:
+        return []
+    true = run.truth.select(_parameters(run.truth.names))
+    changed = np.flatnonzero(np.any(np.diff(true, axis=0) != 0.0, axis=1)) + 1
+    return [float(t) for t in run.time_of(run.truth.stamp[changed])]
 
 
 def outside(run: Run) -> NDArray[np.bool_] | None:
@@ -126,7 +164,7 @@ class Metrics:
     first_violation: float  # s
     violating_joint: str
     latch_time: float  # s
-    parameter_error: dict[int, float]  # |P^ - P| / |P| at MOMENTS
+    parameter_error: dict[int, float]  # `Estimates.relative_error` at MOMENTS
     final_parameter_error: float
     tail_parameter_error: float  # rms over the last ten seconds
     time_to_1_percent: float  # s, from which on the parameter error stays below

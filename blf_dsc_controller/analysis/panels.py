@@ -3,13 +3,21 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.analysis.metrics import estimates_of, latch_time, outside, rms
+from blf_dsc_controller.analysis.metrics import (
+    Estimates,
+    estimates_of,
+    latch_time,
+    outside,
+    rms,
+    true_change_times,
+)
 from blf_dsc_controller.analysis.style import ALARM, INK, MUTED
 from blf_dsc_controller.messages.topics import (
     COMPUTE_TIME,
@@ -20,7 +28,7 @@ from blf_dsc_controller.messages.topics import (
     LYAPUNOV_BOUND,
     LYAPUNOV_TERMS,
 )
-from blf_dsc_controller.run import Floats, Run, Series
+from blf_dsc_controller.run import Floats, LearnedArm, Run, Series
 
 GROUPS = (
     'Motion',
@@ -33,6 +41,7 @@ GROUPS = (
     'Timing',
 )
 _STOPPED = GROUPS[:3]
+_CHANGED = ('Tracking', 'Parameters')
 _LEARNING = GROUPS[3:7]
 _LEAST = 1e-12  # J, the smallest value on a logarithmic axis
 _LEAST_ERROR = 1e-5  # %
@@ -81,11 +90,16 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
     for k, run in enumerate(runs):
         latched = latch_time(run)
         latch = () if latched is None else (Mark(latched, 'latch'),)
+        changes = true_change_times(run)
+        changed = dict.fromkeys(_CHANGED, 'the arm changes')
         stops = [Mark(time, f'stop: {one.reason}', ALARM) for time, one in run.timed_stops]
         for panel in (*_motion(run), *_learning(run), *_monitors(run), *_timing(run)):
             before = found.get((panel.group, panel.title), replace(panel, lines=(), marks=()))
             marks = latch if panel.group in _LEARNING else panel.marks
             marks = (*marks, *(stops if panel.group in _STOPPED else ()))
+            if panel.group in _CHANGED:
+                text = changed.pop(panel.group, '')  # once
+                marks = (*marks, *(Mark(time, text, MUTED) for time in changes))
             found[panel.group, panel.title] = replace(
                 before,
                 lines=(*before.lines, *(line._replace(run=k) for line in panel.lines)),
@@ -94,37 +108,6 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
             )
     drawn = [panel for panel in found.values() if panel.lines]
     return sorted(drawn, key=lambda panel: GROUPS.index(panel.group))
-
-
-def thin(time: Floats, values: Floats, pieces: int = 1500) -> tuple[Floats, Floats]:
-    """Thin a series without losing a peak; of a mostly constant one the corners remain."""
-    changes = np.flatnonzero(np.diff(values) != 0.0)
-    if changes.size < values.size // 100:
-        kept = np.unique(np.concatenate([[0], changes, changes + 1, [values.size - 1]]))
-        return time[kept], values[kept]
-    return envelope(time, values, pieces)
-
-
-def envelope(time: Floats, values: Floats, pieces: int = 1500) -> tuple[Floats, Floats]:
-    """Lowest and highest sample of each piece of a series (N,), in their order.
-
-    NaN is unknown; a piece in which nothing is known stays a gap. At most two samples of each piece
-    remain, all of them if they are so few.
-    """
-    if values.size <= 2 * pieces:
-        return time, values
-    edges = np.linspace(0, values.size, pieces + 1).astype(np.intp)[:-1]
-    low = _extreme(np.where(np.isnan(values), np.inf, values), edges, np.minimum)
-    high = _extreme(np.where(np.isnan(values), -np.inf, values), edges, np.maximum)
-    kept = np.sort(np.stack([low, high]), axis=0).T.ravel()
-    return time[kept], values[kept]
-
-
-def _extreme(values: Floats, edges: np.ndarray, reduction: np.ufunc) -> np.ndarray:
-    """Index of the first sample of each piece that is its extreme one."""
-    extremes = np.repeat(reduction.reduceat(values, edges), np.diff([*edges, values.size]))
-    found = np.where(values == extremes, np.arange(values.size), values.size)
-    return np.asarray(np.minimum.reduceat(found, edges))
 
 
 def _motion(run: Run) -> Iterator[Panel]:
@@ -165,22 +148,56 @@ def _learning(run: Run) -> Iterator[Panel]:
     estimates = estimates_of(run)
     if estimates is None or run.learning is None:
         return
-    for j, name in enumerate(estimates.names):
-        lines = [Line('estimate', estimates.time, estimates.estimate[:, j])]
-        if estimates.true is not None:
-            lines.append(Line('true', estimates.time, estimates.true[:, j], INK, dashed=True))
-        yield Panel('Parameters', name, 'kg m²', tuple(lines))
-    if estimates.relative_error is not None:
-        error = np.maximum(100.0 * estimates.relative_error, _LEAST_ERROR)
-        one = Line('1 %', estimates.time, np.ones_like(error), MUTED, dashed=True)
-        lines = [Line('relative error', estimates.time, error), one]
-        symbol, title = r'$\|\hat P - P\| \;/\; \|P\|$', 'relative parameter error'
-        yield Panel('Parameters', title, '%', tuple(lines), symbol=symbol, log=True)
+    error = _relative_error(estimates)
+    if run.arm is not None:
+        yield from (*error, *_of_links(run, run.arm, estimates))
+    else:
+        for j, name in enumerate(estimates.names):
+            lines = [Line('estimate', estimates.time, estimates.estimate[:, j])]
+            if estimates.true is not None:
+                lines.append(Line('true', estimates.time, estimates.true[:, j], INK, dashed=True))
+            yield Panel('Parameters', name, 'kg m²', tuple(lines))
+        yield from error
     for name in run.learning.names:
         if name.startswith(DISTURBANCE):
             estimate = _column(run, run.learning, name, 'estimate')
             true = _column(run, run.truth, name, 'true', colour=INK, dashed=True)
+            true = true if run.arm is None else []  # it has the friction that is learned beside
             yield Panel('Disturbance', name, 'N m', (*estimate, *true))
+
+
+def _relative_error(estimates: Estimates) -> Iterator[Panel]:
+    if estimates.relative_error is None:
+        return
+    error = np.maximum(100.0 * estimates.relative_error, _LEAST_ERROR)
+    one = Line('1 %', estimates.time, np.ones_like(error), MUTED, dashed=True)
+    lines = (Line('relative error', estimates.time, error), one)
+    symbol, title = r'$\|\hat P - P\| \;/\; \|P\|$', 'relative parameter error'
+    if estimates.torques is not None:
+        symbol, title = r'$\|H\hat P - HP\| \;/\; \|HP\|$', 'torque error'
+    yield Panel('Parameters', title, '%', lines, symbol=symbol, log=True)
+
+
+def _of_links(run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel]:
+    """Errors of the parameters of each link in deviations of the prior, and frictions."""
+    origin, what = estimates.true, 'errors'
+    if origin is None:
+        origin, what = estimates.estimate[:1], 'changes'
+    off = estimates.estimate - origin
+    for i, joint in enumerate(run.joints, 1):
+        lines = tuple(
+            Line(name, estimates.time, off[:, j] / arm.deviations[name])
+            for j, name in enumerate(estimates.names)
+            if re.fullmatch(rf'.*\D{i}', name)
+        )
+        yield Panel('Parameters', f'{what} of link {i}, {joint}', 'prior deviations', lines)
+    for kind in ('viscous', 'coulomb'):
+        names = [name for name in arm.units if name.startswith(f'{kind} ')]
+        lines = tuple(
+            line for name in names for line in _column(run, run.learning, name, name.split(' ')[1])
+        )
+        if lines:
+            yield Panel('Parameters', f'{kind} friction', arm.units[names[0]], lines)
 
 
 def _monitors(run: Run) -> Iterator[Panel]:

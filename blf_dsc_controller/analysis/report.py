@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from blf_dsc_controller.analysis.page import Cell, write_page
-from blf_dsc_controller.analysis.panels import Panel, panels, thin
+from blf_dsc_controller.analysis.panels import Panel, panels
 from blf_dsc_controller.analysis.reported_bag import ReportedBag
 from blf_dsc_controller.analysis.style import COLOURS, INK
 from blf_dsc_controller.analysis.summary import format_table, summarize
+from blf_dsc_controller.analysis.thinning import thin
 from blf_dsc_controller.errors import MissingExtraError
 from blf_dsc_controller.run import Floats
 

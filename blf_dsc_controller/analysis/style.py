@@ -107,6 +107,22 @@ def head(axes: Axes, title: str) -> None:
     )
 
 
+def head_of_column(axes: Axes, title: str, *, first: bool) -> None:
+    """Put the title above a panel; above the first of a column also the legend of all of them."""
+    axes.set_title(title, loc='left', fontsize=11)
+    entries = len(axes.get_legend_handles_labels()[1])
+    if first and entries:
+        axes.legend(
+            loc='lower right',
+            bbox_to_anchor=(1.0, 1.15),
+            ncols=entries,
+            frameon=False,
+            fontsize=10,
+            borderaxespad=0.15,
+            handlelength=1.6,
+        )
+
+
 def formula(name: str) -> str:
     """Name of a parameter in mathematical type if it is a formula such as `m2*l1*l2`."""
     if not re.fullmatch(r'(?:[A-Za-z]\d*|[()+*^-]|\d)+', name) or not re.search(r'\d', name):

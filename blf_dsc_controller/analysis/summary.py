@@ -34,6 +34,11 @@ _JOINT = {  # entry of the summary: metric; title, unit, units to 1 and decimals
     'torque_limit_nm': ('torque_limit', 'limit', 'N m', 1.0, 2),
 }
 
+_MEASURED = {  # comparison with the truth: entry of the summary, its line of the table
+    'relative_error': 'parameters  error',
+    'torque_error': 'model       torque error of the learned model',
+}
+
 
 def summarize(run: Run) -> Summary:
     """Summary of a run as plain data for JSON; units are part of the names.
@@ -85,13 +90,15 @@ def plain(value: Any) -> Any:
 def _learning(run: Run, estimates: Estimates, metrics: Metrics) -> Summary:
     reached = {t: error for t, error in metrics.parameter_error.items() if not math.isnan(error)}
     is_known = estimates.true is not None
+    relative, torque = _MEASURED
+    measured = relative if estimates.torques is None else torque
     learning: Summary = plain(
         {
             'used': run.learns,
             'latch_time_s': metrics.latch_time,
             'model_changes_s': change_times(run),
-            'relative_error_at_s': reached if is_known else None,
-            'final_relative_error': metrics.final_parameter_error,
+            f'{measured}_at_s': reached if is_known else None,
+            f'final_{measured}': metrics.final_parameter_error,
             'time_to_1_percent_s': metrics.time_to_1_percent,
             'final_estimate': _named(estimates, estimates.estimate),
             'rejected_columns': {name: reason or None for name, reason in run.rejected.items()},
@@ -181,13 +188,13 @@ def _learning_lines(learning: Summary) -> Iterator[str]:
     if unlike:
         names, true = ', '.join(learning['final_estimate']), ', '.join(unlike)
         yield f'parameters  not comparable: the model has {names}, the plant {true}'
-    if learning['final_relative_error'] is None:
-        return
-    moments = [f'{moment} s {_percent(e)}' for moment, e in learning['relative_error_at_s'].items()]
-    moments.append(f'end {_percent(learning["final_relative_error"])}')
     settled = learning['time_to_1_percent_s']
     ending = 'not below 1 %' if settled is None else f'below 1 % from {settled:.3f} s on'
-    yield f'parameters  error {", ".join(moments)}; {ending}'
+    for measured, title in _MEASURED.items():
+        end = learning.get(f'final_{measured}')
+        if end is not None:
+            moments = [f'{t} s {_percent(e)}' for t, e in learning[f'{measured}_at_s'].items()]
+            yield f'{title} {", ".join([*moments, f"end {_percent(end)}"])}; {ending}'
 
 
 def _real_time(timing: Summary) -> Iterator[str]:

@@ -22,11 +22,12 @@ from blf_dsc_controller.bags.content import (
     joint_names,
     read_content,
 )
+from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import Event, EventType, decode
 from blf_dsc_controller.messages.types import typestore
-from blf_dsc_controller.run import Floats, Run, Series, Stamps, Stop
+from blf_dsc_controller.run import Floats, LearnedArm, Run, Series, Stamps, Stop
 
 
 def read_run(path: str | Path, namespace: str = '') -> Run:
@@ -70,6 +71,7 @@ def read_run(path: str | Path, namespace: str = '') -> Run:
         message_counts=content.message_counts,
         rejected=_rejected_columns(content, learning, namespace),
         stops=tuple(_stops(events, int(states.stamp[0]))),
+        arm=_arm(Path(path)),
         learns=_learns(events),
     )
 
@@ -154,6 +156,17 @@ def _events(content: Content) -> Iterator[Event]:
     for raw in journal.raw if journal is not None else ():
         with suppress(BlfDscError):
             yield decode(raw)
+
+
+def _arm(path: Path) -> LearnedArm | None:
+    """Arm of the recorded configuration, None if it is not from a URDF that can still be read."""
+    context = read_context(path)
+    if context.facts.get('model') == 'urdf':
+        from blf_dsc_controller.messages.samples import learned_arm  # compiles
+
+        with suppress(BlfDscError):
+            return learned_arm(context.controller_config())
+    return None
 
 
 def _stops(events: Iterable[Event], first: int) -> Iterator[Stop]:

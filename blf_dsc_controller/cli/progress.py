@@ -43,7 +43,7 @@ class Progress:
         P = parameters_of(self._config, elapsed)[self._order]
         error = np.linalg.norm(np.asarray(estimate) - P) / np.linalg.norm(P)
         status = f'max|xi1|/bound {ratio:.2f}'
-        if np.all(self._order >= 0):
+        if np.all(self._order >= 0) and not self._config.robot.urdf:  # else it has no unit
             status += f', parameter error {100 * error:.2f} %'
         self._bar.set_postfix_str(status, refresh=False)
         self._bar.update(min(elapsed, self._config.duration) - self._bar.n)

@@ -7,13 +7,13 @@ import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.factory import estimate_names
+from blf_dsc_controller.law.factory import column_names, estimate_names, model_of, prior_covariance
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Sample, sample_of
 from blf_dsc_controller.messages.telemetry import disturbance_names
 from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LYAPUNOV_TERMS, MODEL_CHANGES
-from blf_dsc_controller.run import Floats, Run, Series, Stamps
+from blf_dsc_controller.run import Floats, LearnedArm, Run, Series, Stamps
 
 
 def columns_of(rows: Floats, settings: Settings) -> Sample:
@@ -29,6 +29,20 @@ def learning_of(config: ControllerConfig, stamps: Stamps, samples: Sample) -> Se
     figures = (samples.lambda_min, samples.latched, samples.changes)
     return Series(
         (*names, LAMBDA_MIN, LATCHED, MODEL_CHANGES), stamps, np.hstack((*values, *figures))
+    )
+
+
+def learned_arm(config: ControllerConfig) -> LearnedArm | None:
+    """Units, prior and regressor of what is learned of a URDF; None of another model."""
+    if config.model != 'urdf':
+        return None
+    model, names = model_of(config), estimate_names(config)
+    friction = ('N m s/rad' if 'viscous' in name else 'N m' for name in column_names(config))
+    deviations = np.sqrt(np.diag(prior_covariance(config))).tolist()
+    return LearnedArm(
+        dict(zip(names, (*model.parameter_units, *friction), strict=True)),
+        dict(zip(names, deviations, strict=True)),
+        model.regressor,
     )
 
 
@@ -61,6 +75,7 @@ def run_of(
         torque_limit=np.broadcast_to(config.torque.limit, position.shape),
         learning=learning_of(config, stamps[used], Sample(*(part[used] for part in samples))),
         monitor=monitor if controller.settings.truth_known else None,
+        arm=learned_arm(config),
         learns=config.law == 'blf_dsc' and config.learning.weight > 0.0,
         rejected={one.column: f'{one}' for one in rejected},
     )

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs of arms from a URDF: seven joints and their parameters readable, errors in torques."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import matplotlib.image
+import numpy as np
+import pytest
+import recorded_run
+from test_law_urdf import panda
+
+from blf_dsc_controller.analysis.figures import draw
+from blf_dsc_controller.analysis.metrics import estimates_of, measure
+from blf_dsc_controller.analysis.panels import panels
+from blf_dsc_controller.analysis.summary import format_table, summarize
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.configuration.params_file import dumps
+from blf_dsc_controller.messages.samples import learned_arm
+from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED
+from blf_dsc_controller.run import LearnedArm, Run, Series
+
+PERIOD = 10_000_000  # ns
+TIME = np.arange(1001) * PERIOD * 1e-9
+P = np.array([2.0, 3.0, 5.0])  # kg m^2, kg m, and one that no torque shows
+
+
+def pendulum(_q, _dq, _v, a, H):
+    """Regressor of a pendulum whose gravity does not depend on its angle."""
+    H[0] = a[0], 1.0, 0.0
+
+
+def run_of(estimate, true=P, regressor=pendulum):
+    """One joint on sin t whose estimates are these, (3,) or (N, 3)."""
+    stamp = np.arange(TIME.size) * PERIOD
+    names = ('Izz1', 'm*cx1', 'Ixx1')
+    one = np.ones((TIME.size, 1))
+    learned = np.hstack((np.broadcast_to(estimate, (TIME.size, 3)), one, one))
+    q = np.sin(TIME)[:, np.newaxis]
+    return Run(
+        joints=('joint1',),
+        stamp=stamp,
+        received=stamp,
+        position=q + 0.01,
+        velocity=0 * q,
+        torque=0 * q,
+        reference=q,
+        error=0 * q,
+        bound=one,
+        torque_limit=one,
+        learning=Series((*names, LAMBDA_MIN, LATCHED), stamp, learned),
+        truth=Series(names, stamp, np.broadcast_to(true, (TIME.size, 3))),
+        arm=LearnedArm(
+            dict.fromkeys(names, 'kg'), dict(zip(names, (0.5, 1.0, 2.0), strict=True)), regressor
+        ),
+    )
+
+
+def test_error_is_that_of_the_torques_along_the_reference():
+    assert measure(run_of(1.1 * P)).final_parameter_error == pytest.approx(0.1)
+    assert measure(run_of(P * (1.0, 1.0, 7.0))).final_parameter_error == pytest.approx(0.0)
+    off = measure(run_of(P * (1.25, 1.0, 1.0))).final_parameter_error
+    expected = np.linalg.norm(0.5 * np.sin(TIME)) / np.linalg.norm(3.0 - 2.0 * np.sin(TIME))
+    assert off == pytest.approx(expected, rel=0.01)
+
+
+def test_regressor_is_asked_along_the_motion_of_the_reference():
+    asked = []
+
+    def noting(q, dq, v, a, _H):
+        asked.append((q[0], dq[0], v[0], a[0]))
+
+    estimates_of(run_of(P, regressor=noting))
+    q, dq, v, a = np.transpose(asked)
+    t = np.arcsin(q)
+    np.testing.assert_allclose(a, -q, atol=1e-4)
+    np.testing.assert_array_equal(dq, v)
+    np.testing.assert_allclose(np.abs(dq), np.cos(t), atol=1e-4)
+
+
+def test_table_and_summary_tell_the_torque_error_by_its_name():
+    summary = summarize(run_of(1.1 * P))
+    assert summary['learning']['final_torque_error'] == pytest.approx(0.1)
+    assert 'final_relative_error' not in summary['learning']
+    line = 'torque error of the learned model 5 s 10 %, 10 s 10 %, end 10 %; not below 1 %'
+    assert f'model       {line}' in format_table(summary).splitlines()
+
+
+def test_without_a_motion_the_error_is_unknown():
+    run = run_of(P)
+    still = replace(run, reference=np.full_like(run.reference, np.nan))
+    assert np.isnan(measure(still).final_parameter_error)
+    assert 'torque error' not in format_table(summarize(still))
+
+
+def test_estimates_are_shown_in_deviations_of_their_prior():
+    found = {panel.title: panel for panel in panels([run_of(P + 1.0)])}
+    lines = {line.name: line.values[-1] for line in found['errors of link 1, joint1'].lines}
+    assert lines == pytest.approx({'Izz1': 2.0, 'm*cx1': 1.0, 'Ixx1': 0.5})
+
+
+def test_a_change_of_the_true_arm_is_marked():
+    true = np.tile(P, (TIME.size, 1))
+    true[400:] *= 1.5
+    for panel in panels([run_of(P, true)]):
+        marks = [mark.time for mark in panel.marks if mark.text == 'the arm changes']
+        first = panel.title in ('error of joint1', 'torque error')
+        assert marks == pytest.approx([4.0] if first else [])
+
+
+def test_seven_joints_and_sixty_parameters_fit_into_the_pictures(tmp_path):
+    config = panda()
+    arm = learned_arm(config)
+    names = tuple(arm.units)
+    stamp = np.arange(50) * PERIOD
+    wide = np.tile(np.linspace(0.1, 1.0, 50)[:, np.newaxis], (1, 7))
+    learned = np.ones((50, len(names) + 2)) * np.arange(len(names) + 2)
+    run = Run(
+        *(config.joints, stamp, stamp, wide, wide, wide, wide + 0.001, wide / 1e3, wide, wide),
+        learning=Series((*names, LAMBDA_MIN, LATCHED), stamp, learned),
+        arm=arm,
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')  # of matplotlib, that there is no room for the axes
+        tracking, parameters = draw(run, tmp_path)
+    for path in (tracking, parameters):
+        assert 1200 < matplotlib.image.imread(path).shape[1] < 2000
+    shown = [panel for panel in panels([run]) if panel.group == 'Parameters']
+    assert all(len(panel.lines) <= 8 for panel in shown)  # as many as there are colours
+    told = [line.name for panel in shown for line in panel.lines]
+    joints = list(config.joints)
+    assert sorted(told) == sorted([*names[:48], *joints, *joints])
+
+
+def test_the_arm_of_a_bag_is_that_of_its_recorded_configuration(tmp_path):
+    config = panda()
+    text = dumps({'blf_dsc_controller': config})
+    messages = recorded_run.messages(recorded_run.record(tmp_path / 'two_links', 0.1))
+    bag = recorded_run.write(tmp_path / 'bag', messages, text, model='urdf')
+    run = read_run(bag)
+    assert run.arm is not None
+    assert run.arm.deviations == learned_arm(config).deviations
+    # It learned parameters of other names: those have a norm.
+    assert estimates_of(run).torques is None
+    assert read_run(tmp_path / 'two_links').arm is None
