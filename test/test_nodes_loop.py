@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from fake_clock import FakeClock
+from random_arm import random_urdf
 from rclpy.time import Time
 from ros_rig import simulated_torques, states, torques
 
@@ -47,6 +48,21 @@ def test_lockstep_torques_are_those_of_the_offline_run_bit_for_bit(ros, plant):
     over_ros, stamps = run_lockstep(ros, plant)
     np.testing.assert_array_equal(over_ros, simulated_torques(plant))
     np.testing.assert_array_equal(stamps, LOCKSTEP_START + MILLISECOND * np.arange(len(stamps)))
+
+
+def test_an_arm_from_a_urdf_is_the_same_over_ros_bit_for_bit(ros):
+    """Three joints of other kinds, with an event and everything that a window learns."""
+    arm = {'robot.urdf': random_urdf(3, seed=5)[0], 'robot.tip': 'tip'}
+    plant = arm | {'duration': 3.0, 'truth.mass_deviation': 0.3, 'actuator.delay': 1}
+    plant |= {'events.begin': [2.0], 'events.payload': [0.3]}
+    learner = arm | {'learning.window': 1.0, 'barrier.bound': [0.5] * 3}
+    commands = ros.listen(topics.COMMANDS)
+    node, _ = ros.loop(plant | OBSERVED, learner | OBSERVED)
+    ros.until(lambda: node.finished and len(commands) >= 3001)
+
+    over_ros = torques(commands)
+    np.testing.assert_array_equal(over_ros, simulated_torques(plant, learner))
+    assert np.abs(over_ros[2100] - over_ros[1900]).max() > 0.01  # it carries a payload now
 
 
 def test_a_seed_is_heard_in_the_torques(ros):

@@ -104,7 +104,7 @@ def test_too_large_a_gain_of_the_columns_overflows_as_it_is_warned():
     assert warnings(changes | {'learning.column_gain': 0.02}) == []
     ends = []
     for gain in (1.0, 0.02):
-        loop = run(configured('recommended', 8.0, changes | {'learning.column_gain': gain}))
+        loop = run(configured('recommended', 12.0, changes | {'learning.column_gain': gain}))
         ends.append(np.abs(loop.xi1).max() < BOUND)
     assert ends == [False, True]
 

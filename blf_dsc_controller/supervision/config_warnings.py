@@ -38,7 +38,8 @@ class ReferenceLoad(NamedTuple):
     """What the reference demands, followed exactly with the initial estimate."""
 
     torque: Floats  # largest magnitude (n,), N m
-    rate: float  # largest eigenvalue of M^-1 K_p, 1/s
+    rate: float  # largest eigenvalue of M^-1 K_p + omega_v, 1/s
+    damping: Floats  # of each joint with the others free, at least (n,), N m s/rad
 
 
 def config_warnings(config: ControllerConfig, q: Floats | None = None) -> list[str]:
@@ -50,7 +51,7 @@ def config_warnings(config: ControllerConfig, q: Floats | None = None) -> list[s
     load = reference_load(config, settings)
     found = [*_of_start(config, q), *_of_torque(config, settings, load)]
     if settings.surface != LINEAR:
-        found += _of_surface(config, settings)
+        found += _of_surface(config, settings, load)
         if settings.kappa > 0.0 and settings.Gamma.any():
             windows = windows_along(config, settings)
             found += [
@@ -64,7 +65,7 @@ def reference_load(config: ControllerConfig, settings: Settings) -> ReferenceLoa
     """Evaluate the dynamics along the reference, over its slowest period."""
     P = settings.initial_estimate[: settings.p]
     H, Yp, Yr = np.zeros((3, settings.n, settings.p))
-    torque, rate = np.zeros(settings.n), 0.0
+    torque, rate, inertia = np.zeros(settings.n), 0.0, np.full(settings.n, np.inf)
     moments = np.linspace(0.0, _horizon(config), _POINTS, endpoint=False)
     M = np.zeros((settings.n, settings.n))
     for q, dq, ddq in sampled(reference_of(config), moments):
@@ -75,8 +76,12 @@ def reference_load(config: ControllerConfig, settings: Settings) -> ReferenceLoa
             M[:, i] = Yp @ P
         if np.linalg.eigvalsh(M)[0] > 0.0:
             roots = np.linalg.eigvals(np.linalg.solve(M, np.diag(settings.Kp)))
-            rate = max(rate, float(np.abs(roots).max()))
-    return ReferenceLoad(torque, rate)
+            rate = max(rate, float(np.abs(roots).max()) + settings.damping_rate)
+            inertia = np.minimum(inertia, 1.0 / np.diag(np.linalg.inv(M)))
+    damping = settings.Kp.copy()
+    if settings.damping_rate > 0.0:
+        damping += settings.damping_rate * inertia
+    return ReferenceLoad(torque, rate, damping)
 
 
 def windows_along(config: ControllerConfig, settings: Settings) -> Floats:
@@ -142,7 +147,7 @@ def _of_torque(config: ControllerConfig, settings: Settings, load: ReferenceLoad
             f'{config.sample_time:g} s: above 1 the sampled loop has little margin for delays, and '
             f'above 2 it chatters between the limits: lower the gain or the sample time'
         )
-    fraction = float(np.max(settings.gamma * config.sample_time / np.maximum(settings.Kp, 1e-12)))
+    fraction = float(np.max(settings.gamma * config.sample_time / np.maximum(load.damping, 1e-12)))
     if fraction > 0.5:
         yield (
             f'disturbance.gain: in each sample the disturbance estimate absorbs {fraction:.2g} of '
@@ -150,7 +155,7 @@ def _of_torque(config: ControllerConfig, settings: Settings, load: ReferenceLoad
         )
 
 
-def _of_surface(config: ControllerConfig, settings: Settings) -> Iterator[str]:
+def _of_surface(config: ControllerConfig, settings: Settings, load: ReferenceLoad) -> Iterator[str]:
     T, filtering = config.sample_time, config.surface.time_constant
     rate = float(np.max(settings.K / 2.0 + settings.mu))
     if filtering < T:
@@ -164,7 +169,7 @@ def _of_surface(config: ControllerConfig, settings: Settings) -> Iterator[str]:
             f'{filtering:g} s follows only {0.25 / filtering:.3g} 1/s without ringing: lower '
             f'surface.time_constant or the gains'
         )
-    stiff = settings.slope_limit * T / np.maximum(settings.Kp, 1e-12)
+    stiff = settings.slope_limit * T / np.maximum(load.damping, 1e-12)
     for joint, ratio in zip(config.joints, stiff, strict=True):
         if ratio > 2.0:
             yield (
