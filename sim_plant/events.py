@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from sim_plant.disturbance import JointDisturbance
 
@@ -65,7 +65,7 @@ def add(total: np.ndarray, fraction: float, one: np.ndarray) -> None:
         total[i] += fraction * one[i]
 
 
-@inner
+@called
 def update_acting(
     disturbance: JointDisturbance, load: Load, events: Events, sample: float, acting: Acting
 ) -> None:
