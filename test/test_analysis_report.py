@@ -96,7 +96,8 @@ def test_bags_of_one_name_are_numbered(folder):
 def test_the_arm_has_its_lengths_and_moves_as_measured(folder):
     (bag,) = read_bags([folder / 'one'])
     moving = arm(bag, 0)
-    assert moving['lengths'] == [1.0, 0.8]  # of the plant's configuration
+    assert [joint.offset for joint in moving['joints']] == [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+    assert moving['tip'] == [0.8, 0.0, 0.0]  # of the plant's configuration
     assert len(moving['time']) == 50  # a second, at fifty pictures
     assert moving['angles'][-1] == pytest.approx(bag.run.position[-1], abs=1e-4)
     assert moving['reference'][0] == pytest.approx(bag.run.reference[0], abs=1e-4)

@@ -12,9 +12,11 @@ import pytest
 import recorded_run
 from test_law_urdf import panda
 
+from blf_dsc_controller.analysis.drawn_arm import arm_of_chain
 from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.metrics import estimates_of, measure
 from blf_dsc_controller.analysis.panels import panels
+from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.params_file import dumps
@@ -103,7 +105,8 @@ def test_estimates_are_shown_in_deviations_of_their_prior():
 
 def test_a_change_of_the_true_arm_is_marked():
     true = np.tile(P, (TIME.size, 1))
-    true[400:] *= 1.5
+    true[400:500] *= np.linspace(1.01, 1.5, 100)[:, np.newaxis]
+    true[500:] *= 1.5
     for panel in panels([run_of(P, true)]):
         marks = [mark.time for mark in panel.marks if mark.text == 'the arm changes']
         first = panel.title in ('error of joint1', 'torque error')
@@ -140,8 +143,24 @@ def test_the_arm_of_a_bag_is_that_of_its_recorded_configuration(tmp_path):
     messages = recorded_run.messages(recorded_run.record(tmp_path / 'two_links', 0.1))
     bag = recorded_run.write(tmp_path / 'bag', messages, text, model='urdf')
     run = read_run(bag)
+    (reported,) = read_bags([bag])
+    assert reported.arm == arm_of_chain(config.robot.chain(config.joints))
     assert run.arm is not None
     assert run.arm.deviations == learned_arm(config).deviations
     # It learned parameters of other names: those have a norm.
     assert estimates_of(run).torques is None
     assert read_run(tmp_path / 'two_links').arm is None
+
+
+def test_the_page_draws_the_arm_in_space():
+    chain = panda().robot.chain(panda().joints)
+    drawn = arm_of_chain(chain)
+    tip, turned = np.zeros(3), np.eye(3)
+    for joint in drawn.joints:
+        tip = tip + turned @ joint.offset
+        turned = turned @ joint.rotation
+    # Stretched out to its full height: 0.333, 0.316, 0.384 m up, flange and hand 0.2104 m down.
+    tip = tip + turned @ drawn.tip
+    np.testing.assert_allclose(tip, [0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.2104], atol=1e-5)
+    assert drawn.joints[3].axis == [0.0, 0.0, 1.0]
+    assert not any(joint.slides for joint in drawn.joints)

@@ -15,6 +15,7 @@ from matplotlib.ticker import FuncFormatter
 from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.panels import Line, Mark, Panel, panels
 from blf_dsc_controller.analysis.style import (
+    ALARM,
     COLOURS,
     GREEN,
     INK,
@@ -171,10 +172,12 @@ def _draw_line(axes: Axes, line: Line, until: float, *, label: str, **style: Any
 
 
 def _draw_mark(axes: Axes, mark: Mark, row: int) -> None:
+    if mark.colour == ALARM:
+        axes.axvline(mark.time, color=mark.colour, lw=1.4)
+    else:
+        axes.axvline(mark.time, color=mark.colour or INK, lw=1.1, ls=(0, (1, 2)), zorder=1)
     if not mark.colour:
-        axes.axvline(mark.time, color=INK, lw=1.1, ls=(0, (1, 2)), zorder=1)
         return
-    axes.axvline(mark.time, color=mark.colour, lw=1.4)
     is_early = mark.time < sum(axes.get_xlim()) / 2.0
     axes.annotate(
         mark.text,

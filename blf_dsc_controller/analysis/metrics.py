@@ -118,12 +118,13 @@ def change_times(run: Run) -> list[float]:
 
 
 def true_change_times(run: Run) -> list[float]:
-    """Times [s] at which the true parameters of the plant changed, as by a payload."""
+    """Times [s] at which the true parameters of the plant began to change, as by a payload."""
     if run.truth is None:
         return []
     true = run.truth.select(_parameters(run.truth.names))
-    changed = np.flatnonzero(np.any(np.diff(true, axis=0) != 0.0, axis=1)) + 1
-    return [float(t) for t in run.time_of(run.truth.stamp[changed])]
+    changed = np.any(np.diff(true, axis=0) != 0.0, axis=1)
+    begins = np.flatnonzero(np.diff(changed, prepend=False) & changed) + 1
+    return [float(t) for t in run.time_of(run.truth.stamp[begins])]
 
 
 def outside(run: Run) -> NDArray[np.bool_] | None:

@@ -98,8 +98,8 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
             marks = latch if panel.group in _LEARNING else panel.marks
             marks = (*marks, *(stops if panel.group in _STOPPED else ()))
             if panel.group in _CHANGED:
-                text = changed.pop(panel.group, '')  # once
-                marks = (*marks, *(Mark(time, text, MUTED) for time in changes))
+                texts = (changed.pop(panel.group, ''), *[''] * len(changes))  # once
+                marks = (*marks, *(Mark(*one, INK) for one in zip(changes, texts, strict=False)))
             found[panel.group, panel.title] = replace(
                 before,
                 lines=(*before.lines, *(line._replace(run=k) for line in panel.lines)),

@@ -141,10 +141,7 @@ def colour(k: int) -> str:
 
 
 def arm(bag: ReportedBag, k: int) -> dict[str, Any]:
-    """Angles and link lengths of an arm, at a rate that the eye can follow.
-
-    Joint 1 is measured from the horizontal, each further joint from the link before it.
-    """
+    """Joints of an arm and their positions, at a rate that the eye can follow."""
     run = bag.run
     pictures = int(min(_MOST_PICTURES, max(2.0, run.duration * _RATE)))
     times = np.linspace(0.0, run.duration, pictures)
@@ -156,7 +153,8 @@ def arm(bag: ReportedBag, k: int) -> dict[str, Any]:
     return {
         'name': bag.name,
         'colour': colour(k),
-        'lengths': bag.lengths,
+        'joints': bag.arm.joints,
+        'tip': bag.arm.tip,
         'time': times.round(4).tolist(),
         'angles': position,
         'reference': reference,

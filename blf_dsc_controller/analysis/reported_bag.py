@@ -4,19 +4,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.analysis.drawn_arm import DrawnArm, arm_of_chain, planar_arm
 from blf_dsc_controller.analysis.metrics import change_times, latch_time, outside
-from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.bags.context import Context, read_context
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.configuration.ros_yaml import parse
-from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.messages.topics import CHANGES, DIAGNOSTICS
 from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Run
@@ -42,7 +44,7 @@ class ReportedBag:
     run: Run
     version: str  # that recorded it, empty if it was another recorder
     parameters: dict[str, str]  # `node name: parameter` to its value as text
-    lengths: list[float]  # of each link [m]
+    arm: DrawnArm
     events: list[Event]  # by time
 
 
@@ -76,9 +78,6 @@ def _read(path: Path, name: str, namespace: str) -> ReportedBag:
     except ConfigurationError:  # not there, or it cannot be read
         sections = []
     entries = {name: entry.value for section in sections for name, entry in section.entries.items()}
-    # A link without a length of its own has that of the first.
-    keys = (f'arm.l{i + 1}' for i in range(len(run.joints)))
-    lengths = [entries.get(key, entries.get('arm.l1', 1.0)) for key in keys]
     lost = (Event(0.0, 'lost', f'{topic}: {text}') for topic, text in context.losses.items())
     events = (*_events(run), *_diagnosed(path, run), *_changed(path, run, namespace), *lost)
     return ReportedBag(
@@ -90,9 +89,20 @@ def _read(path: Path, name: str, namespace: str) -> ReportedBag:
             for section in sections
             for name, entry in sorted(section.entries.items())
         },
-        lengths=[float(f'{length}') for length in lengths],
+        arm=_drawn(context, entries, len(run.joints)),
         events=sorted(events, key=lambda event: event.time),
     )
+
+
+def _drawn(context: Context, entries: Mapping[str, Any], n: int) -> DrawnArm:
+    """Arm of the recorded URDF if it can be read, else links in a plane."""
+    if context.facts.get('model') == 'urdf':
+        with suppress(BlfDscError):
+            config = context.controller_config()
+            return arm_of_chain(config.robot.chain(config.joints))
+    # A link without a length of its own has that of the first.
+    lengths = (entries.get(f'arm.l{i + 1}', entries.get('arm.l1', 1.0)) for i in range(n))
+    return planar_arm([float(f'{length}') for length in lengths])
 
 
 def _events(run: Run) -> Iterator[Event]:
