@@ -13,8 +13,9 @@ function layoutOf(panel) {
     title: {text: panel.title, x: 0.01, xanchor: 'left', font: {size: 14}},
     margin: {l: 62, r: 34, t: 50, b: 40},
     paper_bgcolor: 'white', plot_bgcolor: 'white', bargap: 0, barmode: 'overlay',
-    legend: {orientation: 'h', x: 1, xanchor: 'right', y: 1.01, yanchor: 'bottom',
-      font: {size: 11}},
+    legend: {font: {size: 11}, ...(panel.traces.length > 4
+      ? {x: 1.02, xanchor: 'left', y: 0, yanchor: 'bottom'}
+      : {orientation: 'h', x: 1, xanchor: 'right', y: 1.01, yanchor: 'bottom'})},
     modebar: {orientation: 'v'},
     font: {family: 'system-ui, DejaVu Sans, sans-serif', size: 12, color: '#22272e'},
     hovermode: panel.time ? 'x' : 'closest',
