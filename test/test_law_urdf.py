@@ -60,6 +60,10 @@ def test_text_of_a_urdf_is_as_good_as_its_file():
         ({'joints': ['a', 'b']}, "robot.urdf: no joint 'a' in the URDF"),
         ({'robot.urdf': 'package://no_such/arm.urdf'}, "package 'no_such' was not found"),
         ({'barrier.bound': [0.01] * 2}, 'barrier.bound: got 2 entries, but 7 are needed'),
+        (
+            {'learning.initial_estimate': [1.0] * 3, 'learning.adaptation_gain': [0.5] * 3},
+            'learning.initial_estimate: got 3 entries, but model urdf has 48',
+        ),
     ],
 )
 def test_what_is_wrong_with_an_arm_is_said(changes, message):

@@ -26,7 +26,7 @@ from blf_dsc_controller.configuration.gains import (
 )
 from blf_dsc_controller.configuration.learning import Learning
 from blf_dsc_controller.configuration.reference import Approach, MotionLimits, Reference
-from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.configuration.robot import Robot, parameters_of
 from blf_dsc_controller.configuration.schema import non_negative, parameter, positive
 
 if TYPE_CHECKING:
@@ -170,7 +170,7 @@ class ControllerConfig(Sampled):
         needed = MODELS[self.model]
         count = parameter_count(needed or len(self.joints))
         if self.model == 'urdf':
-            count = len(self.learning.initial_estimate)
+            count = parameters_of(self.robot, self.robot.chain(self.joints)).model.p
         return [
             *joint_problems(self.joints, f'model {self.model}', needed),
             *self.sample_time_problems(),

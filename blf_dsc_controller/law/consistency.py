@@ -7,10 +7,11 @@ of u^T u beside Phi and b the residual of the solution is known,
 
     r^2 = mean(u^T u) - b^T theta_LS   [(N m)^2],
 
-and a window is latched only if r^2 is at most four times the least of any full window.  Rows that
-contradict the latched solution (their mean square over 0.1 s is more than eight times r^2) mean
-that the arm has changed: window, filters and latch are dropped, and learning starts anew.  Until
-the new window is full it averages no disturbance out, so its solution is pulled to the estimate
+and a window is latched only if r^2 is at most four times the least of any full window, and if its
+solution gives the arm a positive inertia, which the residual does not show.  Rows that contradict
+the latched solution (their mean square over 0.1 s is more than eight times r^2) mean that the arm
+has changed: window, filters and latch are dropped, and learning starts anew.  Until the new window
+is full it averages no disturbance out, so its solution is pulled to the estimate
 before the change, weakly excited directions most; likewise a full window whose residual is unusual,
 to the solution a window ago.
 """
