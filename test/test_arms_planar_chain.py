@@ -18,7 +18,7 @@ SIZES = (1, 2, 3, 7)
 PER_JOINT = {
     one.name: flatten(ControllerConfig())[one.name][0]
     for one in parameters(ControllerConfig)
-    if one.length == ('joints',) and not one.name.startswith('reference')
+    if one.length == ('joints',) and not one.omittable and not one.name.startswith('reference')
 }
 """Every setting that has one entry per joint, with the first of its default."""
 

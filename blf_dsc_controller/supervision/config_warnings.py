@@ -203,6 +203,7 @@ def _of_update(config: ControllerConfig, settings: Settings, windows: Floats) ->
 def _of_window(config: ControllerConfig, settings: Settings, windows: Floats) -> Iterator[str]:
     learning = config.learning
     p = settings.p
+    windows = windows + settings.prior_weight * settings.information
     alone, together = (
         float(np.linalg.eigvalsh(Phi)[:, 0].max()) for Phi in (windows[:, :p, :p], windows)
     )
