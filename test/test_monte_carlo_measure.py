@@ -71,8 +71,9 @@ def test_study_of_these_tests_has_all_kinds_of_figures(tmp_path):
     weak = whole(study(tmp_path, WEAK + STUDY))
     assert (strong['outcome'] == 'kept').sum() > 12
     assert (weak['outcome'] == 'violated').sum() > 12
-    latched = np.isfinite(strong['latch_time_s'])  # unless the solution is not physical
-    assert latched.sum() > 20
+    # Windows of 0.1 s say little: with change detection some solutions are no possible arm.
+    any_arm = LOOP.replace('learning: {', 'learning: {change_detection: false, ')
+    assert np.isfinite(whole(study(tmp_path, any_arm + STUDY))['latch_time_s']).all()
     assert (weak['saturated_fraction'] > 0.1).any()
     assert (strong['first_violation_s'] >= 0).sum() == (strong['outcome'] != 'kept').sum()
 
