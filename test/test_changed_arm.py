@@ -15,7 +15,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from changes import BOUND, GENTLE, OFF, ROWS, begin_of, end_of
+from changes import BOUND, OFF, ROWS, allowed, begin_of, end_of
 from ros_rig import simulated_torques, torques
 from test_mujoco_plant import example  # noqa: F401 - a fixture
 
@@ -47,8 +47,10 @@ def test_bound_holds_in_lockstep_and_learning_costs_nothing(ros, name):
     learning, without = (offline(plant, law) for law in ({}, OFF))
     assert np.all(np.abs(learning.error) < BOUND)
     changed = learning.time >= begin_of(plant)
-    largest, allowed = (np.abs(one.error[changed]).max(axis=0) for one in (learning, without))
-    assert np.all(largest <= np.maximum(1.2 * allowed, GENTLE))
+    largest, without_learning = (
+        np.abs(one.error[changed]).max(axis=0) for one in (learning, without)
+    )
+    assert np.all(largest <= allowed(plant, without_learning))
     assert_learned(learning.learning.values[-1], plant)
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from changes import BOUND, CHANGED, GENTLE, LIGHTER, OFF, ROWS, WINDOW, begin_of, end_of, payload
+from changes import BOUND, CHANGED, LIGHTER, OFF, ROWS, WINDOW, allowed, begin_of, end_of, payload
 from paper_case import NO_DISTURBANCE, configured
 
 from blf_dsc_controller.analysis.metrics import estimates_of
@@ -74,9 +74,8 @@ def test_bound_holds_when_the_arm_changes(name, sensors):
 
     assert np.all(learning.largest(0.0) < BOUND)
     begin = begin_of(row)
-    allowed = np.maximum(1.2 * without.largest(begin), GENTLE)
     read_to = 0.5 * plant.get('sensor.resolution', 0.0)
-    assert np.all(learning.largest(begin) <= allowed + read_to)
+    assert np.all(learning.largest(begin) <= allowed(row, without.largest(begin)) + read_to)
     assert learning.changes[-1] >= 1.0
     assert learning.error[-1] < 0.01
 
