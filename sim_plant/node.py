@@ -38,7 +38,7 @@ from sim_plant import kernels as plant_kernels
 from sim_plant.arms import parameter_names_of, urdf_of
 from sim_plant.command_input import Latency, TorqueInput
 from sim_plant.handshake import Handshake
-from sim_plant.plant import Plant, plant_of, settings_of, steps_of
+from sim_plant.plant import FASTEST, Plant, plant_of, settings_of, steps_of
 
 LOCKSTEP_START = 1_000_000_000
 """First stamp in lock-step [ns]: a zero stamp says 'not set' in ROS."""
@@ -226,11 +226,21 @@ class PlantNode(LoopNode[PlantConfig]):
         else:
             if self._stale:
                 self.input.torque[:] = 0.0
-            self.plant.step(self.input.torque)
+            self._step()
         self._apply_changes()
         self._publish_state()
         if self._stale and not was_stale:
             self.get_logger().error('the torque is too old and is no longer applied')
+            self._report()
+
+    def _step(self) -> None:
+        was_broken = self.plant.is_broken
+        self.plant.step(self.input.torque)
+        if self.plant.is_broken and not was_broken:
+            self.get_logger().error(
+                f'the torque {self.input.torque} N m drove a joint beyond {FASTEST:g} rad/s: '
+                'the arm stands still until it is reset'
+            )
             self._report()
 
     def _is_over(self) -> bool:
@@ -281,6 +291,8 @@ class PlantNode(LoopNode[PlantConfig]):
             waits = WARN, 'braked: waiting for the first torque'
             active = self.state_label == 'active'
             level, message = waits if active else (STALE, self.state_label)
+        elif self.plant.is_broken:
+            level, message = ERROR, f'a joint was faster than {FASTEST:g} rad/s: reset the arm'
         elif self.input.stale_steps > self._reported_stale:
             message = 'the last torque is too old (actuator.command_timeout): not applied'
             level = ERROR

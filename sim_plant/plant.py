@@ -28,6 +28,10 @@ from sim_plant.kernels import (
 from sim_plant.sensors import VELOCITY_SOURCES, Encoders, generator, is_noisy
 
 
+FASTEST = 1e3
+"""Velocity [rad/s] of a joint that no arm survives: it stays where it was."""
+
+
 class SavedPlant(NamedTuple):
     """A plant's state at one moment, random generator included."""
 
@@ -39,7 +43,7 @@ class Plant:
     """A sampled arm: `measure()`, then `step(torque)`, and so on.
 
     It starts at `position` (n,) [rad] with `velocity` (n,) [rad/s]; `seed` is that of the sensor
-    noise: the same seed repeats the run.
+    noise: the same seed repeats the run.  `is_broken` once a joint was faster than `FASTEST`.
     """
 
     def __init__(
@@ -58,6 +62,8 @@ class Plant:
         self._initial = self.state.copy()
         self._measurement = np.zeros(3 * self.joints)
         self._truth = np.zeros(settings.p + 3 * self.joints)
+        self._before = np.zeros(self.joints)
+        self.is_broken = False
         self._seed = seed
         self.rng = generator(seed)
 
@@ -84,8 +90,20 @@ class Plant:
         return self._measurement
 
     def step(self, torque: np.ndarray) -> None:
-        """Apply the commanded torque (n,) [N m] and advance to the next sample."""
+        """Apply the commanded torque (n,) [N m] and advance to the next sample.
+
+        An arm that breaks by it stands still from then on.
+        """
+        if self.is_broken:
+            self.hold()
+            return
+        q, dq = self._now.x[: self.joints], self._now.x[self.joints :]
+        self._before[:] = q
         step_plant(self.arm, self.settings, self.state, torque)
+        if not dq @ dq <= FASTEST**2:  # NaN as well
+            self.is_broken = True
+            q[:] = self._before
+            dq[:] = 0.0
 
     def change(self, settings: PlantSettings) -> None:
         """Continue with other settings of as many joints and the same period and delay."""
@@ -107,6 +125,7 @@ class Plant:
     def reset(self) -> None:
         """Return to sample 0 and repeat the run of the same seed."""
         self.state[:] = self._initial
+        self.is_broken = False
         self.rng = generator(self._seed)
 
     def save(self) -> SavedPlant:
@@ -116,6 +135,7 @@ class Plant:
     def restore(self, saved: SavedPlant) -> None:
         """Resume from a saved moment of a plant of the same settings."""
         self.state[:] = saved.state
+        self.is_broken = False
         self.rng.bit_generator.state = saved.generator
 
 

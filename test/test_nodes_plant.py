@@ -59,6 +59,25 @@ def test_a_command_that_will_not_do_moves_nothing_and_is_counted(ros, wrong):
     assert node.input.rejected == 1
 
 
+def test_an_arm_driven_too_fast_breaks_and_stands_still_until_it_is_reset(ros):
+    node, heard, send = started(ros, **{'actuator.torque_limit': (0.0, 0.0)})
+    for count in range(2, 500):
+        send((0.0, 9e3))
+        ros.until(lambda k=count: len(heard) == k)
+        if node.plant.is_broken:
+            break
+    for count in range(count + 1, count + 4):
+        send((0.0, 9e3))
+        ros.until(lambda k=count: len(heard) == k)
+    _, measured = states(heard)
+    assert np.isfinite(measured).all()
+    assert np.abs(measured[:, 1]).max() < 1e3
+    np.testing.assert_array_equal(measured[-3:, 0], measured[-2, 0][None].repeat(3, axis=0))
+    assert not measured[-3:, 1].any()
+    node.reset()
+    assert not node.plant.is_broken
+
+
 def test_the_arm_of_a_urdf_is_simulated_described_and_its_truth_named(ros):
     description, truth = ros.listen(topics.ROBOT_DESCRIPTION), ros.listen(topics.TRUTH)
     given = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp', 'truth.mass_factor': 1.2}
