@@ -27,7 +27,6 @@ from sim_plant.kernels import (
 )
 from sim_plant.sensors import VELOCITY_SOURCES, Encoders, generator, is_noisy
 
-
 FASTEST = 1e3
 """Velocity [rad/s] of a joint that no arm survives: it stays where it was."""
 
