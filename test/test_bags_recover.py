@@ -126,6 +126,38 @@ def test_any_damage_is_survived(whole, tmp_path_factory, data):
     assert found >= 2 * PER_CHUNK * (CHUNKS - hit - outside)
 
 
+def test_any_damage_to_the_head_of_a_chunk_is_survived(whole, tmp_path):
+    original = whole.read_bytes()
+    _, (at, _, _), *_ = chunks(original)
+    for place in range(at, at + 60):
+        content = bytearray(original)
+        content[place] ^= 128
+        folder = tmp_path / str(place)
+        folder.mkdir()
+        recovery = recover(damaged(folder / 'bag', content), folder / 'clean')
+        assert sum(recovery.messages.values()) >= 2 * PER_CHUNK * (CHUNKS - 1)
+
+
+def test_a_topic_is_never_recovered_under_a_damaged_name(plain, tmp_path):
+    """Outside the chunks, where no checksum of MCAP protects it, a topic's name is repeated."""
+    original = plain.read_bytes()
+    inside = [range(at, end) for at, end, _ in chunks(original)]
+    name = COMMANDS.resolved.encode()
+    named = [at for at in range(len(original)) if original.startswith(name, at)]
+    places = [at for at in named if not any(at in chunk for chunk in inside)]
+    first, _, second = places  # a record of its own, the metadata of the bag, the index
+    written = set(read(plain.parent))
+    for k, damage in enumerate([[first], [second], [first, second]]):
+        content = bytearray(original)
+        for at in (inside[0].start + 100, *damage):
+            content[at] ^= 1
+        recovery = recover(damaged(tmp_path / f'bag{k}', content), tmp_path / f'clean{k}')
+        assert set(read(recovery.path)) <= written
+        found = 2 if len(damage) == 1 else 1
+        assert len(recovery.messages) == found
+        assert recovery.unknown == (2 - found) * PER_CHUNK * (CHUNKS - 1)
+
+
 def test_a_corrupted_chunk_is_skipped_and_reported_with_its_times_and_messages(whole, tmp_path):
     content = bytearray(whole.read_bytes())
     at, end, chunk = chunks(content)[2]

@@ -167,7 +167,7 @@ def unpack(chunk: Chunk) -> bytes:
     try:
         stream, size = get_chunk_data_stream(chunk)
         records = stream.read(size)
-    except (McapError, ZstdError, RuntimeError, ValueError, MemoryError) as error:
+    except (McapError, ZstdError, RuntimeError, ValueError, OverflowError, MemoryError) as error:
         raise MalformedRecordError(f'cannot be decompressed: {error}') from error
     if size != chunk.uncompressed_size:
         raise MalformedRecordError(f'{size} bytes where {chunk.uncompressed_size} were written')

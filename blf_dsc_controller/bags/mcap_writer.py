@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, cast
+from zlib import crc32
 
 from mcap.writer import CompressionType, Writer
 
@@ -77,6 +79,7 @@ class McapFile:
             'offered_qos_profiles': quality_text(topic.offered),
             'topic_type_hash': topic.definition.hash,
         }
+        metadata['checksum'] = channel_checksum(topic.name, topic.type, metadata)
         schema = self._schemas[topic.type]
         self._channels += 1
         number = self._writer.register_channel(topic.name, 'cdr', schema, metadata)
@@ -115,6 +118,13 @@ class McapFile:
         """Write the index and close the file."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
+
+
+def channel_checksum(topic: str, type_name: str, metadata: Mapping[str, str]) -> str:
+    """CRC-32 of a channel, which is repeated where no checksum of MCAP protects it."""
+    qualities, type_hash = metadata.get('offered_qos_profiles'), metadata.get('topic_type_hash')
+    parts = (topic, type_name, qualities, type_hash)
+    return f'{crc32(repr(parts).encode()):08x}'
 
 
 class ReservedFile:

@@ -31,7 +31,7 @@ from blf_dsc_controller.bags.mcap_reader import (
     record_head,
     unpack,
 )
-from blf_dsc_controller.bags.mcap_writer import CHANNEL_RECORD
+from blf_dsc_controller.bags.mcap_writer import CHANNEL_RECORD, channel_checksum
 from blf_dsc_controller.bags.metadata import parse_qualities
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.writer import BagWriter
@@ -158,12 +158,9 @@ class _Transfer:
 
     def _write(self, salvage: Salvage, message: StoredMessage) -> bool:
         number, sequence, log_time, publish_time, raw = message
-        channel = salvage.channels.get(number)
+        channel = salvage.channel(number)
         if channel is None:
-            entries = salvage.metadata.get(f'{CHANNEL_RECORD}{number}')
-            if entries is None or 'topic' not in entries:
-                return False
-            channel = Channel(number, entries['topic'], 'cdr', entries, 0)
+            return False
         handle = self.handles.get(channel.topic) or self._add_topic(salvage, channel)
         if handle is None:
             return False
@@ -173,7 +170,7 @@ class _Transfer:
 
     def _add_topic(self, salvage: Salvage, channel: Channel) -> int | None:
         schema = salvage.schemas.get(channel.schema_id)
-        type_name = channel.metadata.get('topic_type', '') if schema is None else schema.name
+        type_name = salvage.type_of(channel)
         if not type_name:
             return None
         try:
@@ -232,9 +229,29 @@ class Salvage:
             elif not self.is_complete:
                 self._lose(piece, piece.reason)
         for loss, number, count in counts:
-            channel = self.channels.get(number)
+            channel = self.channel(number)
             topic = f'topic number {number}' if channel is None else channel.topic
             loss.messages[topic] = count
+
+    def channel(self, number: int) -> Channel | None:
+        """Channel of a number, or what a record of its own says of it; None if both are damaged."""
+        channel = self.channels.get(number)
+        if channel is not None and self._is_intact(channel):
+            return channel
+        entries = self.metadata.get(f'{CHANNEL_RECORD}{number}', {})
+        channel = Channel(number, entries.get('topic', ''), 'cdr', entries, 0)
+        return channel if channel.topic and self._is_intact(channel) else None
+
+    def type_of(self, channel: Channel) -> str:
+        """Type of a channel's messages; empty if it is lost."""
+        schema = self.schemas.get(channel.schema_id)
+        return channel.metadata.get('topic_type', '') if schema is None else str(schema.name)
+
+    def _is_intact(self, channel: Channel) -> bool:
+        """Whether the checksum of a channel fits; bags of other recorders have none."""
+        checksum = channel.metadata.get('checksum')
+        expected = channel_checksum(channel.topic, self.type_of(channel), channel.metadata)
+        return checksum is None or checksum == expected
 
     def _messages_in(self, records: bytes, piece: Piece, kind: str) -> Iterator[StoredMessage]:
         try:
