@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from random_arm import CONFIG, random_urdf
 
+from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import build, change
@@ -99,6 +100,33 @@ def test_gravity_is_compensated_with_the_initial_estimate():
     gravity = H @ base.of(chain.inertias, config.robot.rotors(chain))
     assert np.abs(gravity).max() > 5.0
     np.testing.assert_allclose(torque, gravity, atol=0.02)  # P^(0) has four digits
+
+
+def test_bound_begins_as_a_funnel_where_an_unknown_load_makes_the_arm_sag():
+    barrier = panda().barrier
+    assert barrier.initial_bound[0] == 0.0  # about the vertical
+    assert 0.01 < barrier.initial_bound[5] < 0.03
+    assert panda(robot__payload=0.0).barrier.initial_bound[5] < 0.2 * barrier.initial_bound[5]
+    wide = panda(barrier__bound=[0.03] * 7).barrier
+    assert wide.initial_bound == (0.0,) * 7
+    assert panda(barrier__initial_bound=[0.0] * 7).barrier.widest == (0.002,) * 7
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_rated_load_that_nobody_told_is_within_the_bound_from_the_start(seed):
+    plant = {'duration': 1.5, 'truth.seed': seed, 'events.payload': [3.0]}
+    plant |= {'events.begin': [0.0], 'events.duration': [0.0]}
+
+    def run(**law):
+        loop = load_loop('panda', {'sim_plant': plant, 'blf_dsc_controller': law})
+        return simulate(loop.controller, loop.plant).run()
+
+    found = run()
+    assert np.abs(found.error).max() > 0.005
+    assert np.all(np.abs(found.error) < 0.6 * found.bound)
+    assert np.all(found.bound[-1] < 0.0051)
+    assert not found.stops
+    assert run(**{'barrier.initial_bound': [0.0] * 7}).stops  # with a constant bound
 
 
 def test_prismatic_joints_and_a_third_arm_need_nothing_else():

@@ -4,7 +4,8 @@
 From the delay of the loop, 1.5 T + robot.lag, comes one rate, omega_v = 0.5 / delay, at which the
 damping loop keeps a phase margin of 60 degrees; every other gain is a fraction of it and of the
 inertia m_i = 1 / (M^-1)_ii of a joint with the others free, the least over several postures
-(doc/tuning.md).
+(doc/arms.md).  What gravity may be off by, the rated payload among it, makes a joint sag at the
+start before the disturbance estimate follows: where that is more than the bound, it is a funnel.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from blf_dsc_controller.arms.urdf import Chain
     from blf_dsc_controller.configuration.schema import Value
 
+_SAG = 1.5  # standard deviations of gravity over m omega_v^2; measured: at most 1
 _PHASE = 0.5  # rad that the damping loop loses to the delay
 _BOUND = 0.002  # rad
 _UNMODELLED = 0.01  # of the rated torque, rms: ripple, noise, Stribeck
@@ -46,13 +48,15 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
     P0 = parameters_of(robot, chain).of(chain.inertias, robot.rotors(chain))
     period = given.get('sample_time', 0.001)
     rate = _PHASE / (1.5 * period + robot.lag) if isinstance(period, float) else 0.0
-    m = _free_inertia(robot, chain, P0, lower, upper)
+    m, gravity = _over_postures(robot, chain, P0, lower, upper)
+    sag = _SAG * gravity / (m * rate**2) if rate else np.zeros(n)
     floor = _UNMODELLED * effort
     zeros = (0.0,) * n
     return {
         'joints': tuple(joint.name for joint in chain.joints),
         'barrier.bound': (_BOUND,) * n,
-        'barrier.initial_bound': zeros,
+        'barrier.initial_bound': _listed(np.where(sag > _bound_of(given, n), sag, 0.0)),
+        'barrier.funnel_rate': float(f'{rate / 20.0:.4g}'),
         'barrier.weight': _listed(0.25 * m * rate**2),
         'barrier.slope_limit': _listed(1.8 * m * rate**2),
         'surface.gain': (1.3 * rate,) * n,
@@ -100,22 +104,39 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
     }
 
 
-def _free_inertia(
+def _over_postures(
     robot: Robot, chain: Chain, P: np.ndarray, lower: np.ndarray, upper: np.ndarray
-) -> np.ndarray:
-    """Least 1 / (M^-1)_ii (n,) over random postures within the limits."""
-    model = parameters_of(robot, chain).model
+) -> tuple[np.ndarray, np.ndarray]:
+    """Least 1 / (M^-1)_ii (n,), and largest standard deviation of gravity (n,) [N m].
+
+    Over random postures within the limits.
+    """
+    from blf_dsc_controller.arms.prior import prior_factor  # compiles
+
+    parameters = parameters_of(robot, chain)
+    model = parameters.model
     n = model.n
+    L = prior_factor(chain, parameters, 'base', robot.payload, np.zeros(n))
     random = np.random.default_rng(0)
     Yp, Yr, M = np.zeros((n, P.size)), np.zeros((n, P.size)), np.zeros((n, n))
-    least = np.full(n, np.inf)
+    least, deviation = np.full(n, np.inf), np.zeros(n)
     for _ in range(_POSTURES):
         q = random.uniform(lower, upper)
         for i, unit in enumerate(np.eye(n)):
             model.momentum_regressor(q, unit, Yp, Yr)
             M[:, i] = Yp @ P
         least = np.minimum(least, 1.0 / np.diag(np.linalg.inv(M)))
-    return least
+        model.momentum_regressor(q, np.zeros(n), Yp, Yr)
+        deviation = np.maximum(deviation, np.linalg.norm(Yr @ L, axis=1))
+    return least, deviation
+
+
+def _bound_of(given: Mapping[str, Any], n: int) -> np.ndarray:
+    """Bound [rad] that is given, or the default one; what is invalid is told later."""
+    try:
+        return np.broadcast_to(np.array(given['barrier.bound'], dtype=float), (n,))
+    except (KeyError, TypeError, ValueError):
+        return np.full(n, _BOUND)
 
 
 def _finite(values: list[float], instead: float) -> np.ndarray:
