@@ -6,25 +6,28 @@ All messages of a topic are decoded at once, without a loop where they differ on
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.sources import BagError, open_bag
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.cdr import (
+    Layout,
     MessageError,
     MissingJointError,
     array_layout,
     joint_state_layout,
 )
-from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder, JointStateDecoder
+from blf_dsc_controller.messages.codecs import Decoder, Float64MultiArrayDecoder, JointStateDecoder
 from blf_dsc_controller.messages.topics import (
     CLOCK,
     COMMANDS,
+    FLOAT64_MULTI_ARRAY,
     JOINT_STATE,
     JOINT_STATES,
     TOPICS,
@@ -32,7 +35,6 @@ from blf_dsc_controller.messages.topics import (
 )
 from blf_dsc_controller.run import Floats, Stamps
 
-_T = TypeVar('_T')
 _OF_INTEREST = tuple(one for one in TOPICS if one is not CLOCK)
 
 
@@ -195,23 +197,17 @@ def decode_joint_states(
     messages: TopicMessages,
     names: Sequence[str],
     required: Sequence[str] = ('position', 'velocity'),
+    errors: dict[int, MessageError] | None = None,
 ) -> tuple[Stamps, Floats]:
     """Stamps (N,) [ns] and [position, velocity, effort] (N, 3, n) of the n `names`.
 
+    Messages that cannot be decoded are added to `errors` by their number, and zero.
+
     Raises:
-        UnreadableMessageError: a message cannot be decoded.
+        UnreadableMessageError: there are no `errors` to add them to.
     """
-    decoder = JointStateDecoder(names, required)
-    next(_decoded(messages, decoder.decode))
-    shape = len(messages.raw), 3, len(names)
-    at_once = decoder.decode_all(messages.raw)
-    if at_once is not None:
-        return at_once[0], at_once[1].reshape(shape)
-    stamp, values = np.empty(shape[0], dtype=np.int64), np.empty(shape)
-    for k, stamp_k in enumerate(_decoded(messages, decoder.decode)):
-        stamp[k] = stamp_k
-        values[k].flat = decoder.values
-    return stamp, values
+    stamps, values = _decode(messages, JointStateDecoder(names, required), errors)
+    return stamps, values.reshape(stamps.size, 3, len(names))
 
 
 def decode_arrays(messages: TopicMessages, size: int) -> Floats | None:
@@ -220,37 +216,44 @@ def decode_arrays(messages: TopicMessages, size: int) -> Floats | None:
     Raises:
         UnreadableMessageError: a message cannot be decoded.
     """
-    decoder = Float64MultiArrayDecoder(size)
-    if next(_decoded(messages, decoder.decode)) != size:
-        return None
-    at_once = decoder.decode_all(messages.raw)
-    if at_once is not None:
-        return at_once
-    values = np.empty((len(messages.raw), size))
-    for k, got in enumerate(_decoded(messages, decoder.decode)):
-        if got != size:
-            return None
-        values[k] = decoder.values
-    return values
+    sizes, values = _decode(messages, Float64MultiArrayDecoder(size))
+    return values if (sizes == size).all() else None
+
+
+def first_layout(messages: TopicMessages) -> Layout:
+    """Layout of the first of some joint states or arrays; UnreadableMessageError if it has none."""
+    find = array_layout if messages.type == FLOAT64_MULTI_ARRAY else joint_state_layout
+    try:
+        return find(messages.raw[0])
+    except MessageError as error:
+        raise UnreadableMessageError(messages.name, 0, error) from error
 
 
 def joint_names(messages: TopicMessages) -> tuple[str, ...]:
     """Names in the first of some joint states; UnreadableMessageError if there are none."""
-    names = next(_decoded(messages, joint_state_layout)).names
+    names = first_layout(messages).names
     if not names:
         unnamed = MessageError('it names no joint, so its values cannot be assigned to joints')
         raise UnreadableMessageError(messages.name, 0, unnamed)
     return names
 
 
-def array_size(messages: TopicMessages) -> int:
-    """Number of values in the first of some Float64MultiArrays."""
-    return next(_decoded(messages, array_layout)).arrays[0].size
-
-
-def _decoded(messages: TopicMessages, decode: Callable[[bytes], _T]) -> Iterator[_T]:
+def _decode(
+    messages: TopicMessages, decoder: Decoder, errors: dict[int, MessageError] | None = None
+) -> tuple[NDArray[np.int64], Floats]:
+    """What `decoder` returns of each message, and its values."""
+    with suppress(MessageError):
+        at_once = decoder.decode_all(messages.raw)
+        if at_once is not None:
+            return at_once
+    count = len(messages.raw)
+    returned, values = np.zeros(count, dtype=np.int64), np.zeros((count, decoder.values.size))
     for k, raw in enumerate(messages.raw):
         try:
-            yield decode(raw)
+            returned[k] = decoder.decode(raw)
+            values[k] = decoder.values
         except MessageError as error:
-            raise UnreadableMessageError(messages.name, k, error) from error
+            if errors is None:
+                raise UnreadableMessageError(messages.name, k, error) from error
+            errors[k] = error
+    return returned, values

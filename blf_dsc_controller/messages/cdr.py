@@ -8,6 +8,7 @@ last field, may hold anything.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from struct import unpack_from
 from typing import NamedTuple
 
@@ -54,13 +55,43 @@ class Doubles(NamedTuple):
     offset: int
     size: int
 
+    @property
+    def place(self) -> int:
+        """Of the first value among the doubles that could follow ORIGIN."""
+        return (self.offset - ORIGIN) // 8
+
 
 class Layout(NamedTuple):
     """Byte order of a message, names in it, and the places of its arrays."""
 
     byte_order: str
+    begin: int  # offset of what follows the stamp
     names: tuple[str, ...]
     arrays: tuple[Doubles, ...]
+
+    @property
+    def fixed_parts(self) -> tuple[slice, ...]:
+        """Bytes that are the same in all messages of this layout: byte order, names, sizes."""
+        first, *others = (array.size_offset for array in self.arrays)
+        return slice(2), slice(self.begin, first + 4), *(slice(at, at + 4) for at in others)
+
+    def columns_of(self, joints: Sequence[str]) -> list[int]:
+        """Place of each joint among the names.
+
+        Raises:
+            MissingJointError: a joint is not among them.
+            DuplicatedJointError: a joint is there twice.
+        """
+        for joint in joints:
+            count = self.names.count(joint)
+            if count == 0:
+                raise MissingJointError(joint, self.names)
+            if count > 1:
+                raise DuplicatedJointError(
+                    f'joint {joint!r} appears {count} times in the message '
+                    f'({", ".join(self.names)}): name each joint once'
+                )
+        return [self.names.index(joint) for joint in joints]
 
 
 def joint_state_layout(raw: bytes | bytearray) -> Layout:
@@ -74,7 +105,9 @@ def joint_state_layout(raw: bytes | bytearray) -> Layout:
     cursor.unsigned()
     cursor.text()
     names = tuple(cursor.text() for _ in range(cursor.unsigned()))
-    return Layout(cursor.byte_order, names, tuple(cursor.doubles() for _ in range(3)))
+    return Layout(
+        cursor.byte_order, STAMP_OFFSET + 8, names, tuple(cursor.doubles() for _ in range(3))
+    )
 
 
 def array_layout(raw: bytes | bytearray) -> Layout:
@@ -85,7 +118,7 @@ def array_layout(raw: bytes | bytearray) -> Layout:
         cursor.unsigned()
         cursor.unsigned()
     cursor.unsigned()
-    return Layout(cursor.byte_order, (), (cursor.doubles(),))
+    return Layout(cursor.byte_order, ORIGIN, (), (cursor.doubles(),))
 
 
 class TrajectoryContent(NamedTuple):

@@ -8,9 +8,10 @@ for as long as the messages have the same names and lengths.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
 from operator import itemgetter
-from struct import Struct, pack
+from struct import Struct
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,9 +21,7 @@ from blf_dsc_controller.messages.cdr import (
     ORIGIN,
     STAMP_OFFSET,
     Doubles,
-    DuplicatedJointError,
     Layout,
-    MissingJointError,
     ShortArrayError,
     array_layout,
     joint_state_layout,
@@ -34,11 +33,6 @@ from blf_dsc_controller.run import Floats, Stamps
 JOINT_STATE_FIELDS = ('position', 'velocity', 'effort')
 _STAMPS = {'<': Struct('<iI'), '>': Struct('>iI')}
 _STAMP = _STAMPS['<']
-_FEWEST = 8  # messages, below which one after the other is as fast
-
-# A message is decoded in a buffer behind 12 bytes, so that its doubles lie on a grid of float64.
-# The first value of the grid is the NaN of empty fields, the third the message's fifth byte.
-_MARGIN = 12
 
 
 class JointStateEncoder:
@@ -103,47 +97,70 @@ def encode_clock(stamp_ns: int) -> bytes:
     return b'\x00\x01\x00\x00' + _STAMP.pack(*divmod(stamp_ns, NANOSECONDS))
 
 
-def _view(buffer: bytearray, doubles: Doubles) -> NDArray[np.float64]:
+def _view(buffer: bytearray, doubles: Doubles) -> Floats:
     return np.frombuffer(buffer, '<f8', doubles.size, doubles.offset if doubles.size else 0)
 
 
-class _Decoder:
-    """Takes values off the places where they are in all messages of one layout."""
+class Decoder(ABC):
+    """Takes `values` (s,) off the places where they are in all messages of one layout."""
 
     def __init__(self, size: int) -> None:
         self.values = np.full(size, np.nan)
         self._length = -1  # of the messages whose layout is known
 
-    def _learn(self, raw: bytes, layout: Layout, index: NDArray[np.intp], names_at: int) -> None:
-        """Know the layout of a message from here on; `index` of the values in the grid."""
-        sizes = [array.size_offset for array in layout.arrays]
-        self._extents = [(0, 2), (names_at, sizes[0] + 4), *((at, at + 4) for at in sizes[1:])]
-        self._parts = itemgetter(*(slice(*extent) for extent in self._extents))
-        self._fixed = self._parts(raw)
-        self._index = index
-        self._order = layout.byte_order
-        self._buffer = bytearray(_MARGIN + len(raw))
-        self._grid = np.frombuffer(self._buffer, self._order + 'f8', len(self._buffer) // 8)
-        self._grid[0] = np.nan
-        self._length = len(raw)
+    @abstractmethod
+    def decode(self, raw: bytes) -> int:
+        """Fill `values` and return the stamp or the size of a message."""
 
-    def _grid_of(self, raw: Sequence[bytes]) -> Floats | None:
-        """Grid of each of N messages (N, :); None if one does not have the known layout."""
-        count, row = len(raw), -(-(_MARGIN + self._length) // 8)
-        if count < _FEWEST or set(map(len, raw)) != {self._length}:
+    def decode_all(self, raw: Sequence[bytes]) -> tuple[NDArray[np.int64], Floats] | None:
+        """What `decode` returns of N messages (N,), and their values (N, s).
+
+        None unless all have the layout of the first.
+
+        Raises:
+            MessageError: as `decode` of the first.
+        """
+        self.decode(raw[0])
+        count, size = len(raw), self._length
+        if set(map(len, raw)) != {size}:
             return None
-        rest = 8 * row - _MARGIN - self._length
-        margin = bytes(rest) + pack(self._order + 'd4x', np.nan)
-        joined = margin.join([b'', *raw, b''])
-        table = np.frombuffer(joined, np.uint8, count * 8 * row, rest).reshape(count, -1)
-        for (start, end), fixed in zip(self._extents, self._fixed, strict=True):
-            part = table[:, _MARGIN + start : _MARGIN + end]
-            if (part != np.frombuffer(fixed, np.uint8)).any():
-                return None
-        return np.frombuffer(joined, self._order + 'f8', count * row, rest).reshape(count, -1)
+        joined = b''.join(raw)
+        table = np.frombuffer(joined, np.uint8).reshape(-1, size)
+        if any((table[:, part] != table[0, part]).any() for part in self._fixed_parts):
+            return None
+        grid = np.ndarray((count, self._count), self._float, joined, ORIGIN, (size, 8))
+        values = np.full((count, self.values.size), np.nan)
+        values[:, self._known] = grid[:, self._places]
+        return self._decoded(joined), values
+
+    @abstractmethod
+    def _decoded(self, joined: bytes) -> NDArray[np.int64]:
+        """What `decode` returns of messages one after the other."""
+
+    def _is_known(self, raw: bytes) -> bool:
+        return len(raw) == self._length and self._fixed_of(raw) == self._fixed
+
+    def _learn(self, raw: bytes, layout: Layout, places: NDArray[np.intp]) -> None:
+        """Know a layout from here on.
+
+        Doubles lie on a grid from ORIGIN on: there are the `places` (s,) of the values, -1 for NaN.
+        """
+        self._length = len(raw)
+        self._fixed_parts = layout.fixed_parts
+        self._fixed_of = itemgetter(*self._fixed_parts)
+        self._fixed = self._fixed_of(raw)
+        self._float = np.dtype(layout.byte_order + 'f8')
+        self._count = (len(raw) - ORIGIN) // 8
+        self._known = np.flatnonzero(places >= 0)
+        self._places = places[self._known]
+        self.values[:] = np.nan
+
+    def _fill(self, raw: bytes) -> None:
+        grid = np.frombuffer(raw, self._float, self._count, ORIGIN)
+        self.values[self._known] = grid[self._places]
 
 
-class JointStateDecoder(_Decoder):
+class JointStateDecoder(Decoder):
     """Decodes sensor_msgs/JointState into arrays in the order of the n `joints`, by name.
 
     Other joints in the message are ignored. A field that is not `required` and is empty in the
@@ -171,29 +188,24 @@ class JointStateDecoder(_Decoder):
             DuplicatedJointError: one of `joints` is named twice.
             ShortArrayError: an array is not as long as the names.
         """
-        if len(raw) != self._length or self._parts(raw) != self._fixed:
+        if not self._is_known(raw):
             layout = joint_state_layout(raw)
-            self._learn(raw, layout, self._index_in(layout), STAMP_OFFSET + 8)
+            self._learn(raw, layout, self._places_in(layout))
             self._stamp = _STAMPS[layout.byte_order]
-        self._buffer[_MARGIN:] = raw
-        self._grid.take(self._index, out=self.values, mode='clip')
+        self._fill(raw)
         seconds, nanoseconds = self._stamp.unpack_from(raw, STAMP_OFFSET)
         return int(seconds * NANOSECONDS + nanoseconds)
 
-    def decode_all(self, raw: Sequence[bytes]) -> tuple[Stamps, Floats] | None:
-        """Stamps (N,) [ns] and values (N, 3 n); None if the layout of the last message changes."""
-        grid = self._grid_of(raw)
-        if grid is None:
-            return None
-        kinds = [('seconds', self._order + 'i4'), ('nanoseconds', self._order + 'u4')]
-        stamp = np.ascontiguousarray(grid[:, 2]).view(kinds)
-        nanoseconds = stamp['seconds'].astype(np.int64) * NANOSECONDS + stamp['nanoseconds']
-        return nanoseconds, grid.take(self._index, axis=1).astype(np.float64)
+    def _decoded(self, joined: bytes) -> Stamps:
+        kind = np.dtype([('sec', 'i4'), ('nanosec', 'u4')]).newbyteorder(self._float.byteorder)
+        count = len(joined) // self._length
+        stamp = np.ndarray(count, kind, joined, STAMP_OFFSET, (self._length,))
+        return np.asarray(stamp['sec'].astype(np.int64) * NANOSECONDS + stamp['nanosec'])
 
-    def _index_in(self, layout: Layout) -> NDArray[np.intp]:
-        columns = np.array(columns_of(self._joints, layout.names), dtype=np.intp)
-        index = np.zeros((3, columns.size), dtype=np.intp)
-        for row, field, array in zip(index, JOINT_STATE_FIELDS, layout.arrays, strict=True):
+    def _places_in(self, layout: Layout) -> NDArray[np.intp]:
+        columns = np.array(layout.columns_of(self._joints), dtype=np.intp)
+        places = np.full((3, columns.size), -1)
+        for row, field, array in zip(places, JOINT_STATE_FIELDS, layout.arrays, strict=True):
             if array.size == 0 and field not in self._required:
                 continue
             if array.size != len(layout.names):
@@ -201,11 +213,11 @@ class JointStateDecoder(_Decoder):
                     f'`{field}` of the message holds {array.size} values for {len(layout.names)} '
                     'names: publish one value for each name'
                 )
-            row[:] = columns + _place(array)
-        return index.reshape(-1)
+            row[:] = columns + array.place
+        return places.ravel()
 
 
-class Float64MultiArrayDecoder(_Decoder):
+class Float64MultiArrayDecoder(Decoder):
     """Decodes std_msgs/Float64MultiArray of an expected size; dimensions are skipped.
 
     Attributes:
@@ -218,40 +230,14 @@ class Float64MultiArrayDecoder(_Decoder):
         Raises:
             MessageError: not plain CDR, or `raw` ends too early.
         """
-        if len(raw) != self._length or self._parts(raw) != self._fixed:
+        if not self._is_known(raw):
             layout = array_layout(raw)
             (array,) = layout.arrays
             if array.size != self.values.size:
                 return array.size
-            self._learn(raw, layout, np.arange(array.size) + _place(array), ORIGIN)
-        self._buffer[_MARGIN:] = raw
-        self._grid.take(self._index, out=self.values, mode='clip')
+            self._learn(raw, layout, np.arange(array.size) + array.place)
+        self._fill(raw)
         return self.values.size
 
-    def decode_all(self, raw: Sequence[bytes]) -> Floats | None:
-        """Values (N, size) of N messages; None if the layout of the last message changes."""
-        grid = self._grid_of(raw)
-        return None if grid is None else grid.take(self._index, axis=1).astype(np.float64)
-
-
-def _place(array: Doubles) -> int:
-    """Index of the first value in the grid."""
-    return (_MARGIN + array.offset) // 8
-
-
-def columns_of(joints: Sequence[str], names: tuple[str, ...]) -> list[int]:
-    """Place of each joint among `names`.
-
-    Raises:
-        MissingJointError: a joint is not among them.
-        DuplicatedJointError: a joint is there twice.
-    """
-    for joint in joints:
-        if joint not in names:
-            raise MissingJointError(joint, names)
-        if names.count(joint) > 1:
-            raise DuplicatedJointError(
-                f'joint {joint!r} appears {names.count(joint)} times in the message '
-                f'({", ".join(names)}): name each joint once'
-            )
-    return [names.index(joint) for joint in joints]
+    def _decoded(self, joined: bytes) -> NDArray[np.int64]:
+        return np.full(len(joined) // self._length, self.values.size, dtype=np.int64)

@@ -14,9 +14,9 @@ from blf_dsc_controller.bags.content import (
     TopicMessages,
     decode_arrays,
     decode_joint_states,
+    first_layout,
 )
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.messages.cdr import joint_state_layout
 from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS
 from blf_dsc_controller.messages.samples import learning_of
 from blf_dsc_controller.messages.topics import (
@@ -72,9 +72,9 @@ def _expected(config: ControllerConfig, run: Rerun) -> dict[Topic, Columns]:
     errors = {'position': samples.xi1, 'velocity': samples.xi2, 'effort': samples.torque}
     monitor: dict[str, Floats] = {}
     if run.monitored:
-        messages = list(run.monitored.values())
-        names = joint_state_layout(messages[0]).names
-        _, values = decode_joint_states(TopicMessages(MONITOR.resolved, raw=messages), names, ())
+        messages = TopicMessages(MONITOR.resolved, raw=list(run.monitored.values()))
+        names = first_layout(messages).names
+        _, values = decode_joint_states(messages, names, ())
         table = np.full((len(samples.xi1), len(names)), np.nan)
         table[list(run.monitored)] = values[:, 0]
         monitor = dict(zip(names, table.T, strict=True))
@@ -130,7 +130,7 @@ def _compare_commands(
 def _compare_stamped(
     recorded: TopicMessages, stamps: Stamps, columns: Columns, *, is_named: bool
 ) -> Comparison:
-    names = joint_state_layout(recorded.raw[0]).names
+    names = first_layout(recorded).names
     stamp, values = decode_joint_states(recorded, names, ())
     known = np.isin(stamp, stamps)
     if is_named:

@@ -12,7 +12,6 @@ import numpy as np
 
 from blf_dsc_controller.bags.content import Content, UnreadableMessageError, decode_joint_states
 from blf_dsc_controller.messages.cdr import MessageError
-from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.messages.topics import JOINT_STATES, LEARNING, REFERENCE, TRACKING_ERROR
 from blf_dsc_controller.run import Floats, Stamps
 
@@ -82,22 +81,8 @@ def arrivals(
     recorded = content.topics[JOINT_STATES]
     count = bisect_left(recorded.received, until)
     recorded = replace(recorded, received=recorded.received[:count], raw=recorded.raw[:count])
-    try:
-        stamps, values = decode_joint_states(recorded, joints, required)
-    except UnreadableMessageError:
-        pass
-    else:
-        return Arrivals(stamps.tolist(), values.reshape(count, -1), {})
-    decoder = JointStateDecoder(joints, required)
-    stamp = [0] * count
-    measurement = np.zeros((count, 3 * len(joints)))
     errors: dict[int, MessageError] = {}
-    for k, raw in enumerate(recorded.raw):
-        try:
-            stamp[k] = decoder.decode(raw)
-            measurement[k] = decoder.values
-        except MessageError as error:
-            errors[k] = error
+    stamps, values = decode_joint_states(recorded, joints, required, errors)
     if len(errors) == count:
         raise UnreadableMessageError(recorded.name, 0, errors[0])
-    return Arrivals(stamp, measurement, errors)
+    return Arrivals(stamps.tolist(), values.reshape(count, -1), errors)

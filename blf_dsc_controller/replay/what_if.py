@@ -19,16 +19,14 @@ from blf_dsc_controller.bags.content import (
     Content,
     NameMap,
     TopicMessages,
-    array_size,
     decode_arrays,
     decode_joint_states,
+    first_layout,
     read_content,
 )
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import begin, controller_of
-from blf_dsc_controller.messages.cdr import joint_state_layout
-from blf_dsc_controller.messages.codecs import columns_of as places_of
 from blf_dsc_controller.messages.samples import columns_of, run_of
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE, JOINT_STATES, TRACKING_ERROR
 from blf_dsc_controller.replay.states import States, law_states
@@ -149,13 +147,14 @@ def _command_values(content: Content, recorded: TopicMessages, joints: Sequence[
     """Commands (m, n): by name, or in the order of the joints, or in that of the joint states."""
     if recorded.type == JOINT_STATE:
         return decode_joint_states(recorded, joints, ('effort',))[1][:, 2]
-    size = array_size(recorded)
+    size = first_layout(recorded).arrays[0].size
     values = decode_arrays(recorded, size)
-    names = joint_state_layout(content.topics[JOINT_STATES].raw[0]).names
+    states = first_layout(content.topics[JOINT_STATES])
+    names = states.names
     if values is None or size not in (len(joints), len(names)):
         reason = (
             f'{recorded.name} has {size} values, but there are {len(joints)} joints, and '
             f'{len(names)} in the joint states ({", ".join(names)}): their order is not known'
         )
         raise BlfDscError(reason)
-    return values if size == len(joints) else values[:, places_of(joints, names)]
+    return values if size == len(joints) else values[:, states.columns_of(joints)]
