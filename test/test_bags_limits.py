@@ -12,7 +12,8 @@ from small_disk import small_disk
 
 from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.recover import recover
-from blf_dsc_controller.bags.writer import BagWriter, DiskFullError, Ring, SplitLimits
+from blf_dsc_controller.bags.ring import Ring
+from blf_dsc_controller.bags.writer import BagWriter, DiskFullError
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import BOUND, JOINT_STATES, STREAM
 
@@ -88,13 +89,13 @@ def test_the_reserve_is_gone_when_the_bag_is_closed(tmp_path):
 @pytest.mark.parametrize(
     ('limits', 'count'),
     [
-        (SplitLimits(size=20_000), 3),  # 200 messages, each with its chunk and index some 290 bytes
-        (SplitLimits(duration=0.5), 4),  # of 2 s
+        ({'split_size': 20_000}, 3),  # 200 messages, each with its chunk and index some 290 bytes
+        ({'split_duration': 0.5}, 4),  # of 2 s
     ],
 )
 def test_a_bag_is_split_and_reads_as_one(tmp_path, limits, count):
     now = 0.0
-    bag = BagWriter(tmp_path / 'bag', flush_interval=0.01, clock=lambda: now, limits=limits)
+    bag = BagWriter(tmp_path / 'bag', flush_interval=0.01, clock=lambda: now, **limits)
     bag.configure(CONFIGURATION, 5)
     first = bag.add_topic('/a', JOINT_STATES.type, [STREAM])
     for k in range(200):

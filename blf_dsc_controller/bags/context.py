@@ -72,6 +72,14 @@ class Losses:
         return f', {self.missed} missed{earlier}'
 
 
+def statistics(written: Mapping[str, int], losses: Mapping[str, Losses]) -> dict[str, str]:
+    """Facts on how many messages of each topic were written and lost."""
+    return {
+        f'{MESSAGES}{topic}': f'{count} written{losses[topic].text()}'
+        for topic, count in written.items()
+    }
+
+
 @dataclass(frozen=True)
 class Context:
     """What a bag records of its run; empty, if another recorder made it.

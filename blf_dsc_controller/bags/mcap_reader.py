@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MCAP files as raw records: a fast reader of whole files, and the parts to salvage damaged ones.
+"""MCAP files as raw records, whole or damaged.
 
-Reading chunk by chunk is three times as fast as a general reader. Lengths are not trusted: content
-that does not fit its length raises MalformedRecordError.
+Reading chunk by chunk is three times as fast as a general reader. Lengths are not trusted: a record
+that does not fit its length is a gap. It ends at the next chunk, searched for byte by byte: a chunk
+holds its length three times, so that hardly anything else looks like one.
 """
 
 from __future__ import annotations
@@ -14,25 +15,31 @@ from mmap import mmap
 from pathlib import Path
 from struct import Struct
 from struct import error as struct_error
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
-from mcap.data_stream import ReadDataStream
+from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from zstandard import ZstdError
 
-MAGIC = b'\x89MCAP0\r\n'
-HEAD = Struct('<BQ')
-"""Opcode and length of the content, before each record."""
-
 Data: TypeAlias = bytes | mmap
 
 StoredMessage: TypeAlias = tuple[int, int, int, int, bytes]
 """Channel number, sequence number, log time [ns], publish time [ns], content."""
 
+INDEX = Struct('<BQHI')
+"""Opcode, length, channel number, bytes of the entries, of a message index."""
+
+_CHUNK_BYTE = bytes([Opcode.CHUNK])
+_MAGIC = b'\x89MCAP0\r\n'
+_HEAD = Struct('<BQ')  # opcode and length of the content, before each record
 _MESSAGE = Struct('<BQHIQQ')
+_BEFORE_COMPRESSION = 41  # bytes from the start of a chunk to the name of its compression
+_COMPRESSIONS = (b'', b'zstd', b'lz4')
+_U32 = Struct('<I')
+_U64 = Struct('<Q')
 _OPCODES = frozenset(Opcode)
 _CHANNEL, _MESSAGE_CODE, _SCHEMA = int(Opcode.CHANNEL), int(Opcode.MESSAGE), int(Opcode.SCHEMA)
 _KINDS: dict[int, Any] = {
@@ -48,14 +55,18 @@ class MalformedRecordError(ValueError):
     """A record whose content does not fit its length."""
 
 
-class _Stream(ReadDataStream):
-    """Raises where the end comes before `length` bytes."""
+class Piece(NamedTuple):
+    """A whole record of a file, or a gap: bytes that make no sense (opcode 0)."""
 
-    def read(self, length: int) -> bytes:
-        data = super().read(length)
-        if len(data) < length:
-            raise MalformedRecordError('the record is too short')
-        return data
+    at: int
+    size: int
+    opcode: int
+    raw: bytes = b''  # the record with its head; empty for a gap
+    reason: str = ''  # of a gap
+
+    def parsed(self) -> Any:
+        """Attachment, channel, chunk, metadata or schema."""
+        return _parse(self.opcode, self.raw[_HEAD.size :])
 
 
 def read_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
@@ -64,23 +75,23 @@ def read_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, in
     Raises:
         MalformedRecordError: the file is damaged.
     """
-    data = path.read_bytes()
     channels: dict[int, Channel] = {}
-    at, opcode = len(MAGIC), 0
-    while opcode != Opcode.DATA_END:
-        opcode, end = record_head(data, at)
+    for piece in scan(path.read_bytes()):
         records = b''
-        if opcode == Opcode.CHUNK:
+        if piece.opcode == Opcode.CHUNK:
             try:
-                records = unpack(read_record(opcode, data[at + HEAD.size : end]))
+                records = unpack(piece.parsed())
             except MalformedRecordError as error:
-                reason = f'the chunk at byte {at} is damaged: {error}'
+                reason = f'the chunk at byte {piece.at} is damaged: {error}'
                 raise MalformedRecordError(reason) from error
-        elif opcode in (Opcode.CHANNEL, Opcode.MESSAGE):
-            records = data[at:end]
+        elif piece.opcode in (Opcode.CHANNEL, Opcode.MESSAGE):
+            records = piece.raw
+        elif piece.opcode == Opcode.DATA_END:
+            return
+        elif piece.reason:
+            raise MalformedRecordError(piece.reason)
         for number, _, log_time, _, raw in messages_in(records, {}, channels, topics):
             yield channels[number].topic, log_time, raw
-        at = end
 
 
 def messages_in(
@@ -110,52 +121,32 @@ def messages_in(
             if topics is None or number in channels:
                 yield number, sequence, log_time, publish_time, records[at + before_content : end]
         else:
-            opcode, end = record_head(records, at)
+            opcode, end = _head(records, at)
             if opcode == _CHANNEL:
-                channel = read_record(opcode, records[at + HEAD.size : end])
+                channel = _parse(opcode, records[at + _HEAD.size : end])
                 if topics is None or channel.topic in topics:
                     channels[channel.id] = channel
             elif opcode == _SCHEMA and topics is None:
-                schema = read_record(opcode, records[at + HEAD.size : end])
+                schema = _parse(opcode, records[at + _HEAD.size : end])
                 schemas[schema.id] = schema
         at = end
 
 
-def record_head(data: Data, at: int) -> tuple[int, int]:
-    """Opcode and end of the record at an offset.
-
-    Raises:
-        MalformedRecordError: there is none, or it is cut off.
-    """
-    if at + HEAD.size > len(data):
-        raise MalformedRecordError('cut off')
-    opcode, length = HEAD.unpack_from(data, at)
-    end = at + HEAD.size + length
-    if end > len(data):
-        raise MalformedRecordError('cut off')
-    if opcode not in _OPCODES:
-        raise MalformedRecordError(f'there is no record of kind {opcode}')
-    return int(opcode), int(end)
-
-
-def read_record(opcode: int, content: bytes) -> Any:
-    """Parse an attachment, channel, chunk, metadata or schema, which must fill its content.
-
-    Raises:
-        MalformedRecordError: it does not, or an attachment's checksum differs.
-    """
-    stream = _Stream(BytesIO(content))
-    try:
-        record = _KINDS[opcode].read(stream)
-    except (McapError, struct_error, OverflowError, UnicodeDecodeError) as error:
-        raise MalformedRecordError('the record is too short') from error
-    if stream.count != len(content):
-        raise MalformedRecordError('the record is too long')
-    if opcode == Opcode.ATTACHMENT:
-        crc = int.from_bytes(content[-4:], 'little')
-        if crc and zlib.crc32(content[:-4]) != crc:
-            raise MalformedRecordError('the checksum differs')
-    return record
+def scan(data: Data) -> Iterator[Piece]:
+    """Whole records and gaps of a file, in its order; together all but the magic bytes."""
+    at = len(_MAGIC) if data[: len(_MAGIC)] == _MAGIC else 0
+    while at < len(data) and not (at == len(data) - len(_MAGIC) and data[at:] == _MAGIC):
+        try:
+            opcode, end = _check(data, at)
+        except MalformedRecordError as error:
+            end = data.find(_CHUNK_BYTE, at + 1)
+            while end >= 0 and not _is_chunk(data, end):
+                end = data.find(_CHUNK_BYTE, end + 1)
+            end = len(data) if end < 0 else end
+            yield Piece(at, end - at, 0, reason=str(error))
+        else:
+            yield Piece(at, end - at, opcode, data[at:end])
+        at = end
 
 
 def unpack(chunk: Chunk) -> bytes:
@@ -174,3 +165,67 @@ def unpack(chunk: Chunk) -> bytes:
     if chunk.uncompressed_crc and zlib.crc32(records) != chunk.uncompressed_crc:
         raise MalformedRecordError('the checksum differs')
     return records
+
+
+def _head(data: Data, at: int) -> tuple[int, int]:
+    """Opcode and end of the record at an offset, or MalformedRecordError."""
+    if at + _HEAD.size > len(data):
+        raise MalformedRecordError('cut off')
+    opcode, length = _HEAD.unpack_from(data, at)
+    end = at + _HEAD.size + length
+    if end > len(data):
+        raise MalformedRecordError('cut off')
+    if opcode not in _OPCODES:
+        raise MalformedRecordError(f'there is no record of kind {opcode}')
+    return int(opcode), int(end)
+
+
+def _check(data: Data, at: int) -> tuple[int, int]:
+    """Opcode and end of a record whose content fits its length, or MalformedRecordError.
+
+    Where the content does not determine its length, another record must follow.
+    """
+    opcode, end = _head(data, at)
+    if opcode == Opcode.CHUNK:
+        if not _is_chunk(data, at):
+            raise MalformedRecordError('the head of a chunk is damaged')
+    elif opcode in _KINDS:
+        _parse(opcode, data[at + _HEAD.size : end])
+    elif opcode == Opcode.MESSAGE_INDEX:
+        entries_at = at + INDEX.size
+        if entries_at > end or entries_at + INDEX.unpack_from(data, at)[-1] != end:
+            raise MalformedRecordError('the record does not fit its length')
+    elif end + _HEAD.size < len(data):
+        _head(data, end)
+    return opcode, end
+
+
+def _is_chunk(data: Data, at: int) -> bool:
+    """Whether the three lengths in the head of a chunk agree, and its compression is known."""
+    name_at = at + _BEFORE_COMPRESSION
+    try:
+        _, length = _HEAD.unpack_from(data, at)
+        (name_length,) = _U32.unpack_from(data, name_at - _U32.size)
+        (packed_length,) = _U64.unpack_from(data, name_at + name_length)
+    except struct_error:
+        return False
+    end = name_at + name_length + _U64.size + packed_length
+    is_known = data[name_at : name_at + name_length] in _COMPRESSIONS
+    return is_known and end == at + _HEAD.size + length and end <= len(data)
+
+
+def _parse(opcode: int, content: bytes) -> Any:
+    """Record of one of _KINDS, or MalformedRecordError: written again, it must be the same.
+
+    A checksum of an attachment may be left out, as zero.
+    """
+    try:
+        record = _KINDS[opcode].read(ReadDataStream(BytesIO(content)))
+    except (McapError, struct_error, OverflowError, UnicodeDecodeError) as error:
+        raise MalformedRecordError('the record is too short') from error
+    builder = RecordBuilder()
+    record.write(builder)
+    again = builder.end()[_HEAD.size :]  # type: ignore[no-untyped-call]
+    if again[:-4] != content[:-4] or content[-4:] not in (again[-4:], bytes(4)):
+        raise MalformedRecordError('the record does not fit its length or checksum')
+    return record

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, TypeAlias
 
 import yaml
+from rosbags.rosbag2.errors import ReaderError
+from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.topics import FOREVER, Quality
@@ -15,6 +17,9 @@ from blf_dsc_controller.messages.types import Definition
 
 VERSION = 9
 ROS_DISTRO = 'jazzy'
+
+Profile: TypeAlias = dict[str, Any]
+"""Quality of service of a publisher as rosbag2 writes it."""
 
 _DURATIONS = ('deadline', 'lifespan', 'liveliness_lease_duration')
 
@@ -25,9 +30,13 @@ class TopicInformation:
 
     name: str
     type: str
-    offered: tuple[Quality, ...]
+    offered: list[Profile]
     definition: Definition
     message_count: int = 0
+
+    def offered_text(self) -> str:
+        """Text for the entry `offered_qos_profiles` of a channel."""
+        return _dump(self.offered)
 
 
 @dataclass
@@ -67,7 +76,7 @@ class BagInformation:
                     'name': topic.name,
                     'type': topic.type,
                     'serialization_format': 'cdr',
-                    'offered_qos_profiles': _quality_trees(topic.offered),
+                    'offered_qos_profiles': topic.offered,
                     'type_description_hash': topic.definition.hash,
                 },
                 'message_count': topic.message_count,
@@ -95,36 +104,21 @@ class BagInformation:
         }
 
 
-def quality_text(offered: Iterable[Quality]) -> str:
-    """Text for the entry `offered_qos_profiles` of a channel."""
-    return _dump(_quality_trees(offered))
+def profile_of(quality: Quality) -> Profile:
+    """Plain data of a quality of service, in the order of rosbag2."""
+    profile = {'history': quality.history, **asdict(quality)}
+    for name in _DURATIONS:
+        seconds, nanoseconds = divmod(profile[name], NANOSECONDS)
+        profile[name] = {'sec': seconds, 'nsec': nanoseconds}
+    return {**profile, 'avoid_ros_namespace_conventions': False}
 
 
-def parse_qualities(text: str) -> tuple[Quality, ...]:
-    """Qualities of service in such a text; none, if it is something else."""
+def parse_profiles(text: str) -> list[Profile]:
+    """Profiles in such a text of any rosbag2; none, if it is something else."""
     try:
-        return tuple(
-            Quality(**{one.name: _plain(tree[one.name]) for one in fields(Quality)})
-            for tree in yaml.safe_load(text) or ()
-        )
-    except (yaml.YAMLError, KeyError, TypeError, AttributeError):
-        return ()
-
-
-def _plain(value: Any) -> Any:
-    """A duration in ns; everything else as it is."""
-    return value['sec'] * NANOSECONDS + value['nsec'] if isinstance(value, dict) else value
-
-
-def _quality_trees(offered: Iterable[Quality]) -> list[dict[str, Any]]:
-    trees = []
-    for quality in offered:
-        tree = {'history': quality.history, **asdict(quality)}  # in the order of rosbag2
-        for name in _DURATIONS:
-            seconds, nanoseconds = divmod(tree[name], NANOSECONDS)
-            tree[name] = {'sec': seconds, 'nsec': nanoseconds}
-        trees.append({**tree, 'avoid_ros_namespace_conventions': False})
-    return trees
+        return [{**profile} for profile in dump_qos_v9(parse_qos(text))]
+    except (ReaderError, KeyError, TypeError, AttributeError):
+        return []
 
 
 def _period(files: Sequence[FileInformation]) -> dict[str, dict[str, int]]:

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make a clean bag of what a damaged one still holds; the damaged one is only read.
-
-Where a record makes no sense, the next chunk is searched for byte by byte: a chunk holds its length
-three times, so that hardly anything else looks like one.
-"""
+"""Make a clean bag of what a damaged one still holds; the damaged one is only read."""
 
 from __future__ import annotations
 
@@ -12,49 +8,28 @@ from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from struct import Struct
-from struct import error as struct_error
-from typing import NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Schema
 
-from blf_dsc_controller.bags.context import ATTACHMENT, MESSAGES, RECORD, Losses
+from blf_dsc_controller.bags.context import ATTACHMENT, MESSAGES, RECORD, Losses, statistics
 from blf_dsc_controller.bags.mcap_reader import (
-    HEAD,
-    MAGIC,
+    INDEX,
     Data,
     MalformedRecordError,
+    Piece,
     StoredMessage,
     messages_in,
-    read_record,
-    record_head,
+    scan,
     unpack,
 )
-from blf_dsc_controller.bags.mcap_writer import CHANNEL_RECORD, channel_checksum
-from blf_dsc_controller.bags.metadata import parse_qualities
+from blf_dsc_controller.bags.metadata import parse_profiles
 from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.bags.writer import CHANNEL_RECORD, BagWriter, channel_checksum
 from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.types import Definition, UnknownTypeError, definition
 
-_TIMES_AND_SIZES = 28  # bytes from the start of a chunk's content to its compression
-_COMPRESSIONS = (b'', b'zstd', b'lz4')
-_CHUNK_BYTE = bytes([Opcode.CHUNK])
-_INDEX = Struct('<HI')  # channel number, bytes of the entries
 _INDEX_ENTRY = 16  # bytes
-_U32 = Struct('<I')
-_U64 = Struct('<Q')
-
-
-class Piece(NamedTuple):
-    """A whole record of a file, or a gap: bytes that make no sense (opcode 0)."""
-
-    at: int
-    size: int
-    opcode: int
-    content: bytes = b''
-    reason: str = ''
 
 
 @dataclass
@@ -119,11 +94,7 @@ def recover(path: Path, out: Path) -> Recovery:
             if not salvage.is_complete:
                 recovery.unfinished.append((file.name, salvage.last))
         recovery.messages = bag.message_counts
-        statistics = {
-            f'{MESSAGES}{topic}': f'{count} written{recovery.missing[topic].text()}'
-            for topic, count in recovery.messages.items()
-        }
-        bag.note({'recovered_from': str(path), **statistics})
+        bag.note({'recovered_from': str(path)} | statistics(bag.message_counts, recovery.missing))
     return recovery
 
 
@@ -182,7 +153,7 @@ class _Transfer:
             known = known._replace(text=text, encoding=schema.encoding)
         if channel.metadata.get('topic_type_hash'):
             known = known._replace(hash=channel.metadata['topic_type_hash'])
-        offered = parse_qualities(channel.metadata.get('offered_qos_profiles', ''))
+        offered = parse_profiles(channel.metadata.get('offered_qos_profiles', ''))
         handle = self.bag.add_topic(channel.topic, type_name, offered, known)
         self.handles[channel.topic] = handle
         self.missing[channel.topic] = Losses(len(offered))
@@ -207,9 +178,8 @@ class Salvage:
         lost_chunk: Loss | None = None
         counts: list[tuple[Loss, int, int]] = []
         for piece in scan(data):
-            opcode, content = piece.opcode, piece.content
-            if opcode == Opcode.CHUNK:
-                chunk, lost_chunk = read_record(opcode, content), None
+            if piece.opcode == Opcode.CHUNK:
+                chunk, lost_chunk = piece.parsed(), None
                 try:
                     records = unpack(chunk)
                 except MalformedRecordError as error:
@@ -218,14 +188,13 @@ class Salvage:
                     lost_chunk.end = chunk.message_end_time
                 else:
                     yield from self._messages_in(records, piece, 'part of a chunk: ')
-            elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
-                record = HEAD.pack(opcode, len(content)) + content
-                yield from self._messages_in(record, piece, '')
-            elif opcode == Opcode.MESSAGE_INDEX and lost_chunk is not None:
-                number, size = _INDEX.unpack_from(content)
+            elif piece.opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+                yield from self._messages_in(piece.raw, piece, '')
+            elif piece.opcode == Opcode.MESSAGE_INDEX and lost_chunk is not None:
+                *_, number, size = INDEX.unpack_from(piece.raw)
                 counts.append((lost_chunk, number, size // _INDEX_ENTRY))
-            elif opcode:
-                self._describe(opcode, content)
+            elif piece.opcode:
+                self._describe(piece)
             elif not self.is_complete:
                 self._lose(piece, piece.reason)
         for loss, number, count in counts:
@@ -265,37 +234,19 @@ class Salvage:
         except MalformedRecordError as error:
             self._lose(piece, f'{kind}{error}')
 
-    def _describe(self, opcode: int, content: bytes) -> None:
-        if opcode == Opcode.ATTACHMENT:
-            self.attachments.append(read_record(opcode, content))
-        elif opcode == Opcode.METADATA:
-            record = read_record(opcode, content)
+    def _describe(self, piece: Piece) -> None:
+        if piece.opcode == Opcode.ATTACHMENT:
+            self.attachments.append(piece.parsed())
+        elif piece.opcode == Opcode.METADATA:
+            record = piece.parsed()
             self.metadata.setdefault(record.name, {}).update(record.metadata)
-        elif opcode == Opcode.DATA_END:
+        elif piece.opcode == Opcode.DATA_END:
             self.is_complete = True
 
     def _lose(self, piece: Piece, reason: str) -> Loss:
         loss = Loss(self.path.name, piece.at, piece.size, reason, self.last)
         self.losses.append(loss)
         return loss
-
-
-def scan(data: Data) -> Iterator[Piece]:
-    """Whole records and gaps of a file, in its order; together all but the magic bytes."""
-    at = len(MAGIC) if data[: len(MAGIC)] == MAGIC else 0
-    while at < len(data) and not (at == len(data) - len(MAGIC) and data[at:] == MAGIC):
-        try:
-            opcode, end = _check_record(data, at)
-        except MalformedRecordError as error:
-            end = data.find(_CHUNK_BYTE, at + 1)
-            while end >= 0 and not _is_chunk(data, end):
-                end = data.find(_CHUNK_BYTE, end + 1)
-            end = len(data) if end < 0 else end
-            yield Piece(at, end - at, 0, reason=str(error))
-        else:
-            content = data[at + HEAD.size : end]
-            yield Piece(at, len(content), opcode, content)
-        at = end
 
 
 def format_time(stamp: int) -> str:
@@ -306,41 +257,3 @@ def format_time(stamp: int) -> str:
     except (OverflowError, OSError, ValueError):
         return plain
     return f'{plain} ({moment:%Y-%m-%d %H:%M:%S} UTC)'
-
-
-def _check_record(data: Data, at: int) -> tuple[int, int]:
-    """Opcode and end of a record whose content fits its length, or MalformedRecordError.
-
-    Where the content does not determine its length, another record must follow.
-    """
-    opcode, end = record_head(data, at)
-    content_at = at + HEAD.size
-    if opcode == Opcode.CHUNK:
-        if not _is_chunk(data, at):
-            raise MalformedRecordError('the head of a chunk is damaged')
-    elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT):
-        read_record(opcode, data[content_at:end])
-    elif opcode == Opcode.MESSAGE_INDEX:
-        entries_at = content_at + _INDEX.size
-        if entries_at > end or entries_at + _INDEX.unpack_from(data, content_at)[1] != end:
-            raise MalformedRecordError('the record does not fit its length')
-    elif end + HEAD.size < len(data):
-        record_head(data, end)
-    return opcode, end
-
-
-def _is_chunk(data: Data, at: int) -> bool:
-    """Whether the three lengths in the head of a chunk agree, and its compression is known."""
-    name_at = at + HEAD.size + _TIMES_AND_SIZES + _U32.size
-    try:
-        _, length = HEAD.unpack_from(data, at)
-        (name_length,) = _U32.unpack_from(data, name_at - _U32.size)
-        (packed_length,) = _U64.unpack_from(data, name_at + name_length)
-    except struct_error:
-        return False
-    end = name_at + name_length + _U64.size + packed_length
-    return (
-        end == at + HEAD.size + length
-        and end <= len(data)
-        and data[name_at : name_at + name_length] in _COMPRESSIONS
-    )

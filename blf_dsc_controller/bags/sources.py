@@ -6,10 +6,12 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import yaml
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
+from rosbags.rosbag2.storage_mcap import McapReader
 
 from blf_dsc_controller.bags.mcap_reader import read_messages
 from blf_dsc_controller.errors import BlfDscError
@@ -29,9 +31,8 @@ class OpenBag:
     `held` is name and type, empty where unknown, of each topic; `counts` its number of messages.
     """
 
-    def __init__(self, reader: Reader1 | Reader2, files: list[Path]) -> None:
+    def __init__(self, reader: Reader1 | Reader2) -> None:
         self._reader = reader
-        self._files = files
         held = dict.fromkeys((one.topic, one.msgtype) for one in reader.connections)
         self.held = [(name, kind.replace('__schemaless__', '')) for name, kind in held]
         self.counts = {name: reader.topics[name].msgcount for name, _ in self.held}
@@ -41,12 +42,13 @@ class OpenBag:
 
         Those of one topic come nearly in the order of their reception.
         """
-        if self._files:
-            for file in self._files:
+        files = _mcap_files(self._reader)
+        if files:
+            for file in files:
                 yield from read_messages(file, topics)
             return
-        # The common types serialise alike in ROS 1 and 2 but for padding and `seq` of the header.
         is_ros1 = isinstance(self._reader, Reader1)
+        # The common types serialise alike in ROS 1 and 2 but for padding and `seq` of the header.
         chosen = [one for one in self._reader.connections if one.topic in topics]
         for connection, received, raw in self._reader.messages(chosen) if chosen else ():
             cdr = typestore().ros1_to_cdr(raw, connection.msgtype) if is_ros1 else raw
@@ -63,24 +65,22 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     try:
         if path.suffix == '.bag':
             with Reader1(path) as reader1:
-                yield OpenBag(reader1, [])
+                yield OpenBag(reader1)
         else:
             with Reader2(path) as reader2:
-                yield OpenBag(reader2, _mcap_files(path))
+                yield OpenBag(reader2)
     except BlfDscError:
         raise
     except Exception as error:  # a damaged file makes the library raise nearly anything
         raise BagError(f'{path} cannot be read as a bag: {_reason(path, error)}') from error
 
 
-def _mcap_files(path: Path) -> list[Path]:
+def _mcap_files(reader: Reader1 | Reader2) -> list[Path]:
     """Files of a bag in their order, if all are plain MCAP; else none."""
-    files = [path]
-    if path.is_dir():
-        tree = yaml.safe_load((path / 'metadata.yaml').read_text(encoding='utf-8'))
-        names = tree['rosbag2_bagfile_information']['relative_file_paths']
-        files = [path / name for name in names]
-    return files if all(file.suffix == '.mcap' for file in files) else []
+    if isinstance(reader, Reader1) or reader.compression_mode:
+        return []
+    storages: list[Any] = getattr(reader.storage, 'storages', [reader.storage])
+    return [Path(str(one.path)) for one in storages if isinstance(one, McapReader)]
 
 
 def _reason(path: Path, error: Exception) -> str:

@@ -4,23 +4,35 @@
 from __future__ import annotations
 
 import time
-from collections import Counter, deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from pathlib import Path
-from typing import TypeAlias
+from typing import IO, cast
+from zlib import crc32
 
+from mcap.writer import CompressionType, Writer
+
+from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.context import ATTACHMENT, RECORD, facts_of
-from blf_dsc_controller.bags.mcap_writer import McapFile
-from blf_dsc_controller.bags.metadata import BagInformation, TopicInformation
+from blf_dsc_controller.bags.metadata import (
+    BagInformation,
+    FileInformation,
+    Profile,
+    TopicInformation,
+    profile_of,
+)
+from blf_dsc_controller.bags.reserved_file import ReservedFile
 from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.topics import Quality
 from blf_dsc_controller.messages.types import Definition, definition
 
-_Message: TypeAlias = tuple[int, bytes, int, int, int]
-"""As `write` takes it."""
+CHANNEL_RECORD = 'blf_dsc_controller channel '
+"""Start of the name of a metadata record that repeats a topic outside of the chunks."""
+
+_COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
+_CHUNK_SIZE = 1 << 20
+_CHUNK_ENTRY = 100  # bytes that a chunk takes in the index at the end ...
+_CHANNEL_ENTRY = 16  # ... and for each channel
 
 
 class DiskFullError(BagError):
@@ -34,20 +46,13 @@ class DiskFullError(BagError):
         )
 
 
-@dataclass(frozen=True)
-class SplitLimits:
-    """When the next file of a bag is begun: at a size [bytes], or after a time [s]; inf: never."""
-
-    size: float = inf
-    duration: float = inf
-
-
 class BagWriter:
     """Writes serialised messages into a new bag.
 
     Data leaves the process within `flush_interval` [s] plus the time to the next call of `write` or
     `flush_if_due`; then it survives the process being killed. Without an interval it leaves when a
-    chunk is full. The chunks are compressed by `none` or `zstd`.
+    chunk is full. The chunks are compressed by `none` or `zstd`. The next file of the bag is begun
+    at `split_size` [bytes] or after `split_duration` [s].
 
     Raises:
         BagError: `path` exists already.
@@ -60,11 +65,15 @@ class BagWriter:
         compression: str = 'none',
         flush_interval: float | None = 0.1,
         clock: Callable[[], float] = time.monotonic,
-        limits: SplitLimits = SplitLimits(),
+        split_size: float = inf,
+        split_duration: float = inf,
     ) -> None:
         self.path = Path(path)
-        self._compression = compression
-        self._limits = limits
+        self.closed = False
+        self._compression = _COMPRESSIONS[compression]
+        self._flush_interval = inf if flush_interval is None else flush_interval
+        self._clock = clock
+        self._split_size, self._split_duration = split_size, split_duration
         self._bag = BagInformation()
         self._configuration: tuple[str, int] | None = None
         try:
@@ -73,17 +82,14 @@ class BagWriter:
             raise BagError(
                 f'{path} exists already and is not overwritten: choose another folder or remove it'
             ) from None
-        self._file = self._new_file()
-        self._flush_interval = inf if flush_interval is None else flush_interval
-        self._clock = clock
-        self._flushed = self._began = clock()
-        self.closed = False
+        self._begin_file()
+        self._flushed = self._began
 
     def add_topic(
         self,
         name: str,
         type_name: str,
-        offered: Sequence[Quality],
+        offered: Sequence[Quality | Profile],
         known: Definition | None = None,
     ) -> int:
         """Add a topic by its full name, with the quality of service of each publisher.
@@ -95,9 +101,10 @@ class BagWriter:
             UnknownTypeError: the definition is left out and the type is no common one of Jazzy.
         """
         found = definition(type_name) if known is None else known
-        topic = TopicInformation(name, type_name, tuple(offered), found)
+        profiles = [profile_of(one) if isinstance(one, Quality) else one for one in offered]
+        topic = TopicInformation(name, type_name, profiles, found)
         self._bag.topics.append(topic)
-        return self._file.add_channel(topic)
+        return self._add_channel(topic)
 
     def write(
         self,
@@ -115,49 +122,50 @@ class BagWriter:
         Raises:
             DiskFullError: there is no room left; the bag is complete and closed.
         """
-        self._file.write(
-            handle, raw, log_time, log_time if publish_time is None else publish_time, sequence
-        )
+        published = log_time if publish_time is None else publish_time
+        self._writer.add_message(handle, log_time, raw, published, sequence)
         self._bag.topics[handle - 1].message_count += 1
+        file = self._bag.files[-1]
+        file.message_count += 1
+        file.starting_time = min(file.starting_time, log_time)
+        file.ending_time = max(file.ending_time, log_time)
         self.flush_if_due()
 
     def configure(self, configuration: str, known_at: int | None = None) -> None:
         """Store a parameter file of all nodes known so far, received now or at `known_at` [ns]."""
         self._configuration = configuration, time.time_ns() if known_at is None else known_at
         self._bag.custom_data.update(facts_of(configuration))
-        self._describe(self._file)
+        self._store_context()
 
     def note(self, facts: dict[str, str]) -> None:
         """Store facts of the run by name."""
         self._bag.custom_data.update(facts)
-        self._file.note(RECORD, self._bag.custom_data)
+        self._writer.add_metadata(RECORD, self._bag.custom_data)
 
     def flush_if_due(self) -> None:
         """Flush if the flush interval has passed; DiskFullError as in `write`."""
-        if self._file.is_full or self._clock() - self._flushed >= self._flush_interval:
+        if self._stream.is_full or self._clock() - self._flushed >= self._flush_interval:
             self.flush()
 
     def flush(self) -> None:
         """Pass everything written so far to the operating system; DiskFullError as in `write`."""
-        self._file.flush()
+        self._end_chunk()
         self._flushed = self._clock()
-        if self._file.is_full:
+        if self._stream.is_full:
             self.close()
             raise DiskFullError(self.path, sum(self.message_counts.values()))
-        if (
-            self._file.size >= self._limits.size
-            or self._flushed - self._began >= self._limits.duration
-        ):
-            self._end(self._file)
-            self._file = self._new_file()
-            self._began = self._flushed
+        duration = self._flushed - self._began
+        if self._stream.tell() >= self._split_size or duration >= self._split_duration:
+            self._end_file()
+            self._begin_file()
 
     def close(self) -> None:
         """Complete the bag; a second call does nothing."""
         if self.closed:
             return
         self.closed = True
-        self._end(self._file)
+        self._end_chunk()
+        self._end_file()
         (self.path / 'metadata.yaml').write_text(self._bag.file_text(), encoding='utf-8')
 
     @property
@@ -171,100 +179,65 @@ class BagWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _new_file(self) -> McapFile:
+    def _begin_file(self) -> None:
         """Begin the next file, with the topics of the one before it."""
-        name = f'{self.path.name}_{len(self._bag.files)}.mcap'
-        file = McapFile(self.path / name, self._compression)
-        self._bag.files.append(file.information)
-        file.describe(self._bag)
+        file = FileInformation(f'{self.path.name}_{len(self._bag.files)}.mcap')
+        self._bag.files.append(file)
+        self._stream = ReservedFile(self.path / file.path)
+        self._writer = Writer(
+            cast('IO[bytes]', self._stream), chunk_size=_CHUNK_SIZE, compression=self._compression
+        )
+        self._writer.start(profile='ros2', library=f'blf_dsc_controller {__version__}')
+        self._schemas: dict[str, int] = {}
+        self._index_size = 0
+        self._describe()
         for topic in self._bag.topics:
-            file.add_channel(topic)
-        self._describe(file)
-        return file
+            self._add_channel(topic)
+        self._store_context()
+        self._began = self._clock()
 
-    def _describe(self, file: McapFile) -> None:
-        if self._bag.custom_data:
-            file.note(RECORD, self._bag.custom_data)
-        if self._configuration is not None:
-            text, known_at = self._configuration
-            file.attach(ATTACHMENT, 'application/yaml', text, known_at)
+    def _describe(self) -> None:
+        """Store what is known of the bag; rosbag2 reads the last such record of a file."""
+        self._writer.add_metadata('rosbag2', {'serialized_metadata': self._bag.record_text()})
 
-    def _end(self, file: McapFile) -> None:
-        file.flush()
-        file.describe(self._bag)
-        file.close()
+    def _add_channel(self, topic: TopicInformation) -> int:
+        """Add a topic to the file and return its number, the same in each file.
 
-
-class Ring:
-    """A black box: the messages of the last `seconds` in memory, written out on demand.
-
-    It also keeps the last message of each latched topic however old it is. It takes the place of a
-    BagWriter; `message_counts` are all messages written so far, by topic.
-    """
-
-    closed = False
-
-    def __init__(self, seconds: float, compression: str) -> None:
-        self.message_counts: Counter[str] = Counter()
-        self._span = round(seconds * NANOSECONDS)
-        self._compression = compression
-        self._topics: list[tuple[str, str, tuple[Quality, ...]]] = []
-        self._messages: deque[_Message] = deque()
-        self._latched: dict[int, _Message] = {}
-        self._configuration: tuple[str, int] | None = None
-
-    def add_topic(self, name: str, type_name: str, offered: Sequence[Quality]) -> int:
-        """Add a topic and return its handle."""
-        self._topics.append((name, type_name, tuple(offered)))
-        self.message_counts[name] = 0
-        return len(self._topics)
-
-    def write(
-        self, handle: int, raw: bytes, log_time: int, publish_time: int, sequence: int
-    ) -> None:
-        """Keep a message, and drop those that are too old by now."""
-        self.message_counts[self._topics[handle - 1][0]] += 1
-        self._messages.append((handle, raw, log_time, publish_time, sequence))
-        while self._messages[0][2] < log_time - self._span:
-            old = self._messages.popleft()
-            if self._is_latched(old[0]):
-                self._latched[old[0]] = old
-
-    def configure(self, configuration: str, known_at: int | None = None) -> None:
-        """Keep the configuration of the run, as in BagWriter."""
-        self._configuration = configuration, time.time_ns() if known_at is None else known_at
-
-    def note(self, facts: dict[str, str]) -> None:
-        """Do nothing: each dump has facts of its own."""
-
-    def flush_if_due(self) -> None:
-        """Do nothing: the messages stay in memory."""
-
-    def flush(self) -> None:
-        """Do nothing: the messages stay in memory."""
-
-    def close(self) -> None:
-        """Do nothing: what was not dumped is dropped."""
-
-    def dump(self, path: Path, facts: dict[str, str]) -> int:
-        """Write the kept messages as a bag and return their number; the ring continues.
-
-        Raises:
-            BagError: `path` exists already.
-            DiskFullError: there is no room for all of it.
+        It is stored in the chunk of its first message, in the index at the end, and in a record of
+        its own, for a file that has lost both.
         """
-        kept = [*self._latched.values(), *self._messages]
-        with BagWriter(path, compression=self._compression, flush_interval=None) as bag:
-            if self._configuration is not None:
-                bag.configure(*self._configuration)
-            bag.note(facts)
-            for name, type_name, offered in self._topics:
-                bag.add_topic(name, type_name, offered)
-            for message in kept:
-                bag.write(*message)
-            bag.flush()
-        return len(kept)
+        text, hash_, encoding = topic.definition
+        if topic.type not in self._schemas:
+            schema = self._writer.register_schema(topic.type, encoding, text.encode())
+            self._schemas[topic.type] = schema
+        metadata = {'offered_qos_profiles': topic.offered_text(), 'topic_type_hash': hash_}
+        metadata['checksum'] = channel_checksum(topic.name, topic.type, metadata)
+        schema = self._schemas[topic.type]
+        number = self._writer.register_channel(topic.name, 'cdr', schema, metadata)
+        repeated = {'topic': topic.name, 'topic_type': topic.type, **metadata}
+        self._writer.add_metadata(f'{CHANNEL_RECORD}{number}', repeated)
+        return number
 
-    def _is_latched(self, handle: int) -> bool:
-        offered = self._topics[handle - 1][2]
-        return bool(offered) and all(one.durability == 'transient_local' for one in offered)
+    def _store_context(self) -> None:
+        if self._bag.custom_data:
+            self._writer.add_metadata(RECORD, self._bag.custom_data)
+        if self._configuration is not None:
+            text, at = self._configuration
+            self._writer.add_attachment(at, at, ATTACHMENT, 'application/yaml', text.encode())
+
+    def _end_chunk(self) -> None:
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._stream.flush()
+        self._index_size += _CHUNK_ENTRY + _CHANNEL_ENTRY * len(self._bag.topics)
+        self._stream.reserve(self._index_size)
+
+    def _end_file(self) -> None:
+        self._describe()
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._stream.close()
+
+
+def channel_checksum(topic: str, type_name: str, metadata: Mapping[str, str]) -> str:
+    """CRC-32 of a channel, which is repeated where no checksum of MCAP protects it."""
+    profiles, type_hash = metadata.get('offered_qos_profiles'), metadata.get('topic_type_hash')
+    return f'{crc32(repr((topic, type_name, profiles, type_hash)).encode()):08x}'

@@ -12,9 +12,10 @@ from typing import Any
 
 from std_srvs.srv import Trigger
 
-from blf_dsc_controller.bags.context import MESSAGES, Losses
+from blf_dsc_controller.bags.context import Losses, statistics
+from blf_dsc_controller.bags.ring import Ring
 from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.bags.writer import BagWriter, DiskFullError, Ring, SplitLimits
+from blf_dsc_controller.bags.writer import BagWriter, DiskFullError
 from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.configuration.params_file import dumps
 from blf_dsc_controller.errors import BlfDscError
@@ -65,12 +66,12 @@ class BagRecorderNode(PlainNode):
 
     def _record_bag(self) -> BagWriter | Ring:
         config = self._config
-        limits = SplitLimits(config.split_size * _MEGABYTE or inf, config.split_duration or inf)
         bag = BagWriter(
             config.output,
             compression=config.compression,
             flush_interval=_FLUSH_INTERVAL,
-            limits=limits,
+            split_size=config.split_size * _MEGABYTE or inf,
+            split_duration=config.split_duration or inf,
         )
         self.get_logger().info(f'recording into {bag.path}')
         return bag
@@ -107,7 +108,7 @@ class BagRecorderNode(PlainNode):
             self._record()
         self._raw_subscriptions.close()
         if not self._sink.closed:
-            self._sink.note(self._statistics())
+            self._sink.note(statistics(self._sink.message_counts, self._losses))
             self._sink.close()
         for line in self._summary():
             self.get_logger().info(line)
@@ -196,12 +197,6 @@ class BagRecorderNode(PlainNode):
                 f'the bag cannot be written any further: {error}; what was written before is '
                 'saved by bag_recover'
             )
-
-    def _statistics(self) -> dict[str, str]:
-        return {
-            f'{MESSAGES}{topic}': f'{count} written{self._losses[topic].text()}'
-            for topic, count in self._sink.message_counts.items()
-        }
 
     def _summary(self) -> Iterator[str]:
         for topic in self._chosen.difference(self._losses, self._skipped):
