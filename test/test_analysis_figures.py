@@ -67,6 +67,14 @@ def test_a_violation_is_marked(run, tmp_path):
         assert red > 100 if marked else red == 0
 
 
+def test_mouth_of_a_funnel_does_not_hide_the_error(run, tmp_path):
+    draw(run, tmp_path)
+    shown = amount(pixels(tmp_path / 'tracking.png'), '#0072B2')
+    widening = np.linspace(20.0, 1.0, len(run.bound))[:, None]
+    draw(dataclasses.replace(run, bound=run.bound * widening), tmp_path)
+    assert amount(pixels(tmp_path / 'tracking.png'), '#0072B2') > 0.8 * shown
+
+
 def test_less_in_the_bag_is_a_smaller_picture(run, tmp_path):
     draw(run, tmp_path)
     full = [pixels(tmp_path / name).shape for name in ('tracking.png', 'parameters.png')]

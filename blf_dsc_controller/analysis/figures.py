@@ -144,19 +144,21 @@ def _draw_panel(axes: Axes, panel: Panel, runs: Sequence[str], until: float) -> 
     for row, mark in enumerate(panel.marks):
         if mark.time <= until:
             _draw_mark(axes, mark, row)
+    _set_scale(axes, panel)
+
+
+def _set_scale(axes: Axes, panel: Panel) -> None:
+    """Scale the axis of values; over two decades where there is next to nothing to see."""
+    if panel.span:
+        axes.set_ylim(-panel.span, panel.span)
     if panel.log:
-        _set_logarithmic(axes)
+        axes.set_yscale('log')
+        low, high = axes.get_ylim()
+        if high < _FLAT * low:
+            axes.set_ylim(low / _DECADE, high * _DECADE)
     if panel.unit == '%':
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g} %'))
     axes.set_ylabel(panel.symbol or f'[{panel.unit}]')
-
-
-def _set_logarithmic(axes: Axes) -> None:
-    """Set a logarithmic axis, over two decades where there is next to nothing to see."""
-    axes.set_yscale('log')
-    low, high = axes.get_ylim()
-    if high < _FLAT * low:
-        axes.set_ylim(low / _DECADE, high * _DECADE)
 
 
 def _draw_line(axes: Axes, line: Line, until: float, *, label: str, **style: Any) -> None:

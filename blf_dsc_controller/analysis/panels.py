@@ -44,6 +44,7 @@ _STOPPED = GROUPS[:3]
 _CHANGED = ('Tracking', 'Parameters')
 _LEARNING = GROUPS[3:7]
 _LEAST = 1e-12  # J, the smallest value on a logarithmic axis
+_ROOM = 1.2  # of the largest value shown, to either side
 _LEAST_ERROR = 1e-5  # %
 
 
@@ -82,6 +83,7 @@ class Panel:
     log: bool = False
     histogram: bool = False
     marks: tuple[Mark, ...] = ()
+    span: float = 0.0  # pictures show so much of both signs; 0: everything
 
 
 def panels(runs: Sequence[Run]) -> list[Panel]:
@@ -105,6 +107,7 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
                 lines=(*before.lines, *(line._replace(run=k) for line in panel.lines)),
                 marks=(*before.marks, *(mark._replace(run=k) for mark in marks)),
                 note=panel.note if len(runs) == 1 else '',
+                span=panel.span if len(runs) == 1 else 0.0,
             )
     drawn = [panel for panel in found.values() if panel.lines]
     return sorted(drawn, key=lambda panel: GROUPS.index(panel.group))
@@ -131,17 +134,19 @@ def _motion(run: Run) -> Iterator[Panel]:
 
 
 def _error(run: Run, i: int, error: Floats) -> Panel:
-    lines, marks, note = [Line('error', run.time, error)], [], ''
+    lines, marks, note, span = [Line('error', run.time, error)], [], '', 0.0
     violated = outside(run)
     if run.bound is not None and violated is not None:
         bound = 1e3 * run.bound[:, i]
         lines.append(Line('bound', run.time, bound, MUTED, True, True, True))  # noqa: FBT003
         first = run.time[violated[:, i]][:1].tolist()
         marks = [Mark(time, f'outside from {time:.3f} s', ALARM) for time in first]
+        if bound[0] > bound[-1]:  # a funnel: its mouth would leave nothing to see of the error
+            span = _ROOM * np.nanmax(np.abs(error), initial=bound[-1])
     if not np.isnan(error).all():
         note = f'max {np.nanmax(np.abs(error)):.3g}, rms {rms(error):.3g}'
     title = f'error of {run.joints[i]}'
-    return Panel('Tracking', title, 'mrad', tuple(lines), note, marks=tuple(marks))
+    return Panel('Tracking', title, 'mrad', tuple(lines), note, marks=tuple(marks), span=span)
 
 
 def _learning(run: Run) -> Iterator[Panel]:
