@@ -3,17 +3,22 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
+from random_arm import random_urdf
 
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.configuration.reference import MotionLimits
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.law.exciting_reference import ExcitationProblem, search
+from blf_dsc_controller.law.factory import estimate_names, settings_of_config
+from blf_dsc_controller.reference.clearance import Clearance
 from blf_dsc_controller.reference.limits import MotionError
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -104,3 +109,97 @@ def test_the_tool_writes_a_preset_that_loads(tmp_path, capsys):
     assert 'exists already' in capsys.readouterr().err
     assert main(['excite', str(tmp_path / 'other.yaml'), '--guess', '1.0']) == 1
     assert '--guess has 1 values' in capsys.readouterr().err
+
+
+# Arms from a URDF.
+
+LIGHT = {'robot.payload': 0.2, 'torque.limit': [60.0] * 3}  # of a random arm, to leave it room
+
+
+@cache
+def chain_problem():
+    """A random arm of three joints, whose base stands high above the floor."""
+    urdf = random_urdf(3, seed=5)[0]
+    config = build(ControllerConfig, {'robot.urdf': urdf, 'robot.tip': 'tip', **LIGHT})
+    clearance = Clearance(config.robot.chain(config.joints), 0.02, -3.0)
+    guess = np.array(config.learning.initial_estimate)
+    return config, ExcitationProblem(config, guess, 0.8, 1, clearance)
+
+
+def reference_of(config):
+    names = ('offset', 'amplitude', 'frequency', 'phase')
+    return {name: getattr(config.reference, name) for name in names}
+
+
+def test_predicted_information_of_a_panda_is_that_of_its_loop():
+    loop = load_loop('panda')
+    motion = reference_of(loop.controller)
+    plant = replace(loop.plant, duration=11.0)
+    state = simulate(loop.controller, plant).controller.state
+    upper = np.triu(state.running[:-1, :-1]) / state.rows[0]
+    Phi = upper + np.triu(upper, 1).T
+    settings = settings_of_config(loop.controller)
+    a = settings.prior_weight
+    loop_s = np.linalg.slogdet(np.linalg.solve(settings.information, Phi) / a + np.eye(len(Phi)))[1]
+
+    problem = ExcitationProblem(loop.controller, settings.initial_estimate[: settings.p], 0.8, 3)
+
+    assert problem.evaluate(motion).gain == pytest.approx(loop_s, rel=0.01)
+    assert problem.evaluate(motion).ratios[1].max() > 0.8
+
+
+def test_a_motion_for_an_arm_keeps_its_limits_and_shows_more_than_others():
+    _, problem = chain_problem()
+    reached = problem.evaluate(problem.parameters(search(problem, 0, 1)))
+    assert reached.ratios.max() <= 1.0
+    assert reached.room.min() >= 0.0
+    random = np.random.default_rng(0)
+    others = [problem.evaluate(problem.parameters(problem.start(random))) for _ in range(100)]
+    allowed = [other.gain for other in others if other.is_allowed]
+    assert len(allowed) > 3
+    assert max(allowed) < reached.gain
+
+
+def test_what_remains_of_the_prior_is_all_at_rest_and_little_where_it_is_shown():
+    config, problem = chain_problem()
+    names = estimate_names(config)
+    at_rest = problem.remaining(problem.parameters(np.zeros(9)))
+    np.testing.assert_allclose(at_rest, 1.0, atol=1e-12)
+    alone = np.zeros(9)
+    alone[3] = 0.5  # only the first joint moves
+    remaining = problem.remaining(problem.parameters(alone))
+    assert remaining[names.index('viscous j1')] < 0.7
+    assert remaining[names.index('viscous j2')] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_torque_is_that_of_every_guess():
+    config, problem = chain_problem()
+    motion = problem.parameters(np.full(9, 0.1))
+    P = np.array(config.learning.initial_estimate)
+    either = ExcitationProblem(config, np.array([P, 1.5 * P]), 0.8, 1).evaluate(motion)
+    heavy = ExcitationProblem(config, 1.5 * P, 0.8, 1).evaluate(motion)
+    light = problem.evaluate(motion)
+    np.testing.assert_allclose(either.ratios, np.maximum(heavy.ratios, light.ratios))
+    assert np.all(heavy.ratios[3] > light.ratios[3])
+
+
+def test_the_tool_names_what_the_motion_of_an_arm_does_not_show(tmp_path, capsys):
+    (tmp_path / 'arm.urdf').write_text(random_urdf(3, seed=5)[0])
+    config = tmp_path / 'arm.yaml'
+    config.write_text(
+        '/**:\n  ros__parameters:\n    robot: {tip: tip, payload: 0.2, '
+        f'urdf: {tmp_path}/arm.urdf}}\n    torque.limit: [60.0, 60.0, 60.0]\n'
+        '    limits.velocity: [0.1, 0.1, 0.1]\n'
+    )
+    out = tmp_path / 'mine.yaml'
+    command = ['excite', str(out), '--config', str(config), '--harmonics', '1', '--starts', '1']
+    assert main([*command, '--radius', '0.02', '--floor', '3.0']) == 1
+    assert 'a lower floor' in capsys.readouterr().err
+    assert main([*command, '--radius', '0.02', '--floor', '-3.0']) == 0
+    told = capsys.readouterr().out
+    assert 'a window leaves' in told
+    combination = re.search(r'100 % of (\S+)', told)
+    assert combination
+    assert combination[1] in out.read_text()
+    config.write_text(config.read_text() + out.read_text())
+    assert load_loop(config).controller.reference.type == 'sinusoids'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the joints and the tip of a chain are, for pictures."""
+"""Where the joints and the tip of a chain are."""
 
 from __future__ import annotations
 
@@ -8,24 +8,33 @@ import numpy as np
 from blf_dsc_controller.arms.urdf import Chain
 
 
-def skeleton(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Base, joints and tip (n + 2, 3) [m], and the axes of the joints (n, 3), at q (n,)."""
-    frame = np.eye(4)
-    corners, axes = [frame[:3, 3]], []
-    for joint, position in zip(chain.joints, q, strict=True):
-        frame = frame @ joint.placement
-        axis, motion = joint.axis, np.eye(4)
+def frames(chain: Chain, q: np.ndarray) -> list[np.ndarray]:
+    """Placements (..., 4, 4) in the base of the base, of each joint's frame and of the tip.
+
+    `q` is (..., n): one posture, or an array of them.
+    """
+    placements = [np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))]
+    for i, joint in enumerate(chain.joints):
+        axis, position = joint.axis, q[..., i, None]
+        motion = placements[0].copy()
         if joint.kind == 'prismatic':
-            motion[:3, 3] = position * axis
+            motion[..., :3, 3] = position * axis
         else:
             along = np.outer(axis, axis)
-            c, s = np.cos(position), np.sin(position)
-            motion[:3, :3] = along + c * (np.eye(3) - along) + s * np.cross(np.eye(3), axis)
-        frame = frame @ motion
-        corners.append(frame[:3, 3])
-        axes.append(frame[:3, :3] @ axis)
-    corners.append((frame @ chain.tip_placement)[:3, 3])
-    return np.array(corners), np.array(axes)
+            c, s = np.cos(position)[..., None], np.sin(position)[..., None]
+            motion[..., :3, :3] = along + c * (np.eye(3) - along) + s * np.cross(np.eye(3), axis)
+        placements.append(placements[-1] @ joint.placement @ motion)
+    return [*placements, placements[-1] @ chain.tip_placement]
+
+
+def skeleton(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Base, joints and tip (n + 2, 3) [m], and the axes of the joints (n, 3), at q (n,)."""
+    placements = np.array(frames(chain, q))
+    axes = [
+        placement[:3, :3] @ joint.axis
+        for placement, joint in zip(placements[1:-1], chain.joints, strict=True)
+    ]
+    return placements[:, :3, 3], np.array(axes)
 
 
 def tip_radius(chain: Chain, q: np.ndarray, bound: np.ndarray) -> float:

@@ -3,62 +3,150 @@
 
 from __future__ import annotations
 
+import os
+
+# Before numpy is imported: threads cost more than they bring to matrices of this size.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import textwrap
 from argparse import Namespace
 
 import numpy as np
+from tqdm import tqdm
 
+from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.params_file import format_value, load, locate
+from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law import exciting_reference
+from blf_dsc_controller.law.factory import estimate_names
+from blf_dsc_controller.reference.clearance import Clearance
 
 _DIGITS = 4  # of a radian, in the file
 _UNITS = {'frequency': 'rad/s, of the cosines, then of the sines'}
+_UNSHOWN = 0.8  # of the deviation of the prior
+_WIDTH = 98
 
 
 def excite(options: Namespace) -> None:
     """Search, and write the preset."""
     if options.out.exists():
         raise BlfDscError(f'{options.out} exists already: choose another name')
-    options.out.write_text(_preset(options), encoding='utf-8')
+    text = _preset(options)
+    options.out.write_text(text, encoding='utf-8')
+    print(text[: text.index('\n\n')])
     print(f'wrote {options.out}')
 
 
 def _preset(options: Namespace) -> str:
     config = load(locate(options.config), CONTROLLER, ControllerConfig)
-    guess = options.guess or config.learning.initial_estimate
-    if len(guess) != len(config.learning.initial_estimate):
-        raise BlfDscError(
-            f'--guess has {len(guess)} values, but the model {config.model} has '
-            f'{len(config.learning.initial_estimate)} parameters'
-        )
     problem = exciting_reference.ExcitationProblem(
-        config, np.array(guess), options.torque_fraction, options.harmonics
+        config,
+        _guess(config, options.guess),
+        options.torque_fraction,
+        options.harmonics,
+        _clearance(config, options.radius, options.floor),
     )
-    x = exciting_reference.search(problem, options.seed, options.starts)
-    parameters = problem.parameters(np.round(x, _DIGITS))
+    parameters = problem.parameters(_search(problem, options.seed, options.starts))
+    for name in ('offset', 'amplitude'):
+        parameters[name] = tuple(round(value, _DIGITS) for value in parameters[name])
     names = ('offset', 'amplitude', 'frequency', 'phase')
     before = problem.evaluate({name: getattr(config.reference, name) for name in names})
     after = problem.evaluate(parameters)
-    command = (
-        f'blf_dsc excite PRESET.yaml --config {options.config} '
-        f'--guess {" ".join(f"{value:g}" for value in guess)} '
-        f'--torque-fraction {options.torque_fraction:g} --harmonics {options.harmonics} '
-        f'--starts {options.starts} --seed {options.seed}'
+    if config.learning.prior_weight > 0.0:
+        remaining = problem.remaining(parameters)
+        left = [
+            f'{100.0 * np.exp(-one.gain / 2 / remaining.size):.2g} %' for one in (before, after)
+        ]
+        figures = (
+            f'a window leaves {left[1]} of the deviation of the prior, in the geometric mean over '
+            f'all directions, instead of {left[0]}'
+        )
+        unshown = _unshown(config, remaining)
+    else:
+        figures = (
+            f'minimum eigenvalue of the excitation matrix {after.lambda_min:.3g}, instead of '
+            f'{before.lambda_min:.3g}'
+        )
+        unshown = []
+    about = (
+        'The reference that excites the learning most within the limits of joints and torque: '
+        f'{figures} with the reference of that file.'
     )
+    command = (
+        f'blf_dsc excite PRESET.yaml --config {options.config} --torque-fraction '
+        f'{options.torque_fraction:g} --harmonics {options.harmonics} --starts {options.starts} '
+        f'--seed {options.seed}'
+    )
+    if options.guess:
+        command += f' --guess {" ".join(f"{value:g}" for value in options.guess)}'
+    if config.model == 'urdf':
+        command += f' --radius {options.radius:g} --floor {options.floor:g}'
+    lines = [*textwrap.wrap(about, _WIDTH), command, *unshown]
+    comment = ''.join(f'# {line}\n' for line in lines)
     entries = ''.join(
         f'      # {_UNITS.get(name, "rad")}\n      {name}: {format_value(value)}\n'
         for name, value in parameters.items()
     )
     return f"""\
-# The reference that excites the learning most within the limits of joints and torque: minimum
-# eigenvalue of the excitation matrix {after.lambda_min:.3g}, instead of {before.lambda_min:.3g} \
-with the reference of that file.
-# {command}
-
+{comment}
 /**/{CONTROLLER}:
   ros__parameters:
     reference:
       type: sinusoids
 {entries}"""
+
+
+def _guess(config: ControllerConfig, given: list[float] | None) -> np.ndarray:
+    """Parameters P (k, p) that the torque is computed with: as given, or else those of the start.
+
+    An arm of a URDF must also be able to carry its payload.
+    """
+    start = config.learning.initial_estimate
+    if given and len(given) != len(start):
+        raise BlfDscError(
+            f'--guess has {len(given)} values, but the model {config.model} has {len(start)} '
+            'parameters'
+        )
+    if given or config.model != 'urdf':
+        return np.atleast_2d(given or start)
+    robot, chain = config.robot, config.robot.chain(config.joints)
+    base, tip = parameters_of(robot, chain), chain.tip_placement[:, 3]
+    loaded = np.zeros_like(chain.inertias)
+    loaded[-1] = inertia_of(robot.payload * np.outer(tip, tip))
+    return np.array((start, start + base.of(loaded, np.zeros(len(chain.joints)))))
+
+
+def _clearance(config: ControllerConfig, radius: float, floor: float) -> Clearance | None:
+    if config.model != 'urdf':
+        return None
+    return Clearance(config.robot.chain(config.joints), radius, floor)
+
+
+def _search(problem: exciting_reference.ExcitationProblem, seed: int, starts: int) -> np.ndarray:
+    total = starts * exciting_reference.ITERATIONS
+    with tqdm(total=total, desc='searching', unit='iteration', disable=None) as bar:
+
+        def show(done: int, best: float) -> None:
+            bar.set_postfix_str(f'best {best:.4g}' if best > -np.inf else '', refresh=False)
+            bar.update(done - bar.n)
+
+        return exciting_reference.search(problem, seed, starts, show)
+
+
+def _unshown(config: ControllerConfig, remaining: np.ndarray) -> list[str]:
+    """Lines that name the parameters that the motion shows little of, the least shown first."""
+    order = [int(k) for k in np.argsort(-remaining) if remaining[k] > _UNSHOWN]
+    if not order:
+        return ['It shows all parameters.']
+    names = list(estimate_names(config))
+    if config.model == 'urdf':
+        sums = parameters_of(config.robot, config.robot.chain(config.joints)).combinations
+        names[: len(sums)] = sums
+    lines = ['It hardly shows the following; of the deviation of the prior a window leaves']
+    for k in order:
+        text = f'{100.0 * remaining[k]:4.0f} % of {names[k]}'
+        lines += textwrap.wrap(text, _WIDTH, subsequent_indent=' ' * 10, initial_indent=' ')
+    return lines

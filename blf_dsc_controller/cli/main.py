@@ -177,8 +177,10 @@ def _parser() -> argparse.ArgumentParser:
             'excite',
             'find a reference that excites the learning',
             'Find the sum of sinusoids, of the period of the learning window, that excites the '
-            'learning most within the limits of joints and torque, and write it as a preset.',
-            'exciting.yaml --config my.yaml --guess 1 0.32 0.4',
+            'learning most within the limits of joints and torque, and write it as a preset. The '
+            'links of an arm of a URDF also keep their distance from each other and the floor, and '
+            'the parameters that the motion does not show are named.',
+            'exciting.yaml --config my.yaml',
         )
     )
     _identify_options(
@@ -273,7 +275,8 @@ def _excite_options(parser: argparse.ArgumentParser) -> None:
         '--guess',
         type=float,
         nargs='+',
-        help='parameters P for computing the torque (learning.initial_estimate)',
+        help='parameters P for computing the torque (learning.initial_estimate; of a URDF with and '
+        'without its payload)',
     )
     option(
         '--torque-fraction',
@@ -281,9 +284,11 @@ def _excite_options(parser: argparse.ArgumentParser) -> None:
         default=0.8,
         help='fraction of the torque limit to stay below (0.8)',
     )
-    option('--harmonics', type=int, default=2, help='of the window (2)')
-    option('--starts', type=int, default=8, help='number of searches; the best result is kept (8)')
+    option('--harmonics', type=int, default=3, help='of the window (3)')
+    option('--starts', type=int, default=4, help='number of searches; the best result is kept (4)')
     option('--seed', type=int, default=0, help='of the starts (0)')
+    option('--radius', type=float, default=0.07, help='of the links of a URDF [m] (0.07)')
+    option('--floor', type=float, default=0.0, help='height of the floor in the base [m] (0)')
 
 
 def _identify_options(parser: argparse.ArgumentParser) -> None:

@@ -1,79 +1,120 @@
 # SPDX-License-Identifier: Apache-2.0
 """Search for the sum of sinusoids that excites the learning most.
 
-The minimum eigenvalue of the excitation matrix says how well the worst determined combination of
-parameters and disturbance columns can be identified from a window.  For a reference whose period is
-the window it is, in the steady state,
+For a reference whose period is the window the excitation matrix is, in the steady state,
 
     Phi = 1/tau_d int X_f^T X_f dt,      X_f = [H(q, dq, dq, ddq) | D] behind the learning's filter
 
-which follows from the harmonics of X by Parseval's theorem.  It is maximised over offset, cosines
-and sines of each joint within the limits of joints and torque; the torque is that of a guess of P.
+with the rows' weights of the learning.  Its eigenvalues mu_i relative to the information R of the
+prior, a multiple a of which the learning adds to Phi (`learning.prior_weight`), say how well a
+window determines theta.  What is maximised, over offset, cosines and sines of each joint, is
+
+    a = 0:  log min mu_i                    the worst determined combination
+    a > 0:  sum log (1 + mu_i / a)          the log-determinant of (a R)^-1 (Phi + a R)
+
+The second says how much a window shrinks the volume that the prior leaves.  With a prior the worst
+determined combination is one that no motion shows, and the prior stands for it: the least
+eigenvalue would spend the motion on that.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.compiled.layout import pack as pack_settings
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.law.factory import prior_covariance, settings_of_config
 from blf_dsc_controller.law.prediction import rows_along
+from blf_dsc_controller.reference.clearance import Clearance
 from blf_dsc_controller.reference.limits import MotionError
 from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
 
+ITERATIONS = 150
+"""Most iterations of a search."""
+
 _SAMPLES_PER_HARMONIC = 64
+_COARSE = 4  # samples to one of the rows behind the filter
 _MARGIN = 1e-3  # of each limit, for peaks between two samples
-_ITERATIONS = 150
-_SPREAD = 0.4  # rad, of the amplitudes that a search starts from
+_PENALTY = 1e4  # of the mean square excess: limits are exceeded by some percent
+_SHRINKS = 30  # of the amplitudes, by a hundredth each, to keep them
+_SPREAD = 0.2  # of the amplitudes that a search starts from
 
 
 class Excitation(NamedTuple):
     """Excitation by a periodic reference in the steady state, and how it uses the limits."""
 
-    lambda_min: float  # minimum eigenvalue of Phi
+    lambda_min: float  # minimum eigenvalue of Phi, relative to R
+    gain: float  # what is maximised
     ratios: np.ndarray  # (4, n) largest position, velocity, acceleration, torque over its limit
+    room: np.ndarray  # (k,) least room of each pair of links and to the floor; negative: too near
+    excess: float  # mean square by which the limits are violated, in their units
+
+    @property
+    def is_allowed(self) -> bool:
+        """Whether it keeps all limits."""
+        return bool(self.ratios.max() <= 1.0 and self.room.min(initial=0.0) >= 0.0)
 
 
 class ExcitationProblem:
     """Excitation of a controller as a function of its periodic reference.
 
-    The torque is computed with the parameters `guess` (p,) and limited to `torque_fraction` of the
-    configured limit; `harmonics` is the highest harmonic of the window in the reference.
+    The torque is computed with each of the parameters `guess` (p,) or (k, p), and the friction that
+    the controller starts from, and limited to `torque_fraction` of the configured limit;
+    `harmonics` is the highest harmonic of the window in the reference.
     """
 
     def __init__(
-        self, config: ControllerConfig, guess: np.ndarray, torque_fraction: float, harmonics: int
+        self,
+        config: ControllerConfig,
+        guess: np.ndarray,
+        torque_fraction: float,
+        harmonics: int,
+        clearance: Clearance | None = None,
     ) -> None:
-        self._settings = settings_of_config(config)
-        self._vector = pack_settings(self._settings)
-        self._guess = guess
+        settings = self._settings = settings_of_config(config)
+        self._vector = pack_settings(settings)
+        self._clearance = clearance
+        guess = np.atleast_2d(guess)
+        friction = np.tile(settings.initial_estimate[settings.p :], (len(guess), 1))
+        self._guess = np.hstack((guess, friction))
+        self._scale = np.linalg.cholesky(prior_covariance(config))
         limits = config.limits
         lower, upper = np.array(limits.position_lower), np.array(limits.position_upper)
-        self._middle = 0.5 * (lower + upper)
-        torque = torque_fraction * self._settings.torque_limit
-        self._limits = (0.5 * (upper - lower), limits.velocity, limits.acceleration, torque)
-        self.n = self._settings.n
+        self._middle, self._reach = 0.5 * (lower + upper), 0.5 * (upper - lower)
+        torque = torque_fraction * settings.torque_limit
+        tracked = self._reach - settings.bound
+        self._limits = np.array((tracked, limits.velocity, limits.acceleration, torque))
+        self.n = settings.n
         self.harmonics = harmonics
         self._base = 2.0 * np.pi / config.learning.window
+        rates = self._base * np.arange(1, harmonics + 1)
+        self._units = np.min(
+            [np.outer(limit, rates**-k) for k, limit in enumerate(self._limits[:3])], axis=0
+        )
         samples = _SAMPLES_PER_HARMONIC * max(harmonics, 2)
         self._times = np.arange(samples) * (config.learning.window / samples)
         omega = self._base * np.arange(samples // 2 + 1)
-        # Two poles in series: the power of a harmonic falls by the fourth power of one pole's gain.
-        self._gain = 1.0 / (1.0 + (omega / self._settings.pole) ** 2) ** 2
-        self._gain[1:] *= 2.0  # the harmonics of negative frequency
+        self._filter = 1.0 / (1.0 + 1j * omega / settings.pole) ** 2  # two poles in series
+
+    def start(self, random: np.random.Generator) -> np.ndarray:
+        """A random x in the middle of the range of each joint, see `parameters`."""
+        n, h = self.n, self.harmonics
+        return np.append(random.uniform(-0.5, 0.5, n), random.normal(0.0, _SPREAD, 2 * n * h))
 
     def parameters(self, x: np.ndarray) -> dict[str, tuple[float, ...]]:
-        """Parameters of `reference` for x: offsets (n,), cosines (n, h) and sines (n, h) [rad].
+        """Parameters of `reference` for x: offsets (n,), cosines (n, h) and sines (n, h).
 
-        Sines are cosines of phase -pi/2.
+        Offsets are in units of half the range, amplitudes of what alone would reach a limit of
+        position, velocity or acceleration. Sines are cosines of phase -pi/2.
         """
         n, h = self.n, self.harmonics
-        amplitude = np.concatenate(list(x[n:].reshape(2, n, h)), axis=1)
+        unit = self._units
+        amplitude = np.concatenate(list(x[n:].reshape(2, n, h) * unit), axis=1)
         return {
-            'offset': tuple(x[:n].tolist()),
+            'offset': tuple((self._middle + self._reach * x[:n]).tolist()),
             'amplitude': tuple(amplitude.ravel().tolist()),
             'frequency': tuple(np.tile(self._base * np.arange(1, h + 1), 2).tolist()),
             'phase': tuple(np.repeat((0.0, -0.5 * np.pi), h).tolist()),
@@ -81,58 +122,105 @@ class ExcitationProblem:
 
     def evaluate(self, parameters: dict[str, tuple[float, ...]]) -> Excitation:
         """Excitation by the reference with parameters offset, amplitude, frequency and phase."""
-        settings = self._settings
+        motion, rows = self._rows(parameters)
+        q, dq, ddq = motion.transpose(1, 0, 2)
+        torque = np.abs(rows @ self._guess.T).max(axis=2)
+        ratios = np.abs(np.stack((q - self._middle, dq, ddq, torque), axis=1)) / self._limits
+        room = self._clearance.room(q) if self._clearance else np.zeros((len(q), 0))
+        over = (ratios - 1.0 + _MARGIN, _MARGIN - room)
+        excess = sum((np.maximum(one, 0.0) ** 2).sum() for one in over) / len(q)
+        mu = np.linalg.eigvalsh(self._relative_excitation(dq, rows))
+        a = self._settings.prior_weight
+        gain = np.log1p(np.maximum(mu, 0.0) / a).sum() if a > 0.0 else np.log(max(mu[0], 1e-12))
+        return Excitation(
+            float(mu[0]),
+            float(gain),
+            ratios.max(axis=0),
+            room.min(axis=0),
+            float(excess),
+        )
+
+    def remaining(self, parameters: dict[str, tuple[float, ...]]) -> np.ndarray:
+        """Deviation (m,) of each entry of theta after a window, over that of its prior."""
+        motion, rows = self._rows(parameters)
+        mu, V = np.linalg.eigh(self._relative_excitation(motion[:, 1], rows))
+        a, L = self._settings.prior_weight, self._scale
+        after = (L @ V) ** 2 @ (a / (a + np.maximum(mu, 0.0)))
+        return np.asarray(np.sqrt(after / (L**2).sum(axis=1)))
+
+    def _rows(self, parameters: dict[str, tuple[float, ...]]) -> tuple[np.ndarray, np.ndarray]:
+        """Motion (k, 3, n) and [H | D] (k, n, m) over a period."""
         motion = sampled(pack(self.n, [sinusoids_term(**parameters)]), self._times)
-        rows = np.zeros((self._times.size, settings.n, settings.m))
+        rows = np.zeros((self._times.size, self.n, self._settings.m))
         rows_along(self._settings.model, self._vector, self._times, motion, rows)
-        torque = rows[:, :, : settings.p] @ self._guess
-        values = (motion[:, 0] - self._middle, motion[:, 1], motion[:, 2], torque)
-        ratios = [
-            np.abs(value).max(axis=0) / limit
-            for value, limit in zip(values, self._limits, strict=True)
-        ]
-        X = np.fft.rfft(rows, axis=0) / self._times.size
-        Phi = np.einsum('k,kij,kil->jl', self._gain, X.conj(), X, optimize=True).real
-        return Excitation(float(np.linalg.eigvalsh(Phi)[0]), np.array(ratios))
+        return motion, rows
+
+    def _relative_excitation(self, dq: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """L^T Phi L (m, m) where R^-1 = L L^T: its eigenvalues are those of Phi relative to R."""
+        settings = self._settings
+        coarse = dq[::_COARSE]
+        spectrum = np.fft.rfft(rows, axis=0)[: len(coarse) // 2 + 1] / _COARSE
+        X = np.fft.irfft(spectrum * self._filter[: len(spectrum), None, None], len(coarse), axis=0)
+        X *= settings.row_weight[:, None]
+        if settings.motion_scale > 0.0:
+            X *= (np.abs(coarse) / np.hypot(coarse, settings.motion_scale))[..., None]
+        X = X.reshape(-1, settings.m) @ self._scale
+        return np.asarray(X.T @ X / len(coarse))
 
 
-def search(problem: ExcitationProblem, seed: int, starts: int) -> np.ndarray:
+def search(
+    problem: ExcitationProblem,
+    seed: int,
+    starts: int,
+    progress: Callable[[int, float], None] = lambda _done, _best: None,
+) -> np.ndarray:
     """Best x (see `ExcitationProblem.parameters`) of searches from random starting points.
+
+    `progress` is told after each iteration how many of `starts` * ITERATIONS are done, and the best
+    gain of the searches that are finished.
 
     Raises:
         MotionError: none of the searches found a reference that keeps the limits.
     """
-    from scipy.optimize import minimize
+    from scipy.optimize import approx_fprime, minimize
 
     random = np.random.default_rng(seed)
-    n, h = problem.n, problem.harmonics
-
-    def evaluate(x: np.ndarray) -> Excitation:
-        return problem.evaluate(problem.parameters(x))
+    best: np.ndarray | None = None
+    most, done = -np.inf, 0
 
     def cost(x: np.ndarray) -> float:
-        return float(-np.log(max(evaluate(x).lambda_min, 1e-12)))
+        reached = problem.evaluate(problem.parameters(x))
+        return _PENALTY * reached.excess - reached.gain
 
-    def slack(x: np.ndarray) -> np.ndarray:
-        return 1.0 - _MARGIN - evaluate(x).ratios.ravel()
+    def follow(_x: np.ndarray) -> None:
+        nonlocal done
+        done += 1
+        progress(done, most)
 
-    best, most = None, -np.inf
-    for _ in range(starts):
-        start = (random.uniform(-np.pi, np.pi, n), random.normal(0.0, _SPREAD, 2 * n * h))
-        found = minimize(
+    for number in range(starts):
+        done = number * ITERATIONS
+        result = minimize(
             cost,
-            np.concatenate(start),
-            method='SLSQP',
-            constraints={'type': 'ineq', 'fun': slack},
-            options={'maxiter': _ITERATIONS, 'ftol': 1e-6},
+            problem.start(random),
+            jac=lambda x: approx_fprime(x, cost),
+            method='L-BFGS-B',
+            callback=follow,
+            options={'maxiter': ITERATIONS, 'ftol': 1e-6},
         )
-        lambda_min, ratios = evaluate(found.x)
-        if np.all(ratios <= 1.0) and lambda_min > most:
-            best, most = found.x, lambda_min
+        x = result.x
+        for _ in range(_SHRINKS):
+            reached = problem.evaluate(problem.parameters(x))
+            if reached.is_allowed:
+                if reached.gain > most:
+                    best, most = x, reached.gain
+                break
+            x[problem.n :] *= 0.99
+    progress(starts * ITERATIONS, most)
     if best is None:
         raise MotionError(
             f'no reference was found, in {starts} searches, that keeps positions, velocities, '
-            'accelerations and torques within their limits: allow a larger fraction of the '
-            'torque, widen limits, or search from more starts'
+            'accelerations and torques within their limits and the links apart from each other '
+            'and from the floor: allow a larger fraction of the torque, widen limits, take a '
+            'smaller radius or a lower floor, or search from more starts'
         )
-    return np.asarray(best)
+    return best

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far the links of an arm are from each other and from the floor.
+
+Meshes are not read.  A link is taken for all points within `radius` of the straight line from its
+joint to the next, or to the tip; by way of its centre of mass, if that is farther from the line
+than the radius.  Every two links are checked, but for those between which the arm, from joint to
+joint, is shorter than two radii: they touch in every posture, and only the limits of the joints can
+keep them apart.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from blf_dsc_controller.arms.chain_geometry import frames
+from blf_dsc_controller.arms.urdf import Chain
+
+_LEAST = 1e-6  # m, of a line; shorter ones are points of the next
+_CARRIED = 2  # joints, up to which the arm may be near the floor
+
+
+class Clearance:
+    """Room between the links of a chain, and between them and the floor.
+
+    The floor is the plane z = `floor` [m] in the base; the first two joints may be near it.
+    """
+
+    def __init__(self, chain: Chain, radius: float, floor: float) -> None:
+        self._chain, self._radius, self._floor = chain, radius, floor
+        centres = [joint.inertia[:4] / joint.inertia[0] for joint in chain.joints]
+        self._centres = [np.append(centre[1:], 1.0) for centre in centres]
+        self._aside = [False] * len(centres)
+        rest = np.zeros(len(centres))
+        origins = self.corners(rest)
+        for i, (begin, end) in enumerate(pairwise(origins[1:])):
+            centre = (frames(chain, rest)[i + 1] @ self._centres[i])[:3]
+            self._aside[i] = bool(distance(centre, centre, begin, end) > radius)
+        links = [0, *(k for i, aside in enumerate(self._aside, 1) for k in [i] * (1 + aside))]
+        length = np.linalg.norm(np.diff(origins, axis=0), axis=1)
+        end = np.cumsum(length)
+        pairs = [
+            (a, b)
+            for a, one in enumerate(links)
+            for b, other in enumerate(links)
+            if min(length[one], length[other]) > _LEAST
+            and end[other] - length[other] - end[one] > 2.0 * radius
+        ]
+        self._first, self._second = np.array(pairs, dtype=int).reshape(-1, 2).T
+
+    def corners(self, q: np.ndarray) -> np.ndarray:
+        """Base, joints, centres of mass that are aside, and tip (..., k, 3) [m], at q (..., n)."""
+        placements = frames(self._chain, q)
+        corners = [placements[0][..., :3, 3]]
+        for placement, centre, aside in zip(
+            placements[1:], self._centres, self._aside, strict=False
+        ):
+            corners.append(placement[..., :3, 3])
+            if aside:
+                corners.append((placement @ centre)[..., :3])
+        return np.stack([*corners, placements[-1][..., :3, 3]], axis=-2)
+
+    def room(self, q: np.ndarray) -> np.ndarray:
+        """Room (..., k) of each pair of links, then of the corners above the floor, at q (..., n).
+
+        In units of what there should be: two radii, or one above the floor; negative: too near.
+        """
+        corners = self.corners(q)
+        begin, end = corners[..., :-1, :], corners[..., 1:, :]
+        a, b = self._first, self._second
+        apart = distance(begin[..., a, :], end[..., a, :], begin[..., b, :], end[..., b, :])
+        above = corners[..., 1 + _CARRIED + sum(self._aside[:_CARRIED]) :, 2] - self._floor
+        room = (apart / (2.0 * self._radius), above / self._radius)
+        return np.concatenate(room, axis=-1) - 1.0
+
+
+def distance(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Distance (...) [m] of the straight lines from a to b and from c to d (..., 3).
+
+    Ericson, Real-Time Collision Detection, 2005, 5.1.9; a line may be a point.
+    """
+    u, v, w = b - a, d - c, a - c
+    uu, uv, vv = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
+    uw, vw = (u * w).sum(-1), (v * w).sum(-1)
+    tiny = np.finfo(float).tiny
+    s = np.clip((uv * vw - vv * uw) / np.maximum(uu * vv - uv * uv, tiny), 0.0, 1.0)
+    t = np.clip((uv * s + vw) / np.maximum(vv, tiny), 0.0, 1.0)
+    s = np.clip((uv * t - uw) / np.maximum(uu, tiny), 0.0, 1.0)
+    gap: np.ndarray = np.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
+    return gap
