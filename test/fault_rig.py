@@ -117,7 +117,7 @@ class Rig:
             self.wall += MILLISECOND
             if self.steady >= self.next_watch:
                 self._command(self.guard.watch())
-                self.next_watch = self.steady + self.guard.next_watch * 1e9
+                self.next_watch = self.steady + self.guard.watchdog.next_check * 1e9
 
     def mend(self):
         """Take the fault away, and reset arm and controller as the nodes' services do."""

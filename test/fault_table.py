@@ -65,12 +65,12 @@ def run(fault: Fault, rig: Rig | None = None) -> Outcome:
         if noticed < 0 and rig.supervisor.phase is Phase.SAFE_STOP:
             noticed, stop = sample + 1, commanded
     reason, text = rig.supervisor.reason, rig.supervisor.text
-    error = float(rig.guard.ratio.max())
+    error = float(rig.guard.samples.ratio.max())
     before, after = np.array(rig.commands[start:stop]), np.array(rig.commands[stop:])
     rejected = rig.input.rejected
     rig.mend()
     rig.step(LEAD)
-    recovered = rig.supervisor.phase is Phase.TRACKING and bool(rig.guard.ratio.max() < 1.0)
+    recovered = rig.supervisor.phase is Phase.TRACKING and bool(rig.guard.samples.ratio.max() < 1.0)
     return Outcome(noticed, reason, text, before, after, last, error, recovered, rejected)
 
 
@@ -312,7 +312,7 @@ def replaced(*, possible: bool) -> Callable[[Rig], None]:
                 goal = tuple(state.q + (0.2 if rig.plant.sample % 60 else -0.2))
                 point = TrajectoryPoint(time=1.5 if possible else 0.001, positions=goal)
                 try:
-                    rig.guard.follow(Trajectory(JOINTS, (point,)))
+                    rig.guard.adopt(rig.guard.plan(Trajectory(JOINTS, (point,))))
                 except TrajectoryError:
                     assert not possible
                 else:

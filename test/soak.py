@@ -83,7 +83,7 @@ class Soak:
             self.ros.run(self.arm, count)
             assert self.law.guard.supervisor.running, self.law.stopped
             self.report.samples += count
-            self.report.worst = max(self.report.worst, float(self.law.guard.ratio.max()))
+            self.report.worst = max(self.report.worst, float(self.law.guard.samples.ratio.max()))
             fault = self.rng.choice(FAULTS)
             self.report.faults[fault.__name__] += 1
             fault(self)

@@ -72,7 +72,7 @@ def with_mujoco(ros, example, row, law):  # noqa: F811
     assert not controller.stopped
     ros.kill(arm)
     ros.kill(controller)
-    return controller.guard.ratio, controller.controller.state.estimate
+    return controller.guard.samples.ratio, controller.controller.state.estimate
 
 
 def offline(plant, law):

@@ -27,7 +27,7 @@ def assert_runs(ros, arm, law, samples=60):
     """The loop goes on, the law is in command, and the error within its bound."""
     ros.run(arm, samples)
     assert in_command(law), law.stopped
-    assert law.guard.ratio.max() < 1.0
+    assert law.guard.samples.ratio.max() < 1.0
 
 
 def test_nodes_start_by_themselves(ros):

@@ -189,7 +189,7 @@ def test_the_controller_keeps_the_bound_and_learns_the_parameters(example):
         arm = ros.add(example.MujocoPlant)
         ros.until(lambda: arm.steps >= 8000 or law.stopped)
         assert law.guard.supervisor.phase is Phase.TRACKING, law.stopped
-        assert law.guard.ratio.max() < 1.0
+        assert law.guard.samples.ratio.max() < 1.0
         # Learning begins after 6.8 s; a second later 0.1 % is left with our own plant, whose torque
         # is held the same way.  Before, half of each parameter was missing.
         np.testing.assert_allclose(law.controller.state.estimate[:3], P, rtol=0.01)

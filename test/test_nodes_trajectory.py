@@ -41,7 +41,7 @@ def test_an_approach_over_ros_is_the_offline_one_bit_for_bit(ros):
     assert arm.plant.sample == pytest.approx(1e3 * law.guard.settled, abs=2)
     ros.until(lambda: len(commands) >= 4001)
 
-    assert law.guard.ratio.max() < 1.0
+    assert law.guard.samples.ratio.max() < 1.0
     plant = build(PlantConfig, {'initial.position': AWAY, 'duration': 4.0})
     offline = simulate(ControllerConfig(), plant)
     np.testing.assert_array_equal(torques(commands)[:4001], offline.samples[:, 8:10])
@@ -82,7 +82,7 @@ def test_a_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ro
     # On the last of the three, then held at its end.
     now = law.controller.reference_at(last[0] + 3.4)
     np.testing.assert_allclose(now, [two_tones(3.95, np.array(shifts[2]))[0], [0, 0], [0, 0]])
-    assert law.guard.ratio.max() < 1.0
+    assert law.guard.samples.ratio.max() < 1.0
     assert np.max([np.abs(one.position) for one in errors]) < 2e-3
     positions = np.array([one.position for one in references])
     velocities = np.array([one.velocity for one in references])
@@ -182,7 +182,7 @@ def test_an_unexpected_error_while_planning_rejects_the_trajectory(
     def fail(*_):
         raise MemoryError('no room')
 
-    monkeypatch.setattr('blf_dsc_controller.supervision.planning.plan_trajectory', fail)
+    monkeypatch.setattr('blf_dsc_controller.supervision.guard.plan_trajectory', fail)
     arm, law = ros.loop(None, {'safety__watchdog': watchdog, 'safety__state_timeout': 60.0})
     ros.run(arm, 20)
     sent = trajectory(JOINTS, np.zeros(2), duration=0.1)
@@ -200,7 +200,7 @@ def test_a_trajectory_planned_aside_leads_on_without_a_jump(ros, sender):
     ros.run(arm, 1500)
     velocities = np.array([one.velocity for one in references])
     assert np.abs(np.diff(velocities, axis=0)).max() < 4.1e-3  # 4 rad/s^2 for a millisecond
-    assert law.guard.ratio.max() < 1.0
+    assert law.guard.samples.ratio.max() < 1.0
 
 
 def test_an_error_that_escapes_from_a_callback_is_a_safe_stop(ros):

@@ -118,7 +118,7 @@ def test_activated_again_on_the_reference_the_law_takes_over_only_at_its_velocit
     first = len(rig.commands)
     rig.step(1500)
     assert rig.guard.supervisor.running, rig.supervisor.text
-    assert rig.guard.ratio.max() < 0.6
+    assert rig.guard.samples.ratio.max() < 0.6
     assert (rig.guard.settled > 0.1) == rest
     assert np.abs(rig.commands[first:]).max() < 15.0
 

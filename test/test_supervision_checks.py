@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.supervision.checks import OUTSIDE, SUSPECT, check_sample, is_valid_state
-from blf_dsc_controller.supervision.supervisor import Phase, Supervisor, Verdict
+from blf_dsc_controller.supervision.state_check import StateCheck
+from blf_dsc_controller.supervision.supervisor import Reason
 
 DT = 1e-3
 
@@ -88,7 +89,7 @@ STEPS = st.sampled_from([0, 1, 499_999, 500_001, 1_000_000, 1_000_001, 1_499_999
 RARE_STEPS = st.sampled_from([2_000_000, 3_000_000, 41_000_000, 50_000_000, -1_000_000])
 
 
-class FullCheck(Supervisor):
+class FullCheck(StateCheck):
     """Checks each stamp in full."""
 
     def _is_next(self, _stamp):
@@ -97,24 +98,19 @@ class FullCheck(Supervisor):
 
 @given(steps=st.lists(STEPS | RARE_STEPS | st.just(1_000_000), max_size=60))
 def test_the_short_check_of_a_stamp_is_the_full_one(steps):
-    short, full = Supervisor(['joint1', 'joint2'], 1e-3), FullCheck(['joint1', 'joint2'], 1e-3)
-    for one in (short, full):
-        one.enter(Phase.STARTING)
-        one.enter(Phase.TRACKING)
+    short, full = StateCheck(['joint1', 'joint2'], DT), FullCheck(['joint1', 'joint2'], DT)
     stamp = 1_000_000_000
     for step in steps:
         stamp += step
-        verdicts = [one.check_state(SAFETY, stamp, STILL, STILL) for one in (short, full)]
-        assert verdicts[0] is verdicts[1]
-        for of in ('reason', 'text', 'repeated', 'stops', 'revision'):
-            assert getattr(short, of) == getattr(full, of)
-        assert vars(short.overruns) == vars(full.overruns)
+        problems = [one.check(SAFETY, stamp, STILL, STILL) for one in (short, full)]
+        assert problems[0] == problems[1]
+        assert vars(short) == vars(full)
 
 
 def test_velocities_are_checked_after_the_short_check_too():
-    supervisor = Supervisor(['joint1', 'joint2'], 1e-3)
-    supervisor.enter(Phase.STARTING)
-    supervisor.enter(Phase.TRACKING)
-    assert supervisor.check_state(SAFETY, 1_000_000_000, STILL, STILL) is Verdict.USE
+    states = StateCheck(['joint1', 'joint2'], DT)
+    assert states.check(SAFETY, 1_000_000_000, STILL, STILL) is None
     too_fast = np.array([0.0, 2.0 * SAFETY.velocity_limit])
-    assert supervisor.check_state(SAFETY, 1_001_000_000, STILL, too_fast) is Verdict.STOP
+    problem = states.check(SAFETY, 1_001_000_000, STILL, too_fast)
+    assert problem is not None
+    assert problem.reason is Reason.VELOCITY

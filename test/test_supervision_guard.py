@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fault_rig import MILLISECOND, Rig
+from fault_rig import JOINTS, MILLISECOND, Rig
 from plain_law import dynamics
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
@@ -13,8 +13,9 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
 from blf_dsc_controller.supervision.planning import LatePlanError
 from blf_dsc_controller.supervision.safe_torque import LastState, Ramp, safe_torque
+from blf_dsc_controller.supervision.state_check import StateCheck
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
-from blf_dsc_controller.supervision.watchdogs import Overruns, Silence
+from blf_dsc_controller.supervision.watchdog import Watchdog
 
 Q, DQ = np.array([0.3, -0.4]), np.array([0.5, -2.0])
 P = np.array([1.0, 0.32, 0.4])
@@ -62,25 +63,26 @@ def test_a_ramp_is_straight_and_ends_at_a_goal_that_moves():
 
 def test_missed_states_are_averaged():
     """Every second state missed is a fraction of a half, after a few windows."""
-    overruns = Overruns()
-    for _ in range(1000):
-        overruns.count_sample(2, 100.0)
-    assert overruns.count == 1000
-    assert overruns.fraction == pytest.approx(0.5, abs=0.01)
-    for _ in range(1000):
-        overruns.count_sample(1, 100.0)
-    assert overruns.fraction < 1e-4
+    states, safety = StateCheck(JOINTS, 1e-3), Safety(overrun_window=0.1, overrun_fraction=1.0)
+    for k in range(1001):
+        assert states.check(safety, (1 + 2 * k) * MILLISECOND, Q, DQ) is None
+    assert states.missed == 1000
+    assert states.missed_fraction == pytest.approx(0.5, abs=0.01)
+    for k in range(1000):
+        assert states.check(safety, (2002 + k) * MILLISECOND, Q, DQ) is None
+    assert states.missed_fraction < 1e-4
 
 
 def test_silence_is_detected_by_a_check_in_time():
-    silence = Silence()
-    assert silence.check(0, 0.04) == 0.0  # no state has come yet
-    silence.restart(10 * MILLISECOND)
-    assert silence.check(41 * MILLISECOND, 0.04) == 0.0
-    assert silence.next_check == pytest.approx(0.01)  # 1 ms after it could be silent
-    assert silence.check(51 * MILLISECOND, 0.04) == pytest.approx(0.041)
-    assert silence.check(200 * MILLISECOND, 0.04) == 0.0  # it has slept itself
-    assert silence.check(208 * MILLISECOND, 0.04) == pytest.approx(0.198)
+    times = iter([0, 10, 41, 51, 200, 208])  # ms
+    watchdog = Watchdog(lambda: next(times) * MILLISECOND, lambda: 0)
+    assert watchdog.silence(0.04) == 0.0  # no state has come yet
+    watchdog.restart()
+    assert watchdog.silence(0.04) == 0.0
+    assert watchdog.next_check == pytest.approx(0.01)  # 1 ms after it could be silent
+    assert watchdog.silence(0.04) == pytest.approx(0.041)
+    assert watchdog.silence(0.04) == 0.0  # it has slept itself
+    assert watchdog.silence(0.04) == pytest.approx(0.198)
 
 
 @pytest.mark.parametrize(('watchdog', 'live'), [('auto', True), ('on', False)])
@@ -147,7 +149,7 @@ def test_activated_again_at_once_the_torque_goes_on_where_it_was():
     # The surface filter starts anew: that costs K_p = 60 N m s/rad times the few mrad/s that it
     # lagged behind, of a torque of 9 N m.
     assert np.abs(rig.commands[201] - before).max() < 0.3
-    assert rig.guard.ratio.max() < 0.5
+    assert rig.guard.samples.ratio.max() < 0.5
 
 
 @pytest.mark.parametrize('again', ['activate', 'reset'])
@@ -178,7 +180,7 @@ def test_stamps_that_switch_the_watchdog_off_are_told(watchdog, late, told):
     rig.base -= int(late * 1e9)
     rig.step(2)
     assert rig.supervisor.phase is Phase.TRACKING
-    said = rig.guard.unwatched
+    said = rig.guard.watchdog.why_off
     assert (f'{late:.4g} s behind' in said if late > 0 else 'ahead of' in said) == told
     rig.wait(100)
     assert (rig.supervisor.reason is Reason.STATE_TIMEOUT) == (not told)
@@ -364,7 +366,7 @@ def to(goal, seconds):
 def test_a_plan_is_followed_from_its_time_on():
     rig = Rig()
     rig.step(100)
-    plan = rig.guard.planner(to((2.1, 1.5), 1.0), rig.guard.time + 0.03)()
+    plan = rig.guard.plan(to((2.1, 1.5), 1.0), rig.guard.time + 0.03)
     before = rig.guard.controller.reference_at(plan.at)
     rig.step(20)
     rig.guard.adopt(plan)
@@ -377,7 +379,7 @@ def test_a_plan_is_followed_from_its_time_on():
 def test_a_plan_that_comes_too_late_is_not_followed():
     rig = Rig()
     rig.step(100)
-    plan = rig.guard.planner(to((2.1, 1.5), 1.0), rig.guard.time + 0.03)()
+    plan = rig.guard.plan(to((2.1, 1.5), 1.0), rig.guard.time + 0.03)
     rig.step(31)
     with pytest.raises(LatePlanError):
         rig.guard.adopt(plan)
@@ -386,7 +388,7 @@ def test_a_plan_that_comes_too_late_is_not_followed():
 def test_a_plan_from_another_reference_is_not_followed():
     rig = Rig()
     rig.step(100)
-    plan = rig.guard.planner(to((2.1, 1.5), 1.0), rig.guard.time + 0.03)()
-    rig.guard.follow(to((2.0, 1.4), 1.0))
+    plan = rig.guard.plan(to((2.1, 1.5), 1.0), rig.guard.time + 0.03)
+    rig.guard.adopt(rig.guard.plan(to((2.0, 1.4), 1.0)))
     with pytest.raises(TrajectoryError, match='replaced while it was planned'):
         rig.guard.adopt(plan)

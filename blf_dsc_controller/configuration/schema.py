@@ -164,6 +164,12 @@ def flatten(config: object) -> dict[str, Value]:
     return {one.name: operator.attrgetter(one.name)(config) for one in parameters(type(config))}
 
 
+def differences(before: object, after: object) -> dict[str, Value]:
+    """Return the values by dotted name that another configuration of the same type changes."""
+    old = flatten(before)
+    return {name: value for name, value in flatten(after).items() if value != old[name]}
+
+
 def build(cls: type[Config], given: Mapping[str, object], source: str = '') -> Config:
     """Make a configuration from values by dotted name; missing ones keep their defaults.
 

@@ -190,7 +190,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         for message in self._telemetry.sample(stamp, sample, guard.compute_time):
             self._publish(message)
         if (guard.controller.samples - 1) % DECIMATION == 0:
-            self._publish(self._monitor.message(stamp, sample, guard.ratio, sample.bound))
+            self._publish(self._monitor.message(stamp, sample, guard.samples.ratio, sample.bound))
 
     def _report_learning(self, guard: Guard, events: tuple[float, float, float]) -> None:
         before, self._learning_events = self._learning_events, events
@@ -221,7 +221,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if self.guard is not None:
             self._watch(self.guard)
             if self._pending is None:
-                wait = self.guard.next_watch
+                wait = self.guard.watchdog.next_check
         self._poll_timer.timer_period_ns = int(1e9 * wait)
         self._poll_timer.reset()
 
@@ -254,9 +254,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
         supervisor = guard.supervisor
         if supervisor.phase is Phase.SAFE_STOP:
             self.get_logger().fatal(f'{self.config.safety.torque} torque: {supervisor.text}')
-        if guard.unwatched and guard.start_stamp != self._warned_at:
+        if guard.watchdog.why_off and guard.start_stamp != self._warned_at:
             self._warned_at = guard.start_stamp
-            self.get_logger().warning(guard.unwatched)
+            self.get_logger().warning(guard.watchdog.why_off)
         self._started = self._started or supervisor.running
         if guard.start_error is not None and self.config.autostart and not self._started:
             self.failure, self.finished = guard.start_error, True

@@ -93,29 +93,29 @@ class ControllerStatus:
         return self._diagnostics.status('state', _LEVELS[phase], message, values)
 
     def _loop(self, guard: Guard) -> DiagnosticStatus:
-        supervisor = guard.supervisor
+        states, samples = guard.states, guard.samples
         values = {
             'samples': guard.controller.samples,
-            'repeated states ignored': supervisor.repeated,
-            'samples outside the bound': guard.outside,
-            'largest error against the bound': f'{guard.ratio.max():.3g}',
-            'states missed': supervisor.overruns.count,
-            'samples with a torque at its limit': supervisor.saturated,
+            'repeated states ignored': states.repeated,
+            'samples outside the bound': samples.outside,
+            'largest error against the bound': f'{samples.ratio.max():.3g}',
+            'states missed': states.missed,
+            'samples with a torque at its limit': samples.saturated,
             'messages for other joints': guard.foreign,
             'watchdog on the steady clock': _watchdog(guard),
             **self._cuts(guard),
             **(self.trajectories.values if self.trajectories else {}),
         }
-        if guard.outside:
+        if samples.outside:
             return self._diagnostics.status('loop', WARN, 'the error has left its bound', values)
-        if supervisor.saturated_time > 0.0:
+        if samples.saturated_time > 0.0:
             message = 'torque at its limit: adaptation by the tracking error is frozen'
             return self._diagnostics.status('loop', WARN, message, values)
         if guard.has_sample and guard.controller.sample.cuts.any():
             message = 'torque changes at its limit: adaptation by the tracking error is frozen'
             return self._diagnostics.status('loop', WARN, message, values)
         return self._diagnostics.status(
-            'loop', OK, _MESSAGES.get(supervisor.phase, 'stopped'), values
+            'loop', OK, _MESSAGES.get(guard.supervisor.phase, 'stopped'), values
         )
 
     def _cuts(self, guard: Guard) -> dict[str, int]:
@@ -146,5 +146,6 @@ class ControllerStatus:
 
 
 def _watchdog(guard: Guard) -> str:
-    off = f'off: {guard.unwatched}' if guard.unwatched else 'off'
-    return 'on' if guard.watching else off
+    why_off = guard.watchdog.why_off
+    off = f'off: {why_off}' if why_off else 'off'
+    return 'on' if guard.watchdog.on else off

@@ -101,8 +101,8 @@ class TrajectoryInput:
         if len(raw) > self._largest:
             problem = f'it has {len(raw)} bytes, more than {MOST_POINTS} points can have'
             raise TrajectoryError([f'{problem}: send it in pieces'])
-        if not guard.watching:
-            self._adopt(guard, guard.planner(_trajectory(raw, guard.start_stamp))())
+        if not guard.watchdog.on:
+            self._adopt(guard, guard.plan(_trajectory(raw, guard.start_stamp)))
             return
         if self._job is not None:
             self._reject(TrajectoryError(['a newer one arrived while it was being planned']))
@@ -112,7 +112,7 @@ class TrajectoryInput:
         start, at = guard.start_stamp, guard.time + lead
 
         def plan() -> Plan:
-            return guard.planner(_trajectory(raw, start), at)()
+            return guard.plan(_trajectory(raw, start), at)
 
         self._job = _Job(raw, lead, self._thread.submit(plan))
 

@@ -146,10 +146,6 @@ class Rerun:
     def _is_over(self) -> bool:
         return bool(self.end or self.departure)
 
-    @property
-    def _in_command(self) -> bool:
-        return self._guard.supervisor.phase not in (Phase.SAFE_STOP, Phase.INACTIVE)
-
     # Between two events.
 
     def _locate(self, event: Event) -> tuple[int, bool]:
@@ -191,7 +187,7 @@ class Rerun:
     def _was_used(self, k: int) -> bool:
         """Whether the recorded controller must have processed a state that it may have missed."""
         stamp = self._came.stamp[k]
-        if not self._in_command:
+        if not self._guard.supervisor.uses_states:
             return True
         if k in self._came.errors or stamp == self._last:
             return False
@@ -203,10 +199,11 @@ class Rerun:
         if k in self._came.errors:
             torque = guard.reject(self._came.errors[k])
             self._command(guard.journal.stamp, torque, is_exact=is_exact)
-        elif self._in_command and stamp > self._lost:
+        elif guard.supervisor.uses_states and stamp > self._lost:
             self.end = f'the state with stamp {self._lost} ns was used but is not in the bag'
         else:
-            is_due = self._in_command and stamp > self._last and stamp in (self._sampled or ())
+            is_new = stamp > self._last and stamp in (self._sampled or ())
+            is_due = guard.supervisor.uses_states and is_new
             torque = guard.update(stamp, self._came.measurement[k])
             if guard.has_sample:
                 if stamp <= self._last:
@@ -232,7 +229,7 @@ class Rerun:
             self._monitor = Monitor(self._config.joints, names, controller.settings)
         if (samples - 1) % DECIMATION == 0:
             sample = controller.sample
-            message = self._monitor.message(stamp, sample, guard.ratio, sample.bound)
+            message = self._monitor.message(stamp, sample, guard.samples.ratio, sample.bound)
             self.monitored[row] = message[1]
 
     def _command(self, stamp: int, torque: Floats | None, *, is_exact: bool) -> None:
@@ -276,11 +273,11 @@ class Rerun:
         elif event.type is EventType.TRAJECTORY:
             points = tuple(TrajectoryPoint(**point) for point in content['points'])
             trajectory = Trajectory(tuple(content['joints']), points, content['begin'])
-            guard.follow(trajectory, content['at'])
+            guard.adopt(guard.plan(trajectory, content['at']))
         elif event.type is EventType.PARAMETERS:
             guard.retune(change(guard.config, content['parameters']))
         elif event.type is EventType.SILENCE:
-            while guard.watchdog_torques < content['torques']:
+            while guard.watchdog.torques < content['torques']:
                 self._command(event.stamp, guard.time_out(''), is_exact=True)
             guard.end_silence()
         elif _reason(event) is Reason.STATE_TIMEOUT:

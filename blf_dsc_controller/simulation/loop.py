@@ -155,8 +155,9 @@ def _run_compiled(guard: Guard, plant: Plant, record: Record, chunk: range) -> b
     safety, controller = guard.config.safety, guard.controller
     if not guard.supervisor.running or safety.velocity != 'measured':
         return False
-    checks = (np.array((safety.velocity_limit, safety.error_ratio)), *guard.checked)
-    before = controller.save(), plant.save(), [array.copy() for array in guard.checked]
+    checked = guard.samples.ratio, guard.samples.kept
+    checks = (np.array((safety.velocity_limit, safety.error_ratio)), *checked)
+    before = controller.save(), plant.save(), [array.copy() for array in checked]
     rows = slice(chunk.start, chunk.stop)
     arrays = record.measurements[rows], record.samples[rows], record.truths[rows]
     samples = chunk.start, chunk.stop - 1, chunk.stop == record.stamps.size
@@ -166,7 +167,7 @@ def _run_compiled(guard: Guard, plant: Plant, record: Record, chunk: range) -> b
         return True
     controller.restore(before[0])
     plant.restore(before[1])
-    for array, saved in zip(guard.checked, before[2], strict=True):
+    for array, saved in zip(checked, before[2], strict=True):
         array[:] = saved
     return False
 

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.reference.approach import Motion
-from blf_dsc_controller.reference.limits import MotionLimits
-from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, plan_trajectory
+from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError
 
 
 class LatePlanError(TrajectoryError):
@@ -46,12 +45,3 @@ class Plan(NamedTuple):
             raise TrajectoryError([problem])
         if self.at < now:
             raise LatePlanError(self.at, now)
-
-
-def plan(trajectory: Trajectory, before: np.ndarray, at: float, limits: MotionLimits) -> Plan:
-    """Plan a trajectory that takes over from the packed reference `before` at a time [s].
-
-    Raises:
-        TrajectoryError: as `plan_trajectory`.
-    """
-    return Plan(trajectory, at, before, plan_trajectory(trajectory, before, at, limits))

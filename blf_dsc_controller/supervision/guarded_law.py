@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The law between its checks: for every joint state a torque that is safe to apply.
+
+joint state -> StateCheck -> law -> SampleCheck -> torque
+                   |                     |
+                   +---- safe torque <---+    until the next reset or activation
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from math import inf
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.errors import BlfDscError, StartError
+from blf_dsc_controller.law.factory import begin, controller_of
+from blf_dsc_controller.messages import cdr
+from blf_dsc_controller.messages.journal import EventType, Journal
+from blf_dsc_controller.reference.approach import check_takeover
+from blf_dsc_controller.reference.limits import MotionError
+from blf_dsc_controller.supervision.safe_torque import (
+    LastState,
+    Ramp,
+    limit_first_torque,
+    safe_torque,
+)
+from blf_dsc_controller.supervision.sample_check import SampleCheck
+from blf_dsc_controller.supervision.state_check import SKIP, StateCheck
+from blf_dsc_controller.supervision.supervisor import Phase, Reason, Supervisor
+from blf_dsc_controller.supervision.velocity import Velocity
+from blf_dsc_controller.supervision.watchdog import PERIOD, Watchdog
+
+Vector = NDArray[np.float64]
+_NANO = 1e-9
+
+_REASONS: dict[type[cdr.MessageError], Reason] = {
+    cdr.MissingJointError: Reason.JOINT_MISSING,
+    cdr.DuplicatedJointError: Reason.JOINT_DUPLICATED,
+    cdr.ShortArrayError: Reason.FIELD_MISSING,
+}
+
+
+class GuardedLaw:
+    """The law, its checks, and the torque without it; it notes every start and stop in its journal.
+
+    `update`, `reject`, `watch` and `fail` return the torque (n,) [N m] to command, or None.
+
+    Attributes:
+        config: in force.
+        controller: the law.
+        supervisor: phase, and the reason of a stop.
+        states, samples: the checks before and after the law.
+        watchdog: the check that states come at all.
+        journal: events, and what has been processed so far.
+        has_sample: whether the law used the last message, so that there is new telemetry.
+        start_error: why the law could not start; None if it could.
+        foreign: messages ignored because they name none of the joints.
+        start_stamp: of t = 0 [ns]; -1 before the first start.
+        last_stamp: of the last sample of the law [ns].
+        settled: end of the approach or of a mixed-in trajectory [s].
+        compute_time: of the last sample [s].
+    """
+
+    def __init__(
+        self,
+        config: ControllerConfig,
+        steady: Callable[[], int] = time.monotonic_ns,
+        wall: Callable[[], int] = time.time_ns,
+    ) -> None:
+        """Compile the law; `steady` and `wall` are the clocks [ns]."""
+        n = len(config.joints)
+        self.config = config
+        self.controller = controller_of(config)
+        self.supervisor = Supervisor()
+        self.states = StateCheck(config.joints, config.sample_time)
+        self.samples = SampleCheck(config.joints, self.controller)
+        self.watchdog = Watchdog(steady, wall)
+        self.journal = Journal()
+        self.has_sample = False
+        self.start_error: BlfDscError | None = None
+        self.foreign = 0
+        self.start_stamp = self.last_stamp = -1
+        self.settled = self.compute_time = 0.0
+        self._velocity = Velocity(config.safety.velocity, n)
+        self._learns_from_effort = config.learning.torque_source == 'effort'
+        self._last_state, self._ramp = LastState(n), Ramp(n)
+        self._torque = np.zeros(n)  # the last one commanded
+        self._clean = True  # whether the window holds valid samples only
+        self._resumable = False  # whether the law may continue along its reference
+        self.journal.note(EventType.CONFIGURE, parameters=flatten(config))
+
+    @property
+    def commanding(self) -> bool:
+        """Whether a torque has been commanded since the controller was configured."""
+        return self.journal.commands > 0
+
+    @property
+    def time(self) -> float:
+        """Time of the last sample of the law [s]."""
+        return self._time_of(self.last_stamp)
+
+    def update(self, stamp: int, measurement: Vector) -> Vector | None:
+        """Return the torque for a joint state with its stamp [ns], None to command nothing.
+
+        `measurement` is [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
+        """
+        self._begin_message()
+        self.journal.stamp = stamp
+        self.watchdog.restart()
+        n, safety, supervisor = self._torque.size, self.config.safety, self.supervisor
+        q, dq = measurement[:n], measurement[n : 2 * n]
+        self._velocity.replace(stamp, q, dq)
+        if supervisor.uses_states:
+            effort = measurement[2 * n :] if self._learns_from_effort else None
+            problem = self.states.check(safety, stamp, q, dq, effort)
+            if problem is SKIP:
+                return None
+            if problem is None:
+                return self._use(stamp, measurement)
+            self._stop(*problem)
+        self._last_state.salvage(stamp, q, dq, safety.velocity_limit, self.config.sample_time)
+        return self._safe(self.config.sample_time)
+
+    def _use(self, stamp: int, measurement: Vector) -> Vector | None:
+        """Give a valid state to the law."""
+        self._last_state.take(stamp, measurement)
+        if self.supervisor.phase is Phase.STARTING and not self._start(stamp, measurement):
+            return self._safe(self.config.sample_time) if self.commanding else None
+        dt = (stamp - self.last_stamp) * _NANO
+        self._advance_to(stamp)
+        before = perf_counter()
+        torque = self.controller.update(self.time, dt, measurement)
+        self.compute_time = perf_counter() - before
+        if self.controller.samples == 1 and self.commanding:
+            limit_first_torque(self.controller, self._torque, dt)
+        problem = self.samples.check(self.config.safety, dt)
+        if problem is not None:
+            self._stop(*problem)
+            return self._safe(self.config.sample_time)
+        self._torque[:] = torque
+        self.has_sample = True
+        self.journal.commands += 1
+        return self._torque
+
+    def _start(self, stamp: int, measurement: Vector) -> bool:
+        """Resume along the running reference if the law can take over, or else start at t = 0."""
+        q, dq, _ = measurement.reshape(3, -1)
+        resumed = self._resumes(stamp, q, dq)
+        if not resumed:
+            try:
+                self.settled = begin(self.controller, self.config, q, dq)
+            except (StartError, MotionError) as error:
+                self.start_error = error
+                self._stop(Reason.START_REJECTED, str(error))
+                return False
+            self.start_stamp = stamp
+        self.journal.note(EventType.START, resumed=resumed)
+        self.last_stamp = stamp - self.config.sample_time_ns
+        self.watchdog.switch(self.config.safety.watchdog, stamp)
+        self.supervisor.enter(Phase.APPROACHING)
+        return True
+
+    def _resumes(self, stamp: int, q: Vector, dq: Vector) -> bool:
+        controller, t = self.controller, self._time_of(stamp)
+        if not self._resumable or stamp <= self.last_stamp:
+            return False
+        bound = controller.bound_at(t)
+        try:
+            check_takeover(self.config, bound, q, dq, controller.reference_vector, t)
+        except StartError:
+            return False
+        return True
+
+    def _advance_to(self, stamp: int) -> None:
+        self.last_stamp = stamp
+        if self.supervisor.phase is Phase.APPROACHING and self.time >= self.settled:
+            self.supervisor.enter(Phase.TRACKING)
+
+    def advance(self, stamp: int, measurement: Vector, count: int) -> None:
+        """Go on to the state of a stamp [ns], the last of `count` that the law has used.
+
+        There was nothing to object to, and `samples.ratio` and `samples.kept` are up to date.
+        """
+        self.journal.stamp = stamp
+        self.journal.messages += count
+        self.journal.commands += count
+        self.has_sample = True
+        self._last_state.take(stamp, measurement)
+        self._torque[:] = self.controller.state.torque
+        self.states.advance(stamp)
+        self.samples.saturated_time = 0.0
+        self._advance_to(stamp)
+
+    def reject(self, error: cdr.MessageError) -> Vector | None:
+        """Return the torque for an unreadable message, None if it is for another arm."""
+        self._begin_message()
+        names = error.names if isinstance(error, cdr.MissingJointError) else ()
+        if names and not set(self.config.joints) & set(names):  # drivers may share joint_states
+            self.foreign += 1
+            return None
+        self.watchdog.restart()
+        self._stop(_REASONS.get(type(error), Reason.BAD_MESSAGE), str(error))
+        return self._safe_without_state(self.config.sample_time)
+
+    def watch(self) -> Vector | None:
+        """Check the steady clock, `watchdog.next_check` after the last time.
+
+        Returns a torque during a silence.
+        """
+        limit = self.config.sample_time + self.config.safety.state_timeout
+        silent = self.watchdog.silence(limit)
+        if silent == 0.0 or not (self.watchdog.on and self.commanding):
+            return None
+        return self.time_out(f'no joint state has come for {silent:.3g} s')
+
+    def time_out(self, text: str) -> Vector | None:
+        """Return the torque of one watchdog period without a joint state."""
+        if self.supervisor.phase is not Phase.STARTING:  # which waits for a state
+            self._stop(Reason.STATE_TIMEOUT, text)
+        self.watchdog.torques += 1
+        return self._safe_without_state(PERIOD)
+
+    def end_silence(self) -> None:
+        """Note how many torques the watchdog has commanded."""
+        if self.watchdog.torques:
+            self.journal.note(EventType.SILENCE, torques=self.watchdog.torques)
+            self.watchdog.torques = 0
+
+    def fail(self, text: str) -> Vector | None:
+        """Return the torque after an unexpected error."""
+        self._stop(Reason.FAILED, text)
+        return self._safe_without_state(self.config.sample_time)
+
+    def _begin_message(self) -> None:
+        self.end_silence()
+        self.has_sample = False
+        self.journal.messages += 1
+
+    def _time_of(self, stamp: int) -> float:
+        return (stamp - self.start_stamp) * _NANO
+
+    def _stop(self, reason: Reason, text: str) -> None:
+        if self.supervisor.stop(reason, text):
+            self.journal.note(EventType.STOP, reason=reason, text=text)
+            self._clean = self._resumable = False
+            self._ramp.begin(self._torque, self.config.safety.stop_ramp)
+
+    def _safe_without_state(self, dt: float) -> Vector | None:
+        self.has_sample = False
+        self._last_state.miss(dt)
+        return self._safe(dt)
+
+    def _safe(self, dt: float) -> Vector | None:
+        """Safe torque, `dt` [s] further on the ramp.
+
+        None while no state has been seen, and while inactive from the beginning.
+        """
+        is_new = self.supervisor.phase is Phase.INACTIVE and not self.commanding
+        if is_new or self._last_state.age == inf:
+            return None
+        settings = self.controller.settings
+        goal = safe_torque(self.config.safety, settings, self._last_state, self.samples.estimate)
+        limit = settings.torque_limit
+        self._torque[:] = np.clip(self._ramp.advance(goal, dt), -limit, limit)
+        self.journal.commands += 1
+        return self._torque

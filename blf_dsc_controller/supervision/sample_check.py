@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The check of every sample of the law before its torque is commanded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import Safety
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.settings import LINEAR
+from blf_dsc_controller.supervision import checks
+from blf_dsc_controller.supervision.supervisor import Problem, Reason
+
+Vector = NDArray[np.float64]
+
+
+class SampleCheck:
+    """Checks each sample of a controller, and keeps the estimates of the last valid one.
+
+    Attributes:
+        ratio: largest |xi1| / k_c of each joint since the start (n,).
+        outside: samples past the bound since the start.
+        saturated: samples with a torque at its limit since the start.
+        saturated_time: time that they have lasted without a break [s].
+        kept: estimates and d^3 (m + n,) of the last valid sample.
+    """
+
+    def __init__(self, joints: Sequence[str], controller: Controller) -> None:
+        self._joints = tuple(joints)
+        self._controller = controller
+        self.ratio = np.zeros(len(self._joints))
+        self.kept = np.zeros(controller.settings.m + len(self._joints))
+        self.keep()
+        self.restart()
+
+    def restart(self) -> None:
+        """Count from the next sample on."""
+        self.ratio[:] = 0.0
+        self.outside = self.saturated = 0
+        self.saturated_time = 0.0
+
+    @property
+    def estimate(self) -> Vector:
+        """The kept estimate (m,)."""
+        return self.kept[: self._controller.settings.m]
+
+    def keep(self) -> None:
+        """Keep the present estimates."""
+        state = self._controller.state
+        np.concatenate((state.estimate, state.disturbance), out=self.kept)
+
+    def restore(self) -> None:
+        """Reset the controller but for its estimates, which are the kept ones then."""
+        self._controller.reset()
+        state = self._controller.state
+        state.estimate[:], state.disturbance[:] = self.estimate, self.kept[state.estimate.size :]
+
+    def check(self, safety: Safety, dt: float) -> Problem | None:
+        """Return why the torque of a sample, `dt` [s] after the one before, must not be used."""
+        controller = self._controller
+        flags = checks.check_sample(
+            controller.settings_vector,
+            controller.state_vector,
+            controller.signals_vector,
+            controller.sample_vector,
+            safety.error_ratio,
+            self.ratio,
+            self.kept,
+        )
+        if flags & checks.OUTSIDE:
+            self.outside += 1
+        if not flags & checks.SUSPECT:
+            self.saturated_time = 0.0
+            return None
+        problem = self._not_finite() or self._past_limits(safety, dt)
+        if problem is None:
+            self.keep()
+        return problem
+
+    def _not_finite(self) -> Problem | None:
+        state, demand = self._controller.state, self._controller.signals.demand
+        if not (np.isfinite(state.estimate).all() and np.isfinite(state.disturbance).all()):
+            text = f'an estimate is not finite: {state.estimate}, disturbance {state.disturbance}'
+            return Problem(Reason.ESTIMATE, text)
+        # Saturation makes a finite torque of an infinite demand.
+        if not (np.isfinite(demand).all() and np.isfinite(self._controller.sample.torque).all()):
+            return Problem(Reason.TORQUE, f'the demanded torque is not finite: {demand}')
+        return None
+
+    def _past_limits(self, safety: Safety, dt: float) -> Problem | None:
+        saturated = self._saturated(safety, dt)
+        has_barrier = self._controller.settings.surface != LINEAR
+        return (self._outside(safety) if has_barrier else None) or saturated
+
+    def _outside(self, safety: Safety) -> Problem | None:
+        xi1, bound = self._controller.sample.xi1, self._controller.sample.bound
+        ratio = np.abs(xi1) / bound
+        worst = int(np.argmax(ratio))
+        if safety.error_ratio == 0.0 or ratio[worst] < safety.error_ratio:
+            return None
+        share = '' if safety.error_ratio == 1.0 else f'{safety.error_ratio:g} times '
+        text = (
+            f'joint {self._joints[worst]!r} is {xi1[worst]:+.6g} rad from its reference: '
+            f'past {share}its bound of {bound[worst]:.6g} rad'
+        )
+        return Problem(Reason.OUTSIDE_BOUND, text)
+
+    def _saturated(self, safety: Safety, dt: float) -> Problem | None:
+        demand, limit = self._controller.signals.demand, self._controller.settings.torque_limit
+        worst = int(np.argmax(np.abs(demand) - limit))
+        is_saturated = bool(np.abs(demand[worst]) > limit[worst])
+        self.saturated += is_saturated
+        self.saturated_time = self.saturated_time + dt if is_saturated else 0.0
+        if self.saturated_time <= safety.saturation_time:
+            return None
+        text = (
+            f'joint {self._joints[worst]!r} needs {demand[worst]:+.4g} N m and has been at '
+            f'its limit of {limit[worst]:g} N m for {self.saturated_time:.4g} s'
+        )
+        return Problem(Reason.SATURATED, text)
