@@ -25,7 +25,7 @@ from rclpy.timer import Timer
 from std_msgs.msg import String
 
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import Value, flatten
+from blf_dsc_controller.configuration.schema import Value, differences
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder
@@ -72,22 +72,11 @@ class PlantNode(LoopNode[PlantConfig]):
         self._changes = create_publisher(self, topics.CHANGES)
         self._handshake = Handshake(self, self._now)
         self.plant: Plant
-        self._rest()
+        self.deactivate()
         self.start()
 
     def _now(self) -> float:
         return self._steady() * 1e-9
-
-    def _rest(self) -> None:
-        """Stand still: neither sending states nor running."""
-        self._offered = self._running = False
-        self._has_torque = True
-        self._published = self._began = 0.0
-        self._first = 0
-        self._torque_waits = self._stale = False
-        if self._step_timer is not None:
-            self.destroy_timer(self._step_timer)
-            self._step_timer = None
 
     # Life cycle.
 
@@ -100,16 +89,13 @@ class PlantNode(LoopNode[PlantConfig]):
         self.plant.truth()
         self.plant.step(np.zeros(len(self.config.joints)))
         self.plant.reset()
-        self._rest()
+        self.deactivate()
         outputs = [topics.JOINT_STATES, topics.TRUTH]
         outputs += [] if self._lockstep else [topics.TIMING]
         outputs += [topics.CLOCK] if self.config.publish_clock else []
         if self.connect(outputs, topics.COMMANDS, self._on_command):
-            self._publish_description()
-
-    def _publish_description(self) -> None:
-        text = urdf_of(self.config)
-        create_publisher(self, topics.ROBOT_DESCRIPTION).publish(String(data=text))
+            description = String(data=urdf_of(self.config))
+            create_publisher(self, topics.ROBOT_DESCRIPTION).publish(description)
 
     def activate(self) -> None:
         """Send the present state once a controller listens, and continue with its torque."""
@@ -118,11 +104,16 @@ class PlantNode(LoopNode[PlantConfig]):
 
     def deactivate(self) -> None:
         """Stop time: the arm stays where it is, and torques are not applied."""
-        self._rest()
+        self._offered = self._running = False
+        self._has_torque = True
+        self._published = self._began = 0.0
+        self._first = 0
+        self._torque_waits = self._stale = False
+        if self._step_timer is not None:
+            self.destroy_timer(self._step_timer)
+            self._step_timer = None
 
-    def release(self) -> None:
-        """Stop time, as when deactivated."""
-        self._rest()
+    release = deactivate
 
     def close(self) -> None:
         """Wait until every subscriber has the last messages."""
@@ -131,7 +122,7 @@ class PlantNode(LoopNode[PlantConfig]):
     def reset(self) -> str:
         """Take the arm to its start, braked, and reset the controller before the first state."""
         self._start_stamp = self.stamp + _BETWEEN_RUNS
-        self._rest()
+        self.deactivate()
         self.plant.reset()
         self._apply_changes()
         self.input.restart()
@@ -148,17 +139,13 @@ class PlantNode(LoopNode[PlantConfig]):
     def _on_poll(self) -> None:
         if self.finished or self.state_label != 'active':
             return
+        waits = (self._lockstep or not self._running) and not self._has_torque
         if not self._offered:
             if self._handshake.is_done(observed=self._is_observed()):
                 self._offer()
-        elif self._is_overdue():
+        elif waits and self._now() - self._published > _REPEAT_PERIOD:
             self.get_logger().info('no torque yet: sending the state again')
             self._publish_state()
-
-    def _is_overdue(self) -> bool:
-        waits = self._lockstep or not self._running
-        silent = self._now() - self._published
-        return waits and not self._has_torque and silent > _REPEAT_PERIOD
 
     def _offer(self) -> None:
         if not self._lockstep:
@@ -266,8 +253,7 @@ class PlantNode(LoopNode[PlantConfig]):
             self._publish(self._telemetry.clock(stamp))
 
     def _reconfigure(self, config: PlantConfig) -> None:
-        before = flatten(self.config)
-        self._changed |= {k: v for k, v in flatten(config).items() if v != before[k]}
+        self._changed |= differences(self.config, config)
         self.config = config
 
     def _apply_changes(self) -> None:
@@ -281,27 +267,26 @@ class PlantNode(LoopNode[PlantConfig]):
 
     def _report(self) -> None:
         """Publish diagnostics; the level depends on what happened since the last report."""
+        stale, rejected = self.input.stale_steps, self.input.rejected
         values = {
             'commands of a wrong length': self.input.wrong_length,
             'commands that were not finite or too large': self.input.impossible,
-            'steps with a torque that was too old': self.input.stale_steps,
+            'steps with a torque that was too old': stale,
             'late steps': self.latency.late_steps,
         }
-        if not self._running:
-            waits = WARN, 'braked: waiting for the first torque'
-            active = self.state_label == 'active'
-            level, message = waits if active else (STALE, self.state_label)
+        level, message = OK, 'running'
+        if self.state_label != 'active':
+            level, message = STALE, self.state_label
+        elif not self._running:
+            level, message = WARN, 'braked: waiting for the first torque'
         elif self.plant.is_broken:
             level, message = ERROR, f'a joint was faster than {FASTEST:g} rad/s: reset the arm'
-        elif self.input.stale_steps > self._reported_stale:
-            message = 'the last torque is too old (actuator.command_timeout): not applied'
+        elif stale > self._reported_stale:
             level = ERROR
-        elif self.input.rejected > self._reported_rejected:
+            message = 'the last torque is too old (actuator.command_timeout): not applied'
+        elif rejected > self._reported_rejected:
             level, message = WARN, self.input.problem
-        else:
-            level, message = OK, 'running'
-        self._reported_stale = self.input.stale_steps
-        self._reported_rejected = self.input.rejected
+        self._reported_stale, self._reported_rejected = stale, rejected
         self._diagnostics.publish([self._diagnostics.status('torque', level, message, values)])
 
 

@@ -81,7 +81,7 @@ class Soak:
         while self.report.samples < samples:
             count = int(self.rng.integers(1000, 4000))
             self.ros.run(self.arm, count)
-            assert self.law.guard.supervisor.running, self.law.stopped
+            assert self.law.guard.supervisor.running, self.law.guard.supervisor.text
             self.report.samples += count
             self.report.worst = max(self.report.worst, float(self.law.guard.samples.ratio.max()))
             fault = self.rng.choice(FAULTS)

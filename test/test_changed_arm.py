@@ -68,11 +68,11 @@ def with_mujoco(ros, example, row, law):  # noqa: F811
     controller = ros.add(ControllerNode, QUIET | law)
     arm = ros.add(example.MujocoPlant, row)
     steps = round(1e3 * end_of(row))
-    ros.until(lambda: arm.steps >= steps or controller.stopped)
-    assert not controller.stopped
+    ros.until(lambda: arm.steps >= steps or controller.guard.supervisor.text)
+    assert not controller.guard.supervisor.text
     ros.kill(arm)
     ros.kill(controller)
-    return controller.guard.samples.ratio, controller.controller.state.estimate
+    return controller.guard.samples.ratio, controller.guard.controller.state.estimate
 
 
 def offline(plant, law):

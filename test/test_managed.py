@@ -26,7 +26,7 @@ def in_command(node):
 def assert_runs(ros, arm, law, samples=60):
     """The loop goes on, the law is in command, and the error within its bound."""
     ros.run(arm, samples)
-    assert in_command(law), law.stopped
+    assert in_command(law), law.guard.supervisor.text
     assert law.guard.samples.ratio.max() < 1.0
 
 
@@ -158,8 +158,8 @@ def test_a_plant_killed_and_started_again_stops_the_controller_until_reset(ros):
     ros.run(arm, 50)
     ros.kill(arm)
     again = ros.add(PlantNode, mode='lockstep')
-    ros.until(lambda: law.stopped)
-    assert 'before the last one' in law.stopped
+    ros.until(lambda: law.guard.supervisor.text)
+    assert 'before the last one' in law.guard.supervisor.text
     assert ros.reset(again).success
     ros.until(lambda: in_command(law))
     assert_runs(ros, again, law)

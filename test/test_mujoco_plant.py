@@ -187,11 +187,11 @@ def test_the_controller_keeps_the_bound_and_learns_the_parameters(example):
     try:
         law = ros.add(ControllerNode, telemetry__enabled=False)
         arm = ros.add(example.MujocoPlant)
-        ros.until(lambda: arm.steps >= 8000 or law.stopped)
-        assert law.guard.supervisor.phase is Phase.TRACKING, law.stopped
+        ros.until(lambda: arm.steps >= 8000 or law.guard.supervisor.text)
+        assert law.guard.supervisor.phase is Phase.TRACKING, law.guard.supervisor.text
         assert law.guard.samples.ratio.max() < 1.0
         # Learning begins after 6.8 s; a second later 0.1 % is left with our own plant, whose torque
         # is held the same way.  Before, half of each parameter was missing.
-        np.testing.assert_allclose(law.controller.state.estimate[:3], P, rtol=0.01)
+        np.testing.assert_allclose(law.guard.controller.state.estimate[:3], P, rtol=0.01)
     finally:
         ros.close()

@@ -58,7 +58,7 @@ def test_a_state_that_is_not_finite_stops_the_arm_for_good(ros):
     arm = Arm(ros)
     assert arm.torque_for(0, START).any()
     np.testing.assert_array_equal(arm.torque_for(1, (START[0], np.nan)), NOTHING)
-    assert 'not finite' in node.stopped
+    assert 'not finite' in node.guard.supervisor.text
     np.testing.assert_array_equal(arm.torque_for(2, START), NOTHING)
 
 
@@ -68,8 +68,8 @@ def test_a_state_without_one_of_the_joints_stops_the_arm_and_names_it(ros):
     assert arm.torque_for(0, START).any()
     stranger = JointStateEncoder(('joint1', 'joint3'))
     np.testing.assert_array_equal(arm.torque_for(1, START, encoder=stranger), NOTHING)
-    assert "'joint2' is not in the message" in node.stopped
-    assert 'joint1, joint3' in node.stopped
+    assert "'joint2' is not in the message" in node.guard.supervisor.text
+    assert 'joint1, joint3' in node.guard.supervisor.text
 
 
 def test_an_arm_that_falls_silent_gets_the_safe_torque_again_and_again(ros):
@@ -78,10 +78,10 @@ def test_an_arm_that_falls_silent_gets_the_safe_torque_again_and_again(ros):
     arm = Arm(ros)
     heard = ros.listen(topics.COMMANDS)
     assert arm.torque_for(0, START).any()
-    assert not node.stopped
+    assert not node.guard.supervisor.text
     clock.advance(0.1)
-    ros.until(lambda: node.stopped)  # with the clock as its only reason
-    assert 'no joint state has come for' in node.stopped
+    ros.until(lambda: node.guard.supervisor.text)  # with the clock as its only reason
+    assert 'no joint state has come for' in node.guard.supervisor.text
     before = len(heard)
     ros.until(lambda: clock.advance(0.01) or len(heard) >= before + 20)
     np.testing.assert_array_equal(torques(heard)[-1], NOTHING)
@@ -141,7 +141,7 @@ def test_a_gain_changed_while_running_acts_from_the_next_sample_on(ros):
     arm.torque_for(0, START, VELOCITY)
     assert set_parameters(ros, node, feedback__gain=gain) == (True, [''])
     torque = arm.torque_for(1, START, VELOCITY)
-    np.testing.assert_array_equal(node.controller.settings.Kp, gain)
+    np.testing.assert_array_equal(node.guard.controller.settings.Kp, gain)
     assert not np.array_equal(torque, law_torques(*[(START, VELOCITY)] * 2)[1])
 
 

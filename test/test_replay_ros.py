@@ -102,7 +102,7 @@ def stopped(tmp_path_factory):
     activate(run.ros, run.law)
     run.run(200)
     run.arm._start_stamp += SECOND // 10  # the next state is too late
-    run.ros.until(lambda: run.law.stopped)
+    run.ros.until(lambda: run.law.guard.supervisor.text)
     run.run(50)
     run.change('safety.damping', [4.0, 3.0])
     run.run(50)
@@ -118,7 +118,7 @@ def stopped(tmp_path_factory):
     run.ros.until(lambda: publisher.get_subscription_count() >= 2)
     stamp = run.law.guard.last_stamp + MILLISECOND
     publisher.publish(JointStateEncoder(JOINTS[:1]).encode(stamp, [0.0], [0.0], [0.0]))
-    run.ros.until(lambda: run.law.stopped)
+    run.ros.until(lambda: run.law.guard.supervisor.text)
     activate(run.ros, run.arm)
     run.run(50)
     return run.end()
@@ -280,7 +280,7 @@ def test_a_stop_for_silence_replays_with_its_torques(tmp_path):
     run.run(50)
     deactivate(run.ros, run.arm)
     clock.advance(0.1)
-    run.ros.until(lambda: run.law.stopped)
+    run.ros.until(lambda: run.law.guard.supervisor.text)
     silent = run.law.guard.last_stamp
     activate(run.ros, run.arm)
     run.ros.until(lambda: clock.advance(0.01) or run.arm._offered)

@@ -12,7 +12,7 @@ import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law import factory as assembly
-from blf_dsc_controller.law.controller import Controller, update
+from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.cdr import MessageError
@@ -58,18 +58,6 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._status = ControllerStatus(self, joints)
         parameters.on_change(self, ControllerConfig, self._retune, self._problems)
         self.start()
-
-    @property
-    def controller(self) -> Controller:
-        """The law with its state; only while configured."""
-        if self.guard is None:
-            raise AttributeError(f'{self.get_name()} is not configured: there is no controller')
-        return self.guard.controller
-
-    @property
-    def stopped(self) -> str:
-        """Why the controller is in its safe stop; empty while it is not."""
-        return self.guard.supervisor.text if self.guard else ''
 
     # Life cycle.
 
@@ -141,14 +129,13 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if self._status.trajectories is not None:
             self._status.trajectories.poll(guard)
         try:
-            torque, stamp = self._torque_for(guard, raw)
+            torque = self._torque_for(guard, raw)
         except Exception as error:  # noqa: BLE001 - whatever it is, the arm needs a torque
             self.survive(error)
             return
-        if torque is not None:
-            self._command(torque)
+        self._command(torque)
         if guard.has_sample:
-            self._publish_telemetry(guard, stamp)
+            self._publish_telemetry(guard)
         self._report_if_changed(guard)
 
     def survive(self, error: Exception) -> bool:
@@ -156,13 +143,11 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if self.guard is None:
             return False
         self.get_logger().fatal(''.join(traceback.format_exception(error)))
-        torque = self.guard.fail(f'{type(error).__name__}: {error}')
-        if torque is not None:
-            self._command(torque)
+        self._command(self.guard.fail(f'{type(error).__name__}: {error}'))
         self._report_if_changed(self.guard)
         return True
 
-    def _torque_for(self, guard: Guard, raw: bytes) -> tuple[np.ndarray | None, int]:
+    def _torque_for(self, guard: Guard, raw: bytes) -> np.ndarray | None:
         try:
             stamp = self._decoder.decode(raw)
         except MessageError as error:
@@ -170,26 +155,26 @@ class ControllerNode(LoopNode[ControllerConfig]):
             torque = guard.reject(error)
             if guard.foreign != foreign:
                 self.get_logger().warning(f'ignored: {error}', throttle_duration_sec=10.0)
-            return torque, 0
-        return guard.update(stamp, self._decoder.values), stamp
+            return torque
+        return guard.update(stamp, self._decoder.values)
 
-    def _publish_telemetry(self, guard: Guard, stamp: int) -> None:
-        state = guard.controller.state
+    def _publish_telemetry(self, guard: Guard) -> None:
+        controller, stamp = guard.controller, guard.last_stamp
+        state, sample, samples = controller.state, controller.sample, controller.samples
         events = (state.columns_checked[0], state.active.sum(), state.changes[0])
         if events != self._learning_events:
             self._report_learning(guard, events)
         if not self.config.telemetry.enabled:
             return
-        sample = guard.controller.sample
-        settings = guard.controller.settings
-        if guard.controller.samples == 1 or self._monitor is None:
-            self._monitor = Monitor(self.config.joints, self._estimates, settings)
-            self._publish_bound(stamp, sample.bound)
-        elif settings.funnel_rate > 0.0 and not np.array_equal(sample.bound, self._published_bound):
-            self._publish_bound(stamp, sample.bound)
+        narrows = controller.settings.funnel_rate > 0.0
+        if samples == 1 or self._monitor is None:
+            self._monitor = Monitor(self.config.joints, self._estimates, controller.settings)
+            self._publish_bound(guard, stamp, sample.bound)
+        elif narrows and not np.array_equal(sample.bound, self._published_bound):
+            self._publish_bound(guard, stamp, sample.bound)
         for message in self._telemetry.sample(stamp, sample, guard.compute_time):
             self._publish(message)
-        if (guard.controller.samples - 1) % DECIMATION == 0:
+        if (samples - 1) % DECIMATION == 0:
             self._publish(self._monitor.message(stamp, sample, guard.samples.ratio, sample.bound))
 
     def _report_learning(self, guard: Guard, events: tuple[float, float, float]) -> None:
@@ -207,12 +192,13 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if self._status.rejected or events[2] > before[2]:
             self._report()
 
-    def _command(self, torque: np.ndarray) -> None:
-        self._publish(self._telemetry.command(torque))
+    def _command(self, torque: np.ndarray | None) -> None:
+        if torque is not None:
+            self._publish(self._telemetry.command(torque))
 
-    def _publish_bound(self, stamp: int, bound: np.ndarray) -> None:
+    def _publish_bound(self, guard: Guard, stamp: int, bound: np.ndarray) -> None:
         self._published_bound[:] = bound
-        limit = self.controller.settings.torque_limit
+        limit = guard.controller.settings.torque_limit
         self._publish(self._telemetry.bound(stamp, bound, limit))
 
     def _on_poll(self) -> None:
@@ -229,9 +215,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if self._pending is not None and self._is_observed():
             raw, self._pending = self._pending, None
             self._on_joint_state(raw)
-        torque = guard.watch()
-        if torque is not None:
-            self._command(torque)
+        self._command(guard.watch())
         self._report_if_changed(guard)
 
     # Changes of the configuration, and reports.
@@ -240,13 +224,12 @@ class ControllerNode(LoopNode[ControllerConfig]):
         return self.guard.problems(config) if self.guard else []
 
     def _retune(self, config: ControllerConfig) -> None:
-        self.config = config
-        if self.guard is not None:
-            self.guard.retune(config)
-            stamp = self.guard.last_stamp
-            if stamp >= 0 and config.telemetry.enabled:
-                t = (stamp - self.guard.start_stamp) * 1e-9
-                self._publish_bound(self.guard.journal.stamp, self.guard.controller.bound_at(t))
+        self.config, guard = config, self.guard
+        if guard is not None:
+            guard.retune(config)
+            if guard.last_stamp >= 0 and config.telemetry.enabled:
+                bound = guard.controller.bound_at(guard.time)
+                self._publish_bound(guard, guard.journal.stamp, bound)
 
     def _report_if_changed(self, guard: Guard) -> None:
         if not self._status.has_news(guard):

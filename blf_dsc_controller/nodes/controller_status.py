@@ -16,20 +16,14 @@ from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, Diagnos
 from blf_dsc_controller.nodes.endpoints import create_publisher
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.supervisor import Phase, Reason
+from blf_dsc_controller.supervision.supervisor import Phase, Supervisor
 
-_LEVELS = {
-    Phase.INACTIVE: STALE,
-    Phase.STARTING: WARN,
-    Phase.APPROACHING: OK,
-    Phase.TRACKING: OK,
-    Phase.SAFE_STOP: ERROR,
-}
-_MESSAGES = {
-    Phase.INACTIVE: 'not in command',
-    Phase.STARTING: 'waiting for a joint state to start from',
-    Phase.APPROACHING: 'approaching the reference',
-    Phase.TRACKING: 'tracking',
+_PHASES = {
+    Phase.INACTIVE: (STALE, 'not in command'),
+    Phase.STARTING: (WARN, 'waiting for a joint state to start from'),
+    Phase.APPROACHING: (OK, 'approaching the reference'),
+    Phase.TRACKING: (OK, 'tracking'),
+    Phase.SAFE_STOP: (ERROR, 'stopped'),
 }
 
 
@@ -80,17 +74,18 @@ class ControllerStatus:
             self.journal.publish(guard.journal.pending.popleft().encode())
 
     def _state(self, life: str, guard: Guard | None) -> DiagnosticStatus:
-        phase = guard.supervisor.phase if guard else Phase.INACTIVE
-        reason = guard.supervisor.reason if guard else Reason.NONE
-        if guard is not None and phase is Phase.SAFE_STOP:
-            message = f'stopped: {guard.supervisor.text}'
+        supervisor = guard.supervisor if guard else Supervisor()
+        level, message = _PHASES[supervisor.phase]
+        values: dict[str, Any] = {PHASE: supervisor.phase, REASON: supervisor.reason}
+        values['lifecycle'] = life
+        if guard is None:
+            message = 'not configured'
         else:
-            message = _MESSAGES[phase] if guard else 'not configured'
-        values: dict[str, Any] = {PHASE: phase, REASON: reason.value, 'lifecycle': life}
-        if guard is not None:
-            values[STOPS] = guard.supervisor.stops
+            values[STOPS] = supervisor.stops
             values['safe torque'] = guard.config.safety.torque
-        return self._diagnostics.status('state', _LEVELS[phase], message, values)
+        if supervisor.text:
+            message += f': {supervisor.text}'
+        return self._diagnostics.status('state', level, message, values)
 
     def _loop(self, guard: Guard) -> DiagnosticStatus:
         states, samples = guard.states, guard.samples
@@ -106,17 +101,16 @@ class ControllerStatus:
             **self._cuts(guard),
             **(self.trajectories.values if self.trajectories else {}),
         }
+        level, message = WARN, 'torque{} at its limit: adaptation by the tracking error is frozen'
         if samples.outside:
-            return self._diagnostics.status('loop', WARN, 'the error has left its bound', values)
-        if samples.saturated_time > 0.0:
-            message = 'torque at its limit: adaptation by the tracking error is frozen'
-            return self._diagnostics.status('loop', WARN, message, values)
-        if guard.has_sample and guard.controller.sample.cuts.any():
-            message = 'torque changes at its limit: adaptation by the tracking error is frozen'
-            return self._diagnostics.status('loop', WARN, message, values)
-        return self._diagnostics.status(
-            'loop', OK, _MESSAGES.get(guard.supervisor.phase, 'stopped'), values
-        )
+            message = 'the error has left its bound'
+        elif samples.saturated_time > 0.0:
+            message = message.format('')
+        elif guard.has_sample and guard.controller.sample.cuts.any():
+            message = message.format(' changes')
+        else:
+            level, message = OK, _PHASES[guard.supervisor.phase][1]
+        return self._diagnostics.status('loop', level, message, values)
 
     def _cuts(self, guard: Guard) -> dict[str, int]:
         """Samples in which the law's torque was cut, joint by joint."""

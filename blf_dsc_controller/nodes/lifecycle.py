@@ -33,17 +33,15 @@ POLL_PERIOD = 0.01  # s
 _DIAGNOSTICS_PERIOD = 1.0  # s
 
 
-class ManagedNode(LifecycleNode):
+class ManagedNode(LifecycleNode, process.PlainNode):
     """A lifecycle node that starts by itself, and that no request can bring down.
 
     Override `configure`, `activate`, `deactivate` and `release`. Topics, services and parameters
     exist for the life of the node; what it computes with is made when it is configured and released
-    when it is cleaned up. `finished` and `failure` are those of `process.PlainNode`.
+    when it is cleaned up.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
-        self.finished = False
-        self.failure: BlfDscError | None = None
         self._transition_error: Exception | None = None
         super().__init__(name, **options)
         wrap_change_state(self, self._rejecting)
@@ -60,13 +58,6 @@ class ManagedNode(LifecycleNode):
     def release(self) -> None:
         """Release what `configure` made; also called after an error, when nothing was made."""
 
-    def close(self) -> None:
-        """Save and release what must not be lost, while ROS is still up."""
-
-    def survive(self, error: Exception) -> bool:  # noqa: ARG002
-        """Whether the node goes on after an error that has escaped from one of its callbacks."""
-        return False
-
     @property
     def state_label(self) -> str:
         """State of the node: unconfigured, inactive, active or finalized."""
@@ -74,11 +65,8 @@ class ManagedNode(LifecycleNode):
 
     def autostart(self) -> None:
         """Configure and activate the node, as a manager would; BlfDscError if a step fails."""
-        for name, step in (
-            ('configure', self.trigger_configure),
-            ('activate', self.trigger_activate),
-        ):
-            if step() != TransitionCallbackReturn.SUCCESS:
+        for name in ('configure', 'activate'):
+            if getattr(self, f'trigger_{name}')() != TransitionCallbackReturn.SUCCESS:
                 error = self._transition_error
                 if isinstance(error, BlfDscError):
                     raise error

@@ -47,8 +47,8 @@ class PlayerNode(Node):
             messages = sorted(bag.messages(known), key=lambda message: message[1])
         if not messages:
             raise BagError(f'{path} is empty: it holds no message')
-        self._messages = [(outputs[name], raw) for name, _, raw in messages]
-        self._outputs = [output for output in outputs.values() if output is not None]
+        self._messages = [partial(outputs[name].publish, raw) for name, _, raw in messages]
+        self.outputs = [output for output in outputs.values() if output is not None]
         self.timeline = Timeline([at for _, at, _ in messages], rate, loop=loop)
         self._clock_output = (
             self.create_publisher(message_class(CLOCK.type), '/clock', 10) if clock else None
@@ -68,14 +68,10 @@ class PlayerNode(Node):
         """Publish what is due."""
         now = time.monotonic_ns()
         for number in self.timeline.due(now, _MOST_AT_ONCE):
-            self._publish(number)
+            self._messages[number]()
         if self._clock_output is not None and now - self._clock_published >= _CLOCK_PERIOD:
             self._clock_published = now
             self._clock_output.publish(encode_clock(self.timeline.position(now)))
-
-    def drain(self) -> None:
-        """Wait until every subscriber has what was published."""
-        drain(self._outputs)
 
     def _output(self, name: str, type_name: str) -> Any:
         try:
@@ -85,10 +81,6 @@ class PlayerNode(Node):
             return None
         quality = HISTORY if name.rsplit('/', 1)[-1] in _LATCHED else STREAM
         return self.create_publisher(class_, name, qos_profile(quality))
-
-    def _publish(self, number: int) -> None:
-        output, raw = self._messages[number]
-        output.publish(raw)
 
     def pause(self) -> tuple[bool, str]:
         """Hold the position in the bag."""
@@ -103,7 +95,7 @@ class PlayerNode(Node):
         number = self.timeline.step()
         if number is None:
             return False, 'pause first' if not self.timeline.paused else 'this is the end'
-        self._publish(number)
+        self._messages[number]()
         return True, f'message {number + 1} of {len(self._messages)}'
 
 
@@ -144,7 +136,7 @@ def play(
             node.play()
             wait = node.timeline.wait(time.monotonic_ns())
             executor.spin_once(timeout_sec=min(wait, _LONGEST_WAIT))
-        node.drain()
+        drain(node.outputs)
     except KeyboardInterrupt:
         pass
     finally:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any
 
 import rclpy
 from rclpy.duration import Duration
@@ -28,9 +28,6 @@ from blf_dsc_controller.configuration.common import Realtime
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.nodes.rclpy_internals import RCLError, UnknownROSArgsError
 
-if TYPE_CHECKING:
-    from blf_dsc_controller.nodes.lifecycle import ManagedNode
-
 _POLL = 0.1  # s; EventsExecutor has no usable spin()
 _DRAIN_TIMEOUT = 10.0  # s for all topics; a recorder on a busy machine has been seen 2 s behind
 
@@ -40,10 +37,9 @@ _MCL_FUTURE = 2
 
 
 class PlainNode(Node):
-    """A node without a life cycle for `run`.
+    """A node for `run`.
 
-    It sets `finished` once it has nothing more to do, and `failure` if it cannot go on; the process
-    ends with it.
+    It sets `finished` once it has nothing more to do, with `failure` if it cannot go on.
     """
 
     finished = False
@@ -57,10 +53,7 @@ class PlainNode(Node):
         return False
 
 
-Runnable: TypeAlias = 'PlainNode | ManagedNode'
-
-
-def run(make_node: Callable[[], Runnable]) -> int:
+def run(make_node: Callable[[], PlainNode]) -> int:
     """Run a node until it has finished, a signal comes, or it fails.
 
     Returns the exit code: 0 at the end or on SIGINT and SIGTERM, 1 after an error, printed on
@@ -69,7 +62,7 @@ def run(make_node: Callable[[], Runnable]) -> int:
     signals: list[int] = []  # a flag, so that no callback is cut off in the middle
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: signals.append(number))
-    node: Runnable | None = None
+    node: PlainNode | None = None
     problem = ''
     try:
         rclpy.init(args=sys.argv, signal_handler_options=rclpy.SignalHandlerOptions.NO)
@@ -98,7 +91,7 @@ def run(make_node: Callable[[], Runnable]) -> int:
     return 0
 
 
-def spin_once(executor: Any, node: Runnable) -> None:
+def spin_once(executor: Any, node: PlainNode) -> None:
     """Wait for work and do it; an error that escapes is raised unless the node survives it."""
     try:
         executor.spin_once(timeout_sec=_POLL)
@@ -109,7 +102,7 @@ def spin_once(executor: Any, node: Runnable) -> None:
             raise
 
 
-def _close(node: Runnable) -> None:
+def _close(node: PlainNode) -> None:
     try:
         node.close()
     except OSError as error:  # such as a full disk, already reported if it ended the node

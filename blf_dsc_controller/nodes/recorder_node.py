@@ -62,10 +62,16 @@ class BagRecorderNode(PlainNode):
         create_steady_timer(self, _DISCOVERY_PERIOD, self._discover)
         create_steady_timer(self, _TAKE_PERIOD, self._record)
         # The folder comes last: whatever ends the node from here on also completes the bag.
-        self._sink = self._record_ring() if self._config.ring else self._record_bag()
+        self._sink = self._open_sink()
 
-    def _record_bag(self) -> BagWriter | Ring:
+    def _open_sink(self) -> BagWriter | Ring:
         config = self._config
+        if config.ring:
+            ring = Ring(config.ring, config.compression)
+            self.create_service(Trigger, '~/trigger', partial(self._on_trigger, ring))
+            kept = f'keeping the last {config.ring:g} s in memory, until ~/trigger is called'
+            self.get_logger().info(kept)
+            return ring
         bag = BagWriter(
             config.output,
             compression=config.compression,
@@ -75,15 +81,6 @@ class BagRecorderNode(PlainNode):
         )
         self.get_logger().info(f'recording into {bag.path}')
         return bag
-
-    def _record_ring(self) -> Ring:
-        seconds = self._config.ring
-        ring = Ring(seconds, self._config.compression)
-        self.create_service(Trigger, '~/trigger', partial(self._on_trigger, ring))
-        self.get_logger().info(
-            f'keeping the last {seconds:g} s in memory, until ~/trigger is called'
-        )
-        return ring
 
     def _on_trigger(
         self, ring: Ring, _: Trigger.Request, response: Trigger.Response
@@ -150,7 +147,6 @@ class BagRecorderNode(PlainNode):
         if len(types) > 1:
             self._skip(topic, f'it has several types, {" and ".join(types)}')
             return
-        offered = [quality_of(publisher.qos_profile) for publisher in publishers]
         self._record(flush=True)  # importing a type, and its first subscription, may take 0.1 s
         try:
             message_class(types[0])
@@ -158,7 +154,7 @@ class BagRecorderNode(PlainNode):
         except (ImportError, AttributeError, UnknownTypeError):
             self._skip(topic, f'its type {types[0]} is not installed here')
             return
-        self._start(topic, types[0], offered)
+        self._start(topic, types[0], [quality_of(one.qos_profile) for one in publishers])
 
     def _start(self, topic: str, type_name: str, offered: list[Quality]) -> None:
         self._record(flush=True)
@@ -185,10 +181,7 @@ class BagRecorderNode(PlainNode):
                 self._losses_by_handle[message.handle].count(message.sequence)
                 self._sink.write(*message)
             self._parameter_client.poll()
-            if flush:
-                self._sink.flush()
-            else:
-                self._sink.flush_if_due()
+            (self._sink.flush if flush else self._sink.flush_if_due)()
         except DiskFullError as error:
             self.failure, self.finished = error, True
         except OSError as error:

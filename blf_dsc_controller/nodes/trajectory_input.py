@@ -91,11 +91,12 @@ class TrajectoryInput:
 
     def _on_trajectory(self, raw: bytes) -> None:
         try:
-            self._take(self._guard(), raw)
+            self._take(raw)
         except Exception as error:  # noqa: BLE001 - the present reference goes on
             self._reject(error)
 
-    def _take(self, guard: Guard | None, raw: bytes) -> None:
+    def _take(self, raw: bytes) -> None:
+        guard = self._guard()
         if guard is None:
             raise TrajectoryError(['the controller is not configured'])
         if len(raw) > self._largest:
