@@ -6,8 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.reference import Approach, MotionLimits
 from blf_dsc_controller.reference.approach import blend, stop
-from blf_dsc_controller.reference.limits import MotionError, MotionLimits, worst_violation
+from blf_dsc_controller.reference.limits import MotionError, worst_violation
 from blf_dsc_controller.reference.polynomials import minimum_jerk
 from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
 
@@ -20,8 +22,9 @@ MOVING = np.array([[0.8, 1.5], [0.6, -0.9]])
 
 
 def limits(velocity=(1.5, 1.5), acceleration=(2.0, 2.0), reach=(6.0, 6.0), longest=30.0):
-    top = np.array(reach)
-    return MotionLimits(JOINTS, -top, top, np.array(velocity), np.array(acceleration), longest)
+    lower = tuple(-limit for limit in reach)
+    allowed = MotionLimits(lower, reach, velocity, acceleration)
+    return ControllerConfig(JOINTS, limits=allowed, approach=Approach(longest=longest))
 
 
 def led(main, start, limits):
@@ -54,8 +57,8 @@ def test_all_of_it_keeps_the_limits_and_a_little_less_time_would_not(main, start
     _, dqr, ddqr = sampled(motion.vector, fine).transpose(1, 0, 2)
 
     # Between the looks, a 200th of the way apart or closer, a peak hides less than a thousandth.
-    assert np.all(np.abs(dqr).max(axis=0) <= 1.001 * limits().velocity)
-    assert np.all(np.abs(ddqr).max(axis=0) <= 1.001 * limits().acceleration)
+    assert np.all(np.abs(dqr).max(axis=0) <= 1.001 * np.array(limits().limits.velocity))
+    assert np.all(np.abs(ddqr).max(axis=0) <= 1.001 * np.array(limits().limits.acceleration))
     shorter = 0.98 * (motion.settled - T0)
     with pytest.raises(MotionError):
         led(main, start, limits(longest=shorter))
@@ -108,9 +111,9 @@ def test_a_way_that_would_take_too_long_is_rejected():
 
 
 def test_positions_count_from_the_middle_of_what_is_allowed():
-    top = np.full(2, 9.0)
-    limits = MotionLimits(JOINTS, np.array([-1.0, 0.5]), np.array([3.0, 1.5]), top, top, 30.0)
-    found = worst_violation(pack(2, [PAPER]), np.linspace(0.0, 7.0, 1001), limits)
+    allowed = MotionLimits((-1.0, 0.5), (3.0, 1.5), (9.0, 9.0), (9.0, 9.0))
+    config = ControllerConfig(JOINTS, limits=allowed)
+    found = worst_violation(pack(2, [PAPER]), np.linspace(0.0, 7.0, 1001), config)
     assert (found.joint, found.quantity, found.limit) == ('elbow', 'position', 1.5)
     assert found.value == pytest.approx(1.6961, abs=1e-5)
-    assert worst_violation(pack(2, [PAPER]), np.linspace(2.0, 4.0, 101), limits) is None
+    assert worst_violation(pack(2, [PAPER]), np.linspace(2.0, 4.0, 101), config) is None

@@ -6,7 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blf_dsc_controller.reference.limits import MotionError, MotionLimits
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.reference import MotionLimits
+from blf_dsc_controller.reference.limits import MotionError
 from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term, unpack
 from blf_dsc_controller.reference.trajectory import (
     Trajectory,
@@ -16,8 +18,9 @@ from blf_dsc_controller.reference.trajectory import (
 )
 
 JOINTS = ('shoulder', 'elbow')
-TOP = np.array([4.0, 3.0])
-LIMITS = MotionLimits(JOINTS, -TOP, TOP, np.full(2, 1.5), np.full(2, 6.0), 30.0)
+LIMITS = ControllerConfig(
+    JOINTS, limits=MotionLimits((-4.0, -3.0), (4.0, 3.0), (1.5, 1.5), (6.0, 6.0))
+)
 PAPER = pack(2, [sinusoids_term((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))])
 NOW = 3.3  # s
 GOALS = np.array([[1.6, 1.2], [2.0, 1.5], [1.8, 1.0]])

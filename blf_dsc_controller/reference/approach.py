@@ -18,10 +18,8 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import OutsideBarrierError, StartError, VelocityMismatchError
 from blf_dsc_controller.reference.limits import (
     MotionError,
-    MotionLimits,
     Violation,
     check_times,
-    limits_of,
     worst_violation,
 )
 from blf_dsc_controller.reference.polynomials import at_rest, hermite, minimum_jerk
@@ -53,23 +51,23 @@ def hold(position: np.ndarray) -> Term:
     return spline_term(np.zeros(1), at_rest(position))
 
 
-def stop(t0: float, q: np.ndarray, dq: np.ndarray, limits: MotionLimits) -> Term:
+def stop(t0: float, q: np.ndarray, dq: np.ndarray, config: ControllerConfig) -> Term:
     """Come to rest from q (n,) [rad] and dq (n,) [rad/s] at t0 [s]."""
-    h = max(_SHORTEST, float(np.max(_BRAKE * np.abs(dq) / limits.acceleration)))
+    h = max(_SHORTEST, float(np.max(_BRAKE * np.abs(dq) / config.limits.acceleration)))
     points = np.zeros((3, 2, q.size))
     points[0] = q, q + 0.5 * h * dq
     points[1, 0] = dq
     return hermite(np.array([t0, t0 + h]), points)
 
 
-def blend(before: Sequence[Term], target: Term, t0: float, limits: MotionLimits) -> Motion:
+def blend(before: Sequence[Term], target: Term, t0: float, config: ControllerConfig) -> Motion:
     """Go over from `before` to `target`, starting at t0 [s], as fast as the limits allow.
 
     Raises:
         MotionError: `target` itself violates a limit, or every blend that is short enough does.
     """
-    n = len(limits.joints)
-    found = worst_violation(pack(n, [target]), check_times(t0, t0 + limits.longest), limits)
+    n, longest = len(config.joints), config.approach.longest
+    found = worst_violation(pack(n, [target]), check_times(t0, t0 + longest), config)
     if found is not None:
         raise MotionError(
             f'the reference exceeds the limits of the arm: {found}; ask for less, or raise '
@@ -81,21 +79,21 @@ def blend(before: Sequence[Term], target: Term, t0: float, limits: MotionLimits)
         return pack(n, [*before, target._replace(begin=t0, fade=duration)])
 
     def violation(duration: float) -> Violation | None:
-        return worst_violation(attempt(duration), check_times(t0, t0 + duration), limits)
+        return worst_violation(attempt(duration), check_times(t0, t0 + duration), config)
 
-    too_short, duration = 0.0, min(_SHORTEST, limits.longest)
+    too_short, duration = 0.0, min(_SHORTEST, longest)
     closest = None
     while (found := violation(duration)) is not None:
         if closest is None or found.ratio < closest.ratio:
             closest = found
-        if duration >= limits.longest:
+        if duration >= longest:
             raise MotionError(
-                f'no motion of at most {limits.longest:g} s from here to the reference keeps '
+                f'no motion of at most {longest:g} s from here to the reference keeps '
                 f'within the limits of the arm: in the one that comes closest {closest}; start '
                 f'closer and at rest, or raise {closest.parameters} or approach.longest',
                 closest,
             )
-        too_short, duration = duration, min(duration * _STEP, limits.longest)
+        too_short, duration = duration, min(duration * _STEP, longest)
     for _ in range(_BISECTIONS):
         middle = 0.5 * (too_short + duration)
         if violation(middle) is None:
@@ -185,7 +183,6 @@ def plan_start(
     except StartError:
         if not config.approach.enabled:
             raise
-        limits = limits_of(config)
         (target,) = unpack(vector)
-        return blend([stop(t, q, dq, limits)], target, t, limits)
+        return blend([stop(t, q, dq, config)], target, t, config)
     return Motion(vector, t)

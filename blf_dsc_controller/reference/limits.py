@@ -17,17 +17,6 @@ _MOST = 1_000_000  # samples, for very long ones
 _ROUNDING = 1e-9  # relative, for motions that just reach a limit
 
 
-class MotionLimits(NamedTuple):
-    """Limits of the n joints, and of the time an approach or a blend may take."""
-
-    joints: tuple[str, ...]
-    lower: np.ndarray  # (n,) rad
-    upper: np.ndarray  # (n,) rad
-    velocity: np.ndarray  # (n,) rad/s
-    acceleration: np.ndarray  # (n,) rad/s^2
-    longest: float  # s
-
-
 class Violation(NamedTuple):
     """The largest violation of a limit by a motion."""
 
@@ -62,19 +51,6 @@ class MotionError(BlfDscError):
         super().__init__(message)
 
 
-def limits_of(config: ControllerConfig) -> MotionLimits:
-    """Limits of approaches and trajectories in a controller's configuration."""
-    limits = config.limits
-    return MotionLimits(
-        config.joints,
-        np.array(limits.position_lower),
-        np.array(limits.position_upper),
-        np.array(limits.velocity),
-        np.array(limits.acceleration),
-        config.approach.longest,
-    )
-
-
 def check_times(begin: float, end: float) -> np.ndarray:
     """Times from `begin` to `end` [s], close enough to catch the largest velocity of a motion."""
     count = 1 + (end - begin) / _PERIOD
@@ -82,16 +58,18 @@ def check_times(begin: float, end: float) -> np.ndarray:
 
 
 def worst_violation(
-    vector: np.ndarray, times: np.ndarray, limits: MotionLimits
+    vector: np.ndarray, times: np.ndarray, config: ControllerConfig
 ) -> Violation | None:
     """Largest violation of a packed reference at times (k,) [s]; None if it keeps the limits."""
     qr, dqr, ddqr = sampled(vector, times).transpose(1, 0, 2)
-    middle, reach = 0.5 * (limits.upper + limits.lower), 0.5 * (limits.upper - limits.lower)
+    limits = config.limits
+    lower, upper = np.array((limits.position_lower, limits.position_upper))
+    middle, reach = 0.5 * (upper + lower), 0.5 * (upper - lower)
     worst = None
     for quantity, value, allowed in (
         ('position', qr - middle, reach),
-        ('velocity', dqr, limits.velocity),
-        ('acceleration', ddqr, limits.acceleration),
+        ('velocity', dqr, np.array(limits.velocity)),
+        ('acceleration', ddqr, np.array(limits.acceleration)),
     ):
         ratios = np.abs(value) / allowed
         at, i = np.unravel_index(np.argmax(ratios), ratios.shape)
@@ -102,5 +80,5 @@ def worst_violation(
         reached = float(value[at, i])
         limit = shift + float(np.copysign(allowed[i], reached))
         time = float(times[at])
-        worst = Violation(limits.joints[i], quantity, shift + reached, limit, time, ratio)
+        worst = Violation(config.joints[i], quantity, shift + reached, limit, time, ratio)
     return worst

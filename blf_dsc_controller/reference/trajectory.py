@@ -23,10 +23,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.reference.approach import Motion, blend
 from blf_dsc_controller.reference.limits import (
     MotionError,
-    MotionLimits,
     check_times,
     worst_violation,
 )
@@ -73,21 +73,21 @@ class Trajectory(NamedTuple):
 
 
 def plan_trajectory(
-    trajectory: Trajectory, vector: np.ndarray, now: float, limits: MotionLimits
+    trajectory: Trajectory, vector: np.ndarray, now: float, config: ControllerConfig
 ) -> Motion:
     """Packed reference that continues `vector` at time now [s] and then follows the trajectory.
 
     Raises:
         TrajectoryError: it is not valid, too late, or violates a limit.
     """
-    problems = _problems(trajectory, limits.joints, now)
+    problems = _problems(trajectory, config.joints, now)
     if problems:
         raise TrajectoryError(problems)
     begin = now if trajectory.begin is None else trajectory.begin
     t0 = max(now, begin)
-    times, points = _remaining_points(trajectory, limits.joints, begin, t0)
+    times, points = _remaining_points(trajectory, config.joints, begin, t0)
     before = _terms_until(vector, now, t0)
-    n = len(limits.joints)
+    n = len(config.joints)
     try:
         if times[0] > t0:
             present = sampled(pack(n, before), np.array([t0]))[0]
@@ -95,11 +95,11 @@ def plan_trajectory(
             blended = max((one.settled for one in before if one.fade > 0.0), default=now)
             motion = Motion(pack(n, [*before, term]), min(blended, t0))
         else:
-            motion = blend(before, _through_points(times, points), t0, limits)
+            motion = blend(before, _through_points(times, points), t0, config)
     except MotionError as error:
         raise TrajectoryError([str(error)]) from error
     end = max(float(times[-1]), motion.settled)
-    found = worst_violation(motion.vector, check_times(t0, end), limits)
+    found = worst_violation(motion.vector, check_times(t0, end), config)
     if found is not None:
         raise TrajectoryError([f'{found}; ask for less, or raise {found.parameters}'])
     return motion

@@ -8,7 +8,6 @@ from typing import Any
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import differences
 from blf_dsc_controller.messages.journal import EventType
-from blf_dsc_controller.reference.limits import limits_of
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, plan_trajectory
 from blf_dsc_controller.supervision import retuning
 from blf_dsc_controller.supervision.guarded_law import GuardedLaw
@@ -59,8 +58,7 @@ class Guard(GuardedLaw):
         """
         self._check_running()
         at, before = self.time if at is None else at, self.controller.reference_vector
-        motion = plan_trajectory(trajectory, before, at, limits_of(self.config))
-        return Plan(trajectory, at, before, motion)
+        return Plan(trajectory, at, before, plan_trajectory(trajectory, before, at, self.config))
 
     def adopt(self, planned: Plan) -> None:
         """Follow a planned trajectory.
