@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from blf_dsc_controller.configuration.arm_defaults import controller_defaults
 from blf_dsc_controller.configuration.common import (
@@ -27,12 +28,7 @@ from blf_dsc_controller.configuration.gains import (
 from blf_dsc_controller.configuration.learning import Learning
 from blf_dsc_controller.configuration.reference import Approach, MotionLimits, Reference
 from blf_dsc_controller.configuration.robot import Robot, parameters_of
-from blf_dsc_controller.configuration.schema import non_negative, parameter, positive
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from blf_dsc_controller.configuration.schema import Value
+from blf_dsc_controller.configuration.schema import Value, non_negative, parameter, positive
 
 _size = partial(parameter, read_only='it sets the size of the state of the law')
 _WINDOW = 'the data in the excitation window depend on it'
@@ -143,20 +139,20 @@ class ControllerConfig(Sampled):
     autostart: bool = autostart()
     arm: ArmGeometry = ArmGeometry()
     robot: Robot = Robot()
-    reference: Reference = field(default_factory=Reference)
-    approach: Approach = field(default_factory=Approach)
-    limits: MotionLimits = field(default_factory=MotionLimits)
-    barrier: Barrier = field(default_factory=Barrier)
-    surface: Surface = field(default_factory=Surface)
-    feedback: Feedback = field(default_factory=Feedback)
-    disturbance: DisturbanceEstimate = field(default_factory=DisturbanceEstimate)
-    torque: Torque = field(default_factory=Torque)
-    learning: Learning = field(default_factory=Learning)
-    comparison: Comparison = field(default_factory=Comparison)
-    truth: Truth = field(default_factory=Truth)
+    reference: Reference = Reference()
+    approach: Approach = Approach()
+    limits: MotionLimits = MotionLimits()
+    barrier: Barrier = Barrier()
+    surface: Surface = Surface()
+    feedback: Feedback = Feedback()
+    disturbance: DisturbanceEstimate = DisturbanceEstimate()
+    torque: Torque = Torque()
+    learning: Learning = Learning()
+    comparison: Comparison = Comparison()
+    truth: Truth = Truth()
     safety: Safety = Safety()
     telemetry: Telemetry = Telemetry()
-    realtime: Realtime = field(default_factory=Realtime)
+    realtime: Realtime = Realtime()
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> Mapping[str, Value]:

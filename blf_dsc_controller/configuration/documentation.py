@@ -8,14 +8,10 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from blf_dsc_controller.configuration.nodes import NODES
 from blf_dsc_controller.configuration.params_file import format_value
-from blf_dsc_controller.configuration.schema import parameters
-
-if TYPE_CHECKING:
-    from blf_dsc_controller.configuration.schema import Parameter
+from blf_dsc_controller.configuration.schema import Parameter, parameters
 
 _PREFACE = """\
 # Parameters

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from blf_dsc_controller.arms.two_link_geometry import urdf
 from blf_dsc_controller.arms.urdf import Chain, read_chain
@@ -14,9 +15,6 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.robot import Robot, given_robot
 from blf_dsc_controller.configuration.schema import Value, parameter, parameters
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 PLANT = 'sim_plant'
 CONTROLLER = 'blf_dsc_controller'

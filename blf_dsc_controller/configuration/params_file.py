@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
@@ -19,14 +19,9 @@ from blf_dsc_controller.configuration.nodes import (
     known_names,
 )
 from blf_dsc_controller.configuration.ros_yaml import Section, parse
-from blf_dsc_controller.configuration.schema import build, flatten, parameters, unknown
+from blf_dsc_controller.configuration.schema import Value, build, flatten, parameters, unknown
 from blf_dsc_controller.configuration.share import share_folder
 from blf_dsc_controller.errors import ConfigurationError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from blf_dsc_controller.configuration.schema import Value
 
 Config = TypeVar('Config')
 

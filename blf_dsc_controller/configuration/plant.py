@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
@@ -165,7 +165,7 @@ class PlantConfig(Sampled):
     load: Load = Load()
     wall: Wall = Wall()
     events: Events = Events()
-    realtime: Realtime = field(default_factory=Realtime)
+    realtime: Realtime = Realtime()
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Value]:

@@ -13,15 +13,12 @@ import difflib
 import math
 import re
 import sys
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Iterator
+from typing import Any, NamedTuple, cast
 
 import yaml
 
 from blf_dsc_controller.errors import ConfigurationError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 _TRUE = ('Y', 'y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON')
 _FALSE = ('N', 'n', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF')
@@ -36,21 +33,19 @@ _PARAMETERS = 'ros__parameters'
 _PART = re.compile(r'\*|\*\*|[A-Za-z_][A-Za-z0-9_]*')
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """A value with its line number."""
 
     value: object
     line: int
 
 
-@dataclass(frozen=True)
-class Section:
+class Section(NamedTuple):
     """The parameters under one `ros__parameters`, for all nodes that match `pattern`."""
 
     pattern: str
     line: int
-    entries: dict[str, Entry] = field(default_factory=dict)
+    entries: dict[str, Entry]
 
     @property
     def is_wildcard(self) -> bool:
@@ -138,12 +133,12 @@ def _section(node: yaml.Node, name: str) -> Section:
         raise _error(_line(node), f'{name} is not a valid node name')
     if not isinstance(node, yaml.MappingNode):
         raise _error(_line(node), f'{_PARAMETERS} of {name} has no parameters')
-    section = Section(name, _line(node))
+    entries: dict[str, Entry] = {}
     for key, entry in _entries(node, ''):
-        if key in section.entries:
-            raise _repeated(entry.line, key, section.entries[key].line)
-        section.entries[key] = entry
-    return section
+        if key in entries:
+            raise _repeated(entry.line, key, entries[key].line)
+        entries[key] = entry
+    return Section(name, _line(node), entries)
 
 
 def _entries(node: yaml.MappingNode, prefix: str) -> Iterator[tuple[str, Entry]]:

@@ -16,14 +16,12 @@ import functools
 import math
 import operator
 import typing
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from blf_dsc_controller.errors import ConfigurationError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
 
 Config = TypeVar('Config')
 Value: TypeAlias = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
@@ -93,25 +91,22 @@ class Parameter:
             return 'one of ' + ', '.join(self.choices)
         return ' and '.join(f'{words} {limit:g}' for words, limit, _ in self._limits())
 
-    def problems(self, given: object) -> list[str]:
+    def problems(self, given: Any) -> list[str]:
         """Check a value; each problem names the parameter, what it got, and what is expected."""
-        if self.kind.is_array and not isinstance(given, _ARRAYS):
-            found = [f'{self._type_mismatch(given)}: write a list, like {_shown(self.default)}']
-        else:
-            entries: list[Any] = list(given) if self.kind.is_array else [given]  # type: ignore[call-overload]
-            if not all(_is(entry, self.kind.element) for entry in entries):
-                found = [self._type_mismatch(given) + _remedy(entries, self.kind.element)]
-            elif not entries and not (self.may_be_empty or self.omittable):
-                found = ['got an empty list, but at least one entry is needed']
-            else:
-                found = list(self._range_problems(entries))
-        return [f'{self.name}: {problem}' for problem in found]
+        return [f'{self.name}: {problem}' for problem in self._problems(given)]
 
-    def _type_mismatch(self, given: object) -> str:
+    def _problems(self, given: Any) -> Iterator[str]:
         article = 'an' if self.kind is Kind.INTEGER else 'a'
-        return f'got {_shown(given)}, but {article} {self.kind.value} is expected'
-
-    def _range_problems(self, entries: list[Any]) -> Iterator[str]:
+        mismatch = f'got {_shown(given)}, but {article} {self.kind.value} is expected'
+        if self.kind.is_array and not isinstance(given, _ARRAYS):
+            yield f'{mismatch}: write a list, like {_shown(self.default)}'
+            return
+        entries = list(given) if self.kind.is_array else [given]
+        if not all(_is(entry, self.kind.element) for entry in entries):
+            yield mismatch + _remedy(entries, self.kind.element)
+            return
+        if not entries and not (self.may_be_empty or self.omittable):
+            yield 'got an empty list, but at least one entry is needed'
         for index, entry in enumerate(entries, 1):
             if isinstance(entry, float) and not math.isfinite(entry):
                 expected = 'a finite number is needed'
@@ -177,7 +172,10 @@ def build(cls: type[Config], given: Mapping[str, object], source: str = '') -> C
     each value is valid by itself, those between parameters.
     """
     known = {one.name: one for one in parameters(cls)}
-    derived = _derived_defaults(cls, given, source)
+    try:
+        derived: Mapping[str, Value] = getattr(cls, 'defaults', lambda _: {})(given)
+    except ConfigurationError as error:
+        raise ConfigurationError(error.problems, source) from error
     problems = [unknown(name, known) for name in given if name not in known]
     values: dict[str, Any] = {}
     for name, one in known.items():
@@ -194,20 +192,6 @@ def build(cls: type[Config], given: Mapping[str, object], source: str = '') -> C
         if not problems:
             return config
     raise ConfigurationError(problems, source)
-
-
-def _derived_defaults(
-    cls: type[Any], given: Mapping[str, object], source: str
-) -> Mapping[str, Value]:
-    """Return the defaults that depend on what is given, such as the gains for an arm."""
-    derive = getattr(cls, 'defaults', None)
-    if derive is None:
-        return {}
-    try:
-        found: Mapping[str, Value] = derive(given)
-    except ConfigurationError as error:
-        raise ConfigurationError(error.problems, source) from error
-    return found
 
 
 def change(config: Config, given: Mapping[str, object], source: str = '') -> Config:

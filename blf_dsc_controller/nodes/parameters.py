@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -12,6 +13,7 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from blf_dsc_controller.configuration.nodes import is_builtin, known_names
@@ -25,11 +27,6 @@ from blf_dsc_controller.configuration.schema import (
 )
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.nodes.rclpy_internals import parameter_overrides
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rclpy.node import Node
 
 Config = TypeVar('Config')
 
