@@ -300,11 +300,7 @@ def refused(**changes) -> Callable[[Rig], None]:
 
 def replaced(*, possible: bool) -> Callable[[Rig], None]:
     """Another trajectory each 30 ms, before the last one is through; or one that is too fast."""
-    from blf_dsc_controller.reference.trajectory import (
-        Trajectory,
-        TrajectoryError,
-        TrajectoryPoint,
-    )
+    from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
 
     def inject(rig):
         def sense(state):
@@ -372,13 +368,7 @@ FAULTS = (
         every(lambda s: [s.raw(named('a', 'b')), s.raw()]),
         R.NONE,
     ),
-    Fault(
-        "only another robot's states",
-        every(renamed('a', 'b')),
-        R.STATE_TIMEOUT,
-        60,
-        live=True,
-    ),
+    Fault("only another robot's states", every(renamed('a', 'b')), R.STATE_TIMEOUT, 60, live=True),
     Fault('no positions', once(unmeasured('position')), R.FIELD_MISSING),
     Fault('no velocities', once(unmeasured('velocity')), R.FIELD_MISSING),
     Fault(
@@ -396,12 +386,7 @@ FAULTS = (
     Fault('message of noise', once(lambda _: [b'\x00\x01\x00\x00' + b'\xff' * 60]), R.BAD_MESSAGE),
     Fault('a state twice', once(lambda s: [s.raw(), s.raw()]), R.NONE),
     Fault('each state four times', every(lambda s: [s.raw()] * 4), R.NONE),
-    Fault(
-        'the same stamp for ever',
-        same_stamp,
-        R.STAMP_REPEATED,
-        5,
-    ),
+    Fault('the same stamp for ever', same_stamp, R.STAMP_REPEATED, 5),
     Fault('stamp 2 ms back', shifted(-2 * MILLISECOND), R.STAMP_BACKWARD),
     Fault('stamp half a second back', shifted(-500 * MILLISECOND), R.STAMP_BACKWARD),
     Fault('stamp 10 s ahead', shifted(10**10), R.STAMP_JUMP),

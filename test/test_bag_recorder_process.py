@@ -47,9 +47,7 @@ class Recording:
         parameters = [f'output:={bag}', f'topics:=[{names}]']
         arguments = [word for parameter in parameters for word in ('-p', parameter)]
         self.process = subprocess.Popen(
-            [*RECORDER, '--ros-args', *arguments],
-            stderr=subprocess.PIPE,
-            text=True,
+            [*RECORDER, '--ros-args', *arguments], stderr=subprocess.PIPE, text=True
         )
         self.context = Context()
         rclpy.init(context=self.context)

@@ -125,11 +125,7 @@ def test_joints_have_names_of_their_own_and_the_arm_has_two(cls):
             'learning.radius: got 5 kg m^2, but learning.initial_estimate lies at 5 kg m^2',
         ),
         (
-            {
-                'law': 'model_based',
-                'truth.parameters': [1.0, 0.32, 0.4],
-                'learning.radius': 1.1,
-            },
+            {'law': 'model_based', 'truth.parameters': [1.0, 0.32, 0.4], 'learning.radius': 1.1},
             'learning.radius: got 1.1 kg m^2, but truth.parameters lie at 1.12357 kg m^2',
         ),
         (
@@ -141,10 +137,7 @@ def test_joints_have_names_of_their_own_and_the_arm_has_two(cls):
             {'barrier.weight': [1000.0, 2e4]},
             'barrier.slope_limit: got 20000 N m/rad for joint2, but it must be above barrier.w',
         ),
-        (
-            {'barier.bound': [1.0, 1.0]},
-            'barier.bound: unknown parameter, did you ',
-        ),
+        ({'barier.bound': [1.0, 1.0]}, 'barier.bound: unknown parameter, did you '),
     ],
 )
 def test_a_controller_that_cannot_run_is_rejected(given, message):

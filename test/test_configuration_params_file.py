@@ -219,8 +219,7 @@ def test_a_loop_rejects_nodes_that_do_not_agree_and_takes_overrides(file):
     with pytest.raises(ConfigurationError, match=r'sim_plant has 0\.002 s, but'):
         load_loop(path)
     loop = load_loop(
-        path,
-        {'blf_dsc_controller': {'sample_time': 0.002}, 'sim_plant': {'mode': 'lockstep'}},
+        path, {'blf_dsc_controller': {'sample_time': 0.002}, 'sim_plant': {'mode': 'lockstep'}}
     )
     assert (loop.controller.sample_time, loop.plant.mode) == (0.002, 'lockstep')
 

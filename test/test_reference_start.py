@@ -170,8 +170,7 @@ def test_what_makes_no_reference_is_refused_with_the_reason(given, problem):
 
 def test_the_bag_of_an_offline_run_tells_the_moving_bound(tmp_path):
     config = build(
-        ControllerConfig,
-        {'barrier.initial_bound': [0.02, 0.01], 'barrier.funnel_rate': 4.0},
+        ControllerConfig, {'barrier.initial_bound': [0.02, 0.01], 'barrier.funnel_rate': 4.0}
     )
     record = run(config, PAPER + 0.009, 0.5)
     write_bag(tmp_path / 'bag', record, config, 'none')

@@ -153,10 +153,7 @@ def test_what_is_over_is_forgotten():
 NAN = float('nan')
 BAD = {
     'unknown joint': (trajectory(joints=('shoulder', 'wrist')), "no joint 'wrist' here"),
-    'missing joint': (
-        trajectory((GOALS[:, :1],), joints=JOINTS[:1]),
-        "joint 'elbow' is missing",
-    ),
+    'missing joint': (trajectory((GOALS[:, :1],), joints=JOINTS[:1]), "joint 'elbow' is missing"),
     'repeated joint': (
         trajectory((np.hstack((GOALS, GOALS[:, 1:])),), joints=(*JOINTS, 'elbow')),
         "joint 'elbow' is named more than once",
@@ -206,10 +203,7 @@ BAD = {
         trajectory((GOALS * [[1.0, 1.0], [1.9, 1.0], [1.0, 1.0]],), times=(2.0, 3.0, 6.0)),
         "the velocity of joint 'shoulder' would be",
     ),
-    'too sudden': (
-        trajectory((GOALS[:1],), times=(0.2,)),
-        'past its limit of -6 rad/s^2',
-    ),
+    'too sudden': (trajectory((GOALS[:1],), times=(0.2,)), 'past its limit of -6 rad/s^2'),
     'too far': (
         trajectory((FAR,), times=(5.0, 10.0, 15.0)),
         "the position of joint 'elbow' would be",

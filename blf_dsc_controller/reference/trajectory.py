@@ -25,11 +25,7 @@ import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.reference.approach import Motion, blend
-from blf_dsc_controller.reference.limits import (
-    MotionError,
-    check_times,
-    worst_violation,
-)
+from blf_dsc_controller.reference.limits import MotionError, check_times, worst_violation
 from blf_dsc_controller.reference.polynomials import (
     cubics,
     ending_at_rest,
