@@ -122,15 +122,9 @@ def test_a_parameter_that_will_not_do_is_named(ros, given, problem):
 
 def set_parameters(ros, node, **values):
     """Do what `ros2 param set` does; return whether it was accepted, and why not."""
-    client = ros.tester.create_client(SetParameters, f'{node.get_name()}/set_parameters')
-    ros.until(client.service_is_ready)
-    request = SetParameters.Request()
-    for name, value in values.items():
-        dotted = name.replace('__', '.')
-        request.parameters.append(Parameter(dotted, value=value).to_parameter_msg())
-    future = client.call_async(request)
-    ros.until(future.done)
-    results = future.result().results
+    given = [Parameter(name.replace('__', '.'), value=value) for name, value in values.items()]
+    request = SetParameters.Request(parameters=[one.to_parameter_msg() for one in given])
+    results = ros.call(SetParameters, f'{node.get_name()}/set_parameters', request).results
     return all(result.successful for result in results), [result.reason for result in results]
 
 
