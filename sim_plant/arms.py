@@ -3,17 +3,15 @@
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 
-from blf_dsc_controller.arms.base_parameters import BaseParameters, base_parameters
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.arms.two_link_geometry import urdf
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.truth import Truth
 from sim_plant.arm import Arm
 from sim_plant.dynamics import PointMassArm
@@ -26,9 +24,9 @@ def arm_of(config: PlantConfig) -> Arm:
     if not robot.urdf:
         return PointMassArm(*vars(config.arm).values())
     chain = robot.chain(config.joints)
-    parameters = _base_parameters(chain, robot.gravity)
     rotors = config.truth.rotor_factor * robot.rotors(chain)
-    return rigid_arm(chain, robot.gravity, true_inertias(chain, config.truth), rotors, parameters)
+    inertias, parameters = true_inertias(chain, config.truth), parameters_of(robot, chain)
+    return rigid_arm(chain, robot.gravity, inertias, rotors, parameters)
 
 
 def true_inertias(chain: Chain, truth: Truth) -> np.ndarray:
@@ -47,7 +45,7 @@ def parameter_names_of(config: PlantConfig) -> tuple[str, ...]:
     robot = config.robot
     if not robot.urdf:
         return PARAMETER_NAMES
-    return _base_parameters(robot.chain(config.joints), robot.gravity).model.parameter_names
+    return parameters_of(robot, robot.chain(config.joints)).model.parameter_names
 
 
 def urdf_of(config: PlantConfig) -> str:
@@ -56,8 +54,3 @@ def urdf_of(config: PlantConfig) -> str:
         return config.robot.text
     arm, limits = config.arm, config.actuator.torque_limit
     return urdf(PLANT, config.joints, (arm.l1, arm.l2), (arm.m1, arm.m2), limits)
-
-
-@functools.lru_cache(maxsize=4)
-def _base_parameters(chain: Chain, gravity: tuple[float, float, float]) -> BaseParameters:
-    return base_parameters(chain, gravity)

@@ -102,8 +102,8 @@ def test_the_short_check_of_a_stamp_is_the_full_one(steps):
     stamp = 1_000_000_000
     for step in steps:
         stamp += step
-        problems = [one.check(SAFETY, stamp, STILL, STILL) for one in (short, full)]
-        assert problems[0] == problems[1]
+        faults = [one.check(SAFETY, stamp, STILL, STILL) for one in (short, full)]
+        assert faults[0] == faults[1]
         assert vars(short) == vars(full)
 
 
@@ -111,6 +111,6 @@ def test_velocities_are_checked_after_the_short_check_too():
     states = StateCheck(['joint1', 'joint2'], DT)
     assert states.check(SAFETY, 1_000_000_000, STILL, STILL) is None
     too_fast = np.array([0.0, 2.0 * SAFETY.velocity_limit])
-    problem = states.check(SAFETY, 1_001_000_000, STILL, too_fast)
-    assert problem is not None
-    assert problem.reason is Reason.VELOCITY
+    fault = states.check(SAFETY, 1_001_000_000, STILL, too_fast)
+    assert fault is not None
+    assert fault.reason is Reason.VELOCITY

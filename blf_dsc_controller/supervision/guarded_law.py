@@ -118,12 +118,12 @@ class GuardedLaw:
         self._velocity.replace(stamp, q, dq)
         if supervisor.uses_states:
             effort = measurement[2 * n :] if self._learns_from_effort else None
-            problem = self.states.check(safety, stamp, q, dq, effort)
-            if problem is SKIP:
+            fault = self.states.check(safety, stamp, q, dq, effort)
+            if fault is SKIP:
                 return None
-            if problem is None:
+            if fault is None:
                 return self._use(stamp, measurement)
-            self._stop(*problem)
+            self._stop(*fault)
         self._last_state.salvage(stamp, q, dq, safety.velocity_limit, self.config.sample_time)
         return self._safe(self.config.sample_time)
 
@@ -139,9 +139,9 @@ class GuardedLaw:
         self.compute_time = perf_counter() - before
         if self.controller.samples == 1 and self.commanding:
             limit_first_torque(self.controller, self._torque, dt)
-        problem = self.samples.check(self.config.safety, dt)
-        if problem is not None:
-            self._stop(*problem)
+        fault = self.samples.check(self.config.safety, dt)
+        if fault is not None:
+            self._stop(*fault)
             return self._safe(self.config.sample_time)
         self._torque[:] = torque
         self.has_sample = True

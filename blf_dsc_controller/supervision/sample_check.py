@@ -12,7 +12,7 @@ from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import LINEAR
 from blf_dsc_controller.supervision import checks
-from blf_dsc_controller.supervision.supervisor import Problem, Reason
+from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ class SampleCheck:
         state = self._controller.state
         state.estimate[:], state.disturbance[:] = self.estimate, self.kept[state.estimate.size :]
 
-    def check(self, safety: Safety, dt: float) -> Problem | None:
+    def check(self, safety: Safety, dt: float) -> Fault | None:
         """Return why the torque of a sample, `dt` [s] after the one before, must not be used."""
         controller = self._controller
         flags = checks.check_sample(
@@ -75,27 +75,27 @@ class SampleCheck:
         if not flags & checks.SUSPECT:
             self.saturated_time = 0.0
             return None
-        problem = self._not_finite() or self._past_limits(safety, dt)
-        if problem is None:
+        fault = self._not_finite() or self._past_limits(safety, dt)
+        if fault is None:
             self.keep()
-        return problem
+        return fault
 
-    def _not_finite(self) -> Problem | None:
+    def _not_finite(self) -> Fault | None:
         state, demand = self._controller.state, self._controller.signals.demand
         if not (np.isfinite(state.estimate).all() and np.isfinite(state.disturbance).all()):
             text = f'an estimate is not finite: {state.estimate}, disturbance {state.disturbance}'
-            return Problem(Reason.ESTIMATE, text)
+            return Fault(Reason.ESTIMATE, text)
         # Saturation makes a finite torque of an infinite demand.
         if not (np.isfinite(demand).all() and np.isfinite(self._controller.sample.torque).all()):
-            return Problem(Reason.TORQUE, f'the demanded torque is not finite: {demand}')
+            return Fault(Reason.TORQUE, f'the demanded torque is not finite: {demand}')
         return None
 
-    def _past_limits(self, safety: Safety, dt: float) -> Problem | None:
+    def _past_limits(self, safety: Safety, dt: float) -> Fault | None:
         saturated = self._saturated(safety, dt)
         has_barrier = self._controller.settings.surface != LINEAR
         return (self._outside(safety) if has_barrier else None) or saturated
 
-    def _outside(self, safety: Safety) -> Problem | None:
+    def _outside(self, safety: Safety) -> Fault | None:
         xi1, bound = self._controller.sample.xi1, self._controller.sample.bound
         ratio = np.abs(xi1) / bound
         worst = int(np.argmax(ratio))
@@ -106,9 +106,9 @@ class SampleCheck:
             f'joint {self._joints[worst]!r} is {xi1[worst]:+.6g} rad from its reference: '
             f'past {share}its bound of {bound[worst]:.6g} rad'
         )
-        return Problem(Reason.OUTSIDE_BOUND, text)
+        return Fault(Reason.OUTSIDE_BOUND, text)
 
-    def _saturated(self, safety: Safety, dt: float) -> Problem | None:
+    def _saturated(self, safety: Safety, dt: float) -> Fault | None:
         demand, limit = self._controller.signals.demand, self._controller.settings.torque_limit
         worst = int(np.argmax(np.abs(demand) - limit))
         is_saturated = bool(np.abs(demand[worst]) > limit[worst])
@@ -120,4 +120,4 @@ class SampleCheck:
             f'joint {self._joints[worst]!r} needs {demand[worst]:+.4g} N m and has been at '
             f'its limit of {limit[worst]:g} N m for {self.saturated_time:.4g} s'
         )
-        return Problem(Reason.SATURATED, text)
+        return Fault(Reason.SATURATED, text)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The check of every joint state before the law uses it: stamps, values, missed states.
 
-It reads no clock: the same states have the same problems.
+It reads no clock: the same states have the same faults.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.supervision.checks import is_valid_state
-from blf_dsc_controller.supervision.supervisor import Problem, Reason
+from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
 _NANO = 1e-9
 
-SKIP = Problem(Reason.NONE, '')
+SKIP = Fault(Reason.NONE, '')
 """Returned for a state to ignore."""
 
 
@@ -53,18 +53,18 @@ class StateCheck:
 
     def check(
         self, safety: Safety, stamp: int, q: Vector, dq: Vector, effort: Vector | None = None
-    ) -> Problem | None:
+    ) -> Fault | None:
         """Return why the controller must stop, SKIP to ignore the state, or None to use it.
 
         Units are ns, rad, rad/s; `effort` are the applied torques (n,) [N m] if learning uses them.
         """
-        problem = None if self._is_next(stamp) else self._check_stamp(safety, stamp)
-        if problem is not None:
-            return problem
+        fault = None if self._is_next(stamp) else self._check_stamp(safety, stamp)
+        if fault is not None:
+            return fault
         if not is_valid_state(q, dq, safety.velocity_limit):
             return self._invalid(safety, q, dq)
         if effort is not None and not np.isfinite(effort).all():
-            return Problem(Reason.NOT_FINITE, f'the efforts used for learning are {effort}')
+            return Fault(Reason.NOT_FINITE, f'the efforts used for learning are {effort}')
         self._last_stamp = stamp
         return None
 
@@ -78,10 +78,10 @@ class StateCheck:
             and self.missed_fraction == 0.0
         )
 
-    def _check_stamp(self, safety: Safety, stamp: int) -> Problem | None:
+    def _check_stamp(self, safety: Safety, stamp: int) -> Fault | None:
         if stamp <= 0:
             text = f'a joint state has the stamp {stamp} ns, which is not a valid time'
-            return Problem(Reason.STAMP_MISSING, text)
+            return Fault(Reason.STAMP_MISSING, text)
         if self._last_stamp < 0:
             return None
         step = (stamp - self._last_stamp) * _NANO
@@ -90,25 +90,25 @@ class StateCheck:
         self._repeats = 0
         if step < 0.0:
             text = f'the stamp of a joint state is {-step:.6g} s before the last one'
-            return Problem(Reason.STAMP_BACKWARD, text)
+            return Fault(Reason.STAMP_BACKWARD, text)
         if step > self._sample_time + safety.state_timeout:
             text = (
                 f'the stamp of a joint state is {step:.6g} s after the last one: '
                 f'{self._sample_time:g} s is the sample time, and it may be late by '
                 f'{safety.state_timeout:g} s (safety.state_timeout)'
             )
-            return Problem(Reason.STAMP_JUMP, text)
+            return Fault(Reason.STAMP_JUMP, text)
         return self._count_missed(safety, max(1, round(step / self._sample_time)) - 1)
 
-    def _check_repeats(self, safety: Safety) -> Problem:
+    def _check_repeats(self, safety: Safety) -> Fault:
         self.repeated += 1
         self._repeats += 1
         if self._repeats <= safety.repeated_states:
             return SKIP
         text = f'{self._repeats} joint states in a row repeat the stamp of the one before them'
-        return Problem(Reason.STAMP_REPEATED, text)
+        return Fault(Reason.STAMP_REPEATED, text)
 
-    def _count_missed(self, safety: Safety, missed: int) -> Problem | None:
+    def _count_missed(self, safety: Safety, missed: int) -> Fault | None:
         keep = 1.0 - min(1.0, self._sample_time / safety.overrun_window)
         self.missed += missed
         self.missed_fraction *= keep
@@ -120,15 +120,15 @@ class StateCheck:
             f'{100.0 * self.missed_fraction:.0f} % of the joint states were missed: more than '
             f'safety.overrun_fraction allows over {safety.overrun_window:g} s'
         )
-        return Problem(Reason.OVERRUN, text)
+        return Fault(Reason.OVERRUN, text)
 
-    def _invalid(self, safety: Safety, q: Vector, dq: Vector) -> Problem:
+    def _invalid(self, safety: Safety, q: Vector, dq: Vector) -> Fault:
         if not (np.isfinite(q).all() and np.isfinite(dq).all()):
             text = f'the joint state is not finite: positions {q}, velocities {dq}'
-            return Problem(Reason.NOT_FINITE, text)
+            return Fault(Reason.NOT_FINITE, text)
         worst = int(np.argmax(np.abs(dq)))
         text = (
             f'the velocity of joint {self._joints[worst]!r} is {dq[worst]:+.6g} rad/s: more '
             f'than safety.velocity_limit, {safety.velocity_limit:g} rad/s'
         )
-        return Problem(Reason.VELOCITY, text)
+        return Fault(Reason.VELOCITY, text)

@@ -47,7 +47,7 @@ class Reason(str, Enum):
     FAILED = 'failed'
 
 
-class Problem(NamedTuple):
+class Fault(NamedTuple):
     """Why the controller must stop, in a sentence with the figures."""
 
     reason: Reason
