@@ -100,7 +100,7 @@ def test_real_time_is_counted_by_the_plant_in_whole_samples(ros):
     assert not plant.finished
     clock.advance(0.05)
     ros.until(lambda: plant.finished)
-    ros.until(lambda: len(heard[topics.REFERENCE]) == controller.controller.samples)
+    ros.until(lambda: len(heard[topics.REFERENCE]) == controller.guard.controller.samples)
     ros.until(lambda: len(heard[topics.TIMING]) == 300)
 
     stamps, _ = states(heard[topics.JOINT_STATES])

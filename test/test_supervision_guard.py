@@ -12,7 +12,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
 from blf_dsc_controller.supervision.planning import LatePlanError
-from blf_dsc_controller.supervision.safe_torque import LastState, Ramp, safe_torque
+from blf_dsc_controller.supervision.safe_torque import LastState, SafeTorque, safe_torque
 from blf_dsc_controller.supervision.state_check import StateCheck
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from blf_dsc_controller.supervision.watchdog import Watchdog
@@ -52,13 +52,19 @@ def test_a_safe_torque_keeps_the_limit_and_is_zero_if_not_finite():
 
 
 def test_a_ramp_is_straight_and_ends_at_a_goal_that_moves():
-    ramp = Ramp(1)
-    ramp.begin(np.array([4.0]), 0.004)
-    goals = (0.0, 0.0, 8.0, 8.0, 7.0)
-    got = [ramp.advance(np.array([goal]), 0.001)[0] for goal in goals]
+    ramp, safety = SafeTorque(2), Safety(torque='damping', damping=(1.0, 1.0))
+
+    def advance(goal):
+        ramp.last.take(1, np.array([0.0, 0.0, -goal, 0.0, 0.0, 0.0]))
+        return ramp.advance(safety, settings(), P, 0.001)[0]
+
+    ramp.commanded[0] = 4.0
+    ramp.begin_ramp(0.004)
+    got = [advance(goal) for goal in (0.0, 0.0, 8.0, 8.0, 7.0)]
     np.testing.assert_allclose(got, [3.0, 2.0, 7.0, 8.0, 7.0])
-    ramp.begin(np.array([4.0]), 0.0)
-    assert ramp.advance(np.array([1.0]), 0.001) == 1.0
+    ramp.commanded[0] = 4.0
+    ramp.begin_ramp(0.0)
+    assert advance(1.0) == 1.0
 
 
 def test_missed_states_are_averaged():

@@ -39,7 +39,7 @@ class Guard(GuardedLaw):
         self.samples.saturated_time = 0.0
         self.watchdog.restart()
         if self._resumable:
-            self._ramp.begin(self._torque, self.config.safety.deactivation_ramp)
+            self._safe_torque.begin_ramp(self.config.safety.deactivation_ramp)
 
     def reset(self) -> None:
         """Forget all estimates and faults, and start with the next state."""
@@ -77,7 +77,7 @@ class Guard(GuardedLaw):
         """Put a configuration in force, between two samples."""
         self._note(EventType.PARAMETERS, parameters=differences(self.config, config))
         if self.supervisor.running:
-            last = self._last_state.measurement
+            last = self._safe_torque.last.measurement
             retuning.apply_bumpless(self.controller, config, self.time, last)
         else:
             retuning.apply(self.controller, config)

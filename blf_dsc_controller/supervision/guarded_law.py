@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from math import inf
 from time import perf_counter
 
 import numpy as np
@@ -24,12 +23,7 @@ from blf_dsc_controller.messages import cdr
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.reference.approach import check_takeover
 from blf_dsc_controller.reference.limits import MotionError
-from blf_dsc_controller.supervision.safe_torque import (
-    LastState,
-    Ramp,
-    limit_first_torque,
-    safe_torque,
-)
+from blf_dsc_controller.supervision.safe_torque import SafeTorque, limit_first_torque
 from blf_dsc_controller.supervision.sample_check import SampleCheck
 from blf_dsc_controller.supervision.state_check import SKIP, StateCheck
 from blf_dsc_controller.supervision.supervisor import Phase, Reason, Supervisor
@@ -89,8 +83,7 @@ class GuardedLaw:
         self.settled = self.compute_time = 0.0
         self._velocity = Velocity(config.safety.velocity, n)
         self._learns_from_effort = config.learning.torque_source == 'effort'
-        self._last_state, self._ramp = LastState(n), Ramp(n)
-        self._torque = np.zeros(n)  # the last one commanded
+        self._safe_torque = SafeTorque(n)
         self._clean = True  # whether the window holds valid samples only
         self._resumable = False  # whether the law may continue along its reference
         self.journal.note(EventType.CONFIGURE, parameters=flatten(config))
@@ -113,10 +106,10 @@ class GuardedLaw:
         self._begin_message()
         self.journal.stamp = stamp
         self.watchdog.restart()
-        n, safety, supervisor = self._torque.size, self.config.safety, self.supervisor
+        n, safety, last = len(self.config.joints), self.config.safety, self._safe_torque.last
         q, dq = measurement[:n], measurement[n : 2 * n]
         self._velocity.replace(stamp, q, dq)
-        if supervisor.uses_states:
+        if self.supervisor.uses_states:
             effort = measurement[2 * n :] if self._learns_from_effort else None
             fault = self.states.check(safety, stamp, q, dq, effort)
             if fault is SKIP:
@@ -124,12 +117,12 @@ class GuardedLaw:
             if fault is None:
                 return self._use(stamp, measurement)
             self._stop(*fault)
-        self._last_state.salvage(stamp, q, dq, safety.velocity_limit, self.config.sample_time)
+        last.salvage(stamp, q, dq, safety.velocity_limit, self.config.sample_time)
         return self._safe(self.config.sample_time)
 
     def _use(self, stamp: int, measurement: Vector) -> Vector | None:
         """Give a valid state to the law."""
-        self._last_state.take(stamp, measurement)
+        self._safe_torque.last.take(stamp, measurement)
         if self.supervisor.phase is Phase.STARTING and not self._start(stamp, measurement):
             return self._safe(self.config.sample_time) if self.commanding else None
         dt = (stamp - self.last_stamp) * _NANO
@@ -138,15 +131,15 @@ class GuardedLaw:
         torque = self.controller.update(self.time, dt, measurement)
         self.compute_time = perf_counter() - before
         if self.controller.samples == 1 and self.commanding:
-            limit_first_torque(self.controller, self._torque, dt)
+            limit_first_torque(self.controller, self._safe_torque.commanded, dt)
         fault = self.samples.check(self.config.safety, dt)
         if fault is not None:
             self._stop(*fault)
             return self._safe(self.config.sample_time)
-        self._torque[:] = torque
+        self._safe_torque.commanded[:] = torque
         self.has_sample = True
         self.journal.commands += 1
-        return self._torque
+        return torque
 
     def _start(self, stamp: int, measurement: Vector) -> bool:
         """Resume along the running reference if the law can take over, or else start at t = 0."""
@@ -191,8 +184,8 @@ class GuardedLaw:
         self.journal.messages += count
         self.journal.commands += count
         self.has_sample = True
-        self._last_state.take(stamp, measurement)
-        self._torque[:] = self.controller.state.torque
+        self._safe_torque.last.take(stamp, measurement)
+        self._safe_torque.commanded[:] = self.controller.state.torque
         self.states.advance(stamp)
         self.samples.saturated_time = 0.0
         self._advance_to(stamp)
@@ -249,11 +242,11 @@ class GuardedLaw:
         if self.supervisor.stop(reason, text):
             self.journal.note(EventType.STOP, reason=reason, text=text)
             self._clean = self._resumable = False
-            self._ramp.begin(self._torque, self.config.safety.stop_ramp)
+            self._safe_torque.begin_ramp(self.config.safety.stop_ramp)
 
     def _safe_without_state(self, dt: float) -> Vector | None:
         self.has_sample = False
-        self._last_state.miss(dt)
+        self._safe_torque.last.miss(dt)
         return self._safe(dt)
 
     def _safe(self, dt: float) -> Vector | None:
@@ -261,12 +254,10 @@ class GuardedLaw:
 
         None while no state has been seen, and while inactive from the beginning.
         """
-        is_new = self.supervisor.phase is Phase.INACTIVE and not self.commanding
-        if is_new or self._last_state.age == inf:
+        if self.supervisor.phase is Phase.INACTIVE and not self.commanding:
             return None
-        settings = self.controller.settings
-        goal = safe_torque(self.config.safety, settings, self._last_state, self.samples.estimate)
-        limit = settings.torque_limit
-        self._torque[:] = np.clip(self._ramp.advance(goal, dt), -limit, limit)
-        self.journal.commands += 1
-        return self._torque
+        torque = self._safe_torque.advance(
+            self.config.safety, self.controller.settings, self.samples.estimate, dt
+        )
+        self.journal.commands += torque is not None
+        return torque

@@ -82,26 +82,38 @@ def safe_torque(safety: Safety, settings: Settings, last: LastState, estimate: V
     return limited * (1.0 - last.age / safety.fade_time)
 
 
-class Ramp:
-    """A straight line in time from one torque (n,) [N m] to another."""
+class SafeTorque:
+    """The torque without the law: on a ramp from the last torque to the safe one.
+
+    Attributes:
+        commanded: the last torque (n,) [N m], of the law or of this.
+        last: the last joint state that can be used.
+    """
 
     def __init__(self, n: int) -> None:
+        self.commanded = np.zeros(n)
+        self.last = LastState(n)
         self._start = np.zeros(n)
-        self._duration = 0.0
-        self._elapsed = 0.0
+        self._duration = self._elapsed = 0.0
 
-    def begin(self, torque: Vector, duration: float) -> None:
-        """Start at `torque` (n,) [N m]; the ramp lasts `duration` [s]."""
-        self._start[:] = torque
-        self._duration = duration
-        self._elapsed = 0.0
+    def begin_ramp(self, duration: float) -> None:
+        """Start a straight line in time at the last torque; it lasts `duration` [s]."""
+        self._start[:] = self.commanded
+        self._duration, self._elapsed = duration, 0.0
 
-    def advance(self, goal: Vector, dt: float) -> Vector:
-        """Advance by `dt` [s] towards `goal` and return the torque (n,) [N m] there."""
+    def advance(
+        self, safety: Safety, settings: Settings, estimate: Vector, dt: float
+    ) -> Vector | None:
+        """Return the torque (n,) [N m] after `dt` [s] more; None while no state has been seen."""
+        if self.last.age == inf:
+            return None
+        goal = safe_torque(safety, settings, self.last, estimate)
         self._elapsed += dt
-        if self._elapsed >= self._duration:
-            return goal
-        return self._start + self._elapsed / self._duration * (goal - self._start)
+        if self._elapsed < self._duration:
+            goal = self._start + self._elapsed / self._duration * (goal - self._start)
+        limit = settings.torque_limit
+        self.commanded[:] = np.clip(goal, -limit, limit)
+        return self.commanded
 
 
 def limit_first_torque(controller: Controller, last: Vector, dt: float) -> None:

@@ -75,7 +75,10 @@ class SampleCheck:
         if not flags & checks.SUSPECT:
             self.saturated_time = 0.0
             return None
-        fault = self._not_finite() or self._past_limits(safety, dt)
+        fault = self._not_finite()
+        if fault is None:
+            saturated = self._saturated(safety, dt)
+            fault = self._outside(safety) or saturated
         if fault is None:
             self.keep()
         return fault
@@ -90,16 +93,13 @@ class SampleCheck:
             return Fault(Reason.TORQUE, f'the demanded torque is not finite: {demand}')
         return None
 
-    def _past_limits(self, safety: Safety, dt: float) -> Fault | None:
-        saturated = self._saturated(safety, dt)
-        has_barrier = self._controller.settings.surface != LINEAR
-        return (self._outside(safety) if has_barrier else None) or saturated
-
     def _outside(self, safety: Safety) -> Fault | None:
+        if safety.error_ratio == 0.0 or self._controller.settings.surface == LINEAR:
+            return None
         xi1, bound = self._controller.sample.xi1, self._controller.sample.bound
         ratio = np.abs(xi1) / bound
         worst = int(np.argmax(ratio))
-        if safety.error_ratio == 0.0 or ratio[worst] < safety.error_ratio:
+        if ratio[worst] < safety.error_ratio:
             return None
         share = '' if safety.error_ratio == 1.0 else f'{safety.error_ratio:g} times '
         text = (
