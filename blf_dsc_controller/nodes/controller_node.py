@@ -100,12 +100,12 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _command_zero(self) -> None:
         """Command zero torque, as drivers hold the last command, and release the guard."""
-        states = self.resolve_topic_name(topics.JOINT_STATES.relative)
-        if self.guard is not None and self.guard.commanding and self.count_publishers(states):
-            self._command(np.zeros(len(self.config.joints)))
-        if self.guard is not None:
-            self.guard.release()
-            self._status.publish_events(self.guard)
+        guard, states = self.guard, self.resolve_topic_name(topics.JOINT_STATES.relative)
+        if guard is not None:
+            if guard.commanding and self.count_publishers(states):
+                self._command(np.zeros(len(self.config.joints)))
+            guard.release()
+            self._status.publish_events(guard)
 
     def reset(self) -> str:
         """Start again with the next joint state, with the initial estimates."""
@@ -203,20 +203,17 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _on_poll(self) -> None:
         """Check for missing states, and set the timer to the next check: waking up is costly."""
-        wait = POLL_PERIOD
-        if self.guard is not None:
-            self._watch(self.guard)
+        wait, guard = POLL_PERIOD, self.guard
+        if guard is not None:
+            if self._pending is not None and self._is_observed():
+                raw, self._pending = self._pending, None
+                self._on_joint_state(raw)
+            self._command(guard.watch())
+            self._report_if_changed(guard)
             if self._pending is None:
-                wait = self.guard.watchdog.next_check
+                wait = guard.watchdog.next_check
         self._poll_timer.timer_period_ns = int(1e9 * wait)
         self._poll_timer.reset()
-
-    def _watch(self, guard: Guard) -> None:
-        if self._pending is not None and self._is_observed():
-            raw, self._pending = self._pending, None
-            self._on_joint_state(raw)
-        self._command(guard.watch())
-        self._report_if_changed(guard)
 
     # Changes of the configuration, and reports.
 

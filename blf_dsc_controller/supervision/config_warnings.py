@@ -54,10 +54,8 @@ def config_warnings(config: ControllerConfig, q: Floats | None = None) -> list[s
         found += _of_surface(config, settings, load)
         if settings.kappa > 0.0 and settings.Gamma.any():
             windows = windows_along(config, settings)
-            found += [
-                *_of_update(config, settings, windows),
-                *_of_window(config, settings, windows),
-            ]
+            found += _of_update(config, settings, windows)
+            found += _of_window(config, settings, windows)
     return found
 
 

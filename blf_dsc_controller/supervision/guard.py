@@ -11,7 +11,7 @@ from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, plan_trajectory
 from blf_dsc_controller.supervision import retuning
 from blf_dsc_controller.supervision.guarded_law import GuardedLaw
-from blf_dsc_controller.supervision.planning import Plan
+from blf_dsc_controller.supervision.planning import LatePlanError, Plan
 from blf_dsc_controller.supervision.supervisor import Phase
 
 
@@ -64,10 +64,15 @@ class Guard(GuardedLaw):
         """Follow a planned trajectory.
 
         Raises:
+            LatePlanError: it begins in the past.
             TrajectoryError: it does not continue the present reference, which goes on.
         """
         self._check_running()
-        planned.check(self.controller.reference_vector, self.time)
+        if planned.before is not self.controller.reference_vector:
+            problem = 'the reference was replaced while it was planned: send it again'
+            raise TrajectoryError([problem])
+        if planned.at < self.time:
+            raise LatePlanError(planned.at, self.time)
         self._note(EventType.TRAJECTORY, **planned.content)
         self.controller.reference_vector, self.settled = planned.motion
         is_settled = self.settled <= self.time

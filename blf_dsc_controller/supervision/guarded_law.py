@@ -202,10 +202,7 @@ class GuardedLaw:
         return self._safe_without_state(self.config.sample_time)
 
     def watch(self) -> Vector | None:
-        """Check the steady clock, `watchdog.next_check` after the last time.
-
-        Returns a torque during a silence.
-        """
+        """Return a torque during a silence; to be called when `watchdog.next_check` is over."""
         limit = self.config.sample_time + self.config.safety.state_timeout
         silent = self.watchdog.silence(limit)
         if silent == 0.0 or not (self.watchdog.on and self.commanding):

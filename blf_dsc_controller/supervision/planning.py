@@ -32,16 +32,3 @@ class Plan(NamedTuple):
         joints, points, begin = self.trajectory
         given = [point._asdict() for point in points]
         return {'joints': joints, 'points': given, 'begin': begin, 'at': self.at}
-
-    def check(self, reference_vector: np.ndarray, now: float) -> None:
-        """Check that it continues the reference in force at the time `now` [s].
-
-        Raises:
-            LatePlanError: it begins in the past.
-            TrajectoryError: it continues another reference.
-        """
-        if self.before is not reference_vector:
-            problem = 'the reference was replaced while it was planned: send it again'
-            raise TrajectoryError([problem])
-        if self.at < now:
-            raise LatePlanError(self.at, now)
