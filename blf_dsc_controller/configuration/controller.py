@@ -21,9 +21,9 @@ from blf_dsc_controller.configuration.gains import (
     Comparison,
     DisturbanceEstimate,
     Feedback,
+    KnownArm,
     Surface,
     Torque,
-    Truth,
 )
 from blf_dsc_controller.configuration.learning import Learning
 from blf_dsc_controller.configuration.reference import Approach, MotionLimits, Reference
@@ -149,7 +149,7 @@ class ControllerConfig(Sampled):
     torque: Torque = Torque()
     learning: Learning = Learning()
     comparison: Comparison = Comparison()
-    truth: Truth = Truth()
+    truth: KnownArm = KnownArm()
     safety: Safety = Safety()
     telemetry: Telemetry = Telemetry()
     realtime: Realtime = Realtime()

@@ -131,7 +131,7 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class Truth:
+class KnownArm:
     """Known data of the arm: required by the law `model_based`, shown by the monitors.
 
     The known disturbance is constant + amplitude*sin(frequency*t + phase) on each joint.

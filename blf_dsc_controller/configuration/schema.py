@@ -149,9 +149,9 @@ positive = functools.partial(parameter, above=0.0)
 non_negative = functools.partial(parameter, at_least=0.0)
 
 
-def parameters(cls: type[Any]) -> tuple[Parameter, ...]:
+def parameters(cls: Any) -> tuple[Parameter, ...]:
     """Return every parameter of a configuration, in the order of declaration, by dotted name."""
-    return tuple(_parameters(cls, ''))  # type: ignore[arg-type] # to mypy, a type is not hashable
+    return _parameters(cls)
 
 
 def flatten(config: object) -> dict[str, Value]:
@@ -187,7 +187,7 @@ def build(cls: type[Config], given: Mapping[str, object], source: str = '') -> C
     lengths = [problem for one in known.values() for problem in _length_problems(one, values)]
     problems += lengths
     if len(values) == len(known) and not lengths:
-        config = _assemble(cls, values, '')
+        config: Config = _assemble(cls, values)
         problems += getattr(config, 'problems', list)()
         if not problems:
             return config
@@ -213,30 +213,42 @@ def counted(count: int, one: str, many: str) -> str:
 
 
 @functools.cache
-def _parameters(cls: type[Any], prefix: str) -> list[Parameter]:
+def _parameters(cls: Any) -> tuple[Parameter, ...]:
+    found: list[Parameter] = []
+    for name, one in _fields(cls).items():
+        if isinstance(one, Parameter):
+            found.append(one)
+        else:
+            found += [dataclasses.replace(p, name=f'{name}.{p.name}') for p in _parameters(one)]
+    return tuple(found)
+
+
+@functools.cache
+def _fields(cls: Any) -> dict[str, Any]:
+    """Return the parameter or the class of the group that each field declares."""
     types = typing.get_type_hints(cls)
     annotated = typing.get_type_hints(cls, include_extras=True)
-    found: list[Parameter] = []
+    found: dict[str, Any] = {}
     for field in dataclasses.fields(cls):
-        name, hint = prefix + field.name, types[field.name]
-        if 'parameter' in field.metadata:
-            one: Parameter = field.metadata['parameter']
-            if typing.get_origin(hint) is typing.Literal:
-                one, hint = dataclasses.replace(one, choices=typing.get_args(hint)), str
-            length = getattr(annotated[field.name], '__metadata__', ())
-            found.append(dataclasses.replace(one, name=name, kind=_KINDS[hint], length=length))
-        else:
-            found += _parameters(hint, f'{name}.')
+        hint, one = types[field.name], field.metadata.get('parameter')
+        if one is None:
+            found[field.name] = hint
+            continue
+        if typing.get_origin(hint) is typing.Literal:
+            one, hint = dataclasses.replace(one, choices=typing.get_args(hint)), str
+        length = getattr(annotated[field.name], '__metadata__', ())
+        found[field.name] = dataclasses.replace(
+            one, name=field.name, kind=_KINDS[hint], length=length
+        )
     return found
 
 
-def _assemble(cls: type[Config], values: Mapping[str, Value], prefix: str) -> Config:
-    types = typing.get_type_hints(cls)
+def _assemble(cls: Any, values: Mapping[str, Value], prefix: str = '') -> Any:
     content = {
-        field.name: values[prefix + field.name]
-        if 'parameter' in field.metadata
-        else _assemble(types[field.name], values, f'{prefix}{field.name}.')
-        for field in dataclasses.fields(cls)  # type: ignore[arg-type]
+        name: values[prefix + name]
+        if isinstance(one, Parameter)
+        else _assemble(one, values, f'{prefix}{name}.')
+        for name, one in _fields(cls).items()
     }
     return cls(**content)
 
