@@ -43,9 +43,7 @@ class MarkersNode(PlainNode):
         self._chain = self._config.chain
         watched = (topics.JOINT_STATES, topics.REFERENCE, topics.BOUND)
         self._decoders = [JointStateDecoder(joints, required=('position',)) for _ in watched]
-        self._raw_subscriptions = RawSubscriptions(
-            self.context, f'_{self.get_name()}_subscriptions', _DEPTH
-        )
+        self._raw_subscriptions = RawSubscriptions(self, _DEPTH)
         for handle, topic in enumerate(watched):
             name = self.resolve_topic_name(topic.relative)
             self._raw_subscriptions.subscribe(name, topic.type, [topic.offered], handle)

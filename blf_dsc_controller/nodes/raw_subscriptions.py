@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from operator import attrgetter
 from typing import NamedTuple
 
-from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
@@ -37,12 +36,15 @@ class RawMessage(NamedTuple):
 
 
 class RawSubscriptions:
-    """Subscriptions of a hidden `node` to any number of topics, each with a queue of `depth`."""
+    """Subscriptions to any number of topics, each with a queue of `depth`.
 
-    def __init__(self, context: Context, name: str, depth: int) -> None:
+    They are those of a hidden `node` beside their owner.
+    """
+
+    def __init__(self, owner: Node, depth: int) -> None:
         self.node = Node(
-            name,
-            context=context,
+            f'_{owner.get_name()}_subscriptions',
+            context=owner.context,
             use_global_arguments=False,
             enable_rosout=False,
             start_parameter_services=False,

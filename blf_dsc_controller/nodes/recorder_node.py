@@ -49,10 +49,7 @@ class BagRecorderNode(PlainNode):
         super().__init__('bag_recorder', enable_rosout=False, **options)
         self._config = declare(self, RecorderConfig)
         self._chosen = {self.resolve_topic_name(name) for name in self._config.topics}
-        hidden_name = f'_{self.get_name()}_subscriptions'
-        self._raw_subscriptions = RawSubscriptions(
-            self.context, hidden_name, self._config.queue_depth
-        )
+        self._raw_subscriptions = RawSubscriptions(self, self._config.queue_depth)
         self._losses: dict[str, Losses] = {}
         self._losses_by_handle: dict[int, Losses] = {}
         self._skipped: set[str] = set()
