@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from blf_dsc_controller.run import Run
 
 _LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 _MOST_OF_A_KIND = 50
+_LONGEST = 1000  # characters of a parameter that are shown
 _AT_LIMIT = 1.0 - 1e-9
 
 
@@ -169,4 +171,7 @@ def _changed(path: Path, run: Run, namespace: str) -> Iterator[Event]:
 
 
 def _shown(value: object) -> str:
+    if isinstance(value, str) and len(value) > _LONGEST:  # a URDF
+        digest = zlib.crc32(value.encode())
+        return f'{value[:40]} ... ({len(value)} characters, CRC {digest:08x})'
     return f'[{", ".join(map(_shown, value))}]' if isinstance(value, list) else f'{value}'

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 _fixed = partial(parameter, read_only='the arm is built once, when the node starts')
 
+TOPIC = 'topic://'
+"""Start of a `robot.urdf` that is published: the node waits for it when it starts."""
+
 _DRIVE_ACCELERATION = 400.0  # rad/s^2, of a drive alone at its rated torque
 
 
@@ -30,7 +33,10 @@ class Robot:
     """Arm from a URDF, for the model `urdf`."""
 
     urdf: str = _fixed(
-        '', 'URDF: a file, package://name/path, a file of config/, or its text; empty: no URDF'
+        '',
+        'URDF: a file, package://name/path, a file of config/, topic://robot_description, or its '
+        'text; empty: no URDF',
+        kept=lambda given: given and read_urdf(given),
     )
     base: str = _fixed('', 'link that stands still; empty: the root')
     tip: str = _fixed('', 'link at the end, where payloads are; empty: that of the last joint')
@@ -92,9 +98,15 @@ class Robot:
 
 
 def read_urdf(given: str) -> str:
-    """Text of a URDF given as a file, a resource or itself."""
+    """Text of a URDF given as a file, a resource or itself; BlfDscError if it cannot be read."""
     if given.lstrip().startswith('<'):
         return given
+    if given.startswith(TOPIC):
+        raise BlfDscError(
+            f'{given!r} is a topic, for which only a node can wait: write what is on it into a '
+            'file (`ros2 param get --hide-type robot_state_publisher robot_description > '
+            'robot.urdf`) and give that'
+        )
     try:
         return resolve(given).read_text(encoding='utf-8')
     except (OSError, UnicodeDecodeError) as error:

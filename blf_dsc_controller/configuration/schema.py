@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, TypeAlias, TypeVar
 
-from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 
 Config = TypeVar('Config')
 Value: TypeAlias = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
@@ -63,7 +63,8 @@ class Parameter:
 
     Ranges and choices apply to each entry of an array. `read_only` is the reason why the parameter
     cannot change while the node runs; empty: it can. An array that is `omittable` may be empty
-    whatever its length is otherwise. The last three are known from the field of the dataclass:
+    whatever its length is otherwise. A configuration holds what `kept` makes of a given text; it
+    raises BlfDscError where it cannot. The last three are known from the field of the dataclass:
     `length` names the parameters whose lengths multiply to the length of this array; a number among
     them is a length itself.
     """
@@ -80,6 +81,7 @@ class Parameter:
     may_be_empty: bool = False
     omittable: bool = False
     read_only: str = ''
+    kept: Callable[[str], str] = str
     name: str = ''
     kind: Kind = Kind.DOUBLE
     length: tuple[str, ...] = ()
@@ -172,6 +174,7 @@ def build(cls: type[Config], given: Mapping[str, object], source: str = '') -> C
     each value is valid by itself, those between parameters.
     """
     known = {one.name: one for one in parameters(cls)}
+    given = _kept(known, given, source)
     try:
         derived: Mapping[str, Value] = getattr(cls, 'defaults', lambda _: {})(given)
     except ConfigurationError as error:
@@ -192,6 +195,20 @@ def build(cls: type[Config], given: Mapping[str, object], source: str = '') -> C
         if not problems:
             return config
     raise ConfigurationError(problems, source)
+
+
+def _kept(
+    known: Mapping[str, Parameter], given: Mapping[str, object], source: str
+) -> Mapping[str, object]:
+    """Return the given values as the configuration holds them, such as a URDF for its file."""
+    values = dict(given)
+    for name, value in given.items():
+        if name in known and isinstance(value, str):
+            try:
+                values[name] = known[name].kept(value)
+            except BlfDscError as error:
+                raise ConfigurationError([f'{name}: {error}'], source) from error
+    return values
 
 
 def change(config: Config, given: Mapping[str, object], source: str = '') -> Config:

@@ -17,6 +17,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from blf_dsc_controller.configuration.nodes import is_builtin, known_names
+from blf_dsc_controller.configuration.robot import TOPIC
 from blf_dsc_controller.configuration.schema import (
     Kind,
     Parameter,
@@ -26,6 +27,7 @@ from blf_dsc_controller.configuration.schema import (
     parameters,
 )
 from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.nodes.description import wait_for_description
 from blf_dsc_controller.nodes.rclpy_internals import parameter_overrides
 
 Config = TypeVar('Config')
@@ -39,10 +41,13 @@ _RANGES: dict[Kind, tuple[str, type[Any], type[Any], Any]] = {
 def declare(node: Node, cls: type[Config]) -> Config:
     """Declare every parameter of a configuration, and return the one the node was started with.
 
-    Raises ConfigurationError with all problems of the files and arguments the node was started
-    with; then no parameter is declared.
+    A URDF on a topic is waited for. Raises ConfigurationError with all problems of the files and
+    arguments the node was started with; then no parameter is declared.
     """
-    config = build(cls, _overrides(node, cls), node.get_fully_qualified_name())
+    given = _overrides(node, cls)
+    if str(given.get('robot.urdf', '')).startswith(TOPIC):
+        given['robot.urdf'] = wait_for_description(node, given['robot.urdf'].removeprefix(TOPIC))
+    config = build(cls, given, node.get_fully_qualified_name())
     values = flatten(config)
     for one in parameters(cls):
         value = values[one.name]

@@ -36,6 +36,14 @@ _MCL_CURRENT = 1
 _MCL_FUTURE = 2
 
 
+_signals: list[int] = []  # received; a flag, so that no callback is cut off in the middle
+
+
+def interrupted() -> bool:
+    """Whether SIGINT or SIGTERM has come to the process of `run`."""
+    return bool(_signals)
+
+
 class PlainNode(Node):
     """A node for `run`.
 
@@ -59,9 +67,8 @@ def run(make_node: Callable[[], PlainNode]) -> int:
     Returns the exit code: 0 at the end or on SIGINT and SIGTERM, 1 after an error, printed on
     stderr.
     """
-    signals: list[int] = []  # a flag, so that no callback is cut off in the middle
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: signals.append(number))
+        signal.signal(number, lambda number, _: _signals.append(number))
     node: PlainNode | None = None
     problem = ''
     try:
@@ -72,7 +79,7 @@ def run(make_node: Callable[[], PlainNode]) -> int:
         # What is loaded now stays: looking through it again would hold up the loop for 0.1 s.
         gc.collect()
         gc.freeze()
-        while not (signals or node.finished):
+        while not (interrupted() or node.finished):
             spin_once(executor, node)
         executor.remove_node(node)
         if node.failure is not None:

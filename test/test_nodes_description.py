@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The URDF on a latched topic: waited for, and kept as if it had been given as a file."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+
+from random_arm import random_urdf
+from std_msgs.msg import String
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.topics import Quality
+from blf_dsc_controller.nodes import description
+from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.endpoints import qos_profile
+from sim_plant.node import PlantNode
+
+TEXT = random_urdf(3, seed=5)[0]
+ON_TOPIC = {'robot.urdf': 'topic://robot_description', 'robot.tip': 'tip', 'autostart': False}
+
+
+def publish(ros, topic, quality=topics.ROBOT_DESCRIPTION.offered):
+    publisher = ros.tester.create_publisher(String, topic, qos_profile(quality))
+    publisher.publish(String(data=TEXT))
+
+
+def test_a_controller_takes_the_arm_that_is_published(ros):
+    ros.add(PlantNode, {'robot.urdf': TEXT, 'robot.tip': 'tip'})
+    node = ros.add(ControllerNode, ON_TOPIC)
+    assert node.config == build(ControllerConfig, ON_TOPIC | {'robot.urdf': TEXT})
+    assert node.get_parameter('robot.urdf').value == TEXT  # what the recorder asks for
+
+
+def test_the_name_is_that_of_the_node_unless_it_begins_with_a_slash(ros):
+    publish(ros, '/left/robot_description')
+    publish(ros, '/elsewhere')
+    for urdf in ('topic://robot_description', 'topic:///elsewhere'):
+        node = ros.add(PlantNode, ON_TOPIC | {'robot.urdf': urdf}, namespace='left')
+        assert node.config.robot.urdf == TEXT
+        ros.kill(node)
+
+
+@pytest.mark.parametrize(
+    ('publishers', 'told'), [(0, 'nobody publishes there'), (1, 'may not be latched')]
+)
+def test_where_none_comes_the_node_says_what_to_do(ros, monkeypatch, publishers, told):
+    monkeypatch.setattr(description, 'TIMEOUT', 1.0)
+    if publishers:
+        publish(ros, 'robot_description', Quality(1, 'reliable', 'volatile'))
+        ros.until(lambda: ros.tester.count_publishers('/robot_description') == 1)
+    with pytest.raises(ConfigurationError, match=f'/robot_description within 1 s, and .*{told}'):
+        ros.add(ControllerNode, ON_TOPIC)
+
+
+def test_without_a_node_a_topic_is_rejected():
+    with pytest.raises(
+        ConfigurationError, match=r'robot.urdf: .* is a topic, for which only a node'
+    ):
+        build(ControllerConfig, ON_TOPIC)
