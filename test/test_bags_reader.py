@@ -11,9 +11,9 @@ import synthetic_bag
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from synthetic_bag import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 
-from blf_dsc_controller.bags.content import UnreadableMessageError
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.sources import BagError
+from blf_dsc_controller.bags.topic_messages import UnreadableMessageError
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import (

@@ -10,13 +10,9 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from blf_dsc_controller.bags.content import (
-    NameMap,
-    UnreadableMessageError,
-    decode_joint_states,
-    read_content,
-)
+from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.sources import BagError
+from blf_dsc_controller.bags.topic_messages import UnreadableMessageError
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
@@ -39,8 +35,8 @@ def run(tmp_path_factory):
     """Stamps, [q, dq, effort] and torques of a run of ours."""
     path = recorded_run.record(tmp_path_factory.mktemp('ours') / 'bag', 0.5)
     content = read_content(path)
-    stamp, values = decode_joint_states(content.topics[JOINT_STATES], CONFIG.joints)
-    return stamp, values, what_if(path, CONFIG)
+    states = content.topics[JOINT_STATES].joint_states(CONFIG.joints)
+    return states.stamp, states.values, what_if(path, CONFIG)
 
 
 def spread(values):

@@ -147,7 +147,7 @@ def test_dropped_states_are_found_by_the_journal(tmp_path):
     rig.guard.release()
     result = rig.verify(tmp_path)
     assert result.difference is None
-    assert result.states.passed_over == 2
+    assert result.passed_over == 2
     assert compared(result)['tracking_error'] == 6 * len(of(rig, TRACKING_ERROR))
     # The ramp differs from the dropped state on until the law is in command again.
     assert compared(result)['commands'] == 2 * (49 + 20 + 49)
@@ -207,5 +207,5 @@ def test_a_second_controller_in_a_bag_is_not_replayed(tmp_path):
     result = rig.verify(tmp_path)
     assert result.difference is None
     assert result.remarks[0] == 'another controller was started: the replay ends there'
-    assert result.states.stamp.size == 40
-    assert np.array_equal(result.states.stamp, LOCKSTEP + np.arange(40) * MILLISECOND)
+    assert result.stamp.size == 40
+    assert np.array_equal(result.stamp, LOCKSTEP + np.arange(40) * MILLISECOND)

@@ -182,7 +182,7 @@ def test_trajectories_and_a_gain_replay_where_they_took_effect(moved):
     assert result.remarks == ()
     assert [one.type for one in result.events].count(EventType.PARAMETERS) == 1
     assert [one.type for one in result.events].count(EventType.TRAJECTORY) == 2
-    samples = result.states.stamp.size
+    samples = result.stamp.size
     assert samples >= 1300
     assert compared(result)['commands'] == 2 * samples
     assert compared(result)['reference'] == 4 * samples
@@ -231,7 +231,7 @@ def test_stops_ramps_and_starts_replay_with_every_torque(stopped):
     )
     torques = sum(entry[0] == COMMANDS.resolved for entry in recorded_run.messages(stopped))
     assert compared(result)['commands'] == 2 * torques
-    count = torques - result.states.stamp.size
+    count = torques - result.stamp.size
     assert count >= 600 + 3 * 50
     assert result.safe_torques == count
 
@@ -292,8 +292,8 @@ def test_a_stop_for_silence_replays_with_its_torques(tmp_path):
     result = verify(bag)
     assert result.difference is None
     assert result.turns == ['activate', 'safe stop (state timeout)', 'deactivate', 'activate']
-    before = np.count_nonzero(result.states.stamp <= silent)
-    assert result.states.stamp.size >= before + 30
+    before = np.count_nonzero(result.stamp <= silent)
+    assert result.stamp.size >= before + 30
     torques = sum(entry[0] == COMMANDS.resolved for entry in recorded_run.messages(bag))
     assert compared(result)['commands'] == 2 * torques
-    assert compared(result)['tracking_error'] == 6 * result.states.stamp.size
+    assert compared(result)['tracking_error'] == 6 * result.stamp.size

@@ -10,14 +10,12 @@ import pytest
 import recorded_run
 
 from blf_dsc_controller.analysis.summary import summarize
-from blf_dsc_controller.bags.content import (
-    UnreadableMessageError,
-    decode_joint_states,
-    read_content,
-)
+from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.sources import BagError
+from blf_dsc_controller.bags.topic_messages import UnreadableMessageError
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.law.factory import controller_of, estimate_names
@@ -100,8 +98,8 @@ def test_a_bound_that_narrows_replays_too(tmp_path):
 def test_the_learning_has_begun_in_that_bag(bag):
     # Else the replay above would not have seen the composite learning at all.
     content = read_content(bag)
-    _, values = decode_joint_states(content.topics[LEARNING], ('latched',), ('position',))
-    assert values[-1, 0, 0] == 1.0
+    latched = content.topics[LEARNING].joint_states(('latched',), ('position',))
+    assert latched.values[-1, 0, 0] == 1.0
 
 
 @pytest.mark.parametrize(
@@ -158,15 +156,15 @@ def test_repeated_and_unused_states_are_skipped(entries, rewritten):
     ]
     result = verify(rewritten(changed))
     assert result.difference is None
-    assert result.states.passed_over == 2
-    assert result.states.stamp.size == SAMPLES
+    assert result.passed_over == 2
+    assert result.stamp.size == SAMPLES
 
 
 def test_a_lost_state_ends_the_replay_there_and_says_so(entries, rewritten):
     lost = of(entries, JOINT_STATES)[500]
     result = verify(rewritten([entry for entry in entries if entry is not lost]))
     assert result.difference is None
-    assert result.states.stamp.size == 500
+    assert result.stamp.size == 500
     assert any(f'stamp {START + 500 * MILLISECOND} ns' in remark for remark in result.remarks)
 
 
@@ -207,33 +205,35 @@ def retuned(bag):
     """The bag as it would be, had feedback.gain and barrier.bound been changed at 0.5 s."""
     config = recorded_run.loop_config().controller
     content = read_content(bag)
-    stamp, values = decode_joint_states(content.topics[JOINT_STATES], config.joints)
+    states = content.topics[JOINT_STATES].joint_states(config.joints)
     telemetry = ControllerTelemetry(config.joints, estimate_names(config))
     law = controller_of(config)
     before = START - MILLISECOND
     yield from journal_of(bag)
-    for k, now in enumerate(stamp.tolist()):
+    for k, now in enumerate(states.stamp.tolist()):
         yield [JOINT_STATES.resolved, JOINT_STATES.type, now, content.topics[JOINT_STATES].raw[k]]
         if k == 500:
             changes = {'feedback.gain': [50.0, 25.0], 'barrier.bound': [0.004, 0.003]}
             for number, (name, value) in enumerate(changes.items(), 3):
                 config = change(config, {name: tuple(value)})
                 t = (now - MILLISECOND - START) * 1e-9
-                apply_bumpless(law, config, t, values[k - 1].ravel())
+                apply_bumpless(law, config, t, states.values[k - 1].ravel())
                 given = {'parameters': {name: value}}
                 event = Event(number, EventType.PARAMETERS, now - MILLISECOND, k, k, given)
                 yield [JOURNAL.resolved, JOURNAL.type, now, event.encode()]
-        law.update((now - START) * 1e-9, (now - before) * 1e-9, values[k].ravel())
+        law.update((now - START) * 1e-9, (now - before) * 1e-9, states.values[k].ravel())
         before = now
         for topic, raw in telemetry.sample(now, law.sample, 0.0):
             yield [topic.resolved, topic.type, now, raw]
 
 
-def test_parameters_changed_on_the_way_are_replayed_where_they_took_effect(bag, rewritten):
-    messages = list(retuned(bag))
-    result = verify(rewritten(messages))
+def test_parameters_changed_on_the_way_are_replayed_where_they_took_effect(bag, rewritten, capsys):
+    path = rewritten(list(retuned(bag)))
+    result = verify(path)
     assert [one.type for one in result.events].count(EventType.PARAMETERS) == 2
     assert result.difference is None
+    assert main(['replay', str(path)]) == 0
+    assert '2 changes of parameters replayed' in capsys.readouterr().out
 
 
 def test_an_event_that_the_recorder_lost_ends_the_replay(bag, rewritten):
@@ -252,8 +252,8 @@ def test_another_configuration_runs_in_open_loop(bag):
     found = what_if(bag, stiffer)
     # By (28) alone, as long as nothing is adapted: at the first sample the gain times xi2.
     recorded = read_content(bag).topics[TRACKING_ERROR]
-    _, errors = decode_joint_states(recorded, config.joints, ('velocity',))
-    expected = -10.0 * errors[0, 1, 0]
+    errors = recorded.joint_states(config.joints, ('velocity',))
+    expected = -10.0 * errors.values[0, 1, 0]
     assert found.difference[0, 0] == pytest.approx(expected, rel=1e-9)
     assert found.difference[0, 1] == 0.0
     assert found.error_ratio == pytest.approx(same.error_ratio)

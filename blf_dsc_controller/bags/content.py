@@ -1,54 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of a bag, its topics and joints matched to ours by name.
-
-All messages of a topic are decoded at once, without a loop where they differ only in numbers.
-"""
+"""The messages of a bag, its topics and joints matched to ours by name."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.sources import BagError, open_bag
+from blf_dsc_controller.bags.topic_messages import TopicMessages
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.messages.cdr import (
-    Layout,
-    MessageError,
-    MissingJointError,
-    array_layout,
-    joint_state_layout,
-)
-from blf_dsc_controller.messages.codecs import Decoder, Float64MultiArrayDecoder, JointStateDecoder
 from blf_dsc_controller.messages.topics import (
     CLOCK,
     COMMANDS,
-    FLOAT64_MULTI_ARRAY,
     JOINT_STATE,
     JOINT_STATES,
     TOPICS,
     Topic,
 )
-from blf_dsc_controller.run import Floats, Stamps
 
 _OF_INTEREST = tuple(one for one in TOPICS if one is not CLOCK)
-
-
-class UnreadableMessageError(BagError):
-    """A message of a bag that cannot be decoded."""
-
-    def __init__(self, topic: str, index: int, error: MessageError) -> None:
-        reason = str(error)
-        if isinstance(error, MissingJointError):
-            reason = (
-                f'{error.fact}: the bag is from another robot, or its joints have other names: '
-                f'--map {error.joint}=ITS_NAME, of replay --config and of identify'
-            )
-        super().__init__(f'message {index + 1} of {topic} cannot be read: {reason}')
 
 
 @dataclass(frozen=True)
@@ -94,20 +67,11 @@ class NameMap:
 NO_NAMES = NameMap()
 
 
-@dataclass
-class TopicMessages:
-    """All messages of one topic, undecoded, in the order of their reception."""
-
-    name: str
-    type: str = ''
-    received: list[int] = field(default_factory=list)  # ns
-    raw: list[bytes] = field(default_factory=list)
-
-
 @dataclass(frozen=True)
 class Content:
     """The messages of the package's topics in a bag, and the number of messages of every topic."""
 
+    path: Path
     topics: Mapping[Topic, TopicMessages]
     message_counts: Mapping[str, int]
 
@@ -145,7 +109,7 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
             order = np.argsort(times, kind='stable').tolist()
             messages.received = [messages.received[k] for k in order]
             messages.raw = [messages.raw[k] for k in order]
-    return Content({topic: one for topic, one in topics.items() if one.raw}, counts)
+    return Content(path, {topic: one for topic, one in topics.items() if one.raw}, counts)
 
 
 def _find(topic: Topic, held: list[tuple[str, str]], namespace: str, names: NameMap) -> str | None:
@@ -191,69 +155,3 @@ def _bad_entry(entry: str, reason: str) -> BlfDscError:
         f'--map {entry}: {reason}; expected OURS=THEIRS with a topic, as in '
         'joint_states=/arm/states, or a joint, as in joint1=shoulder'
     )
-
-
-def decode_joint_states(
-    messages: TopicMessages,
-    names: Sequence[str],
-    required: Sequence[str] = ('position', 'velocity'),
-    errors: dict[int, MessageError] | None = None,
-) -> tuple[Stamps, Floats]:
-    """Stamps (N,) [ns] and [position, velocity, effort] (N, 3, n) of the n `names`.
-
-    Messages that cannot be decoded are added to `errors` by their number, and zero.
-
-    Raises:
-        UnreadableMessageError: there are no `errors` to add them to.
-    """
-    stamps, values = _decode(messages, JointStateDecoder(names, required), errors)
-    return stamps, values.reshape(stamps.size, 3, len(names))
-
-
-def decode_arrays(messages: TopicMessages, size: int) -> Floats | None:
-    """Values (N, size) of Float64MultiArrays, None if one of them has another size.
-
-    Raises:
-        UnreadableMessageError: a message cannot be decoded.
-    """
-    sizes, values = _decode(messages, Float64MultiArrayDecoder(size))
-    return values if (sizes == size).all() else None
-
-
-def first_layout(messages: TopicMessages) -> Layout:
-    """Layout of the first of some joint states or arrays; UnreadableMessageError if it has none."""
-    find = array_layout if messages.type == FLOAT64_MULTI_ARRAY else joint_state_layout
-    try:
-        return find(messages.raw[0])
-    except MessageError as error:
-        raise UnreadableMessageError(messages.name, 0, error) from error
-
-
-def joint_names(messages: TopicMessages) -> tuple[str, ...]:
-    """Names in the first of some joint states; UnreadableMessageError if there are none."""
-    names = first_layout(messages).names
-    if not names:
-        unnamed = MessageError('it names no joint, so its values cannot be assigned to joints')
-        raise UnreadableMessageError(messages.name, 0, unnamed)
-    return names
-
-
-def _decode(
-    messages: TopicMessages, decoder: Decoder, errors: dict[int, MessageError] | None = None
-) -> tuple[NDArray[np.int64], Floats]:
-    """What `decoder` returns of each message, and its values."""
-    with suppress(MessageError):
-        at_once = decoder.decode_all(messages.raw)
-        if at_once is not None:
-            return at_once
-    count = len(messages.raw)
-    returned, values = np.zeros(count, dtype=np.int64), np.zeros((count, decoder.values.size))
-    for k, raw in enumerate(messages.raw):
-        try:
-            returned[k] = decoder.decode(raw)
-            values[k] = decoder.values
-        except MessageError as error:
-            if errors is None:
-                raise UnreadableMessageError(messages.name, k, error) from error
-            errors[k] = error
-    return returned, values

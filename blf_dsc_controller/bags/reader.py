@@ -10,31 +10,23 @@ import csv
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.bags.content import (
-    Content,
-    TopicMessages,
-    decode_arrays,
-    decode_joint_states,
-    joint_names,
-    read_content,
-)
+from blf_dsc_controller.bags.content import Content, read_content
 from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.bags.topic_messages import JointStates
+from blf_dsc_controller.bags.torque import TorqueError, applied_torque, next_effort
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import Event, EventType, decode
 from blf_dsc_controller.messages.types import typestore
-from blf_dsc_controller.run import Floats, LearnedArm, Run, Series, Stamps, Stop
+from blf_dsc_controller.run import Floats, LearnedArm, Run, Series, Stop
 
 
 def read_run(path: str | Path, namespace: str = '') -> Run:
     """Read a bag.
-
-    The k-th command belongs to the k-th joint state if there are as many; otherwise the torque is
-    that of the tracking error, or else the effort of the next joint state.
 
     Raises:
         BagError: there is no bag, it is damaged, it holds no joint states, or the topics of several
@@ -43,23 +35,23 @@ def read_run(path: str | Path, namespace: str = '') -> Run:
     """
     content = read_content(Path(path), namespace)
     joints = _joints(content)
-    states = _decode(content.topics[topics.JOINT_STATES], joints)
-    errors = _optional(content, topics.TRACKING_ERROR, joints)
-    references = _optional(content, topics.REFERENCE, joints)
+    states = content.topics[topics.JOINT_STATES].joint_states(joints, ('position',)).by_stamp()
+    errors = _decode(content, topics.TRACKING_ERROR, joints)
+    references = _decode(content, topics.REFERENCE, joints)
+    bounds = _decode(content, topics.BOUND, joints)
     events = list(_events(content))
-    bounds = _optional(content, topics.BOUND, joints)
     learning = _vector(content, topics.LEARNING)
     reference = None if references is None else references.position.exact(states.stamp)
     error = None if errors is None else errors.position.exact(states.stamp)
     if error is None and reference is not None:
-        error = states.position.values - reference
+        error = states.values[:, 0] - reference
     return Run(
         joints=joints,
         stamp=states.stamp,
         received=states.received,
-        position=states.position.values,
+        position=states.values[:, 0],
         velocity=states.values[:, 1],
-        torque=_torque(content, states, errors),
+        torque=_torque(content, states),
         reference=reference,
         error=error,
         bound=None if bounds is None else bounds.position.held(states.stamp),
@@ -76,54 +68,32 @@ def read_run(path: str | Path, namespace: str = '') -> Run:
     )
 
 
-class _Decoded(NamedTuple):
-    """All messages of one topic, ordered by stamp, one of each stamp."""
-
-    names: tuple[str, ...]
-    stamp: Stamps  # (m,) ns
-    received: Stamps  # (m,) ns
-    values: Floats  # (m, 3, n)
-
-    @property
-    def position(self) -> Series:
-        return Series(self.names, self.stamp, self.values[:, 0])
-
-    @property
-    def effort(self) -> Series:
-        return Series(self.names, self.stamp, self.values[:, 2])
-
-
 def _joints(content: Content) -> tuple[str, ...]:
     """Joints of the controller, in its order; all of the joint states if it is not in the bag."""
     sources = (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND, topics.JOINT_STATES)
-    return joint_names(next(content.topics[one] for one in sources if one in content.topics))
+    return next(content.topics[one] for one in sources if one in content.topics).joint_names()
 
 
-def _decode(messages: TopicMessages, names: Sequence[str]) -> _Decoded:
-    stamp, values = decode_joint_states(messages, names, ('position',))
-    stamp, order = np.unique(stamp, return_index=True)
-    received = np.array(messages.received, dtype=np.int64)[order]
-    return _Decoded(tuple(names), stamp, received, values[order])
-
-
-def _optional(content: Content, topic: topics.Topic, joints: Sequence[str]) -> _Decoded | None:
-    return _decode(content.topics[topic], joints) if topic in content.topics else None
+def _decode(
+    content: Content, topic: topics.Topic, joints: Sequence[str] = ()
+) -> JointStates | None:
+    """Messages of a topic by stamp, of these joints or all names; None without any."""
+    messages = content.topics.get(topic)
+    if messages is None:
+        return None
+    return messages.joint_states(joints or messages.joint_names(), ('position',)).by_stamp()
 
 
 def _vector(content: Content, topic: topics.Topic) -> Series | None:
-    messages = content.topics.get(topic)
-    return None if messages is None else _decode(messages, joint_names(messages)).position
+    decoded = _decode(content, topic)
+    return None if decoded is None else decoded.position
 
 
-def _torque(content: Content, states: _Decoded, errors: _Decoded | None) -> Floats:
-    commands = content.topics.get(topics.COMMANDS)
-    if commands is not None and len(commands.raw) == states.stamp.size:
-        torque = decode_arrays(commands, len(states.names))
-        if torque is not None:
-            return torque
-    if errors is not None:
-        return errors.effort.exact(states.stamp)
-    return np.vstack([states.effort.values[1:], np.full(len(states.names), np.nan)])
+def _torque(content: Content, states: JointStates) -> Floats:
+    try:
+        return applied_torque(content, states)[0]
+    except TorqueError:
+        return next_effort(states)
 
 
 def _rejected_columns(content: Content, learning: Series | None, namespace: str) -> dict[str, str]:

@@ -38,8 +38,9 @@ def replay(options: Namespace) -> int:
         _identify(options, config)
     elif config is None:
         result = verify(options.bag, options.namespace)
-        states = result.states
-        _print_speed(states.stamp.size, states.duration, perf_counter() - begin)
+        stamp = result.stamp
+        duration = float(np.ptp(stamp)) * 1e-9 if stamp.size else 0.0
+        _print_speed(stamp.size, duration, perf_counter() - begin)
         print('\n'.join(_verification(result)))
         return 0 if result.difference is None else DIFFERENT
     else:
@@ -91,17 +92,19 @@ def _verification(result: Verification) -> Iterator[str]:
         verdict = 'bit-equal' if one.difference is None else 'DIFFERENT'
         left_out = f' (not compared: {one.left_out})' if one.left_out else ''
         yield f'{one.topic}: {one.values} values {verdict}{left_out}'
-    changes, trajectories = map(result.count, (EventType.PARAMETERS, EventType.TRAJECTORY))
-    if changes:
-        yield f'{changes} changes of parameters replayed where they took effect'
-    if trajectories:
-        yield f'{trajectories} trajectories replayed where they took effect'
+    types = [one.type for one in result.events]
+    for type_, what in (
+        (EventType.PARAMETERS, 'changes of parameters'),
+        (EventType.TRAJECTORY, 'trajectories'),
+    ):
+        if type_ in types:
+            yield f'{types.count(type_)} {what} replayed where they took effect'
     if len(result.turns) > 1:
         yield f'replayed in turn: {", ".join(result.turns)}'
     if result.safe_torques:
         yield f'{result.safe_torques} of the commands are safe torques, or on the ramp to one'
-    if result.states.passed_over:
-        yield f'{result.states.passed_over} states skipped: the controller did not use them'
+    if result.passed_over:
+        yield f'{result.passed_over} states skipped: the controller did not use them'
     yield from (f'note: {remark}' for remark in result.remarks)
     if result.difference is not None:
         yield f'DIFFERENT, first at {result.difference}'

@@ -16,17 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.urdf import chain_joints, moving_joints
-from blf_dsc_controller.bags.content import (
-    NO_NAMES,
-    NameMap,
-    decode_joint_states,
-    read_content,
-)
+from blf_dsc_controller.bags.content import NO_NAMES, NameMap, read_content
 from blf_dsc_controller.bags.sources import BagError
+from blf_dsc_controller.bags.torque import applied_torque
 from blf_dsc_controller.messages.cdr import joint_state_layout
 from blf_dsc_controller.messages.topics import JOINT_STATES
-from blf_dsc_controller.replay.states import law_states
-from blf_dsc_controller.replay.what_if import applied_torque
 from blf_dsc_controller.run import Floats, Stamps
 
 _SLOWEST = 0.02  # s between states
@@ -70,15 +64,13 @@ def read_recording(
         received, raw = [messages.received[k] for k in kept], [messages.raw[k] for k in kept]
         messages = replace(messages, received=received, raw=raw)
         content = replace(content, topics={**content.topics, JOINT_STATES: messages})
-    stamp, values = decode_joint_states(messages, theirs, ('position',))
-    q, torque, source = values[:, 0], values[:, 2], f'effort of {messages.name}'
+    states = messages.joint_states(theirs, ('position',))
+    torque, source = states.values[:, 2], f'effort of {messages.name}'
     if not np.nan_to_num(torque).any():
-        states = law_states(content, theirs)
-        stamp, q = states.stamp, states.measurement[:, : len(joints)]
-        torque, source = applied_torque(path, content, states, theirs)
+        torque, source = applied_torque(content, states)
         if not np.nan_to_num(torque).any():
             raise BagError(f'{path}: all torques in the {source} are zero: record measured efforts')
-    return _resampled(joints, stamp, q, torque, source)
+    return _resampled(joints, states.stamp, states.values[:, 0], torque, source)
 
 
 def _arm_joints(text: str, in_bag: set[str], names: NameMap) -> tuple[str, ...]:

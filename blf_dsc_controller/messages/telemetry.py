@@ -121,6 +121,9 @@ class Monitor:
     """Messages of the slow topic `~/monitor`: how far the guarantees of the law hold.
 
     Where the truth is known: the Lyapunov function (29) term by term, and the bound (32) on it.
+
+    Attributes:
+        names: of the values.
     """
 
     def __init__(self, joints: Sequence[str], estimates: Sequence[str], settings: Settings) -> None:
@@ -130,11 +133,17 @@ class Monitor:
         if settings.truth_known == 1:
             names += [*topics.LYAPUNOV_TERMS, topics.LYAPUNOV_BOUND]
             self._ceiling = ExponentialBound(settings)
+        self.names = tuple(names)
         self._encoder = JointStateEncoder(names, ('position',))
         self._start: int | None = None
 
-    def message(self, stamp: int, sample: Sample, ratio: np.ndarray, bound: np.ndarray) -> Message:
-        """Telemetry sample, largest |xi1| / k_c so far (n,), and present k_c (n,) [rad]."""
+    def values(
+        self, stamp: int, sample: Sample, ratio: np.ndarray, bound: np.ndarray
+    ) -> list[float]:
+        """Values of `names`, of a telemetry sample at a stamp [ns].
+
+        `ratio` is the largest |xi1| / k_c so far (n,), `bound` the present k_c (n,) [rad].
+        """
         distance = bound - np.abs(sample.xi1)
         values = [*ratio, *distance, *sample.estimate, sample.lambda_min[0], sample.latched[0]]
         if self._ceiling is not None:
@@ -142,6 +151,11 @@ class Monitor:
             V = float(sample.lyapunov.sum())
             t = (stamp - self._start) * 1e-9
             values += [*sample.lyapunov, self._ceiling.at(t, V, bool(sample.latched[0]))]
+        return values
+
+    def message(self, stamp: int, sample: Sample, ratio: np.ndarray, bound: np.ndarray) -> Message:
+        """Message of these values."""
+        values = self.values(stamp, sample, ratio, bound)
         return topics.MONITOR, self._encoder.encode(stamp, values)
 
 

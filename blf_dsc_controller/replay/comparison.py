@@ -3,19 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.bags.content import (
-    Content,
-    TopicMessages,
-    decode_arrays,
-    decode_joint_states,
-    first_layout,
-)
+from blf_dsc_controller.bags.content import Content
+from blf_dsc_controller.bags.topic_messages import TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS
 from blf_dsc_controller.messages.samples import learning_of
@@ -28,9 +23,7 @@ from blf_dsc_controller.messages.topics import (
     Topic,
 )
 from blf_dsc_controller.replay.rerun import Commands, Difference, Rerun
-from blf_dsc_controller.run import Floats, Stamps
-
-Columns = Mapping[str, Floats]  # values (N,) by field, such as `velocity of joint1`, `lambda_min`
+from blf_dsc_controller.run import Floats, Series, Stamps
 
 
 class Comparison(NamedTuple):
@@ -52,50 +45,49 @@ def compare(
     Raises:
         UnreadableMessageError: a message cannot be decoded.
     """
-    recorded = content.topics.get(COMMANDS)
-    if recorded is not None:
-        efforts = [f'effort of {joint}' for joint in config.joints]
-        is_gappy = recorded.name in gappy
-        yield _compare_commands(recorded, run.commands, efforts, is_gappy=is_gappy)
-    stamps = run.states.stamp
-    for topic, columns in _expected(config, run).items():
-        recorded = content.topics.get(topic)
-        if recorded is not None:
-            is_named = topic in (LEARNING, MONITOR)
-            yield _compare_stamped(recorded, stamps, columns, is_named=is_named)
+    messages = content.topics.get(COMMANDS)
+    if messages is not None:
+        names = _names(config.joints, ['effort'])
+        is_gappy = messages.name in gappy
+        yield _compare_commands(messages, run.commands, names, is_gappy=is_gappy)
+    for topic, replayed in _replayed(config, run).items():
+        messages = content.topics.get(topic)
+        if messages is not None:
+            recorded = _recorded(messages, is_vector=topic in (LEARNING, MONITOR))
+            yield _compare_series(messages.name, run.stamp, recorded, replayed)
 
 
-def _expected(config: ControllerConfig, run: Rerun) -> dict[Topic, Columns]:
-    """Columns of every topic with a stamp over the replayed samples; NaN between two messages."""
-    joints, samples = config.joints, run.samples
-    learning = learning_of(config, run.states.stamp, samples)
-    errors = {'position': samples.xi1, 'velocity': samples.xi2, 'effort': samples.torque}
-    monitor: dict[str, Floats] = {}
-    if run.monitored:
-        messages = TopicMessages(MONITOR.resolved, raw=list(run.monitored.values()))
-        names = first_layout(messages).names
-        _, values = decode_joint_states(messages, names, ())
-        table = np.full((len(samples.xi1), len(names)), np.nan)
-        table[list(run.monitored)] = values[:, 0]
-        monitor = dict(zip(names, table.T, strict=True))
+def _replayed(config: ControllerConfig, run: Rerun) -> dict[Topic, Series]:
+    """Values of every topic with a stamp."""
+    errors, reference = (_names(config.joints, JOINT_STATE_FIELDS[:count]) for count in (3, 2))
+    stamp, samples = run.stamp, run.samples
     return {
-        TRACKING_ERROR: _of_joints(joints, errors),
-        REFERENCE: _of_joints(joints, {'position': samples.qr, 'velocity': samples.dqr}),
-        LEARNING: dict(zip(learning.names, learning.values.T, strict=True)),
-        MONITOR: monitor,
+        TRACKING_ERROR: Series(
+            errors, stamp, np.hstack((samples.xi1, samples.xi2, samples.torque))
+        ),
+        REFERENCE: Series(reference, stamp, np.hstack((samples.qr, samples.dqr))),
+        LEARNING: learning_of(config, stamp, samples),
+        MONITOR: run.monitor,
     }
 
 
-def _of_joints(joints: Sequence[str], fields: Mapping[str, Floats]) -> dict[str, Floats]:
-    return {
-        f'{field} of {joint}': column
-        for field, values in fields.items()
-        for joint, column in zip(joints, values.T, strict=True)
-    }
+def _recorded(messages: TopicMessages, *, is_vector: bool) -> Series:
+    """Values of a vector, or those fields of joint states that are not empty."""
+    states = messages.joint_states(messages.layout().names, ())
+    if is_vector:
+        return states.position
+    names = _names(states.names, JOINT_STATE_FIELDS)
+    all_of_them = Series(names, states.stamp, states.values.reshape(states.stamp.size, -1))
+    filled = [name for name in names if not np.isnan(all_of_them.column(name)).all()]
+    return Series(tuple(filled), states.stamp, all_of_them.select(filled))
+
+
+def _names(joints: Sequence[str], fields: Sequence[str]) -> tuple[str, ...]:
+    return tuple(f'{field} of {joint}' for field in fields for joint in joints)
 
 
 def _compare_commands(
-    recorded: TopicMessages, commands: Commands, fields: Sequence[str], *, is_gappy: bool
+    recorded: TopicMessages, commands: Commands, names: Sequence[str], *, is_gappy: bool
 ) -> Comparison:
     """Compare commands by their number in the run: they have no stamp."""
     count = len(recorded.raw)
@@ -103,9 +95,9 @@ def _compare_commands(
     if count < due or is_gappy:
         reason = f'{count} commands for {due} states that the law used, and they have no stamp'
         return Comparison(recorded.name, 0, None, reason)
-    values = decode_arrays(recorded, len(fields))
+    values = recorded.arrays(len(names))
     if values is None:
-        return Comparison(recorded.name, 0, None, f'they are not {len(fields)} values each')
+        return Comparison(recorded.name, 0, None, f'they are not {len(names)} values each')
     number = commands.number
     # After a dropped state there may be more replayed torques than commands before the next event.
     later = np.append(np.minimum.accumulate(number[::-1])[::-1][1:], count)
@@ -124,52 +116,36 @@ def _compare_commands(
             'the middleware dropped, or by the watchdog at the end'
         )
     stamp, torque = commands.stamp[rows], commands.torque[rows]
-    return _compare(recorded.name, stamp, stamp[:1], fields, values[number[rows]], torque, left_out)
+    return _compare(recorded.name, stamp, stamp[:1], names, values[number[rows]], torque, left_out)
 
 
-def _compare_stamped(
-    recorded: TopicMessages, stamps: Stamps, columns: Columns, *, is_named: bool
-) -> Comparison:
-    names = first_layout(recorded).names
-    stamp, values = decode_joint_states(recorded, names, ())
-    known = np.isin(stamp, stamps)
-    if is_named:
-        fields = dict(zip(names, values[:, 0].T, strict=True))
-    else:
-        by_field = dict(zip(JOINT_STATE_FIELDS, values.swapaxes(0, 1), strict=True))
-        fields = _of_joints(names, by_field)
-        fields = {name: column for name, column in fields.items() if not np.isnan(column).all()}
-    shared = [field for field in columns if field in fields]
-    absent = [field for field in (*columns, *fields) if (field in columns) != (field in fields)]
-    stamp = stamp[known]
-    rows = np.searchsorted(stamps, stamp)
-    shape = len(shared), rows.size
-    return _compare(
-        recorded.name,
-        stamp,
-        stamps[:1],
-        shared,
-        np.array([fields[field][known] for field in shared]).reshape(shape).T,
-        np.array([columns[field][rows] for field in shared]).reshape(shape).T,
-        ', '.join(absent),
-    )
+def _compare_series(topic: str, stamp: Stamps, recorded: Series, replayed: Series) -> Comparison:
+    """Compare values of the same name in the samples (N,); NaN between two messages."""
+    shared = [name for name in replayed.names if name in recorded.names]
+    absent = {*replayed.names, *recorded.names}.difference(shared)
+    left_out = [name for name in (*replayed.names, *recorded.names) if name in absent]
+    known = np.isin(recorded.stamp, stamp)
+    sampled = recorded.stamp[known]
+    own = Series(tuple(shared), replayed.stamp, replayed.select(shared)).exact(sampled)
+    values = recorded.select(shared)[known]
+    return _compare(topic, sampled, stamp[:1], shared, values, own, ', '.join(left_out))
 
 
 def _compare(
     topic: str,
     stamp: Stamps,
     start: Stamps,
-    fields: Sequence[str],
+    names: Sequence[str],
     recorded: Floats,
     replayed: Floats,
     left_out: str,
 ) -> Comparison:
-    """Compare tables (N, fields) with the stamps (N,), of a run that began at `start` (1,)."""
+    """Compare tables (N, names) with the stamps (N,), of a run that began at `start` (1,)."""
     difference = None
     for k, j in np.argwhere(~_alike(recorded, replayed))[:1]:
         time = float((stamp[k] - start[0]) * 1e-9)
         pair = float(recorded[k, j]), float(replayed[k, j])
-        difference = Difference(topic, fields[j], int(stamp[k]), time, *pair)
+        difference = Difference(topic, names[j], int(stamp[k]), time, *pair)
     return Comparison(topic, recorded.size, difference, left_out)
 
 

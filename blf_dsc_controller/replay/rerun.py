@@ -9,24 +9,25 @@ command all are used, and the torques are compared as far as they match.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.state import Sample
+from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.messages.samples import columns_of
 from blf_dsc_controller.messages.telemetry import DECIMATION, Monitor
 from blf_dsc_controller.messages.topics import FOREVER, TRACKING_ERROR
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
-from blf_dsc_controller.replay.states import Arrivals, States
-from blf_dsc_controller.run import Floats, Stamps
+from blf_dsc_controller.run import Floats, Series, Stamps
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
@@ -67,32 +68,43 @@ class Rerun:
 
     Attributes:
         events: that were replayed.
-        monitored: messages of the monitor, by the number of their sample.
+        passed_over: number of joint states that the law did not use.
         departure: where it did something else than the journal says; the replay ends there.
         end: why else the replay ended before the bag; empty if it did not.
     """
 
-    def __init__(self, config: ControllerConfig, came: Arrivals, sampled: Stamps | None) -> None:
-        """Start with `config`; `sampled` are the stamps [ns] with telemetry, None without any."""
+    def __init__(
+        self,
+        config: ControllerConfig,
+        states: JointStates,
+        errors: Mapping[int, MessageError],
+        sampled: Stamps | None,
+    ) -> None:
+        """Start with `config`.
+
+        `errors` are those of unreadable messages by their number among the joint states; `sampled`
+        are the stamps [ns] with telemetry, None without any.
+        """
         self.events: list[Event] = []
-        self.monitored: dict[int, bytes] = {}
+        self.passed_over = 0
         self.departure: Difference | None = None
         self.end = ''
         self._config = config
         self._guard = Guard(config, lambda: 0, lambda: 0)
         self._guard.journal.pending.clear()
-        self._came = came
+        self._states, self._errors = states, errors
+        self._stamps = states.stamp.tolist()
         self._sampled = None if sampled is None else frozenset(sampled.tolist())
-        lost = np.setdiff1d([] if sampled is None else sampled, came.stamp)
+        lost = np.setdiff1d([] if sampled is None else sampled, states.stamp)
         self._lost = int(lost[0]) if lost.size else FOREVER
         self._position = -1  # number of the last joint state before now
         self._messages = 0  # that were processed by then, according to the journal
         self._last = -1  # stamp of the last state that the law used [ns]
-        self._passed_over = 0
         self._numbers: list[int] = []  # of the joint states that the law used
-        self._rows = np.empty((len(came.stamp), self._guard.controller.sample_vector.size))
+        self._rows = np.empty((len(self._stamps), self._guard.controller.sample_vector.size))
         self._monitor: Monitor | None = None
-        self._commands: list[tuple[int, bytes, bool, bool]] = []  # as in Commands
+        self._monitored: list[tuple[int, list[float]]] = []  # ns, values
+        self._commands: list[tuple[int, Floats, bool, bool]] = []  # as in Commands
         self._offsets = [(0, 0)]  # from a torque on: its number in the bag
         self._failed = False
 
@@ -113,30 +125,36 @@ class Rerun:
             self.events.append(event)
             if self._is_over or event.type is EventType.RELEASE:
                 return
-        self._feed(None, len(self._came.stamp) - 1, is_exact=in_step)
+        self._feed(None, len(self._stamps) - 1, is_exact=in_step)
 
     @property
-    def states(self) -> States:
-        """States that the law used."""
-        stamps = np.array(self._came.stamp, dtype=np.int64)[self._numbers]
-        return States(stamps, self._came.measurement[self._numbers], self._passed_over)
+    def stamp(self) -> Stamps:
+        """Stamps (N,) [ns] of the states that the law used."""
+        return self._states.stamp[self._numbers]
 
     @property
     def samples(self) -> Sample:
         """Columns of the law's telemetry samples, each (N, its length)."""
         return columns_of(self._rows[: len(self._numbers)], self._guard.controller.settings)
 
+    @property
+    def monitor(self) -> Series:
+        """Values of the monitor."""
+        names = () if self._monitor is None else self._monitor.names
+        stamp = np.array([stamp for stamp, _ in self._monitored], dtype=np.int64)
+        values = np.array([values for _, values in self._monitored])
+        return Series(names, stamp, values.reshape(stamp.size, len(names)))
+
     @cached_property
     def commands(self) -> Commands:
         """Every torque."""
         count = len(self._commands)
-        torque = np.frombuffer(b''.join(one[1] for one in self._commands))
         number = np.arange(count)
         for own, recorded in self._offsets:
             number[own:] = np.arange(recorded, recorded + count - own)
         return Commands(
             np.array([one[0] for one in self._commands], dtype=np.int64),
-            torque.reshape(count, len(self._config.joints)),
+            np.array([one[1] for one in self._commands]).reshape(count, len(self._config.joints)),
             np.array([one[2] for one in self._commands], dtype=np.bool_),
             np.array([one[3] for one in self._commands], dtype=np.bool_),
             number,
@@ -150,14 +168,14 @@ class Rerun:
 
     def _locate(self, event: Event) -> tuple[int, bool]:
         """Number of the last joint state before an event, and whether none before was dropped."""
-        stamps, processed = self._came.stamp, event.messages - self._messages
+        stamps, processed = self._stamps, event.messages - self._messages
         self._messages = event.messages
         end = self._position + processed
         if processed == 0 or (end < len(stamps) and self._seen(end) == event.stamp):
             return end, True
         is_unreadable = _reason(event) in _UNREADABLE
         for k in range(self._position + 1, len(stamps)):
-            is_it = (k in self._came.errors) == is_unreadable and self._seen(k) == event.stamp
+            is_it = (k in self._errors) == is_unreadable and self._seen(k) == event.stamp
             if is_it and (k >= end or stamps[k + 1 : k + 2] != [event.stamp]):
                 return k, False
         if self._numbers:
@@ -166,9 +184,9 @@ class Rerun:
 
     def _seen(self, k: int) -> int:
         """Stamp of the last readable state up to number k."""
-        while k in self._came.errors:
+        while k in self._errors:
             k -= 1
-        return self._came.stamp[k] if k >= 0 else -1
+        return self._stamps[k] if k >= 0 else -1
 
     def _feed(self, event: Event | None, end: int, *, is_exact: bool) -> None:
         """Process the joint states up to number `end`, before an event."""
@@ -177,34 +195,34 @@ class Rerun:
                 return
             if k == end and _reason(event) is Reason.FAILED:
                 continue  # nothing shows how far the law came with this one
-            is_certain = event and (is_exact or k == end or self._came.stamp[k] == event.stamp)
+            is_certain = event and (is_exact or k == end or self._stamps[k] == event.stamp)
             if is_certain or self._was_used(k):
                 self._process(k, event, is_exact=is_exact)
             else:
-                self._passed_over += 1
+                self.passed_over += 1
         self._position = end
 
     def _was_used(self, k: int) -> bool:
         """Whether the recorded controller must have processed a state that it may have missed."""
-        stamp = self._came.stamp[k]
+        stamp = self._stamps[k]
         if not self._guard.supervisor.uses_states:
             return True
-        if k in self._came.errors or stamp == self._last:
+        if k in self._errors or stamp == self._last:
             return False
         is_starting = self._guard.supervisor.phase is Phase.STARTING
         return not is_starting and (self._sampled is None or stamp in self._sampled)
 
     def _process(self, k: int, event: Event | None, *, is_exact: bool) -> None:
-        guard, stamp = self._guard, self._came.stamp[k]
-        if k in self._came.errors:
-            torque = guard.reject(self._came.errors[k])
+        guard, stamp = self._guard, self._stamps[k]
+        if k in self._errors:
+            torque = guard.reject(self._errors[k])
             self._command(guard.journal.stamp, torque, is_exact=is_exact)
         elif guard.supervisor.uses_states and stamp > self._lost:
             self.end = f'the state with stamp {self._lost} ns was used but is not in the bag'
         else:
             is_new = stamp > self._last and stamp in (self._sampled or ())
             is_due = guard.supervisor.uses_states and is_new
-            torque = guard.update(stamp, self._came.measurement[k])
+            torque = guard.update(stamp, self._states.values[k].ravel())
             if guard.has_sample:
                 if stamp <= self._last:
                     self.end = f'the stamps restart at {stamp} ns'
@@ -229,14 +247,14 @@ class Rerun:
             self._monitor = Monitor(self._config.joints, names, controller.settings)
         if (samples - 1) % DECIMATION == 0:
             sample = controller.sample
-            message = self._monitor.message(stamp, sample, guard.samples.ratio, sample.bound)
-            self.monitored[row] = message[1]
+            values = self._monitor.values(stamp, sample, guard.samples.ratio, sample.bound)
+            self._monitored.append((stamp, values))
 
     def _command(self, stamp: int, torque: Floats | None, *, is_exact: bool) -> None:
         if torque is not None:
             of_law = self._guard.has_sample
             is_exact = of_law or (is_exact and not self._failed)
-            self._commands.append((stamp, torque.tobytes(), of_law, is_exact))
+            self._commands.append((stamp, torque.copy(), of_law, is_exact))
 
     # Events.
 
@@ -295,7 +313,7 @@ class Rerun:
 
     def _depart(self, what: str, stamp: int) -> None:
         if self.departure is None:
-            begin = self._came.stamp[self._numbers[0]] if self._numbers else stamp
+            begin = self._stamps[self._numbers[0]] if self._numbers else stamp
             time = (stamp - begin) * 1e-9
             self.departure = Difference(TRACKING_ERROR.resolved, what, stamp, time, 1.0, 0.0)
 

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,13 +14,17 @@ import numpy as np
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.content import Content, read_content
 from blf_dsc_controller.bags.context import Context, read_context
+from blf_dsc_controller.bags.topic_messages import JointStates, UnreadableMessageError
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import required_fields
+from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.journal import Event, EventType, decode
-from blf_dsc_controller.messages.topics import FOREVER, JOURNAL
+from blf_dsc_controller.messages.topics import FOREVER, JOINT_STATES, JOURNAL
 from blf_dsc_controller.replay.comparison import Comparison, compare
 from blf_dsc_controller.replay.rerun import Difference, Rerun
-from blf_dsc_controller.replay.states import States, arrivals, sampled_stamps
+from blf_dsc_controller.replay.states import sampled_stamps
+from blf_dsc_controller.run import Stamps
 
 _TURNS = (EventType.ACTIVATE, EventType.DEACTIVATE, EventType.RESET, EventType.STOP)
 
@@ -26,7 +32,8 @@ _TURNS = (EventType.ACTIVATE, EventType.DEACTIVATE, EventType.RESET, EventType.S
 class Verification(NamedTuple):
     """What a replay found."""
 
-    states: States  # that the law used
+    stamp: Stamps  # (N,) ns, of the states that the law used
+    passed_over: int  # number of states that it did not use
     comparisons: tuple[Comparison, ...]  # one for each topic of the controller
     events: tuple[Event, ...]  # that were replayed
     safe_torques: int  # number of replayed torques that are not the law's
@@ -54,25 +61,26 @@ def verify(path: Path, namespace: str = '') -> Verification:
             controller, or it cannot be read.
     """
     context, content = read_context(path), read_content(path, namespace)
-    events, until, end = _events(path, content)
+    events, until, end = _events(content)
     config = context.build_config(events[0].content['parameters'], JOURNAL.resolved)
-    came = arrivals(content, config.joints, required_fields(config), until)
+    states, errors = _states(content, config, until)
     start = next((one.stamp for one in events if one.type is EventType.START), None)
-    if start is not None and start not in came.stamp:
+    if start is not None and start not in states.stamp:
         reason = (
             f'{path} does not hold the first state that the controller used, with the stamp '
             f'{start} ns, so its state at any later one is not known: start the recorder first'
         )
         raise BlfDscError(reason)
-    run = Rerun(config, came, sampled_stamps(content))
+    run = Rerun(config, states, errors, sampled_stamps(content))
     run.run(events[1:], in_step=context.facts.get('clock') == 'lockstep')
     gappy = [topic for topic in content.message_counts if context.missed(topic)]
     comparisons = tuple(compare(content, config, run, gappy))
     if not (run.departure or any(one.values for one in comparisons)):
-        raise _nothing_to_compare(path, content)
+        raise _nothing_to_compare(content)
     found = [run.departure, *(one.difference for one in comparisons)]
     return Verification(
-        run.states,
+        run.stamp,
+        run.passed_over,
         comparisons,
         tuple(run.events),
         int(np.count_nonzero(~run.commands.of_law)),
@@ -81,11 +89,11 @@ def verify(path: Path, namespace: str = '') -> Verification:
     )
 
 
-def _events(path: Path, content: Content) -> tuple[list[Event], int, str]:
+def _events(content: Content) -> tuple[list[Event], int, str]:
     """Events of the first controller of a bag, when [ns] another one was started, and that text."""
     recorded = content.topics.get(JOURNAL)
     if recorded is None:
-        raise _nothing_to_compare(path, content)
+        raise _nothing_to_compare(content)
     events: list[Event] = []
     for received, raw in zip(recorded.received, recorded.raw, strict=True):
         event = decode(raw)
@@ -93,17 +101,37 @@ def _events(path: Path, content: Content) -> tuple[list[Event], int, str]:
             return events, received, 'another controller was started'
         events.append(event)
     if events[0].type is not EventType.CONFIGURE:
-        reason = f'{path} does not hold the beginning of {recorded.name}: start the recorder first'
-        raise BlfDscError(reason)
+        raise BlfDscError(
+            f'{content.path} does not hold the beginning of {recorded.name}: start the recorder '
+            'first'
+        )
     return events, FOREVER, ''
 
 
-def _nothing_to_compare(path: Path, content: Content) -> BlfDscError:
+def _states(
+    content: Content, config: ControllerConfig, until: int
+) -> tuple[JointStates, dict[int, MessageError]]:
+    """Every joint state that was received before `until` [ns], and why some are unreadable.
+
+    Raises:
+        UnreadableMessageError: not one of them can be read.
+    """
+    recorded = content.topics[JOINT_STATES]
+    count = bisect_left(recorded.received, until)
+    recorded = replace(recorded, received=recorded.received[:count], raw=recorded.raw[:count])
+    errors: dict[int, MessageError] = {}
+    states = recorded.joint_states(config.joints, required_fields(config), errors)
+    if len(errors) == count:
+        raise UnreadableMessageError(recorded.name, 0, errors[0])
+    return states, errors
+
+
+def _nothing_to_compare(content: Content) -> BlfDscError:
     listing = ''.join(f'\n  {name} ({count})' for name, count in content.message_counts.items())
     return BlfDscError(
-        f'{path} holds nothing that the controller published, or not its journal, so there is '
-        f'nothing to compare; it holds:{listing}\nTo see what a configuration would command, '
-        'use --config'
+        f'{content.path} holds nothing that the controller published, or not its journal, so '
+        f'there is nothing to compare; it holds:{listing}\nTo see what a configuration would '
+        'command, use --config'
     )
 
 

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The messages of one topic of a bag, decoded at once where they differ only in numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.bags.sources import BagError
+from blf_dsc_controller.messages.cdr import (
+    Layout,
+    MessageError,
+    MissingJointError,
+    array_layout,
+    joint_state_layout,
+)
+from blf_dsc_controller.messages.codecs import Decoder, Float64MultiArrayDecoder, JointStateDecoder
+from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY
+from blf_dsc_controller.run import Floats, Series, Stamps
+
+
+class UnreadableMessageError(BagError):
+    """A message of a bag that cannot be decoded."""
+
+    def __init__(self, topic: str, index: int, error: MessageError) -> None:
+        reason = str(error)
+        if isinstance(error, MissingJointError):
+            reason = (
+                f'{error.fact}: the bag is from another robot, or its joints have other names: '
+                f'--map {error.joint}=ITS_NAME, of replay --config and of identify'
+            )
+        super().__init__(f'message {index + 1} of {topic} cannot be read: {reason}')
+
+
+class JointStates(NamedTuple):
+    """N states of n joints, or N vectors of n named values in `position`."""
+
+    names: tuple[str, ...]
+    stamp: Stamps  # (N,) ns
+    received: Stamps  # (N,) ns
+    values: Floats  # (N, 3, n) position, velocity, effort; NaN where empty
+
+    def select(self, rows: NDArray[np.generic]) -> JointStates:
+        """Some of the states."""
+        return JointStates(self.names, self.stamp[rows], self.received[rows], self.values[rows])
+
+    def by_stamp(self) -> JointStates:
+        """States ordered by stamp, one of each stamp."""
+        return self.select(np.unique(self.stamp, return_index=True)[1])
+
+    @property
+    def position(self) -> Series:
+        """Positions, or named values."""
+        return Series(self.names, self.stamp, self.values[:, 0])
+
+    @property
+    def effort(self) -> Series:
+        """Efforts."""
+        return Series(self.names, self.stamp, self.values[:, 2])
+
+
+@dataclass
+class TopicMessages:
+    """All messages of one topic, undecoded, in the order of their reception."""
+
+    name: str
+    type: str = ''
+    received: list[int] = field(default_factory=list)  # ns
+    raw: list[bytes] = field(default_factory=list)
+
+    def joint_states(
+        self,
+        names: Sequence[str],
+        required: Sequence[str] = ('position', 'velocity'),
+        errors: dict[int, MessageError] | None = None,
+    ) -> JointStates:
+        """Decode sensor_msgs/JointState.
+
+        Messages that cannot be decoded are added to `errors` by their number, and zero.
+
+        Raises:
+            UnreadableMessageError: there are no `errors` to add them to.
+        """
+        stamp, values = self._decode(JointStateDecoder(names, required), errors)
+        received = np.array(self.received, dtype=np.int64)
+        return JointStates(tuple(names), stamp, received, values.reshape(stamp.size, 3, len(names)))
+
+    def arrays(self, size: int) -> Floats | None:
+        """Values (N, size) of Float64MultiArrays, None if one of them has another size.
+
+        Raises:
+            UnreadableMessageError: a message cannot be decoded.
+        """
+        sizes, values = self._decode(Float64MultiArrayDecoder(size))
+        return values if (sizes == size).all() else None
+
+    def layout(self) -> Layout:
+        """Layout of the first message; UnreadableMessageError if it has none."""
+        find = array_layout if self.type == FLOAT64_MULTI_ARRAY else joint_state_layout
+        try:
+            return find(self.raw[0])
+        except MessageError as error:
+            raise UnreadableMessageError(self.name, 0, error) from error
+
+    def joint_names(self) -> tuple[str, ...]:
+        """Names in the first message; UnreadableMessageError if there are none."""
+        names = self.layout().names
+        if not names:
+            unnamed = MessageError('it names no joint, so its values cannot be assigned to joints')
+            raise UnreadableMessageError(self.name, 0, unnamed)
+        return names
+
+    def _decode(
+        self, decoder: Decoder, errors: dict[int, MessageError] | None = None
+    ) -> tuple[NDArray[np.int64], Floats]:
+        """What `decoder` returns of each message, and its values."""
+        with suppress(MessageError):
+            at_once = decoder.decode_all(self.raw)
+            if at_once is not None:
+                return at_once
+        count = len(self.raw)
+        returned, values = np.zeros(count, dtype=np.int64), np.zeros((count, decoder.values.size))
+        for k, raw in enumerate(self.raw):
+            try:
+                returned[k] = decoder.decode(raw)
+                values[k] = decoder.values
+            except MessageError as error:
+                if errors is None:
+                    raise UnreadableMessageError(self.name, k, error) from error
+                errors[k] = error
+        return returned, values
