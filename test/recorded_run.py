@@ -52,3 +52,13 @@ def write(path, entries, configuration='', **facts):
                 handles[topic] = bag.add_topic(topic, type_name, [])
             bag.write(handles[topic], raw, at)
     return path
+
+
+def of(entries, topic):
+    """Entries of one topic."""
+    return [entry for entry in entries if entry[0] == topic.resolved]
+
+
+def compared(result):
+    """Number of values that a verification compared, by the last part of the topic."""
+    return {one.topic.rsplit('/', 1)[-1]: one.values for one in result.comparisons}

@@ -9,13 +9,11 @@ import sys
 import time
 
 import rclpy
-from mcap.stream_reader import StreamReader
 from own_domain import own_domain
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
 
 from blf_dsc_controller.messages.codecs import JointStateEncoder
@@ -90,21 +88,3 @@ class Rig:
         self._executor.shutdown()
         self.node.destroy_node()
         self.context.try_shutdown()
-
-
-def read(path):
-    """All messages of a bag, by a reader that does not know this package."""
-    with Reader(path) as reader:
-        return [(c.topic, at, bytes(raw)) for c, at, raw in reader.messages()]
-
-
-def messages_on_disk(path):
-    """Number of messages in a file that nobody has closed."""
-    count = 0
-    try:
-        with path.open('rb') as stream:
-            for record in StreamReader(stream, record_size_limit=None).records:
-                count += type(record).__name__ == 'Message'
-    except Exception:  # noqa: BLE001 - what follows the last whole record is not of interest
-        return count
-    return count

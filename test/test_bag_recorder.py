@@ -10,13 +10,13 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import rclpy
+from foreign_readers import messages_on_disk, read
 from nav_msgs.msg import Goals
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from recorder_rig import messages_on_disk
 from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -80,8 +80,7 @@ class Loop:
     def messages(self):
         """End the recording and read it."""
         self.close()
-        with Reader(self.bag) as reader:
-            return [(c.topic, stamp, bytes(raw)) for c, stamp, raw in reader.messages()]
+        return read(self.bag)
 
 
 @pytest.fixture

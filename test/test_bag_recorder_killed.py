@@ -19,9 +19,10 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
+from foreign_readers import read
 from mcap.reader import make_reader
 from rclpy.qos import QoSProfile
-from recorder_rig import Rig, read
+from recorder_rig import Rig
 
 from blf_dsc_controller.bags.recover import recover
 

@@ -14,10 +14,10 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import rclpy
+from foreign_readers import messages_on_disk
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from recorder_rig import messages_on_disk
 from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
 

@@ -10,7 +10,8 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from recorder_rig import PATIENCE, Rig, read
+from foreign_readers import read
+from recorder_rig import PATIENCE, Rig
 from small_disk import small_disk
 from std_srvs.srv import Trigger
 

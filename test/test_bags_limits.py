@@ -6,8 +6,8 @@ from __future__ import annotations
 import itertools
 
 import pytest
+from foreign_readers import read
 from mcap.reader import make_reader
-from rosbags.rosbag2 import Reader
 from small_disk import small_disk
 
 from blf_dsc_controller.bags.context import read_context
@@ -24,11 +24,6 @@ ENCODER = JointStateEncoder(['joint1', 'joint2'])
 
 def message(k):
     return ENCODER.encode(k, [k, 0], [0, 0], [0, 0])
-
-
-def read(path):
-    with Reader(path) as reader:
-        return [(c.topic, at, bytes(raw)) for c, at, raw in reader.messages()]
 
 
 def write_without_end(bag, handle, times):

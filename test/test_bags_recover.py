@@ -8,13 +8,15 @@ from io import BytesIO
 from pathlib import Path
 
 import pytest
+from foreign_readers import read
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.recover import Salvage, recover
+from blf_dsc_controller.bags.recover import recover
+from blf_dsc_controller.bags.salvage import Salvage
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
@@ -50,12 +52,6 @@ def chunks(data):
     indexes = make_reader(BytesIO(data)).get_summary().chunk_indexes
     starts = [one.chunk_start_offset for one in indexes]
     return [(at, at + one.chunk_length, one) for at, one in zip(starts, indexes, strict=True)]
-
-
-def read(path):
-    """Every message of a clean bag, by a library that is not ours, in the order of time."""
-    with Reader(path) as reader:
-        return [(c.topic, at, bytes(raw)) for c, at, raw in reader.messages()]
 
 
 def indexed(path):

@@ -9,8 +9,8 @@ import sys
 
 import pytest
 import yaml
+from foreign_readers import messages_on_disk
 from mcap.reader import make_reader
-from mcap.stream_reader import StreamReader
 
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.writer import BagWriter
@@ -218,18 +218,6 @@ def test_a_given_definition_and_hash_are_stored(tmp_path):
     assert found['hashes'] == {'/x': 'RIHS01_5'}
 
 
-def readable(path):
-    """Count the messages that stand in a file which nobody has closed."""
-    records = StreamReader(path.open('rb'), record_size_limit=None).records
-    count = 0
-    try:
-        for record in records:
-            count += type(record).__name__ == 'Message'
-    except Exception:  # noqa: BLE001 - what follows the last whole record is not of interest
-        return count
-    return count
-
-
 def test_data_leaves_the_process_as_time_goes_by(tmp_path):
     now = 0.0
     bag = BagWriter(tmp_path / 'bag', flush_interval=0.1, clock=lambda: now)
@@ -239,7 +227,7 @@ def test_data_leaves_the_process_as_time_goes_by(tmp_path):
         now = k * 1e-3
         bag.write(handle, raw, START + k)
         if k % 7 == 0:  # each phase of the interval
-            on_disk = readable(tmp_path / 'bag' / 'bag_0.mcap')
+            on_disk = messages_on_disk(tmp_path / 'bag' / 'bag_0.mcap')
             assert on_disk >= k - 100  # of one message a millisecond
     bag.close()
 
@@ -266,7 +254,7 @@ def test_what_was_flushed_survives_a_kill(tmp_path, compression):
         [sys.executable, '-c', KILLED, str(tmp_path / 'bag'), compression], check=False
     )
     assert run.returncode == -9
-    assert readable(tmp_path / 'bag' / 'bag_0.mcap') == 1000
+    assert messages_on_disk(tmp_path / 'bag' / 'bag_0.mcap') == 1000
 
 
 def test_an_empty_bag_is_a_bag(tmp_path):

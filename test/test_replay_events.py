@@ -8,6 +8,7 @@ import pytest
 import recorded_run
 from fault_rig import JOINTS, LOCKSTEP, MILLISECOND, Rig
 from fault_table import FAULTS, run
+from recorded_run import compared, of
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.law.factory import estimate_names
@@ -67,14 +68,6 @@ class Recorder(Rig):
         )
 
 
-def of(rig, topic):
-    return [entry for entry in rig.entries if entry[0] == topic.resolved]
-
-
-def compared(result):
-    return {one.topic.rsplit('/', 1)[-1]: one.values for one in result.comparisons}
-
-
 @pytest.mark.parametrize('fault', IN_MESSAGES, ids=lambda fault: fault.name)
 def test_every_fault_replays_with_every_torque(fault, tmp_path):
     rig = Recorder(fault.given, live=fault.live)
@@ -83,8 +76,8 @@ def test_every_fault_replays_with_every_torque(fault, tmp_path):
     assert result.difference is None
     if any('another controller' in one for one in result.remarks):
         return  # what was killed ends there
-    assert compared(result)['commands'] == 2 * len(of(rig, COMMANDS))
-    assert compared(result)['tracking_error'] == 6 * len(of(rig, TRACKING_ERROR))
+    assert compared(result)['commands'] == 2 * len(of(rig.entries, COMMANDS))
+    assert compared(result)['tracking_error'] == 6 * len(of(rig.entries, TRACKING_ERROR))
     assert ('safe stop' in ' '.join(result.turns)) == (outcome.noticed >= 0)
     assert [one for one in result.comparisons if 'torques' in one.left_out] == []
 
@@ -130,9 +123,9 @@ def test_the_watchdog_s_torques_replay_too(tmp_path):
     ]
     assert [one.type for one in result.events].count(EventType.SILENCE) == 2
     assert [one.type for one in result.events].count(EventType.TRAJECTORY) == 2
-    assert compared(result)['commands'] == 2 * len(of(rig, COMMANDS))
-    states = len(of(rig, JOINT_STATES))
-    assert len(of(rig, COMMANDS)) > states + 10
+    assert compared(result)['commands'] == 2 * len(of(rig.entries, COMMANDS))
+    states = len(of(rig.entries, JOINT_STATES))
+    assert len(of(rig.entries, COMMANDS)) > states + 10
 
 
 def test_dropped_states_are_found_by_the_journal(tmp_path):
@@ -148,7 +141,7 @@ def test_dropped_states_are_found_by_the_journal(tmp_path):
     result = rig.verify(tmp_path)
     assert result.difference is None
     assert result.passed_over == 2
-    assert compared(result)['tracking_error'] == 6 * len(of(rig, TRACKING_ERROR))
+    assert compared(result)['tracking_error'] == 6 * len(of(rig.entries, TRACKING_ERROR))
     # The ramp differs from the dropped state on until the law is in command again.
     assert compared(result)['commands'] == 2 * (49 + 20 + 49)
     (commands,) = (one for one in result.comparisons if one.topic.endswith('commands'))
@@ -176,7 +169,7 @@ def test_an_unexpected_error_is_replayed_as_a_stop(tmp_path):
 def test_a_changed_stop_reason_is_a_departure(tmp_path):
     """The recorded controller stopped where the replayed one does not."""
     rig = eventful()
-    for entry in of(rig, JOURNAL):
+    for entry in of(rig.entries, JOURNAL):
         event = decode(entry[3])
         if event.content.get('reason') == 'bad message':
             content = {**event.content, 'reason': 'stamp jump'}
@@ -190,7 +183,7 @@ def test_a_stop_that_is_moved_is_named(tmp_path):
     rig.deliver(b'')
     rig.step(10)
     rig.publish_events()
-    stop = of(rig, JOURNAL)[-1]
+    stop = of(rig.entries, JOURNAL)[-1]
     event = decode(stop[3])
     later = event._replace(stamp=event.stamp + MILLISECOND, messages=event.messages + 1)
     stop[3] = later.encode()

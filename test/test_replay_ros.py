@@ -14,6 +14,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 import recorded_run
 from fake_clock import FakeClock
 from rclpy.parameter import Parameter
+from recorded_run import compared, of
 from ros_rig import RosRig, activate, configure, deactivate
 from sent_trajectory import JOINTS, SECOND, send, trajectory
 
@@ -167,13 +168,8 @@ def altered(event_type, change):
 
 def trajectories(bag):
     """Events of the trajectories in a bag."""
-    entries = recorded_run.messages(bag)
-    events = [decode(entry[3]) for entry in entries if entry[0] == JOURNAL.resolved]
+    events = [decode(entry[3]) for entry in of(recorded_run.messages(bag), JOURNAL)]
     return [event for event in events if event.type is EventType.TRAJECTORY]
-
-
-def compared(result):
-    return {one.topic.rsplit('/', 1)[-1]: one.values for one in result.comparisons}
 
 
 def test_trajectories_and_a_gain_replay_where_they_took_effect(moved):
@@ -229,7 +225,7 @@ def test_stops_ramps_and_starts_replay_with_every_torque(stopped):
         'activate, deactivate, activate, safe stop (stamp jump), deactivate, '
         'activate, reset, safe stop (joint missing)'
     )
-    torques = sum(entry[0] == COMMANDS.resolved for entry in recorded_run.messages(stopped))
+    torques = len(of(recorded_run.messages(stopped), COMMANDS))
     assert compared(result)['commands'] == 2 * torques
     count = torques - result.stamp.size
     assert count >= 600 + 3 * 50
@@ -237,7 +233,7 @@ def test_stops_ramps_and_starts_replay_with_every_torque(stopped):
 
 
 def stamps(bag, topic):
-    raw = [entry[3] for entry in recorded_run.messages(bag) if entry[0] == topic.resolved]
+    raw = [entry[3] for entry in of(recorded_run.messages(bag), topic)]
     seconds, nanoseconds = np.array([Struct('<iI').unpack_from(one, STAMP_OFFSET) for one in raw]).T
     return seconds * SECOND + nanoseconds
 
@@ -294,6 +290,6 @@ def test_a_stop_for_silence_replays_with_its_torques(tmp_path):
     assert result.turns == ['activate', 'safe stop (state timeout)', 'deactivate', 'activate']
     before = np.count_nonzero(result.stamp <= silent)
     assert result.stamp.size >= before + 30
-    torques = sum(entry[0] == COMMANDS.resolved for entry in recorded_run.messages(bag))
+    torques = len(of(recorded_run.messages(bag), COMMANDS))
     assert compared(result)['commands'] == 2 * torques
     assert compared(result)['tracking_error'] == 6 * result.stamp.size

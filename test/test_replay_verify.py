@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import recorded_run
+from recorded_run import compared, of
 
 from blf_dsc_controller.analysis.summary import summarize
 from blf_dsc_controller.bags.content import read_content
@@ -60,16 +61,11 @@ def rewritten(bag, entries, tmp_path):
     return write
 
 
-def of(entries, topic):
-    return [entry for entry in entries if entry[0] == topic.resolved]
-
-
 def test_every_number_is_the_same(bag):
     result = verify(bag)
     assert result.difference is None
     assert result.remarks == ()
-    compared = {one.topic.rsplit('/', 1)[-1]: one.values for one in result.comparisons}
-    assert compared == {
+    assert compared(result) == {
         'commands': 2 * SAMPLES,
         'tracking_error': 6 * SAMPLES,
         'reference': 4 * SAMPLES,

@@ -12,6 +12,7 @@ from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.bags import recover as recovering
 from blf_dsc_controller.bags.reader import export as export_run
 from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.bags.salvage import format_time
 
 
 def report(options: Namespace) -> None:
@@ -54,11 +55,7 @@ def _losses(recovery: recovering.Recovery) -> Iterator[str]:
     for loss in recovery.losses:
         yield f'LOST {loss}'
     for name, last in recovery.unfinished:
-        after = (
-            'nothing in it could be read'
-            if last is None
-            else f'it ends at {recovering.format_time(last)}'
-        )
+        after = 'nothing in it could be read' if last is None else f'it ends at {format_time(last)}'
         yield (
             f'{name}: the recording was not closed; {after}. What came later is not in the file: '
             'at most 0.1 s if the recorder was killed'

@@ -22,7 +22,8 @@ from blf_dsc_controller.messages.topics import (
     TRACKING_ERROR,
     Topic,
 )
-from blf_dsc_controller.replay.rerun import Commands, Difference, Rerun
+from blf_dsc_controller.replay.outputs import Commands, Outputs
+from blf_dsc_controller.replay.rerun import Difference
 from blf_dsc_controller.run import Floats, Series, Stamps
 
 
@@ -36,7 +37,7 @@ class Comparison(NamedTuple):
 
 
 def compare(
-    content: Content, config: ControllerConfig, run: Rerun, gappy: Collection[str] = ()
+    content: Content, config: ControllerConfig, outputs: Outputs, gappy: Collection[str] = ()
 ) -> Iterator[Comparison]:
     """Compare each topic of the controller that the bag holds.
 
@@ -49,25 +50,25 @@ def compare(
     if messages is not None:
         names = _names(config.joints, ['effort'])
         is_gappy = messages.name in gappy
-        yield _compare_commands(messages, run.commands, names, is_gappy=is_gappy)
-    for topic, replayed in _replayed(config, run).items():
+        yield _compare_commands(messages, outputs.commands, names, is_gappy=is_gappy)
+    for topic, replayed in _replayed(config, outputs).items():
         messages = content.topics.get(topic)
         if messages is not None:
             recorded = _recorded(messages, is_vector=topic in (LEARNING, MONITOR))
-            yield _compare_series(messages.name, run.stamp, recorded, replayed)
+            yield _compare_series(messages.name, outputs.stamp, recorded, replayed)
 
 
-def _replayed(config: ControllerConfig, run: Rerun) -> dict[Topic, Series]:
+def _replayed(config: ControllerConfig, outputs: Outputs) -> dict[Topic, Series]:
     """Values of every topic with a stamp."""
     errors, reference = (_names(config.joints, JOINT_STATE_FIELDS[:count]) for count in (3, 2))
-    stamp, samples = run.stamp, run.samples
+    stamp, samples = outputs.stamp, outputs.samples
     return {
         TRACKING_ERROR: Series(
             errors, stamp, np.hstack((samples.xi1, samples.xi2, samples.torque))
         ),
         REFERENCE: Series(reference, stamp, np.hstack((samples.qr, samples.dqr))),
         LEARNING: learning_of(config, stamp, samples),
-        MONITOR: run.monitor,
+        MONITOR: outputs.monitor,
     }
 
 

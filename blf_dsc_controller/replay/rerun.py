@@ -10,24 +10,19 @@ command all are used, and the torques are compared as far as they match.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.factory import estimate_names
-from blf_dsc_controller.law.state import Sample
 from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.journal import Event, EventType
-from blf_dsc_controller.messages.samples import columns_of
-from blf_dsc_controller.messages.telemetry import DECIMATION, Monitor
 from blf_dsc_controller.messages.topics import FOREVER, TRACKING_ERROR
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
-from blf_dsc_controller.run import Floats, Series, Stamps
+from blf_dsc_controller.replay.outputs import Outputs
+from blf_dsc_controller.run import Floats, Stamps
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
@@ -53,21 +48,12 @@ class Difference(NamedTuple):
         )
 
 
-class Commands(NamedTuple):
-    """M replayed torques in the order in which they were commanded."""
-
-    stamp: Stamps  # (M,) ns, of the last joint state before each
-    torque: Floats  # (M, n) N m
-    of_law: NDArray[np.bool_]  # (M,) torques of the law; the others are safe torques
-    exact: NDArray[np.bool_]  # (M,) whether the same states led to it as in the recorded run
-    number: NDArray[np.intp]  # (M,) of the recorded command
-
-
 class Rerun:
     """The guarded controller once more.
 
     Attributes:
         events: that were replayed.
+        outputs: samples and torques.
         passed_over: number of joint states that the law did not use.
         departure: where it did something else than the journal says; the replay ends there.
         end: why else the replay ended before the bag; empty if it did not.
@@ -89,23 +75,16 @@ class Rerun:
         self.passed_over = 0
         self.departure: Difference | None = None
         self.end = ''
-        self._config = config
         self._guard = Guard(config, lambda: 0, lambda: 0)
         self._guard.journal.pending.clear()
         self._states, self._errors = states, errors
         self._stamps = states.stamp.tolist()
+        self.outputs = Outputs(self._guard, len(self._stamps))
         self._sampled = None if sampled is None else frozenset(sampled.tolist())
         lost = np.setdiff1d([] if sampled is None else sampled, states.stamp)
         self._lost = int(lost[0]) if lost.size else FOREVER
         self._position = -1  # number of the last joint state before now
         self._messages = 0  # that were processed by then, according to the journal
-        self._last = -1  # stamp of the last state that the law used [ns]
-        self._numbers: list[int] = []  # of the joint states that the law used
-        self._rows = np.empty((len(self._stamps), self._guard.controller.sample_vector.size))
-        self._monitor: Monitor | None = None
-        self._monitored: list[tuple[int, list[float]]] = []  # ns, values
-        self._commands: list[tuple[int, Floats, bool, bool]] = []  # as in Commands
-        self._offsets = [(0, 0)]  # from a torque on: its number in the bag
         self._failed = False
 
     def run(self, events: Sequence[Event], *, in_step: bool) -> None:
@@ -128,39 +107,6 @@ class Rerun:
         self._feed(None, len(self._stamps) - 1, is_exact=in_step)
 
     @property
-    def stamp(self) -> Stamps:
-        """Stamps (N,) [ns] of the states that the law used."""
-        return self._states.stamp[self._numbers]
-
-    @property
-    def samples(self) -> Sample:
-        """Columns of the law's telemetry samples, each (N, its length)."""
-        return columns_of(self._rows[: len(self._numbers)], self._guard.controller.settings)
-
-    @property
-    def monitor(self) -> Series:
-        """Values of the monitor."""
-        names = () if self._monitor is None else self._monitor.names
-        stamp = np.array([stamp for stamp, _ in self._monitored], dtype=np.int64)
-        values = np.array([values for _, values in self._monitored])
-        return Series(names, stamp, values.reshape(stamp.size, len(names)))
-
-    @cached_property
-    def commands(self) -> Commands:
-        """Every torque."""
-        count = len(self._commands)
-        number = np.arange(count)
-        for own, recorded in self._offsets:
-            number[own:] = np.arange(recorded, recorded + count - own)
-        return Commands(
-            np.array([one[0] for one in self._commands], dtype=np.int64),
-            np.array([one[1] for one in self._commands]).reshape(count, len(self._config.joints)),
-            np.array([one[2] for one in self._commands], dtype=np.bool_),
-            np.array([one[3] for one in self._commands], dtype=np.bool_),
-            number,
-        )
-
-    @property
     def _is_over(self) -> bool:
         return bool(self.end or self.departure)
 
@@ -178,7 +124,7 @@ class Rerun:
             is_it = (k in self._errors) == is_unreadable and self._seen(k) == event.stamp
             if is_it and (k >= end or stamps[k + 1 : k + 2] != [event.stamp]):
                 return k, False
-        if self._numbers:
+        if self.outputs.last >= 0:
             self.end = f'the state with stamp {event.stamp} ns was received but is not in the bag'
         return self._position, False
 
@@ -207,7 +153,7 @@ class Rerun:
         stamp = self._stamps[k]
         if not self._guard.supervisor.uses_states:
             return True
-        if k in self._errors or stamp == self._last:
+        if k in self._errors or stamp == self.outputs.last:
             return False
         is_starting = self._guard.supervisor.phase is Phase.STARTING
         return not is_starting and (self._sampled is None or stamp in self._sampled)
@@ -220,14 +166,14 @@ class Rerun:
         elif guard.supervisor.uses_states and stamp > self._lost:
             self.end = f'the state with stamp {self._lost} ns was used but is not in the bag'
         else:
-            is_new = stamp > self._last and stamp in (self._sampled or ())
+            is_new = stamp > self.outputs.last and stamp in (self._sampled or ())
             is_due = guard.supervisor.uses_states and is_new
             torque = guard.update(stamp, self._states.values[k].ravel())
             if guard.has_sample:
-                if stamp <= self._last:
+                if stamp <= self.outputs.last:
                     self.end = f'the stamps restart at {stamp} ns'
                     return
-                self._sample(k, stamp)
+                self.outputs.add_sample(stamp)
             self._command(stamp, torque, is_exact=is_exact)
             if is_due and not guard.has_sample and not _stops_at(event, stamp):
                 self._depart(f'used by the law ({guard.supervisor.text})', stamp)
@@ -235,26 +181,9 @@ class Rerun:
         if pending and _key(pending[0]) != _key(event):
             self._depart_by(pending[0], event)
 
-    def _sample(self, k: int, stamp: int) -> None:
-        guard, row = self._guard, len(self._numbers)
-        controller = guard.controller
-        self._last = stamp
-        self._numbers.append(k)
-        self._rows[row] = controller.sample_vector
-        samples = controller.samples
-        if samples == 1 or self._monitor is None:
-            names = estimate_names(self._config)
-            self._monitor = Monitor(self._config.joints, names, controller.settings)
-        if (samples - 1) % DECIMATION == 0:
-            sample = controller.sample
-            values = self._monitor.values(stamp, sample, guard.samples.ratio, sample.bound)
-            self._monitored.append((stamp, values))
-
     def _command(self, stamp: int, torque: Floats | None, *, is_exact: bool) -> None:
         if torque is not None:
-            of_law = self._guard.has_sample
-            is_exact = of_law or (is_exact and not self._failed)
-            self._commands.append((stamp, torque.copy(), of_law, is_exact))
+            self.outputs.add_command(stamp, torque, is_exact=is_exact and not self._failed)
 
     # Events.
 
@@ -277,7 +206,7 @@ class Rerun:
             is_stop = event.type is EventType.STOP
             self._depart(f'{event.type}: {_reason(event)}' if is_stop else event.type, event.stamp)
             return
-        self._offsets.append((pending.popleft().commands, event.commands))
+        self.outputs.count_from(pending.popleft().commands, event.commands)
 
     def _act(self, event: Event) -> None:
         guard, content = self._guard, event.content
@@ -313,7 +242,7 @@ class Rerun:
 
     def _depart(self, what: str, stamp: int) -> None:
         if self.departure is None:
-            begin = self._stamps[self._numbers[0]] if self._numbers else stamp
+            begin = int(self.outputs.stamp[0]) if self.outputs.last >= 0 else stamp
             time = (stamp - begin) * 1e-9
             self.departure = Difference(TRACKING_ERROR.resolved, what, stamp, time, 1.0, 0.0)
 

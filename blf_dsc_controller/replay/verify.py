@@ -74,16 +74,16 @@ def verify(path: Path, namespace: str = '') -> Verification:
     run = Rerun(config, states, errors, sampled_stamps(content))
     run.run(events[1:], in_step=context.facts.get('clock') == 'lockstep')
     gappy = [topic for topic in content.message_counts if context.missed(topic)]
-    comparisons = tuple(compare(content, config, run, gappy))
+    comparisons = tuple(compare(content, config, run.outputs, gappy))
     if not (run.departure or any(one.values for one in comparisons)):
         raise _nothing_to_compare(content)
     found = [run.departure, *(one.difference for one in comparisons)]
     return Verification(
-        run.stamp,
+        run.outputs.stamp,
         run.passed_over,
         comparisons,
         tuple(run.events),
-        int(np.count_nonzero(~run.commands.of_law)),
+        int(np.count_nonzero(~run.outputs.commands.of_law)),
         tuple(_remarks(context, run.end or end)),
         min((one for one in found if one), key=lambda one: one.stamp, default=None),
     )
