@@ -6,13 +6,14 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from blf_dsc_controller.arms.urdf import Chain, chain_joints, read_chain
+from blf_dsc_controller.arms.urdf import Chain, UrdfError, chain_joints, moving_joints, read_chain
 from blf_dsc_controller.configuration.schema import parameter
 from blf_dsc_controller.configuration.share import resolve
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
@@ -39,7 +40,9 @@ class Robot:
         kept=lambda given: given and read_urdf(given),
     )
     base: str = _fixed('', 'link that stands still; empty: the root')
-    tip: str = _fixed('', 'link at the end, where payloads are; empty: that of the last joint')
+    tip: str = _fixed(
+        '', 'link at the end, where payloads are; empty: that of the last joint, if it is one chain'
+    )
     gravity: Annotated[tuple[float, ...], '3'] = _fixed(
         (0.0, 0.0, -9.81), 'gravity in the base: (0, 0, 9.81) hangs from the ceiling', 'm/s^2', 'g'
     )
@@ -115,9 +118,23 @@ def read_urdf(given: str) -> str:
 
 @functools.lru_cache(maxsize=16)
 def chain_of(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain:
-    """`read_chain`, where an empty base is the root and an empty tip what the last joint moves."""
-    base, tip, found = chain_joints(text, base, tip, joints)
-    return read_chain(text, base, tip, found)
+    """`read_chain`, where an empty base is the root and an empty tip what the last joint moves.
+
+    Without tip and joints all that moves has to be one chain.
+    """
+    if tip or joints:
+        return read_chain(text, *chain_joints(text, base, tip, joints))
+    moving = moving_joints(text)
+    for last in moving:
+        with suppress(UrdfError):  # a joint that the base does not carry
+            start, end, _ = chain_joints(text, base, '', (last,))
+            found = chain_joints(text, start, end, ())[2]
+            if len(found) == len(moving):
+                return read_chain(text, start, end, found)
+    raise UrdfError(
+        'neither a tip nor joints were given, and what moves is not one chain: '
+        f'{", ".join(moving) or "nothing"}. Set robot.tip to the last link of the arm'
+    )
 
 
 def parameters_of(robot: Robot, chain: Chain) -> BaseParameters:
