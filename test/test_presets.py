@@ -41,7 +41,7 @@ def test_preset_runs_by_name_and_is_kept_as_it_ran(preset, tmp_path, capsys, mon
     held = preset != 'comparison_detuned'
     assert summary['tracking']['held'] is held
     assert ('held by every joint' in printed) is held
-    of_urdf = preset in {'panda', 'ur5e'}
+    of_urdf = kept.model == 'urdf'
     assert ('torque error of the learned model' in printed) is of_urdf
     assert ('final_torque_error' in summary['learning']) is of_urdf
 
