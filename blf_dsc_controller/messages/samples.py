@@ -11,8 +11,8 @@ from blf_dsc_controller.law.factory import column_names, estimate_names, model_o
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Sample, sample_of
-from blf_dsc_controller.messages.telemetry import disturbance_names
-from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LYAPUNOV_TERMS, MODEL_CHANGES
+from blf_dsc_controller.messages.telemetry import learning_names
+from blf_dsc_controller.messages.topics import LYAPUNOV_TERMS
 from blf_dsc_controller.run import Floats, LearnedArm, Run, Series, Stamps
 
 
@@ -24,12 +24,9 @@ def columns_of(rows: Floats, settings: Settings) -> Sample:
 
 def learning_of(config: ControllerConfig, stamps: Stamps, samples: Sample) -> Series:
     """What the law learned, under the names of `~/learning`."""
-    names = (*estimate_names(config), *disturbance_names(config.joints))
-    values = (samples.estimate, samples.disturbance)
-    figures = (samples.lambda_min, samples.latched, samples.changes)
-    return Series(
-        (*names, LAMBDA_MIN, LATCHED, MODEL_CHANGES), stamps, np.hstack((*values, *figures))
-    )
+    names = learning_names(estimate_names(config), config.joints)
+    figures = samples.lambda_min, samples.latched, samples.changes
+    return Series(names, stamps, np.hstack((samples.estimate, samples.disturbance, *figures)))
 
 
 def learned_arm(config: ControllerConfig) -> LearnedArm | None:

@@ -31,6 +31,12 @@ DECIMATION = 10
 """Samples from one slow message (monitor, truth) to the next."""
 
 
+def learning_names(estimates: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
+    """Names of what is learned of n `joints`; `estimates` are those of theta^."""
+    figures = topics.LAMBDA_MIN, topics.LATCHED, topics.MODEL_CHANGES
+    return (*estimates, *disturbance_names(joints), *figures)
+
+
 def disturbance_names(joints: Sequence[str]) -> tuple[str, ...]:
     """Names of the disturbance torques, estimated or true."""
     return tuple(topics.DISTURBANCE + joint for joint in joints)
@@ -40,14 +46,7 @@ class ControllerTelemetry:
     """Messages of the controller of n joints and `estimates`, the m entries of theta^."""
 
     def __init__(self, joints: Sequence[str], estimates: Sequence[str]) -> None:
-        learning = (
-            *estimates,
-            *disturbance_names(joints),
-            topics.LAMBDA_MIN,
-            topics.LATCHED,
-            topics.MODEL_CHANGES,
-            topics.COMPUTE_TIME,
-        )
+        learning = (*learning_names(estimates, joints), topics.COMPUTE_TIME)
         self._command = Float64MultiArrayEncoder(len(joints))
         self._reference = JointStateEncoder(joints, ('position', 'velocity'))
         self._error = JointStateEncoder(joints)
@@ -71,16 +70,9 @@ class ControllerTelemetry:
             topics.TRACKING_ERROR,
             self._error.encode(stamp, sample.xi1, sample.xi2, sample.torque),
         )
-        n = sample.xi1.size
-        m = sample.estimate.size
-        values = self._values
-        values[:m] = sample.estimate
-        values[m : m + n] = sample.disturbance
-        values[m + n] = sample.lambda_min[0]
-        values[m + n + 1] = sample.latched[0]
-        values[m + n + 2] = sample.changes[0]
-        values[m + n + 3] = compute_time
-        yield topics.LEARNING, self._learning.encode(stamp, values)
+        figures = sample.lambda_min, sample.latched, sample.changes, (compute_time,)
+        np.concatenate((sample.estimate, sample.disturbance, *figures), out=self._values)
+        yield topics.LEARNING, self._learning.encode(stamp, self._values)
 
 
 class PlantTelemetry:

@@ -23,8 +23,24 @@ from blf_dsc_controller.messages.topics import (
     Topic,
 )
 from blf_dsc_controller.replay.outputs import Commands, Outputs
-from blf_dsc_controller.replay.rerun import Difference
 from blf_dsc_controller.run import Floats, Series, Stamps
+
+
+class Difference(NamedTuple):
+    """The first number of a topic that is not the same."""
+
+    topic: str
+    field: str
+    stamp: int  # ns
+    time: float  # s since the first state
+    recorded: float
+    replayed: float
+
+    def __str__(self) -> str:
+        return (
+            f'{self.time:.6f} s (stamp {self.stamp} ns), {self.topic}, {self.field}: '
+            f'recorded {self.recorded!r}, replayed {self.replayed!r}'
+        )
 
 
 class Comparison(NamedTuple):

@@ -10,7 +10,6 @@ command all are used, and the torques are compared as far as they match.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.messages.topics import FOREVER, TRACKING_ERROR
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
+from blf_dsc_controller.replay.comparison import Difference
 from blf_dsc_controller.replay.outputs import Outputs
 from blf_dsc_controller.run import Floats, Stamps
 from blf_dsc_controller.supervision.guard import Guard
@@ -29,23 +29,6 @@ from blf_dsc_controller.supervision.supervisor import Phase, Reason
 _UNREADABLE = frozenset(
     (Reason.BAD_MESSAGE, Reason.JOINT_MISSING, Reason.JOINT_DUPLICATED, Reason.FIELD_MISSING)
 )
-
-
-class Difference(NamedTuple):
-    """The first number of a topic that is not the same."""
-
-    topic: str
-    field: str
-    stamp: int  # ns
-    time: float  # s since the first state
-    recorded: float
-    replayed: float
-
-    def __str__(self) -> str:
-        return (
-            f'{self.time:.6f} s (stamp {self.stamp} ns), {self.topic}, {self.field}: '
-            f'recorded {self.recorded!r}, replayed {self.replayed!r}'
-        )
 
 
 class Rerun:

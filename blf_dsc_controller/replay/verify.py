@@ -21,8 +21,8 @@ from blf_dsc_controller.law.factory import required_fields
 from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.journal import Event, EventType, decode
 from blf_dsc_controller.messages.topics import FOREVER, JOINT_STATES, JOURNAL
-from blf_dsc_controller.replay.comparison import Comparison, compare
-from blf_dsc_controller.replay.rerun import Difference, Rerun
+from blf_dsc_controller.replay.comparison import Comparison, Difference, compare
+from blf_dsc_controller.replay.rerun import Rerun
 from blf_dsc_controller.replay.states import sampled_stamps
 from blf_dsc_controller.run import Stamps
 
