@@ -36,10 +36,7 @@ _CHUNK_BYTE = bytes([Opcode.CHUNK])
 _MAGIC = b'\x89MCAP0\r\n'
 _HEAD = Struct('<BQ')  # opcode and length of the content, before each record
 _MESSAGE = Struct('<BQHIQQ')
-_BEFORE_COMPRESSION = 41  # bytes from the start of a chunk to the name of its compression
-_COMPRESSIONS = (b'', b'zstd', b'lz4')
-_U32 = Struct('<I')
-_U64 = Struct('<Q')
+_COMPRESSIONS = ('', 'zstd', 'lz4')
 _OPCODES = frozenset(Opcode)
 _CHANNEL, _MESSAGE_CODE, _SCHEMA = int(Opcode.CHANNEL), int(Opcode.MESSAGE), int(Opcode.SCHEMA)
 _KINDS: dict[int, Any] = {
@@ -62,11 +59,8 @@ class Piece(NamedTuple):
     size: int
     opcode: int
     raw: bytes = b''  # the record with its head; empty for a gap
+    record: Any = None  # attachment, channel, chunk, metadata or schema
     reason: str = ''  # of a gap
-
-    def parsed(self) -> Any:
-        """Attachment, channel, chunk, metadata or schema."""
-        return _parse(self.opcode, self.raw[_HEAD.size :])
 
 
 def read_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
@@ -80,7 +74,7 @@ def read_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, in
         records = b''
         if piece.opcode == Opcode.CHUNK:
             try:
-                records = unpack(piece.parsed())
+                records = unpack(piece.record)
             except MalformedRecordError as error:
                 reason = f'the chunk at byte {piece.at} is damaged: {error}'
                 raise MalformedRecordError(reason) from error
@@ -123,11 +117,11 @@ def messages_in(
         else:
             opcode, end = _head(records, at)
             if opcode == _CHANNEL:
-                channel = _parse(opcode, records[at + _HEAD.size : end])
+                channel = _parse(records[at:end])
                 if topics is None or channel.topic in topics:
                     channels[channel.id] = channel
             elif opcode == _SCHEMA and topics is None:
-                schema = _parse(opcode, records[at + _HEAD.size : end])
+                schema = _parse(records[at:end])
                 schemas[schema.id] = schema
         at = end
 
@@ -137,16 +131,15 @@ def scan(data: Data) -> Iterator[Piece]:
     at = len(_MAGIC) if data[: len(_MAGIC)] == _MAGIC else 0
     while at < len(data) and not (at == len(data) - len(_MAGIC) and data[at:] == _MAGIC):
         try:
-            opcode, end = _check(data, at)
+            piece = _piece(data, at)
         except MalformedRecordError as error:
             end = data.find(_CHUNK_BYTE, at + 1)
             while end >= 0 and not _is_chunk(data, end):
                 end = data.find(_CHUNK_BYTE, end + 1)
             end = len(data) if end < 0 else end
-            yield Piece(at, end - at, 0, reason=str(error))
-        else:
-            yield Piece(at, end - at, opcode, data[at:end])
-        at = end
+            piece = Piece(at, end - at, 0, reason=str(error))
+        yield piece
+        at += piece.size
 
 
 def unpack(chunk: Chunk) -> bytes:
@@ -180,52 +173,45 @@ def _head(data: Data, at: int) -> tuple[int, int]:
     return int(opcode), int(end)
 
 
-def _check(data: Data, at: int) -> tuple[int, int]:
-    """Opcode and end of a record whose content fits its length, or MalformedRecordError.
+def _piece(data: Data, at: int) -> Piece:
+    """Record at an offset, or MalformedRecordError if its content does not fit its length.
 
     Where the content does not determine its length, another record must follow.
     """
     opcode, end = _head(data, at)
-    if opcode == Opcode.CHUNK:
-        if not _is_chunk(data, at):
-            raise MalformedRecordError('the head of a chunk is damaged')
-    elif opcode in _KINDS:
-        _parse(opcode, data[at + _HEAD.size : end])
+    raw, record = data[at:end], None
+    if opcode in _KINDS:
+        record = _parse(raw)
     elif opcode == Opcode.MESSAGE_INDEX:
-        entries_at = at + INDEX.size
-        if entries_at > end or entries_at + INDEX.unpack_from(data, at)[-1] != end:
+        if len(raw) < INDEX.size or INDEX.size + INDEX.unpack_from(raw)[-1] != len(raw):
             raise MalformedRecordError('the record does not fit its length')
     elif end + _HEAD.size < len(data):
         _head(data, end)
-    return opcode, end
+    return Piece(at, end - at, opcode, raw, record)
 
 
 def _is_chunk(data: Data, at: int) -> bool:
-    """Whether the three lengths in the head of a chunk agree, and its compression is known."""
-    name_at = at + _BEFORE_COMPRESSION
     try:
-        _, length = _HEAD.unpack_from(data, at)
-        (name_length,) = _U32.unpack_from(data, name_at - _U32.size)
-        (packed_length,) = _U64.unpack_from(data, name_at + name_length)
-    except struct_error:
+        return _piece(data, at).opcode == Opcode.CHUNK
+    except MalformedRecordError:
         return False
-    end = name_at + name_length + _U64.size + packed_length
-    is_known = data[name_at : name_at + name_length] in _COMPRESSIONS
-    return is_known and end == at + _HEAD.size + length and end <= len(data)
 
 
-def _parse(opcode: int, content: bytes) -> Any:
+def _parse(raw: bytes) -> Any:
     """Record of one of _KINDS, or MalformedRecordError: written again, it must be the same.
 
     A checksum of an attachment may be left out, as zero.
     """
+    stream = ReadDataStream(BytesIO(raw))
+    builder = RecordBuilder()
     try:
-        record = _KINDS[opcode].read(ReadDataStream(BytesIO(content)))
+        record = _KINDS[stream.read(_HEAD.size)[0]].read(stream)
+        record.write(builder)
     except (McapError, struct_error, OverflowError, UnicodeDecodeError) as error:
         raise MalformedRecordError('the record is too short') from error
-    builder = RecordBuilder()
-    record.write(builder)
-    again = builder.end()[_HEAD.size :]  # type: ignore[no-untyped-call]
-    if again[:-4] != content[:-4] or content[-4:] not in (again[-4:], bytes(4)):
+    again = builder.end()  # type: ignore[no-untyped-call]
+    if raw not in (again, again[:-4] + bytes(4)):
         raise MalformedRecordError('the record does not fit its length or checksum')
+    if isinstance(record, Chunk) and record.compression not in _COMPRESSIONS:
+        raise MalformedRecordError('the compression of a chunk is not known')
     return record

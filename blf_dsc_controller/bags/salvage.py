@@ -71,7 +71,7 @@ class Salvage:
         counts: list[tuple[Loss, int, int]] = []
         for piece in scan(data):
             if piece.opcode == Opcode.CHUNK:
-                chunk, lost_chunk = piece.parsed(), None
+                chunk, lost_chunk = piece.record, None
                 try:
                     records = unpack(chunk)
                 except MalformedRecordError as error:
@@ -128,10 +128,10 @@ class Salvage:
 
     def _describe(self, piece: Piece) -> None:
         if piece.opcode == Opcode.ATTACHMENT:
-            self.attachments.append(piece.parsed())
+            self.attachments.append(piece.record)
         elif piece.opcode == Opcode.METADATA:
-            record = piece.parsed()
-            self.metadata.setdefault(record.name, {}).update(record.metadata)
+            entries = self.metadata.setdefault(piece.record.name, {})
+            entries.update(piece.record.metadata)
         elif piece.opcode == Opcode.DATA_END:
             self.is_complete = True
 
