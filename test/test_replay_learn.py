@@ -13,7 +13,7 @@ from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import JOINT_STATES
-from blf_dsc_controller.replay.identify import identify
+from blf_dsc_controller.replay.learn import learn
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -33,7 +33,7 @@ def bag(tmp_path_factory):
 
 
 def test_the_parameters_are_found(bag):
-    found = identify(bag, ControllerConfig())
+    found = learn(bag, ControllerConfig())
     assert found.names[:3] == ('(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2')
     # What the law itself finds in its first window is as good: its rows are these.
     assert found.estimate[:3] == pytest.approx(TRUE, rel=2e-3)
@@ -45,7 +45,7 @@ def test_noise_leaves_the_truth_within_the_deviations(tmp_path):
     noise = {'sensor.position_noise': 1e-5, 'sensor.velocity_noise': 1e-3}
     noise['disturbance.amplitude'] = [0.0, 0.0]  # which would be left over, and widen all
     runs = [record(tmp_path / f'{seed}', **noise, seed=seed) for seed in range(4)]
-    found = [identify(run, ControllerConfig()) for run in runs]
+    found = [learn(run, ControllerConfig()) for run in runs]
     estimates = np.array([one.estimate[:3] for one in found])
     deviation = np.array([one.deviation[:3] for one in found])
     # Four deviations: of twelve draws none should be further off; 2e-3 is what sampling leaves.
@@ -59,15 +59,15 @@ def test_noise_leaves_the_truth_within_the_deviations(tmp_path):
 def test_joint_states_with_their_effort_are_enough(bag, tmp_path):
     entries = [one for one in recorded_run.messages(bag) if one[0] == JOINT_STATES.resolved]
     path = recorded_run.write(tmp_path / 'bag', entries)
-    alone = identify(path, ControllerConfig())
+    alone = learn(path, ControllerConfig())
     assert alone.source == 'effort of /joint_states'
-    assert alone.estimate == pytest.approx(identify(bag, ControllerConfig()).estimate, rel=1e-6)
+    assert alone.estimate == pytest.approx(learn(bag, ControllerConfig()).estimate, rel=1e-6)
 
 
 def test_a_bag_too_short_is_rejected(tmp_path):
     path = recorded_run.record(tmp_path / 'bag', 0.3)
     with pytest.raises(BlfDscError, match=r'holds 0\.3 s, .* window of 6\.28 s'):
-        identify(path, ControllerConfig())
+        learn(path, ControllerConfig())
 
 
 def test_the_command_prints_estimates_and_excitation(bag, capsys):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc replay`: a bag through the controller again: verify, what-if, identify or play."""
+"""`blf_dsc replay`: a bag through the controller again: verify, what-if, learn or play."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.params_file import load, locate
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.messages.topics import COMMANDS
-from blf_dsc_controller.replay.identify import identify
+from blf_dsc_controller.replay.learn import learn
 from blf_dsc_controller.replay.verify import Verification, verify
 from blf_dsc_controller.replay.what_if import WhatIf, what_if
 
@@ -35,7 +35,7 @@ def replay(options: Namespace) -> int:
         config = load(locate(options.config), CONTROLLER, ControllerConfig)
     begin = perf_counter()
     if options.learn:
-        _identify(options, config)
+        _learn(options, config)
     elif config is None:
         result = verify(options.bag, options.namespace)
         stamp = result.stamp
@@ -66,9 +66,9 @@ def _play(options: Namespace) -> None:
     )
 
 
-def _identify(options: Namespace, config: ControllerConfig | None) -> None:
+def _learn(options: Namespace, config: ControllerConfig | None) -> None:
     config = config or read_context(options.bag).controller_config()
-    found = identify(options.bag, config, options.namespace, NameMap.parse(options.map))
+    found = learn(options.bag, config, options.namespace, NameMap.parse(options.map))
     print(f'torque: {found.source}; window from {found.begin:.3f} s to {found.end:.3f} s')
     width = max(len(name) for name in found.names)
     for name, value, deviation in zip(found.names, found.estimate, found.deviation, strict=True):

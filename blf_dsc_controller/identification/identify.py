@@ -22,7 +22,7 @@ from blf_dsc_controller.identification.physical import solve
 from blf_dsc_controller.identification.prior import JOINT_TERMS, columns_of, prior_of
 from blf_dsc_controller.identification.recording import Recording, read_recording
 from blf_dsc_controller.identification.rows import WINDOW, Rows, rows_of
-from blf_dsc_controller.replay.identify import correlation_length
+from blf_dsc_controller.replay.learn import correlation_length
 from blf_dsc_controller.run import Floats
 
 _SHORTEST = 5.0  # s

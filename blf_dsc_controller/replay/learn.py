@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identification of an arm from a bag: the learning alone, on recorded states and torques.
+"""The learning alone, on the recorded states and torques of any bag.
 
 The rows X theta = u are those of the controller (see law.prediction), over the window that excites
 them most:  theta = (Phi + rho I)^-1 b  with (21) and (22). The deviations are those of least
@@ -25,7 +25,7 @@ from blf_dsc_controller.run import Floats
 _CANDIDATES = 600  # windows
 
 
-class Identification(NamedTuple):
+class Learned(NamedTuple):
     """Estimates of m unknowns from one window."""
 
     names: tuple[str, ...]  # of the unknowns
@@ -44,10 +44,10 @@ class Identification(NamedTuple):
         return self.excitation >= self.threshold
 
 
-def identify(
+def learn(
     path: Path, config: ControllerConfig, namespace: str = '', names: NameMap = NO_NAMES
-) -> Identification:
-    """Identify the arm of a bag, whatever moved it; path, namespace and names as for `what_if`.
+) -> Learned:
+    """Learn the arm of a bag, whatever moved it; path, namespace and names as for `what_if`.
 
     `config` gives the model, and the window, columns and filters of the learning.
 
@@ -75,7 +75,7 @@ def identify(
     estimate, deviation, excitation, residual = _solve(
         rows[end - window : end], active, config.learning.regularization
     )
-    return Identification(
+    return Learned(
         names=estimate_names(config),
         estimate=estimate,
         deviation=deviation,
