@@ -11,7 +11,7 @@ from plain_law import dynamics
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
-from blf_dsc_controller.supervision.planning import LatePlanError
+from blf_dsc_controller.supervision.guard import LatePlanError
 from blf_dsc_controller.supervision.safe_torque import LastState, SafeTorque, safe_torque
 from blf_dsc_controller.supervision.state_check import StateCheck
 from blf_dsc_controller.supervision.supervisor import Phase, Reason

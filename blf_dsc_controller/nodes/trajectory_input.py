@@ -20,8 +20,7 @@ from blf_dsc_controller.reference.trajectory import (
     TrajectoryError,
     TrajectoryPoint,
 )
-from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.planning import LatePlanError, Plan
+from blf_dsc_controller.supervision.guard import Guard, LatePlanError, Plan
 
 _NANO = 1e-9
 _POINT_SIZE = 32  # bytes per joint of a point with all its fields, which begin with 8 bytes each

@@ -3,16 +3,34 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import differences
 from blf_dsc_controller.messages.journal import EventType
+from blf_dsc_controller.reference.approach import Motion
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, plan_trajectory
 from blf_dsc_controller.supervision import retuning
 from blf_dsc_controller.supervision.guarded_law import GuardedLaw
-from blf_dsc_controller.supervision.planning import LatePlanError, Plan
 from blf_dsc_controller.supervision.supervisor import Phase
+
+
+class LatePlanError(TrajectoryError):
+    """The time from which on a trajectory was to be followed has passed while it was planned."""
+
+    def __init__(self, at: float, now: float) -> None:
+        super().__init__([f'it was to begin at {at:.6g} s and was planned at {now:.6g} s'])
+
+
+class Plan(NamedTuple):
+    """A planned trajectory."""
+
+    trajectory: Trajectory
+    at: float  # s since the start, from which on it has an effect
+    before: np.ndarray  # packed reference that it continues
+    motion: Motion
 
 
 class Guard(GuardedLaw):
@@ -73,7 +91,9 @@ class Guard(GuardedLaw):
             raise TrajectoryError([problem])
         if planned.at < self.time:
             raise LatePlanError(planned.at, self.time)
-        self._note(EventType.TRAJECTORY, **planned.content)
+        joints, points, begin = planned.trajectory
+        given = [point._asdict() for point in points]
+        self._note(EventType.TRAJECTORY, joints=joints, points=given, begin=begin, at=planned.at)
         self.controller.reference_vector, self.settled = planned.motion
         is_settled = self.settled <= self.time
         self.supervisor.enter(Phase.TRACKING if is_settled else Phase.APPROACHING)
