@@ -14,7 +14,8 @@ import numpy as np
 from harness import Ratio, interleaved, ratio
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import build, flatten, parameters
+from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.schema import build, change, flatten, parameters
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.reference.terms import sampled
@@ -55,6 +56,12 @@ def chain(n: int, **changes: Any) -> ControllerConfig:
     return two_link(**{name.replace('.', '__'): value for name, value in values.items()}, **changes)
 
 
+def of_urdf(preset: str) -> ControllerConfig:
+    """Controller of a preset with the arm of a URDF, which learns from any window."""
+    config = load_loop(preset).controller
+    return change(config, {'learning.change_detection': False})
+
+
 def label(config: ControllerConfig) -> str:
     """Size of the problem; p counts everything that is estimated, as in m = p + columns."""
     law = controller_of(config).settings
@@ -74,11 +81,11 @@ def updates(config: ControllerConfig) -> Callable[[], int]:
     law = controller.settings
     full = round(law.learning_start / _T) + law.window + law.interval
     ahead = full + (_ROUNDS + 1) * _UPDATES
-    told = sampled(controller.reference_vector, _T * np.arange(ahead + 1))
+    reference = sampled(controller.reference_vector, _T * np.arange(ahead + 1))
     noise = np.random.default_rng(0).standard_normal((2, ahead + 1, law.n))
     states = np.zeros((ahead + 1, 3 * law.n))
-    states[:, : law.n] = told[:, 0] + _NOISE[0] * noise[0]
-    states[:, law.n : 2 * law.n] = told[:, 1] + _NOISE[1] * noise[1]
+    states[:, : law.n] = reference[:, 0] + _NOISE[0] * noise[0]
+    states[:, law.n : 2 * law.n] = reference[:, 1] + _NOISE[1] * noise[1]
     clock = itertools.count()
 
     def go_on(count: int) -> int:
@@ -99,6 +106,9 @@ def measure() -> Iterator[Ratio]:
     columns = (chain(7), chain(7, **wide), chain(7, **tones))
     cases: dict[str, dict[str, ControllerConfig]] = {
         'joints and unknowns': {label(one): one for one in map(chain, range(2, 8))},
+        'arms from a URDF': {
+            f'{name}: {label(of_urdf(name))}': of_urdf(name) for name in ('panda', 'ur5e')
+        },
         'disturbance columns': {label(one): one for one in columns},
         'window': {
             f'window of {samples} samples': two_link(learning__window=samples * _T)

@@ -23,11 +23,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from harness import Contestant, ContestantError, Ratio, Watched, own_graph, ratio, wait_for
 
-from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER
-from blf_dsc_controller.configuration.params_file import dump
-from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, LoopConfig
+from blf_dsc_controller.configuration.params_file import dump, load_loop
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.telemetry import PlantTelemetry
 from blf_dsc_controller.simulation.loop import simulate
@@ -46,6 +44,7 @@ _TELLING = 'controller, telemetry on'
 _RECORDED = 'controller, telemetry and recorder on'
 _PROCESSES = (_NULL, _NULL_TYPED, _QUIET, _TELLING, _RECORDED)
 _GUESTS = (_NULL, _QUIET, _TELLING)
+_PRESETS = {'recommended': 'node', 'panda': 'node with seven joints'}
 _HERE = Path(__file__).parent
 
 
@@ -206,15 +205,23 @@ class StandIn:
 
 def measure() -> Iterator[Ratio]:
     """Latency, CPU and lock-step rate of the controller node relative to the null node."""
+    for preset, group in _PRESETS.items():
+        yield from _measure(preset, group)
+
+
+def _measure(preset: str, group: str) -> Iterator[Ratio]:
+    loop = load_loop(preset)
     real: dict[str, list[Run]] = {name: [] for name in _PROCESSES}
     lockstep: dict[str, list[Run]] = {name: [] for name in _PROCESSES}
-    together: dict[str, list[Run]] = {name: [] for name in _GUESTS}
-    states = _recorded_states()
+    hosted = _GUESTS if preset == 'recommended' else ()
+    together: dict[str, list[Run]] = {name: [] for name in hosted}
+    states = _recorded_states(loop)
     with own_graph(), tempfile.TemporaryDirectory() as folder, closing(StandIn(states)) as arm:
         for k in range(_ROUNDS):
             for name in _PROCESSES:
                 for runs, period in ((real, 1e-3), (lockstep, 0.0)):
-                    with _started(name, Path(folder), f'{k}-{name}-{period}') as these:
+                    tag = f'{k}-{name}-{period}'.replace(' ', '_')
+                    with _started(name, loop.controller, Path(folder, tag)) as these:
                         runs[name].append(arm.play(these, period))
                     arm.left_alone()
             for name, each in together.items():
@@ -222,13 +229,13 @@ def measure() -> Iterator[Ratio]:
                 # has sent more than it keeps for those who come late.
                 with closing(StandIn(states)) as here, here.host(name) as guests:
                     each.append(here.play(guests, 0.0))
-    yield from _real_time(real)
-    yield from _rates('node, lock-step', lockstep)
-    yield from _rates('node and arm in one process, lock-step', together)
+    yield from _real_time(f'{group}, real time at 1 kHz', real)
+    yield from _rates(f'{group}, lock-step', lockstep)
+    if together:
+        yield from _rates(f'{group} and arm in one process, lock-step', together)
 
 
-def _real_time(runs: dict[str, list[Run]]) -> Iterator[Ratio]:
-    group = 'node, real time at 1 kHz'
+def _real_time(group: str, runs: dict[str, list[Run]]) -> Iterator[Ratio]:
     median = {name: np.array([np.median(r.latency) for r in each]) for name, each in runs.items()}
     tail = {
         name: np.array([np.percentile(r.latency, 99.9) for r in each])
@@ -256,14 +263,12 @@ def _pairs(runs: Collection[str]) -> Iterator[tuple[str, str]]:
 
 
 @contextmanager
-def _started(name: str, folder: Path, tag: str) -> Iterator[list[Contestant]]:
+def _started(name: str, config: ControllerConfig, path: Path) -> Iterator[list[Contestant]]:
     """Processes of a contestant: its node, after the recorder if it is to have one."""
-    tag = tag.replace(' ', '_')
-    commands = [_command(name, folder / f'{tag}.yaml')]
+    commands = [_command(name, config, path.with_suffix('.yaml'))]
     if name == _RECORDED:
         module = 'blf_dsc_controller.nodes.recorder_node'
-        bag = folder / tag
-        commands.insert(0, ['-m', module, '--ros-args', '-p', f'output:={bag}'])
+        commands.insert(0, ['-m', module, '--ros-args', '-p', f'output:={path}'])
     contestants: list[Contestant] = []
     try:
         contestants.extend(Contestant(name, command) for command in commands)
@@ -273,10 +278,9 @@ def _started(name: str, folder: Path, tag: str) -> Iterator[list[Contestant]]:
             contestant.end()
 
 
-def _command(name: str, params: Path) -> list[str]:
+def _command(name: str, config: ControllerConfig, params: Path) -> list[str]:
     if name in (_NULL, _NULL_TYPED):
         return [str(_HERE / 'null_node.py'), 'raw' if name == _NULL else 'typed']
-    config = ControllerConfig()
     telemetry = replace(config.telemetry, enabled=name != _QUIET)
     observers = int(name == _RECORDED)
     dump(params, {CONTROLLER: replace(config, telemetry=telemetry, wait_for_subscribers=observers)})
@@ -284,9 +288,9 @@ def _command(name: str, params: Path) -> list[str]:
     return ['-m', module, '--ros-args', '--params-file', str(params)]
 
 
-def _recorded_states() -> list[bytes]:
-    plant = PlantConfig(duration=(_STEPS + _WARM_UP) * 1e-3)
-    record = simulate(ControllerConfig(), plant)
-    telemetry = PlantTelemetry(plant.joints, PARAMETER_NAMES)
+def _recorded_states(loop: LoopConfig) -> list[bytes]:
+    plant = replace(loop.plant, duration=(_STEPS + _WARM_UP) * 1e-3)
+    record = simulate(loop.controller, plant)
+    telemetry = PlantTelemetry(plant.joints, record.parameters)
     rows = zip(record.stamps[:-1].tolist(), record.measurements, strict=False)
     return [telemetry.joint_states(_START + stamp, row)[1] for stamp, row in rows]

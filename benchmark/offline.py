@@ -48,8 +48,8 @@ def disagreement() -> float:
     plant = replace(loops.PLANT, duration=_AGREEMENT)
     rows = Reference().rows(loops.CONTROLLER, plant)
     record = simulate_law(loops.CONTROLLER, plant)
-    told = [record.sample(k) for k in range(len(rows))]
-    mine = np.array([np.concatenate((s.xi1, s.torque, s.estimate)) for s in told])
+    samples = [record.sample(k) for k in range(len(rows))]
+    mine = np.array([np.concatenate((s.xi1, s.torque, s.estimate)) for s in samples])
     return float(np.abs(mine - rows).max())
 
 

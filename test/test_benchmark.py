@@ -53,6 +53,9 @@ def test_growth_is_written_as_table_and_picture(monkeypatch, tmp_path):
     text = (tmp_path / 'RESULTS.md').read_text()
     assert '## growth with joints' in text
     assert '| n = 7 joints, p = 70 unknowns (28 of the arm + 42 of disturbances) | **' in text
+    assert (
+        '| panda: n = 7 joints, p = 62 unknowns (48 of the arm + 14 of disturbances) | **' in text
+    )
     assert '| window of 100000 samples | **' in text
     assert (tmp_path / 'results.png').stat().st_size > 0
     monkeypatch.setattr(growth, '_ANY_EXCITATION', 1e6)
@@ -108,6 +111,7 @@ def test_node_beside_null_node_in_two_processes_and_in_one(monkeypatch):
     assert played == [
         ('node, lock-step', {node._NULL: 1}),
         ('node and arm in one process, lock-step', dict.fromkeys(node._GUESTS, 1)),
+        ('node with seven joints, lock-step', {node._NULL: 1}),
     ]
 
 
