@@ -41,7 +41,7 @@ PIP_FAILED := { echo 'The installation failed: see above. It needs a package ind
   'set HTTPS_PROXY, for a mirror PIP_INDEX_URL, without a network PIP_FIND_LINKS and' \
   'PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
 
-.PHONY: help venv demo paper changes test test-long test-browser test-nightly soak lint clean bench
+.PHONY: help venv demo paper arms changes test test-long test-browser test-nightly soak lint clean bench
 
 help: ## List what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' Makefile
@@ -59,6 +59,11 @@ paper: $(READY) ## Run the paper's simulation with every law and check its claim
 	@mkdir -p out; out=out/paper; n=1; \
 	while [ -e "$$out" ]; do n=$$((n + 1)); out=out/paper-$$n; done; \
 	$(RUN) -m blf_dsc_controller paper --out "$$out"
+
+arms: $(READY) ## Compare laws on a Panda and a UR5e whose URDF is wrong, into out/
+	@mkdir -p out; out=out/arms; n=1; \
+	while [ -e "$$out" ]; do n=$$((n + 1)); out=out/arms-$$n; done; \
+	$(RUN) -m blf_dsc_controller arms --out "$$out"
 
 # A file's tests stay together on one of the workers, for what they set up is shared; the files
 # come in the order of test/conftest.py.

@@ -206,6 +206,19 @@ def _parser() -> argparse.ArgumentParser:
     paper.add_argument(
         '--out', type=Path, default=Path('paper_study'), help='new folder for the report'
     )
+    arms = command(
+        'arms',
+        'studies',
+        'compare laws on arms whose URDF is wrong',
+        'Tune each law on one arm with wrong masses, run it on others, and write a page of the '
+        'errors; offline, on all cores, some ten minutes on two.',
+        '--config panda --out arms',
+    )
+    option = arms.add_argument
+    option('--config', nargs='+', default=['panda', 'ur5e'], help='presets or files (panda ur5e)')
+    option('--truths', type=int, default=5, help='runs of each law after tuning (5)')
+    option('--generations', type=int, default=7, help='of the tuning, after the first (7)')
+    option('--out', type=Path, default=Path('arms'), help='new folder for the page')
     _monte_carlo_options(
         command(
             'monte-carlo',

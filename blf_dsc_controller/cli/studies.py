@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc paper`, the simulation of the paper; `blf_dsc monte-carlo`, loops with random plants."""
+"""`blf_dsc paper`, `blf_dsc arms`: laws side by side; `blf_dsc monte-carlo`: random plants."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from blf_dsc_controller.analysis.summary import format_table
+from blf_dsc_controller.arm_comparison.study import compare as compare_arms
 from blf_dsc_controller.cli.run import announced_compilation, make_folder
 from blf_dsc_controller.configuration.params_file import locate
 from blf_dsc_controller.errors import BlfDscError
@@ -33,6 +34,16 @@ def paper(options: Namespace) -> None:
     """Run the paper's Section IV with every law, write the report and print the claims."""
     for claim in compare(make_folder(options.out)):
         print(f'{claim.where:<18} {claim.says}\n{"":<18} {claim.full_verdict}')
+    print(f'wrote {options.out / "index.html"}')
+
+
+def arms(options: Namespace) -> None:
+    """Tune and run every law on arms of URDFs, write the page and print who is best at what."""
+    folder = make_folder(options.out)
+    with announced_compilation():
+        rows = compare_arms(folder, options.config, options.truths, options.generations)
+    for arm, figure, best, least, *ours in rows:
+        print(f'{arm:<6} {figure:<36} {best}: {least} (proposed {ours[0]}, tuned {ours[1]})')
     print(f'wrote {options.out / "index.html"}')
 
 

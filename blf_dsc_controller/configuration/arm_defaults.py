@@ -10,15 +10,17 @@ start before the disturbance estimate follows: where that is more than the bound
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from blf_dsc_controller.configuration.robot import Robot, given_robot, parameters_of
+from blf_dsc_controller.configuration.robot import given_robot, parameters_of
 
 if TYPE_CHECKING:
+    from blf_dsc_controller.arms.base_parameters import BaseParameters
     from blf_dsc_controller.arms.urdf import Chain
     from blf_dsc_controller.configuration.schema import Value
 
@@ -45,10 +47,13 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
     velocity = _finite([joint.velocity for joint in chain.joints], 2.0)
     lower = _finite([joint.lower for joint in chain.joints], -_FREE)
     upper = _finite([joint.upper for joint in chain.joints], _FREE)
-    P0 = parameters_of(robot, chain).of(chain.inertias, robot.rotors(chain))
+    parameters = parameters_of(robot, chain)
+    P0 = parameters.of(chain.inertias, robot.rotors(chain))
     period = given.get('sample_time', 0.001)
     rate = _PHASE / (1.5 * period + robot.lag) if isinstance(period, float) else 0.0
-    m, gravity = _over_postures(robot, chain, P0, lower, upper)
+    payload = robot.payload if isinstance(robot.payload, float) else 0.0
+    limits = tuple(lower), tuple(upper)
+    m, gravity = over_postures(chain, parameters, payload, tuple(P0), *limits)
     sag = _SAG * gravity / (m * rate**2) if rate else np.zeros(n)
     floor = _UNMODELLED * effort
     zeros = (0.0,) * n
@@ -94,6 +99,7 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
         'comparison.surface_gain': (rate / 3.0,) * n,
         'comparison.position_gain': _listed(m * (rate / 4.0) ** 2),
         'comparison.robust_gain': zeros,
+        'comparison.integral_gain': zeros,
         'truth.constant': zeros,
         'truth.amplitude': zeros,
         'truth.frequency': (1.0,) * n,
@@ -104,21 +110,26 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
     }
 
 
-def _over_postures(
-    robot: Robot, chain: Chain, P: np.ndarray, lower: np.ndarray, upper: np.ndarray
+@functools.lru_cache(maxsize=16)
+def over_postures(
+    chain: Chain,
+    parameters: BaseParameters,
+    payload: float,
+    P: tuple[float, ...],
+    lower: tuple[float, ...],
+    upper: tuple[float, ...],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Least 1 / (M^-1)_ii (n,), and largest standard deviation of gravity (n,) [N m].
 
-    Over random postures within the limits.
+    Over random postures within the limits; for a rated payload [kg].
     """
     from blf_dsc_controller.arms.prior import prior_factor  # compiles
 
-    parameters = parameters_of(robot, chain)
     model = parameters.model
     n = model.n
-    L = prior_factor(chain, parameters, 'base', robot.payload, np.zeros(n))
+    L = prior_factor(chain, parameters, 'base', payload, np.zeros(n))
     random = np.random.default_rng(0)
-    Yp, Yr, M = np.zeros((n, P.size)), np.zeros((n, P.size)), np.zeros((n, n))
+    Yp, Yr, M = np.zeros((n, len(P))), np.zeros((n, len(P))), np.zeros((n, n))
     least, deviation = np.full(n, np.inf), np.zeros(n)
     for _ in range(_POSTURES):
         q = random.uniform(lower, upper)

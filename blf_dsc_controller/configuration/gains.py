@@ -125,6 +125,9 @@ class Comparison:
     robust_gain: PerJoint = non_negative(
         (0.0, 0.0), 'amplitude of the robust term; not used by slotine_li', 'N m', 'mu_bar'
     )
+    integral_gain: PerJoint = non_negative(
+        (0.0, 0.0), 'integrator on the surface error; only of slotine_li', 'N m/rad'
+    )
     leakage: float = non_negative(
         0.001, 'leakage of the parameter estimate; not used by slotine_li', symbol='W_c'
     )

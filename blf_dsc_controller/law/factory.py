@@ -6,7 +6,8 @@ All laws share one kernel; they differ in the surface and in which gains are zer
     blf_dsc       (28): filtered surface, barrier, composite learning, d^3
     model_based   (16): the same with P^ = P and the disturbance known, nothing adapted
     backstepping  (35): linear surface, position gain, leaky adaptation by the tracking error
-    slotine_li    tau = H P^ - K_p s, P^' = -Gamma H^T s: (35) without its extra terms
+    slotine_li    tau = H P^ - K_p s, P^' = -Gamma H^T s: (35) without its extra terms; may
+                  integrate s, by (30)
 """
 
 from __future__ import annotations
@@ -203,7 +204,7 @@ def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
             'mu_bar': np.array(comparison.robust_gain),
             'Wc': comparison.leakage,
         },
-        'slotine_li': linear | {'weight': nothing},
+        'slotine_li': linear | {'weight': nothing, 'gamma': np.array(comparison.integral_gain)},
     }
     return laws[config.law]
 

@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import differential_evolution
@@ -149,28 +149,43 @@ def loops_of(task: Task) -> list[LoopConfig]:
     return [loop._replace(controller=law) for loop in loops]
 
 
+def search(
+    cost: Callable[[Floats], float],
+    ranges: Floats,
+    population: int,
+    generations: int,
+    **options: Any,
+) -> tuple[Floats, float, int]:
+    """Best point within the ranges (k, 2), its cost, and how many costs were evaluated.
+
+    Differential evolution of one seed from points evenly spread, as many for every law; `options`
+    are scipy's.
+    """
+    points = qmc.LatinHypercube(len(ranges), rng=np.random.default_rng(SEED)).random(population)
+    found = differential_evolution(
+        cost,
+        ranges,
+        init=points * np.diff(ranges).T + ranges[:, 0],
+        maxiter=generations,
+        tol=0.0,
+        polish=False,
+        rng=np.random.default_rng(SEED),
+        **options,
+    )
+    return found.x, float(found.fun), int(found.nfev)
+
+
 def tune(task: Task) -> tuple[Floats, float, int]:
     """Best exponents, their objective, and how many times it was evaluated."""
     loops = loops_of(task)
     ranges = np.log10([(gain.least, gain.most) for gain in task.gains])
-    # Evenly spread, as many points for every law.
-    points = qmc.LatinHypercube(len(ranges), rng=np.random.default_rng(SEED)).random(POPULATION)
     with tqdm(total=EVALUATIONS, desc='tuning', unit='run') as bar:
 
         def cost(exponents: Floats) -> float:
             bar.update()
             return objective(exponents, task, loops)
 
-        found = differential_evolution(
-            cost,
-            ranges,
-            init=points * np.diff(ranges).T + ranges[:, 0],
-            maxiter=GENERATIONS,
-            tol=0.0,
-            polish=False,
-            rng=np.random.default_rng(SEED),
-        )
-    return found.x, float(found.fun), int(found.nfev)
+        return search(cost, ranges, POPULATION, GENERATIONS)
 
 
 def preset(name: str, exponents: Floats, value: float, evaluations: int) -> str:

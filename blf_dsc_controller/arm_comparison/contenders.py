@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The laws that are compared: what each is, which gains are tuned, and one run of it in figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.arm_comparison.baselines import simulate_baseline
+from blf_dsc_controller.configuration.arm_defaults import over_postures
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import LoopConfig
+from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.law.factory import model_of
+from blf_dsc_controller.law.state import sample_of
+from blf_dsc_controller.reference import terms
+from blf_dsc_controller.reference.approach import reference_of
+from blf_dsc_controller.simulation.loop import simulate_law
+
+PICK_UP = 15.0  # s
+DURATION = 30.0  # s
+INTERVALS = {
+    'first 3 s': (0.0, 3.0),
+    '8 to 15 s': (8.0, PICK_UP),
+    'pick-up': (PICK_UP, 17.0),
+    'from 20 s': (20.0, DURATION),
+}
+_BEFORE = PICK_UP - 0.01  # s, when the model is looked at for the first time
+_ROWS = 200
+
+
+class Gain(NamedTuple):
+    """One tuned number: its name, its range, and whether it multiplies each joint's inertia m."""
+
+    name: str
+    least: float
+    most: float
+    inertial: bool = False
+
+
+class Contender(NamedTuple):
+    """A law with the gains that are tuned; with none they are those that follow from the URDF."""
+
+    label: str
+    gains: tuple[Gain, ...] = ()
+    law: str = 'blf_dsc'  # or one of BASELINES
+    learns: bool = True
+    friction: bool = True  # compensates the friction that the controller knows
+
+
+BASELINES = ('computed_torque', 'pd_gravity')
+
+_DAMPING = Gain('feedback.damping_rate', 10.0, 200.0)
+_ADAPTATION = Gain('learning.adaptation_gain', 0.01, 30.0)
+_FEEDBACK = (
+    _DAMPING,
+    Gain('surface.gain', 5.0, 300.0),
+    Gain('surface.mu', 2.0, 100.0),
+    Gain('barrier.weight', 100.0, 1e4, inertial=True),
+    Gain('disturbance.gain', 100.0, 3e4, inertial=True),
+)
+_SLOTINE_LI = (
+    _DAMPING,
+    Gain('comparison.surface_gain', 5.0, 300.0),
+    Gain('comparison.integral_gain', 100.0, 3e4, inertial=True),
+    _ADAPTATION,
+)
+_PD = (Gain('position', 100.0, 3e4), Gain('velocity', 10.0, 200.0))
+_PID = (*_PD, Gain('integral', 100.0, 3e6))
+
+CONTENDERS = {
+    'proposed': Contender('proposed, gains by the URDF'),
+    'no_learning': Contender('the same without learning', learns=False),
+    'slotine_li': Contender('Slotine-Li, the same gains', law='slotine_li'),
+    'proposed_tuned': Contender('proposed, tuned', (*_FEEDBACK, _ADAPTATION)),
+    'no_learning_tuned': Contender('without learning, tuned', _FEEDBACK, learns=False),
+    'slotine_li_tuned': Contender('Slotine-Li with integrator, tuned', _SLOTINE_LI, 'slotine_li'),
+    'computed_torque': Contender('computed torque', _PD, BASELINES[0], friction=False),
+    'computed_torque_i': Contender('+ integrator', _PID, BASELINES[0], friction=False),
+    'computed_torque_if': Contender('+ integrator, friction', _PID, BASELINES[0]),
+    'pd_gravity': Contender('PD + gravity', _PD, BASELINES[1], friction=False),
+    'pd_gravity_i': Contender('+ integrator', _PID, BASELINES[1], friction=False),
+    'pd_gravity_if': Contender('+ integrator, friction', _PID, BASELINES[1]),
+}
+
+
+class Figures(NamedTuple):
+    """One run: the largest true error of any joint in each of INTERVALS, the torque, the model."""
+
+    errors: tuple[float, ...]  # rad
+    largest: float  # rad, of the whole run
+    roughness: float  # rms change of the torque from sample to sample, of its limit
+    model: tuple[float, ...]  # torque error on another motion: before the pick-up, at the end
+
+
+def law_changes(
+    contender: Contender, config: ControllerConfig, values: Mapping[str, float]
+) -> dict[str, object]:
+    """Parameters that make the configured law the contender, with these values of its gains."""
+    changes: dict[str, object] = {'law': contender.law}
+    if contender.law == 'slotine_li':  # the slope of the proposed law's surface at zero
+        slope = np.array(config.surface.gain) / 2.0 + config.surface.mu
+        changes['comparison.surface_gain'] = slope.tolist()
+    elif not contender.learns:
+        changes |= {
+            'learning.weight': 0.0,
+            'learning.adaptation_gain': [0.0] * len(config.learning.initial_estimate),
+            'learning.excitation_threshold': 1e9,
+            'learning.change_detection': False,
+        }
+    for gain in contender.gains:
+        group, _, field = gain.name.partition('.')
+        present, value = getattr(getattr(config, group), field), values[gain.name]
+        per_entry = joint_inertia(config) if gain.inertial else np.ones(np.size(present))
+        each = value * per_entry
+        changes[gain.name] = each.tolist() if isinstance(present, tuple) else value
+    return changes
+
+
+def joint_inertia(config: ControllerConfig) -> np.ndarray:
+    """The m of the gains, (n,) [kg m^2]: the least inertia of a joint, the others being free."""
+    robot, limits = config.robot, (config.limits.position_lower, config.limits.position_upper)
+    chain, P0 = robot.chain(config.joints), config.learning.initial_estimate
+    return over_postures(chain, parameters_of(robot, chain), robot.payload, P0, *limits)[0]
+
+
+def run(name: str, loop: LoopConfig, values: Mapping[str, float], unseen: np.ndarray) -> Figures:
+    """Run a contender with these values of its gains, by their names.
+
+    `unseen` (k, p) are the rows of H on which the learned model is judged.
+    """
+    contender = CONTENDERS[name]
+    with np.errstate(all='ignore'):  # a run that diverges has figures too
+        if contender.law in BASELINES:
+            errors, torques = simulate_baseline(
+                loop,
+                joint_inertia(loop.controller),
+                dict(values),
+                computed=contender.law == BASELINES[0],
+                friction=contender.friction,
+            )
+            model: tuple[float, ...] = ()
+        else:
+            errors, torques, model = _simulate_law(contender, loop, values, unseen)
+        time = np.arange(len(errors)) * loop.plant.sample_time
+        peaks = [
+            np.abs(errors[(time >= begin) & (time < end)]).max(initial=0.0)
+            for begin, end in INTERVALS.values()
+        ]
+        change = np.diff(torques, axis=0) / loop.controller.torque.limit
+        rough = np.sqrt(np.mean(change**2, axis=0)).max()
+    return Figures(tuple(map(float, peaks)), float(np.abs(errors).max()), float(rough), model)
+
+
+def _simulate_law(
+    contender: Contender, loop: LoopConfig, values: Mapping[str, float], unseen: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, tuple[float, ...]]:
+    config = change(loop.controller, law_changes(contender, loop.controller, values))
+    record = simulate_law(config, loop.plant)
+    settings = record.controller.settings
+    n, p = settings.n, settings.p
+    columns = sample_of(np.arange(record.samples.shape[1]), settings)
+    errors = record.truths[:, p + n : p + 2 * n] - record.samples[:, columns.qr]
+    rows = [round(_BEFORE / config.sample_time), -1]
+    estimates = record.samples[rows][:, columns.estimate[:p]]
+    model = tuple(
+        float(np.linalg.norm(unseen @ (estimate - P)) / np.linalg.norm(unseen @ P))
+        for estimate, P in zip(estimates, record.truths[rows, :p], strict=True)
+    )
+    return errors, record.samples[:, columns.torque], model
+
+
+def torque_rows(config: ControllerConfig) -> np.ndarray:
+    """Rows of H(q, q', q', q'') (k, p) along the configured reference."""
+    model = model_of(config)
+    times = np.linspace(0.0, PICK_UP, _ROWS)
+    H = np.zeros((_ROWS, model.n, len(config.learning.initial_estimate)))
+    for rows, (q, dq, ddq) in zip(H, terms.sampled(reference_of(config), times), strict=True):
+        model.regressor(q, dq, dq, ddq, rows)
+    return H.reshape(_ROWS * model.n, -1)

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The study: each contender tuned on one truth, then run on others, and a page of the figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from blf_dsc_controller.analysis.page import Cell, write_page
+from blf_dsc_controller.arm_comparison.contenders import (
+    CONTENDERS,
+    DURATION,
+    INTERVALS,
+    PICK_UP,
+    Figures,
+    run,
+    torque_rows,
+)
+from blf_dsc_controller.configuration.nodes import LoopConfig
+from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.paper.tune import HOPELESS, search
+from blf_dsc_controller.run import Floats
+
+POPULATION = 16
+ROUGHEST = 0.05
+"""rms change of a torque from sample to sample, of its limit, that a motor is to be spared."""
+
+_UNSEEN = 1000  # seed of a motion that nobody runs
+_COLUMNS = (*INTERVALS, 'torque error before the pick-up', 'at the end')
+_OURS = ('proposed', 'proposed_tuned')
+
+
+class Result(NamedTuple):
+    """A contender on one arm: gains found and their cost (None if not tuned), validation runs."""
+
+    gains: dict[str, float]
+    cost: float | None
+    runs: list[Figures]
+
+    def columns(self) -> list[Floats]:
+        """Of each of _COLUMNS the values of all runs, in mrad or %; empty if there is no model."""
+        errors = 1e3 * np.array([one.errors for one in self.runs]).T
+        return [*errors, *(100.0 * np.array([one.model for one in self.runs]).T)]
+
+
+Results = dict[str, dict[str, Result]]
+"""By arm and contender."""
+
+
+def trial(name: str, seed: int) -> LoopConfig:
+    """Loop of a preset: seed 0 has its own truth and motion, every other seed has others.
+
+    Raises BlfDscError if it has no arm of a URDF that follows sinusoids.
+    """
+    loop = load_loop(name)
+    reference, events = loop.controller.reference, loop.plant.events
+    if loop.controller.model != 'urdf' or reference.type != 'sinusoids':
+        raise BlfDscError(
+            f'--config {name}: got model {loop.controller.model} and reference {reference.type}, '
+            'but an arm of a URDF that follows sinusoids is needed, as in config/panda.yaml'
+        )
+    plant = {
+        'duration': DURATION,
+        'seed': seed,
+        'truth.seed': loop.plant.truth.seed + seed,
+        'events.begin': [PICK_UP],
+        'events.duration': [0.0],
+        'events.payload': [max(events.payload, default=0.0)],
+    }
+    # No funnel, which the others do not have: all approach the motion from rest.
+    motion: dict[str, object] = {'barrier.initial_bound': [0.0] * len(loop.plant.joints)}
+    if seed > 0:
+        random = np.random.default_rng(seed)
+        signs = random.choice((-1.0, 1.0), len(reference.amplitude))
+        motion['reference.amplitude'] = (signs * reference.amplitude).tolist()
+        motion['reference.phase'] = random.uniform(0.0, 2.0 * np.pi, len(reference.phase)).tolist()
+    return loop._replace(
+        controller=change(loop.controller, motion), plant=change(loop.plant, plant)
+    )
+
+
+def values_of(name: str, exponents: Floats) -> dict[str, float]:
+    """Gains of a contender, whose decimal logarithms are the coordinates of a point."""
+    pairs = zip(CONTENDERS[name].gains, exponents, strict=True)
+    return {gain.name: float(f'{10.0**exponent:.3g}') for gain, exponent in pairs}
+
+
+def cost_of(figures: Figures) -> float:
+    """Mean over the intervals of the decades of the largest error, in mrad; less is more.
+
+    A torque rougher than ROUGHEST costs ten decades a decade.
+    """
+    rough = max(np.log10(figures.roughness / ROUGHEST), 0.0)
+    cost = float(np.mean(np.log10(1e3 * np.array(figures.errors))) + 10.0 * rough)
+    return min(cost, HOPELESS) if np.isfinite(cost) else HOPELESS
+
+
+def tuning_cost(exponents: Floats, name: str, loop: LoopConfig, unseen: Floats) -> float:
+    """`cost_of` a contender with a sample of delay more than it will have: none is at its edge."""
+    delayed = change(loop.plant, {'actuator.delay': loop.plant.actuator.delay + 1})
+    values = values_of(name, exponents)
+    return cost_of(run(name, loop._replace(plant=delayed), values, unseen))
+
+
+def compare(folder: Path, names: Sequence[str], truths: int, generations: int) -> list[list[str]]:
+    """Tune and run everything, write the page into an empty folder; return `least_errors`."""
+    loops = {name: [trial(name, seed) for seed in range(truths + 1)] for name in names}
+    tuned = sum(bool(contender.gains) for contender in CONTENDERS.values())
+    each = tuned * POPULATION * (generations + 1) + len(CONTENDERS) * truths
+    results: Results = {}
+    with tqdm(total=len(names) * each, unit='run') as bar, ProcessPoolExecutor() as pool:
+        for name in names:
+            unseen = torque_rows(trial(name, _UNSEEN).controller)
+            if not results:  # compiles, which the workers then inherit or load
+                for contender in ('proposed', 'computed_torque'):
+                    run(contender, loops[name][0], {}, unseen)
+
+            def computed(
+                function: Callable[[Floats], float], points: Iterable[Floats]
+            ) -> Iterator[float]:
+                for value in pool.map(function, points):
+                    bar.update()
+                    yield value
+
+            results[name] = {}
+            for contender, what in CONTENDERS.items():
+                bar.set_description(f'{name} {contender}')
+                gains, cost = {}, None
+                if what.gains:
+                    point, cost, _ = search(
+                        partial(tuning_cost, name=contender, loop=loops[name][0], unseen=unseen),
+                        np.log10([(gain.least, gain.most) for gain in what.gains]),
+                        POPULATION,
+                        generations,
+                        workers=computed,
+                        updating='deferred',
+                    )
+                    gains = values_of(contender, point)
+                runs = partial(run, contender, values=gains, unseen=unseen)
+                figures = list(pool.map(runs, loops[name][1:]))
+                bar.update(truths)
+                results[name][contender] = Result(gains, cost, figures)
+    _write(folder, results, truths, generations)
+    return least_errors(results)
+
+
+def least_errors(results: Results) -> list[list[str]]:
+    """Of each arm and column, whose worst run is best, and the worst of the proposed law."""
+    rows = []
+    for arm, laws in results.items():
+        for k, column in enumerate(_COLUMNS):
+            worst = {name: one.columns()[k].max() for name, one in laws.items() if _has(one, k)}
+            best = min(worst, key=lambda name: float(worst[name]))
+            shown = [f'{worst[name]:.3g}' for name in (best, *_OURS)]
+            rows.append([arm, f'{column} [{_unit(k)}]', label_of(best), *shown])
+    return rows
+
+
+def label_of(name: str) -> str:
+    """Label of a contender that says what an addition is added to."""
+    label = CONTENDERS[name].label
+    return f'{CONTENDERS[name.rpartition("_")[0]].label} {label}' if label[0] == '+' else label
+
+
+def table_of(laws: dict[str, Result], bound: float) -> list[list[str | Cell]]:
+    """A header, and a row for each contender: median / worst of its runs, the best marked."""
+    header = ['law', *(f'{column} [{_unit(k)}]' for k, column in enumerate(_COLUMNS))]
+    rows: list[list[str | Cell]] = [[*header, 'bound kept', 'roughness [%]', 'gains']]
+    best = [
+        min(one.columns()[k].max() for one in laws.values() if _has(one, k))
+        for k in range(len(_COLUMNS))
+    ]
+    for name, one in laws.items():
+        row: list[str | Cell] = [label_of(name)]
+        for k in range(len(_COLUMNS)):
+            values = one.columns()[k] if _has(one, k) else np.array([np.nan])
+            text = f'{np.median(values):.2f} / {values.max():.2f}' if _has(one, k) else '-'
+            row.append(Cell(text, 'good' if values.max() == best[k] else 'number'))
+        kept = sum(figures.largest < bound for figures in one.runs)
+        rough = max(figures.roughness for figures in one.runs)
+        gains = ', '.join(f'{gain} {value:g}' for gain, value in one.gains.items())
+        rows.append([*row, f'{kept} of {len(one.runs)}', f'{100.0 * rough:.1f}', gains or 'rule'])
+    return rows
+
+
+def _has(result: Result, column: int) -> bool:
+    return column < len(result.columns())
+
+
+def _unit(column: int) -> str:
+    return 'mrad' if column < len(INTERVALS) else '%'
+
+
+def _write(folder: Path, results: Results, truths: int, generations: int) -> None:
+    plain = {
+        arm: {
+            name: {**one._asdict(), 'runs': [figures._asdict() for figures in one.runs]}
+            for name, one in laws.items()
+        }
+        for arm, laws in results.items()
+    }
+    (folder / 'figures.json').write_text(json.dumps(plain, indent=1) + '\n', encoding='utf-8')
+    bounds = {arm: min(load_loop(arm).controller.barrier.bound) for arm in results}
+    write_page(
+        folder / 'index.html',
+        'arms.html',
+        'Arms from a URDF, laws side by side',
+        tables={arm: table_of(laws, bounds[arm]) for arm, laws in results.items()},
+        bounds=bounds,
+        least=least_errors(results),
+        truths=truths,
+        evaluations=POPULATION * (generations + 1),
+        roughest=100.0 * ROUGHEST,
+        folder=folder.name,
+    )

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Laws side by side on arms from URDFs: the baselines' identities, and the command."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from blf_dsc_controller.arm_comparison.baselines import simulate_baseline
+from blf_dsc_controller.arm_comparison.contenders import (
+    CONTENDERS,
+    INTERVALS,
+    Figures,
+    joint_inertia,
+    run,
+    torque_rows,
+)
+from blf_dsc_controller.arm_comparison.study import ROUGHEST, cost_of, trial
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.nodes import LoopConfig
+from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.reference import terms
+from blf_dsc_controller.reference.approach import reference_of
+
+IDEAL = {
+    'truth.mass_deviation': 0.0,
+    'truth.centre_deviation': 0.0,
+    'truth.rotor_factor': 1.0,
+    'disturbance.viscous': [0.0] * 6,
+    'disturbance.coulomb': [0.0] * 6,
+    'sensor.resolution': 0.0,
+    'sensor.velocity': 'measured',
+    'sensor.velocity_pole': 0.0,
+    'actuator.delay': 0,
+    'actuator.time_constant': 0.0,
+    'actuator.torque_noise': 0.0,
+    'actuator.ripple': 0.0,
+    'events.payload': [0.0],
+}
+HOLD = (0.15, -1.85, 1.36, -1.63, -1.71, 0.42)  # rad
+E0 = 0.004 * np.array([1.0, -0.5, 0.2, 0.8, -1.0, 0.6])  # rad, inside the bound
+REST = {  # sinusoids without amplitude, for a hold would begin where the arm is
+    'reference.offset': list(HOLD),
+    'reference.amplitude': [0.0] * 18,
+}
+
+
+def ideal(period, duration, law=None, **plant):
+    """A UR5e as its URDF says, all sensors and drives ideal, that starts E0 off the reference."""
+    loop = load_loop('ur5e')
+    config, step = loop.controller, {'sample_time': period}
+    chain = config.robot.chain(config.joints)
+    P = parameters_of(config.robot, chain).of(chain.inertias, config.robot.rotors(chain))
+    config = change(config, step | {'learning.initial_estimate': P.tolist()} | (law or {}))
+    start = {'initial.position': (np.array(HOLD) + E0).tolist(), 'duration': duration}
+    return LoopConfig(change(loop.plant, IDEAL | step | start | plant), config, loop.recorder)
+
+
+def error_of(period):
+    """Errors of computed torque with the true model, and those of e'' + k_d e' + k_p e = 0."""
+    loop = ideal(period, 0.2, REST)
+    gains = {'position': 900.0, 'velocity': 50.0}
+    errors, _ = simulate_baseline(
+        loop, joint_inertia(loop.controller), gains, computed=True, friction=False
+    )
+    A = np.array([[0.0, 1.0], [-900.0, -50.0]])
+    decay = [expm(A * period * k)[0, 0] for k in range(len(errors))]
+    return errors, np.outer(decay, E0)
+
+
+def test_computed_torque_with_the_true_model_has_linear_error_dynamics():
+    """But for the torque being held for a sample: of first order in the sample time."""
+    (coarse, line), (fine, finer_line) = error_of(1e-3), error_of(1e-4)
+    deviations = np.abs(coarse - line).max(), np.abs(fine - finer_line).max()
+    np.testing.assert_allclose(coarse[0], E0, atol=1e-15)
+    assert deviations[0] < 0.02 * np.abs(E0).max()
+    assert deviations[0] / deviations[1] == pytest.approx(10.0, rel=0.1)
+
+
+def test_computed_torque_with_the_true_model_follows_a_motion():
+    """Where the model is true, the reference's acceleration leaves no error."""
+    loop = ideal(1e-3, 2.0)
+    loop = loop._replace(plant=change(loop.plant, {'initial.position': list(HOLD)}))
+    m = joint_inertia(loop.controller)
+    gains = {'position': 900.0, 'velocity': 50.0}
+    errors, torques = simulate_baseline(loop, m, gains, computed=True, friction=False)
+    assert np.abs(errors[1000:]).max() < 5e-5  # half a sample of the reference's jerk, over k_p
+    assert np.ptp(torques, axis=0).max() > 5.0
+
+
+def resting(gains, **plant):
+    start = {'initial.position': list(HOLD)}
+    loop = ideal(1e-3, 3.0, REST, **start | plant)
+    inertia = joint_inertia(loop.controller)
+    return inertia, simulate_baseline(loop, inertia, gains, computed=False, friction=False)
+
+
+def test_gravity_compensation_holds_the_arm_at_rest():
+    _, (errors, torques) = resting({})
+    assert np.abs(errors).max() < 1e-10  # rad, of 1 s^2 of rounding
+    assert np.abs(torques[0]).max() > 10.0
+
+
+def test_a_push_leaves_a_spring_s_error_that_the_integrator_removes():
+    push = np.array([3.0, -2.0, 1.0, 0.3, -0.2, 0.1])  # N m
+    gains = {'position': 900.0, 'velocity': 50.0}
+    inertia, (errors, _) = resting(gains, **{'load.torque': push.tolist()})
+    np.testing.assert_allclose(errors[-1], push / (900.0 * inertia), rtol=1e-2)
+    _, (integrated, _) = resting(gains | {'integral': 5000.0}, **{'load.torque': push.tolist()})
+    assert np.all(np.abs(integrated[-1]) < 1e-3 * np.abs(errors[-1]))
+
+
+def test_friction_that_is_known_is_compensated_along_the_reference():
+    config = load_loop('ur5e').controller
+    ((q, dq, _),) = terms.sampled(reference_of(config), np.zeros(1))
+    start = {'initial.position': q.tolist(), 'initial.velocity': dq.tolist()}  # no approach
+    loop = ideal(1e-3, 0.01, **start)
+    m = joint_inertia(config)
+    (_, with_it), (_, without) = (
+        simulate_baseline(loop, m, {}, computed=False, friction=on) for on in (True, False)
+    )
+    robot, v = config.robot, config.learning.coulomb_velocity
+    friction = robot.viscous * dq + robot.coulomb * np.tanh(dq / v)
+    np.testing.assert_allclose(with_it[0] - without[0], friction, atol=1e-12)
+    assert np.abs(friction).min() > 0.1
+
+
+def test_integrator_of_slotine_li_is_the_gain_of_its_disturbance_estimate():
+    config = load_loop('ur5e').controller
+    chosen = {'law': 'slotine_li', 'comparison.integral_gain': [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]}
+    settings = settings_of_config(change(config, chosen))
+    assert settings.gamma.tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    assert not settings_of_config(change(config, {'law': 'slotine_li'})).gamma.any()
+
+
+def test_every_trial_has_a_truth_a_motion_and_noise_of_its_own():
+    trials = [trial('ur5e', seed) for seed in range(4)]
+    for get in (
+        lambda loop: loop.controller.reference.phase,
+        lambda loop: loop.controller.reference.amplitude,
+        lambda loop: loop.plant.seed,
+        lambda loop: loop.plant.truth.seed,
+    ):
+        assert len({get(each) for each in trials}) == 4
+    assert trials[0].controller.reference == load_loop('ur5e').controller.reference
+    assert len({each.controller.learning.initial_estimate for each in trials}) == 1
+
+
+def test_a_rough_torque_costs_ten_decades_a_decade_and_a_diverged_run_the_most():
+    figures = Figures((1e-3, 1e-2, 1e-1, 1e0), 1.0, ROUGHEST / 2.0, ())
+    assert cost_of(figures) == pytest.approx(1.5)
+    assert cost_of(figures._replace(roughness=10.0 * ROUGHEST)) == pytest.approx(11.5)
+    assert cost_of(figures._replace(errors=(np.nan,) * 4)) == 30.0
+    assert cost_of(figures._replace(errors=(1e300,) * 4)) == 30.0
+
+
+@pytest.fixture(scope='module')
+def page(tmp_path_factory):
+    """The command at its smallest: one arm, one truth, the first population alone."""
+    out = tmp_path_factory.mktemp('arms') / 'page'
+    small = ['--config', 'ur5e', '--truths', '1', '--generations', '0']
+    assert main(['arms', *small, '--out', str(out)]) == 0
+    return out
+
+
+def test_page_has_every_law_and_needs_nothing_beside_it(page):
+    text = (page / 'index.html').read_text(encoding='utf-8')
+    assert not re.search(r'(?:src|href)="(?!data:)', text)
+    for contender in CONTENDERS.values():
+        assert contender.label in text
+    found = json.loads((page / 'figures.json').read_text(encoding='utf-8'))['ur5e']
+    assert list(found) == list(CONTENDERS)
+    for name, contender in CONTENDERS.items():
+        assert list(found[name]['gains']) == [gain.name for gain in contender.gains]
+        assert len(found[name]['runs']) == 1
+        assert len(found[name]['runs'][0]['errors']) == len(INTERVALS)
+    for gain in (gain for contender in CONTENDERS.values() for gain in contender.gains):
+        assert gain.name in text
+
+
+@pytest.mark.parametrize('name', ['proposed_tuned', 'slotine_li_tuned', 'pd_gravity_if'])
+def test_figures_come_again_from_the_gains_of_the_page(page, name):
+    """The same seed, the same figures: of a run in this process, too."""
+    found = json.loads((page / 'figures.json').read_text(encoding='utf-8'))['ur5e'][name]
+    rows = torque_rows(trial('ur5e', 1000).controller)
+    again = run(name, trial('ur5e', 1), found['gains'], rows)
+    assert json.loads(json.dumps(again._asdict())) == found['runs'][0]
+
+
+def test_what_learns_knows_the_arm_better_than_its_urdf(page):
+    found = json.loads((page / 'figures.json').read_text(encoding='utf-8'))['ur5e']
+    before, after = (
+        [found[name]['runs'][0]['model'][k] for name in ('proposed', 'no_learning')] for k in (0, 1)
+    )
+    assert before[0] < before[1] / 2.0
+    assert after[0] < after[1] / 5.0  # the URDF knows nothing of the payload
+
+
+def test_an_arm_without_a_urdf_is_rejected(tmp_path, capsys):
+    assert main(['arms', '--config', 'recommended', '--out', str(tmp_path / 'out')]) == 1
+    assert 'got model two_link' in capsys.readouterr().err
