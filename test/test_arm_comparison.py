@@ -154,7 +154,7 @@ def test_every_trial_has_a_truth_a_motion_and_noise_of_its_own():
 
 
 def test_a_rough_torque_costs_ten_decades_a_decade_and_a_diverged_run_the_most():
-    figures = Figures((1e-3, 1e-2, 1e-1, 1e0), 1.0, ROUGHEST / 2.0, ())
+    figures = Figures((1e-3, 1e-2, 1e-1, 1e0), 200.0, ROUGHEST / 2.0, ())
     assert cost_of(figures) == pytest.approx(1.5)
     assert cost_of(figures._replace(roughness=10.0 * ROUGHEST)) == pytest.approx(11.5)
     assert cost_of(figures._replace(errors=(np.nan,) * 4)) == 30.0

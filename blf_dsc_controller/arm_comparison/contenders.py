@@ -91,7 +91,7 @@ class Figures(NamedTuple):
     """One run: the largest true error of any joint in each of INTERVALS, the torque, the model."""
 
     errors: tuple[float, ...]  # rad
-    largest: float  # rad, of the whole run
+    ratio: float  # largest error of the whole run, of the bound
     roughness: float  # rms change of the torque from sample to sample, of its limit
     model: tuple[float, ...]  # torque error on another motion: before the pick-up, at the end
 
@@ -152,7 +152,8 @@ def run(name: str, loop: LoopConfig, values: Mapping[str, float], unseen: np.nda
         ]
         change = np.diff(torques, axis=0) / loop.controller.torque.limit
         rough = np.sqrt(np.mean(change**2, axis=0)).max()
-    return Figures(tuple(map(float, peaks)), float(np.abs(errors).max()), float(rough), model)
+    ratio = np.abs(errors / loop.controller.barrier.bound).max()
+    return Figures(tuple(map(float, peaks)), float(ratio), float(rough), model)
 
 
 def _simulate_law(

@@ -171,7 +171,7 @@ def label_of(name: str) -> str:
     return f'{CONTENDERS[name.rpartition("_")[0]].label} {label}' if label[0] == '+' else label
 
 
-def table_of(laws: dict[str, Result], bound: float) -> list[list[str | Cell]]:
+def table_of(laws: dict[str, Result]) -> list[list[str | Cell]]:
     """A header, and a row for each contender: median / worst of its runs, the best marked."""
     header = ['law', *(f'{column} [{_unit(k)}]' for k, column in enumerate(_COLUMNS))]
     rows: list[list[str | Cell]] = [[*header, 'bound kept', 'roughness [%]', 'gains']]
@@ -185,7 +185,7 @@ def table_of(laws: dict[str, Result], bound: float) -> list[list[str | Cell]]:
             values = one.columns()[k] if _has(one, k) else np.array([np.nan])
             text = f'{np.median(values):.2f} / {values.max():.2f}' if _has(one, k) else '-'
             row.append(Cell(text, 'good' if values.max() == best[k] else 'number'))
-        kept = sum(figures.largest < bound for figures in one.runs)
+        kept = sum(figures.ratio < 1.0 for figures in one.runs)
         rough = max(figures.roughness for figures in one.runs)
         gains = ', '.join(f'{gain} {value:g}' for gain, value in one.gains.items())
         rows.append([*row, f'{kept} of {len(one.runs)}', f'{100.0 * rough:.1f}', gains or 'rule'])
@@ -209,13 +209,11 @@ def _write(folder: Path, results: Results, truths: int, generations: int) -> Non
         for arm, laws in results.items()
     }
     (folder / 'figures.json').write_text(json.dumps(plain, indent=1) + '\n', encoding='utf-8')
-    bounds = {arm: min(load_loop(arm).controller.barrier.bound) for arm in results}
     write_page(
         folder / 'index.html',
         'arms.html',
         'Arms from a URDF, laws side by side',
-        tables={arm: table_of(laws, bounds[arm]) for arm, laws in results.items()},
-        bounds=bounds,
+        tables={arm: table_of(laws) for arm, laws in results.items()},
         least=least_errors(results),
         truths=truths,
         evaluations=POPULATION * (generations + 1),
