@@ -28,7 +28,6 @@ from blf_dsc_controller.run import Floats
 _SHORTEST = 5.0  # s
 _HELD_BACK = 0.2  # of the rows, at the end
 _STILL = 0.02  # rad/s or m/s
-_RESIDUAL = 1e-4  # least, of a joint's torque: what sampling leaves
 _PASSES = 6
 
 

@@ -53,7 +53,7 @@ class Comparison(NamedTuple):
 
 
 def compare(
-    content: Content, config: ControllerConfig, outputs: Outputs, gappy: Collection[str] = ()
+    content: Content, config: ControllerConfig, outputs: Outputs, gappy: Collection[str]
 ) -> Iterator[Comparison]:
     """Compare each topic of the controller that the bag holds.
 
