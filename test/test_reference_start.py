@@ -16,8 +16,8 @@ from blf_dsc_controller.configuration.reference import Approach, Reference
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError, OutsideBarrierError, VelocityMismatchError
 from blf_dsc_controller.law.factory import begin, controller_of
-from blf_dsc_controller.reference.approach import reference_of
-from blf_dsc_controller.reference.terms import sampled
+from blf_dsc_controller.reference.approach import plan_start, reference_of
+from blf_dsc_controller.reference.terms import sampled, unpack
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -49,6 +49,30 @@ def test_from_anywhere_the_arm_comes_to_the_reference_within_the_bound(start):
     paper = sampled(reference_of(CONFIG), t)[:, 0]
     np.testing.assert_allclose(qr[t >= settled], paper[t >= settled], atol=1e-14)
     assert np.abs(qr[t < settled] - paper[t < settled]).max() > BOUND
+
+
+def test_a_fast_reference_is_approached_by_way_of_its_middle_at_rest():
+    """At 96 % of the velocity limit it leaves too little speed for four radians straight away."""
+    fast = {'amplitude': (0.72, 0.72), 'frequency': (2.0,), 'phase': (0.0,)}
+    config = replace(
+        CONFIG,
+        reference=Reference(**fast),
+        limits=replace(CONFIG.limits, acceleration=(3.0, 3.0)),
+        approach=Approach(longest=15.0),  # s; the straight way takes 19 s
+    )
+    start = np.array(config.reference.offset) + 4.0
+    motion = plan_start(config, np.full(2, BOUND), start, STILL)
+
+    assert len(unpack(motion.vector)) == 3
+    assert motion.settled <= config.approach.longest
+    t = np.linspace(0.0, motion.settled + 5.0, 20_000)
+    q, dq, ddq = sampled(motion.vector, t).transpose(1, 0, 2)
+    np.testing.assert_allclose(q[0], start)
+    assert np.all(np.abs(dq) <= config.limits.velocity)
+    assert np.all(np.abs(ddq) <= config.limits.acceleration)
+    assert np.abs(np.diff(q, axis=0)).max() < 1e-2
+    after = t >= motion.settled
+    np.testing.assert_array_equal(q[after], sampled(reference_of(config), t[after])[:, 0])
 
 
 def test_a_start_inside_the_bound_needs_no_approach():

@@ -48,6 +48,7 @@ def _preset(options: Namespace) -> str:
         options.torque_fraction,
         options.harmonics,
         _clearance(config, options.radius, options.floor),
+        options.speed_fraction,
     )
     parameters = problem.parameters(_search(problem, options.seed, options.starts))
     for name in ('offset', 'amplitude'):
@@ -77,8 +78,8 @@ def _preset(options: Namespace) -> str:
     )
     command = (
         f'blf_dsc excite PRESET.yaml --config {options.config} --torque-fraction '
-        f'{options.torque_fraction:g} --harmonics {options.harmonics} --starts {options.starts} '
-        f'--seed {options.seed}'
+        f'{options.torque_fraction:g} --speed-fraction {options.speed_fraction:g} '
+        f'--harmonics {options.harmonics} --starts {options.starts} --seed {options.seed}'
     )
     if options.guess:
         command += f' --guess {" ".join(f"{value:g}" for value in options.guess)}'

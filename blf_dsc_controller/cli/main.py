@@ -297,6 +297,13 @@ def _excite_options(parser: argparse.ArgumentParser) -> None:
         default=0.8,
         help='fraction of the torque limit to stay below (0.8)',
     )
+    option(
+        '--speed-fraction',
+        type=float,
+        default=0.95,
+        help='fraction of limits.velocity and limits.acceleration to use; the rest is for the '
+        'approach (0.95)',
+    )
     option('--harmonics', type=int, default=3, help='of the window (3)')
     option('--starts', type=int, default=4, help='number of searches; the best result is kept (4)')
     option('--seed', type=int, default=0, help='of the starts (0)')

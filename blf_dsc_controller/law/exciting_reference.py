@@ -62,8 +62,9 @@ class ExcitationProblem:
     """Excitation of a controller as a function of its periodic reference.
 
     The torque is computed with each of the parameters `guess` (p,) or (k, p), and the friction that
-    the controller starts from, and limited to `torque_fraction` of the configured limit;
-    `harmonics` is the highest harmonic of the window in the reference.
+    the controller starts from, and limited to `torque_fraction` of the configured limit, as are
+    velocity and acceleration to `speed_fraction`; `harmonics` is the highest harmonic of the window
+    in the reference.
     """
 
     def __init__(
@@ -73,6 +74,7 @@ class ExcitationProblem:
         torque_fraction: float,
         harmonics: int,
         clearance: Clearance | None = None,
+        speed_fraction: float = 1.0,
     ) -> None:
         settings = self._settings = settings_of_config(config)
         self._vector = pack_settings(settings)
@@ -87,6 +89,7 @@ class ExcitationProblem:
         torque = torque_fraction * settings.torque_limit
         tracked = self._reach - settings.bound
         self._limits = np.array((tracked, limits.velocity, limits.acceleration, torque))
+        self._limits[1:3] *= speed_fraction
         self.n = settings.n
         self.harmonics = harmonics
         self._base = 2.0 * np.pi / config.learning.window

@@ -158,6 +158,20 @@ def check_takeover(
             raise VelocityMismatchError(joint, float(difference), float(limit))
 
 
+def _by_way_of_the_middle(
+    begin: Sequence[Term], target: Term, t: float, config: ControllerConfig
+) -> Motion | None:
+    """Approach to sinusoids that leave little speed for it, by a rest in their middle; or None."""
+    if config.reference.type != 'sinusoids':
+        return None
+    try:
+        rest = blend(begin, hold(np.array(config.reference.offset)), t, config)
+        motion = blend(unpack(rest.vector), target, rest.settled, config)
+    except MotionError:
+        return None
+    return motion if motion.settled <= t + config.approach.longest else None
+
+
 def plan_start(
     config: ControllerConfig, bound: np.ndarray, q: np.ndarray, dq: np.ndarray, t: float = 0.0
 ) -> Motion:
@@ -179,5 +193,12 @@ def plan_start(
         if not config.approach.enabled:
             raise
         (target,) = unpack(vector)
-        return blend([stop(t, q, dq, config)], target, t, config)
+        begin = [stop(t, q, dq, config)]
+        try:
+            return blend(begin, target, t, config)
+        except MotionError:
+            motion = _by_way_of_the_middle(begin, target, t, config)
+            if motion is None:
+                raise
+            return motion
     return Motion(vector, t)
