@@ -51,14 +51,19 @@ class Stop(NamedTuple):
     text: str  # with the figures
 
 
+Regressor = Callable[[Floats, Floats, Floats, Floats, Floats], None]
+"""Fills H (n, p) of (q, dq, v, a), (n,) each: H P = M(q) a + C(q, dq) v + G(q) [N m]."""
+
+
 @dataclass(frozen=True, eq=False)
 class LearnedArm:
     """What gives the estimates of an arm one scale, where they are kg beside kg m^2."""
 
     units: Mapping[str, str]  # of each estimate by name
     deviations: Mapping[str, float]  # standard deviations of their prior, in these units
-    regressor: Callable[[Floats, Floats, Floats, Floats, Floats], None]
-    """Fills H (n, p) of (q, dq, v, a), (n,) each: H P = M(q) a + C(q, dq) v + G(q) [N m]."""
+    regressor: Regressor
+    base: tuple[tuple[str, ...], Regressor] | None = None
+    """Base parameters and their regressor, if others are learned."""
 
 
 @dataclass(frozen=True)

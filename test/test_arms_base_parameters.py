@@ -10,7 +10,7 @@ from random_arm import CONFIG, PANDA, UR5E, random_urdf
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.chain_kernels import ROTOR
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
-from blf_dsc_controller.arms.prior import CENTRE, FORMS, LINKS, prior_factor
+from blf_dsc_controller.arms.prior import CENTRE, prior_factor
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import read_chain
 
@@ -66,7 +66,7 @@ def test_prior_holds_heavier_links_moved_centres_and_the_payload(chain):
     base = base_parameters(chain, WALL)
     n = base.model.n
     rotors = np.full(n, 0.02)
-    L = prior_factor(chain, base, 'base', 3.0, rotors)
+    L = prior_factor(chain, base, 3.0, rotors)
     P = base.of(chain.inertias, rotors)
 
     def distance(inertias, rotors=rotors):
@@ -97,39 +97,10 @@ def test_prior_holds_heavier_links_moved_centres_and_the_payload(chain):
 
 def test_a_prior_without_payload_is_tighter():
     base = base_parameters(UR5E_CHAIN)
-    loaded, empty = (
-        prior_factor(UR5E_CHAIN, base, 'base', load, np.full(6, 0.02)) for load in (5.0, 0.0)
-    )
+    loaded, empty = (prior_factor(UR5E_CHAIN, base, load, np.full(6, 0.02)) for load in (5.0, 0.0))
     for L in (loaded, empty):
         np.testing.assert_array_equal(L, np.tril(L))
         assert (np.diag(L) > 0.0).all()
     assert np.linalg.eigvalsh(loaded @ loaded.T - empty @ empty.T)[0] > -1e-12
     tool = base.model.parameter_names.index('m*cx6')
     assert np.linalg.norm(empty[tool]) == pytest.approx(0.365 * CENTRE)
-
-
-def test_forms_with_fewer_unknowns_hold_what_they_say():
-    """A factor for a link, or a load on the last, is reached by theta, and the rest is not."""
-    n, rotors = 7, np.full(7, 0.02)
-    base = base_parameters(PANDA_CHAIN, WALL)
-    P = base.of(PANDA_CHAIN.inertias, rotors)
-    L = {form: prior_factor(PANDA_CHAIN, base, form, 3.0, rotors) for form in FORMS}
-    assert {form: one.shape[1] for form, one in L.items()} == {
-        'base': base.model.p,
-        'payload': 10 + n,
-        'scale': 2 * n,
-    }
-    scaled, loaded, other = (PANDA_CHAIN.inertias.copy() for _ in range(3))
-    scaled[3] *= 1.0 + LINKS
-    np.testing.assert_allclose(P + L['scale'][:, 3], base.of(scaled, rotors))
-    loaded[-1] += inertia_of(np.diag((1e-3, 2e-3, 3e-3, 1.5)))
-    other[2] += loaded[-1] - other[-1]
-    for inertias, within in ((loaded, True), (other, False)):
-        off = base.of(inertias, rotors) - P
-        theta = np.linalg.lstsq(L['payload'], off, rcond=None)[0]
-        assert np.allclose(L['payload'] @ theta, off, atol=1e-9) is within
-    heavy = rotors.copy()
-    heavy[-1] *= 2.0
-    for form in ('payload', 'scale'):
-        expected = base.of(PANDA_CHAIN.inertias, heavy)
-        np.testing.assert_allclose(P + L[form][:, -1], expected, atol=1e-12)

@@ -9,7 +9,7 @@ from random_arm import CONFIG, random_urdf
 
 from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.configuration.robot import learned_of
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import (
@@ -60,6 +60,8 @@ def test_text_of_a_urdf_is_as_good_as_its_file():
         ({'robot.tip': ''}, 'robot.urdf: neither a tip .* not one chain: .*panda_finger_joint1'),
         ({'joints': ['a', 'b']}, "robot.urdf: no joint 'a' in the URDF"),
         ({'robot.urdf': 'package://no_such/arm.urdf'}, "package 'no_such' was not found"),
+        ({'robot.rotor_inertia': [0.1]}, 'robot.rotor_inertia: got 1 entry for 7 joints'),
+        ({'robot.lag': 'short'}, "robot.lag: got 'short', but a double is expected"),
         ({'barrier.bound': [0.01] * 2}, 'barrier.bound: got 2 entries, but 7 are needed'),
         (
             {'learning.initial_estimate': [1.0] * 3, 'learning.adaptation_gain': [0.5] * 3},
@@ -91,13 +93,13 @@ def test_gravity_is_compensated_with_the_initial_estimate():
     law = controller_of(config)
     q = np.array(config.reference.offset)
     chain = config.robot.chain(config.joints)
-    base = parameters_of(config.robot, chain)
+    base = learned_of(config.robot, chain)
     H = np.zeros((7, base.model.p))
     base.model.regressor(q, np.zeros(7), np.zeros(7), np.zeros(7), H)
 
     torque = law.update(0.0, 1e-3, np.concatenate((q, np.zeros(14))))
 
-    gravity = H @ base.of(chain.inertias, config.robot.rotors(chain))
+    gravity = H @ base.initial
     assert np.abs(gravity).max() > 5.0
     np.testing.assert_allclose(torque, gravity, atol=0.02)  # P^(0) has four digits
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ from blf_dsc_controller.messages.topics import (
     POSITION,
     VELOCITY,
 )
-from blf_dsc_controller.run import Floats, LearnedArm, Run
+from blf_dsc_controller.run import Floats, Regressor, Run
 
 MOMENTS = (5, 10, 20, 40, 60)
 """Times at which the parameter error is reported [s]."""
@@ -44,40 +44,58 @@ class Estimates:
     true: Floats | None  # (m, p); None if unknown, or if the plant's parameters have other names
     unlike: tuple[str, ...] = ()  # those names
     torques: Floats | None = None  # (k, p) rows of H along the reference, for an arm of a URDF
+    base: tuple[Floats, Floats] | None = None  # true P (m, q) and its rows (k, q) of H
 
     @property
     def relative_error(self) -> Floats | None:
         """|P^ - P| / |P|, (m,); of the torques H P^ and H P, where P has no unit of its own."""
-        if self.true is None:
+        if self.base is not None and self.torques is not None:
+            true, rows = self.base
+            R: Any = np.linalg.qr(np.hstack((self.torques, rows)), 'r')
+            off, size = np.hstack((self.estimate, -true)) @ R.T, true @ R[:, len(self.names) :].T
+        elif self.true is not None:
+            off, size = self.estimate - self.true, self.true
+        else:
             return None
-        R: Any = np.eye(len(self.names))
-        if self.torques is not None:
-            R = np.linalg.qr(self.torques, 'r')
-        error = np.linalg.norm((self.estimate - self.true) @ R.T, axis=1)
         with np.errstate(invalid='ignore'):  # no motion, no torques: unknown
-            return np.asarray(error / np.linalg.norm(self.true @ R.T, axis=1))
+            return np.asarray(np.linalg.norm(off, axis=1) / np.linalg.norm(size, axis=1))
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the truth is known to compare with."""
+        return self.true is not None or self.base is not None
 
 
 def estimates_of(run: Run) -> Estimates | None:
     """Estimates of the model parameters, None if nothing was learned.
 
-    They are compared with the truth by name, and only if the plant has the same parameters.
+    They are compared with the truth by name, and only if the plant has the same parameters; or, of
+    an arm of a URDF, by their torques.
     """
     if run.learning is None:
         return None
     names, at = _parameters(run.learning.names), run.time_of(run.learning.stamp)
-    estimate, truth = run.learning.select(names), run.truth
-    is_known = run.arm is not None and _parameters(run.arm.units) == names
-    torques = _torques(run, run.arm, len(names)) if run.arm and is_known else None
+    estimate, truth, arm = run.learning.select(names), run.truth, run.arm
+    is_known = arm is not None and _parameters(arm.units) == names
+    torques = _torques(run, arm.regressor, len(names)) if arm and is_known else None
     theirs = () if truth is None else _parameters(truth.names)
-    if truth is None or set(names) != set(theirs):
-        return Estimates(names, at, estimate, None, theirs, torques)
-    columns = [truth.names.index(name) for name in names]
-    true = truth.held(run.learning.stamp)[:, columns]
-    return Estimates(names, at, estimate, true, (), torques)
+
+    def true_of(names: Sequence[str]) -> Floats | None:
+        if truth is None or run.learning is None or set(names) != set(theirs):
+            return None
+        return truth.held(run.learning.stamp)[:, [truth.names.index(name) for name in names]]
+
+    true, base = true_of(names), None
+    if true is not None and torques is not None:
+        base = true, torques
+    elif arm and arm.base and torques is not None:
+        P = true_of(arm.base[0])
+        base = None if P is None else (P, _torques(run, arm.base[1], len(arm.base[0])))
+    unlike = theirs if true is None and base is None else ()
+    return Estimates(names, at, estimate, true, unlike, torques, base)
 
 
-def _torques(run: Run, arm: LearnedArm, p: int) -> Floats:
+def _torques(run: Run, regressor: Regressor, p: int) -> Floats:
     """Rows of H(q, dq, dq, ddq) (k n, p) along the reference, or the motion without one.
 
     Differences of three samples are the derivatives.
@@ -92,7 +110,7 @@ def _torques(run: Run, arm: LearnedArm, p: int) -> Floats:
     ddq = 2.0 * (forward - backward) / (after + before)
     H = np.zeros((rows.size, len(run.joints), p))
     for k in range(rows.size):
-        arm.regressor(q[rows[k]], dq[k], dq[k], ddq[k], H[k])
+        regressor(q[rows[k]], dq[k], dq[k], ddq[k], H[k])
     return H.reshape(-1, p)
 
 

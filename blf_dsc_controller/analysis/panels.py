@@ -155,7 +155,8 @@ def _learning(run: Run) -> Iterator[Panel]:
         return
     error = _relative_error(estimates)
     if run.arm is not None:
-        yield from (*error, *_of_links(run, run.arm, estimates))
+        of_inertias = _by_kind if run.arm.base else _of_links
+        yield from (*error, *of_inertias(run, run.arm, estimates), *_frictions(run, run.arm))
     else:
         for j, name in enumerate(estimates.names):
             lines = [Line('estimate', estimates.time, estimates.estimate[:, j])]
@@ -184,7 +185,7 @@ def _relative_error(estimates: Estimates) -> Iterator[Panel]:
 
 
 def _of_links(run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel]:
-    """Errors of the parameters of each link in deviations of the prior, and frictions."""
+    """Errors of the parameters of each link in deviations of the prior."""
     origin, what = estimates.true, 'errors'
     if origin is None:
         origin, what = estimates.estimate[:1], 'changes'
@@ -196,6 +197,23 @@ def _of_links(run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel
             if re.fullmatch(rf'.*\D{i}', name)
         )
         yield Panel('Parameters', f'{what} of link {i}, {joint}', 'prior deviations', lines)
+
+
+def _by_kind(_run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel]:
+    """Few parameters as they are: those of one kind and unit together."""
+    kinds: dict[str, list[int]] = {}
+    for j, name in enumerate(estimates.names):
+        kind = re.sub(r'\d+$', '', name.split(' ')[0])
+        kinds.setdefault(f'{kind} [{arm.units[name]}]'.removesuffix(' []'), []).append(j)
+    for title, members in kinds.items():
+        lines = (
+            Line(estimates.names[j], estimates.time, estimates.estimate[:, j]) for j in members
+        )
+        unit = arm.units[estimates.names[members[0]]]
+        yield Panel('Parameters', title, unit or '1', tuple(lines))
+
+
+def _frictions(run: Run, arm: LearnedArm) -> Iterator[Panel]:
     for kind in ('viscous', 'coulomb'):
         names = [name for name in arm.units if name.startswith(f'{kind} ')]
         lines = tuple(

@@ -89,7 +89,6 @@ def plain(value: Any) -> Any:
 
 def _learning(run: Run, estimates: Estimates, metrics: Metrics) -> Summary:
     reached = {t: error for t, error in metrics.parameter_error.items() if not math.isnan(error)}
-    is_known = estimates.true is not None
     relative, torque = _MEASURED
     measured = relative if estimates.torques is None else torque
     learning: Summary = plain(
@@ -97,7 +96,7 @@ def _learning(run: Run, estimates: Estimates, metrics: Metrics) -> Summary:
             'used': run.learns,
             'latch_time_s': metrics.latch_time,
             'model_changes_s': change_times(run),
-            f'{measured}_at_s': reached if is_known else None,
+            f'{measured}_at_s': reached if estimates.is_known else None,
             f'final_{measured}': metrics.final_parameter_error,
             'time_to_1_percent_s': metrics.time_to_1_percent,
             'final_estimate': _named(estimates, estimates.estimate),

@@ -46,13 +46,8 @@ def base_parameters(
 ) -> BaseParameters:
     """Base parameters of a chain; gravity [m/s^2] in its base, rotor inertias if wanted."""
     full = serial_chain(chain, gravity)
-    Y = _stacked_regressor(full)
     order = np.array([k for k in range(full.p) if rotors or k % (ROTOR + 1) != ROTOR])
-    pivots = np.abs(np.diag(np.linalg.qr(Y[:, order], mode='r')))
-    kept = order[pivots > _DEPENDENT]
-    # Rounded, so that every machine's linear algebra gives the same.
-    K: np.ndarray = np.linalg.lstsq(Y[:, kept], Y, rcond=None)[0].round(12)
-    K[np.abs(K) < _DEPENDENT] = 0.0
+    kept, K = independent(stacked_regressor(full), order)
     if not rotors:
         K[:, ROTOR :: ROTOR + 1] = 0.0
     columns = [(int(k) // (ROTOR + 1), int(k) % (ROTOR + 1)) for k in kept]
@@ -60,7 +55,17 @@ def base_parameters(
     return BaseParameters(serial_chain(chain, gravity, columns), K, sums)
 
 
-def _stacked_regressor(full: SerialChain) -> np.ndarray:
+def independent(Y: np.ndarray, order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns (p,) of Y that are independent, tried in this order, and K of Y = Y[:, columns] K."""
+    pivots = np.abs(np.diag(np.linalg.qr(Y[:, order], mode='r')))
+    kept = order[pivots > _DEPENDENT]
+    # Rounded, so that every machine's linear algebra gives the same.
+    K: np.ndarray = np.linalg.lstsq(Y[:, kept], Y, rcond=None)[0].round(12)
+    K[np.abs(K) < _DEPENDENT] = 0.0
+    return kept, K
+
+
+def stacked_regressor(full: SerialChain) -> np.ndarray:
     """Rows of H at random motions, twice as many as columns."""
     random = np.random.default_rng(0)
     blocks = np.zeros((2 * (ROTOR + 1), full.n, full.p))

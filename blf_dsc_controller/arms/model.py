@@ -13,6 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
+from blf_dsc_controller.arms.combined_chain import CombinedChain
 from blf_dsc_controller.arms.planar_chain import PlanarChain
 from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.arms.two_link import TwoLink
@@ -67,5 +68,7 @@ def arm_model(name: str, n: int, l1: float, gravity: float) -> ArmModel:
 
 
 compile_methods(
-    ArmModel, ('regressor', 'momentum_regressor', 'regressors'), TwoLink, PlanarChain, SerialChain
+    ArmModel,
+    ('regressor', 'momentum_regressor', 'regressors'),
+    *(TwoLink, PlanarChain, SerialChain, CombinedChain),
 )

@@ -23,39 +23,36 @@ CENTRE = 0.01
 PAYLOAD_SIZE = 0.05
 """Extent of a payload, and standard deviation of its centre of mass from the tip [m]."""
 
-FORMS = ('base', 'payload', 'scale')
-"""What is learned: all base parameters, the load on the last body, or one factor for each body."""
+ROTORS = 0.5
+"""Standard deviation of the inertia of a drive, of its value."""
 
 
 def prior_factor(
-    chain: Chain, parameters: BaseParameters, form: str, payload: float, rotors: np.ndarray
+    chain: Chain, parameters: BaseParameters, payload: float, rotors: np.ndarray
 ) -> np.ndarray:
-    """Factor L (p, r) of P = P0 + L theta, where theta (r,) has mean zero and covariance one.
+    """Lower triangular L (p, p) of P = P0 + L theta; theta (p,) has mean zero and covariance one.
 
     P0 are the base parameters of the URDF, `payload` is what the arm is rated for [kg], and
     `rotors` (n,) are the standard deviations of the rotor inertias [kg m^2, or kg], which no URDF
-    tells.  Of the form `base`, L is lower triangular and r = p; of `payload`, r = 10 + n; of
-    `scale`, r = 2 n, rotors last.
+    tells.
     """
     n = len(chain.joints)
     blocks: list[tuple[int, np.ndarray]] = []  # of a body, directions (11, k) of its entries
     for i, joint in enumerate(chain.joints):
-        if form == 'base':
-            J = pseudo_inertia(joint.inertia)
-            blocks.append((i, _of_ten(deviations(J, LINKS, CENTRE))))
-        elif form == 'scale':
-            blocks.append((i, _of_ten(LINKS * joint.inertia[:, None])))
-    if form != 'scale':
-        load = payload * np.diag((*(PAYLOAD_SIZE**2,) * 3, 1.0))
-        J = chain.tip_placement @ load @ chain.tip_placement.T
-        blocks.append((n - 1, _of_ten(deviations(J, 1.0, PAYLOAD_SIZE))))
+        J = pseudo_inertia(joint.inertia)
+        blocks.append((i, _of_ten(deviations(J, LINKS, CENTRE))))
+    J = chain.tip_placement @ payload_inertia(payload) @ chain.tip_placement.T
+    blocks.append((n - 1, _of_ten(deviations(J, 1.0, PAYLOAD_SIZE))))
     blocks += [(i, rotors[i] * np.eye(ROTOR + 1)[:, ROTOR:]) for i in range(n)]
     K = parameters.K.reshape(-1, n, ROTOR + 1)
     L = np.column_stack([K[:, i] @ block for i, block in blocks])
-    if form == 'base':  # Cholesky's factor of L L^T, without squaring the rounding
-        R = np.linalg.qr(L.T, mode='r')
-        return np.transpose(R * np.copysign(1.0, np.diag(R))[:, None])
-    return L
+    R = np.linalg.qr(L.T, mode='r')  # Cholesky's factor of L L^T, without squaring the rounding
+    return np.transpose(R * np.copysign(1.0, np.diag(R))[:, None])
+
+
+def payload_inertia(payload: float) -> np.ndarray:
+    """Pseudo-inertia (4, 4) of a payload [kg] about its centre."""
+    return payload * np.diag((*(PAYLOAD_SIZE**2,) * 3, 1.0))
 
 
 def _of_ten(directions: np.ndarray) -> np.ndarray:

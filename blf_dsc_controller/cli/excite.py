@@ -14,11 +14,10 @@ from argparse import Namespace
 import numpy as np
 from tqdm import tqdm
 
-from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.params_file import format_value, load, locate
-from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.configuration.robot import learned_of, parameters_of
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law import exciting_reference
 from blf_dsc_controller.law.factory import estimate_names
@@ -114,10 +113,7 @@ def _guess(config: ControllerConfig, given: list[float] | None) -> np.ndarray:
     if given or config.model != 'urdf':
         return np.atleast_2d(given or start)
     robot, chain = config.robot, config.robot.chain(config.joints)
-    base, tip = parameters_of(robot, chain), chain.tip_placement[:, 3]
-    loaded = np.zeros_like(chain.inertias)
-    loaded[-1] = inertia_of(robot.payload * np.outer(tip, tip))
-    return np.array((start, start + base.of(loaded, np.zeros(len(chain.joints)))))
+    return np.array((start, start + robot.payload * learned_of(robot, chain).load))
 
 
 def _clearance(config: ControllerConfig, radius: float, floor: float) -> Clearance | None:
@@ -143,7 +139,7 @@ def _unshown(config: ControllerConfig, remaining: np.ndarray) -> list[str]:
     if not order:
         return ['It shows all parameters.']
     names = list(estimate_names(config))
-    if config.model == 'urdf':
+    if config.model == 'urdf' and config.robot.learn == 'base':
         sums = parameters_of(config.robot, config.robot.chain(config.joints)).combinations
         names[: len(sums)] = sums
     lines = ['It hardly shows the following; of the deviation of the prior a window leaves']

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from blf_dsc_controller.configuration.robot import given_robot, parameters_of
+from blf_dsc_controller.configuration.robot import given_robot, learned_of, parameters_of
 
 if TYPE_CHECKING:
     from blf_dsc_controller.arms.base_parameters import BaseParameters
@@ -28,8 +28,10 @@ _SAG = 1.5  # standard deviations of gravity over m omega_v^2; measured: at most
 _PHASE = 0.5  # rad that the damping loop loses to the delay
 _BOUND = 0.002  # rad
 _UNMODELLED = 0.01  # of the rated torque, rms: ripple, noise, Stribeck
-_WINDOW = 5.0  # s
-_PRIOR = 0.01  # one over the independent rows in a window
+_WINDOW = {'base': 5.0, 'payload': 2.0, 'scale': 5.0}  # s
+# One over the independent rows in a window; more where few unknowns cannot explain them all.
+_PRIOR = {'base': 0.01, 'payload': 0.1, 'scale': 0.1}
+_REGULARISATION = {'base': 1e-5, 'payload': 1e-9, 'scale': 1e-9}  # to 0, where P is about 1
 _ANCHOR = 5.0  # of the mean square of the unmodelled torque
 _POSTURES = 20
 _FREE = 2.0 * math.pi  # rad, limit of a joint without one
@@ -48,12 +50,12 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
     lower = _finite([joint.lower for joint in chain.joints], -_FREE)
     upper = _finite([joint.upper for joint in chain.joints], _FREE)
     parameters = parameters_of(robot, chain)
-    P0 = parameters.of(chain.inertias, robot.rotors(chain))
+    P = parameters.of(chain.inertias, robot.rotors(chain))
+    P0 = learned_of(robot, chain).initial
     period = given.get('sample_time', 0.001)
     rate = _PHASE / (1.5 * period + robot.lag) if isinstance(period, float) else 0.0
-    payload = robot.payload if isinstance(robot.payload, float) else 0.0
     limits = tuple(lower), tuple(upper)
-    m, gravity = over_postures(chain, parameters, payload, tuple(P0), *limits)
+    m, gravity = over_postures(chain, parameters, robot.payload, tuple(P), *limits)
     sag = _SAG * gravity / (m * rate**2) if rate else np.zeros(n)
     floor = _UNMODELLED * effort
     zeros = (0.0,) * n
@@ -81,14 +83,15 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
         'limits.acceleration': _listed(4.0 * _SLOW * velocity),
         'learning.initial_estimate': _listed(P0),
         'learning.adaptation_gain': (0.5,) * P0.size,
-        'learning.radius': 10.0 * float(np.linalg.norm(P0)),
-        'learning.window': _WINDOW,
+        'learning.radius': 10.0 * max(float(np.linalg.norm(P0)), robot.payload),
+        'learning.window': _WINDOW[robot.learn],
+        'learning.regularization': _REGULARISATION[robot.learn],
         'learning.settling_time': 0.3,
         'learning.filter_pole': 20.0,
         'learning.row_interval': 10,
         'learning.interval': 50,
         'learning.excitation_threshold': 1e-9,
-        'learning.prior_weight': _PRIOR,
+        'learning.prior_weight': _PRIOR[robot.learn],
         'learning.anchor_weight': _ANCHOR * float(floor.min()) ** 2,
         'learning.motion_scale': 0.05,
         'learning.residual_floor': _listed(floor),
@@ -127,7 +130,7 @@ def over_postures(
 
     model = parameters.model
     n = model.n
-    L = prior_factor(chain, parameters, 'base', payload, np.zeros(n))
+    L = prior_factor(chain, parameters, payload, np.zeros(n))
     random = np.random.default_rng(0)
     Yp, Yr, M = np.zeros((n, len(P))), np.zeros((n, len(P))), np.zeros((n, n))
     least, deviation = np.full(n, np.inf), np.zeros(n)

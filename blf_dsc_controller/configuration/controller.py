@@ -27,7 +27,7 @@ from blf_dsc_controller.configuration.gains import (
 )
 from blf_dsc_controller.configuration.learning import Learning
 from blf_dsc_controller.configuration.reference import Approach, MotionLimits, Reference
-from blf_dsc_controller.configuration.robot import Robot, parameters_of
+from blf_dsc_controller.configuration.robot import Robot, learned_of
 from blf_dsc_controller.configuration.schema import Value, non_negative, parameter, positive
 
 _size = partial(parameter, read_only='it sets the size of the state of the law')
@@ -166,7 +166,9 @@ class ControllerConfig(Sampled):
         needed = MODELS[self.model]
         count = parameter_count(needed or len(self.joints))
         if self.model == 'urdf':
-            count = parameters_of(self.robot, self.robot.chain(self.joints)).model.p
+            count = learned_of(self.robot, self.robot.chain(self.joints)).model.p
+        elif self.robot.learn != 'base':
+            return [f'robot.learn: got {self.robot.learn}, but model {self.model} learns base only']
         return [
             *joint_problems(self.joints, f'model {self.model}', needed),
             *self.sample_time_problems(),

@@ -9,17 +9,18 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
 from blf_dsc_controller.arms.urdf import Chain, UrdfError, chain_joints, moving_joints, read_chain
-from blf_dsc_controller.configuration.schema import parameter
+from blf_dsc_controller.configuration.schema import build, counted, parameter
 from blf_dsc_controller.configuration.share import resolve
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 
 if TYPE_CHECKING:
     from blf_dsc_controller.arms.base_parameters import BaseParameters
+    from blf_dsc_controller.arms.forms import LearnedParameters
 
 _fixed = partial(parameter, read_only='the arm is built once, when the node starts')
 
@@ -53,6 +54,9 @@ class Robot:
         at_least=0.0,
     )
     payload: float = _fixed(3.0, 'mass that the arm is rated to carry', 'kg', at_least=0.0)
+    learn: Literal['base', 'payload', 'scale'] = _fixed(
+        'base', 'what is learned: all that torques show, the load at the tip, or a factor a link'
+    )
     rotor_inertia: Annotated[tuple[float, ...], 'joints'] = _fixed(
         (),
         'inertia of each drive, reflected to its joint; empty: from its effort',
@@ -75,6 +79,12 @@ class Robot:
         at_least=0.0,
         omittable=True,
     )
+
+    def problems(self) -> list[str]:
+        """Check that there may be something to be learned."""
+        if self.learn == 'payload' and self.payload == 0.0:
+            return ['payload: got 0 kg, but learn: payload needs the mass that it may have']
+        return []
 
     @property
     def text(self) -> str:
@@ -150,16 +160,38 @@ def _parameters_of(chain: Chain, gravity: tuple[float, float, float]) -> BasePar
     return base_parameters(chain, gravity)
 
 
-def given_robot(given: Mapping[str, Any], joints: object) -> tuple[Robot, Chain]:
-    """Robot and chain of parameters by dotted name, which are not validated yet.
+def learned_of(robot: Robot, chain: Chain) -> LearnedParameters:
+    """Parameters of the arm that are learned, with the rotors."""
+    base, rotors = parameters_of(robot, chain), tuple(robot.rotors(chain).tolist())
+    return _learned_of(chain, base, robot.learn, robot.payload, rotors)
 
-    Raises ConfigurationError with what is wrong with the URDF.
+
+@functools.lru_cache(maxsize=16)
+def _learned_of(
+    chain: Chain, base: BaseParameters, form: str, payload: float, rotors: tuple[float, ...]
+) -> LearnedParameters:
+    from blf_dsc_controller.arms.forms import learned_parameters  # compiles
+
+    return learned_parameters(chain, base, form, payload, np.array(rotors))
+
+
+def given_robot(given: Mapping[str, Any], joints: object) -> tuple[Robot, Chain]:
+    """Robot and chain of parameters by dotted name, of which only the robot's are validated.
+
+    Raises ConfigurationError with what is wrong with them or with the URDF.
     """
-    names = ('urdf', 'base', 'tip', 'gravity', 'lag', 'payload', 'rotor_inertia')
-    values = {name: given[f'robot.{name}'] for name in names if f'robot.{name}' in given}
-    robot = Robot(**values)
+    values = {name: given[f'robot.{name}'] for name in vars(Robot()) if f'robot.{name}' in given}
+    try:
+        robot = build(Robot, values)
+    except ConfigurationError as error:
+        raise ConfigurationError([f'robot.{problem}' for problem in error.problems]) from error
     wanted = tuple(joints) if isinstance(joints, (list, tuple)) else ()
     try:
-        return robot, robot.chain(wanted)
+        chain = robot.chain(wanted)
     except BlfDscError as error:
         raise ConfigurationError([f'robot.urdf: {error}']) from error
+    rotors, n = len(robot.rotor_inertia), len(chain.joints)
+    if rotors not in (0, n):
+        entries = counted(rotors, 'entry', 'entries')
+        raise ConfigurationError([f'robot.rotor_inertia: got {entries} for {n} joints'])
+    return robot, chain

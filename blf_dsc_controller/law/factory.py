@@ -12,14 +12,14 @@ All laws share one kernel; they differ in the surface and in which gains are zer
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel, arm_model
-from blf_dsc_controller.arms.prior import prior_factor
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.configuration.robot import learned_of
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import (
@@ -32,7 +32,6 @@ from blf_dsc_controller.law.settings import (
 )
 from blf_dsc_controller.reference.approach import plan_start, reference_of
 
-_ROTORS = 0.5  # deviation of a drive's inertia, of its value
 _FRICTION = 0.05  # deviation of friction, of the rated torque
 
 
@@ -40,8 +39,7 @@ def model_of(config: ControllerConfig) -> ArmModel:
     """Model named by `model`, with the geometry known to the controller."""
     if config.model == 'urdf':
         robot = config.robot
-        model = parameters_of(robot, robot.chain(config.joints)).model
-        return model._replace(vector=model.vector.copy())  # its working memory
+        return deepcopy(learned_of(robot, robot.chain(config.joints)).model)  # working memory
     return arm_model(config.model, len(config.joints), config.arm.l1, config.arm.gravity)
 
 
@@ -77,10 +75,7 @@ def prior_covariance(config: ControllerConfig) -> np.ndarray:
     columns = column_names(config)
     if config.model != 'urdf':
         return np.eye(len(model_of(config).parameter_names) + len(columns))
-    robot, chain = config.robot, config.robot.chain(config.joints)
-    L = prior_factor(
-        chain, parameters_of(robot, chain), 'base', robot.payload, _ROTORS * robot.rotors(chain)
-    )
+    L = learned_of(config.robot, config.robot.chain(config.joints)).L
     covariance = np.zeros((len(L) + len(columns),) * 2)
     covariance[: len(L), : len(L)] = L @ L.T
     limits = zip(config.torque.limit, config.limits.velocity, strict=True)

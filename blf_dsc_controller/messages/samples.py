@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -36,10 +38,15 @@ def learned_arm(config: ControllerConfig) -> LearnedArm | None:
     model, names = model_of(config), estimate_names(config)
     friction = ('N m s/rad' if 'viscous' in name else 'N m' for name in column_names(config))
     deviations = np.sqrt(np.diag(prior_covariance(config))).tolist()
+    base = None
+    if config.robot.learn != 'base':
+        all_shown = model_of(replace(config, robot=replace(config.robot, learn='base')))
+        base = all_shown.parameter_names, all_shown.regressor
     return LearnedArm(
         dict(zip(names, (*model.parameter_units, *friction), strict=True)),
         dict(zip(names, deviations, strict=True)),
         model.regressor,
+        base,
     )
 
 

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is learned of a chain: all that torques show, the load, or one factor for each body.
+
+Of the forms `payload` and `scale` the inertias of all bodies are phi = D c, with rotor inertias in
+c first, and then
+
+    payload   the ten of a load in the frame of the tip, 0 by the URDF, and one factor of all bodies
+    scale     a factor for each body, 1 by the URDF
+
+As few as are independent are learned, P = K c, and the others count with them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from blf_dsc_controller.arms.base_parameters import (
+    BaseParameters,
+    independent,
+    stacked_regressor,
+)
+from blf_dsc_controller.arms.chain_kernels import ROTOR, bodies_of
+from blf_dsc_controller.arms.combined_chain import CombinedChain, combined_chain
+from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
+from blf_dsc_controller.arms.prior import (
+    LINKS,
+    PAYLOAD_SIZE,
+    ROTORS,
+    deviations,
+    payload_inertia,
+    prior_factor,
+)
+from blf_dsc_controller.arms.serial_chain import SerialChain, serial_chain
+from blf_dsc_controller.arms.urdf import Chain
+
+TRUSTED = 0.001
+"""Standard deviation of the factor of all bodies where only the load is unknown: next to none."""
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedParameters:
+    """The parameters P of a model.
+
+    Attributes:
+        initial: (p,) P of the URDF.
+        L: (p, r) of P = initial + L theta, where theta has mean zero and covariance one.
+        load: (p,) that 1 kg at the tip adds to P, of `scale` nearly.
+    """
+
+    model: SerialChain | CombinedChain
+    initial: np.ndarray
+    L: np.ndarray
+    load: np.ndarray
+
+
+def learned_parameters(
+    chain: Chain, base: BaseParameters, form: str, payload: float, rotors: np.ndarray
+) -> LearnedParameters:
+    """Parameters of a form; rated payload [kg], rotors (n,) [kg m^2, or kg]."""
+    n, tip = len(chain.joints), chain.tip_placement
+    phi = np.column_stack((chain.inertias, np.zeros(n)))
+    ten = np.array([inertia_of(tip @ pseudo_inertia(one) @ tip.T) for one in np.eye(ROTOR)])
+    if form == 'base':
+        L = prior_factor(chain, base, payload, ROTORS * rotors)
+        loaded = np.zeros_like(chain.inertias)
+        loaded[-1] = ten[0]
+        load = base.of(loaded, np.zeros(n))
+        return LearnedParameters(base.model, base.of(chain.inertias, rotors), L, load)
+    unit = np.eye(phi.size).reshape(n, ROTOR + 1, -1)
+    if form == 'payload':
+        D = np.vstack((ten @ unit[-1, :ROTOR], phi.ravel()))
+        start, spread = np.append(np.zeros(ROTOR), 1.0), np.full(ROTOR + 1, TRUSTED)
+        load = np.eye(n + ROTOR + 1)[n]
+    else:
+        D = np.einsum('ie,iek->ik', phi, unit)
+        start, spread = np.ones(n), np.full(n, LINKS)
+        spread[-1] = np.hypot(LINKS, payload / phi[-1, 0])
+        load = np.eye(2 * n)[-1] / phi[-1, 0]
+    D = np.vstack((unit[:, ROTOR], D))
+    L = np.diag(np.append(ROTORS * rotors, spread))
+    if form == 'payload':
+        L[n:-1, n:-1] = deviations(payload_inertia(payload), 1.0, PAYLOAD_SIZE)
+    size = np.linalg.norm(D, axis=1)
+    whole = serial_chain(chain, tuple(bodies_of(base.model.vector).gravity))
+    kept, K = independent(stacked_regressor(whole) @ (D.T / size), np.arange(size.size))
+    K *= size / size[kept, None]
+    model = combined_chain(whole, int(form == 'payload'), kept, D[kept])
+    return LearnedParameters(model, K @ np.append(rotors, start), K @ L, K @ load)
