@@ -19,7 +19,14 @@ from blf_dsc_controller.arm_comparison.contenders import (
     run,
     torque_rows,
 )
-from blf_dsc_controller.arm_comparison.study import ROUGHEST, cost_of, trial
+from blf_dsc_controller.arm_comparison.study import (
+    ROUGHEST,
+    Result,
+    cost_of,
+    least_errors,
+    table_of,
+    trial,
+)
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.params_file import load_loop
@@ -159,6 +166,30 @@ def test_a_rough_torque_costs_ten_decades_a_decade_and_a_diverged_run_the_most()
     assert cost_of(figures._replace(roughness=10.0 * ROUGHEST)) == pytest.approx(11.5)
     assert cost_of(figures._replace(errors=(np.nan,) * 4)) == 30.0
     assert cost_of(figures._replace(errors=(1e300,) * 4)) == 30.0
+
+
+def made(pick_up, model=()):
+    """Two runs with 1 and 2 mrad but at the pick-up, of which the second leaves the bound."""
+    one = Figures((1e-3, 1e-3, pick_up, 1e-3), 0.9, 0.01, model)
+    return Result({}, None, [one, one._replace(errors=(2e-3, 2e-3, pick_up, 2e-3), ratio=1.0)])
+
+
+def test_best_is_the_law_whose_worst_run_is_the_least_whoever_it_is():
+    laws = {
+        'proposed': made(3e-3, (0.02, 0.01)),
+        'proposed_tuned': made(2.5e-3, (0.03, 0.04)),
+        'pd_gravity_i': made(1.5e-3),
+    }
+    rows = {row[1]: row[2:] for row in least_errors({'arm': laws})}
+    assert rows['pick-up [mrad]'] == ['PD + gravity + integrator', '1.5', '3', '2.5']
+    assert rows['at the end [%]'] == ['proposed, gains by the URDF', '1', '1', '4']
+    header, _, tuned, baseline = table_of(laws)
+    column = header.index('pick-up [mrad]')
+    assert tuned[column] == ('2.50 / 2.50', 'number', '')
+    assert baseline[column] == ('1.50 / 1.50', 'good', '')
+    assert baseline[1][0] == '1.50 / 2.00'
+    assert baseline[header.index('at the end [%]')] == '-'
+    assert baseline[header.index('bound kept')] == '1 of 2'
 
 
 @pytest.fixture(scope='module')

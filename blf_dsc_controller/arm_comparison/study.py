@@ -46,10 +46,11 @@ class Result(NamedTuple):
     cost: float | None
     runs: list[Figures]
 
-    def columns(self) -> list[Floats]:
-        """Of each of _COLUMNS the values of all runs, in mrad or %; empty if there is no model."""
-        errors = 1e3 * np.array([one.errors for one in self.runs]).T
-        return [*errors, *(100.0 * np.array([one.model for one in self.runs]).T)]
+    def columns(self) -> Floats:
+        """Of each of _COLUMNS the values of all runs, in mrad or %; NaN if there is no model."""
+        rows = [(*one.errors, *(one.model or (np.nan, np.nan))) for one in self.runs]
+        units = np.where(np.arange(len(_COLUMNS)) < len(INTERVALS), 1e3, 1e2)
+        return np.asarray((np.array(rows) * units).T)
 
 
 Results = dict[str, dict[str, Result]]
@@ -157,11 +158,12 @@ def least_errors(results: Results) -> list[list[str]]:
     """Of each arm and column, whose worst run is best, and the worst of the proposed law."""
     rows = []
     for arm, laws in results.items():
-        for k, column in enumerate(_COLUMNS):
-            worst = {name: one.columns()[k].max() for name, one in laws.items() if _has(one, k)}
-            best = min(worst, key=lambda name: float(worst[name]))
-            shown = [f'{worst[name]:.3g}' for name in (best, *_OURS)]
-            rows.append([arm, f'{column} [{_unit(k)}]', label_of(best), *shown])
+        worst = {name: one.columns().max(axis=1) for name, one in laws.items()}
+        best = np.nanargmin(list(worst.values()), axis=0)
+        for k, title in enumerate(_titles()):
+            name = list(worst)[best[k]]
+            shown = [f'{worst[each][k]:.3g}' for each in (name, *_OURS)]
+            rows.append([arm, title, label_of(name), *shown])
     return rows
 
 
@@ -173,18 +175,14 @@ def label_of(name: str) -> str:
 
 def table_of(laws: dict[str, Result]) -> list[list[str | Cell]]:
     """A header, and a row for each contender: median / worst of its runs, the best marked."""
-    header = ['law', *(f'{column} [{_unit(k)}]' for k, column in enumerate(_COLUMNS))]
-    rows: list[list[str | Cell]] = [[*header, 'bound kept', 'roughness [%]', 'gains']]
-    best = [
-        min(one.columns()[k].max() for one in laws.values() if _has(one, k))
-        for k in range(len(_COLUMNS))
-    ]
+    rows: list[list[str | Cell]] = [['law', *_titles(), 'bound kept', 'roughness [%]', 'gains']]
+    best = np.nanmin([one.columns().max(axis=1) for one in laws.values()], axis=0)
     for name, one in laws.items():
         row: list[str | Cell] = [label_of(name)]
-        for k in range(len(_COLUMNS)):
-            values = one.columns()[k] if _has(one, k) else np.array([np.nan])
-            text = f'{np.median(values):.2f} / {values.max():.2f}' if _has(one, k) else '-'
-            row.append(Cell(text, 'good' if values.max() == best[k] else 'number'))
+        for values, least in zip(one.columns(), best, strict=True):
+            text = f'{np.median(values):.2f} / {values.max():.2f}'
+            style = 'good' if values.max() == least else 'number'
+            row.append('-' if np.isnan(values[0]) else Cell(text, style))
         kept = sum(figures.ratio < 1.0 for figures in one.runs)
         rough = max(figures.roughness for figures in one.runs)
         gains = ', '.join(f'{gain} {value:g}' for gain, value in one.gains.items())
@@ -192,12 +190,8 @@ def table_of(laws: dict[str, Result]) -> list[list[str | Cell]]:
     return rows
 
 
-def _has(result: Result, column: int) -> bool:
-    return column < len(result.columns())
-
-
-def _unit(column: int) -> str:
-    return 'mrad' if column < len(INTERVALS) else '%'
+def _titles() -> list[str]:
+    return [f'{name} [{"mrad" if name in INTERVALS else "%"}]' for name in _COLUMNS]
 
 
 def _write(folder: Path, results: Results, truths: int, generations: int) -> None:
