@@ -94,9 +94,9 @@ def test_pictures_show_the_load_in_its_units(out):
     assert (out / 'parameters.png').stat().st_size > 10_000
     shown = {one.title: one for one in panels([read_run(out / 'bag')])}
     (mass,) = shown['load [kg]'].lines
-    assert (mass.name, shown['load [kg]'].unit) == ('load m', 'kg')
+    assert (mass.name, shown['load [kg]'].unit) == ('m', 'kg')
     assert mass.values[-1] == pytest.approx(2.0, rel=0.02)
-    assert [line.name for line in shown['load [kg m]'].lines] == [f'load m*c{k}' for k in 'xyz']
+    assert [line.name for line in shown['load [kg m]'].lines] == [f'm*c{k}' for k in 'xyz']
     assert len(shown['load [kg m^2]'].lines) == 6
     assert [line.name for line in shown['rotor [kg m^2]'].lines] == [
         f'rotor{k}' for k in range(1, 8)

@@ -207,7 +207,8 @@ def _by_kind(_run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel
         kinds.setdefault(f'{kind} [{arm.units[name]}]'.removesuffix(' []'), []).append(j)
     for title, members in kinds.items():
         lines = (
-            Line(estimates.names[j], estimates.time, estimates.estimate[:, j]) for j in members
+            Line(estimates.names[j].split(' ')[-1], estimates.time, estimates.estimate[:, j])
+            for j in members
         )
         unit = arm.units[estimates.names[members[0]]]
         yield Panel('Parameters', title, unit or '1', tuple(lines))
