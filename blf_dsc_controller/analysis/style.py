@@ -24,7 +24,7 @@ ALARM = '#B3001B'
 
 _DPI = 130
 _CHARACTER = 0.085  # inches, about, of a title and a legend
-_HANDLE = 0.45
+_HANDLE = 0.5
 _MARGIN = 0.75  # of a panel, beside its axes
 _SETTINGS: Any = {
     'font.family': 'DejaVu Sans',
