@@ -102,7 +102,6 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
         'comparison.surface_gain': (rate / 3.0,) * n,
         'comparison.position_gain': _listed(m * (rate / 4.0) ** 2),
         'comparison.robust_gain': zeros,
-        'comparison.integral_gain': zeros,
         'truth.constant': zeros,
         'truth.amplitude': zeros,
         'truth.frequency': (1.0,) * n,

@@ -126,7 +126,10 @@ class Comparison:
         (0.0, 0.0), 'amplitude of the robust term; not used by slotine_li', 'N m', 'mu_bar'
     )
     integral_gain: PerJoint = non_negative(
-        (0.0, 0.0), 'integrator on the surface error; only of slotine_li', 'N m/rad'
+        (),
+        'integrator on the surface error, only of slotine_li; empty: none',
+        'N m/rad',
+        omittable=True,
     )
     leakage: float = non_negative(
         0.001, 'leakage of the parameter estimate; not used by slotine_li', symbol='W_c'

@@ -199,7 +199,8 @@ def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
             'mu_bar': np.array(comparison.robust_gain),
             'Wc': comparison.leakage,
         },
-        'slotine_li': linear | {'weight': nothing, 'gamma': np.array(comparison.integral_gain)},
+        'slotine_li': linear
+        | {'weight': nothing, 'gamma': np.array(comparison.integral_gain or nothing)},
     }
     return laws[config.law]
 
