@@ -131,6 +131,15 @@ def test_rated_load_that_nobody_told_is_within_the_bound_from_the_start(seed):
     assert run(**{'barrier.initial_bound': [0.0] * 7}).stops  # with a constant bound
 
 
+@pytest.mark.parametrize('learn', ['base', 'payload', 'scale'])
+def test_drives_of_unknown_effort_are_learned_from_zero(learn):
+    text = (CONFIG / 'panda.urdf').read_text().replace('effort="12"', 'effort="0"')
+    config = panda(robot__urdf=text, robot__learn=learn)
+    assert np.all(np.isfinite(settings_of_config(config).information))
+    deviation = np.sqrt(np.diag(prior_covariance(config)))
+    assert deviation[estimate_names(config).index('rotor7')] >= 0.01
+
+
 def test_prismatic_joints_and_a_third_arm_need_nothing_else():
     given = {'model': 'urdf', 'robot.urdf': random_urdf(4, seed=3)[0]}  # it does not branch
     config = build(ControllerConfig, given)

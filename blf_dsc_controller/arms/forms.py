@@ -28,6 +28,7 @@ from blf_dsc_controller.arms.prior import (
     LINKS,
     PAYLOAD_SIZE,
     ROTORS,
+    UNKNOWN_ROTOR,
     deviations,
     payload_inertia,
     prior_factor,
@@ -62,8 +63,9 @@ def learned_parameters(
     n, tip = len(chain.joints), chain.tip_placement
     phi = np.column_stack((chain.inertias, np.zeros(n)))
     ten = np.array([inertia_of(tip @ pseudo_inertia(one) @ tip.T) for one in np.eye(ROTOR)])
+    unsure = np.where(rotors > 0.0, ROTORS * rotors, UNKNOWN_ROTOR)
     if form == 'base':
-        L = prior_factor(chain, base, payload, ROTORS * rotors)
+        L = prior_factor(chain, base, payload, unsure)
         loaded = np.zeros_like(chain.inertias)
         loaded[-1] = ten[0]
         load = base.of(loaded, np.zeros(n))
@@ -79,7 +81,7 @@ def learned_parameters(
         spread[-1] = np.hypot(LINKS, payload / phi[-1, 0])
         load = np.eye(2 * n)[-1] / phi[-1, 0]
     D = np.vstack((unit[:, ROTOR], D))
-    L = np.diag(np.append(ROTORS * rotors, spread))
+    L = np.diag(np.append(unsure, spread))
     if form == 'payload':
         L[n:-1, n:-1] = deviations(payload_inertia(payload), 1.0, PAYLOAD_SIZE)
     size = np.linalg.norm(D, axis=1)

@@ -24,7 +24,10 @@ PAYLOAD_SIZE = 0.05
 """Extent of a payload, and standard deviation of its centre of mass from the tip [m]."""
 
 ROTORS = 0.5
-"""Standard deviation of the inertia of a drive, of its value."""
+"""Standard deviation of the inertia of a drive, of its value ..."""
+
+UNKNOWN_ROTOR = 0.01
+"""... and where it is 0, because neither the effort nor the inertia is known [kg m^2, or kg]."""
 
 
 def prior_factor(
