@@ -1,9 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The errors a user of the package can meet. One base, so one `except` catches them all."""
 
+from typing import Any
+
 
 class BlfDscError(Exception):
-    """Base of every error this package raises on purpose."""
+    """Base of every error this package raises on purpose; it passes between processes."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Message and attributes, whatever the constructor takes."""
+        return Exception.__new__, (type(self), *self.args), self.__dict__
 
 
 class ConfigurationError(BlfDscError):

@@ -4,12 +4,16 @@
 from __future__ import annotations
 
 import ast
+import copy
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import blf_dsc_controller as blf
+from blf_dsc_controller.errors import ConfigurationError, MissingExtraError, OutsideBarrierError
 
 README = Path(__file__).resolve().parents[1] / 'README.md'
 
@@ -35,3 +39,18 @@ def test_every_public_name_is_documented():
 def test_importing_the_package_loads_none_of_it(tmp_path):
     program = 'import sys, blf_dsc_controller; print("numpy" in sys.modules)'
     assert run_python('-c', program, folder=tmp_path).strip() == 'False'
+
+
+@pytest.mark.parametrize(
+    'error',
+    [
+        ConfigurationError(['a: got 1', 'b: got 2'], 'my.yaml'),
+        OutsideBarrierError('joint1', 0.1, 0.002),
+        MissingExtraError('dask', 'dask', 'a cluster'),
+    ],
+)
+def test_errors_pass_between_processes(error):
+    copied = copy.copy(error)  # as pickle does
+    assert type(copied) is type(error)
+    assert str(copied) == str(error)
+    assert vars(copied) == vars(error)

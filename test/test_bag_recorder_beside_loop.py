@@ -51,11 +51,14 @@ def test_every_message_of_a_loop_in_real_time_is_in_the_bag(tmp_path):
         count = len(recorded[topic.resolved])
         assert recorded[topic.resolved] == list(range(1, count + 1))
         assert said == f'{count} written, 0 missed'
-    assert len(recorded[topics.JOINT_STATES.resolved]) == SAMPLES
+    logs = tmp_path / 'out' / 'logs'
+    # On a busy machine the first torque may take seconds; then the plant sends its state again.
+    again = (logs / f'{topics.PLANT}.log').read_text().count('sending the state again')
+    assert len(recorded[topics.JOINT_STATES.resolved]) == SAMPLES + again
     assert len(recorded[topics.TIMING.resolved]) == SAMPLES - 1  # one for each step between them
     # On a busy machine the controller may pass over a state, and then says nothing of it at all.
     answered = (topics.REFERENCE, topics.TRACKING_ERROR, topics.LEARNING)
     assert len({len(recorded[topic.resolved]) for topic in answered}) == 1
     # Nor did the last ones get lost, of which no later number would tell.
     for node in (topics.PLANT, topics.CONTROLLER):
-        assert 'not reach every' not in (tmp_path / 'out' / 'logs' / f'{node}.log').read_text()
+        assert 'not reach every' not in (logs / f'{node}.log').read_text()

@@ -30,6 +30,7 @@ INTERVALS = {
 }
 _BEFORE = PICK_UP - 0.01  # s, when the model is looked at for the first time
 _ROWS = 200
+_STIFFEST = 4.0  # times the barrier's weight, at least: its slope limit
 
 
 class Gain(NamedTuple):
@@ -117,6 +118,9 @@ def law_changes(
         per_entry = joint_inertia(config) if gain.inertial else np.ones(np.size(present))
         each = value * per_entry
         changes[gain.name] = each.tolist() if isinstance(present, tuple) else value
+        if gain.name == 'barrier.weight':
+            limit = np.maximum(config.barrier.slope_limit, _STIFFEST * each)
+            changes['barrier.slope_limit'] = limit.tolist()
     return changes
 
 

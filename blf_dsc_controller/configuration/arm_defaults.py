@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gains and limits of the controller for the arm of a URDF: what is not given follows from it.
 
-From the delay of the loop, 1.5 T + robot.lag, comes one rate, omega_v = 0.5 / delay, at which the
-damping loop keeps a phase margin of 60 degrees; every other gain is a fraction of it and of the
-inertia m_i = 1 / (M^-1)_ii of a joint with the others free, the least over several postures
-(doc/arms.md).  What gravity may be off by, the rated payload among it, makes a joint sag at the
-start before the disturbance estimate follows: where that is more than the bound, it is a funnel.
+From the delay of the loop, 1.5 T + robot.lag, comes one rate, omega_v = 0.5 / delay, at which it
+loses half a radian of phase; every gain is a fraction of it and of the inertia m_i = 1 / (M^-1)_ii
+of a joint with the others free, the least over several postures (doc/arms.md has the margins).
+
+What gravity may be off by, the rated payload among it, makes a joint sag at the start before the
+disturbance estimate follows: where that is more than the bound, it is a funnel.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from blf_dsc_controller.configuration.schema import Value
 
 _SAG = 1.5  # standard deviations of gravity over m omega_v^2; measured: at most 1
-_PHASE = 0.5  # rad that the damping loop loses to the delay
+_PHASE = 0.5  # rad that is lost to the delay at omega_v
 _BOUND = 0.002  # rad
 _UNMODELLED = 0.01  # of the rated torque, rms: ripple, noise, Stribeck
 _WINDOW = {'base': 5.0, 'payload': 2.0, 'scale': 5.0}  # s
@@ -65,13 +66,13 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
         'barrier.initial_bound': _listed(np.where(sag > _bound_of(given, n), sag, 0.0)),
         'barrier.funnel_rate': float(f'{rate / 20.0:.4g}'),
         'barrier.weight': _listed(0.25 * m * rate**2),
-        'barrier.slope_limit': _listed(1.8 * m * rate**2),
-        'surface.gain': (1.3 * rate,) * n,
-        'surface.mu': (0.25 * rate,) * n,
+        'barrier.slope_limit': _listed(m * rate**2),
+        'surface.gain': (2.0 * rate,) * n,
+        'surface.mu': (0.5 * rate,) * n,
         'feedback.gain': zeros,
         'feedback.damping': zeros,
-        'feedback.damping_rate': 0.8 * rate,
-        'disturbance.gain': _listed(0.5 * m * rate**2),
+        'feedback.damping_rate': 0.6 * rate,
+        'disturbance.gain': _listed(0.4 * m * rate**2),
         'torque.limit': _listed(effort),
         'torque.rate_limit': zeros,
         'reference.type': 'hold',
