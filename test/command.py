@@ -60,8 +60,8 @@ class Running:
             text=True,
         )
         bag = out / 'bag' / 'bag_0.mcap'
-        # 200 kB: joint states are being recorded, which are under 1 kB each.
-        wait_for(lambda: bag.exists() and bag.stat().st_size > 200_000)
+        # 500 kB: some 200 samples are recorded, of about 2 kB with all topics.
+        wait_for(lambda: bag.exists() and bag.stat().st_size > 500_000)
         self.children = [
             int(child)
             for child in Path(f'/proc/{self.process.pid}/task/{self.process.pid}/children')

@@ -115,7 +115,7 @@ def test_bound_begins_as_a_funnel_where_an_unknown_load_makes_the_arm_sag():
 
 
 @pytest.mark.parametrize('seed', range(2))
-def test_rated_load_that_nobody_told_is_within_the_bound_from_the_start(seed):
+def test_undeclared_rated_load_is_within_the_bound_from_the_start(seed):
     plant = {'duration': 1.5, 'truth.seed': seed, 'events.payload': [3.0]}
     plant |= {'events.begin': [0.0], 'events.duration': [0.0]}
 

@@ -146,7 +146,7 @@ def over_postures(
 
 
 def _bound_of(given: Mapping[str, Any], n: int) -> np.ndarray:
-    """Bound [rad] that is given, or the default one; what is invalid is told later."""
+    """Bound [rad] that is given, or the default; validation comes later."""
     try:
         return np.broadcast_to(np.array(given['barrier.bound'], dtype=float), (n,))
     except (KeyError, TypeError, ValueError):
