@@ -9,9 +9,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-import numpy as np
-
 from blf_dsc_controller.compiled.jit import compile_methods
+from blf_dsc_controller.compiled.layout import Array
 from sim_plant.dynamics import PointMassArm
 from sim_plant.rigid_arm import RigidArm
 
@@ -27,20 +26,13 @@ class Arm(Protocol):
     def p(self) -> int:
         """Number of parameters P."""
 
-    def fill_parameters(self, payload: float, P: np.ndarray) -> None:
+    def fill_parameters(self, payload: float, P: Array) -> None:
         """Write the parameters P (p,) that the controller estimates."""
 
-    def fill_tip(self, q: np.ndarray, position: np.ndarray, jacobian: np.ndarray) -> None:
+    def fill_tip(self, q: Array, position: Array, jacobian: Array) -> None:
         """Write the position (3,) [m] of the tip in the base, and its Jacobian (3, n) [m/rad]."""
 
-    def accelerate(
-        self,
-        payload: float,
-        q: np.ndarray,
-        dq: np.ndarray,
-        torque: np.ndarray,
-        ddq: np.ndarray,
-    ) -> None:
+    def accelerate(self, payload: float, q: Array, dq: Array, torque: Array, ddq: Array) -> None:
         """Write ddq (n,) [rad/s^2] of M ddq + C dq + G = torque; it may be the torque's vector."""
 
 

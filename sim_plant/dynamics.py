@@ -12,9 +12,8 @@ with G the gradient of the potential: its first term has cos q1, where (34) prin
 from math import cos, sin
 from typing import NamedTuple
 
-import numpy as np
-
 from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
 
 
 class PointMassArm(NamedTuple):
@@ -36,28 +35,21 @@ class PointMassArm(NamedTuple):
         """Number of parameters."""
         return 3
 
-    def fill_parameters(self, payload: float, P: np.ndarray) -> None:
+    def fill_parameters(self, payload: float, P: Array) -> None:
         """`parameters` with a payload [kg]."""
         parameters(loaded(self, payload), P)
 
-    def fill_tip(self, q: np.ndarray, position: np.ndarray, jacobian: np.ndarray) -> None:
+    def fill_tip(self, q: Array, position: Array, jacobian: Array) -> None:
         """`tip`."""
         tip(self, q, position, jacobian)
 
-    def accelerate(
-        self,
-        payload: float,
-        q: np.ndarray,
-        dq: np.ndarray,
-        torque: np.ndarray,
-        ddq: np.ndarray,
-    ) -> None:
+    def accelerate(self, payload: float, q: Array, dq: Array, torque: Array, ddq: Array) -> None:
         """`acceleration` with a payload [kg]."""
         acceleration(loaded(self, payload), q, dq, torque, ddq)
 
 
 @inner
-def parameters(arm: PointMassArm, out: np.ndarray) -> None:
+def parameters(arm: PointMassArm, out: Array) -> None:
     """Write the parameters P (3,) [kg m^2] that the controller estimates."""
     out[0] = (arm.m1 + arm.m2) * arm.l1**2
     out[1] = arm.m2 * arm.l2**2
@@ -71,7 +63,7 @@ def loaded(arm: PointMassArm, payload: float) -> PointMassArm:
 
 
 @inner
-def tip(arm: PointMassArm, q: np.ndarray, position: np.ndarray, jacobian: np.ndarray) -> None:
+def tip(arm: PointMassArm, q: Array, position: Array, jacobian: Array) -> None:
     """Write the position (3,) [m] of the tip and its Jacobian (3, n) [m/rad]."""
     x1, z1 = arm.l1 * cos(q[0]), arm.l1 * sin(q[0])
     x2, z2 = arm.l2 * cos(q[0] + q[1]), arm.l2 * sin(q[0] + q[1])
@@ -82,9 +74,7 @@ def tip(arm: PointMassArm, q: np.ndarray, position: np.ndarray, jacobian: np.nda
 
 
 @inner
-def acceleration(
-    arm: PointMassArm, q: np.ndarray, dq: np.ndarray, torque: np.ndarray, ddq: np.ndarray
-) -> None:
+def acceleration(arm: PointMassArm, q: Array, dq: Array, torque: Array, ddq: Array) -> None:
     """Write ddq = M^-1 (torque - C dq - G) (2,) [rad/s^2]; it may be the torque's own vector."""
     outer = arm.m2 * arm.l2**2
     coupling = arm.m2 * arm.l1 * arm.l2 * cos(q[1])

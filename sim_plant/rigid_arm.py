@@ -36,39 +36,26 @@ class RigidArm(NamedTuple):
 
     n: int
     p: int
-    content: np.ndarray  # Content
-    memory: np.ndarray  # Motion
+    content: Array  # Content
+    memory: Array  # Motion
 
-    def fill_parameters(self, payload: float, P: np.ndarray) -> None:
+    def fill_parameters(self, payload: float, P: Array) -> None:
         """Write the base parameters P (p,) with a payload [kg]."""
         content = content_of(self.content)
         for k in range(self.p):
             P[k] = content.P[k] + payload * content.P_payload[k]
 
-    def fill_tip(self, q: np.ndarray, position: np.ndarray, jacobian: np.ndarray) -> None:
+    def fill_tip(self, q: Array, position: Array, jacobian: Array) -> None:
         """`rigid_body.tip` at q (n,)."""
         fill_tip(self.content, self.memory, q, position, jacobian)
 
-    def accelerate(
-        self,
-        payload: float,
-        q: np.ndarray,
-        dq: np.ndarray,
-        torque: np.ndarray,
-        ddq: np.ndarray,
-    ) -> None:
+    def accelerate(self, payload: float, q: Array, dq: Array, torque: Array, ddq: Array) -> None:
         """`rigid_body.acceleration` with a payload [kg] at q, dq (n,)."""
         accelerate(self.content, self.memory, payload, q, dq, torque, ddq)
 
 
 @called
-def fill_tip(
-    vector: np.ndarray,
-    memory: np.ndarray,
-    q: np.ndarray,
-    position: np.ndarray,
-    jacobian: np.ndarray,
-) -> None:
+def fill_tip(vector: Array, memory: Array, q: Array, position: Array, jacobian: Array) -> None:
     """`RigidArm.fill_tip`."""
     content = content_of(vector)
     now = motion_of(memory, content.bodies)
@@ -78,13 +65,7 @@ def fill_tip(
 
 @called
 def accelerate(
-    vector: np.ndarray,
-    memory: np.ndarray,
-    payload: float,
-    q: np.ndarray,
-    dq: np.ndarray,
-    torque: np.ndarray,
-    ddq: np.ndarray,
+    vector: Array, memory: Array, payload: float, q: Array, dq: Array, torque: Array, ddq: Array
 ) -> None:
     """`RigidArm.accelerate`."""
     bodies = content_of(vector).bodies
@@ -96,8 +77,8 @@ def accelerate(
 def rigid_arm(
     chain: Chain,
     gravity: tuple[float, ...],
-    inertias: np.ndarray,
-    rotors: np.ndarray,
+    inertias: Array,
+    rotors: Array,
     parameters: BaseParameters,
 ) -> RigidArm:
     """Arm with the geometry of a chain, these inertias (n, 10) and rotors (n,) [kg m^2, or kg]."""

@@ -20,8 +20,6 @@ from __future__ import annotations
 from math import cos, sin
 from typing import Annotated, NamedTuple
 
-import numpy as np
-
 from blf_dsc_controller.arms.inertia import INERTIA_NAMES
 from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array, view_of
@@ -54,14 +52,7 @@ bodies_of = view_of(Bodies)
 
 
 @called
-def fill_regressor(
-    vector: np.ndarray,
-    q: np.ndarray,
-    dq: np.ndarray,
-    v: np.ndarray,
-    a: np.ndarray,
-    H: np.ndarray,
-) -> None:
+def fill_regressor(vector: Array, q: Array, dq: Array, v: Array, a: Array, H: Array) -> None:
     """`SerialChain.regressor`."""
     bodies = bodies_of(vector)
     begin(bodies)
@@ -71,9 +62,7 @@ def fill_regressor(
 
 
 @called
-def fill_momentum_regressor(
-    vector: np.ndarray, q: np.ndarray, dq: np.ndarray, Yp: np.ndarray, Yr: np.ndarray
-) -> None:
+def fill_momentum_regressor(vector: Array, q: Array, dq: Array, Yp: Array, Yr: Array) -> None:
     """`SerialChain.momentum_regressor`."""
     bodies = bodies_of(vector)
     begin(bodies)
@@ -84,14 +73,7 @@ def fill_momentum_regressor(
 
 @called
 def fill_regressors(
-    vector: np.ndarray,
-    q: np.ndarray,
-    dq: np.ndarray,
-    v: np.ndarray,
-    a: np.ndarray,
-    H: np.ndarray,
-    Yp: np.ndarray,
-    Yr: np.ndarray,
+    vector: Array, q: Array, dq: Array, v: Array, a: Array, H: Array, Yp: Array, Yr: Array
 ) -> None:
     """`SerialChain.regressors`."""
     bodies = bodies_of(vector)
@@ -103,13 +85,13 @@ def fill_regressors(
 
 
 @inner
-def angular(motion: np.ndarray) -> Vector:
+def angular(motion: Array) -> Vector:
     """Angular part of a motion (6,)."""
     return motion[0], motion[1], motion[2]
 
 
 @inner
-def linear(motion: np.ndarray) -> Vector:
+def linear(motion: Array) -> Vector:
     """Linear part of a motion (6,)."""
     return motion[3], motion[4], motion[5]
 
@@ -159,7 +141,7 @@ def advance(bodies: Bodies, i: int, q: float, dq: float, v: float, a: float) -> 
 
 
 @inner
-def turned(rotation: np.ndarray, c: float, s: float, k: int) -> Vector:
+def turned(rotation: Array, c: float, s: float, k: int) -> Vector:
     """Column k of R0 + c R1 + s R2 (3, 3, 3)."""
     return (
         rotation[0, 0, k] + c * rotation[1, 0, k] + s * rotation[2, 0, k],
@@ -169,7 +151,7 @@ def turned(rotation: np.ndarray, c: float, s: float, k: int) -> Vector:
 
 
 @inner
-def add_torque(bodies: Bodies, i: int, a: float, H: np.ndarray) -> None:
+def add_torque(bodies: Bodies, i: int, a: float, H: Array) -> None:
     """Fill the columns of body i of M a + C v + G."""
     motions, products = bodies.motions, bodies.products[0]
     w, u = angular(motions[VELOCITY]), linear(motions[VELOCITY])
@@ -183,7 +165,7 @@ def add_torque(bodies: Bodies, i: int, a: float, H: np.ndarray) -> None:
 
 
 @inner
-def add_momentum(bodies: Bodies, i: int, dq: float, Yp: np.ndarray, Yr: np.ndarray) -> None:
+def add_momentum(bodies: Bodies, i: int, dq: float, Yp: Array, Yr: Array) -> None:
     """Fill the columns of body i of M dq and of G - C^T dq."""
     motions, momenta, rest = bodies.motions, bodies.products[1], bodies.products[2]
     w, u = angular(motions[VELOCITY]), linear(motions[VELOCITY])
@@ -206,7 +188,7 @@ def add_momentum(bodies: Bodies, i: int, dq: float, Yp: np.ndarray, Yr: np.ndarr
 
 
 @inner
-def choose(bodies: Bodies, i: int, j: int, products: np.ndarray, Y: np.ndarray) -> None:
+def choose(bodies: Bodies, i: int, j: int, products: Array, Y: Array) -> None:
     """Copy what is a column of body i from the eleven to row j; below row i there is nothing."""
     for k in range(int(bodies.first[i]), int(bodies.first[i + 1])):
         Y[j, k] = products[int(bodies.entry[k])]
@@ -216,9 +198,7 @@ def choose(bodies: Bodies, i: int, j: int, products: np.ndarray, Y: np.ndarray) 
 
 
 @inner
-def torque_products(
-    S: np.ndarray, alpha: Vector, A: Vector, v: Vector, w: Vector, out: np.ndarray
-) -> None:
+def torque_products(S: Array, alpha: Vector, A: Vector, v: Vector, w: Vector, out: Array) -> None:
     """Fill S . (I alpha + B(I, v) w) of a unit of each of the ten, h = m c being the moments.
 
         force = m A + alpha x h + w x (v x h)
@@ -247,7 +227,7 @@ def torque_products(
 
 
 @inner
-def momentum_products(S: np.ndarray, w: Vector, u: Vector, out: np.ndarray) -> None:
+def momentum_products(S: Array, w: Vector, u: Vector, out: Array) -> None:
     """Fill S . I v of a unit of each of the ten; w and u are v's angular and linear part."""
     s, t = angular(S), linear(S)
     turn, lever = cross(t, w), cross(u, s)

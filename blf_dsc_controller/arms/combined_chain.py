@@ -50,8 +50,8 @@ class CombinedChain(NamedTuple):
     n: int
     p: int
     loads: int  # 1: the last body has a load, 0: each body has a factor
-    bodies: np.ndarray  # Bodies, with all inertias
-    combination: np.ndarray  # Combination
+    bodies: Array  # Bodies, with all inertias
+    combination: Array  # Combination
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -66,17 +66,13 @@ class CombinedChain(NamedTuple):
         units += [*INERTIA_UNITS, ''] if self.loads else [''] * self.n
         return tuple(units[int(k)] for k in combination_of(self.combination).column)
 
-    def regressor(
-        self, q: np.ndarray, dq: np.ndarray, v: np.ndarray, a: np.ndarray, H: np.ndarray
-    ) -> None:
+    def regressor(self, q: Array, dq: Array, v: Array, a: Array, H: Array) -> None:
         """Fill H (n, p) so that H P = M(q) a + C(q, dq) v + G(q)   [N m], Property III."""
         c = combination_of(self.combination)
         fill_regressor(self.bodies, q, dq, v, a, c.Y[0])
         combine(c, c.Y[0], H)
 
-    def momentum_regressor(
-        self, q: np.ndarray, dq: np.ndarray, Yp: np.ndarray, Yr: np.ndarray
-    ) -> None:
+    def momentum_regressor(self, q: Array, dq: Array, Yp: Array, Yr: Array) -> None:
         """Fill Yp, Yr (n, p) so that Yp P = M dq [N m s] and Yr P = G - C^T dq [N m]."""
         c = combination_of(self.combination)
         fill_momentum_regressor(self.bodies, q, dq, c.Y[1], c.Y[2])
@@ -84,14 +80,7 @@ class CombinedChain(NamedTuple):
         combine(c, c.Y[2], Yr)
 
     def regressors(
-        self,
-        q: np.ndarray,
-        dq: np.ndarray,
-        v: np.ndarray,
-        a: np.ndarray,
-        H: np.ndarray,
-        Yp: np.ndarray,
-        Yr: np.ndarray,
+        self, q: Array, dq: Array, v: Array, a: Array, H: Array, Yp: Array, Yr: Array
     ) -> None:
         """`regressor` and `momentum_regressor` from one pass along the chain."""
         c = combination_of(self.combination)
@@ -102,7 +91,7 @@ class CombinedChain(NamedTuple):
 
 
 @called
-def combine(c: Combination, Y: np.ndarray, out: np.ndarray) -> None:
+def combine(c: Combination, Y: Array, out: Array) -> None:
     """Fill Y T^T (n, p); in row i, Y (n, width) is zero for the bodies before i."""
     for i in range(c.n):
         for j in range(c.p):
@@ -121,9 +110,7 @@ def column_names(n: int, loads: int) -> tuple[str, ...]:
     return (*rotors, *(f'scale{i + 1}' for i in range(n)))
 
 
-def combined_chain(
-    whole: SerialChain, loads: int, columns: np.ndarray, T: np.ndarray
-) -> CombinedChain:
+def combined_chain(whole: SerialChain, loads: int, columns: Array, T: Array) -> CombinedChain:
     """Model of the unknowns `columns` (p,) of `column_names`; T (p, 11 n) their inertias."""
     p, width = T.shape
     row, at = np.nonzero(T)

@@ -11,13 +11,12 @@ from __future__ import annotations
 
 from typing import Protocol
 
-import numpy as np
-
 from blf_dsc_controller.arms.combined_chain import CombinedChain
 from blf_dsc_controller.arms.planar_chain import PlanarChain
 from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.compiled.jit import compile_methods
+from blf_dsc_controller.compiled.layout import Array
 
 
 class ArmModel(Protocol):
@@ -35,28 +34,17 @@ class ArmModel(Protocol):
     def parameter_units(self) -> tuple[str, ...]:
         """Units of the entries of P."""
 
-    def regressor(
-        self, q: np.ndarray, dq: np.ndarray, v: np.ndarray, a: np.ndarray, H: np.ndarray
-    ) -> None:
+    def regressor(self, q: Array, dq: Array, v: Array, a: Array, H: Array) -> None:
         """Fill H (n, p) so that H P = M(q) a + C(q, dq) v + G(q)   [N m], Property III."""
 
-    def momentum_regressor(
-        self, q: np.ndarray, dq: np.ndarray, Yp: np.ndarray, Yr: np.ndarray
-    ) -> None:
+    def momentum_regressor(self, q: Array, dq: Array, Yp: Array, Yr: Array) -> None:
         """Fill Yp, Yr (n, p) so that Yp P = M dq [N m s] and Yr P = G - C^T dq [N m].
 
         Then d/dt(Yp P) + Yr P = tau - tau_dist: the dynamics without the acceleration.
         """
 
     def regressors(
-        self,
-        q: np.ndarray,
-        dq: np.ndarray,
-        v: np.ndarray,
-        a: np.ndarray,
-        H: np.ndarray,
-        Yp: np.ndarray,
-        Yr: np.ndarray,
+        self, q: Array, dq: Array, v: Array, a: Array, H: Array, Yp: Array, Yr: Array
     ) -> None:
         """`regressor` and `momentum_regressor` of one state."""
 

@@ -16,10 +16,9 @@ from __future__ import annotations
 from math import cos, sin
 from typing import NamedTuple
 
-import numpy as np
-
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
 
 
 class PlanarChain(NamedTuple):
@@ -41,14 +40,7 @@ class PlanarChain(NamedTuple):
         """Units of the P_ij."""
         return ('kg m^2',) * (self.n * (self.n + 1) // 2)
 
-    def regressor(
-        self,
-        q: np.ndarray,
-        dq: np.ndarray,
-        v: np.ndarray,
-        a: np.ndarray,
-        H: np.ndarray,
-    ) -> None:
+    def regressor(self, q: Array, dq: Array, v: Array, a: Array, H: Array) -> None:
         """Fill H (n, p) so that H P = M(q) a + C(q, dq) v + G(q)   [N m], Property III."""
         n = q.size
         column = 0
@@ -76,9 +68,7 @@ class PlanarChain(NamedTuple):
                 add_column(H, column, i, j, Q_i, Q_j)
                 column += 1
 
-    def momentum_regressor(
-        self, q: np.ndarray, dq: np.ndarray, Yp: np.ndarray, Yr: np.ndarray
-    ) -> None:
+    def momentum_regressor(self, q: Array, dq: Array, Yp: Array, Yr: Array) -> None:
         """Fill Yp, Yr (n, p) so that Yp P = M dq [N m s] and Yr P = G - C^T dq [N m]."""
         n = q.size
         column = 0
@@ -102,14 +92,7 @@ class PlanarChain(NamedTuple):
                 column += 1
 
     def regressors(
-        self,
-        q: np.ndarray,
-        dq: np.ndarray,
-        v: np.ndarray,
-        a: np.ndarray,
-        H: np.ndarray,
-        Yp: np.ndarray,
-        Yr: np.ndarray,
+        self, q: Array, dq: Array, v: Array, a: Array, H: Array, Yp: Array, Yr: Array
     ) -> None:
         """`regressor` and `momentum_regressor` of one state."""
         self.regressor(q, dq, v, a, H)
@@ -117,7 +100,7 @@ class PlanarChain(NamedTuple):
 
 
 @inner
-def add_column(Y: np.ndarray, column: int, i: int, j: int, Q_i: float, Q_j: float) -> None:
+def add_column(Y: Array, column: int, i: int, j: int, Q_i: float, Q_j: float) -> None:
     """Add the torques Q_i, Q_j of P_ij on the absolute angles to the joint torques of a column.
 
     On the diagonal both are the same angle's, and Q_j counts alone.

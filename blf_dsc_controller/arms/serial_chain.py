@@ -18,7 +18,7 @@ from blf_dsc_controller.arms.chain_kernels import (
 )
 from blf_dsc_controller.arms.inertia import INERTIA_NAMES, INERTIA_UNITS
 from blf_dsc_controller.arms.urdf import Chain
-from blf_dsc_controller.compiled.layout import pack
+from blf_dsc_controller.compiled.layout import Array, pack
 
 
 class SerialChain(NamedTuple):
@@ -29,7 +29,7 @@ class SerialChain(NamedTuple):
 
     n: int
     p: int
-    vector: np.ndarray  # Bodies
+    vector: Array  # Bodies
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -51,27 +51,16 @@ class SerialChain(NamedTuple):
         body = np.repeat(np.arange(self.n), np.diff(bodies.first).astype(int))
         return [(int(b), int(e)) for b, e in zip(body, bodies.entry, strict=True)]
 
-    def regressor(
-        self, q: np.ndarray, dq: np.ndarray, v: np.ndarray, a: np.ndarray, H: np.ndarray
-    ) -> None:
+    def regressor(self, q: Array, dq: Array, v: Array, a: Array, H: Array) -> None:
         """Fill H (n, p) so that H P = M(q) a + C(q, dq) v + G(q)   [N m], Property III."""
         fill_regressor(self.vector, q, dq, v, a, H)
 
-    def momentum_regressor(
-        self, q: np.ndarray, dq: np.ndarray, Yp: np.ndarray, Yr: np.ndarray
-    ) -> None:
+    def momentum_regressor(self, q: Array, dq: Array, Yp: Array, Yr: Array) -> None:
         """Fill Yp, Yr (n, p) so that Yp P = M dq [N m s] and Yr P = G - C^T dq [N m]."""
         fill_momentum_regressor(self.vector, q, dq, Yp, Yr)
 
     def regressors(
-        self,
-        q: np.ndarray,
-        dq: np.ndarray,
-        v: np.ndarray,
-        a: np.ndarray,
-        H: np.ndarray,
-        Yp: np.ndarray,
-        Yr: np.ndarray,
+        self, q: Array, dq: Array, v: Array, a: Array, H: Array, Yp: Array, Yr: Array
     ) -> None:
         """`regressor` and `momentum_regressor` from one pass along the chain."""
         fill_regressors(self.vector, q, dq, v, a, H, Yp, Yr)

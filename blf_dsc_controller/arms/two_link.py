@@ -13,9 +13,8 @@ The masses and l2 appear in P alone; of the arm's geometry the regressor needs o
 from math import cos, sin
 from typing import NamedTuple
 
-import numpy as np
-
 from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
 
 PARAMETER_NAMES = ('(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2')
 
@@ -43,27 +42,16 @@ class TwoLink(NamedTuple):
         """Units of the entries of P."""
         return ('kg m^2',) * 3
 
-    def regressor(
-        self, q: np.ndarray, dq: np.ndarray, v: np.ndarray, a: np.ndarray, H: np.ndarray
-    ) -> None:
+    def regressor(self, q: Array, dq: Array, v: Array, a: Array, H: Array) -> None:
         """Fill H (2, 3) so that H P = M(q) a + C(q, dq) v + G(q)   [N m], Property III."""
         fill_regressor(self.r, angles_of(q), dq, v, a, H)
 
-    def momentum_regressor(
-        self, q: np.ndarray, dq: np.ndarray, Yp: np.ndarray, Yr: np.ndarray
-    ) -> None:
+    def momentum_regressor(self, q: Array, dq: Array, Yp: Array, Yr: Array) -> None:
         """Fill Yp, Yr (2, 3) so that Yp P = M dq [N m s] and Yr P = G - C^T dq [N m]."""
         fill_momentum_regressor(self.r, angles_of(q), dq, Yp, Yr)
 
     def regressors(
-        self,
-        q: np.ndarray,
-        dq: np.ndarray,
-        v: np.ndarray,
-        a: np.ndarray,
-        H: np.ndarray,
-        Yp: np.ndarray,
-        Yr: np.ndarray,
+        self, q: Array, dq: Array, v: Array, a: Array, H: Array, Yp: Array, Yr: Array
     ) -> None:
         """Both regressors from one computation of the sines and cosines, which cost most."""
         angles = angles_of(q)
@@ -72,15 +60,13 @@ class TwoLink(NamedTuple):
 
 
 @inner
-def angles_of(q: np.ndarray) -> Angles:
+def angles_of(q: Array) -> Angles:
     """Sines and cosines that the regressors are made of."""
     return cos(q[0]), cos(q[1]), sin(q[1]), cos(q[0] + q[1])
 
 
 @inner
-def fill_regressor(
-    r: float, angles: Angles, dq: np.ndarray, v: np.ndarray, a: np.ndarray, H: np.ndarray
-) -> None:
+def fill_regressor(r: float, angles: Angles, dq: Array, v: Array, a: Array, H: Array) -> None:
     """`regressor` from the angles' sines and cosines."""
     c1, c2, s2, c12 = angles
     H[0, 0] = a[0] + r * c1
@@ -92,9 +78,7 @@ def fill_regressor(
 
 
 @inner
-def fill_momentum_regressor(
-    r: float, angles: Angles, dq: np.ndarray, Yp: np.ndarray, Yr: np.ndarray
-) -> None:
+def fill_momentum_regressor(r: float, angles: Angles, dq: Array, Yp: Array, Yr: Array) -> None:
     """`momentum_regressor` from the angles' sines and cosines."""
     c1, c2, s2, c12 = angles
     Yp[0, 0] = dq[0]
