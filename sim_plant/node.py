@@ -225,7 +225,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self.plant.step(self.input.torque)
         if self.plant.is_broken and not was_broken:
             self.get_logger().error(
-                f'the torque {self.input.torque} N m drove a joint beyond {FASTEST:g} rad/s: '
+                f'the torque {self.input.torque} N m drove the arm beyond {FASTEST:g} rad/s: '
                 'the arm stands still until it is reset'
             )
             self._report()
@@ -280,7 +280,7 @@ class PlantNode(LoopNode[PlantConfig]):
         elif not self._running:
             level, message = WARN, 'braked: waiting for the first torque'
         elif self.plant.is_broken:
-            level, message = ERROR, f'a joint was faster than {FASTEST:g} rad/s: reset the arm'
+            level, message = ERROR, f'the arm was faster than {FASTEST:g} rad/s: reset it'
         elif stale > self._reported_stale:
             level = ERROR
             message = 'the last torque is too old (actuator.command_timeout): not applied'

@@ -28,13 +28,14 @@ from sim_plant.kernels import (
 from sim_plant.sensors import VELOCITY_SOURCES, Encoders, generator, is_noisy
 
 FASTEST = 1e3
-"""Velocity [rad/s] of a joint that no arm survives: it stays where it was."""
+"""Speed [rad/s] that no arm survives, the norm over its joints: it stays where it was."""
 
 
 class SavedPlant(NamedTuple):
     """A plant's state at one moment, random generator included."""
 
     state: np.ndarray
+    is_broken: bool
     generator: Mapping[str, Any]
 
 
@@ -42,7 +43,7 @@ class Plant:
     """A sampled arm: `measure()`, then `step(torque)`, and so on.
 
     It starts at `position` (n,) [rad] with `velocity` (n,) [rad/s]; `seed` is that of the sensor
-    noise: the same seed repeats the run.  `is_broken` once a joint was faster than `FASTEST`.
+    noise: the same seed repeats the run.  `is_broken` once it was faster than `FASTEST`.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class Plant:
         self._noises = [self._now.reading.noise] if is_noisy(settings.encoders) else []
         self._noises += [self._now.drives.noise] if settings.drives.noise > 0.0 else []
         self._now.x[:] = np.concatenate((position, velocity))
+        self._q, self._dq = self._now.x[: self.joints], self._now.x[self.joints :]
         self._now.reading.sample[0] = self._now.acting.sample[0] = -1.0
         self._initial = self.state.copy()
         self._measurement = np.zeros(3 * self.joints)
@@ -96,13 +98,12 @@ class Plant:
         if self.is_broken:
             self.hold()
             return
-        q, dq = self._now.x[: self.joints], self._now.x[self.joints :]
-        self._before[:] = q
+        self._before[:] = self._q
         step_plant(self.arm, self.settings, self.state, torque)
-        if not dq @ dq <= FASTEST**2:  # NaN as well
+        if not self._dq @ self._dq <= FASTEST**2:  # NaN as well
             self.is_broken = True
-            q[:] = self._before
-            dq[:] = 0.0
+            self._q[:] = self._before
+            self._dq[:] = 0.0
 
     def change(self, settings: PlantSettings) -> None:
         """Continue with other settings of as many joints and the same period and delay."""
@@ -112,7 +113,7 @@ class Plant:
 
     def hold(self) -> None:
         """Stay at rest and without torque for one sample: the brakes are on."""
-        self._now.x[self.joints :] = 0.0
+        self._dq[:] = 0.0
         self._now.drives.applied[:] = self._now.drives.motor[:] = 0.0
         self._now.sample[0] += 1.0
 
@@ -129,12 +130,12 @@ class Plant:
 
     def save(self) -> SavedPlant:
         """Copy of everything that changes."""
-        return SavedPlant(self.state.copy(), self.rng.bit_generator.state)
+        return SavedPlant(self.state.copy(), self.is_broken, self.rng.bit_generator.state)
 
     def restore(self, saved: SavedPlant) -> None:
         """Resume from a saved moment of a plant of the same settings."""
         self.state[:] = saved.state
-        self.is_broken = False
+        self.is_broken = saved.is_broken
         self.rng.bit_generator.state = saved.generator
 
 

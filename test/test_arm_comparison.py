@@ -12,10 +12,12 @@ from scipy.linalg import expm
 
 from blf_dsc_controller.arm_comparison.baselines import simulate_baseline
 from blf_dsc_controller.arm_comparison.contenders import (
+    BASELINES,
     CONTENDERS,
     INTERVALS,
     Figures,
     joint_inertia,
+    law_changes,
     run,
     torque_rows,
 )
@@ -145,6 +147,14 @@ def test_integrator_of_slotine_li_is_the_gain_of_its_disturbance_estimate():
     settings = settings_of_config(change(config, chosen))
     assert settings.gamma.tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
     assert not settings_of_config(change(config, {'law': 'slotine_li'})).gamma.any()
+
+
+@pytest.mark.parametrize('name', [k for k, one in CONTENDERS.items() if one.law not in BASELINES])
+def test_every_gain_of_a_search_is_a_valid_configuration(name):
+    config, contender = load_loop('panda').controller, CONTENDERS[name]
+    for side in ('least', 'most'):
+        values = {gain.name: getattr(gain, side) for gain in contender.gains}
+        change(config, law_changes(contender, config, values))
 
 
 def test_every_trial_has_a_truth_a_motion_and_noise_of_its_own():

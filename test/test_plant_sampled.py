@@ -103,6 +103,19 @@ def test_a_restored_plant_goes_on_as_if_nothing_had_happened(source):
     assert (other.state == arm.state).all()
 
 
+def test_an_arm_that_was_too_fast_stands_also_where_it_is_restored():
+    arm = plant()
+    run(arm, np.full((300, 2), 9e3))
+    assert arm.is_broken
+    before = arm.measure().copy()
+    arm.restore(arm.save())
+    after = run(arm, np.full((3, 2), 9e3))
+    np.testing.assert_array_equal(after[-1, :2], before[:2])
+    assert not after[-1, 2:4].any()
+    arm.reset()
+    assert not arm.is_broken
+
+
 def test_time_is_counted_in_whole_nanoseconds():
     arm = plant()
     run(arm, commands(3))
