@@ -41,7 +41,7 @@ PIP_FAILED := { echo 'The installation failed: see above. It needs a package ind
   'set HTTPS_PROXY, for a mirror PIP_INDEX_URL, without a network PIP_FIND_LINKS and' \
   'PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
 
-.PHONY: help venv demo paper arms changes test test-long test-browser test-nightly soak lint clean bench
+.PHONY: help venv demo paper arms changes expect test test-long test-browser test-nightly soak lint clean bench
 
 help: ## List what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' Makefile
@@ -83,6 +83,9 @@ test-nightly: $(READY) ## Run ten thousand examples of each property of the node
 
 changes: $(READY) ## Change ten thousand arms at random, with and without learning, into out/changes
 	@$(RUN) benchmark/changing_arms.py
+
+expect: $(READY) ## Measure what doc/arms.md says of the presets panda and ur5e
+	@$(RUN) benchmark/what_to_expect.py
 
 bench: $(BENCH_READY) ## Measure everything side by side, into benchmark/RESULTS.md (GROUPS=offline)
 	@$(RUN) benchmark/run.py $(GROUPS)

@@ -8,7 +8,7 @@ import csv
 import numpy as np
 import pytest
 import synthetic_bag
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from synthetic_bag import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 
 from blf_dsc_controller.bags.reader import read_run
@@ -153,8 +153,13 @@ def test_messages_out_of_order_and_twice_are_put_right(tmp_path, made, messages)
 
 
 @pytest.mark.parametrize('storage', [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
-def test_bags_of_another_writer_are_read(tmp_path, made, messages, storage):
-    with Writer(tmp_path / 'bag', version=9, storage_plugin=storage) as writer:
+@pytest.mark.parametrize(
+    'mode', [CompressionMode.NONE, CompressionMode.FILE, CompressionMode.MESSAGE]
+)
+def test_bags_of_another_writer_are_read(tmp_path, made, messages, storage, mode):
+    writer = Writer(tmp_path / 'bag', version=9, storage_plugin=storage)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
         connections = {}
         for topic, stamp, raw in messages:
             if topic not in connections:
