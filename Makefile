@@ -41,7 +41,7 @@ PIP_FAILED := { echo 'The installation failed: see above. It needs a package ind
   'set HTTPS_PROXY, for a mirror PIP_INDEX_URL, without a network PIP_FIND_LINKS and' \
   'PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
 
-.PHONY: help venv demo paper arms changes expect test test-long test-browser test-nightly soak lint clean bench
+.PHONY: help venv demo paper arms changes expect test test-long test-browser test-nightly soak docs lint clean bench
 
 help: ## List what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' Makefile
@@ -92,6 +92,9 @@ bench: $(BENCH_READY) ## Measure everything side by side, into benchmark/RESULTS
 
 soak: $(READY) ## Run half an hour of the plant's time with a fault every few seconds (MINUTES)
 	@$(RUN) test/soak.py --minutes "$(MINUTES)"
+
+docs: $(READY) ## Make the site of the documentation, into out/docs
+	@$(RUN) -m sphinx -q -W --keep-going -n doc out/docs && echo 'Open out/docs/index.html'
 
 lint: $(LINT_READY) ## Check style, types and layers
 	@good=1; for check in 'ruff check' 'ruff format --check' mypy; do \

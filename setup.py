@@ -8,6 +8,8 @@ from setuptools import find_packages, setup
 
 NAME = 'blf_dsc_controller'
 SHARE = f'share/{NAME}'
+# The site of doc/, which the tests build, too. ziamath draws its equations.
+DOCS = ['sphinx>=8', 'myst-parser>=4', 'furo', 'ziamath>=0.12']
 
 
 def version() -> str:
@@ -86,7 +88,9 @@ setup(
             'pyarrow',
             'distributed',
             'plotly>=6',
+            *DOCS,
         ],
+        'docs': DOCS,
         # The peers that `make bench` compares with; Octave and a C compiler are the system's.
         'bench': ['mujoco', 'drake', 'pin'],
         # Fixed, because with nearly every rule on, each release of the linter finds something new.

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The site of the documentation: `make docs`, plain `sphinx-build doc out/docs`, or rosdoc2."""
+
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import ziamath
+from docutils import nodes
+from sphinx.application import Sphinx
+from sphinx.util.logging import getLogger
+from sphinx.writers.html5 import HTML5Translator
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))  # the docstrings of this checkout
+
+from blf_dsc_controller import __version__  # noqa: E402
+
+project = 'blf_dsc_controller'
+author = 'The blf_dsc_controller contributors'
+copyright = author  # noqa: A001 - Sphinx's name
+release = version = __version__
+
+extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.napoleon']
+myst_enable_extensions = ['dollarmath']
+myst_fence_as_directive = ['math']  # as GitHub writes equations
+myst_heading_anchors = 3
+
+default_role = 'code'  # docstrings write `name`
+autodoc_typehints_format = 'short'
+python_use_unqualified_type_names = True
+nitpicky = True
+# Types of other packages, and those of the package that the page on Python does not show.
+nitpick_ignore_regex = [('py:.*', '.*')]
+
+html_theme = 'furo'
+html_title = f'{project} {release}'
+html_show_copyright = False
+# Drawn when the site is made: no script, no font, no request, in any browser.
+html_math_renderer = 'drawn'
+ziamath.config.svg2 = False
+ziamath.config.precision = 2
+html_static_path = ['_static']
+html_css_files = ['site.css']
+
+
+def draw(translator: HTML5Translator, node: nodes.math | nodes.math_block) -> None:
+    """Write an equation as SVG; LaTeX that is not understood is a warning of the build."""
+    inline = isinstance(node, nodes.math)
+    size = 16.0  # of a letter, to which the text's size is 1 em
+    equation = ziamath.Latex(node.astext(), size=size, color='currentColor', inline=inline)
+    if '\\' in equation.mathmlstr():
+        getLogger(__name__).warning('unknown LaTeX: %s', node.astext(), location=node)
+    drawing = equation.svgxml()
+    for side in ('width', 'height'):
+        drawing.set(side, f'{float(drawing.get(side, 0)) / size:.2f}em')
+    drawing.set('style', f'vertical-align: {equation.getyofst() / size:.2f}em')
+    drawing.set('role', 'img')
+    drawing.set('aria-label', node.astext())
+    tag = 'span' if inline else 'div'
+    svg = ET.tostring(drawing, encoding='unicode')
+    translator.body.append(f'<{tag} class="equation">{svg}</{tag}>')
+    raise nodes.SkipNode
+
+
+def setup(app: Sphinx) -> None:
+    """Tell Sphinx of the renderer."""
+    app.add_html_math_renderer('drawn', (draw, None), (draw, None))
