@@ -15,7 +15,7 @@ from synthetic_bag import Synthetic
 from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.cli.progress import Progress
+from blf_dsc_controller.cli.progress import LoopProgress
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.monte_carlo.runs import run_chunk
 from blf_dsc_controller.simulation.bag import write_bag
@@ -55,8 +55,8 @@ def test_the_progress_compares_by_name(record, capsys):
         (names, 'parameter error 0.0'),
         (('mass', 'length', 'other'), 'bound 0.50\n'),
     ):
-        progress = Progress(config.plant, shown)
-        progress.show(10.0, 0.5, record.sample(-1).estimate[:3])
+        progress = LoopProgress(config.plant, shown)
+        progress.show_loop(10.0, 0.5, record.sample(-1).estimate[:3])
         progress.close()
         assert line in capsys.readouterr().err
 

@@ -3,121 +3,261 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
+from itertools import pairwise
 
 import pytest
 import recorded_run
+import synthetic_bag
+from synthetic_bag import START, Synthetic
 
-from blf_dsc_controller.messages.topics import JOINT_STATES
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.messages.topics import ROBOT_DESCRIPTION
+from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.replay.timeline import Timeline
 
-TIMES = [100, 110, 120, 200]
 PATIENCE = 300.0  # s, until a test gives up on what should take a moment
+MEGABYTE = 10**6
+COMMAND = [sys.executable, '-m', 'blf_dsc_controller', 'replay']
 
 
-def test_messages_are_due_as_their_times_say():
-    timeline = Timeline(TIMES, 1.0)
-    assert list(timeline.due(1000, 9)) == [0]
-    assert timeline.wait(1000) == pytest.approx(10e-9)
-    assert list(timeline.due(1009, 9)) == []
-    assert list(timeline.due(1020, 9)) == [1, 2]
-    assert list(timeline.due(1100, 9)) == [3]
-    assert timeline.is_over
+def playing(rate):
+    timeline = Timeline(100, rate)
+    timeline.resume(1000)
+    return timeline
+
+
+def test_a_bag_runs_with_the_clock():
+    timeline = playing(1.0)
+    assert timeline.wait(110, 1000) == pytest.approx(10e-9)
+    assert timeline.wait(110, 1010) == 0.0
+    assert timeline.position(1020) == 120
 
 
 def test_the_rate_stretches_time_and_zero_knows_none():
-    timeline = Timeline(TIMES, 10.0)
-    assert list(timeline.due(0, 9)) == [0]
-    assert list(timeline.due(2, 9)) == [1, 2]
-    assert timeline.wait(2) == pytest.approx(8e-9)
-    fast = Timeline(TIMES, 0.0)
-    assert [list(fast.due(0, 3)), list(fast.due(0, 3))] == [[0, 1, 2], [3]]
+    timeline = playing(10.0)
+    assert timeline.wait(200, 1002) == pytest.approx(8e-9)
+    assert timeline.position(1002) == 120
+    fast = playing(0.0)
+    assert fast.wait(10**12, 1000) == 0.0
+    assert fast.position(2000) == 100
 
 
-def test_a_pause_stops_the_time_and_steps_move_on_one_by_one():
-    timeline = Timeline(TIMES, 1.0)
-    timeline.due(1000, 9)
-    assert timeline.step() is None  # only while paused
+def test_a_pause_stops_the_time():
+    timeline = playing(1.0)
     timeline.pause(1005)
-    assert list(timeline.due(5000, 9)) == []
-    assert timeline.wait(5000) == float('inf')
-    assert timeline.step() == 1
-    timeline.resume(9000)  # at the time of message 1
-    assert timeline.wait(9000) == pytest.approx(10e-9)
-    assert list(timeline.due(9010, 9)) == [2]
+    assert timeline.wait(100, 5000) == float('inf')
+    timeline.jump(110, 6000)  # a step
+    timeline.resume(9000)
+    assert timeline.wait(120, 9000) == pytest.approx(10e-9)
 
 
-def test_a_loop_begins_again():
-    timeline = Timeline(TIMES, 0.0, loop=True)
-    assert list(timeline.due(0, 9)) == [0, 1, 2, 3]
-    assert list(timeline.due(0, 9)) == [0, 1, 2, 3]
-    assert not timeline.is_over
-    assert Timeline([], 1.0, loop=True).is_over
+def string(text):
+    message = typestore().types[ROBOT_DESCRIPTION.type](data=text)
+    raw = bytes(typestore().serialize_cdr(message, ROBOT_DESCRIPTION.type))
+    return raw + bytes(-len(raw) % 4)  # as the middleware hands it over
 
 
-def test_a_bag_is_played_over_ros_byte_by_byte_under_another_name(tmp_path):
-    pytest.importorskip('rclpy', reason='needs ROS 2')
-    import rclpy
-    from rclpy.qos import QoSProfile
-    from sensor_msgs.msg import JointState
-    from std_srvs.srv import Trigger
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    """200 samples, and two URDFs; the second comes after 50 of them."""
+    messages = list(Synthetic(200).messages())
+    urdfs = [(ROBOT_DESCRIPTION, START + k, string(f'<robot {k}/>')) for k in (0, 50_000_000)]
+    ordered = sorted([*urdfs, *messages], key=lambda one: one[1])
+    return synthetic_bag.write(tmp_path_factory.mktemp('played') / 'bag', ordered)
 
-    path = recorded_run.record(tmp_path / 'bag', 0.2)
-    sent = [raw for topic, _, _, raw in recorded_run.messages(path) if topic == '/joint_states']
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node('listener', context=context)
-    executor = rclpy.executors.SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    came = []
-    node.create_subscription(JointState, '/again', came.append, QoSProfile(depth=1000), raw=True)
-    services = {
-        name: node.create_client(Trigger, f'/rosbag2_player/{name}')
-        for name in ('is_paused', 'play_next', 'resume')
-    }
 
-    def wait_for(condition):
+class Player:
+    """A player of a bag in a process of its own, and a node that listens to it."""
+
+    def __init__(self, bag, *options):
+        import rclpy
+
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node = rclpy.create_node('listener', context=self.context)
+        self._executor = rclpy.executors.SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self._process = subprocess.Popen(
+            [*COMMAND, str(bag), '--play', '--start-paused', *options],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def listen(self, type_, name, **quality):
+        from rclpy.qos import QoSProfile
+
+        came = []
+        profile = QoSProfile(depth=1000, **quality)
+        self.node.create_subscription(type_, name, came.append, profile, raw=True)
+        return came
+
+    def spin(self):
+        self._executor.spin_once(timeout_sec=0.02)
+
+    def until(self, condition):
         deadline = time.monotonic() + PATIENCE
         while not condition():
             assert time.monotonic() < deadline, 'still waiting'
-            executor.spin_once(timeout_sec=0.02)
+            self.spin()
 
-    def call(name):
-        wait_for(services[name].service_is_ready)
-        future = services[name].call_async(Trigger.Request())
-        wait_for(future.done)
+    def call(self, name):
+        from std_srvs.srv import Trigger
+
+        client = self.node.create_client(Trigger, f'/rosbag2_player/{name}')
+        self.until(client.service_is_ready)
+        future = client.call_async(Trigger.Request())
+        self.until(future.done)
         return future.result()
 
-    words = ['--play', '--start-paused', '--rate', '0', '--remap', 'joint_states:=again']
-    command = [sys.executable, '-m', 'blf_dsc_controller', 'replay', str(path), *words]
-    player = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    try:
-        wait_for(lambda: node.count_publishers('/again') > 0)
-        wait_for(lambda: call('is_paused').success)
-        assert came == []
-        while not came:  # the first messages are of other topics
-            assert call('play_next').success
-            executor.spin_once(timeout_sec=0.1)
-        assert bytes(came[0]) == sent[0]
-        assert call('resume').success
-        wait_for(lambda: len(came) == len(sent))
-        assert [bytes(raw) for raw in came] == sent
-        _, said = player.communicate(timeout=PATIENCE)
-        assert player.returncode == 0, said
-    finally:
-        player.kill()
-        node.destroy_node()
-        context.try_shutdown()
-    assert JOINT_STATES.resolved == '/joint_states'
+    def end(self):
+        """Wait for the end; return what was printed."""
+        out, said = self._process.communicate(timeout=PATIENCE)
+        assert self._process.returncode == 0, said
+        return out, said
+
+    def close(self):
+        self._process.kill()
+        self._process.communicate()
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+@pytest.fixture
+def play(bag):
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    players = []
+
+    def start(*options):
+        players.append(Player(bag, *options))
+        return players[-1]
+
+    yield start
+    for player in players:
+        player.close()
+
+
+def latched():
+    from rclpy.qos import DurabilityPolicy
+
+    return {'durability': DurabilityPolicy.TRANSIENT_LOCAL}
+
+
+def test_a_bag_is_played_over_ros_byte_by_byte_under_another_name(play, bag):
+    from sensor_msgs.msg import JointState
+    from std_msgs.msg import String
+
+    sent = [raw for topic, _, _, raw in recorded_run.messages(bag) if topic == '/joint_states']
+    player = play('--rate', '0', '--remap', 'joint_states:=again')
+    came = player.listen(JointState, '/again')
+    player.until(lambda: player.node.count_publishers('/again') > 0)
+    player.until(lambda: player.call('is_paused').success)
+    assert came == []
+    while not came:  # the first messages are of other topics
+        assert player.call('play_next').success
+        player.spin()
+    assert bytes(came[0]) == sent[0]
+    # RViz starts later than the publisher of the URDF, and gets it.
+    urdf = player.listen(String, '/robot_description', **latched())
+    player.until(lambda: urdf)
+    assert bytes(urdf[0]) == string('<robot 0/>')
+    assert player.call('resume').success
+    player.until(lambda: len(came) == len(sent))
+    assert [bytes(raw) for raw in came] == sent
+    out, said = player.end()
+    assert f'/rosbag2_player plays 0.199 s of {bag} as fast as possible' in out
+    assert '/again' in out.split()
+    assert 'ros2 service call /rosbag2_player/resume' in out
+    assert said == 'played 0.2/0.199 s\n'
+
+
+def test_publishers_have_the_recorded_quality_of_service(play):
+    from rclpy.qos import DurabilityPolicy
+
+    player = play('--delay', '0')
+    expected = {
+        '/robot_description': DurabilityPolicy.TRANSIENT_LOCAL,
+        '/blf_dsc_controller/bound': DurabilityPolicy.TRANSIENT_LOCAL,
+        '/blf_dsc_controller/tracking_error': DurabilityPolicy.VOLATILE,
+    }
+    for name, durability in expected.items():
+        player.until(lambda name=name: player.node.get_publishers_info_by_topic(name))
+        (found,) = player.node.get_publishers_info_by_topic(name)
+        assert found.qos_profile.durability is durability, name
+
+
+def test_a_part_of_a_bag_begins_with_what_was_latched_before(play):
+    from sensor_msgs.msg import JointState
+    from std_msgs.msg import String
+
+    part = ('--start-offset', '0.1', '--playback-duration', '0.0505')
+    player = play(*part, '--topics', 'joint_states', '/robot_description', '--rate', '0.5')
+    states = player.listen(JointState, '/joint_states', **latched())
+    urdf = player.listen(String, '/robot_description', **latched())
+    for name in ('/joint_states', '/robot_description'):
+        player.until(lambda name=name: player.node.count_publishers(name) > 0)
+    assert player.node.count_publishers('/blf_dsc_controller/bound') == 0
+    assert player.call('resume').success
+    player.end()
+    player.until(lambda: urdf)
+    assert [bytes(one) for one in urdf] == [string('<robot 50000000/>')]
+    player.until(lambda: len(states) == 52)
+    from rclpy.serialization import deserialize_message
+
+    stamps = [deserialize_message(raw, JointState).header.stamp.nanosec for raw in states]
+    assert stamps[0] == 99 * MEGABYTE  # where the arm stood; then from the offset on
+    assert stamps[1:] == [k * MEGABYTE for k in range(100, 151)]
+    assert all(before < after for before, after in pairwise(stamps))
+
+
+def test_a_bag_larger_than_the_memory_is_read_as_it_is_played(tmp_path):
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    size = 300
+    large = ((ROBOT_DESCRIPTION, START + k, bytes(MEGABYTE)) for k in range(size))
+    path = synthetic_bag.write(tmp_path / 'bag', large, lambda _: '/large')
+    command = [*COMMAND, str(path), '--play', '--rate', '0', '--delay', '0']
+    player = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(player.pid, 0)
+    player.returncode = os.waitstatus_to_exitcode(status)
+    assert player.returncode == 0
+    assert usage.ru_maxrss * 1024 < size * MEGABYTE
+
+
+@pytest.mark.parametrize(
+    ('options', 'words'),
+    [
+        (['--rate', 'nan'], '--rate nan: expected a speed from 0.001 to 1e+06, or 0'),
+        (['--rate', 'inf'], '--rate inf: expected'),
+        (['--rate', '-1'], '--rate -1: expected'),
+        (['--delay', 'nan'], '--delay nan: expected a time in seconds, 0 or more'),
+        (['--remap', 'foo'], '--remap foo: expected FROM:=TO'),
+        (['--remap', 'a:=1b'], '--remap a:=1b: expected FROM:=TO'),
+        (['--start-offset', '9'], 'nothing is left after 9 s: the bag lasts 0.199 s'),
+        (['--topics', '/x'], 'the bag has no topic /x; it holds /'),
+    ],
+)
+def test_a_wrong_option_is_refused_in_one_line(bag, capfd, options, words):
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    assert main(['replay', str(bag), '--play', *options]) == 1
+    out, said = capfd.readouterr()
+    assert said.startswith(f'blf_dsc replay: {words}')
+    assert (out, said.count('\n')) == ('', 1)
 
 
 def test_a_bag_with_nothing_to_play_is_called_empty(tmp_path):
     pytest.importorskip('rclpy', reason='needs ROS 2')
     path = recorded_run.write(tmp_path / 'bag', [])
-    command = [sys.executable, '-m', 'blf_dsc_controller', 'replay', str(path), '--play']
-    run = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    run = subprocess.run(
+        [*COMMAND, str(path), '--play'],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
     assert run.returncode == 1
     assert f'blf_dsc replay: {path} is empty' in run.stderr
     assert 'Traceback' not in run.stderr

@@ -3,16 +3,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, TypeAlias
 
 import yaml
+from rosbags.interfaces import (
+    ConnectionExtRosbag1,
+    ConnectionExtRosbag2,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from blf_dsc_controller.messages.cdr import NANOSECONDS
-from blf_dsc_controller.messages.topics import FOREVER, Quality
+from blf_dsc_controller.messages.topics import FOREVER, HISTORY, STREAM, Quality
 from blf_dsc_controller.messages.types import Definition
 
 VERSION = 9
@@ -119,6 +129,43 @@ def parse_profiles(text: str) -> list[Profile]:
         return [{**profile} for profile in dump_qos_v9(parse_qos(text))]
     except (ReaderError, KeyError, TypeError, AttributeError):
         return []
+
+
+def strongest_quality(
+    publishers: Iterable[ConnectionExtRosbag1 | ConnectionExtRosbag2],
+) -> Quality:
+    """Quality of service that every subscriber accepts who accepted one of the publishers.
+
+    The depth of a latched topic is as recorded, else that of a stream: none is lost in a burst.
+    """
+    offered: list[Qos] = []
+    is_latched = False
+    for one in publishers:
+        if isinstance(one, ConnectionExtRosbag1):
+            is_latched |= bool(one.latching)
+        else:
+            offered += one.offered_qos_profiles
+    is_latched |= any(one.durability is QosDurability.TRANSIENT_LOCAL for one in offered)
+    depth = max((one.depth for one in offered if one.history is QosHistory.KEEP_LAST), default=0)
+    return replace(
+        HISTORY if is_latched else STREAM,
+        depth=depth if is_latched and depth else STREAM.depth,
+        reliability='best_effort'
+        if offered and all(one.reliability is QosReliability.BEST_EFFORT for one in offered)
+        else 'reliable',
+        deadline=_shortest(one.deadline for one in offered),
+        liveliness_lease_duration=_shortest(one.liveliness_lease_duration for one in offered),
+        liveliness='manual_by_topic'
+        if any(one.liveliness is QosLiveliness.MANUAL_BY_TOPIC for one in offered)
+        else 'automatic',
+    )
+
+
+def _shortest(times: Iterable[QosTime]) -> int:
+    """Shortest of some times [ns]; zero is unspecified."""
+    return min(
+        (time for one in times if (time := one.sec * NANOSECONDS + one.nsec)), default=FOREVER
+    )
 
 
 def _period(files: Sequence[FileInformation]) -> dict[str, dict[str, int]]:

@@ -14,6 +14,7 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2.storage_mcap import McapReader
 
 from blf_dsc_controller.bags.mcap_reader import read_messages
+from blf_dsc_controller.bags.metadata import strongest_quality
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.types import typestore
 
@@ -28,7 +29,9 @@ class BagError(BlfDscError):
 class OpenBag:
     """An open bag. rosbags' AnyReader would reject bags with one bad type definition.
 
-    `held` is name and type, empty where unknown, of each topic; `counts` its number of messages.
+    `held` is name and type, empty where unknown, of each topic; `counts` its number of messages,
+    `offered` the quality of service that its publishers offered. `times` [ns] are those of the
+    first message and after the last.
     """
 
     def __init__(self, reader: Reader1 | Reader2) -> None:
@@ -36,6 +39,11 @@ class OpenBag:
         held = dict.fromkeys((one.topic, one.msgtype) for one in reader.connections)
         self.held = [(name, kind.replace('__schemaless__', '')) for name, kind in held]
         self.counts = {name: reader.topics[name].msgcount for name, _ in self.held}
+        self.offered = {
+            name: strongest_quality([one.ext for one in reader.topics[name].connections])
+            for name, _ in self.held
+        }
+        self.times = (reader.start_time, reader.end_time)
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
         """Topic, time of reception [ns] and content in CDR of every message of `topics`.
@@ -46,11 +54,22 @@ class OpenBag:
         if files:
             for file in files:
                 yield from read_messages(file, topics)
-            return
+        else:
+            yield from self.in_order(topics)
+
+    def in_order(
+        self, topics: Collection[str], start: int | None = None, stop: int | None = None
+    ) -> Iterator[tuple[str, int, bytes]]:
+        """The same from `start` on and before `stop` [ns], in the order of reception.
+
+        Slower by half, but only a few chunks of the bag are in memory at a time.
+        """
         is_ros1 = isinstance(self._reader, Reader1)
         # The common types serialise alike in ROS 1 and 2 but for padding and `seq` of the header.
         chosen = [one for one in self._reader.connections if one.topic in topics]
-        for connection, received, raw in self._reader.messages(chosen) if chosen else ():
+        for connection, received, raw in (
+            self._reader.messages(chosen, start, stop) if chosen else ()
+        ):
             cdr = typestore().ros1_to_cdr(raw, connection.msgtype) if is_ros1 else raw
             yield connection.topic, received, bytes(cdr)
 

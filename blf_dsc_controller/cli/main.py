@@ -13,6 +13,7 @@ import sys
 import textwrap
 from collections.abc import Sequence
 from functools import partial
+from math import inf
 from pathlib import Path
 
 from blf_dsc_controller.errors import BlfDscError
@@ -277,6 +278,9 @@ def _replay_options(parser: argparse.ArgumentParser) -> None:
     option('--loop', action='store_true', help='start again at the end')
     option('--start-paused', action='store_true', help='wait for ~/resume')
     option('--delay', type=float, default=1.0, help='time for discovery [s] (1)')
+    option('--topics', nargs='+', default=[], metavar='TOPIC', help='to play (all)')
+    option('--start-offset', type=float, default=0.0, help='time in the bag to begin at [s] (0)')
+    option('--playback-duration', type=float, default=inf, help='time in the bag [s] (its rest)')
     option('--remap', action='append', default=[], metavar='FROM:=TO', help='as ROS remaps')
 
 

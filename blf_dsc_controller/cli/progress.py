@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress of a running loop, in one line."""
+"""Progress of a running loop, or of a bag that is played, in one line."""
 
 from __future__ import annotations
 
@@ -19,35 +19,26 @@ _LINE_PERIOD = 10.0  # s between two lines where there is no terminal to draw a 
 
 
 class Progress:
-    """Progress over simulated time, with the largest |xi1| / k_c and the parameter error.
+    """Progress over time: a bar on a terminal; elsewhere, such as in a log, a line now and then."""
 
-    A bar on a terminal; elsewhere, such as in a log, a line now and then.
-    """
-
-    def __init__(self, config: PlantConfig, parameters: Sequence[str]) -> None:
-        """Begin at 0 s; `parameters` are the names of the estimates."""
-        self._order = parameter_order(parameters, config)
-        self._config = config
+    def __init__(self, title: str, seconds: float) -> None:
+        """Begin at 0 of so many seconds; 0 if the end is open."""
+        self._title, self._seconds = title, seconds
         self._line = ''
         self._due = time.monotonic() + _LINE_PERIOD
         self._bar = tqdm(
-            total=config.duration,
-            desc='closed loop',
+            total=seconds,
+            desc=title,
             bar_format=_FORMAT,
             mininterval=0.2,
             disable=not sys.stderr.isatty(),
         )
 
-    def show(self, elapsed: float, ratio: float, estimate: ArrayLike) -> None:
-        """Show the simulated time [s], the largest |xi1| / k_c so far, and P^ (p,)."""
-        P = parameters_of(self._config, elapsed)[self._order]
-        error = np.linalg.norm(np.asarray(estimate) - P) / np.linalg.norm(P)
-        status = f'max|xi1|/bound {ratio:.2f}'
-        if np.all(self._order >= 0) and not self._config.robot.urdf:  # else it has no unit
-            status += f', parameter error {100 * error:.2f} %'
+    def show(self, elapsed: float, status: str = '') -> None:
+        """Show the time [s] that has been reached, and a few words."""
         self._bar.set_postfix_str(status, refresh=False)
-        self._bar.update(min(elapsed, self._config.duration) - self._bar.n)
-        self._line = f'closed loop {elapsed:.1f}/{self._config.duration:g} s, {status}'
+        self._bar.update(min(elapsed, self._seconds) - self._bar.n)
+        self._line = f'{self._title} {elapsed:.1f}/{self._seconds:g} s' + (status and f', {status}')
         if time.monotonic() >= self._due:
             self._print_line()
 
@@ -66,3 +57,22 @@ class Progress:
             print(self._line, file=sys.stderr, flush=True)
             self._line = ''
             self._due = time.monotonic() + _LINE_PERIOD
+
+
+class LoopProgress(Progress):
+    """Progress over simulated time, with the largest |xi1| / k_c and the parameter error."""
+
+    def __init__(self, config: PlantConfig, parameters: Sequence[str]) -> None:
+        """Begin at 0 s; `parameters` are the names of the estimates."""
+        super().__init__('closed loop', config.duration)
+        self._order = parameter_order(parameters, config)
+        self._config = config
+
+    def show_loop(self, elapsed: float, ratio: float, estimate: ArrayLike) -> None:
+        """Show the simulated time [s], the largest |xi1| / k_c so far, and P^ (p,)."""
+        P = parameters_of(self._config, elapsed)[self._order]
+        error = np.linalg.norm(np.asarray(estimate) - P) / np.linalg.norm(P)
+        status = f'max|xi1|/bound {ratio:.2f}'
+        if np.all(self._order >= 0) and not self._config.robot.urdf:  # else it has no unit
+            status += f', parameter error {100 * error:.2f} %'
+        self.show(elapsed, status)

@@ -28,7 +28,10 @@ DIFFERENT = 3
 def replay(options: Namespace) -> int:
     """Replay a bag in the mode that the options choose, and print the result."""
     if options.play:
-        _play(options)
+        require_ros()
+        from blf_dsc_controller.cli.play import play
+
+        play(options)
         return 0
     config = None
     if options.config is not None:
@@ -49,21 +52,6 @@ def replay(options: Namespace) -> int:
         _print_speed(run.stamp.size, run.duration, perf_counter() - begin)
         print('\n'.join(_open_loop(found, config)))
     return 0
-
-
-def _play(options: Namespace) -> None:
-    require_ros()
-    from blf_dsc_controller.nodes.player_node import play
-
-    play(
-        options.bag,
-        options.rate,
-        loop=options.loop,
-        clock=options.clock,
-        paused=options.start_paused,
-        delay=options.delay,
-        remaps=options.remap,
-    )
 
 
 def _learn(options: Namespace, config: ControllerConfig | None) -> None:

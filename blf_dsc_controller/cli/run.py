@@ -18,7 +18,7 @@ from blf_dsc_controller.analysis.summary import format_table, summarize, write_s
 from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import INTERRUPTED, require_ros
-from blf_dsc_controller.cli.progress import Progress
+from blf_dsc_controller.cli.progress import LoopProgress
 from blf_dsc_controller.compiled import COMPILATION_NOTICE
 from blf_dsc_controller.compiled.jit import is_compiled
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
@@ -119,13 +119,13 @@ def _configuration(options: Namespace) -> LoopConfig:
 
 def _run_offline(config: LoopConfig, bag: Path) -> None:
     parameters = model_of(config.controller).parameter_names
-    progress = Progress(config.plant, parameters)
+    progress = LoopProgress(config.plant, parameters)
 
     def show(record: Record, rows: int) -> None:
         n = len(record.config.joints)
         errors = abs(record.samples[:rows, 2 * n : 3 * n] / record.samples[:rows, 6 * n : 7 * n])
         estimate = record.controller.state.estimate[: len(parameters)]
-        progress.show(record.stamps[rows - 1] * 1e-9, np.nanmax(errors), estimate)
+        progress.show_loop(record.stamps[rows - 1] * 1e-9, np.nanmax(errors), estimate)
 
     with announced_compilation():
         record = simulate(config.controller, config.plant, show)

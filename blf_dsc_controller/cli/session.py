@@ -20,7 +20,7 @@ import rclpy
 from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import JointState
 
-from blf_dsc_controller.cli.progress import Progress
+from blf_dsc_controller.cli.progress import LoopProgress
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, LoopConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import model_of
@@ -141,7 +141,7 @@ class Monitor:
         plant = config.plant
         self._interrupts = interrupts
         self._parameters = model_of(config.controller).parameter_names
-        self.progress = Progress(plant, self._parameters)
+        self.progress = LoopProgress(plant, self._parameters)
         self._start, self._elapsed = -1.0, 0.0
         self._end = plant.duration - DECIMATION * plant.sample_time / 2 if plant.duration else inf
         self._latest: JointState | None = None
@@ -171,7 +171,7 @@ class Monitor:
         values = dict(zip(message.name, message.position, strict=True))
         ratio = max(value for name, value in values.items() if name.startswith(RATIO))
         self._elapsed = stamp - self._start
-        self.progress.show(self._elapsed, ratio, [values[name] for name in self._parameters])
+        self.progress.show_loop(self._elapsed, ratio, [values[name] for name in self._parameters])
         return True
 
     def __enter__(self) -> Monitor:

@@ -11,9 +11,10 @@ from typing import Any
 
 from ament_index_python.packages import get_package_share_directory
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
 from rosbags.interfaces import Nodetype
@@ -68,6 +69,9 @@ def qos_profile(quality: Quality) -> QoSProfile:
         depth=quality.depth,
         reliability=ReliabilityPolicy[quality.reliability.upper()],
         durability=DurabilityPolicy[quality.durability.upper()],
+        deadline=Duration(nanoseconds=quality.deadline),
+        liveliness=LivelinessPolicy[quality.liveliness.upper()],
+        liveliness_lease_duration=Duration(nanoseconds=quality.liveliness_lease_duration),
     )
 
 

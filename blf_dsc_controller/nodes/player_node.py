@@ -8,95 +8,165 @@ are std_srvs/Trigger: `is_paused` and `play_next` return their result in `succes
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
+from math import inf
 from pathlib import Path
 from typing import Any
 
-import rclpy
-from rclpy.experimental import EventsExecutor
+from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
 from blf_dsc_controller.bags.sources import BagError, open_bag
 from blf_dsc_controller.messages.codecs import encode_clock
-from blf_dsc_controller.messages.topics import CLOCK, HISTORY, STREAM
+from blf_dsc_controller.messages.topics import CLOCK, Quality
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
-from blf_dsc_controller.nodes.process import drain
 from blf_dsc_controller.replay.timeline import Timeline
 
 _MOST_AT_ONCE = 100
-_LONGEST_WAIT = 0.01  # s
 _CLOCK_PERIOD = 10_000_000  # ns
-_LATCHED = ('bound',)
 
 
 class PlayerNode(Node):
     """Publishes the messages of a bag in its time, and that time on /clock if `clock` is set.
 
-    `rate` is bag time per time, 0 as fast as possible; a `loop` begins again at the end. Raises
-    BagError if there is no bag, it is damaged, or it holds nothing that can be played here.
+    Messages are read as they are played, so that a bag may be larger than memory. A publisher has
+    the recorded quality of service of its topic. `rate` is bag time per time, 0 as fast as
+    possible; a `loop` begins again at the end. `topics` are all, if there are none; played is from
+    `offset` [s] on, for `duration` [s]. It waits for `resume`.
+
+    Raises:
+        BagError: there is no bag, it is damaged, or it holds nothing of these topics and times.
     """
 
-    def __init__(self, path: Path, rate: float, *, loop: bool, clock: bool, **options: Any) -> None:
+    def __init__(
+        self,
+        path: Path,
+        rate: float,
+        *,
+        loop: bool,
+        clock: bool,
+        topics: Collection[str] = (),
+        offset: float = 0.0,
+        duration: float = inf,
+        **options: Any,
+    ) -> None:
         super().__init__('rosbag2_player', **options)
         with open_bag(path) as bag:
-            types = {name: type_ for name, type_ in bag.held if not (clock and name == '/clock')}
-            outputs = {name: self._output(name, type_) for name, type_ in types.items()}
-            known = {name for name, output in outputs.items() if output is not None}
-            messages = sorted(bag.messages(known), key=lambda message: message[1])
-        if not messages:
+            held, offered, counts, times = bag.held, bag.offered, bag.counts, bag.times
+        if not any(counts.values()):
             raise BagError(f'{path} is empty: it holds no message')
-        self._messages = [partial(outputs[name].publish, raw) for name, _, raw in messages]
-        self.outputs = [output for output in outputs.values() if output is not None]
-        self.timeline = Timeline([at for _, at, _ in messages], rate, loop=loop)
+        wanted = {'/' + name.lstrip('/') for name in topics} or {*counts}
+        if not wanted <= {*counts}:
+            missing, listing = sorted(wanted - {*counts}), ', '.join(counts)
+            raise BagError(f'the bag has no topic {", ".join(missing)}; it holds {listing}')
+        self.begin = times[0] + round(offset * 1e9)
+        self.end = (
+            times[1] if duration == inf else min(times[1], self.begin + round(duration * 1e9))
+        )
+        if self.begin > times[1]:
+            seconds = (times[1] - times[0]) * 1e-9
+            raise BagError(f'nothing is left after {offset:g} s: the bag lasts {seconds:.3f} s')
+        self._path, self._loop = path, loop
+        self._latched = {name for name in wanted if offered[name].durability == 'transient_local'}
+        self._outputs: dict[str, Publisher] = {}
+        for name, type_ in held:
+            if name in wanted and not (clock and name == CLOCK.name):
+                self._add(name, type_, offered[name])
+        self.timeline = Timeline(self.begin, rate)
+        self._rate = rate
+        self._messages = self._read()
+        self._next = next(self._messages, None)
+        if self._next is None:
+            raise BagError(f'{path} holds no message of these topics and times that can be played')
         self._clock_output = (
-            self.create_publisher(message_class(CLOCK.type), '/clock', 10) if clock else None
+            self.create_publisher(message_class(CLOCK.type), CLOCK.name, 10) if clock else None
         )
         self._clock_published = 0
         actions: dict[str, Callable[[], tuple[bool, str]]] = {
-            'pause': self.pause,
-            'resume': self._resume,
-            'toggle_paused': lambda: self._resume() if self.timeline.paused else self.pause(),
+            'pause': self._pause,
+            'resume': self.resume,
+            'toggle_paused': lambda: self.resume() if self.timeline.paused else self._pause(),
             'is_paused': lambda: (self.timeline.paused, ''),
             'play_next': self._play_next,
         }
         for name, action in actions.items():
             self.create_service(Trigger, f'~/{name}', partial(_respond, action))
 
-    def play(self) -> None:
-        """Publish what is due."""
+    @property
+    def outputs(self) -> Collection[Publisher]:
+        """Publishers of the bag's topics."""
+        return self._outputs.values()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether no message is left."""
+        return self._next is None
+
+    @property
+    def elapsed(self) -> float:
+        """Time in the bag [s] since where it begins to play."""
+        at = min(self.timeline.position(time.monotonic_ns()), self.end)
+        return (at - self.begin) * 1e-9
+
+    def play(self) -> float:
+        """Publish what is due; return the time until the next message is [s]."""
         now = time.monotonic_ns()
-        for number in self.timeline.due(now, _MOST_AT_ONCE):
-            self._messages[number]()
+        for _ in range(_MOST_AT_ONCE):
+            if self._next is None or self.timeline.wait(self._next[1], now) > 0.0:
+                break
+            self._publish(self._next, now)
         if self._clock_output is not None and now - self._clock_published >= _CLOCK_PERIOD:
             self._clock_published = now
             self._clock_output.publish(encode_clock(self.timeline.position(now)))
+        return 0.0 if self._next is None else self.timeline.wait(self._next[1], now)
 
-    def _output(self, name: str, type_name: str) -> Any:
+    def _add(self, name: str, type_name: str, quality: Quality) -> None:
         try:
-            class_ = message_class(type_name)
+            type_ = message_class(type_name)
+            self._outputs[name] = self.create_publisher(type_, name, qos_profile(quality))
         except (ImportError, AttributeError):
             self.get_logger().warning(f'{name} is not played: {type_name} is not installed here')
-            return None
-        quality = HISTORY if name.rsplit('/', 1)[-1] in _LATCHED else STREAM
-        return self.create_publisher(class_, name, qos_profile(quality))
+        except NameValidationException:
+            self.get_logger().warning(f'{name} is not played: it is not the name of a topic')
 
-    def pause(self) -> tuple[bool, str]:
-        """Hold the position in the bag."""
+    def _read(self) -> Iterator[tuple[str, int, bytes]]:
+        """Messages to play; first the last one of each latched topic from before."""
+        with open_bag(self._path) as bag:
+            if self.begin > bag.times[0]:
+                latched = self._latched & {*self._outputs}
+                before = {one[0]: one for one in bag.in_order(latched, stop=self.begin)}
+                yield from ((name, self.begin, raw) for name, _, raw in before.values())
+            yield from bag.in_order({*self._outputs}, self.begin, self.end + 1)
+
+    def _publish(self, message: tuple[str, int, bytes], now: int) -> None:
+        """Publish the next message, and read the one after it."""
+        name, at, raw = message
+        self._outputs[name].publish(raw)
+        if self._rate == 0.0 or self.timeline.paused:
+            self.timeline.jump(at, now)
+        self._next = next(self._messages, None)
+        if self._next is None and self._loop:
+            self._messages = self._read()
+            self._next = next(self._messages, None)
+            self.timeline.jump(self.begin, now)
+
+    def _pause(self) -> tuple[bool, str]:
         self.timeline.pause(time.monotonic_ns())
         return True, 'paused'
 
-    def _resume(self) -> tuple[bool, str]:
+    def resume(self) -> tuple[bool, str]:
+        """Begin, or continue after a pause."""
         self.timeline.resume(time.monotonic_ns())
         return True, 'playing'
 
     def _play_next(self) -> tuple[bool, str]:
-        number = self.timeline.step()
-        if number is None:
-            return False, 'pause first' if not self.timeline.paused else 'this is the end'
-        self._messages[number]()
-        return True, f'message {number + 1} of {len(self._messages)}'
+        if not self.timeline.paused or self._next is None:
+            return False, 'this is the end' if self._next is None else 'pause first'
+        self._publish(self._next, time.monotonic_ns())
+        return True, f'at {self.elapsed:.3f} s'
 
 
 def _respond(
@@ -104,40 +174,3 @@ def _respond(
 ) -> Trigger.Response:
     response.success, response.message = action()
     return response
-
-
-def play(
-    path: Path,
-    rate: float,
-    *,
-    loop: bool,
-    clock: bool,
-    paused: bool,
-    delay: float,
-    remaps: Sequence[str],
-) -> None:
-    """Play a bag as PlayerNode does, until its end or until Ctrl-C.
-
-    Subscribers have `delay` [s] to be found before the first message; a start that is `paused`
-    waits for the service `resume`. `remaps` are such as `joint_states:=other`.
-    """
-    words = [word for remap in remaps for word in ('--remap', remap)]
-    rclpy.init(args=['bag_replay', '--ros-args', *words] if words else None)
-    try:
-        node = PlayerNode(path, rate, loop=loop, clock=clock)
-        executor = EventsExecutor()
-        executor.add_node(node)
-        begin = time.monotonic()
-        while time.monotonic() - begin < delay:
-            executor.spin_once(timeout_sec=_LONGEST_WAIT)
-        if paused:
-            node.pause()
-        while rclpy.ok() and not node.timeline.is_over:
-            node.play()
-            wait = node.timeline.wait(time.monotonic_ns())
-            executor.spin_once(timeout_sec=min(wait, _LONGEST_WAIT))
-        drain(node.outputs)
-    except KeyboardInterrupt:
-        pass
-    finally:
-        rclpy.try_shutdown()
