@@ -132,3 +132,40 @@ def test_a_ring_keeps_the_last_seconds_and_what_is_latched(tmp_path):
     ring.write(states, message(100), 10 * SECOND, 100, 100)
     ring.dump(tmp_path / 'again', {})
     assert read(tmp_path / 'again')[-1][2] == message(100)
+
+
+def test_a_split_bag_knows_its_run_though_the_first_file_does_not(tmp_path):
+    """The parameters come after the first split, what was missed is known at the end."""
+    now = 0.0
+    bag = BagWriter(tmp_path / 'bag', flush_interval=0.0, clock=lambda: now, split_duration=0.1)
+    handle = bag.add_topic('/joint_states', JOINT_STATES.type, [STREAM])
+    for k in range(12):
+        now = 0.1 * k
+        bag.write(handle, message(k), k)
+        if k == 2:
+            bag.configure(CONFIGURATION, 5)
+    bag.note({'messages /joint_states': '12 written, 7 missed'})
+    bag.close()
+    assert read_context(tmp_path / 'bag' / 'bag_0.mcap').configurations == ()
+    context = read_context(tmp_path / 'bag')
+    assert context.configurations == ((5, CONFIGURATION),)
+    assert context.losses == {'/joint_states': '7 missed'}
+
+
+def test_no_file_is_begun_without_a_message_for_it(tmp_path):
+    now = 0.0
+    bag = BagWriter(tmp_path / 'bag', flush_interval=0.0, clock=lambda: now, split_duration=0.1)
+    handle = bag.add_topic('/a', JOINT_STATES.type, [STREAM])
+    for k in range(50):  # mostly idle
+        now = 0.1 * k
+        bag.flush_if_due()
+        if k in (3, 30):
+            bag.write(handle, message(k), k)
+    bag.close()
+    files = sorted((tmp_path / 'bag').glob('*.mcap'))
+    counts = []
+    for file in files:
+        with file.open('rb') as stream:
+            counts.append(make_reader(stream).get_summary().statistics.message_count)
+    assert counts == [1, 1]
+    assert [at for _, at, _ in read(tmp_path / 'bag')] == [3, 30]

@@ -145,7 +145,7 @@ def test_topics_without_any_type(bag, entries, tmp_path, all_say, capsys):
     configuration = read_context(bag).configuration
     file = write_mcap(tmp_path / 'bag', entries, lambda _: None, configuration)
     all_say(file, '/joint_states (of unknown type)')
-    assert main(['recover', str(file), '--out', str(tmp_path / 'clean')]) == 0
+    assert main(['recover', str(file), '--out', str(tmp_path / 'clean')]) == 1
     assert f'LOST {len(entries)} messages of topics whose' in capsys.readouterr().out
 
 

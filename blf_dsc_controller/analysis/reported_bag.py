@@ -15,6 +15,7 @@ import numpy as np
 
 from blf_dsc_controller.analysis.drawn_arm import DrawnArm, arm_of_chain, planar_arm
 from blf_dsc_controller.analysis.metrics import change_times, latch_time, outside
+from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.bags.context import Context, read_context
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.sources import open_bag
@@ -50,13 +51,16 @@ class ReportedBag:
     events: list[Event]  # by time
 
 
-def read_bags(paths: Sequence[Path], namespace: str = '') -> list[ReportedBag]:
+def read_bags(
+    paths: Sequence[Path], namespace: str = '', names: NameMap = NO_NAMES
+) -> list[ReportedBag]:
     """Read bags; each is named by its folder, and those above it where that is not enough.
 
     Raises:
         BlfDscError: one of them cannot be read.
     """
-    return [_read(path, name, namespace) for path, name in zip(paths, _names(paths), strict=True)]
+    titles = zip(paths, _names(paths), strict=True)
+    return [_read(path, title, namespace, names) for path, title in titles]
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -73,8 +77,8 @@ def _names(paths: Sequence[Path]) -> list[str]:
     ]
 
 
-def _read(path: Path, name: str, namespace: str) -> ReportedBag:
-    run, context = read_run(path, namespace), read_context(path)
+def _read(path: Path, name: str, namespace: str, names: NameMap) -> ReportedBag:
+    run, context = read_run(path, namespace, names), read_context(path)
     try:
         sections = parse(context.configuration)
     except ConfigurationError:  # not there, or it cannot be read

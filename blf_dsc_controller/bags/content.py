@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +74,15 @@ class Content:
     path: Path
     topics: Mapping[Topic, TopicMessages]
     message_counts: Mapping[str, int]
+
+    def of_joints(self, joints: Sequence[str]) -> Content:
+        """Content without the joint states of other joints alone, such as those of a gripper.
+
+        Raises:
+            BagError: the joint states have no stamps.
+        """
+        states = self.topics[JOINT_STATES].of_joints(joints)
+        return replace(self, topics={**self.topics, JOINT_STATES: states})
 
 
 def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Content:

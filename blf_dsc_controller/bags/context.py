@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 from mcap.reader import make_reader
 
 from blf_dsc_controller import __version__
+from blf_dsc_controller.bags.mcap_reader import mcap_files
 from blf_dsc_controller.bags.sources import BagError, open_bag
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import is_builtin
@@ -178,21 +180,19 @@ def facts_of(configuration: str) -> dict[str, str]:
 
 
 def read_context(path: Path) -> Context:
-    """Read the context from the first MCAP file of a bag (folder or file); empty without one."""
-    files = sorted(path.glob('*.mcap')) if path.is_dir() else [path]
-    if not files or files[0].suffix != '.mcap':
-        return Context(path)
-    try:
-        with files[0].open('rb') as stream:
+    """Read the context from all MCAP files of a bag (folder or file); empty without any.
+
+    A recording that is split may know its configuration in a later file only, and what was missed
+    in the last. A damaged file is left out: reading the messages reports the damage.
+    """
+    facts: dict[str, str] = {}
+    texts: dict[tuple[int, str], None] = {}
+    for file in mcap_files(path):
+        with suppress(Exception), file.open('rb') as stream:
             reader = make_reader(stream)
-            facts: dict[str, str] = {}
             for record in reader.iter_metadata():
-                facts = record.metadata if record.name == RECORD else facts
-            texts = tuple(
-                (one.log_time, one.data.decode(errors='replace'))
-                for one in reader.iter_attachments()
-                if one.name == ATTACHMENT
-            )
-    except Exception:  # noqa: BLE001 - reading the messages reports the damage
-        return Context(path)
-    return Context(path, texts, facts)
+                facts.update(record.metadata if record.name == RECORD else {})
+            for one in reader.iter_attachments():
+                if one.name == ATTACHMENT:
+                    texts[one.log_time, one.data.decode(errors='replace')] = None
+    return Context(path, tuple(texts), facts)

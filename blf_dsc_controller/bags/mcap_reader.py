@@ -63,6 +63,17 @@ class Piece(NamedTuple):
     reason: str = ''  # of a gap
 
 
+def mcap_files(path: Path) -> list[Path]:
+    """MCAP files of a folder in the order of their numbers, bag_10 after bag_9, or the one file."""
+    files = sorted(path.glob('*.mcap'), key=_file_number) if path.is_dir() else [path]
+    return [file for file in files if file.suffix == '.mcap']
+
+
+def _file_number(path: Path) -> tuple[int, str]:
+    number = path.stem.rsplit('_', 1)[-1]
+    return (int(number) if number.isdecimal() else -1, path.name)
+
+
 def read_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
     """Topic, log time [ns] and content of each message of `topics`, in the order of the file.
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.bags.content import Content, read_content
+from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.bags.torque import TorqueError, applied_torque, next_effort
@@ -25,17 +25,19 @@ from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Floats, LearnedArm, Run, Series, Stop
 
 
-def read_run(path: str | Path, namespace: str = '') -> Run:
-    """Read a bag.
+def read_run(path: str | Path, namespace: str = '', names: NameMap = NO_NAMES) -> Run:
+    """Read a bag, of the robot in `namespace` if it holds several, with other `names`.
 
     Raises:
         BagError: there is no bag, it is damaged, it holds no joint states, or the topics of several
             robots.
         UnreadableMessageError: a message in it cannot be decoded.
     """
-    content = read_content(Path(path), namespace)
-    joints = _joints(content)
-    states = content.topics[topics.JOINT_STATES].joint_states(joints, ('position',)).by_stamp()
+    content = read_content(Path(path), namespace, names)
+    joints = _joints(content, names)
+    theirs = names.joints_of(joints)
+    content = content.of_joints(theirs)
+    states = content.topics[topics.JOINT_STATES].joint_states(theirs, ('position',)).by_stamp()
     errors = _decode(content, topics.TRACKING_ERROR, joints)
     references = _decode(content, topics.REFERENCE, joints)
     bounds = _decode(content, topics.BOUND, joints)
@@ -68,10 +70,13 @@ def read_run(path: str | Path, namespace: str = '') -> Run:
     )
 
 
-def _joints(content: Content) -> tuple[str, ...]:
-    """Joints of the controller, in its order; all of the joint states if it is not in the bag."""
-    sources = (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND, topics.JOINT_STATES)
-    return next(content.topics[one] for one in sources if one in content.topics).joint_names()
+def _joints(content: Content, names: NameMap) -> tuple[str, ...]:
+    """Joints of the controller, in its order; if it is not in the bag, those named, or all."""
+    sources = (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
+    of_controller = [content.topics[one] for one in sources if one in content.topics]
+    if not of_controller and names.joints:
+        return tuple(names.joints)
+    return (*of_controller, content.topics[topics.JOINT_STATES])[0].joint_names()
 
 
 def _decode(

@@ -10,7 +10,7 @@ from pathlib import Path
 from mcap.records import Channel
 
 from blf_dsc_controller.bags.context import ATTACHMENT, MESSAGES, RECORD, Losses, statistics
-from blf_dsc_controller.bags.mcap_reader import StoredMessage
+from blf_dsc_controller.bags.mcap_reader import StoredMessage, mcap_files
 from blf_dsc_controller.bags.metadata import parse_profiles
 from blf_dsc_controller.bags.salvage import Loss, Salvage
 from blf_dsc_controller.bags.sources import BagError
@@ -34,6 +34,11 @@ class Recovery:
         """Whether no loss is known."""
         return not (self.losses or self.unfinished or self.unknown)
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether all is lost."""
+        return not (self.is_whole or any(self.messages.values()))
+
 
 def recover(path: Path, out: Path) -> Recovery:
     """Make a clean bag `out` of a folder or an MCAP file.
@@ -41,8 +46,7 @@ def recover(path: Path, out: Path) -> Recovery:
     Raises:
         BagError: there is no MCAP file, or `out` exists already.
     """
-    files = sorted(path.glob('*.mcap'), key=_file_number) if path.is_dir() else [path]
-    files = [file for file in files if file.is_file() and file.suffix == '.mcap']
+    files = [file for file in mcap_files(path) if file.is_file()]
     if not files:
         raise BagError(f'{path} cannot be read as a bag: there is no MCAP file to recover')
     recovery = Recovery(out)
@@ -57,12 +61,6 @@ def recover(path: Path, out: Path) -> Recovery:
         recovery.messages = bag.message_counts
         bag.note({'recovered_from': str(path)} | statistics(bag.message_counts, recovery.missing))
     return recovery
-
-
-def _file_number(path: Path) -> tuple[int, str]:
-    """Order of the files of a bag: bag_10.mcap after bag_9.mcap."""
-    number = path.stem.rsplit('_', 1)[-1]
-    return (int(number) if number.isdecimal() else -1, path.name)
 
 
 @dataclass

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +32,7 @@ class UnreadableMessageError(BagError):
         if isinstance(error, MissingJointError):
             reason = (
                 f'{error.fact}: the bag is from another robot, or its joints have other names: '
-                f'--map {error.joint}=ITS_NAME, of replay --config and of identify'
+                f'--map {error.joint}=ITS_NAME'
             )
         super().__init__(f'message {index + 1} of {topic} cannot be read: {reason}')
 
@@ -107,9 +107,39 @@ class TopicMessages:
         except MessageError as error:
             raise UnreadableMessageError(self.name, 0, error) from error
 
+    def of_joints(self, joints: Sequence[str]) -> TopicMessages:
+        """Messages without those for other joints alone, as the controller ignores them.
+
+        All of them if none is left.
+
+        Raises:
+            BagError: all have the same stamp.
+        """
+        errors: dict[int, MessageError] = {}
+        stamp, _ = self._decode(JointStateDecoder(joints, ()), errors)
+        foreign = {
+            k
+            for k, error in errors.items()
+            if isinstance(error, MissingJointError) and error.is_foreign(joints)
+        }
+        stamps = np.delete(stamp, list(errors))
+        if stamps.size > 1 and (stamps == stamps[0]).all():
+            raise BagError(
+                f'all {stamps.size} messages of {self.name} have the stamp {stamps[0]} ns: each '
+                'needs a stamp of its own, so the driver has to set header.stamp'
+            )
+        kept = [k for k in range(stamp.size) if k not in foreign]
+        if len(kept) in (0, stamp.size):
+            return self
+        received, raw = [self.received[k] for k in kept], [self.raw[k] for k in kept]
+        return replace(self, received=received, raw=raw)
+
     def joint_names(self) -> tuple[str, ...]:
-        """Names in the first message; UnreadableMessageError if there are none."""
+        """Names in the message that has most of them; UnreadableMessageError if there are none."""
         names = self.layout().names
+        for raw in {len(raw): raw for raw in self.raw}.values():
+            with suppress(UnreadableMessageError):
+                names = max(names, replace(self, raw=[raw]).layout().names, key=len)
         if not names:
             unnamed = MessageError('it names no joint, so its values cannot be assigned to joints')
             raise UnreadableMessageError(self.name, 0, unnamed)

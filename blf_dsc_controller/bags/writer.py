@@ -52,7 +52,7 @@ class BagWriter:
     Data leaves the process within `flush_interval` [s] plus the time to the next call of `write` or
     `flush_if_due`; then it survives the process being killed. Without an interval it leaves when a
     chunk is full. The chunks are compressed by `none` or `zstd`. The next file of the bag is begun
-    at `split_size` [bytes] or after `split_duration` [s].
+    by the first message after `split_size` [bytes] or `split_duration` [s]: none is without any.
 
     Raises:
         BagError: `path` exists already.
@@ -122,6 +122,10 @@ class BagWriter:
         Raises:
             DiskFullError: there is no room left; the bag is complete and closed.
         """
+        if self._is_due:
+            self._end_chunk()
+            self._end_file()
+            self._begin_file()
         published = log_time if publish_time is None else publish_time
         self._writer.add_message(handle, log_time, raw, published, sequence)
         self._bag.topics[handle - 1].message_count += 1
@@ -154,10 +158,6 @@ class BagWriter:
         if self._stream.is_full:
             self.close()
             raise DiskFullError(self.path, sum(self.message_counts.values()))
-        duration = self._flushed - self._began
-        if self._stream.tell() >= self._split_size or duration >= self._split_duration:
-            self._end_file()
-            self._begin_file()
 
     def close(self) -> None:
         """Complete the bag; a second call does nothing."""
@@ -178,6 +178,13 @@ class BagWriter:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    @property
+    def _is_due(self) -> bool:
+        """Whether the next message is one for the next file."""
+        is_long = self._flushed - self._began >= self._split_duration
+        is_full = is_long or self._stream.tell() >= self._split_size
+        return is_full and self._bag.files[-1].message_count > 0
 
     def _begin_file(self) -> None:
         """Begin the next file, with the topics of the one before it."""

@@ -10,6 +10,7 @@ from blf_dsc_controller.analysis import figures, summary
 from blf_dsc_controller.analysis.report import write_report
 from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.bags import recover as recovering
+from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.bags.reader import export as export_run
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.salvage import format_time
@@ -17,20 +18,21 @@ from blf_dsc_controller.bags.salvage import format_time
 
 def report(options: Namespace) -> None:
     """Write the HTML page of one or several bags."""
-    write_report(read_bags(options.bags, options.namespace), options.out)
+    bags = read_bags(options.bags, options.namespace, NameMap.parse(options.map))
+    write_report(bags, options.out)
     print(f'wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB)')
 
 
 def export(options: Namespace) -> None:
     """Write the table of a bag."""
-    run = read_run(options.bag, options.namespace)
+    run = read_run(options.bag, options.namespace, NameMap.parse(options.map))
     columns = export_run(run, options.out)
     print(f'wrote {options.out}: {run.stamp.size} rows of {columns} columns')
 
 
 def plot(options: Namespace) -> None:
     """Draw and summarise a bag."""
-    run = read_run(options.bag, options.namespace)
+    run = read_run(options.bag, options.namespace, NameMap.parse(options.map))
     metrics = summary.summarize(run)
     options.out.mkdir(parents=True, exist_ok=True)
     summary.write_summary(metrics, options.out / 'summary.json')
@@ -39,11 +41,13 @@ def plot(options: Namespace) -> None:
     print('wrote', ', '.join(str(path) for path in written))
 
 
-def recover(options: Namespace) -> None:
-    """Make a clean bag of a damaged one and list what was lost."""
+def recover(options: Namespace) -> int:
+    """Make a clean bag of a damaged one and list what was lost; 1 if that is all of it."""
     bag = options.bag.resolve()
     out = options.out or bag.with_name(f'{bag.stem}_recovered')
-    print('\n'.join(_losses(recovering.recover(options.bag, out))))
+    recovery = recovering.recover(options.bag, out)
+    print('\n'.join(_losses(recovery)))
+    return int(recovery.is_empty)
 
 
 def _losses(recovery: recovering.Recovery) -> Iterator[str]:
@@ -58,10 +62,12 @@ def _losses(recovery: recovering.Recovery) -> Iterator[str]:
         after = 'nothing in it could be read' if last is None else f'it ends at {format_time(last)}'
         yield (
             f'{name}: the recording was not closed; {after}. What came later is not in the file: '
-            'at most 0.1 s if the recorder was killed'
+            'usually 0.1 s before a kill, more where the computer was overloaded or lost its power'
         )
     if recovery.unknown:
         yield f'LOST {recovery.unknown} messages of topics whose name or type is unknown'
+    if recovery.is_empty:
+        yield 'ALL is lost: no message could be recovered'
     if recovery.is_whole:
         yield 'none of the recorded messages was lost'
     yield f'wrote {recovery.path}'

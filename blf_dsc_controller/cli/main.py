@@ -147,7 +147,7 @@ def _parser() -> argparse.ArgumentParser:
         'bags',
         'make a clean bag of a damaged one',
         'Make a clean bag of one that was cut off or damaged, and list what was lost. '
-        'The damaged bag is not touched.',
+        'The damaged bag is not touched. Exit code: 1 if nothing could be recovered.',
         'run1/bag --out rescued',
     )
     recover.add_argument('bag', type=Path, help='folder of the bag, or its .mcap file')
@@ -171,6 +171,7 @@ def _parser() -> argparse.ArgumentParser:
     plot.add_argument('bag', type=Path, help=_BAG)
     plot.add_argument('--out', type=Path, default=Path(), help='folder to write into (.)')
     for one in (report, export, plot):
+        _map(one)
         _namespace(one)
     _excite_options(
         command(
@@ -237,14 +238,14 @@ def _namespace(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--namespace', default='', help='of the robot, if a bag holds several')
 
 
-def _map(parser: argparse.ArgumentParser, when: str = '') -> None:
+def _map(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--map',
         action='append',
         default=[],
         metavar='OURS=THEIRS',
         help='name of a topic or a joint in the bag, such as commands=/arm/torque or '
-        f'joint1=shoulder{when}',
+        'joint1=shoulder',
     )
 
 
@@ -264,7 +265,7 @@ def _replay_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--config', help='parameter file or preset: what it would have commanded (open loop)'
     )
-    _map(parser, '; with --config or --learn')
+    _map(parser)
     _namespace(parser)
     parser.add_argument(
         '--learn',

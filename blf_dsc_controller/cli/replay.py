@@ -15,6 +15,7 @@ from blf_dsc_controller.cli.main import require_ros
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.params_file import load, locate
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.messages.topics import COMMANDS
 from blf_dsc_controller.replay.learn import learn
@@ -27,6 +28,8 @@ DIFFERENT = 3
 
 def replay(options: Namespace) -> int:
     """Replay a bag in the mode that the options choose, and print the result."""
+    if options.play and options.map:
+        raise BlfDscError('--map has no effect on --play: rename topics by --remap')
     if options.play:
         require_ros()
         from blf_dsc_controller.cli.play import play
@@ -36,27 +39,28 @@ def replay(options: Namespace) -> int:
     config = None
     if options.config is not None:
         config = load(locate(options.config), CONTROLLER, ControllerConfig)
+    names = NameMap.parse(options.map)
     begin = perf_counter()
     if options.learn:
-        _learn(options, config)
+        _learn(options, config, names)
     elif config is None:
-        result = verify(options.bag, options.namespace)
+        result = verify(options.bag, options.namespace, names)
         stamp = result.stamp
         duration = float(np.ptp(stamp)) * 1e-9 if stamp.size else 0.0
         _print_speed(stamp.size, duration, perf_counter() - begin)
         print('\n'.join(_verification(result)))
         return 0 if result.difference is None else DIFFERENT
     else:
-        found = what_if(options.bag, config, options.namespace, NameMap.parse(options.map))
+        found = what_if(options.bag, config, options.namespace, names)
         run = found.run
         _print_speed(run.stamp.size, run.duration, perf_counter() - begin)
         print('\n'.join(_open_loop(found, config)))
     return 0
 
 
-def _learn(options: Namespace, config: ControllerConfig | None) -> None:
+def _learn(options: Namespace, config: ControllerConfig | None, names: NameMap) -> None:
     config = config or read_context(options.bag).controller_config()
-    found = learn(options.bag, config, options.namespace, NameMap.parse(options.map))
+    found = learn(options.bag, config, options.namespace, names)
     print(f'torque: {found.source}; window from {found.begin:.3f} s to {found.end:.3f} s')
     width = max(len(name) for name in found.names)
     for name, value, deviation in zip(found.names, found.estimate, found.deviation, strict=True):

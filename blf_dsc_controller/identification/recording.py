@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,15 +54,11 @@ def read_recording(
             joints.
     """
     content = read_content(path, namespace, names)
-    messages = content.topics[JOINT_STATES]
-    named = [joint_state_layout(raw).names for raw in messages.raw]
+    named = [joint_state_layout(raw).names for raw in content.topics[JOINT_STATES].raw]
     joints = tuple(joints) or _arm_joints(text, set().union(*named), names)
     theirs = names.joints_of(joints)
-    kept = [k for k, each in enumerate(named) if set(theirs) <= set(each)]
-    if kept:  # several nodes may publish joints of their own on one topic
-        received, raw = [messages.received[k] for k in kept], [messages.raw[k] for k in kept]
-        messages = replace(messages, received=received, raw=raw)
-        content = replace(content, topics={**content.topics, JOINT_STATES: messages})
+    content = content.of_joints(theirs)
+    messages = content.topics[JOINT_STATES]
     states = messages.joint_states(theirs, ('position',))
     torque, source = states.values[:, 2], f'effort of {messages.name}'
     if not np.nan_to_num(torque).any():

@@ -8,7 +8,7 @@ last field, may hold anything.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from struct import unpack_from
 from typing import NamedTuple
 
@@ -38,6 +38,10 @@ class MissingJointError(MessageError):
         super().__init__(
             f'{self.fact}: set the parameter `joints` to names from this list, or publish the joint'
         )
+
+    def is_foreign(self, joints: Collection[str]) -> bool:
+        """Whether the message is for other joints alone: drivers may share a topic."""
+        return bool(self.names) and not set(joints) & set(self.names)
 
 
 class DuplicatedJointError(MessageError):

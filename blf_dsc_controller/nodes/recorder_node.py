@@ -33,7 +33,7 @@ from blf_dsc_controller.nodes.raw_subscriptions import RawSubscriptions, quality
 
 _DISCOVERY_PERIOD = 0.1  # s
 _TAKE_PERIOD = 0.01  # s
-_FLUSH_INTERVAL = 0.05  # s; with that of taking, data is in the process for less than 0.1 s
+_FLUSH_INTERVAL = 0.05  # s; with that of taking less than 0.1 s, unless the computer is overloaded
 _MEGABYTE = 1_000_000
 _UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'  # of rmw
 _OF_EVERY_NODE = ('/parameter_events', '/rosout')

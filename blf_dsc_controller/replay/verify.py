@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.content import Content, read_content
+from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.context import Context, read_context
 from blf_dsc_controller.bags.topic_messages import JointStates, UnreadableMessageError
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -50,20 +50,21 @@ class Verification(NamedTuple):
         ]
 
 
-def verify(path: Path, namespace: str = '') -> Verification:
+def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verification:
     """Replay a bag and compare every message of the controller bit for bit.
 
-    `namespace` is that of the robot, if the bag holds several.
+    `namespace` is that of the robot, if the bag holds several; `names` are those of topics and
+    joints that have other names in the bag.
 
     Raises:
         ConfigurationError: this version of the package cannot run the configuration.
         BlfDscError: the bag holds no journal or nothing to compare, it begins after the
             controller, or it cannot be read.
     """
-    context, content = read_context(path), read_content(path, namespace)
+    context, content = read_context(path), read_content(path, namespace, names)
     events, until, end = _events(content)
     config = context.build_config(events[0].content['parameters'], JOURNAL.resolved)
-    states, errors = _states(content, config, until)
+    states, errors = _states(content, config, names.joints_of(config.joints), until)
     start = next((one.stamp for one in events if one.type is EventType.START), None)
     if start is not None and start not in states.stamp:
         reason = (
@@ -109,7 +110,7 @@ def _events(content: Content) -> tuple[list[Event], int, str]:
 
 
 def _states(
-    content: Content, config: ControllerConfig, until: int
+    content: Content, config: ControllerConfig, joints: Sequence[str], until: int
 ) -> tuple[JointStates, dict[int, MessageError]]:
     """Every joint state that was received before `until` [ns], and why some are unreadable.
 
@@ -120,7 +121,7 @@ def _states(
     count = bisect_left(recorded.received, until)
     recorded = replace(recorded, received=recorded.received[:count], raw=recorded.raw[:count])
     errors: dict[int, MessageError] = {}
-    states = recorded.joint_states(config.joints, required_fields(config), errors)
+    states = recorded.joint_states(joints, required_fields(config), errors)
     if len(errors) == count:
         raise UnreadableMessageError(recorded.name, 0, errors[0])
     return states, errors

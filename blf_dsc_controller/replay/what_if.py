@@ -54,8 +54,8 @@ def what_if(
         MotionError: there is no approach within the limits.
         BlfDscError: the bag cannot be read, or it does not hold the applied torques.
     """
-    content = read_content(path, namespace, names)
     joints = names.joints_of(config.joints)
+    content = read_content(path, namespace, names).of_joints(joints)
     states = law_states(content, joints)
     applied, source = applied_torque(content, states)
     config = replace(config, learning=replace(config.learning, torque_source='effort'))

@@ -193,8 +193,7 @@ class GuardedLaw:
     def reject(self, error: cdr.MessageError) -> Vector | None:
         """Return the torque for an unreadable message, None if it is for another arm."""
         self._begin_message()
-        names = error.names if isinstance(error, cdr.MissingJointError) else ()
-        if names and not set(self.config.joints) & set(names):  # drivers may share joint_states
+        if isinstance(error, cdr.MissingJointError) and error.is_foreign(self.config.joints):
             self.foreign += 1
             return None
         self.watchdog.restart()
