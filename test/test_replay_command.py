@@ -11,8 +11,8 @@ import recorded_run
 
 from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.cli.replay import DIFFERENT
-from blf_dsc_controller.messages.topics import COMMANDS
+from blf_dsc_controller.cli.replay import DIFFERENT, PARTIAL
+from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES
 
 WITHOUT_ROS = """
 import sys
@@ -44,6 +44,20 @@ def test_a_difference_is_the_exit_code_and_the_last_line(bag, tmp_path, capsys):
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith('DIFFERENT, first at 0.001000 s (stamp 1001000000 ns), /blf_dsc_c')
     assert 'effort of joint2: recorded ' in last
+
+
+@pytest.mark.parametrize('topic', [JOINT_STATES, COMMANDS])
+def test_a_part_that_is_equal_is_a_verdict_of_its_own(bag, tmp_path, capsys, topic):
+    """A third of the way a state was lost, and the replay ends; without a command, the others."""
+    entries = recorded_run.messages(bag)
+    lost = recorded_run.of(entries, topic)[100]
+    kept = [entry for entry in entries if entry is not lost]
+    path = recorded_run.write(tmp_path / 'bag', kept, read_context(bag).configuration)
+    assert main(['replay', str(path)]) == PARTIAL
+    last = capsys.readouterr().out.splitlines()[-1]
+    percent = float(last.removeprefix('PARTLY COMPARED: ').split()[0])
+    # Of 24 numbers a sample two are commands.
+    assert percent == pytest.approx(33.2 if topic is JOINT_STATES else 91.4, abs=1.5)
 
 
 def test_another_configuration_is_said_to_be_open_loop(bag, capsys):

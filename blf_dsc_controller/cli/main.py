@@ -128,7 +128,8 @@ def _parser() -> argparse.ArgumentParser:
             'run a bag through the controller again and compare bit for bit',
             'Feed the joint states of a bag through the controller with the recorded '
             'configuration, and compare every output bit for bit. '
-            'Exit code: 0 bit-equal, 3 different, 1 an error.',
+            'Exit code: 0 all outputs are bit-equal, 3 some differ, 4 only a part could be '
+            'compared, and is bit-equal, 1 an error.',
             'run1/bag --config my.yaml',
         )
     )

@@ -17,13 +17,15 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.params_file import load, locate
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.journal import EventType
-from blf_dsc_controller.messages.topics import COMMANDS
 from blf_dsc_controller.replay.learn import learn
 from blf_dsc_controller.replay.verify import Verification, verify
 from blf_dsc_controller.replay.what_if import WhatIf, what_if
 
 DIFFERENT = 3
 """Exit code where the replay differs from the bag."""
+
+PARTIAL = 4
+"""Exit code where the replay is equal as far as it goes, but not all outputs could be compared."""
 
 
 def replay(options: Namespace) -> int:
@@ -49,7 +51,9 @@ def replay(options: Namespace) -> int:
         duration = float(np.ptp(stamp)) * 1e-9 if stamp.size else 0.0
         _print_speed(stamp.size, duration, perf_counter() - begin)
         print('\n'.join(_verification(result)))
-        return 0 if result.difference is None else DIFFERENT
+        if result.difference is not None:
+            return DIFFERENT
+        return PARTIAL if result.compared < 1.0 else 0
     else:
         found = what_if(options.bag, config, options.namespace, names)
         run = found.run
@@ -101,12 +105,14 @@ def _verification(result: Verification) -> Iterator[str]:
     if result.difference is not None:
         yield f'DIFFERENT, first at {result.difference}'
         return
-    commands = [one for one in result.comparisons if one.topic.endswith(COMMANDS.leaf)]
-    is_whole = not any(one.left_out for one in commands)
-    compared = (
-        'all outputs' if is_whole else 'everything that could be compared, but not all outputs'
-    )
-    yield f'bit-equal: {compared}'
+    if result.compared < 1.0:
+        percent = min(round(100.0 * result.compared, 2), 99.99)
+        yield (
+            f'PARTLY COMPARED: {percent:g} % of the outputs in the bag, which are bit-equal; the '
+            'others could not be compared'
+        )
+    else:
+        yield 'bit-equal: all outputs in the bag'
 
 
 def _open_loop(found: WhatIf, config: ControllerConfig) -> Iterator[str]:

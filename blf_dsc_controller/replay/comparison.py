@@ -48,6 +48,7 @@ class Comparison(NamedTuple):
 
     topic: str  # name in the bag
     values: int  # numbers compared
+    recorded: int  # numbers in the bag that the replay of all of it would have to give
     difference: Difference | None
     left_out: str = ''  # what was not compared, and why not
 
@@ -111,10 +112,11 @@ def _compare_commands(
     due = int(np.argmin(np.append(commands.of_law, values=False)))
     if count < due or is_gappy:
         reason = f'{count} commands for {due} states that the law used, and they have no stamp'
-        return Comparison(recorded.name, 0, None, reason)
+        return Comparison(recorded.name, 0, count * len(names), None, reason)
     values = recorded.arrays(len(names))
     if values is None:
-        return Comparison(recorded.name, 0, None, f'they are not {len(names)} values each')
+        reason = f'they are not {len(names)} values each'
+        return Comparison(recorded.name, 0, count * len(names), None, reason)
     number = commands.number
     # After a dropped state there may be more replayed torques than commands before the next event.
     later = np.append(np.minimum.accumulate(number[::-1])[::-1][1:], count)
@@ -133,7 +135,9 @@ def _compare_commands(
             'the middleware dropped, or by the watchdog at the end'
         )
     stamp, torque = commands.stamp[rows], commands.torque[rows]
-    return _compare(recorded.name, stamp, stamp[:1], names, values[number[rows]], torque, left_out)
+    compared = values[number[rows]]
+    found = _compare(recorded.name, stamp, stamp[:1], names, compared, torque, left_out)
+    return found._replace(recorded=values.size) if left_out else found
 
 
 def _compare_series(topic: str, stamp: Stamps, recorded: Series, replayed: Series) -> Comparison:
@@ -145,7 +149,8 @@ def _compare_series(topic: str, stamp: Stamps, recorded: Series, replayed: Serie
     sampled = recorded.stamp[known]
     own = Series(tuple(shared), replayed.stamp, replayed.select(shared)).exact(sampled)
     values = recorded.select(shared)[known]
-    return _compare(topic, sampled, stamp[:1], shared, values, own, ', '.join(left_out))
+    found = _compare(topic, sampled, stamp[:1], shared, values, own, ', '.join(left_out))
+    return found._replace(recorded=known.size * len(shared))
 
 
 def _compare(
@@ -163,7 +168,7 @@ def _compare(
         time = float((stamp[k] - start[0]) * 1e-9)
         pair = float(recorded[k, j]), float(replayed[k, j])
         difference = Difference(topic, names[j], int(stamp[k]), time, *pair)
-    return Comparison(topic, recorded.size, difference, left_out)
+    return Comparison(topic, recorded.size, recorded.size, difference, left_out)
 
 
 def _alike(recorded: Floats, replayed: Floats) -> NDArray[np.bool_]:

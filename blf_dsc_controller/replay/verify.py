@@ -41,6 +41,12 @@ class Verification(NamedTuple):
     difference: Difference | None  # the earliest, in a topic or in an event
 
     @property
+    def compared(self) -> float:
+        """Fraction of the controller's outputs in the bag that could be compared."""
+        recorded = sum(one.recorded for one in self.comparisons)
+        return sum(one.values for one in self.comparisons) / recorded if recorded else 0.0
+
+    @property
     def turns(self) -> list[str]:
         """Activations, deactivations, resets and safe stops in turn."""
         return [
