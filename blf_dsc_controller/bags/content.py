@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from blf_dsc_controller.bags.packed_messages import PackedMessages
 from blf_dsc_controller.bags.sources import BagError, open_bag
 from blf_dsc_controller.bags.topic_messages import TopicMessages
 from blf_dsc_controller.errors import BlfDscError
@@ -117,7 +118,7 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
         if (times[1:] < times[:-1]).any():
             order = np.argsort(times, kind='stable').tolist()
             messages.received = [messages.received[k] for k in order]
-            messages.raw = [messages.raw[k] for k in order]
+            messages.raw = PackedMessages(messages.raw[k] for k in order)
     return Content(path, {topic: one for topic, one in topics.items() if one.raw}, counts)
 
 

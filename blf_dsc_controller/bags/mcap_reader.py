@@ -11,7 +11,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Collection, Iterator
 from io import BytesIO
-from mmap import mmap
+from mmap import ACCESS_READ, MADV_DONTNEED, mmap
 from pathlib import Path
 from struct import Struct
 from struct import error as struct_error
@@ -81,22 +81,24 @@ def read_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, in
         MalformedRecordError: the file is damaged.
     """
     channels: dict[int, Channel] = {}
-    for piece in scan(path.read_bytes()):
-        records = b''
-        if piece.opcode == Opcode.CHUNK:
-            try:
-                records = unpack(piece.record)
-            except MalformedRecordError as error:
-                reason = f'the chunk at byte {piece.at} is damaged: {error}'
-                raise MalformedRecordError(reason) from error
-        elif piece.opcode in (Opcode.CHANNEL, Opcode.MESSAGE):
-            records = piece.raw
-        elif piece.opcode == Opcode.DATA_END:
-            return
-        elif piece.reason:
-            raise MalformedRecordError(piece.reason)
-        for number, _, log_time, _, raw in messages_in(records, {}, channels, topics):
-            yield channels[number].topic, log_time, raw
+    with path.open('rb') as stream, mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
+        for piece in scan(data):
+            records = b''
+            if piece.opcode == Opcode.CHUNK:
+                try:
+                    records = unpack(piece.record)
+                except MalformedRecordError as error:
+                    reason = f'the chunk at byte {piece.at} is damaged: {error}'
+                    raise MalformedRecordError(reason) from error
+            elif piece.opcode in (Opcode.CHANNEL, Opcode.MESSAGE):
+                records = piece.raw
+            elif piece.opcode == Opcode.DATA_END:
+                return
+            elif piece.reason:
+                raise MalformedRecordError(piece.reason)
+            for number, _, log_time, _, raw in messages_in(records, {}, channels, topics):
+                yield channels[number].topic, log_time, raw
+            data.madvise(MADV_DONTNEED, 0, piece.at + piece.size)  # read: not kept in memory
 
 
 def messages_in(

@@ -79,19 +79,15 @@ def _joints(content: Content, names: NameMap) -> tuple[str, ...]:
     return (*of_controller, content.topics[topics.JOINT_STATES])[0].joint_names()
 
 
-def _decode(
-    content: Content, topic: topics.Topic, joints: Sequence[str] = ()
-) -> JointStates | None:
-    """Messages of a topic by stamp, of these joints or all names; None without any."""
+def _decode(content: Content, topic: topics.Topic, joints: Sequence[str]) -> JointStates | None:
+    """Messages of a topic by stamp, of these joints; None without any."""
     messages = content.topics.get(topic)
-    if messages is None:
-        return None
-    return messages.joint_states(joints or messages.joint_names(), ('position',)).by_stamp()
+    return None if messages is None else messages.joint_states(joints, ('position',)).by_stamp()
 
 
 def _vector(content: Content, topic: topics.Topic) -> Series | None:
-    decoded = _decode(content, topic)
-    return None if decoded is None else decoded.position
+    messages = content.topics.get(topic)
+    return None if messages is None else messages.vectors()
 
 
 def _torque(content: Content, states: JointStates) -> Floats:

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from array import array
+from collections.abc import MutableSequence, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -11,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.bags.packed_messages import BLOCK, PackedMessages
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.messages.cdr import (
     Layout,
@@ -51,6 +53,8 @@ class JointStates(NamedTuple):
 
     def by_stamp(self) -> JointStates:
         """States ordered by stamp, one of each stamp."""
+        if (self.stamp[1:] > self.stamp[:-1]).all():
+            return self
         return self.select(np.unique(self.stamp, return_index=True)[1])
 
     @property
@@ -70,8 +74,8 @@ class TopicMessages:
 
     name: str
     type: str = ''
-    received: list[int] = field(default_factory=list)  # ns
-    raw: list[bytes] = field(default_factory=list)
+    received: MutableSequence[int] = field(default_factory=lambda: array('q'))  # ns
+    raw: PackedMessages | list[bytes] = field(default_factory=PackedMessages)
 
     def joint_states(
         self,
@@ -89,6 +93,17 @@ class TopicMessages:
         stamp, values = self._decode(JointStateDecoder(names, required), errors)
         received = np.array(self.received, dtype=np.int64)
         return JointStates(tuple(names), stamp, received, values.reshape(stamp.size, 3, len(names)))
+
+    def vectors(self) -> Series:
+        """Decode named values, in the positions of sensor_msgs/JointState, by stamp.
+
+        Raises:
+            UnreadableMessageError: a message cannot be decoded.
+        """
+        names = self.joint_names()
+        stamp, values = self._decode(JointStateDecoder(names, ('position',)), size=len(names))
+        received = np.array(self.received, dtype=np.int64)
+        return JointStates(names, stamp, received, values[:, np.newaxis]).by_stamp().position
 
     def arrays(self, size: int) -> Floats | None:
         """Values (N, size) of Float64MultiArrays, None if one of them has another size.
@@ -146,21 +161,29 @@ class TopicMessages:
         return names
 
     def _decode(
-        self, decoder: Decoder, errors: dict[int, MessageError] | None = None
+        self,
+        decoder: Decoder,
+        errors: dict[int, MessageError] | None = None,
+        size: int | None = None,
     ) -> tuple[NDArray[np.int64], Floats]:
-        """What `decoder` returns of each message, and its values."""
-        with suppress(MessageError):
-            at_once = decoder.decode_all(self.raw)
-            if at_once is not None:
-                return at_once
+        """What `decoder` returns of each message, and all or the first `size` of its values."""
         count = len(self.raw)
-        returned, values = np.zeros(count, dtype=np.int64), np.zeros((count, decoder.values.size))
-        for k, raw in enumerate(self.raw):
-            try:
-                returned[k] = decoder.decode(raw)
-                values[k] = decoder.values
-            except MessageError as error:
-                if errors is None:
-                    raise UnreadableMessageError(self.name, k, error) from error
-                errors[k] = error
+        returned = np.zeros(count, dtype=np.int64)
+        values = np.zeros((count, decoder.values[:size].size))
+        for begin in range(0, count, BLOCK):
+            rows = slice(begin, begin + BLOCK)
+            block = self.raw[rows]
+            with suppress(MessageError):
+                at_once = decoder.decode_all(block)
+                if at_once is not None:
+                    returned[rows], values[rows] = at_once[0], at_once[1][:, :size]
+                    continue
+            for k, raw in enumerate(block, begin):
+                try:
+                    returned[k] = decoder.decode(raw)
+                    values[k] = decoder.values[:size]
+                except MessageError as error:
+                    if errors is None:
+                        raise UnreadableMessageError(self.name, k, error) from error
+                    errors[k] = error
         return returned, values
