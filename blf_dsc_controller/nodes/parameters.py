@@ -51,17 +51,29 @@ def declare(node: Node, cls: type[Config]) -> Config:
     values = flatten(config)
     for one in parameters(cls):
         value = values[one.name]
-        typed = list(value) if isinstance(value, tuple) else value
-        # rclpy takes an empty list for bytes; declared by its type, it reads back as unset.
-        content = RosParameter.Type[one.kind.name] if typed == [] else typed
-        node.declare_parameter(one.name, content, descriptor(one), ignore_override=True)
+        if value == ():
+            _declare_empty(node, one)
+        else:
+            typed = list(value) if isinstance(value, tuple) else value
+            node.declare_parameter(one.name, typed, descriptor(one), ignore_override=True)
     return config
+
+
+def _declare_empty(node: Node, one: Parameter) -> None:
+    """Declare an empty list, which rclpy would take for one of bytes, by its type.
+
+    Declared by the type alone it is unset, and then no request for several parameters is answered.
+    """
+    kind, described = RosParameter.Type[one.kind.name], descriptor(one)
+    node.declare_parameter(one.name, kind, ignore_override=True)
+    node.set_parameters([RosParameter(one.name, kind, [])])
+    described.type = kind.value
+    node.set_descriptor(one.name, described)
 
 
 def read(node: Node, cls: type[Config]) -> Config:
     """Return the current configuration of a node that has declared it."""
-    values = {one.name: node.get_parameter_or(one.name).value for one in parameters(cls)}
-    given = {name: [] if value is None else value for name, value in values.items()}
+    given = {one.name: node.get_parameter(one.name).value for one in parameters(cls)}
     return build(cls, given, node.get_fully_qualified_name())
 
 
