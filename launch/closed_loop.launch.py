@@ -4,6 +4,8 @@
 For instance: ros2 launch blf_dsc_controller closed_loop.launch.py mode:=lockstep bag:=run1
 """
 
+from typing import Any
+
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
@@ -67,28 +69,36 @@ def nodes(context: LaunchContext) -> list[Node]:
         LaunchConfiguration(name).perform(context)
         for name in ('config', 'mode', 'namespace', 'bag', 'markers', 'rviz')
     )
-    common = {'package': PACKAGE, 'namespace': namespace, 'output': 'screen'}
-    parameters = [str(locate(config))]
-    if bag:  # The first sample is to be in it too: nobody starts before the recorder listens.
-        parameters.append({'wait_for_subscribers': 1})
-    of_plant = [*parameters, {'mode': mode}] if mode else parameters
-    loop = [
-        Node(executable='sim_plant', parameters=of_plant, on_exit=Shutdown(), **common),
-        Node(executable='blf_dsc_controller', parameters=parameters, **common),
-    ]
-    if bag:
-        of_recorder = [parameters[0], {'output': bag}]
-        loop.append(Node(executable='bag_recorder', parameters=of_recorder, **common))
+    file = str(locate(config))
+    # The first sample is to be recorded too: nobody starts before the recorder listens.
+    of_loop = {'wait_for_subscribers': 1} if bag else {}
+    of_plant = of_loop | ({'mode': mode} if mode else {})
+
+    def node(executable: str, given: dict[str, Any], *, required: bool = True) -> Node:
+        return Node(
+            package=PACKAGE,
+            executable=executable,
+            # With it, parameters are given to this very node: a section /**/NODE of the file would
+            # win over one for any node.
+            name=executable,
+            namespace=namespace,
+            parameters=[file, given] if given else [file],
+            output='screen',
+            on_exit=Shutdown(reason=f'{executable} has ended') if required else None,
+        )
+
+    # What shows the loop comes first: where it is not installed, nothing has been started yet.
+    started = view(namespace, file) if rviz == 'true' else []
     if 'true' in (markers, rviz):
-        loop.append(Node(executable='arm_markers', parameters=parameters[:1], **common))
-    if rviz == 'true':
-        loop += view(namespace, str(locate(config)))
-    return loop
+        started.append(node('arm_markers', {}, required=False))
+    if bag:
+        started.append(node('bag_recorder', {'output': bag}))
+    return [*started, node('blf_dsc_controller', of_loop), node('sim_plant', of_plant)]
 
 
 def view(namespace: str, config: str) -> list[Node]:
     """RViz, and what turns the arm's states into frames for it; both are packages of their own."""
-    plant = load(config, PLANT, PlantConfig)
+    plant = load(config, f'{namespace}/{PLANT}', PlantConfig)
     robot = plant.robot
     frame = robot.chain(plant.joints).base if robot.urdf else 'base_link'
     return [

@@ -76,7 +76,12 @@ def test_a_section_that_matches_counts(file, pattern, node):
     ],
 )
 def test_a_section_that_does_not_match_does_not_count(file, pattern, node):
-    assert seed_of(file(section(pattern, 'seed: 7')), node) == 0
+    path, own = file(section(pattern, 'seed: 7')), pattern.endswith('sim_plant')
+    if own:  # it is meant for the node, and would be ignored
+        remedy = f'is not {node}: write /**/sim_plant for the node in any namespace'
+        assert problems_of(path, node) == [f'line 2: /{pattern.removeprefix("/")} {remedy}']
+        path = file(section(pattern, 'seed: 7') + section(f'{node}', 'duration: 2.0'))
+    assert seed_of(path, node) == 0
 
 
 def test_the_later_of_two_sections_wins_whichever_is_more_specific(file):
@@ -230,4 +235,6 @@ def test_a_misspelt_node_is_named(file):
     assert caught.value.problems == ['line 2: unknown node sim_plnat, did you mean sim_plant?']
     loop = load_loop(file(section('sim_plant', 'seed: 1') + section('sim_plant2', 'seed: 2')))
     assert loop.plant.seed == 1
+    with pytest.raises(ConfigurationError, match='/left/bag_recorder is not /bag_recorder: write'):
+        load_loop(file(section('/left/bag_recorder', 'output: here')))
     assert load_loop(file(section('robot_state_publisher', 'a: 1'))).plant == PlantConfig()

@@ -198,35 +198,3 @@ def test_all_that_is_imported_is_declared(metadata):
 def test_rosdep_installs_what_pip_would(metadata):
     assert requirements(metadata) == set(ROSDEP_KEYS)
     assert set(ROSDEP_KEYS.values()) <= depends('exec_depend')
-
-
-def test_launch_file_starts_executables_there_are(entry_points):
-    source = ROOT / 'launch/closed_loop.launch.py'
-    code = ast.parse(source.read_text())
-    compile(code, str(source), 'exec')
-    started = {
-        keyword.value.value
-        for node in ast.walk(code)
-        if isinstance(node, ast.Call)
-        for keyword in node.keywords
-        if keyword.arg == 'executable'
-    }
-    of_others = {'rviz2', 'robot_state_publisher'}
-    assert started - of_others == {'sim_plant', 'blf_dsc_controller', 'bag_recorder', 'arm_markers'}
-    assert started - of_others <= {entry.name for entry in entry_points}
-
-
-def test_launch_file_sets_parameters_there_are():
-    from blf_dsc_controller.configuration.nodes import known_names
-
-    code = ast.parse((ROOT / 'launch/closed_loop.launch.py').read_text())
-    keys = {
-        key.value
-        for node in ast.walk(code)
-        if isinstance(node, ast.Dict)
-        for key in node.keys
-        if isinstance(key, ast.Constant)
-    }
-    arguments_of_node = {'package', 'namespace', 'robot_description'}
-    assert {'mode', 'output', 'wait_for_subscribers'} <= keys
-    assert keys - arguments_of_node <= known_names()

@@ -9,10 +9,8 @@ pytest.importorskip('rclpy')
 
 from rcl_interfaces.msg import ParameterType
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.parameter_client import AsyncParameterClient
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import NODES, RecorderConfig
@@ -157,28 +155,6 @@ def test_ros_has_the_values_under_the_types_of_the_schema(start):
     assert node.get_parameter('learning.bias').type_ is Parameter.Type.BOOL
     assert node.get_parameter('learning.frequencies').type_ is Parameter.Type.DOUBLE_ARRAY
     assert node.get_parameter('reference.times').type_ is Parameter.Type.DOUBLE_ARRAY
-
-
-@pytest.mark.parametrize('name', NODES)
-def test_all_parameters_can_be_requested_at_once_as_the_dump_of_ros2_does(start, name):
-    """The answer of a node that has one without a value is empty."""
-    node, tool = start(name), start('tool')
-    declare(node, NODES[name])
-    executor = SingleThreadedExecutor(context=node.context)
-    for one in (node, tool):
-        executor.add_node(one)
-    client = AsyncParameterClient(tool, name)
-    assert client.wait_for_services(timeout_sec=300.0)
-
-    def answer(future):
-        executor.spin_until_future_complete(future, timeout_sec=300.0)
-        return future.result()
-
-    names = answer(client.list_parameters()).result.names
-    values = answer(client.get_parameters(names)).values
-    assert len(values) == len(names) >= len(parameters(NODES[name]))
-    assert all(value.type != ParameterType.PARAMETER_NOT_SET for value in values)
-    executor.shutdown()
 
 
 def test_an_empty_list_keeps_its_type_and_its_description(start):

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -65,7 +65,7 @@ def load(
     name that any node of the package knows is accepted.
     """
     sections = read(path)
-    problems = list(_unknown_names(sections))
+    problems = [*_unknown_names(sections), *unmatched_sections(sections, [node])]
     try:
         config = _load(sections, node, cls, overrides or {})
     except ConfigurationError as error:
@@ -85,7 +85,7 @@ def load_loop(
     """
     path = locate(given)
     sections = read(path)
-    problems = [*_unknown_names(sections), *_unknown_nodes(sections)]
+    problems = [*_unknown_names(sections), *unmatched_sections(sections, NODES)]
     configs: dict[str, Any] = {}
     for node, cls in NODES.items():
         try:
@@ -161,11 +161,25 @@ def _unknown_names(sections: list[Section]) -> Iterator[str]:
                 yield f'line {entry.line}: {unknown(name, known)}'
 
 
-def _unknown_nodes(sections: list[Section]) -> Iterator[str]:
-    """Find misspelt nodes, whose sections would be ignored."""
-    names = {section.pattern.rsplit('/', 1)[-1]: section for section in sections}
-    absent = [node for node in NODES if node not in names]
-    for name, section in names.items():
+def unmatched_sections(sections: list[Section], nodes: Iterable[str]) -> Iterator[str]:
+    """Yield a problem for each section that is meant for one of these nodes and would be ignored.
+
+    Its name is misspelt, or it has another namespace than the node, whose full name is given (that
+    of a node in the root may lack the slash), and no section of that name has the right one.
+    """
+    by_name = {section.pattern.rsplit('/', 1)[-1]: section for section in sections}
+    absent = [node for node in NODES if node not in by_name]
+    for name, section in by_name.items():
         close = difflib.get_close_matches(name, absent, n=1, cutoff=0.8)
         if close and name not in NODES:
             yield f'line {section.line}: unknown node {name}, did you mean {close[0]}?'
+    for node in nodes:
+        full, name = '/' + node.removeprefix('/'), node.rsplit('/', 1)[-1]
+        if name in by_name and not any(
+            section.matches(full) for section in sections if not section.is_wildcard
+        ):
+            section = by_name[name]
+            yield (
+                f'line {section.line}: {section.pattern} is not {full}: write /**/{name} for the '
+                'node in any namespace'
+            )

@@ -27,6 +27,7 @@ from blf_dsc_controller.configuration.schema import (
     parameters,
 )
 from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.nodes import arguments
 from blf_dsc_controller.nodes.description import wait_for_description
 from blf_dsc_controller.nodes.rclpy_internals import parameter_overrides
 
@@ -145,8 +146,11 @@ def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
     """
     own = {one.name: one.kind for one in parameters(cls)}
     others = known_names() - own.keys()
+    arguments.check_sections(sys.argv, node.get_fully_qualified_name())
+    given = {name: one.value for name, one in parameter_overrides(node).items()}
+    given |= arguments.assigned(sys.argv)
     return {
-        name: [] if given.value is None and name in own and own[name].is_array else given.value
-        for name, given in parameter_overrides(node).items()
+        name: [] if value is None and name in own and own[name].is_array else value
+        for name, value in given.items()
         if name not in others and not is_builtin(name)
     }

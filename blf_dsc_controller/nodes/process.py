@@ -26,6 +26,7 @@ from blf_dsc_controller.compiled import COMPILATION_NOTICE
 from blf_dsc_controller.compiled.jit import is_compiled
 from blf_dsc_controller.configuration.common import Realtime
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.nodes.arguments import refuse_unknown
 from blf_dsc_controller.nodes.rclpy_internals import RCLError, UnknownROSArgsError
 
 _POLL = 0.1  # s; EventsExecutor has no usable spin()
@@ -72,6 +73,7 @@ def run(make_node: Callable[[], PlainNode]) -> int:
     node: PlainNode | None = None
     problem = ''
     try:
+        refuse_unknown(sys.argv)
         rclpy.init(args=sys.argv, signal_handler_options=rclpy.SignalHandlerOptions.NO)
         executor = EventsExecutor()
         node = make_node()

@@ -206,7 +206,7 @@ def preset(name: str, exponents: Floats, value: float, evaluations: int) -> str:
         f'# {task.title}.\n'
         f'# Made by `python -m blf_dsc_controller.paper.tune {name} FILE`:\n'
         f'# {evaluations} evaluations, objective {value:.3f} (decades of error; less is better).\n'
-        f'\nblf_dsc_controller:\n  ros__parameters:\n{lines}'
+        f'\n/**/blf_dsc_controller:\n  ros__parameters:\n{lines}'
     )
 
 

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The arguments of a node's process: checked where ROS ignores a mistake, and `-p` before files.
+
+Of all sections that match a node ROS takes the last, in the order in which their names first
+appear: a section `/**/sim_plant` of a file would win over `-p`, which stands under `/**`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from rclpy.utilities import remove_ros_args
+
+from blf_dsc_controller.configuration.params_file import read, unmatched_sections
+from blf_dsc_controller.configuration.ros_yaml import parse
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+
+
+def refuse_unknown(argv: Sequence[str]) -> None:
+    """Raise BlfDscError if there are arguments that ROS would leave to the node."""
+    foreign = remove_ros_args(args=list(argv))[1:]
+    if foreign:
+        remedy = 'ROS reads only those after --ros-args'
+        raise BlfDscError(f'unknown arguments {" ".join(foreign)}: {remedy}')
+
+
+def check_sections(argv: Sequence[str], node: str) -> None:
+    """Raise ConfigurationError if a parameter file means this node, of full name, and misses it."""
+    for option, path in _ros_options(argv):
+        if option == '--params-file':
+            problems = list(unmatched_sections(read(path), [node]))
+            if problems:
+                raise ConfigurationError(problems, path)
+
+
+def assigned(argv: Sequence[str]) -> dict[str, object]:
+    """Return the values of `-p name:=value`; those with the name of a node are left to ROS."""
+    given: dict[str, object] = {}
+    for option, rule in _ros_options(argv):
+        name, _, value = rule.partition(':=')
+        if option != '--params-file' and ':' not in name:
+            (section,) = parse(f'/**: {{ros__parameters: {{{name}: {value}}}}}')
+            given |= {one: entry.value for one, entry in section.entries.items()}
+    return given
+
+
+def _ros_options(argv: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield each option for parameters, and its value."""
+    for_ros = False
+    words = iter(argv)
+    for word in words:
+        if word in ('--ros-args', '--'):
+            for_ros = word == '--ros-args'
+        elif for_ros and word in ('-p', '--param', '--params-file'):
+            yield word, next(words, '')

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The launch file and the command line: what the nodes get of what a user gives.
+
+`launch` comes only with a ROS installation: here its few words are stood in for, and the real nodes
+get the arguments that `launch_ros` would give to their processes.
+"""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+
+import rclpy
+from command import finished
+from own_domain import own_domain
+from rcl_interfaces.srv import GetParameters, ListParameters
+
+from blf_dsc_controller.configuration.params_file import dump, locate
+from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.markers_node import MarkersNode
+from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
+from sim_plant.node import PlantNode
+
+ROOT = Path(__file__).resolve().parents[1]
+NODES = {
+    'sim_plant': PlantNode,
+    'blf_dsc_controller': ControllerNode,
+    'bag_recorder': BagRecorderNode,
+    'arm_markers': MarkersNode,
+}
+
+
+def words(**given):
+    return SimpleNamespace(**given)
+
+
+@pytest.fixture
+def launched(monkeypatch):
+    """Return what the launch file starts, in order, for some arguments."""
+    stand_ins = {
+        'launch': {'LaunchContext': dict, 'LaunchDescription': list},
+        'launch.actions': {
+            'DeclareLaunchArgument': lambda name, **given: words(name=name, **given),
+            'OpaqueFunction': words,
+            'Shutdown': words,
+        },
+        'launch.substitutions': {
+            'LaunchConfiguration': lambda name: words(perform=lambda context: context[name])
+        },
+        'launch_ros': {},
+        'launch_ros.actions': {'Node': words},
+    }
+    for name, content in stand_ins.items():
+        module = ModuleType(name)
+        vars(module).update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+
+    def launch(**given):
+        code = runpy.run_path(str(ROOT / 'launch/closed_loop.launch.py'))
+        *declared, start = code['generate_launch_description']()
+        context = {one.name: one.default_value for one in declared}
+        assert given.keys() <= context.keys()
+        return start.function(context | given)
+
+    return launch
+
+
+def arguments_of(node, folder):
+    """Command line of a node, as `launch_ros` writes it."""
+    full = f'{"/" + node.namespace if node.namespace else ""}/{node.name}'
+    argv = [node.executable, '--ros-args', '-r', f'__node:={node.name}']
+    argv += ['-r', f'__ns:=/{node.namespace}']
+    for number, given in enumerate(node.parameters):
+        path = given
+        if isinstance(given, dict):
+            path = folder / f'{node.name}{number}.yaml'
+            dump(path, {full: given})
+        argv += ['--params-file', str(path)]
+    return argv
+
+
+@pytest.fixture
+def start(monkeypatch):
+    """Start nodes of the package as processes of these arguments would."""
+    contexts, nodes = [], []
+
+    def node(*argv):
+        monkeypatch.setattr(sys, 'argv', list(map(str, argv)))
+        contexts.append(rclpy.Context())
+        rclpy.init(args=sys.argv, context=contexts[-1], domain_id=own_domain())
+        nodes.append(NODES[argv[0]](context=contexts[-1]))
+        return nodes[-1]
+
+    yield node
+    for one in nodes:
+        one.close()
+        one.destroy_node()
+    for context in contexts:
+        rclpy.try_shutdown(context=context)
+
+
+@pytest.mark.parametrize('namespace', ['', 'left'])
+def test_the_arguments_of_a_launch_win_over_its_file(launched, start, tmp_path, namespace):
+    """Each section `/**/NODE` of the preset is later than one for any node."""
+    bag = tmp_path / 'run1'
+    nodes = launched(mode='lockstep', bag=str(bag), namespace=namespace, markers='true')
+    by_name = {one.name: one for one in nodes}
+    assert by_name.keys() == NODES.keys()
+    plant = start(*arguments_of(by_name['sim_plant'], tmp_path))
+    assert (plant.config.mode, plant.config.wait_for_subscribers) == ('lockstep', 1)
+    assert plant.get_namespace() == f'/{namespace}'
+    start(*arguments_of(by_name['bag_recorder'], tmp_path))
+    assert bag.is_dir()
+
+
+def test_the_loop_ends_with_any_of_its_nodes_and_not_with_what_only_shows_it(launched):
+    nodes = launched(bag='run1', rviz='true')
+    ends = {one.executable for one in nodes if getattr(one, 'on_exit', None)}
+    assert ends == {'sim_plant', 'blf_dsc_controller', 'bag_recorder'}
+    script = (ROOT / 'setup.py').read_text()
+    assert all(f"'{name} = " in script for name in NODES)
+
+
+def test_nothing_is_started_before_what_may_not_be_installed(launched):
+    """`launch_ros` looks for a package when its turn comes, and leaves running what runs."""
+    packages = [one.package for one in launched(bag='run1', rviz='true')]
+    assert packages[:2] == ['robot_state_publisher', 'rviz2']
+    assert set(packages[2:]) == {'blf_dsc_controller'}
+
+
+@pytest.mark.parametrize('preset', ['comparison', 'slotine_li'])
+def test_a_preset_holds_in_every_namespace(start, preset):
+    argv = ('blf_dsc_controller', '--ros-args', '-r', '__ns:=/left', '--params-file')
+    node = start(*argv, locate(preset))
+    assert node.config.law == {'comparison': 'backstepping'}.get(preset, preset)
+
+
+def test_a_parameter_on_the_command_line_wins_over_a_file(start):
+    argv = ('sim_plant', '--ros-args', '--params-file', locate('recommended'))
+    given = ('-p', 'mode:=lockstep', '-p', 'arm.l2:=0.7', '-p', 'initial.position:=[2.29, 1.69]')
+    config = start(*argv, *given, '-p', 'elsewhere:seed:=3').config
+    assert (config.mode, config.arm.l2) == ('lockstep', 0.7)
+    assert config.initial.position == (2.29, 1.69)
+    assert config.seed == 0
+
+
+@pytest.mark.parametrize(
+    ('section', 'problem'),
+    [
+        ('sim_plnat', 'line 2: unknown node sim_plnat, did you mean sim_plant?'),
+        (
+            '/right/sim_plant',
+            'line 2: /right/sim_plant is not /left/sim_plant: write /**/sim_plant',
+        ),
+    ],
+)
+def test_a_section_that_a_node_would_miss_is_an_error(start, tmp_path, section, problem):
+    path = tmp_path / 'my.yaml'
+    path.write_text(f'{section}:\n  ros__parameters: {{seed: 1}}\n')
+    argv = ('sim_plant', '--ros-args', '-r', '__ns:=/left', '--params-file', path)
+    with pytest.raises(ConfigurationError) as caught:
+        start(*argv)
+    assert [one.startswith(problem) for one in caught.value.problems] == [True]
+    both = path.read_text().replace(section, '/right/sim_plant') + path.read_text().replace(
+        section, '/left/sim_plant'
+    ).replace('1', '2')
+    path.write_text(both)  # a file for two arms
+    assert start(*argv).config.seed == 2
+
+
+@pytest.mark.parametrize('module', ['sim_plant.node', 'blf_dsc_controller.nodes.controller_node'])
+def test_a_parameter_file_that_ros_would_ignore_is_refused(module):
+    run = finished(sys.executable, '-m', module, '--params-file', locate('recommended'))
+    assert run.returncode == 1
+    assert run.stderr.startswith('unknown arguments --params-file')
+    assert 'ROS reads only those after --ros-args' in run.stderr
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_a_node_answers_a_request_for_all_of_its_parameters(ros, tmp_path, name):
+    """As `ros2 param dump` sends it; the answer is empty where one of them has no value."""
+    given = {'output': str(tmp_path / 'bag')} if name == 'bag_recorder' else {}
+    node = ros.add(NODES[name], given)
+    listed = ros.call(ListParameters, f'/{name}/list_parameters', ListParameters.Request())
+    names = listed.result.names
+    assert len(names) > 3
+    request = GetParameters.Request(names=names)
+    values = ros.call(GetParameters, f'/{name}/get_parameters', request).values
+    assert len(values) == len(names)
+    assert all(value.type for value in values)
+    if name == 'bag_recorder':
+        node.close()
