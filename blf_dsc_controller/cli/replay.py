@@ -72,11 +72,18 @@ def _learn(options: Namespace, config: ControllerConfig | None, names: NameMap) 
             print(f'{name:{width}}  unidentifiable: its column is rejected')
         else:
             print(f'{name:{width}}  {value:10.6g} +- {2 * deviation:.2g} (95 %)')
-    verdict = 'enough' if found.is_excited else 'NOT ENOUGH: do not trust these figures'
+    verdict = 'enough' if found.is_excited else 'NOT ENOUGH'
     print(
         f'excitation {found.excitation:.3g}, threshold {found.threshold:.3g}: {verdict}; '
-        f'residual {found.residual:.3g} N m rms'
+        f'residual {found.residual:.3g} N m rms of {found.torque:.3g}'
     )
+    for line in (*_left_out(found.left_out), *found.notes, *found.doubts):
+        print(line)
+
+
+def _left_out(count: int) -> Iterator[str]:
+    if count:
+        yield f'note: {count} states left out: not finite, or with unknown torques'
 
 
 def _print_speed(samples: int, seconds: float, took: float) -> None:
@@ -118,6 +125,7 @@ def _verification(result: Verification) -> Iterator[str]:
 def _open_loop(found: WhatIf, config: ControllerConfig) -> Iterator[str]:
     yield 'OPEN LOOP: the arm moved under the recorded torques, not under these'
     yield f'recorded torque: {found.source}'
+    yield from _left_out(found.left_out)
     for i, joint in enumerate(config.joints):
         known = found.difference[np.isfinite(found.difference[:, i]), i]
         difference = (

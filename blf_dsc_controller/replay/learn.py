@@ -2,27 +2,35 @@
 """The learning alone, on the recorded states and torques of any bag.
 
 The rows X theta = u are those of the controller (see law.prediction), over the window that excites
-them most:  theta = (Phi + rho I)^-1 b  with (21) and (22). The deviations are those of least
-squares,  s^2 (N Phi)^-1,  with the residual variance s^2 times the correlation length of the
-filtered residuals in samples, which is on the careful side.
+them most:  theta = (Phi + rho I)^-1 b  with (21) and (22). The deviations do not assume that the
+residuals are independent: A^-1 S A^-1 / N^2 with A = Phi + rho I and S the sum over blocks of the
+window of g g^T, where g is the sum of X^T (X theta - u) in a block (Liang and Zeger, Longitudinal
+data analysis using generalized linear models, 1986). What an unmodelled torque has in common with
+the columns of X is in the estimates, and no deviation shows it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.factory import estimate_names, settings_of_config
-from blf_dsc_controller.replay.what_if import what_if
+from blf_dsc_controller.law.factory import estimate_names, model_of
+from blf_dsc_controller.replay.what_if import read_states, run_over
 from blf_dsc_controller.run import Floats
 
 _CANDIDATES = 600  # windows
+_BLOCKS = 20  # of a window
+_POSITIONS = 50  # at which the inertia matrix is checked
+_POOR = 0.2  # of the torque, residual
+_LASTING = 0.05  # of the window, correlation length of the residual
 
 
 class Learned(NamedTuple):
@@ -36,12 +44,41 @@ class Learned(NamedTuple):
     begin: float  # of the window, s
     end: float  # of the window, s
     residual: float  # root mean square of X theta - u, N m after the filter
+    torque: float  # root mean square of u, likewise
+    correlation: float  # correlation length of the residual, s
+    least_inertia: float  # smallest eigenvalue of the inertia matrix in the window, in its unit
     source: str  # topic of the torques
+    left_out: int  # states that are not finite, or without a known torque
 
     @property
     def is_excited(self) -> bool:
         """Whether the controller would learn from this window."""
         return self.excitation >= self.threshold
+
+    @property
+    def notes(self) -> Iterator[str]:
+        """What the deviations cannot show."""
+        if self.correlation > _LASTING * (self.end - self.begin):
+            yield (
+                f'note: the residual is a torque that lasts ({self.correlation:.2g} s), not noise: '
+                'what of it moves as a column does is in the estimate, beyond its interval'
+            )
+
+    @property
+    def doubts(self) -> Iterator[str]:
+        """Why the estimates should not be trusted."""
+        if not self.is_excited:
+            yield 'DO NOT TRUST these figures: the motion does not show all of them'
+        if self.least_inertia <= 0.0:
+            yield (
+                'UNPHYSICAL: the smallest eigenvalue of the inertia matrix is '
+                f'{self.least_inertia:.3g}; are joints, signs or units swapped?'
+            )
+        if self.residual > _POOR * self.torque:
+            yield (
+                f'RESIDUAL TOO LARGE: {100.0 * self.residual / self.torque:.0f} % of the torque is '
+                'not explained; are these the torques of these joints, in N m, with gravity?'
+            )
 
 
 def learn(
@@ -55,36 +92,50 @@ def learn(
         BlfDscError: the bag cannot be read, ends before a window is full, or does not hold the
             applied torques.
     """
+    recorded = read_states(path, config, namespace, names)
+    stamp, sample_time = recorded.states.stamp, config.sample_time
+    if stamp.size > 1:
+        sample_time = float(np.median(np.diff(stamp))) * 1e-9
+    # Along a reference at rest: the recorded one is not known, and rows count by its speed.
     held = replace(
         config,
+        sample_time=sample_time,
         reference=replace(config.reference, type='hold'),
         safety=replace(config.safety, velocity='measured'),
+        learning=replace(config.learning, motion_scale=0.0),
     )
-    found = what_if(path, held, namespace, names)
-    run, rows, active = found.run, found.rows, found.active
-    settings = settings_of_config(config)
-    window, start = settings.window, round(settings.learning_start / config.sample_time)
+    found = run_over(recorded, held)
+    run, rows, active, learning = found.run, found.rows, found.active, config.learning
+    window = round(learning.window / sample_time)
+    start = window + round(learning.settling_time / sample_time)
     if rows.shape[0] < start + 1:
         reason = (
             f'{path} holds {run.duration:.3g} s, which is too short for a window of '
-            f'{config.learning.window:.3g} s and the settling time of the filters: record longer, '
+            f'{learning.window:.3g} s and the settling time of the filters: record longer, '
             'or reduce learning.window'
         )
         raise BlfDscError(reason)
     end = _most_excited(rows, active, window, start)
-    estimate, deviation, excitation, residual = _solve(
-        rows[end - window : end], active, config.learning.regularization
-    )
+    chosen = slice(end - window, end)
+    X, u = rows[chosen, :, :-1][:, :, active != 0.0], rows[chosen, :, -1]
+    Phi, theta, covariance = _solve(X, u, learning.regularization)
+    estimate, deviation = np.full((2, active.size), np.nan)
+    estimate[active != 0.0], deviation[active != 0.0] = theta, np.sqrt(np.diag(covariance))
+    left = X @ theta - u
     return Learned(
         names=estimate_names(config),
         estimate=estimate,
         deviation=deviation,
-        excitation=excitation,
-        threshold=config.learning.excitation_threshold,
+        excitation=float(np.linalg.eigvalsh(Phi)[0]),
+        threshold=learning.excitation_threshold,
         begin=float(run.time[end - window]),
         end=float(run.time[end - 1]),
-        residual=residual,
-        source=found.source,
+        residual=float(np.sqrt(np.mean(left**2))),
+        torque=float(np.sqrt(np.mean(u**2))),
+        correlation=correlation_length(left) * sample_time,
+        least_inertia=_least_inertia(model_of(config), estimate, run.position[chosen]),
+        source=recorded.source,
+        left_out=recorded.left_out,
     )
 
 
@@ -97,19 +148,29 @@ def _most_excited(rows: Floats, active: Floats, window: int, start: int) -> int:
     return int(ends[np.argmax(np.linalg.eigvalsh(Phi)[:, 0])]) + 1
 
 
-def _solve(rows: Floats, active: Floats, rho: float) -> tuple[Floats, Floats, float, float]:
-    kept = active != 0.0
-    X = rows[:, :, :-1][:, :, kept].reshape(-1, int(kept.sum()))
-    u = rows[:, :, -1]
-    samples = rows.shape[0]
-    Phi, b = X.T @ X / samples, X.T @ u.ravel() / samples
-    theta = np.linalg.solve(Phi + rho * np.eye(len(b)), b)
-    left = (X @ theta).reshape(u.shape) - u
-    variance = float(np.sum(left**2)) / max(left.size - len(b), 1)
-    covariance = variance * correlation_length(left) * np.linalg.inv(samples * Phi)
-    estimate, deviation = np.full((2, active.size), np.nan)
-    estimate[kept], deviation[kept] = theta, np.sqrt(np.diag(covariance))
-    return estimate, deviation, float(np.linalg.eigvalsh(Phi)[0]), float(np.sqrt(np.mean(left**2)))
+def _solve(X: Floats, u: Floats, rho: float) -> tuple[Floats, Floats, Floats]:
+    """Phi (m, m), theta (m,) and its covariance (m, m), of rows X (N, n, m) and u (N, n)."""
+    N, m = X.shape[0], X.shape[2]
+    Phi = np.einsum('kia,kib->ab', X, X) / N
+    inverse = np.linalg.pinv(Phi + rho * np.eye(m), hermitian=True)
+    theta = inverse @ np.einsum('kia,ki->a', X, u) / N
+    scores = np.einsum('kia,ki->ka', X, X @ theta - u)
+    g = np.array([block.sum(axis=0) for block in np.array_split(scores, _BLOCKS)])
+    S = g.T @ g * _BLOCKS / (_BLOCKS - 1)
+    return Phi, theta, inverse @ S @ inverse / N**2
+
+
+def _least_inertia(model: ArmModel, estimate: Floats, q: Floats) -> float:
+    """Smallest eigenvalue of M at positions among q (N, n), by the estimate (m,) of P and d."""
+    n, p = model.n, len(model.parameter_names)
+    Yp, Yr, M = np.zeros((n, p)), np.zeros((n, p)), np.zeros((n, n))
+    least = np.inf
+    for position in q[:: max(1, q.shape[0] // _POSITIONS)]:
+        for i, unit in enumerate(np.eye(n)):
+            model.momentum_regressor(position, unit, Yp, Yr)
+            M[:, i] = Yp @ estimate[:p]
+        least = min(least, float(np.linalg.eigvalsh(M)[0]))
+    return least
 
 
 def correlation_length(left: Floats) -> float:

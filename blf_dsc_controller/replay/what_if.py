@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap, read_content
+from blf_dsc_controller.bags.sources import BagError
+from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.bags.torque import applied_torque
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import begin, controller_of
@@ -33,6 +35,7 @@ class WhatIf(NamedTuple):
     active: Floats  # which disturbance columns are estimated at the end (m,)
     applied: Floats  # torque from each state to the next (N, n), N m; NaN where unknown
     source: str  # topic that it comes from
+    left_out: int  # states, as in `RecordedStates`
     error_ratio: Floats  # largest |xi1| / k_c of each joint (n,), against this reference
 
     @property
@@ -41,26 +44,58 @@ class WhatIf(NamedTuple):
         return np.asarray(self.run.torque - self.applied)
 
 
-def what_if(
+class RecordedStates(NamedTuple):
+    """The states that the law used, with the torques that acted."""
+
+    states: JointStates  # (N,)
+    applied: Floats  # torque from each state to the next (N, n), N m; NaN for the last if unknown
+    source: str  # topic that it comes from
+    left_out: int  # states that are not finite, or have no known torque before them
+
+
+def read_states(
     path: Path, config: ControllerConfig, namespace: str = '', names: NameMap = NO_NAMES
-) -> WhatIf:
-    """Run a configuration over the states of any bag (folder, storage file, or ROS 1 `.bag`).
+) -> RecordedStates:
+    """Read states and torques of any bag (folder, storage file, or ROS 1 `.bag`).
 
     `namespace` is that of the robot, if the bag holds several; `names` are those of topics and
     joints that have other names in the bag.
 
     Raises:
-        StartError: the law cannot take over in the first state, and approaches are disabled.
-        MotionError: there is no approach within the limits.
-        BlfDscError: the bag cannot be read, or it does not hold the applied torques.
+        BlfDscError: the bag cannot be read, or does not hold the applied torques.
     """
     joints = names.joints_of(config.joints)
     content = read_content(path, namespace, names).of_joints(joints)
-    states = law_states(content, joints)
-    applied, source = applied_torque(content, states)
+    every = law_states(content, joints)
+    finite = every.select(np.flatnonzero(np.isfinite(every.values[:, :2]).all(axis=(1, 2))))
+    applied, source = applied_torque(content, finite)
+    before = np.concatenate((applied[:1], applied[:-1]))
+    known = np.flatnonzero(np.isfinite(before).all(axis=1))
+    states = finite.select(known)
+    if not states.stamp.size:
+        raise BagError(f'{path} holds no joint state that is finite and has a known torque')
+    left_out = every.stamp.size - states.stamp.size
+    return RecordedStates(states, applied[known], source, left_out)
+
+
+def what_if(
+    path: Path, config: ControllerConfig, namespace: str = '', names: NameMap = NO_NAMES
+) -> WhatIf:
+    """Run a configuration over the states of any bag; arguments and errors as of `read_states`.
+
+    Raises:
+        StartError: the law cannot take over in the first state, and approaches are disabled.
+        MotionError: there is no approach within the limits.
+    """
+    return run_over(read_states(path, config, namespace, names), config)
+
+
+def run_over(recorded_states: RecordedStates, config: ControllerConfig) -> WhatIf:
+    """Run a configuration over recorded states; errors as of `what_if`."""
+    states, applied, source, left_out = recorded_states
     config = replace(config, learning=replace(config.learning, torque_source='effort'))
     controller = controller_of(config)
-    n, m = len(joints), controller.settings.m
+    n, m = len(states.names), controller.settings.m
     stamps = states.stamp.tolist()
     recorded = states.values.reshape(-1, 3 * n)
     measurements = recorded.copy()
@@ -81,4 +116,5 @@ def what_if(
     run = run_of(config, controller, states.stamp, recorded, samples)
     columns = columns_of(samples, controller.settings)
     ratio = (np.abs(columns.xi1) / columns.bound).max(axis=0)
-    return WhatIf(run, rows, controller.state.active.copy(), applied, source, ratio)
+    active = controller.state.active.copy()
+    return WhatIf(run, rows, active, applied, source, left_out, ratio)
