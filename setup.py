@@ -75,6 +75,8 @@ setup(
         'mpi': ['pyarrow', 'mpi4py'],
         # Only for `bag_report`: what draws its pages, 40 MB.
         'report': ['plotly>=6'],
+        # Only for `view`: what serves its page, 130 MB, most of it to read meshes.
+        'view': ['viser>=1.1', 'yourdfpy>=0.0.57'],
         'parquet': ['pyarrow'],  # only for `bag_export` into Parquet
         # setuptools: test_package.py builds a wheel without going to the network.
         'test': [
@@ -89,6 +91,8 @@ setup(
             'distributed',
             'plotly>=6',
             *DOCS,
+            'viser>=1.1',
+            'yourdfpy>=0.0.57',
         ],
         'docs': DOCS,
         # The peers that `make bench` compares with; Octave and a C compiler are the system's.
@@ -111,6 +115,7 @@ setup(
             'blf_dsc_controller = blf_dsc_controller.cli.main:blf_dsc_controller',
             'bag_recorder = blf_dsc_controller.cli.main:bag_recorder',
             'arm_markers = blf_dsc_controller.cli.main:arm_markers',
+            'view = blf_dsc_controller.cli.main:view',
             # Aliases of sub-commands: run, replay, report, ...
             'closed_loop = blf_dsc_controller.cli.main:closed_loop',
             'bag_replay = blf_dsc_controller.cli.main:bag_replay',

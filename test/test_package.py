@@ -25,6 +25,7 @@ EXECUTABLES = {
     'blf_dsc_controller',
     'bag_recorder',
     'arm_markers',
+    'view',
     'closed_loop',
     'excite',
     'bag_plot',
@@ -190,7 +191,7 @@ def test_all_that_is_imported_is_declared(metadata):
     used |= set(imports(ROOT / 'launch/closed_loop.launch.py'))
     foreign = used - set(sys.stdlib_module_names) - set(PACKAGES) - {'llvmlite'}  # a part of numba
     distributions = {'pyyaml' if name == 'yaml' else name for name in foreign}
-    extras = ('monte-carlo', 'dask', 'mpi', 'report')
+    extras = ('monte-carlo', 'dask', 'mpi', 'report', 'view')
     optional = set().union(*(requirements(metadata, extra) for extra in extras))
     assert distributions <= requirements(metadata) | optional | depends('exec_depend')
 

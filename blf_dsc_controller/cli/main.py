@@ -85,6 +85,7 @@ sim_plant = partial(_node, 'sim_plant.node')
 blf_dsc_controller = partial(_node, 'blf_dsc_controller.nodes.controller_node')
 bag_recorder = partial(_node, 'blf_dsc_controller.nodes.recorder_node')
 arm_markers = partial(_node, 'blf_dsc_controller.nodes.markers_node')
+view = partial(_node, 'blf_dsc_controller.view.node')
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -143,6 +144,18 @@ def _parser() -> argparse.ArgumentParser:
     )
     report.add_argument('bags', type=Path, nargs='+', metavar='BAG', help=_BAG)
     report.add_argument('--out', type=Path, default=Path('report.html'), help='file (report.html)')
+    view = command(
+        'view',
+        'view',
+        'show a running system, or a bag, on a page in the browser',
+        'Serve a page with the arm in 3D, its errors inside their bounds, torques and estimates: '
+        'of the system that runs in this ROS domain, with buttons and sliders, or of a bag, with '
+        'play and pause. Nobody else can open it, and it needs no network.',
+        'run1/bag',
+    )
+    view.add_argument('bag', type=Path, nargs='?', help=f'{_BAG}; without it: the running system')
+    view.add_argument('--host', default='127.0.0.1', help='address to serve it at (127.0.0.1)')
+    view.add_argument('--port', type=int, default=8080, help='or the next one free (8080)')
     recover = command(
         'recover',
         'bags',
@@ -171,7 +184,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     plot.add_argument('bag', type=Path, help=_BAG)
     plot.add_argument('--out', type=Path, default=Path(), help='folder to write into (.)')
-    for one in (report, export, plot):
+    for one in (report, view, export, plot):
         _map(one)
         _namespace(one)
     _excite_options(
@@ -259,6 +272,8 @@ def _run_options(parser: argparse.ArgumentParser) -> None:
     option('--offline', action='store_true', help='without ROS: no processes, no topics')
     option('--domain', type=int, help='ROS domain (a free one)')
     option('--out', type=Path, help='new folder (closed_loop, closed_loop-2, ...)')
+    option('--view', action='store_true', help='show it on a page in the browser meanwhile')
+    option('--view-host', default='127.0.0.1', help='address to serve it at (127.0.0.1)')
 
 
 def _replay_options(parser: argparse.ArgumentParser) -> None:

@@ -33,6 +33,7 @@ from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.simulation.record import Record
 from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.view.page import LOCAL, free_port, open_to_others, require_viser
 from sim_plant import kernels as plant_kernels
 
 _FOLDER = 'closed_loop'
@@ -44,6 +45,8 @@ def run(options: Namespace) -> int:
     config = _configuration(options)
     if not options.offline:
         require_ros()
+    if options.view:
+        _check_view(options)
     out = make_folder(options.out)
     try:
         recorder = {'output': str(out / 'bag')}
@@ -51,7 +54,7 @@ def run(options: Namespace) -> int:
         dump(out / 'config.yaml', config.by_node)
         if options.offline:
             _run_offline(config, out / 'bag')
-        completed = options.offline or _run_over_ros(config, out, options.domain)
+        completed = options.offline or _run_over_ros(config, out, options)
         try:
             _report(out)
         except BlfDscError as error:
@@ -135,13 +138,26 @@ def _run_offline(config: LoopConfig, bag: Path) -> None:
     write_bag(bag, record, config.controller, config.recorder.compression, config.plant)
 
 
-def _run_over_ros(config: LoopConfig, out: Path, domain: int | None) -> bool:
+def _run_over_ros(config: LoopConfig, out: Path, options: Namespace) -> bool:
     """Run the three nodes; False if a signal ended the run."""
     from blf_dsc_controller.cli.session import run_session
 
     if not is_compiled(update, *plant_kernels.KERNELS):
         _print_notice()
-    return run_session(config, out, domain)
+    return run_session(config, out, options.domain, options.view_host if options.view else '')
+
+
+def _check_view(options: Namespace) -> None:
+    """Raise BlfDscError if the page cannot be served; warn if others can open it."""
+    if options.offline:
+        raise BlfDscError(
+            '--view shows what runs over ROS: leave out --offline, or look at the bag afterwards '
+            '(blf_dsc view OUT/bag)'
+        )
+    require_viser()
+    free_port(options.view_host, 8080)
+    if options.view_host not in LOCAL:
+        print(f'warning: {open_to_others(options.view_host)}', file=sys.stderr)
 
 
 class _CompilationListener(event.Listener):  # type: ignore[misc]

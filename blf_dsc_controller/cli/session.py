@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from math import inf
 from pathlib import Path
@@ -21,19 +21,21 @@ from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import JointState
 
 from blf_dsc_controller.cli.progress import LoopProgress
-from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, LoopConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, VIEW, LoopConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import model_of
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.telemetry import DECIMATION
 from blf_dsc_controller.messages.topics import RATIO
 from blf_dsc_controller.nodes.endpoints import qos_profile
+from blf_dsc_controller.view.page import free_port, url_of
 
 # In the order in which they start. They end in reverse: the recorder last, to get every message.
 _MODULES = {
     RECORDER: 'blf_dsc_controller.nodes.recorder_node',
     CONTROLLER: 'blf_dsc_controller.nodes.controller_node',
     PLANT: 'sim_plant.node',
+    VIEW: 'blf_dsc_controller.view.node',  # only on request, once the loop runs
 }
 _DOMAINS = range(1, 101)  # 0 is the default; above 101 are the ports that the system hands out
 _FIRST_SIGN = 5.0  # s, at most, until a running loop is seen to run, also on a busy machine
@@ -43,13 +45,16 @@ _ENDING = 20.0  # s that a node may take to end before it is killed
 _TAIL = 12  # lines of a failed node's log that are shown
 _ROOM = 1_000_000  # bytes that a log needs at least
 _PR_SET_PDEATHSIG = 1
+_LIBC = ctypes.CDLL(None)  # loaded before there are threads
+_VIEW_PORT = 8080  # or the next one that is free
 
 
-def run_session(config: LoopConfig, out: Path, domain: int | None) -> bool:
+def run_session(config: LoopConfig, out: Path, domain: int | None, view_host: str = '') -> bool:
     """Run the three nodes on `out/config.yaml` until the plant has ended.
 
-    In a ROS domain of its own, unless one is given. Returns False if SIGINT or SIGTERM ended the
-    run; raises NodeFailedError if a node ended with an error.
+    In a ROS domain of its own, unless one is given, and with a page at `view_host`, unless that is
+    empty. Returns False if SIGINT or SIGTERM ended the run; raises NodeFailedError if a node ended
+    with an error.
     """
     logs = out / 'logs'
     logs.mkdir()
@@ -58,7 +63,7 @@ def run_session(config: LoopConfig, out: Path, domain: int | None) -> bool:
         os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
         os.environ['ROS_LOG_DIR'] = str(logs / 'ros')
         try:
-            return _run_nodes(config, out / 'config.yaml', logs)
+            return _run_nodes(config, out / 'config.yaml', logs, view_host)
         except NodeFailedError:
             if shutil.disk_usage(out).free < _ROOM:
                 print(f'no space left on the disk of {out}', file=sys.stderr)
@@ -89,20 +94,20 @@ class NodeFailedError(BlfDscError):
 class NodeProcess:
     """One node in a process of its own, which does not outlive this one."""
 
-    def __init__(self, name: str, params_file: Path, logs: Path) -> None:
+    def __init__(self, name: str, params_file: Path, logs: Path, *arguments: str) -> None:
         self.name = name
         self._log = logs / f'{name}.log'
         command = [sys.executable, '-m', _MODULES[name], '--ros-args', '--params-file']
         with self._log.open('wb') as output:
             # A session of its own: Ctrl-C reaches the parent alone, which ends the nodes in order.
             self._process = subprocess.Popen(
-                [*command, str(params_file)],
+                [*command, str(params_file), *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, 'PYTHONUNBUFFERED': '1'},
                 start_new_session=True,
-                preexec_fn=_die_with_parent,  # noqa: PLW1509 - no threads have been started yet
+                preexec_fn=_die_with_parent,  # noqa: PLW1509 - takes no lock that a thread could hold
             )
 
     @property
@@ -197,8 +202,9 @@ class Monitor:
         self._latest = message
 
 
-def _run_nodes(config: LoopConfig, params_file: Path, logs: Path) -> bool:
+def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, view_host: str) -> bool:
     nodes: list[NodeProcess] = []
+    views: list[NodeProcess] = []
     interrupts: list[int] = []
     remark = ''
     handlers = {
@@ -207,11 +213,18 @@ def _run_nodes(config: LoopConfig, params_file: Path, logs: Path) -> bool:
     }
     try:
         try:
-            for name in _MODULES:
+            for name in (RECORDER, CONTROLLER, PLANT):
                 nodes.append(NodeProcess(name, params_file, logs))  # noqa: PERF401 - those that started are stopped
-            remark = _monitor(config, nodes, interrupts)
+
+            def show() -> str:
+                port = free_port(view_host, _VIEW_PORT)
+                given = ('-p', f'host:={view_host}', '-p', f'port:={port}')
+                views.append(NodeProcess(VIEW, params_file, logs, *given))
+                return url_of(view_host, port)
+
+            remark = _monitor(config, nodes, interrupts, show if view_host else None)
         finally:
-            for node in reversed(nodes):
+            for node in reversed(nodes + views):
                 node.stop()
     finally:
         for number, handler in handlers.items():
@@ -223,10 +236,17 @@ def _run_nodes(config: LoopConfig, params_file: Path, logs: Path) -> bool:
     return not interrupts
 
 
-def _monitor(config: LoopConfig, nodes: list[NodeProcess], interrupts: list[int]) -> str:
+def _monitor(
+    config: LoopConfig,
+    nodes: list[NodeProcess],
+    interrupts: list[int],
+    show: Callable[[], str] | None,
+) -> str:
     """Show the progress until the plant ends or a signal comes; return a remark on the recorder.
 
     A loop that has begun continues without its recorder; its first message may come a little later.
+    Only then `show` starts the page and returns its address: the nodes wait for a subscriber, which
+    is to be the recorder.
     """
     recorder, *loop = nodes
     ended, warned = inf, False
@@ -243,9 +263,12 @@ def _monitor(config: LoopConfig, nodes: list[NodeProcess], interrupts: list[int]
                     )
                 if not monitor.has_begun and time.monotonic() > ended + _FIRST_SIGN:
                     recorder.check()
+            if monitor.has_begun and show is not None:
+                monitor.progress.write(f'the page: {show()}')
+                show = None
             monitor.wait(0.1)
     return '' if recorder.is_running else ' while the loop continued without it'
 
 
 def _die_with_parent() -> None:
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)

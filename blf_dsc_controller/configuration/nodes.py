@@ -20,8 +20,10 @@ PLANT = 'sim_plant'
 CONTROLLER = 'blf_dsc_controller'
 RECORDER = 'bag_recorder'
 MARKERS = 'arm_markers'
+VIEW = 'view'
 
 _of_bag = partial(parameter, read_only='a bag is opened once, when the recorder starts')
+_of_view = partial(parameter, read_only='the page is served once, when the node starts')
 _of_markers = partial(parameter, read_only='it is read once, when the node starts')
 
 
@@ -100,11 +102,24 @@ class MarkersConfig:
         return joint_problems(self.joints, 'the arm of the markers', needed)
 
 
-NODES: Mapping[str, type[PlantConfig | ControllerConfig | RecorderConfig | MarkersConfig]] = {
+@dataclass(frozen=True)
+class ViewConfig:
+    """Parameters of the node `view`."""
+
+    host: str = _of_view('127.0.0.1', 'address of this computer that the page is served at')
+    port: int = _of_view(
+        8080, 'of the page, or the next one that is free', at_least=1, at_most=65535
+    )
+
+
+NODES: Mapping[
+    str, type[PlantConfig | ControllerConfig | RecorderConfig | MarkersConfig | ViewConfig]
+] = {
     PLANT: PlantConfig,
     CONTROLLER: ControllerConfig,
     RECORDER: RecorderConfig,
     MARKERS: MarkersConfig,
+    VIEW: ViewConfig,
 }
 
 

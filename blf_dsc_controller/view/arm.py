@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The arm as the page draws it: the shapes of its URDF, else a cylinder along each link."""
+
+from __future__ import annotations
+
+import io
+import logging
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.robot import chain_of
+from blf_dsc_controller.configuration.share import resolve
+from blf_dsc_controller.errors import BlfDscError
+
+_THICKNESS = 0.025  # radius of a link over the length of all
+_SHORTEST = 1e-3  # m, of a link that is drawn
+
+
+class Arm(NamedTuple):
+    """The text of a URDF, and the chain of the controlled joints in it."""
+
+    text: str
+    chain: Chain
+
+    @property
+    def reach(self) -> float:
+        """Length of all links together [m]."""
+        offsets = [joint.placement[:3, 3] for joint in self.chain.joints]
+        steps = np.array([*offsets, self.chain.tip_placement[:3, 3]])
+        return float(np.linalg.norm(steps, axis=1).sum())
+
+    def model(self) -> Any:
+        """Model of yourdfpy, whose shapes are those of the URDF if they are found."""
+        model = _load(self.text)
+        return model if model.scene.geometry else _load(with_cylinders(self.text, self.reach))
+
+
+def arm_of(config: ControllerConfig, lengths: Sequence[float] = ()) -> Arm:
+    """Arm of a controller; planar links have these lengths [m], or that of the first."""
+    robot = config.robot
+    if config.model == 'urdf':
+        return Arm(robot.text, robot.chain(config.joints))
+    text = planar_urdf(config.joints, lengths or (config.arm.l1,) * len(config.joints))
+    return Arm(text, chain_of(text, '', 'tip', config.joints))
+
+
+def planar_urdf(joints: Sequence[str], lengths: Sequence[float]) -> str:
+    """URDF without shapes of links of these lengths [m] in the x-z plane, with the link `tip`."""
+    robot = ET.Element('robot', name='arm')
+    ET.SubElement(robot, 'link', name='base')
+    parent = 'base'
+    at = (0.0, *lengths)
+    for name, x in zip((*joints, 'tip_joint'), at, strict=True):
+        child = 'tip' if name == 'tip_joint' else f'link of {name}'
+        inertial = ET.SubElement(ET.SubElement(robot, 'link', name=child), 'inertial')
+        ET.SubElement(inertial, 'mass', value='1')
+        kind = 'fixed' if child == 'tip' else 'continuous'
+        joint = ET.SubElement(robot, 'joint', name=name, type=kind)
+        ET.SubElement(joint, 'parent', link=parent)
+        ET.SubElement(joint, 'child', link=child)
+        ET.SubElement(joint, 'origin', xyz=f'{x:.17g} 0 0')
+        ET.SubElement(joint, 'axis', xyz='0 -1 0')
+        parent = child
+    return ET.tostring(robot, encoding='unicode')
+
+
+def with_cylinders(text: str, reach: float) -> str:
+    """URDF with a cylinder from each joint to the next, and a ball at each that moves."""
+    robot = ET.fromstring(text)  # noqa: S314 - as trusted as the robot that it describes
+    links = {link.get('name'): link for link in robot.findall('link')}
+    for link in links.values():
+        for visual in link.findall('visual'):
+            link.remove(visual)
+    radius = _THICKNESS * reach
+    for joint in robot.findall('joint'):
+        ends = {role: links[joint.find(role).get('link')] for role in ('parent', 'child')}  # type: ignore[union-attr]
+        if joint.get('type') != 'fixed':
+            _add(ends['child'], (0.0, 0.0, 0.0), '0 0 0', 'sphere', radius=f'{1.6 * radius}')
+        origin = joint.find('origin')
+        xyz = [float(x) for x in ('' if origin is None else origin.get('xyz', '')).split()]
+        length = float(np.linalg.norm(xyz))
+        if length > _SHORTEST:
+            x, y, z = xyz
+            rpy = f'0 {np.arccos(z / length)} {np.arctan2(y, x)}'
+            size = {'radius': f'{radius}', 'length': f'{length}'}
+            _add(ends['parent'], (x / 2, y / 2, z / 2), rpy, 'cylinder', **size)
+    return ET.tostring(robot, encoding='unicode')
+
+
+def _add(link: ET.Element, at: Sequence[float], rpy: str, shape: str, **size: str) -> None:
+    visual = ET.SubElement(link, 'visual')
+    ET.SubElement(visual, 'origin', xyz=' '.join(map(str, at)), rpy=rpy)
+    ET.SubElement(ET.SubElement(visual, 'geometry'), shape, size)
+
+
+def _load(text: str) -> Any:
+    import yourdfpy
+
+    logging.getLogger('yourdfpy').setLevel(logging.ERROR)  # meshes that are not found
+    model = yourdfpy.URDF.load(io.BytesIO(text.encode()), filename_handler=_file)
+    for joint in model.robot.joints:
+        if joint.axis is not None:  # it slides along them by their length
+            joint.axis = joint.axis / np.linalg.norm(joint.axis)
+    return model
+
+
+def _file(fname: str) -> str:  # the name of the argument is that of yourdfpy
+    try:
+        return str(resolve(fname.removeprefix('file://')))
+    except (BlfDscError, OSError):
+        return fname

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag on the page: play, pause, and go to any time."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from blf_dsc_controller.analysis.metrics import true_change_times
+from blf_dsc_controller.analysis.reported_bag import read_bags
+from blf_dsc_controller.bags.content import NO_NAMES, NameMap
+from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.messages.topics import LAMBDA_MIN
+from blf_dsc_controller.run import Floats, Run, Series, Stamps
+from blf_dsc_controller.view.arm import arm_of
+from blf_dsc_controller.view.moment import Confidence, Moment, estimates_of
+from blf_dsc_controller.view.page import PAST, Page
+
+_RATE = 30.0  # moments a second
+_MOST = 20_000  # moments of a bag
+_PERIOD = 1.0 / 30.0  # s
+_PLOTTED = 6  # pictures from one plot to the next
+_SPEEDS = ('0.1', '0.5', '1', '2', '5', '10')
+
+
+class BagPlayer:
+    """Plays a bag; raises BlfDscError if it cannot be read or has no configuration of a controller.
+
+    Attributes:
+        slider: of the time [s].
+        button: plays and pauses.
+    """
+
+    def __init__(
+        self, page: Page, path: Path, namespace: str = '', names: NameMap = NO_NAMES
+    ) -> None:
+        (bag,) = read_bags([path], namespace, names)
+        config = read_context(path).controller_config()
+        run = bag.run
+        estimates = estimates_of(config)
+        self.moments = moments(run, tuple(estimates))
+        self._page, self._times = page, np.array([one.time for one in self.moments])
+        self._events = [(*event,) for event in bag.events]
+        self._confidence = Confidence(config)
+        self._playing, self._drawn = False, -1
+        keys = ('sim_plant: arm.l1', 'sim_plant: arm.l2')
+        lengths = [float(bag.parameters[key]) for key in keys if key in bag.parameters]
+        page.draw_arm(arm_of(config, lengths), estimates)
+        gui = page.server.gui
+        end = float(self._times[-1])
+        self.slider = gui.add_slider('time [s]', 0.0, end, 1e-3, 0.0, order=-2.0)
+        self.speed = gui.add_dropdown('speed', _SPEEDS, initial_value='1', order=-1.0)
+        self.button = gui.add_button('Play / Pause', order=-1.5)
+        self.button.on_click(lambda _: self.toggle())
+        page.state('BAG', f'{bag.name}, {run.duration:.1f} s')
+
+    def toggle(self) -> None:
+        """Play, or pause; at the end from the start."""
+        self._playing = not self._playing
+        if self._playing and self.slider.value >= self._times[-1]:
+            self.slider.value = 0.0
+
+    def update(self, elapsed: float) -> None:
+        """Go on by the time that has elapsed [s] if it plays, and draw the moment of the slider."""
+        if self._playing:
+            goal = self.slider.value + elapsed * float(self.speed.value)
+            self._playing = goal < self._times[-1]
+            self.slider.value = min(goal, float(self._times[-1]))
+        k = max(0, int(np.searchsorted(self._times, self.slider.value, side='right')) - 1)
+        if k == self._drawn:
+            return
+        plots = not self._playing or k // _PLOTTED != self._drawn // _PLOTTED
+        self._drawn = k
+        longest = max(PAST, self._confidence.window)
+        first = int(np.searchsorted(self._times, self._times[k] - longest))
+        past = self.moments[first : k + 1]
+        self._page.move(past)
+        if plots:
+            self._page.learned(self._confidence.prior, self._confidence.deviations(past))
+            self._page.plot(past)
+            self._page.events([one for one in self._events if one[0] <= self._times[k]])
+
+
+def play(page: Page, path: Path, namespace: str, names: NameMap) -> NoReturn:
+    """Play a bag on a page until Ctrl-C."""
+    player = BagPlayer(page, path, namespace, names)
+    before = time.monotonic()
+    while True:
+        now = time.monotonic()
+        player.update(now - before)
+        before = now
+        time.sleep(_PERIOD)
+
+
+def moments(run: Run, estimates: tuple[str, ...]) -> list[Moment]:
+    """Moments of a run, some thirty a second, with the values last known at each."""
+    count = int(min(_MOST, max(2.0, _RATE * run.duration)))
+    rows = np.unique(np.searchsorted(run.time, np.linspace(0.0, run.duration, count)))
+    rows = rows[rows < run.time.size]
+    unknown = np.full((rows.size, len(run.joints)), np.nan)
+
+    def at(values: Floats | None) -> Floats:
+        return unknown if values is None else values[rows]
+
+    stamps = run.stamp[rows]
+    changed = np.searchsorted(np.array(true_change_times(run)), run.time[rows], side='right')
+    figures = _held(run.learning, stamps, (*estimates, LAMBDA_MIN))
+    truth = _held(run.truth, stamps, estimates)
+    arrays = (run.position, run.error, run.bound, run.torque, run.torque_limit)
+    columns = (run.time[rows].tolist(), *map(at, arrays), figures[:, :-1], truth)
+    each = zip(*columns, figures[:, -1].tolist(), (changed % 2 == 1).tolist(), strict=True)
+    return [Moment(*one) for one in each]
+
+
+def _held(series: Series | None, stamps: Stamps, names: tuple[str, ...]) -> Floats:
+    """Values (k, m) of some names, NaN where they are not known."""
+    found = np.full((len(stamps), len(names)), np.nan)
+    if series is not None:
+        held = series.held(stamps)
+        for j, name in enumerate(names):
+            if name in series.names:
+                found[:, j] = held[:, series.names.index(name)]
+    return found

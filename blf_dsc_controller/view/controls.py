@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Buttons and sliders of the page of a running system; what they do is the node's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Protocol
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import Kind, Parameter, Value, flatten, parameters
+
+_GAINS = ('barrier', 'surface', 'feedback', 'disturbance', 'torque', 'learning')
+_OF_OTHER_LAWS = ('comparison',)
+_HEADROOM = 4.0  # a slider without a limit ends at so many times the present value
+_STEPS = 400
+
+
+class Actions(Protocol):
+    """What the controls ask for; called in threads of the page's server."""
+
+    def reset(self) -> None:
+        """Start the arm and its controller again."""
+
+    def push(self, torque: Sequence[float]) -> None:
+        """Push the joints for a moment [N m]."""
+
+    def payload(self, mass: float) -> None:
+        """Hang a mass on the tip [kg]."""
+
+    def go_to(self, position: Mapping[str, float], duration: float) -> None:
+        """Send a reference: to a position of each joint [rad] in a time [s]."""
+
+    def set_gain(self, name: str, value: Value) -> None:
+        """Set a parameter of the controller."""
+
+
+class Controls:
+    """Adds the tabs `Try` and `Gains` to those of a page.
+
+    Attributes:
+        buttons: by what is on them.
+        sliders: of each gain by its name, one for each entry.
+    """
+
+    def __init__(
+        self, gui: Any, tabs: Any, config: ControllerConfig, actions: Actions, *, simulated: bool
+    ) -> None:
+        self._gui, self._actions = gui, actions
+        self.buttons: dict[str, Any] = {}
+        self.sliders: dict[str, list[Any]] = {}
+        with tabs.add_tab('Try'):
+            self._button('Reset', actions.reset, 'the arm to its start, all learned forgotten')
+            if simulated:
+                self._add_disturbances(config.joints)
+            self._add_reference(config)
+        values = flatten(config)
+        with tabs.add_tab('Gains'):
+            for group in (*_GAINS, *(_OF_OTHER_LAWS if config.law not in _OWN else ())):
+                shown = [one for one in live_gains() if one.name.startswith(f'{group}.')]
+                with gui.add_folder(group, expand_by_default=group == 'feedback'):
+                    for one in shown:
+                        self._add_gain(one, values[one.name], config.joints)
+
+    def show(self, changed: Mapping[str, Value]) -> None:
+        """Show the values in force of some parameters."""
+        for name, value in changed.items():
+            for slider, entry in zip(self.sliders.get(name, ()), _entries(value), strict=False):
+                slider.max = max(slider.max, entry)
+                slider.value = entry
+
+    def _button(self, label: str, action: Callable[[], None], hint: str) -> None:
+        button = self.buttons[label] = self._gui.add_button(label, hint=hint)
+        button.on_click(lambda _: action())
+
+    def _add_disturbances(self, joints: Sequence[str]) -> None:
+        joint = self._gui.add_dropdown('joint', tuple(joints), hint='to push')
+        torque = self._gui.add_slider('push [N m]', -10.0, 10.0, 0.1, 2.0)
+        self._button(
+            'Push',
+            lambda: self._actions.push([torque.value * (one == joint.value) for one in joints]),
+            'this joint by this torque for half a second',
+        )
+        mass = self._gui.add_slider('payload [kg]', 0.0, 5.0, 0.05, 0.5)
+        self._button('Pick up', lambda: self._actions.payload(mass.value), 'this payload')
+        self._button('Put down', lambda: self._actions.payload(0.0), 'all payload')
+
+    def _add_reference(self, config: ControllerConfig) -> None:
+        limits = zip(config.limits.position_lower, config.limits.position_upper, strict=True)
+        offset = config.reference.offset
+        sliders = {}
+        for k, (joint, (low, high)) in enumerate(zip(config.joints, limits, strict=True)):
+            at = min(max(offset[k] if k < len(offset) else 0.0, low), high)
+            sliders[joint] = self._gui.add_slider(f'{joint} [rad]', low, high, 0.001, at)
+        duration = self._gui.add_slider('in [s]', 0.5, 20.0, 0.1, 4.0)
+        self._button(
+            'Go there',
+            lambda: self._actions.go_to(
+                {joint: one.value for joint, one in sliders.items()}, duration.value
+            ),
+            'and stay; Reset returns to the configured reference',
+        )
+
+    def _add_gain(self, one: Parameter, value: Value, joints: Sequence[str]) -> None:
+        entries = _entries(value)
+        names = joints if one.kind.is_array else ('',)
+        low = one.above if one.at_least is None else one.at_least
+        high = one.below if one.at_most is None else one.at_most
+        top = high or _HEADROOM * max((*entries, 0.0)) or 1.0
+        step = top / _STEPS
+        bottom = step if one.above is not None else low or 0.0
+        unit = f' [{one.unit}]' if one.unit else ''
+        label = one.name.rsplit('.', 1)[-1]
+        limit = f'; {one.allowed}' if one.allowed else ''
+        sliders = self.sliders[one.name] = []
+        for name, entry in zip(names, entries, strict=True):
+            slider = self._gui.add_slider(
+                f'{label} {name}{unit}',
+                min(bottom, entry),
+                top,
+                step,
+                entry,
+                hint=f'{one.symbol or one.name}: {one.description}{limit}',
+            )
+            sliders.append(slider)
+
+        def changed(event: Any) -> None:
+            if event.client is not None:  # moved by hand, not by `show`
+                given = tuple(float(slider.value) for slider in sliders)
+                self._actions.set_gain(one.name, given if one.kind.is_array else given[0])
+
+        for slider in sliders:
+            slider.on_update(changed)
+
+
+def live_gains() -> Iterable[Parameter]:
+    """Numbers of the controller, or one for each joint, that can change while it runs."""
+    for one in parameters(ControllerConfig):
+        scalar = one.kind is Kind.DOUBLE
+        if not one.read_only and (scalar or one.length == ('joints',)):
+            yield one
+
+
+def _entries(value: Any) -> tuple[float, ...]:
+    return tuple(value) if isinstance(value, tuple) else (value,)
+
+
+_OWN = ('blf_dsc', 'model_based')

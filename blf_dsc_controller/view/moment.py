@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the page shows of one moment, and what the motion up to it tells of each estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.compiled.layout import pack
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.factory import (
+    column_names,
+    model_of,
+    prior_covariance,
+    settings_of_config,
+)
+from blf_dsc_controller.law.prediction import rows_along
+from blf_dsc_controller.run import Floats
+
+_FEWEST = 8  # moments, to differentiate twice
+_INDEPENDENT = 100.0  # rows of a window whose unmodelled torques are independent
+
+
+class Moment(NamedTuple):
+    """Values of n joints and m estimates at one time; NaN where unknown."""
+
+    time: float  # s
+    position: Floats  # (n,) rad, q
+    error: Floats  # (n,) rad, xi1
+    bound: Floats  # (n,) rad, k_c
+    torque: Floats  # (n,) N m
+    torque_limit: Floats  # (n,) N m
+    estimate: Floats  # (m,) theta^; NaN: a rejected column
+    truth: Floats  # (m,)
+    lambda_min: float
+    loaded: bool = False  # the true parameters are not those of the start
+
+
+def estimates_of(config: ControllerConfig) -> dict[str, str]:
+    """Units of the estimates of a controller, by name and in their order."""
+    friction = {one: 'N m s/rad' if 'viscous' in one else 'N m' for one in column_names(config)}
+    model = model_of(config)
+    return dict(zip(model.parameter_names, model.parameter_units, strict=True)) | friction
+
+
+class Confidence:
+    """How far the motion of a window determines each estimate.
+
+    The window's excitation Phi of the reference adds to the information R of the prior:
+    covariance = (R + Phi / a)^-1, where a is the mean square of the unmodelled torque
+    (`learning.residual_floor`) over the number of its independent values in a window, as in
+    `excite`.
+    """
+
+    def __init__(self, config: ControllerConfig) -> None:
+        settings = settings_of_config(config)
+        least = float(np.min(config.learning.residual_floor))
+        self.window = config.learning.window
+        self.prior = np.sqrt(np.diag(prior_covariance(config)))  # (m,) standard deviations
+        self._settings, self._vector = settings, pack(settings)
+        self._noise = settings.prior_weight or least * least / _INDEPENDENT
+
+    def deviations(self, past: Sequence[Moment]) -> Floats:
+        """Standard deviation (m,) of each estimate after the last window of some moments."""
+        settings = self._settings
+        recent = [one for one in past if one.time > past[-1].time - self.window]
+        recent = [one for one in recent if np.isfinite(one.error).all()]
+        if len(recent) < _FEWEST:
+            return self.prior
+        times = np.array([one.time for one in recent])
+        qr = np.array([one.position - one.error for one in recent])
+        dqr = np.gradient(qr, times, axis=0)
+        motion = np.stack((qr, dqr, np.gradient(dqr, times, axis=0)), axis=1)
+        X = np.zeros((times.size, settings.n, settings.m))
+        rows_along(settings.model, self._vector, times, motion, X)
+        X *= settings.row_weight[:, np.newaxis]
+        share = min(1.0, (times[-1] - times[0]) / self.window)
+        Phi = np.einsum('kia,kib->ab', X, X) * (share / times.size)
+        covariance = np.linalg.inv(settings.information + Phi / self._noise)
+        return np.asarray(np.sqrt(np.diag(covariance)))

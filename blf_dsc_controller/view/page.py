@@ -1,0 +1,321 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page: the arm in space, plots, numbers and events, from the arrays of moments.
+
+It does not know where they come from. viser serves it, with all that the browser needs: nothing is
+loaded from elsewhere.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+import socket
+from collections import deque
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from blf_dsc_controller.analysis.style import ALARM, COLOURS, GREEN, MUTED, ORANGE
+from blf_dsc_controller.arms.chain_geometry import frames, tip_radius
+from blf_dsc_controller.errors import BlfDscError, MissingExtraError
+from blf_dsc_controller.run import Floats
+from blf_dsc_controller.view.arm import Arm
+from blf_dsc_controller.view.moment import Moment
+
+LOCAL = ('127.0.0.1', 'localhost', '::1')
+"""Hosts that only this computer reaches."""
+
+PAST = 20.0
+"""Time that the plots show [s]."""
+
+_TRAIL = 4.0  # s of the tip's path
+_EVENTS = 12
+_PORTS = 100  # tried from the wanted one on
+_NOT_SHOWN = 0.5  # a deviation that is more than this of the prior's: not identified
+_PLAIN = (86, 110, 150)  # of an arm without colours
+_GHOST = (0, 200, 120, 0.35)
+_LEVELS = {'OK': GREEN, 'WARN': ORANGE, 'ERROR': ALARM, 'STALE': MUTED, 'BAG': MUTED}
+_CELL = 'padding:1px 7px;text-align:right;font-variant-numeric:tabular-nums'
+
+
+class Page:
+    """A page at a host and the first free port from the given one on.
+
+    Raises:
+        MissingExtraError: viser is not installed.
+        BlfDscError: the page cannot be served there.
+
+    Attributes:
+        server: viser's.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        require_viser()
+        import viser
+
+        free = free_port(host, port)
+        with contextlib.redirect_stdout(io.StringIO()):  # its own greeting
+            self.server = viser.ViserServer(host, free, label='blf_dsc', verbose=False)
+        self.url = url_of(host, self.server.get_port())
+        self._events: deque[tuple[float, str, str]] = deque(maxlen=_EVENTS)
+        self._state = 'STALE', ''
+        self.clear()
+
+    def clear(self) -> None:
+        """Show the state only, until `draw_arm`."""
+        server, gui = self.server, self.server.gui
+        self._list: Any = None
+        server.scene.reset()
+        gui.reset()
+        gui.configure_theme(show_logo=False, show_share_button=False, control_width='large')
+        gui.main_panel.dock_right()
+        server.scene.configure_default_lights(cast_shadow=True)
+        self._header = gui.add_html('')
+        self.state(*self._state)
+
+    def draw_arm(self, arm: Arm, estimates: Mapping[str, str]) -> Any:
+        """Draw an arm with the units of its estimates by name; returns the page's tabs."""
+        from viser.extras import ViserUrdf
+
+        self._arm, self._units = arm, {escape(k): v for k, v in estimates.items()}
+        self._joints = [joint.name for joint in arm.chain.joints]
+        self._deviation = self._prior = np.full(len(estimates), np.nan)
+        server, gui, reach = self.server, self.server.gui, arm.reach
+        model = arm.model()
+        self._held = dict.fromkeys(model.actuated_joint_names, 0.0)
+        colour = None if 'rgba' in arm.text or '<mesh' in arm.text else _PLAIN
+        self._drawn = ViserUrdf(server, model, root_node_name='/arm', mesh_color_override=colour)
+        ghost = arm.model()
+        self._ghost = ViserUrdf(
+            server, ghost, root_node_name='/reference', mesh_color_override=_GHOST
+        )
+        base = np.array(model.get_transform(arm.chain.base))
+        self._base = base
+        floor = min(0.0, -reach if _hangs(arm) else 0.0)
+        server.scene.add_grid(
+            '/floor', 4 * reach, 4 * reach, cell_size=0.25, position=(0, 0, floor)
+        )
+        server.initial_camera.position = tuple(np.array((0.55, -1.25, 0.55)) * reach)
+        server.initial_camera.look_at = (0.15 * reach, 0.0, 0.25 * reach)
+        tabs = gui.add_tab_group()
+        with tabs.add_tab('Plots'):
+            self._table = gui.add_html('')
+            self._plots = [
+                self._plot('tracking error [% of the bound]', self._joints, ('bound',), 110.0),
+                self._plot('torque [N m]', self._joints, ()),
+                self._plot(
+                    'estimates less the truth [% of their scale]', tuple(estimates), (), 100.0
+                ),
+                self._plot('excitation: log10 of lambda_min', ('lambda_min',), ()),
+            ]
+        with tabs.add_tab('Estimates'):
+            self._estimates = gui.add_html('')
+        with tabs.add_tab('Events'):
+            self._list = gui.add_html('')
+        self.event(np.nan, '', '')
+        return tabs
+
+    def _plot(
+        self, title: str, names: Sequence[str], limits: Sequence[str], span: float = 0.0
+    ) -> Any:
+        lines: list[Any] = [{'label': 's'}]
+        lines += [
+            {'label': name, 'stroke': COLOURS[k % len(COLOURS)], 'width': 1.5, 'points': _NO_POINTS}
+            for k, name in enumerate(names)
+        ]
+        edge = {'stroke': ALARM, 'width': 1.0, 'dash': [6, 4], 'points': _NO_POINTS}
+        lines += [{'label': sign + name, **edge} for name in limits for sign in '+-']
+        scales: Any = {'x': {'time': False}}
+        if span:
+            scales['y'] = {'range': (-span, span)}
+        empty = (np.zeros(1),) * len(lines)
+        return self.server.gui.add_uplot(
+            empty, tuple(lines), title=title, scales=scales, legend={'show': False}, height=150
+        )
+
+    def state(self, level: str, text: str) -> None:
+        """Show the state of the controller: OK, WARN, ERROR or STALE, and what it is."""
+        self._state = level, text
+        self._header.content = (
+            f'<div style="margin:4px 12px;padding:6px 10px;border-radius:6px;color:white;'
+            f'background:{_LEVELS[level]}"><b>{level}</b> {escape(text)}</div>'
+        )
+
+    def notify(self, title: str, text: str) -> None:
+        """Show a message in each open page."""
+        for client in self.server.get_clients().values():
+            client.add_notification(title, text, color='red', auto_close_seconds=15.0)
+
+    def event(self, time: float, kind: str, text: str) -> None:
+        """Add an event at a time [s] to the list."""
+        if kind:
+            self._events.append((time, kind, text))
+        rows = (
+            f'<tr><td style="{_CELL}">{t:.2f} s</td><td><b>{escape(k)}</b> {escape(e)}</td></tr>'
+            for t, k, e in reversed(self._events)
+        )
+        if self._list is not None:
+            self._list.content = _in_table(rows)
+
+    def events(self, events: Sequence[tuple[float, str, str]]) -> None:
+        """Replace the list by the last of these events."""
+        if list(self._events) != list(events[-_EVENTS:]):
+            self._events.clear()
+            self._events.extend(events)
+            self.event(np.nan, '', '')
+
+    def learned(self, prior: Floats, deviation: Floats) -> None:
+        """Take the standard deviations (m,) of the estimates: before, and after the window."""
+        self._prior, self._deviation = prior, deviation
+
+    def move(self, past: Sequence[Moment]) -> None:
+        """Move the arm to the last of some moments."""
+        now = past[-1]
+        chain, reach, scene = self._arm.chain, self._arm.reach, self.server.scene
+        with self.server.atomic():
+            self._drawn.update_cfg(self._posture(now.position))
+            tip = self._at(frames(chain, now.position)[-1])
+            reference = now.position - now.error
+            if np.isfinite(reference).all():
+                self._ghost.update_cfg(self._posture(reference))
+                if np.isfinite(now.bound).all():
+                    radius = tip_radius(chain, reference, now.bound)
+                    at = self._at(frames(chain, reference)[-1])
+                    scene.add_icosphere(
+                        '/bound', radius, color=(230, 159, 0), opacity=0.35, position=at
+                    )
+            scene.add_icosphere(
+                '/payload', 0.045 * reach, color=(213, 94, 0), position=tip, visible=now.loaded
+            )
+            recent = np.array([one.position for one in past if one.time > now.time - _TRAIL])
+            if len(recent) > 1:
+                path = self._at(frames(chain, recent)[-1])
+                points = np.stack((path[:-1], path[1:]), axis=1)
+                scene.add_line_segments('/path', points, (0, 114, 178), thickness=3.0)
+
+    def plot(self, past: Sequence[Moment]) -> None:
+        """Draw the plots and tables of the last of some moments."""
+        now = past[-1]
+        shown = [one for one in past if one.time > now.time - PAST]
+        t = np.array([one.time for one in shown])
+        edge = np.full(t.size, 100.0)
+        error = np.array([100.0 * one.error / one.bound for one in shown]).T
+        torque = np.array([one.torque for one in shown]).T
+        truth = np.nan_to_num(now.truth)
+        scale = np.where(truth == 0.0, self._prior, np.minimum(self._prior, np.abs(truth)))
+        off = np.array([100.0 * (one.estimate - np.nan_to_num(one.truth)) for one in shown]).T
+        with np.errstate(divide='ignore', invalid='ignore'):
+            excitation = np.log10(np.array([[one.lambda_min for one in shown]]))
+            curves = error, torque, off / scale[:, np.newaxis], excitation
+        with self.server.atomic():
+            for plot, values in zip(self._plots, curves, strict=True):
+                edges = (edge, -edge) if plot is self._plots[0] else ()
+                plot.data = (t, *(np.where(np.isfinite(v), v, np.nan) for v in values), *edges)
+            self._table.content = self._joint_table(now)
+            self._estimates.content = self._estimate_table(now)
+
+    def _joint_table(self, now: Moment) -> str:
+        head = _row('th', f't = {now.time:.2f} s', 'error [mrad]', 'bound', 'torque [N m]', 'limit')
+        columns = 1e3 * now.error, 1e3 * now.bound, now.torque, now.torque_limit
+        rows = zip(self._joints, *columns, strict=True)
+        return _in_table([head, *(_row('td', name, *map(_figure, row)) for name, *row in rows)])
+
+    def _estimate_table(self, now: Moment) -> str:
+        head = _row('th', 'estimate', '', '±', 'truth', 'unit', 'identified')
+        rows = [head]
+        each = zip(
+            self._units,
+            self._units.values(),
+            now.estimate,
+            self._deviation,
+            now.truth,
+            self._deviation / self._prior,
+            strict=True,
+        )
+        for name, unit, value, deviation, truth, left in each:
+            figures = map(_figure, (value, deviation, truth))
+            rejected = not np.isfinite(value)
+            bar = 'rejected' if rejected else _bar(1.0 - left)
+            rows.append(_row('td', name, *figures, unit, bar, pale=rejected or left > _NOT_SHOWN))
+        return _in_table(rows)
+
+    def _posture(self, q: Floats) -> dict[str, float]:
+        return self._held | dict(zip(self._joints, q.tolist(), strict=True))
+
+    def _at(self, placement: Floats) -> Floats:
+        """Origins (..., 3) of placements in the base, in the root of the URDF."""
+        at: Floats = placement[..., :3, 3] @ self._base[:3, :3].T + self._base[:3, 3]
+        return at
+
+    def close(self) -> None:
+        """End the server."""
+        self.server.stop()
+
+
+def url_of(host: str, port: int) -> str:
+    """Address to open in a browser."""
+    return f'http://{"localhost" if host in LOCAL else host}:{port}'
+
+
+def open_to_others(host: str) -> str:
+    """Warning about a page that is not served to this computer alone."""
+    return f'at {host} the page and its controls are open to other computers, without a password'
+
+
+def require_viser() -> None:
+    """Raise MissingExtraError unless viser is installed, with what it needs for URDFs."""
+    for module in ('viser', 'yourdfpy'):
+        if importlib.util.find_spec(module) is None:
+            raise MissingExtraError(module, 'view', 'the page')
+
+
+def free_port(host: str, port: int) -> int:
+    """First free port from the wanted one on; BlfDscError if the host is none of this computer."""
+    for candidate in range(port, min(port + _PORTS, 65536)):
+        family = socket.AF_INET6 if ':' in host else socket.AF_INET
+        with socket.socket(family) as claim:
+            claim.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                claim.bind((host, candidate))
+            except PermissionError as error:
+                reason = f'port {candidate} needs privileges: choose one above 1023'
+                raise BlfDscError(reason) from error
+            except OSError as error:
+                if isinstance(error, socket.gaierror) or error.errno == _NOT_HERE:
+                    reason = f'the page cannot be served at {host!r}: {error.strerror}; give an '
+                    raise BlfDscError(f'{reason}address of this computer') from error
+                continue
+            return candidate
+    raise BlfDscError(f'no free port from {port} to {port + _PORTS - 1}: choose another')
+
+
+_NOT_HERE = 99  # EADDRNOTAVAIL
+_NO_POINTS = {'show': False}
+
+
+def _hangs(arm: Arm) -> bool:
+    """Whether links along x turn in a vertical plane, below their base as well."""
+    return not any(joint.placement[2, 3] for joint in arm.chain.joints)
+
+
+def _figure(value: float) -> str:
+    return f'{value:.4g}' if np.isfinite(value) else '-'
+
+
+def _row(tag: str, *cells: str, pale: bool = False) -> str:
+    style = _CELL + (';opacity:0.55' if pale else '')
+    return '<tr>' + ''.join(f'<{tag} style="{style}">{cell}</{tag}>' for cell in cells) + '</tr>'
+
+
+def _bar(share: float) -> str:
+    percent = 100.0 * min(max(float(np.nan_to_num(share)), 0.0), 1.0)
+    colour = GREEN if share > 1.0 - _NOT_SHOWN else MUTED
+    fill = f'linear-gradient(to right,{colour} {percent:.0f}%,transparent 0)'
+    return f'<div style="width:60px;border:1px solid #bbb;background:{fill}">&nbsp;</div>'
+
+
+def _in_table(rows: Any) -> str:
+    return f'<table style="font-size:12px;margin:4px 8px">{"".join(rows)}</table>'

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page without a browser: what is drawn of a moment, and what a bag or a mistake does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import recorded_run
+import view_rig
+from random_arm import random_urdf
+
+pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
+
+from blf_dsc_controller.arms.chain_geometry import frames
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.robot import chain_of
+from blf_dsc_controller.errors import BlfDscError, MissingExtraError
+from blf_dsc_controller.view import page as page_module
+from blf_dsc_controller.view.arm import Arm, planar_urdf
+from blf_dsc_controller.view.bag import BagPlayer
+from blf_dsc_controller.view.moment import Confidence, Moment
+from blf_dsc_controller.view.page import Page, free_port
+
+HOST = '127.0.0.1'
+PORT = 18080
+
+
+@pytest.fixture(scope='module')
+def player(tmp_path_factory):
+    page = Page(HOST, PORT)
+    path = recorded_run.record(tmp_path_factory.mktemp('view') / 'bag', 2.0)
+    yield BagPlayer(page, path)
+    page.close()
+
+
+def test_a_bag_is_played_and_stops_at_its_end(player):
+    player.slider.value = 0.5
+    player.update(0.2)
+    assert player.slider.value == 0.5  # paused
+    view_rig.click(player.button)
+    player.update(0.5)
+    assert player.slider.value == 1.0
+    shown = player._page._table.content
+    now = max(one.time for one in player.moments if one.time <= 1.0)
+    assert f't = {now:.2f} s' in shown
+    player.speed.value = '10'
+    player.update(0.5)
+    player.update(0.5)
+    assert player.slider.value == player.moments[-1].time == pytest.approx(2.0, abs=1e-3)
+    view_rig.click(player.button)
+    assert player.slider.value == 0.0  # from the start again
+
+
+def test_the_moments_of_a_bag_are_its_values(player):
+    assert len(player.moments) == 60
+    last = player.moments[-1]
+    assert np.abs(last.error).max() < 0.002
+    assert last.bound == pytest.approx([0.002, 0.002])
+    assert last.truth[:3] == pytest.approx([1.0, 0.32, 0.4])
+    assert np.isnan(last.truth[3:]).all()  # nobody knows a true bias
+    assert last.estimate[:3] == pytest.approx(last.truth[:3], rel=0.3)  # half at the start
+    assert player.moments[0].estimate[:3] == pytest.approx([0.5, 0.16, 0.2], rel=0.1)
+
+
+def test_arm_ghost_bound_and_path_are_drawn(player):
+    player.slider.value = 1.5
+    player.update(0.0)
+    drawn = view_rig.nodes(player._page)
+    assert {'/bound', '/path', '/payload'} <= drawn
+    for root in ('/arm', '/reference'):
+        assert sum(name.startswith(root) for name in drawn) > 5
+    plot = player._page._plots[0].data
+    assert plot[0][-1] == pytest.approx(1.5, abs=0.04)  # s
+    assert np.abs(plot[1:3]).max() < 100.0  # % of the bound
+    assert (plot[3] == 100.0).all()
+
+
+def test_a_bag_without_configuration_is_rejected_in_one_line(tmp_path, capsys):
+    bare = recorded_run.write(
+        tmp_path / 'bare', recorded_run.messages(recorded_run.record(tmp_path / 'whole', 0.05))
+    )
+    assert main(['view', str(bare), '--port', str(PORT)]) == 1
+    assert 'does not hold the configuration of a controller' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_links_without_shapes_become_cylinders_where_the_links_are(seed):
+    text = random_urdf(4, seed)[0]
+    chain = chain_of(text, '', 'tip', ('j1', 'j2', 'j3', 'j4'))
+    model = Arm(text, chain).model()
+    assert len(model.scene.geometry) > 4
+    q = np.random.default_rng(seed).uniform(-1.0, 1.0, 4)
+    model.update_cfg(dict(zip(('j1', 'j2', 'j3', 'j4'), q, strict=True)))
+    corners = np.array([frame[:3, 3] for frame in frames(chain, q)])
+    for number, frame in enumerate(frames(chain, q)[1:-1], 1):
+        placed = model.get_transform(f'l{number}', 'base')
+        assert placed == pytest.approx(frame, abs=1e-9)
+    low, high = model.scene.bounds
+    thickness = 0.1 * Arm(text, chain).reach
+    assert (corners >= low - thickness).all()
+    assert (corners <= high + thickness).all()
+
+
+def test_a_chain_of_any_number_of_planar_links_is_drawn():
+    joints = ('a', 'b', 'c')
+    chain = chain_of(planar_urdf(joints, (1.0, 0.8, 0.5)), '', 'tip', joints)
+    for q, tip in (([0.0, 0.0, 0.0], [2.3, 0.0, 0.0]), ([np.pi / 2, 0.0, 0.0], [0.0, 0.0, 2.3])):
+        assert frames(chain, np.array(q))[-1][:3, 3] == pytest.approx(tip)
+
+
+def moments_of(motion):
+    times = np.arange(0.0, 7.0, 1 / 30)
+    nothing, unknown = np.zeros(2), np.full(5, np.nan)
+    return [
+        Moment(t, motion(t), nothing, nothing, nothing, nothing, unknown, unknown, 0.0)
+        for t in times
+    ]
+
+
+def test_only_what_moves_is_identified():
+    confidence = Confidence(ControllerConfig())
+    moving = confidence.deviations(moments_of(lambda t: 2.0 + 0.3 * np.cos([t, t])))
+    still = confidence.deviations(moments_of(lambda _: np.array([2.0, 1.4])))
+    parameters = slice(0, 3)
+    assert (moving[parameters] < 0.2 * confidence.prior[parameters]).all()
+    assert still.max() > 0.9 * confidence.prior.max()
+    assert (moving[parameters] < still[parameters]).all()
+
+
+def test_a_port_that_is_taken_is_left_to_its_owner(player):
+    own = player._page.server.get_port()
+    assert free_port(HOST, own) > own
+    with pytest.raises(BlfDscError, match=r"cannot be served at '192\.0\.2\.1'.*of this computer"):
+        free_port('192.0.2.1', PORT)
+    with pytest.raises(BlfDscError, match=r'cannot be served at .*nowhere'):
+        free_port('nowhere.invalid', PORT)
+
+
+def test_without_viser_the_remedy_is_named(monkeypatch):
+    monkeypatch.setattr(page_module.importlib.util, 'find_spec', lambda _: None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'blf_dsc_controller\[view\]'"):
+        Page(HOST, PORT)
+
+
+def test_a_view_of_an_offline_run_is_rejected_before_it_begins(tmp_path):
+    out = tmp_path / 'run'
+    assert main(['run', '--offline', '--view', '--out', str(out)]) == 1
+    assert not out.exists()

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of a running loop: its buttons and sliders reach the real nodes, in lock-step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import view_rig
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
+
+from ros_rig import RosRig, activate, configure
+
+from blf_dsc_controller.view.node import ViewNode
+
+EVENT = {'events.begin': [1.0], 'events.duration': [0.5], 'events.payload': [0.25]}
+
+
+@pytest.fixture(scope='module')
+def rig():
+    rig = RosRig()
+    yield rig
+    rig.close()
+
+
+@pytest.fixture(scope='module')
+def loop(rig):
+    """Plant, controller and the page that shows them."""
+    view = rig.add(ViewNode, port=18180)
+    rig.until(lambda: view.page._state == ('STALE', 'waiting for /blf_dsc_controller/journal'))
+    arm, law = rig.loop({**EVENT, 'autostart': False})
+    rig.until(lambda: view.controls is not None and 'Push' in view.controls.buttons)
+    assert configure(rig, arm)
+    assert activate(rig, arm)
+    rig.until(lambda: len(view.past) > 3)
+    return arm, law, view
+
+
+@pytest.fixture(scope='module')
+def events(loop):
+    return loop[2].page._events
+
+
+def told(view, word):
+    return [one for one in view.page._events if word in f'{one}']
+
+
+def test_the_page_shows_the_loop(rig, loop):
+    _arm, _law, view = loop
+    rig.until(lambda: view.past[-1].time > 2.0)
+    now = view.past[-1]
+    assert np.abs(now.error).max() < 0.002
+    assert now.bound == pytest.approx([0.002, 0.002])
+    assert now.torque_limit == pytest.approx([20.0, 20.0])
+    assert now.truth[:3] == pytest.approx([1.0, 0.32, 0.4])
+    assert np.isfinite(now.estimate[:3]).all()
+    assert view.page._state == ('OK', 'tracking')
+    assert [t for t, *_ in told(view, 'payload of 0.25 kg begins')] == pytest.approx([1.0], abs=0.5)
+    assert told(view, 'payload of 0.25 kg ends')
+
+
+def test_a_push_reaches_the_plant_and_ends(rig, loop):
+    arm, _, view = loop
+    view_rig.click(view.controls.buttons['Push'])
+    rig.until(lambda: arm.config.load.torque == (2.0, 0.0))
+    rig.until(lambda: arm.config.load.torque == (0.0, 0.0))
+    rig.until(lambda: len(told(view, 'load.torque')) == 2)
+
+
+def test_a_payload_reaches_the_plant(rig, loop):
+    arm, _, view = loop
+    view_rig.click(view.controls.buttons['Pick up'])
+    rig.until(lambda: arm.config.load.payload == 0.5)
+    rig.until(lambda: view.past[-1].loaded)
+    view_rig.click(view.controls.buttons['Put down'])
+    rig.until(lambda: arm.config.load.payload == 0.0)
+
+
+def test_a_gain_reaches_the_controller_or_its_slider_returns(rig, loop):
+    _, law, view = loop
+    first, second = view.controls.sliders['feedback.gain']
+    assert (first.value, second.value) == (60.0, 20.0)
+    view_rig.drag(second, 25.0)
+    rig.until(lambda: law.config.feedback.gain == (60.0, 25.0))
+    rejected = view.controls.sliders['torque.limit'][0]
+    view_rig.drag(rejected, rejected.min)  # less than the arm weighs
+    rig.until(lambda: rejected.value == 20.0)
+    assert law.config.torque.limit == (20.0, 20.0)
+
+
+def test_gains_changed_elsewhere_move_the_sliders(rig, loop):
+    _, law, view = loop
+    law.set_parameters_atomically([_parameter('surface.gain', [140.0, 150.0])])
+    rig.until(lambda: view.controls.sliders['surface.gain'][0].value == 140.0)
+
+
+def _parameter(name, value):
+    from rclpy.parameter import Parameter
+
+    return Parameter(name, value=value)
+
+
+def test_a_reference_is_followed(rig, loop):
+    _, _, view = loop
+    view_rig.click(view.controls.buttons['Go there'])
+    rig.until(lambda: told(view, 'trajectory'))
+    there = [1.9935, 1.3961]  # the middle of the configured reference
+    rig.until(lambda: np.abs(view.past[-1].position - there).max() < 0.002)
+
+
+def test_reset_takes_the_arm_to_its_start(rig, loop):
+    _arm, _law, view = loop
+    view_rig.click(view.controls.buttons['Reset'])
+    rig.until(lambda: told(view, 'reset'))
+    rig.until(lambda: 0.1 < view.past[-1].time < 1.0)  # counted from the new start
+
+
+def test_a_controller_that_died_is_missed(rig, loop):
+    _, law, view = loop
+    rig.kill(law)
+    rig.until(lambda: view.page._state[0] == 'ERROR' and 'gone' in view.page._state[1])
