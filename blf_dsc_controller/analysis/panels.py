@@ -46,6 +46,7 @@ _LEARNING = GROUPS[3:7]
 _LEAST = 1e-12  # J, the smallest value on a logarithmic axis
 _ROOM = 1.2  # of the largest value shown, to either side
 _LEAST_ERROR = 1e-5  # %
+_MOST = 1e100
 
 
 class Line(NamedTuple):
@@ -104,13 +105,21 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
                 marks = (*marks, *(Mark(*one, INK) for one in zip(changes, texts, strict=False)))
             found[panel.group, panel.title] = replace(
                 before,
-                lines=(*before.lines, *(line._replace(run=k) for line in panel.lines)),
+                lines=(
+                    *before.lines,
+                    *(line._replace(run=k, values=_drawn(line.values)) for line in panel.lines),
+                ),
                 marks=(*before.marks, *(mark._replace(run=k) for mark in marks)),
                 note=panel.note if len(runs) == 1 else '',
                 span=panel.span if len(runs) == 1 else 0.0,
             )
     drawn = [panel for panel in found.values() if panel.lines]
     return sorted(drawn, key=lambda panel: GROUPS.index(panel.group))
+
+
+def _drawn(values: Floats) -> Floats:
+    """Values with gaps for what no axis can show, such as infinity."""
+    return np.where(np.abs(values) < _MOST, values, np.nan)
 
 
 def _motion(run: Run) -> Iterator[Panel]:
@@ -142,7 +151,7 @@ def _error(run: Run, i: int, error: Floats) -> Panel:
         first = run.time[violated[:, i]][:1].tolist()
         marks = [Mark(time, f'outside from {time:.3f} s', ALARM) for time in first]
         if bound[0] > bound[-1]:  # a funnel: its mouth would leave nothing to see of the error
-            span = _ROOM * np.nanmax(np.abs(error), initial=bound[-1])
+            span = _ROOM * np.nanmax(np.abs(_drawn(error)), initial=bound[-1])
     if not np.isnan(error).all():
         note = f'max {np.nanmax(np.abs(error)):.3g}, rms {rms(error):.3g}'
     title = f'error of {run.joints[i]}'

@@ -79,12 +79,12 @@ def write_summary(summary: Summary, path: Path) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Data for JSON: lists and dictionaries, None instead of NaN."""
+    """Data for JSON: lists and dictionaries, None instead of NaN and infinity."""
     if isinstance(value, dict):
         return {str(key): plain(each) for key, each in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain(each) for each in value]
-    return None if isinstance(value, float) and math.isnan(value) else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _learning(run: Run, estimates: Estimates, metrics: Metrics) -> Summary:

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import signal
 import sys
 import textwrap
+import warnings
 from collections.abc import Sequence
 from functools import partial
 from math import inf
@@ -29,19 +31,49 @@ _WIDTH = 88
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a sub-command and return its exit code; an error is one message on stderr and 1."""
     options = _parser().parse_args(arguments)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, partial(_interrupt, options.command))
     module, function = options.handler
+    # Infinity in a bag, and names in letters that the pictures' font does not have.
+    warnings.filterwarnings('ignore', category=RuntimeWarning)
+    warnings.filterwarnings('ignore', 'Glyph .* missing')
     try:
         handler = getattr(importlib.import_module(f'blf_dsc_controller.cli.{module}'), function)
         code: int | None = handler(options)
     except (BlfDscError, OSError) as error:
-        print(f'blf_dsc {options.command}: {error}', file=sys.stderr)
+        print(f'blf_dsc {options.command}: {_sentence(error, options)}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         remedy = '; the same command resumes the study' if function == 'monte_carlo' else ''
         print(f'blf_dsc {options.command}: interrupted{remedy}', file=sys.stderr)
         return INTERRUPTED
     return code or 0
+
+
+def _interrupt(command: str, _number: int, _frame: object) -> None:
+    """Raise KeyboardInterrupt; while kernels are compiled, which swallows it, end at once."""
+    numba = sys.modules.get('numba.core.compiler_lock')
+    if numba is not None and numba.global_compiler_lock.is_locked():
+        os.write(2, f'blf_dsc {command}: interrupted\n'.encode())
+        os._exit(INTERRUPTED)
+    raise KeyboardInterrupt
+
+
+def _sentence(error: BlfDscError | OSError, options: argparse.Namespace) -> str:
+    """What went wrong; of a file or folder below --out, that it cannot be written."""
+    out = getattr(options, 'out', None)
+    if isinstance(error, BlfDscError) or not (out and error.errno):
+        return str(error)
+    named, out = Path(error.filename or out).resolve(), Path(out).resolve()
+    if named not in (out, *out.parents) and not named.is_relative_to(out.parent):
+        return str(error)
+    return str(unwritable(options.out, error))
+
+
+def unwritable(path: Path, error: OSError) -> BlfDscError:
+    """What to say where a file or folder of --out cannot be written."""
+    reason = os.strerror(error.errno) if error.errno else error
+    return BlfDscError(f'{path} cannot be written ({reason}): make room or choose another --out')
 
 
 def require_ros() -> None:

@@ -17,7 +17,7 @@ from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.summary import format_table, summarize, write_summary
 from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.cli.main import INTERRUPTED, require_ros
+from blf_dsc_controller.cli.main import INTERRUPTED, require_ros, unwritable
 from blf_dsc_controller.cli.progress import LoopProgress
 from blf_dsc_controller.compiled import COMPILATION_NOTICE
 from blf_dsc_controller.compiled.jit import is_compiled
@@ -62,7 +62,7 @@ def run(options: Namespace) -> int:
                 raise
             print(f'blf_dsc run: interrupted, and nothing to draw: {error}', file=sys.stderr)
     except OSError as error:
-        raise _not_writable(out, error) from error
+        raise unwritable(Path(error.filename or out), error) from error
     return 0 if completed else INTERRUPTED
 
 
@@ -81,17 +81,10 @@ def make_folder(chosen: Path | None) -> Path:
                     f'{path} exists already and is not overwritten: choose another --out'
                 ) from None
         except OSError as error:
-            raise _not_writable(path, error) from error
+            raise unwritable(Path(error.filename or path), error) from error
         else:
             return path
     raise AssertionError
-
-
-def _not_writable(path: Path, error: OSError) -> BlfDscError:
-    return BlfDscError(
-        f'{error.filename or path} cannot be written ({error.strerror}): make room or choose '
-        'another --out'
-    )
 
 
 def _configuration(options: Namespace) -> LoopConfig:
