@@ -2,6 +2,7 @@
 """The package for pip, colcon and ament: two Python packages, their commands and shared files."""
 
 import re
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 from setuptools import find_packages, setup
@@ -26,20 +27,45 @@ def files(folder: str) -> list[str]:
     return sorted(str(path) for path in Path(folder).glob('*.*') if path.is_file())
 
 
+# Who maintains it, and its addresses, are written in package.xml alone.
+MANIFEST = ET.parse('package.xml').getroot()  # noqa: S314 - our own file
+(MAINTAINER,) = MANIFEST.findall('maintainer')
+
 setup(
     name=NAME,
     version=version(),
     description='Output-constrained tracking of robot arms with unknown dynamics, for ROS 2',
-    author='The blf_dsc_controller contributors',
-    maintainer='The blf_dsc_controller contributors',
-    maintainer_email='maintainers@example.org',
+    long_description=Path('README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
+    keywords=[
+        'ROS 2',
+        'robot arm',
+        'adaptive control',
+        'barrier Lyapunov function',
+        'composite learning',
+        'parameter identification',
+    ],
+    author=MAINTAINER.text,
+    maintainer=MAINTAINER.text,
+    maintainer_email=MAINTAINER.get('email'),
+    project_urls={url.get('type', 'website'): url.text for url in MANIFEST.findall('url')},
     license='Apache-2.0',
+    classifiers=[
+        'Development Status :: 4 - Beta',
+        'Intended Audience :: Science/Research',
+        'Intended Audience :: Developers',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3',
+        *(f'Programming Language :: Python :: 3.{minor}' for minor in range(10, 14)),
+        'Topic :: Scientific/Engineering',
+        'Typing :: Typed',
+    ],
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*', 'sim_plant', 'sim_plant.*']),
     package_data={NAME: ['py.typed', 'templates/*'], 'sim_plant': ['py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
-        (SHARE, ['package.xml']),
+        (SHARE, ['package.xml', 'LICENSE', 'CHANGELOG.rst']),
         (f'{SHARE}/config', files('config')),
         (f'{SHARE}/launch', files('launch')),
     ],

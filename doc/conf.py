@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The site of the documentation: `make docs`, plain `sphinx-build doc out/docs`, or rosdoc2."""
 
+import re
 import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -11,7 +12,13 @@ from sphinx.application import Sphinx
 from sphinx.util.logging import getLogger
 from sphinx.writers.html5 import HTML5Translator
 
-ROOT = Path(__file__).resolve().parents[1]
+# rosdoc2 runs a conf.py of its own, in a copy of doc/, which executes this one by its path.
+HERE = Path(__file__).resolve()
+executed = re.search(r'exec\(open\("(.+)"\)', HERE.read_text(encoding='utf-8'))
+ROOT = (Path(executed[1]) if executed else HERE).parents[1]
+for shown in ('CHANGELOG.rst', 'benchmark', 'config', 'examples'):  # by the pages
+    if not (HERE.parents[1] / shown).exists():
+        (HERE.parents[1] / shown).symlink_to(ROOT / shown)
 sys.path.insert(0, str(ROOT))  # the docstrings of this checkout
 
 from blf_dsc_controller import __version__  # noqa: E402
@@ -22,10 +29,12 @@ copyright = author  # noqa: A001 - Sphinx's name
 release = version = __version__
 
 extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.napoleon']
+exclude_patterns = ['user_docs*', 'standard*', '__*', 'modules.rst', f'{project}*']  # rosdoc2's
 myst_enable_extensions = ['dollarmath']
 myst_fence_as_directive = ['math']  # as GitHub writes equations
 myst_heading_anchors = 3
 
+highlight_language = 'none'  # of indented blocks
 default_role = 'code'  # docstrings write `name`
 autodoc_typehints_format = 'short'
 python_use_unqualified_type_names = True

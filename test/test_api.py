@@ -3,32 +3,19 @@
 
 from __future__ import annotations
 
-import ast
 import copy
-import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.errors import ConfigurationError, MissingExtraError, OutsideBarrierError
 
-README = Path(__file__).resolve().parents[1] / 'README.md'
-
 
 def run_python(*arguments, folder):
     command = [sys.executable, *arguments]
     return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
-
-
-def test_example_of_the_readme_runs(tmp_path):
-    (example,) = re.findall(r'```python\n(.*?)```', README.read_text(), re.DOTALL)
-    assert len(example.splitlines()) <= 10
-    largest = ast.literal_eval(run_python('-c', example, folder=tmp_path))
-    assert all(0.0 < error < 0.002 for error in largest)
-    assert (tmp_path / 'pictures' / 'tracking.png').stat().st_size > 0
 
 
 def test_every_public_name_is_documented():

@@ -19,6 +19,7 @@ import blf_dsc_controller
 ROOT = Path(__file__).resolve().parents[1]
 NAME = 'blf_dsc_controller'
 PACKAGES = (NAME, 'sim_plant')
+URL = 'https://example.org/blf_dsc_controller'
 EXECUTABLES = {
     'blf_dsc',
     'sim_plant',
@@ -71,6 +72,9 @@ def wheel(tmp_path_factory):
     copy = tmp_path_factory.mktemp('source') / NAME
     unwanted = ('.*', 'build', 'install', 'log', 'out', '*.egg-info', '__pycache__')
     shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*unwanted))
+    told = (copy / 'package.xml').read_text()
+    url = f'<url type="website">{URL}</url>'  # as whoever publishes it writes it
+    (copy / 'package.xml').write_text(told.replace('<exec_depend>', f'{url}<exec_depend>', 1))
     build = [sys.executable, '-m', 'pip', 'wheel', '--quiet', '--no-deps', '--no-index']
     out = tmp_path_factory.mktemp('wheel')
     subprocess.run(
@@ -116,6 +120,21 @@ def test_one_version_everywhere(metadata):
     assert version in (ROOT / 'CHANGELOG.rst').read_text()
 
 
+def test_metadata_is_that_of_the_manifest_and_readme(wheel, metadata):
+    told = dict(metadata)
+    (name,) = (name for name in wheel.namelist() if name.endswith('.dist-info/METADATA'))
+    assert wheel.read(name).decode().endswith((ROOT / 'README.md').read_text())
+    assert told['Description-Content-Type'] == 'text/markdown'
+    assert told['Project-URL'] == f'website, {URL}'
+    assert told['Author'] == told['Maintainer'] == manifest().findtext('maintainer')
+    assert told['Maintainer-email'] == manifest().find('maintainer').get('email')
+    stated = told.get('License-Expression') or told['License']  # by the age of setuptools
+    assert stated == manifest().findtext('license') == 'Apache-2.0'
+    assert told['Keywords']
+    versions = {value.rpartition('3.')[2] for field, value in metadata if 'Python :: 3.' in value}
+    assert versions == {'10', '11', '12', '13'}
+
+
 def test_manifest_is_of_an_ament_python_package():
     root = manifest()
     assert root.get('format') == '3'
@@ -147,6 +166,8 @@ def test_wheel_shares_what_ros_looks_for(wheel):
     assert {
         f'ament_index/resource_index/packages/{NAME}',
         f'{NAME}/package.xml',
+        f'{NAME}/LICENSE',
+        f'{NAME}/CHANGELOG.rst',
         f'{NAME}/launch/closed_loop.launch.py',
         f'{NAME}/config/recommended.yaml',
     } <= shared

@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What README and doc/ say can be done: their code runs, their files load, their commands exist."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import contextlib
+import importlib.util
+import io
+import re
+import shlex
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from markdown_it import MarkdownIt
+
+from blf_dsc_controller.cli import main as command_line
+from blf_dsc_controller.configuration.nodes import NODES, known_names
+from blf_dsc_controller.configuration.params_file import load, read
+from blf_dsc_controller.monte_carlo.study import load_study
+
+ROOT = Path(__file__).resolve().parents[1]
+OUTSIDE = ('README.md', 'CONTRIBUTING.md', 'examples/mujoco_plant/README.md')
+PAGES = [*(ROOT / name for name in OUTSIDE), *sorted((ROOT / 'doc').glob('*.md'))]
+MAKEFILE = (ROOT / 'Makefile').read_text()
+LAUNCH = (ROOT / 'launch/closed_loop.launch.py').read_text()
+SETUP = (ROOT / 'setup.py').read_text()
+# What the pages may call beside the commands of this package, and is not checked here.
+FOREIGN = {
+    'cd',
+    'colcon',
+    'coverage',
+    'docker',
+    'export',
+    'git',
+    'pytest',
+    'rosdoc2',
+    'source',
+    'xacro',
+}
+
+
+def tokens(page):
+    return MarkdownIt('commonmark').parse(page.read_text())
+
+
+def fences(page, language):
+    return [one.content for one in tokens(page) if one.type == 'fence' and one.info == language]
+
+
+def named(pages):
+    return pytest.mark.parametrize(
+        'page', pages, ids=lambda page: page.relative_to(ROOT).as_posix()
+    )
+
+
+@named([page for page in PAGES[1:] if fences(page, 'python')])
+def test_python_of_a_page_runs_and_prints_what_stands_below_it(page, tmp_path, monkeypatch):
+    """Blocks of a page follow each other in one program, beside the files that the page writes."""
+    monkeypatch.chdir(tmp_path)
+    for text in fences(page, 'yaml'):
+        Path('my.yaml').write_text(text)
+    program = {'__name__': page.stem}
+    blocks = [one for one in tokens(page) if one.type == 'fence']
+    for block, below in pairwise([*blocks, None]):
+        if block.info == 'python':
+            printed = io.StringIO()
+            with contextlib.redirect_stdout(printed):
+                exec(compile(block.content, page, 'exec'), program)  # noqa: S102 - our own pages
+            if below and below.info == 'text':
+                assert printed.getvalue() == below.content
+
+
+def test_example_of_the_readme_keeps_its_bound(tmp_path):
+    (example,) = fences(ROOT / 'README.md', 'python')
+    assert len(example.splitlines()) <= 10
+    run = [sys.executable, '-c', example]
+    printed = subprocess.run(run, cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+    assert all(0.0 < error < 0.002 for error in ast.literal_eval(printed))
+    assert (tmp_path / 'pictures' / 'tracking.png').stat().st_size > 0
+
+
+@named([page for page in PAGES if fences(page, 'yaml')])
+def test_files_of_a_page_load(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    urdf = (ROOT / 'config/ur5e.urdf').as_posix()
+    for text in fences(page, 'yaml'):
+        file = Path('my.yaml')
+        file.write_text(text.replace('/path/to/my.urdf', urdf))
+        sections = [section.pattern.rpartition('/')[2] for section in read(file)]
+        assert set(sections) <= {'**', 'monte_carlo', *NODES}
+        if 'monte_carlo' in sections:
+            load_study(file)
+        else:
+            for node in NODES if '**' in sections else sections:
+                load(file, node, NODES[node])
+
+
+def lines(page):
+    """Commands of a page: each line of its blocks `sh` and of its indented blocks."""
+    for one in tokens(page):
+        if one.type == 'code_block' or (one.type == 'fence' and one.info == 'sh'):
+            yield from one.content.replace('\\\n', ' ').splitlines()
+
+
+def commands(line):
+    """Words of each command of a line, without what the shell makes of them."""
+    words = []
+    line = re.sub(r'>\s*\S+', '', line)
+    for word in [*shlex.split(line, comments=True), '&&']:
+        if word in ('&&', '&', '|'):
+            yield words
+            words = []
+        elif words or '=' not in word:  # not a variable of the environment
+            words.append(word)
+
+
+@named([page for page in PAGES if any(lines(page))])
+def test_commands_of_a_page_exist_with_their_options(page):
+    for line in lines(page):
+        for words in commands(line):
+            if words:
+                check(words)
+
+
+def check(words):
+    program, *rest = words
+    program = program.rpartition('/')[2]
+    if program == 'make':
+        targets = [word for word in rest if '=' not in word]
+        assert all(re.search(rf'^{target}:', MAKEFILE, re.MULTILINE) for target in targets), words
+        assert all(f'$({word.split("=")[0]})' in MAKEFILE for word in rest if '=' in word), words
+    elif program in ('python', 'mpiexec'):
+        check_python(rest)
+    elif program in ('ros2', 'pip', 'pre-commit'):
+        globals()[f'check_{program.replace("-", "_")}'](rest)
+    elif program not in FOREIGN:
+        check_own(program, rest)
+
+
+def check_own(program, rest):
+    """An executable of the package: its options are parsed, its parameters are known."""
+    function = command_line.main if program == 'blf_dsc' else getattr(command_line, program)
+    if function is command_line.main or function.func is command_line._alias:
+        parse([*getattr(function, 'args', ()), *(word for word in rest if word[0] != '[')])
+    else:
+        check_parameters(rest)
+
+
+def parse(words):
+    try:
+        command_line._parser().parse_args(words)
+    except SystemExit as end:
+        if end.code:
+            pytest.fail(f'{shlex.join(words)}: {end}')  # argparse has printed why
+
+
+def check_parameters(rest):
+    for before, word in pairwise(['', *rest]):
+        if before == '-p':
+            assert word.split(':=')[0] in known_names(), word
+
+
+def check_python(rest):
+    if '-m' in rest:
+        module, *arguments = rest[rest.index('-m') + 1 :]
+        if module == 'mpi4py.futures':
+            module, *arguments = arguments[1:]
+        assert importlib.util.find_spec(module), rest
+        if module == 'blf_dsc_controller':
+            parse(arguments)
+    else:
+        assert (ROOT / rest[0]).is_file(), rest
+        check_parameters(rest)
+
+
+def check_ros2(rest):
+    match rest:
+        case ['run', 'blf_dsc_controller', program, *arguments]:
+            check_own(program, arguments)
+        case ['launch', 'blf_dsc_controller', file, *arguments]:
+            assert (ROOT / 'launch' / file).is_file()
+            for argument in arguments:
+                assert f"'{argument.split(':=')[0]}'" in LAUNCH, argument
+        case ['param', 'set', _, name, _]:
+            assert name in known_names(), name
+        case _:
+            assert rest[0] in ('topic', 'service', 'security', 'lifecycle'), rest
+
+
+def check_pip(rest):
+    for extra in re.findall(r'blf_dsc_controller\[(.+?)\]', ' '.join(rest)):
+        assert all(f"'{one}': " in SETUP for one in extra.split(',')), extra
+
+
+def check_pre_commit(rest):
+    assert rest == ['install']
+
+
+@named(PAGES)
+def test_commands_in_the_text_of_a_page_exist(page):
+    """Sub-commands and their options, and what can be made, in `code` within a sentence."""
+    for code in re.findall(r'(?<!`)`((?:blf_dsc|make) [^`]+)`', page.read_text()):
+        program, first, *rest = shlex.split(code)
+        if program == 'make':
+            check([program, first])
+        elif first.islower() and first[0] != '-':
+            options = subcommand(first)._option_string_actions
+            assert {word for word in rest if word.startswith('--')} <= set(options), code
+
+
+def subcommand(name):
+    for action in command_line._parser()._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            return action.choices[name]
+    raise AssertionError
