@@ -49,6 +49,9 @@ class Stop(NamedTuple):
     stamp: int  # ns, of the last joint state before it
     reason: str
     text: str  # with the figures
+    until: int | None = (
+        None  # ns, of the last joint state before the next start; the end of the run
+    )
 
 
 Regressor = Callable[[Floats, Floats, Floats, Floats, Floats], None]
@@ -89,6 +92,9 @@ class Run:
     stops: tuple[Stop, ...] = ()
     arm: LearnedArm | None = None  # of a URDF
     learns: bool = True  # from the prediction error; false for a law that does not use it
+    effort: Floats | None = None  # (N, n) N m, as measured
+    reference_velocity: Floats | None = None  # (N, n) rad/s
+    xi2: Floats | None = None  # (N, n) rad/s
 
     @property
     def time(self) -> Floats:

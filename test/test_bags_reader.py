@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import csv
+import json
 
 import numpy as np
 import pytest
+import recorded_run
 import synthetic_bag
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from synthetic_bag import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthetic
@@ -15,7 +17,7 @@ from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import UnreadableMessageError
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.codecs import JointStateDecoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
     DIAGNOSTICS,
@@ -221,6 +223,61 @@ def test_every_number_of_the_table_reads_back_equal_in_its_row(tmp_path, made, l
         found['truth disturbance elbow'], np.repeat(made.disturbance[::10, 1], 10)
     )
     assert set(found['bound shoulder']) == {0.002}
+
+
+def units(path):
+    if path.suffix == '.parquet':
+        parquet = pytest.importorskip('pyarrow.parquet', reason='needs pyarrow')
+        schema = parquet.read_schema(path)
+        return {one.name: (one.metadata or {}).get(b'unit', b'').decode() for one in schema}
+    (resource,) = json.loads(path.with_suffix('.datapackage.json').read_text())['resources']
+    assert resource['path'] == path.name
+    return {one['name']: one.get('unit', '') for one in resource['schema']['fields']}
+
+
+@pytest.mark.parametrize('ending', ['csv', 'parquet'])
+def test_every_column_of_the_table_has_its_unit(tmp_path, ending):
+    path = recorded_run.record(tmp_path / 'bag', 0.1)
+    out = tmp_path / f'table.{ending}'
+    assert main(['export', str(path), '--out', str(out)]) == 0
+    found, unit = read_table(out), units(out)
+    assert [*unit] == [*found]
+    assert [name for name in unit if not unit[name]] == []
+    expected = {
+        'stamp': 'ns',
+        'received': 'ns',
+        'time': 's',
+        'effort joint1': 'N m',
+        'reference_velocity joint2': 'rad/s',
+        'xi2 joint1': 'rad/s',
+        'learning m2*l2^2': 'kg m^2',
+        'learning disturbance joint1': 'N m',
+        'learning compute_time': 's',
+        'monitor distance_to_bound joint1': 'rad',
+    }
+    assert {name: unit[name] for name in expected} == expected
+    run = read_run(path)
+    states, errors, references = (
+        np.array(
+            [
+                row
+                for *_, raw in recorded_run.of(recorded_run.messages(path), topic)
+                for row in [decoded(raw)]
+            ]
+        )
+        for topic in (JOINT_STATES, TRACKING_ERROR, REFERENCE)
+    )
+    np.testing.assert_array_equal(found['effort joint2'], states[:, 2, 1])
+    np.testing.assert_array_equal(found['xi2 joint1'], errors[:, 1, 0])
+    np.testing.assert_array_equal(found['reference_velocity joint1'], references[:, 1, 0])
+    np.testing.assert_array_equal(found['received'], run.received)
+
+
+def decoded(raw):
+    """Position, velocity and effort (3, 2) of a joint state."""
+    decoder = JointStateDecoder(('joint1', 'joint2'), ())
+    decoder.decode(raw)
+    return decoder.values.reshape(3, 2)
 
 
 def test_a_table_of_another_ending_is_rejected(tmp_path, lost, capsys):

@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag as one run: decoded, joints matched by name, samples matched by their stamps.
-
-A run as one table, a row for each joint state: for spreadsheets, pandas, MATLAB.
-"""
+"""A bag as one run: decoded, joints matched by name, samples matched by their stamps."""
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -18,7 +14,7 @@ from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_con
 from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.bags.torque import TorqueError, applied_torque, next_effort
-from blf_dsc_controller.errors import BlfDscError, MissingExtraError
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import Event, EventType, decode
 from blf_dsc_controller.messages.types import typestore
@@ -67,6 +63,9 @@ def read_run(path: str | Path, namespace: str = '', names: NameMap = NO_NAMES) -
         stops=tuple(_stops(events, int(states.stamp[0]))),
         arm=_arm(Path(path)),
         learns=_learns(events),
+        effort=states.values[:, 2],
+        reference_velocity=None if references is None else references.velocity.exact(states.stamp),
+        xi2=None if errors is None else errors.velocity.exact(states.stamp),
     )
 
 
@@ -142,9 +141,12 @@ def _arm(path: Path) -> LearnedArm | None:
 
 def _stops(events: Iterable[Event], first: int) -> Iterator[Stop]:
     """Stops in the journal; one before the first state gets its stamp [ns]."""
-    for event in events:
+    ordered = list(events)
+    for k, event in enumerate(ordered):
         if event.type is EventType.STOP:
-            yield Stop(max(event.stamp, first), event.content['reason'], event.content['text'])
+            starts = [one.stamp for one in ordered[k:] if one.type is EventType.START]
+            what = event.content['reason'], event.content['text']
+            yield Stop(max(event.stamp, first), *what, until=starts[0] if starts else None)
 
 
 def _learns(events: Iterable[Event]) -> bool:
@@ -153,53 +155,3 @@ def _learns(events: Iterable[Event]) -> bool:
     laws = {one['law'] for one in known if 'law' in one}
     weights = [one['learning.weight'] for one in known if 'learning.weight' in one]
     return laws <= {'blf_dsc'} and any(weights or [1.0])
-
-
-def table(run: Run) -> dict[str, Any]:
-    """Every series of a run aligned on the stamps of its joint states, by name: columns (N,).
-
-    `stamp` [ns] is of integers, all else of floats, NaN where unknown.
-    Values published with each sample are in the row of its stamp; those published less often
-    (truth, timing, monitor) are held until the next message.
-    """
-    columns: dict[str, Any] = {'stamp': run.stamp, 'time': run.time}
-    fields = ('position', 'velocity', 'torque', 'reference', 'error', 'bound', 'torque_limit')
-    for field in fields:
-        values = getattr(run, field)
-        for i, joint in enumerate(run.joints if values is not None else ()):
-            columns[f'{field} {joint}'] = values[:, i]
-    for topic in ('learning', 'truth', 'timing', 'monitor'):
-        series = getattr(run, topic)
-        if series is not None:
-            values = (series.exact if topic == 'learning' else series.held)(run.stamp)
-            columns |= {f'{topic} {name}': values[:, j] for j, name in enumerate(series.names)}
-    return columns
-
-
-def export(run: Run, path: Path) -> int:
-    """Write the table as CSV or Parquet, by the ending of `path`; return the number of columns.
-
-    Numbers read back equal.
-
-    Raises:
-        BlfDscError: the ending is neither .csv nor .parquet.
-        MissingExtraError: pyarrow is not installed.
-    """
-    columns = table(run)
-    if path.suffix == '.csv':
-        with path.open('w', encoding='utf-8', newline='') as stream:
-            writer = csv.writer(stream)
-            writer.writerow(columns)
-            writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
-    elif path.suffix == '.parquet':
-        try:
-            import pyarrow as pa
-            from pyarrow import parquet
-        except ImportError:
-            raise MissingExtraError('pyarrow', 'parquet', 'writing Parquet') from None
-        parquet.write_table(pa.table(columns), path)
-    else:
-        raise BlfDscError(
-            f'{path} ends in neither .csv nor .parquet: the ending of the name sets the format'
-        )
-    return len(columns)

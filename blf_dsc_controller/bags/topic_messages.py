@@ -63,6 +63,11 @@ class JointStates(NamedTuple):
         return Series(self.names, self.stamp, self.values[:, 0])
 
     @property
+    def velocity(self) -> Series:
+        """Velocities."""
+        return Series(self.names, self.stamp, self.values[:, 1])
+
+    @property
     def effort(self) -> Series:
         """Efforts."""
         return Series(self.names, self.stamp, self.values[:, 2])

@@ -11,9 +11,10 @@ from blf_dsc_controller.analysis.report import write_report
 from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.bags import recover as recovering
 from blf_dsc_controller.bags.content import NameMap
-from blf_dsc_controller.bags.reader import export as export_run
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.salvage import format_time
+from blf_dsc_controller.bags.table import described
+from blf_dsc_controller.bags.table import export as export_run
 
 
 def report(options: Namespace) -> None:
@@ -28,6 +29,8 @@ def export(options: Namespace) -> None:
     run = read_run(options.bag, options.namespace, NameMap.parse(options.map))
     columns = export_run(run, options.out)
     print(f'wrote {options.out}: {run.stamp.size} rows of {columns} columns')
+    if options.out.suffix == '.csv':
+        print(f'wrote {described(options.out)}: their units')
 
 
 def plot(options: Namespace) -> None:

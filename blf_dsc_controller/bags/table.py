@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run as one table, a row for each joint state: for spreadsheets, pandas, MATLAB."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.errors import BlfDscError, MissingExtraError
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.run import Run
+
+_FIELDS = {  # of a run, a column for each joint: unit
+    'position': 'rad',
+    'velocity': 'rad/s',
+    'effort': 'N m',
+    'torque': 'N m',
+    'reference': 'rad',
+    'reference_velocity': 'rad/s',
+    'error': 'rad',
+    'xi2': 'rad/s',
+    'bound': 'rad',
+    'torque_limit': 'N m',
+}
+_VALUES = {  # beginning of a name in the vectors: unit
+    topics.DISTURBANCE: 'N m',
+    'viscous ': 'N m s/rad',
+    **dict.fromkeys(('bias ', 'coulomb ', 'sin ', 'cos '), 'N m'),
+    topics.POSITION: 'rad',
+    topics.VELOCITY: 'rad/s',
+    topics.RATIO: '1',
+    topics.DISTANCE: 'rad',
+    topics.LYAPUNOV: 'J',
+    **dict.fromkeys((topics.LATCHED, topics.MODEL_CHANGES, topics.LATE_STEPS), '1'),
+    **dict.fromkeys((topics.COMPUTE_TIME, topics.LATENCY, topics.LATENESS), 's'),
+}
+_PARAMETER = 'kg m^2'  # of arms without a URDF
+
+
+class Column(NamedTuple):
+    """Values (N,), NaN where unknown, with their unit; empty if they have none of their own."""
+
+    values: NDArray[Any]
+    unit: str
+
+
+def table(run: Run) -> dict[str, Column]:
+    """Every series of a run aligned on the stamps of its joint states, by name.
+
+    `stamp` and `received` are of integers, all else of floats. Values published with each sample
+    are in the row of its stamp; those published less often (truth, timing, monitor) are held until
+    the next message.
+    """
+    columns = {
+        'stamp': Column(run.stamp, 'ns'),
+        'received': Column(run.received, 'ns'),
+        'time': Column(run.time, 's'),
+    }
+    for field, unit in _FIELDS.items():
+        values = getattr(run, field)
+        if values is not None and not np.isnan(values).all():
+            for i, joint in enumerate(run.joints):
+                columns[f'{field} {joint}'] = Column(values[:, i], unit)
+    for topic in ('learning', 'truth', 'timing', 'monitor'):
+        series = getattr(run, topic)
+        if series is not None:
+            values = (series.exact if topic == 'learning' else series.held)(run.stamp)
+            for j, name in enumerate(series.names):
+                columns[f'{topic} {name}'] = Column(values[:, j], _unit(name, run))
+    return columns
+
+
+def _unit(name: str, run: Run) -> str:
+    """Unit of a value of the vectors; parameters of a URDF have their own."""
+    if name == topics.LAMBDA_MIN:
+        return '' if run.arm is not None else 's^-4'
+    if run.arm is not None and name in run.arm.units:
+        return run.arm.units[name] or '1'
+    known = [unit for beginning, unit in _VALUES.items() if name.startswith(beginning)]
+    return known[0] if known else '' if run.arm is not None else _PARAMETER
+
+
+def export(run: Run, path: Path) -> int:
+    """Write the table as CSV or Parquet, by the ending of `path`; return the number of columns.
+
+    Numbers read back equal. Units are metadata of Parquet's fields; of a CSV they are in the data
+    package beside it (see `described`).
+
+    Raises:
+        BlfDscError: the ending is neither .csv nor .parquet.
+        MissingExtraError: pyarrow is not installed.
+    """
+    columns = table(run)
+    if path.suffix == '.csv':
+        _write_csv(columns, path)
+    elif path.suffix == '.parquet':
+        _write_parquet(columns, path)
+    else:
+        raise BlfDscError(
+            f'{path} ends in neither .csv nor .parquet: the ending of the name sets the format'
+        )
+    return len(columns)
+
+
+def described(path: Path) -> Path:
+    """Data package (Frictionless) of a CSV: names, types and units of its columns, as JSON."""
+    return path.with_suffix('.datapackage.json')
+
+
+def _write_csv(columns: dict[str, Column], path: Path) -> None:
+    with path.open('w', encoding='utf-8', newline='') as stream:
+        writer = csv.writer(stream)
+        writer.writerow(columns)
+        writer.writerows(zip(*(one.values.tolist() for one in columns.values()), strict=True))
+    fields = [
+        {
+            'name': name,
+            'type': 'integer' if one.values.dtype.kind == 'i' else 'number',
+            **({'unit': one.unit} if one.unit else {}),
+        }
+        for name, one in columns.items()
+    ]
+    resource = {
+        'name': 'run',
+        'path': path.name,
+        'profile': 'tabular-data-resource',
+        'schema': {'fields': fields, 'missingValues': ['', 'nan']},
+    }
+    text = json.dumps({'profile': 'tabular-data-package', 'resources': [resource]}, indent=1)
+    described(path).write_text(text + '\n', encoding='utf-8')
+
+
+def _write_parquet(columns: dict[str, Column], path: Path) -> None:
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ImportError:
+        raise MissingExtraError('pyarrow', 'parquet', 'writing Parquet') from None
+    arrays = [pa.array(one.values) for one in columns.values()]
+    fields = [
+        pa.field(name, array.type, metadata={'unit': one.unit} if one.unit else None)
+        for (name, one), array in zip(columns.items(), arrays, strict=True)
+    ]
+    parquet.write_table(pa.table(arrays, schema=pa.schema(fields)), path)
