@@ -34,6 +34,7 @@ VENV := .venv
 READY := $(VENV)/.ready-$(FLAVOUR)-$(VERSION)
 LINT_READY := $(READY)-lint
 BENCH_READY := $(READY)-bench
+RELEASE_READY := $(READY)-release
 PIP := $(VENV)/bin/python -m pip --disable-pip-version-check -qq
 # This checkout comes first, also before a workspace that has the package installed.
 RUN := PYTHONPATH="$(CURDIR)$${PYTHONPATH:+:$$PYTHONPATH}" $(VENV)/bin/python
@@ -41,7 +42,7 @@ PIP_FAILED := { echo 'The installation failed: see above. It needs a package ind
   'set HTTPS_PROXY, for a mirror PIP_INDEX_URL, without a network PIP_FIND_LINKS and' \
   'PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
 
-.PHONY: help venv demo paper arms changes expect test test-long test-browser test-nightly soak docs lint clean bench
+.PHONY: help venv demo paper arms changes expect test test-long test-browser test-nightly soak docs lint clean bench release
 
 help: ## List what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' Makefile
@@ -96,6 +97,13 @@ soak: $(READY) ## Run half an hour of the plant's time with a fault every few se
 docs: $(READY) ## Make the site of the documentation, into out/docs
 	@$(RUN) -m sphinx -q -W --keep-going -n doc out/docs && echo 'Open out/docs/index.html'
 
+release: $(RELEASE_READY) ## Check versions and metadata, and build sdist and wheel into out/dist
+	@$(MAKE) test TESTS=test/test_package.py
+	@rm -rf out/dist && $(VENV)/bin/python -m build --outdir out/dist . && \
+	$(VENV)/bin/python -m twine check --strict out/dist/*
+	@! grep -q '@.*[.]invalid' package.xml || echo 'package.xml has no maintainer that can be' \
+	    'reached, and so has what is in out/dist: see CONTRIBUTING.md before you publish it.'
+
 lint: $(LINT_READY) ## Check style, types and layers
 	@good=1; for check in 'ruff check' 'ruff format --check' mypy; do \
 	    $(VENV)/bin/python -m $$check || good=0; done; \
@@ -120,6 +128,10 @@ $(READY): setup.py
 
 $(BENCH_READY): $(READY)
 	@$(PIP) install -c $(VENV)/constraints.txt -e '.[bench]' || $(PIP_FAILED)
+	@touch $@
+
+$(RELEASE_READY): $(READY)
+	@$(PIP) install -c $(VENV)/constraints.txt -e '.[release]' || $(PIP_FAILED)
 	@touch $@
 
 $(LINT_READY): $(READY)

@@ -121,6 +121,7 @@ setup(
             'yourdfpy>=0.0.57',
         ],
         'docs': DOCS,
+        'release': ['build', 'twine'],
         # The peers that `make bench` compares with; Octave and a C compiler are the system's.
         'bench': ['mujoco', 'drake', 'pin'],
         # Fixed, because with nearly every rule on, each release of the linter finds something new.

@@ -3,6 +3,7 @@
 
 import ast
 import configparser
+import json
 import re
 import shutil
 import subprocess
@@ -13,6 +14,7 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
+import yaml
 
 import blf_dsc_controller
 
@@ -131,8 +133,16 @@ def test_metadata_is_that_of_the_manifest_and_readme(wheel, metadata):
     stated = told.get('License-Expression') or told['License']  # by the age of setuptools
     assert stated == manifest().findtext('license') == 'Apache-2.0'
     assert told['Keywords']
-    versions = {value.rpartition('3.')[2] for field, value in metadata if 'Python :: 3.' in value}
-    assert versions == {'10', '11', '12', '13'}
+
+
+def test_continuous_integration_runs_every_python_that_is_supported(metadata):
+    jobs = yaml.safe_load((ROOT / '.github/workflows/ci.yml').read_text())['jobs']
+    classified = {value.split(' :: ')[-1] for _, value in metadata if 'Python :: 3.' in value}
+    assert set(jobs['suite']['strategy']['matrix']['python']) == classified
+    container = json.loads((ROOT / '.devcontainer/devcontainer.json').read_text())
+    assert (ROOT / '.devcontainer' / container['build']['dockerfile']).is_file()
+    for script in ('run', 'ros'):
+        subprocess.run(['/bin/bash', '-n', ROOT / '.ci' / script], check=True)
 
 
 def test_manifest_is_of_an_ament_python_package():
