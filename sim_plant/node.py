@@ -20,7 +20,6 @@ import sys
 from functools import partial
 from typing import Any
 
-import numpy as np
 from rclpy.timer import Timer
 from std_msgs.msg import String
 
@@ -85,10 +84,7 @@ class PlantNode(LoopNode[PlantConfig]):
         process.log_compilation(self.get_logger(), *plant_kernels.KERNELS)
         self.plant = plant_of(self.config)
         self._changed.clear()
-        self.plant.measure()
-        self.plant.truth()
-        self.plant.step(np.zeros(len(self.config.joints)))
-        self.plant.reset()
+        self.plant.compile()
         self.deactivate()
         outputs = [topics.JOINT_STATES, topics.TRUTH]
         outputs += [] if self._lockstep else [topics.TIMING]

@@ -128,6 +128,12 @@ class Plant:
         self.is_broken = False
         self.rng = generator(self._seed)
 
+    def compile(self) -> None:
+        """Compile every kernel of this plant, and return to sample 0."""
+        self.step(np.zeros(self.measure().size // 3))
+        self.truth()
+        self.reset()
+
     def save(self) -> SavedPlant:
         """Copy of everything that changes."""
         return SavedPlant(self.state.copy(), self.is_broken, self.rng.bit_generator.state)

@@ -154,6 +154,18 @@ def _parser() -> argparse.ArgumentParser:
             '--config noisy --duration 30 --mode realtime --out first',
         )
     )
+    precompile = command(
+        'precompile',
+        'precompile',
+        'compile what a configuration needs, ahead of its first start',
+        'Compile the kernels of the controller and the simulated arm of a configuration into the '
+        "user's cache (NUMBA_CACHE_DIR, or ~/.cache/blf_dsc_controller), so that their nodes start "
+        'within seconds: after an installation, or when a container is built.',
+        '--config my.yaml',
+    )
+    precompile.add_argument(
+        '--config', default='recommended', help='parameter file, or a preset (recommended)'
+    )
     _replay_options(
         command(
             'replay',

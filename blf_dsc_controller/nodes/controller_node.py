@@ -65,6 +65,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         """Compile the law; create the topics of the loop the first time."""
         process.log_compilation(self.get_logger(), update)
         self.guard = Guard(self.config, self._steady, self._wall)
+        self.guard.compile()
         for warning in config_warnings(self.config):
             self.get_logger().warning(warning)
         outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]

@@ -32,6 +32,7 @@ from blf_dsc_controller.supervision.watchdog import PERIOD, Watchdog
 
 Vector = NDArray[np.float64]
 _NANO = 1e-9
+_ANY_STAMP = 1  # ns
 
 _REASONS: dict[type[cdr.MessageError], Reason] = {
     cdr.MissingJointError: Reason.JOINT_MISSING,
@@ -87,6 +88,14 @@ class GuardedLaw:
         self._clean = True  # whether the window holds valid samples only
         self._resumable = False  # whether the law may continue along its reference
         self.journal.note(EventType.CONFIGURE, parameters=flatten(config))
+
+    def compile(self) -> None:
+        """Compile what the first joint state would otherwise wait for."""
+        at_rest = np.zeros(len(self.config.joints))
+        self.states.check(self.config.safety, _ANY_STAMP, at_rest, at_rest)
+        self.states.restart()
+        self.samples.check(self.config.safety, self.config.sample_time)
+        self.samples.restart()
 
     @property
     def commanding(self) -> bool:
