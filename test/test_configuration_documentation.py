@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The documented table of parameters against the code it is made from."""
+"""The documented tables of parameters and topics against the code they are made from."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from pathlib import Path
 
 from blf_dsc_controller.configuration.documentation import parameter_page
 from blf_dsc_controller.configuration.nodes import known_names
+from blf_dsc_controller.messages.documentation import topic_page
+from blf_dsc_controller.messages.topics import TOPICS
 
 COMMITTED = Path(__file__).parents[1] / 'doc' / 'parameters.md'
 
@@ -30,3 +32,11 @@ def test_every_parameter_has_a_row_of_eight_cells():
     rows = [row for row in parameter_page().splitlines() if row.startswith('| `')]
     assert {row.split('`')[1] for row in rows} == known_names()
     assert {row.replace('\\|', '').count('|') for row in rows} == {9}
+
+
+def test_the_page_of_topics_is_up_to_date():
+    assert (COMMITTED.parent / 'topics.md').read_text(encoding='utf-8') == topic_page(), (
+        'run: python -m blf_dsc_controller.messages.documentation doc/topics.md'
+    )
+    for topic in TOPICS:
+        assert f'| `{topic.relative}` |' in topic_page()

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The generated page of all topics.
+
+`python -m blf_dsc_controller.messages.documentation doc/topics.md` writes it.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.topics import Quality, Topic
+
+_PREFACE = """\
+# Topics
+
+Names are the defaults, those with the name of a node are private to it. Joints are matched by name,
+stamps are the plant's time. The values of a JointState that has no joints are in `position`, by the
+names in `name`. *Kept* is how many messages a publisher keeps (of `joint_trajectory`: the
+subscriber), and *latched* that late subscribers get them; all are reliable.
+
+This page is generated: `python -m blf_dsc_controller.messages.documentation doc/topics.md`.
+
+| topic | type | kept | when | content |
+| --- | --- | --- | --- | --- |
+"""
+
+_NAMED = 'by name: '
+_ABOUT = {
+    topics.JOINT_STATES: (
+        'each sample',
+        'position and velocity as measured; effort: torque applied over the last sample',
+    ),
+    topics.COMMANDS: ('each sample', 'torque [N m], in the order of `joints`'),
+    topics.REFERENCE: ('each sample', 'position and velocity of the reference'),
+    topics.TRACKING_ERROR: (
+        'each sample',
+        r'position: $\xi_1$ [rad], velocity: $\xi_2$ [rad/s], effort: torque after its limit',
+    ),
+    topics.LEARNING: (
+        'each sample',
+        (
+            f'{_NAMED}each estimate, `{topics.DISTURBANCE}<joint>` (with the learned friction), '
+            f'`{topics.LAMBDA_MIN}`, `{topics.LATCHED}`, `{topics.MODEL_CHANGES}` (times that the '
+            f'arm was found to have changed), `{topics.COMPUTE_TIME}` [s]'
+        ),
+    ),
+    topics.JOINT_TRAJECTORY: ('subscribed', 'another reference: [references.md](references.md)'),
+    topics.JOURNAL: (
+        'each event',
+        (
+            'JSON: activations, trajectories, changed parameters, stops, and after which joint '
+            'state; see [operation.md](operation.md#the-journal)'
+        ),
+    ),
+    topics.BOUND: ('at the start, on change', 'position: $k_c$ [rad], effort: torque limit'),
+    topics.STATE: ('on change', 'starting, approaching, tracking, or stopped and why'),
+    topics.MONITOR: (
+        'each 10th sample',
+        (
+            f'{_NAMED}`{topics.RATIO}<joint>`, `{topics.DISTANCE}<joint>` [rad], estimates (NaN: a '
+            f'rejected disturbance column), `{topics.LAMBDA_MIN}`, `{topics.LATCHED}`; where '
+            f'`truth.parameters` are given, the Lyapunov function `{topics.LYAPUNOV}<term>` [J] '
+            'and its bound'
+        ),
+    ),
+    topics.TRUTH: ('each 10th sample', f'{_NAMED}the true values, named as the estimates'),
+    topics.CHANGES: (
+        'on change',
+        (
+            'JSON: `parameters` of the plant that changed while it runs, and the `stamp` [ns] of '
+            'the first sample with them'
+        ),
+    ),
+    topics.TIMING: (
+        'each sample in real time',
+        f'{_NAMED}`{topics.LATENCY}` and `{topics.LATENESS}` [s], `{topics.LATE_STEPS}`',
+    ),
+    topics.ROBOT_DESCRIPTION: ('at the start', 'URDF of the simulated arm'),
+    topics.CLOCK: ('each sample, if `publish_clock`', "the plant's time"),
+    topics.DIAGNOSTICS: ('each second, on change', 'health of controller and plant'),
+}
+
+
+def topic_page() -> str:
+    """Return the Markdown page of all topics."""
+    return _PREFACE + ''.join(map(_row, _all()))
+
+
+def _all() -> list[Topic]:
+    """Every topic of the package, those of the control loop first."""
+    return [one for one in vars(topics).values() if isinstance(one, Topic)]
+
+
+def _row(topic: Topic) -> str:
+    when, content = _ABOUT[topic]
+    kind = topic.type.replace('/msg/', '/')
+    cells = f'`{_written(topic)}`', kind, _kept(topic.offered), when, content
+    return f'| {" | ".join(cells)} |\n'
+
+
+def _written(topic: Topic) -> str:
+    return topic.resolved if topic.name.startswith('/') else topic.relative
+
+
+def _kept(quality: Quality) -> str:
+    latched = ', latched' if quality.durability == 'transient_local' else ''
+    return f'{quality.depth}{latched}'
+
+
+if __name__ == '__main__':
+    Path(sys.argv[1]).write_text(topic_page(), encoding='utf-8')
