@@ -16,7 +16,9 @@ from matplotlib import rcParams
 from matplotlib.colors import to_hex, to_rgb
 from synthetic_bag import Synthetic
 
+from blf_dsc_controller.analysis import figures
 from blf_dsc_controller.analysis.figures import draw
+from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.analysis.style import COLOURS, formula
 from blf_dsc_controller.analysis.thinning import envelope
 from blf_dsc_controller.bags.reader import read_run
@@ -87,6 +89,38 @@ def test_less_in_the_bag_is_a_smaller_picture(run, tmp_path):
     least = dataclasses.replace(little, reference=None, bound=None, learning=None)
     assert draw(least, tmp_path / 'alone') == [tmp_path / 'alone' / 'tracking.png']
     assert not (tmp_path / 'alone' / 'parameters.png').exists()
+
+
+def test_a_small_error_is_seen_beside_a_large_one_on_a_logarithmic_axis(run):
+    error = 1e-6 * np.ones_like(run.error)
+    error[700, 1] = 0.0015
+    found = panels([dataclasses.replace(run, error=error)])
+    (panel,) = (one for one in found if one.title == '|error| of elbow')
+    size, bound = panel.lines
+    assert panel.log
+    assert size.values.size == 300
+    assert (size.values.max(), size.time[size.values.argmax()]) == (
+        1.5,
+        pytest.approx(0.7, abs=0.02),
+    )
+    assert np.median(size.values) == pytest.approx(1e-3)  # mrad
+    assert set(bound.values) == {2.0}
+
+
+def test_no_panel_is_drawn_twice_and_every_line_of_monitors_is_named(run, tmp_path, monkeypatch):
+    learning = run.learning
+    drawn = {}
+
+    def record(path, _title, shown, *_, **__):
+        drawn[path.name] = shown
+
+    monkeypatch.setattr(figures, 'draw_panels', record)
+    draw(dataclasses.replace(run, monitor=learning), tmp_path)
+    titles = [panel.title for shown in drawn.values() for panel in shown]
+    assert len(titles) == len({*titles})
+    assert {'|error| of shoulder', 'minimum eigenvalue', 'distance to bound'} <= {*titles}
+    names = [line.name for panel in drawn['monitors.png'] for line in panel.lines]
+    assert names == ['shoulder', 'elbow', 'bound']
 
 
 def test_gaps_and_a_single_sample_are_drawn(run, tmp_path):

@@ -45,7 +45,9 @@ def by_title(bags):
 def test_every_quantity_has_its_panel(folder):
     titles = set(by_title(read_bags([folder / 'synthetic'])))
     expected = {
-        f'{what} of {joint}' for what in ('error', 'position', 'torque') for joint in JOINTS
+        f'{what} of {joint}'
+        for what in ('error', '|error|', 'position', 'torque')
+        for joint in JOINTS
     }
     expected |= {'(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2', 'relative parameter error'}
     expected |= {'minimum eigenvalue', *(f'disturbance {joint}' for joint in JOINTS)}
@@ -86,6 +88,20 @@ def test_several_bags_lie_over_each_other_and_their_differences_are_listed(folde
     assert '<p>1 parameters differ.</p>' in text
     row = 'blf_dsc_controller: feedback.gain</td><td>[60.0, 20.0]</td><td>[30.0, 10.0]</td>'
     assert row in text
+
+
+def test_legends_name_what_is_alike_in_all_bags_once(folder):
+    bags = read_bags([folder / 'one', folder / 'other'])
+    traces = by_title(bags)['error of joint1']['traces']
+    shown = [trace['name'] for trace in traces if trace['showlegend']]
+    assert shown == ['one: error', 'one: bound', 'other: error']
+
+
+def test_the_page_says_how_long_series_are_thinned(folder, tmp_path):
+    thinned = 'the largest sample of every 2.67 ms, zoomed or not; every sample is in the table'
+    for name, words in (('synthetic', thinned), ('one', 'Lines show every sample.')):
+        write_report(read_bags([folder / name]), tmp_path / f'{name}.html')
+        assert words in (tmp_path / f'{name}.html').read_text()
 
 
 def test_bags_of_one_name_are_numbered(folder):

@@ -71,6 +71,28 @@ def test_every_panel_is_drawn_without_errors(browser, pages, name):
     assert browser.complaints == []
 
 
+@pytest.mark.parametrize('name', ['one', 'both'])
+@pytest.mark.parametrize('width', [400, 1400])
+def test_a_page_fits_its_window_and_no_legend_covers_a_title_or_an_axis(
+    browser, pages, name, width
+):
+    metrics = {'width': width, 'height': 900, 'deviceScaleFactor': 1, 'mobile': False}
+    browser.call('Emulation.setDeviceMetricsOverride', **metrics)
+    show(browser, pages / f'{name}.html')
+    assert browser.value('document.documentElement.scrollWidth') <= width
+    covered = browser.value(
+        f'Array.from({PLOTS}).filter((plot) => {{'
+        '  const box = (part) => plot.querySelector(part)?.getBoundingClientRect();'
+        "  const legend = box('.legend .bg');"
+        "  const others = ['.gtitle', '.xtitle', '.ytitle', '.plot'].map(box);"
+        '  return legend && others.some((other) => other && legend.left < other.right'
+        '    && other.left < legend.right && legend.top < other.bottom'
+        '    && other.top < legend.bottom); }).map((plot) => plot.layout.title.text)'
+    )
+    assert covered == []
+    browser.screenshot(SHOTS / f'report_{name}_{width}.png', whole=True)
+
+
 def test_nothing_is_loaded_from_elsewhere(browser, pages):
     show(browser, pages / 'one.html')
     assert browser.value('performance.getEntriesByType("resource").length') == 0

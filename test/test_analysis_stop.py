@@ -11,7 +11,7 @@ import pytest
 import synthetic_bag
 from fault_rig import JOINTS, Rig
 from synthetic_bag import MILLISECOND, START, Synthetic
-from test_analysis_figures import amount, pixels
+from test_analysis_figures import amount, lightened, pixels
 
 from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.panels import panels
@@ -78,14 +78,17 @@ def test_pictures_and_page_show_the_stop(tmp_path, capsys):
     path = stopped(tmp_path)
     run = read_run(path)
     shown = [panel for panel in panels([run]) if panel.group in ('Motion', 'Tracking', 'Torque')]
-    assert len(shown) == 6
+    assert len(shown) == 8
     for panel in shown:
         assert [(mark.text, mark.colour) for mark in panel.marks] == [
             ('stop: error past the bound', ALARM)
         ]
         assert panel.marks[0].time == pytest.approx(STOP_S)
+        assert panel.marks[0].until == run.duration
     draw(run, tmp_path)
-    assert amount(pixels(tmp_path / 'tracking.png'), ALARM) > 100
+    picture = pixels(tmp_path / 'tracking.png')
+    assert amount(picture, ALARM) > 100
+    assert amount(picture, lightened(ALARM, 0.1)) > 50_000  # shaded from the stop on
     (bag,) = read_bags([path])
     (event,) = (event for event in bag.events if event.kind == 'stop')
     assert event.time == pytest.approx(STOP_S)
@@ -97,6 +100,24 @@ def test_pictures_and_page_show_the_stop(tmp_path, capsys):
     assert 'held by every joint' not in page
     assert main(['plot', str(path), '--out', str(tmp_path / 'plot')]) == 0
     assert 'VIOLATED' in capsys.readouterr().out
+
+
+def test_a_stop_is_shaded_until_the_controller_starts_again(tmp_path):
+    stop, start = (START + k * MILLISECOND for k in (1000, 1800))
+    events = [
+        Event(1, EventType.STOP, stop, 1, 1, {'reason': Reason.VELOCITY, 'text': 'too fast'}),
+        Event(2, EventType.START, start, 1, 1, {'resumed': False}),
+    ]
+    messages = [*Synthetic(4000).messages(), *((JOURNAL, START, one.encode()) for one in events)]
+    path = synthetic_bag.write(tmp_path / 'bag', messages)
+    (bag,) = read_bags([path])
+    pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
+    from blf_dsc_controller.analysis.report import plots
+
+    (plot,) = (one for one in plots(panels([bag.run]), [bag]) if one['title'] == 'torque of elbow')
+    assert plot['marks'] == [
+        (pytest.approx(1.0), 'stop: velocity not plausible', ALARM, pytest.approx(1.8))
+    ]
 
 
 def test_a_guarded_loop_that_is_pushed_out_is_reported_so(tmp_path):

@@ -37,6 +37,7 @@ _HIGH = (6.2, 3.2)
 _ALONE = {'Torque': ORANGE, 'Excitation': GREEN}  # colour of one line
 _WIDE = {'Motion': (3.2, 0.55), 'Estimates': (2.4, 0.75)}  # width and opacity
 _FLAT, _DECADE = 2.0, 10.0
+_SHADED = 0.1
 _WIDTHS_UPON_EACH_OTHER = (5.0, 2.4)
 
 
@@ -49,7 +50,9 @@ def draw(run: Run, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     found = panels([run])
     metrics = measure(run)
+    n = len(run.joints)
     motion = [panel for panel in found if panel.group in ('Motion', 'Tracking', 'Torque')]
+    motion = [panel for panel in motion if n <= _ABREAST or not panel.log]
     excitation = [panel for panel in found if panel.group == 'Excitation']
     parameters = [panel for panel in found if panel.group == 'Parameters']
     disturbances = [panel for panel in found if panel.group == 'Disturbance']
@@ -61,7 +64,6 @@ def draw(run: Run, folder: Path) -> list[Path]:
     for time, stop in run.timed_stops[:1]:
         title += f', stopped at {time:.3f} s ({stop.reason})'
     paths = [folder / 'tracking.png']
-    n = len(run.joints)
     if n <= _ABREAST:
         draw_panels(paths[0], title, motion, n, _SIZE)
     else:
@@ -80,7 +82,7 @@ def draw(run: Run, folder: Path) -> list[Path]:
         paths.append(folder / 'parameters.png')
         draw_panels(paths[-1], title, [*shown, *excitation], 2, _HIGH)
     if monitors:
-        shown = [monitors[0], *excitation, *monitors[1:]]
+        shown = monitors if parameters else [*monitors, *excitation]
         paths.append(folder / 'monitors.png')
         draw_panels(paths[-1], 'Monitors', shown, 2, _HIGH)
     return paths
@@ -149,10 +151,11 @@ def _draw_panel(axes: Axes, panel: Panel, runs: Sequence[str], until: float) -> 
 
 def _set_scale(axes: Axes, panel: Panel) -> None:
     """Scale the axis of values; over two decades where there is next to nothing to see."""
-    if panel.span:
-        axes.set_ylim(-panel.span, panel.span)
     if panel.log:
         axes.set_yscale('log')
+    if panel.span:
+        axes.set_ylim(None if panel.log else -panel.span, panel.span)
+    if panel.log:
         low, high = axes.get_ylim()
         if high < _FLAT * low:
             axes.set_ylim(low / _DECADE, high * _DECADE)
@@ -174,6 +177,8 @@ def _draw_line(axes: Axes, line: Line, until: float, *, label: str, **style: Any
 
 
 def _draw_mark(axes: Axes, mark: Mark, row: int) -> None:
+    if mark.until > mark.time:
+        axes.axvspan(mark.time, mark.until, color=mark.colour, alpha=_SHADED, lw=0)
     if mark.colour == ALARM:
         axes.axvline(mark.time, color=mark.colour, lw=1.4)
     else:

@@ -47,6 +47,7 @@ _LEAST = 1e-12  # J, the smallest value on a logarithmic axis
 _ROOM = 1.2  # of the largest value shown, to either side
 _LEAST_ERROR = 1e-5  # %
 _MOST = 1e100
+_PIECES = 300  # of a run, each with its largest error
 
 
 class Line(NamedTuple):
@@ -63,12 +64,13 @@ class Line(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """A vertical line."""
+    """A vertical line; shaded from there until a later time, if there is one."""
 
     time: float
     text: str
     colour: str = ''
     run: int = 0
+    until: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
         latch = () if latched is None else (Mark(latched, 'latch'),)
         changes = true_change_times(run)
         changed = dict.fromkeys(_CHANGED, 'the arm changes')
-        stops = [Mark(time, f'stop: {one.reason}', ALARM) for time, one in run.timed_stops]
+        stops = list(_stops(run))
         for panel in (*_motion(run), *_learning(run), *_monitors(run), *_timing(run)):
             before = found.get((panel.group, panel.title), replace(panel, lines=(), marks=()))
             marks = latch if panel.group in _LEARNING else panel.marks
@@ -115,6 +117,15 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
             )
     drawn = [panel for panel in found.values() if panel.lines]
     return sorted(drawn, key=lambda panel: GROUPS.index(panel.group))
+
+
+def _stops(run: Run) -> Iterator[Mark]:
+    """Safe stops, each until the next start or the end."""
+    for time, one in run.timed_stops:
+        until = run.duration
+        if one.until is not None:
+            until = (one.until - int(run.stamp[0])) * 1e-9
+        yield Mark(time, f'stop: {one.reason}', ALARM, until=until)
 
 
 def _drawn(values: Floats) -> Floats:
@@ -140,22 +151,46 @@ def _motion(run: Run) -> Iterator[Panel]:
             lines.append(Line('limit', t, limit, MUTED, dashed=True, mirrored=True))
         note = '' if np.isnan(torque).all() else f'peak {np.nanmax(np.abs(torque)):.3g}'
         yield Panel('Torque', f'torque of {joint}', 'N m', tuple(lines), note)
+    if run.error is not None and run.stamp.size > _PIECES:
+        for i in range(len(run.joints)):
+            yield _error_size(run, i, 1e3 * run.error[:, i])
 
 
 def _error(run: Run, i: int, error: Floats) -> Panel:
-    lines, marks, note, span = [Line('error', run.time, error)], [], '', 0.0
+    lines, marks, note = [Line('error', run.time, error)], [], ''
     violated = outside(run)
     if run.bound is not None and violated is not None:
         bound = 1e3 * run.bound[:, i]
         lines.append(Line('bound', run.time, bound, MUTED, True, True, True))  # noqa: FBT003
         first = run.time[violated[:, i]][:1].tolist()
         marks = [Mark(time, f'outside from {time:.3f} s', ALARM) for time in first]
-        if bound[0] > bound[-1]:  # a funnel: its mouth would leave nothing to see of the error
-            span = _ROOM * np.nanmax(np.abs(_drawn(error)), initial=bound[-1])
     if not np.isnan(error).all():
         note = f'max {np.nanmax(np.abs(error)):.3g}, rms {rms(error):.3g}'
-    title = f'error of {run.joints[i]}'
+    title, span = f'error of {run.joints[i]}', _span(run, i, error)
     return Panel('Tracking', title, 'mrad', tuple(lines), note, marks=tuple(marks), span=span)
+
+
+def _span(run: Run, i: int, error: Floats) -> float:
+    """What is shown of a funnel, whose mouth would leave nothing to see of the error; else 0."""
+    if run.bound is None or run.bound[0, i] <= run.bound[-1, i]:
+        return 0.0
+    return float(_ROOM * np.nanmax(np.abs(_drawn(error)), initial=1e3 * run.bound[-1, i]))
+
+
+def _error_size(run: Run, i: int, error: Floats) -> Panel:
+    """Largest error of each piece of the run: the first transient and the last microradian."""
+    begins = np.linspace(0, error.size, _PIECES, endpoint=False).astype(np.intp)
+    size = np.fmax.reduceat(np.abs(error), begins)
+    size[size == 0.0] = np.nan
+    lines = [Line('error', run.time[begins], size)]
+    if run.bound is not None:
+        bound = 1e3 * run.bound[:, i]
+        lines.append(Line('bound', run.time, bound, MUTED, dashed=True))
+    known = size[np.isfinite(size)]
+    note = f'end {known[-1]:.2g}' if known.size else ''
+    title = f'|error| of {run.joints[i]}'
+    span = _span(run, i, error)
+    return Panel('Tracking', title, 'mrad', tuple(lines), note, log=True, span=span)
 
 
 def _learning(run: Run) -> Iterator[Panel]:
@@ -250,7 +285,7 @@ def _monitors(run: Run) -> Iterator[Panel]:
     if run.error is not None and run.bound is not None:
         distance = 1e3 * (run.bound - np.abs(run.error))
         lines = [Line(joint, run.time, distance[:, i]) for i, joint in enumerate(run.joints)]
-        lines.append(Line('', run.time, np.zeros_like(run.time), ALARM))
+        lines.append(Line('bound', run.time, np.zeros_like(run.time), ALARM))
         note, symbol = f'minimum {np.nanmin(distance):.3g}', r'$k_c - |\xi_1|$ [mrad]'
         yield Panel('Monitors', 'distance to bound', 'mrad', tuple(lines), note, symbol)
     if LYAPUNOV_TERMS[0] in run.monitor.names:

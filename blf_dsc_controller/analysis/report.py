@@ -14,9 +14,9 @@ from blf_dsc_controller.analysis.panels import Panel, panels
 from blf_dsc_controller.analysis.reported_bag import ReportedBag
 from blf_dsc_controller.analysis.style import COLOURS, INK
 from blf_dsc_controller.analysis.summary import format_table, summarize
-from blf_dsc_controller.analysis.thinning import thin
+from blf_dsc_controller.analysis.thinning import PIECES, thin
 from blf_dsc_controller.errors import MissingExtraError
-from blf_dsc_controller.run import Floats
+from blf_dsc_controller.run import Floats, Run
 
 _BINS = 200
 _TAIL = 99.9  # percentile up to which a histogram is drawn
@@ -57,6 +57,7 @@ def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
         ' and '.join(bag.name for bag in bags),
         names=[bag.name for bag in bags],
         seconds=max(bag.run.duration for bag in bags),
+        thinned=max(_period(bag.run) for bag in bags),
         versions=sorted({bag.version or 'another recorder' for bag in bags}),
         links=[*groups, 'The arm', 'Events', 'Configuration'],
         summaries=[
@@ -90,11 +91,17 @@ def plots(shown: Sequence[Panel], bags: Sequence[ReportedBag]) -> list[dict[str,
             'time': not panel.histogram,
             'log': panel.log,
             'marks': [
-                (mark.time, mark.text, mark.colour or colour(mark.run)) for mark in panel.marks
+                (mark.time, mark.text, mark.colour or colour(mark.run), mark.until)
+                for mark in panel.marks
             ],
         }
         for panel in shown
     ]
+
+
+def _period(run: Run) -> float:
+    """Time of which two samples are drawn [ms]; 0 if all are."""
+    return 1e3 * run.duration / PIECES if run.stamp.size > 2 * PIECES else 0.0
 
 
 def _traces(panel: Panel, prefixes: Sequence[str]) -> Iterator[dict[str, Any]]:
@@ -112,7 +119,8 @@ def _traces(panel: Panel, prefixes: Sequence[str]) -> Iterator[dict[str, Any]]:
                 'x': _numbers(time),
                 'y': _numbers(sign * values),
                 'line': {'width': 1.3, 'color': shade, 'dash': 'dash' if line.dashed else 'solid'},
-                'showlegend': bool(line.name) and sign > 0.0,
+                # What has a colour of its own looks alike in all bags.
+                'showlegend': bool(line.name) and sign > 0.0 and not (line.colour and line.run),
             }
 
 

@@ -7,8 +7,10 @@ import numpy as np
 
 from blf_dsc_controller.run import Floats
 
+PIECES = 1500
 
-def thin(time: Floats, values: Floats, pieces: int = 1500) -> tuple[Floats, Floats]:
+
+def thin(time: Floats, values: Floats, pieces: int = PIECES) -> tuple[Floats, Floats]:
     """Thin a series without losing a peak; of a mostly constant one the corners remain."""
     changes = np.flatnonzero(np.diff(values) != 0.0)
     if changes.size < values.size // 100:
@@ -17,7 +19,7 @@ def thin(time: Floats, values: Floats, pieces: int = 1500) -> tuple[Floats, Floa
     return envelope(time, values, pieces)
 
 
-def envelope(time: Floats, values: Floats, pieces: int = 1500) -> tuple[Floats, Floats]:
+def envelope(time: Floats, values: Floats, pieces: int = PIECES) -> tuple[Floats, Floats]:
     """Lowest and highest sample of each piece of a series (N,), in their order.
 
     NaN is unknown; a piece in which nothing is known stays a gap. At most two samples of each piece

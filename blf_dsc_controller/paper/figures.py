@@ -49,9 +49,10 @@ def draw_pairs(results: Results, folder: Path) -> Iterator[tuple[Path, str]]:
     for name, caption, pair in _PAIRS:
         runs = [replace(results.runs[case], torque_limit=None) for case in pair.values()]
         shown = panels(runs)
+        linear = [panel for panel in shown if not panel.log]
         tracking = [
             replace(panel, title=f'({letter}) {panel.title}')
-            for letter, panel in zip('abcdef', shown, strict=False)
+            for letter, panel in zip('abcdef', linear, strict=False)
         ]
         estimates = [panel for panel in shown if panel.group == 'Parameters' and not panel.log]
         for number, drawn, columns, size, until, note in (

@@ -7,15 +7,23 @@ const timePlots = [];
 const duration = Math.max(...data.arms.map((arm) => arm.time[arm.time.length - 1]));
 let following = false;
 
-function layoutOf(panel) {
+// Legends are below: above they would cover the title, beside it take half of a narrow plot.
+function legendHeight(panel, width) {
+  const names = panel.traces.filter((trace) => trace.showlegend !== false).map((one) => one.name);
+  const entry = 45 + 6.5 * Math.max(0, ...names.map((name) => name.length));
+  return 19 * Math.ceil(names.length / Math.max(1, Math.floor(width / entry)));
+}
+
+function layoutOf(panel, width) {
+  const legend = legendHeight(panel, width - 110);
   const grid = {gridcolor: '#e5e7eb', zerolinecolor: '#d1d5db'};
   return {
     title: {text: panel.title, x: 0.01, xanchor: 'left', font: {size: 14}},
-    margin: {l: 62, r: 34, t: 50, b: 40},
+    height: 270 + legend,
+    margin: {l: 62, r: 34, t: 34, b: 46 + legend},
     paper_bgcolor: 'white', plot_bgcolor: 'white', bargap: 0, barmode: 'overlay',
-    legend: {font: {size: 11}, ...(panel.traces.length > 4
-      ? {x: 1.02, xanchor: 'left', y: 0, yanchor: 'bottom'}
-      : {orientation: 'h', x: 1, xanchor: 'right', y: 1.01, yanchor: 'bottom'})},
+    legend: {font: {size: 11}, orientation: 'h', x: 0, xanchor: 'left', yref: 'container', y: 0,
+      yanchor: 'bottom'},
     modebar: {orientation: 'v'},
     font: {family: 'system-ui, DejaVu Sans, sans-serif', size: 12, color: '#22272e'},
     hovermode: panel.time ? 'x' : 'closest',
@@ -24,8 +32,11 @@ function layoutOf(panel) {
       ...(panel.time ? {range: [0, duration]} : {})},
     yaxis: {...grid, title: {text: panel.time ? panel.unit : 'count', standoff: 4},
       type: panel.log ? 'log' : 'linear', exponentformat: 'power'},
-    shapes: panel.marks.map(([time, , colour]) => ({type: 'line', x0: time, x1: time, y0: 0,
-      y1: 1, yref: 'paper', line: {color: colour, width: 1.2, dash: 'dot'}})),
+    shapes: panel.marks.flatMap(([time, , colour, until]) => [
+      {type: 'line', x0: time, x1: time, y0: 0, y1: 1, yref: 'paper',
+        line: {color: colour, width: 1.2, dash: 'dot'}},
+      ...(until > time ? [{type: 'rect', x0: time, x1: until, y0: 0, y1: 1, yref: 'paper',
+        layer: 'below', fillcolor: colour, opacity: 0.12, line: {width: 0}}] : [])]),
     annotations: panel.marks.map(([time, text, colour], row) => ({x: time, y: 1, yref: 'paper',
       yanchor: 'top', yshift: -13 * row, xanchor: 'left', text, showarrow: false,
       font: {size: 11, color: colour}})),
@@ -50,7 +61,7 @@ function follow(source, change) {
 function draw(panel, place) {
   const traces = panel.traces.map((trace) => ({mode: 'lines', connectgaps: false, ...trace}));
   const options = {responsive: true, displaylogo: false, scrollZoom: false};
-  return Plotly.newPlot(place, traces, layoutOf(panel), options).then(() => {
+  return Plotly.newPlot(place, traces, layoutOf(panel, place.clientWidth), options).then(() => {
     if (!panel.time) return;
     timePlots.push(place);
     place.on('plotly_relayout', (change) => follow(place, change));
