@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag whose messages are compressed one by one (`compression_mode: message`) is read as any."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import recorded_run
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.messages.types import typestore
+
+pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    return recorded_run.record(tmp_path_factory.mktemp('plain') / 'bag')
+
+
+@pytest.fixture(scope='module', params=[StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def packed(bag, request, tmp_path_factory):
+    writer = Writer(
+        tmp_path_factory.mktemp('packed') / 'bag', version=9, storage_plugin=request.param
+    )
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    connections = {}
+    with writer:
+        for topic, type_name, at, raw in recorded_run.messages(bag):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, type_name, typestore=typestore())
+            writer.write(connections[topic], at, raw)
+    return writer.path
+
+
+def test_it_replays_bit_for_bit(packed, capsys):
+    assert main(['replay', str(packed)]) == 0
+    assert 'bit-equal: all outputs' in capsys.readouterr().out
+
+
+def test_it_is_read_reported_exported_and_learned_from(bag, packed, tmp_path, capsys):
+    np.testing.assert_array_equal(read_run(packed).error, read_run(bag).error)
+    for words in (
+        ['report', str(packed), '--out', str(tmp_path / 'page.html')],
+        ['plot', str(packed), '--out', str(tmp_path / 'plots')],
+        ['export', str(packed), '--out', str(tmp_path / 'packed.csv')],
+        ['export', str(bag), '--out', str(tmp_path / 'plain.csv')],
+        ['replay', str(packed), '--config', 'recommended'],
+    ):
+        assert main(words) == 0, capsys.readouterr().err
+    assert (tmp_path / 'packed.csv').read_bytes() == (tmp_path / 'plain.csv').read_bytes()
