@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.bags.mcap_reader import MalformedRecordError, read_messages, scan
 from blf_dsc_controller.bags.recover import recover
 from blf_dsc_controller.bags.salvage import Salvage
 from blf_dsc_controller.bags.sources import BagError
@@ -272,3 +274,22 @@ def test_where_all_is_lost_the_exit_code_says_so(plain, tmp_path, capsys):
         folder = damaged(tmp_path / f'{k}', data)
         assert main(['recover', str(folder)]) == 1
         assert 'ALL is lost' in capsys.readouterr().out
+
+
+def test_a_record_of_a_damaged_kind_neither_hides_messages_nor_invents_one(plain, tmp_path):
+    """A chunk may look like a footer then, and an index like a message or like the end."""
+    original = plain.read_bytes()
+    topics = {JOINT_STATES.resolved, COMMANDS.resolved}
+    whole_file = list(read_messages(plain, topics))
+    written = set(Salvage(plain).messages(original))
+    file = tmp_path / 'bag_0.mcap'
+    for at in [piece.at for piece in scan(original)]:
+        for bit in range(8):
+            content = bytearray(original)
+            content[at] ^= 1 << bit
+            file.write_bytes(content)
+            with suppress(MalformedRecordError):
+                assert list(read_messages(file, topics)) == whole_file
+            salvage = Salvage(file)
+            found = list(salvage.messages(bytes(content)))
+            assert {one for one in found if salvage.channel(one[0])} <= written
