@@ -20,11 +20,8 @@ def bag(tmp_path_factory):
     return recorded_run.record(tmp_path_factory.mktemp('plain') / 'bag')
 
 
-@pytest.fixture(scope='module', params=[StoragePlugin.SQLITE3, StoragePlugin.MCAP])
-def packed(bag, request, tmp_path_factory):
-    writer = Writer(
-        tmp_path_factory.mktemp('packed') / 'bag', version=9, storage_plugin=request.param
-    )
+def pack(bag, path, storage):
+    writer = Writer(path, version=9, storage_plugin=storage)
     writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
     connections = {}
     with writer:
@@ -32,7 +29,12 @@ def packed(bag, request, tmp_path_factory):
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, type_name, typestore=typestore())
             writer.write(connections[topic], at, raw)
-    return writer.path
+    return path
+
+
+@pytest.fixture(scope='module', params=[StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def packed(bag, request, tmp_path_factory):
+    return pack(bag, tmp_path_factory.mktemp('packed') / 'bag', request.param)
 
 
 def test_it_replays_bit_for_bit(packed, capsys):
@@ -51,3 +53,11 @@ def test_it_is_read_reported_exported_and_learned_from(bag, packed, tmp_path, ca
     ):
         assert main(words) == 0, capsys.readouterr().err
     assert (tmp_path / 'packed.csv').read_bytes() == (tmp_path / 'plain.csv').read_bytes()
+
+
+def test_it_is_recovered_as_a_bag_that_needs_no_unpacking(bag, tmp_path, capsys):
+    packed = pack(bag, tmp_path / 'bag', StoragePlugin.MCAP)
+    (packed / 'metadata.yaml').unlink()  # as a killed recorder leaves it
+    assert main(['recover', str(packed), '--out', str(tmp_path / 'clean')]) == 0
+    assert recorded_run.messages(tmp_path / 'clean') == recorded_run.messages(bag)
+    assert main(['replay', str(tmp_path / 'clean')]) == 0, capsys.readouterr().err

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
 from mcap.records import Channel
+from zstandard import FRAME_HEADER, ZstdDecompressor, ZstdError
 
 from blf_dsc_controller.bags.context import ATTACHMENT, MESSAGES, RECORD, Losses, statistics
 from blf_dsc_controller.bags.mcap_reader import StoredMessage, mcap_files
@@ -16,6 +18,8 @@ from blf_dsc_controller.bags.salvage import Loss, Salvage
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.messages.types import Definition, UnknownTypeError, definition
+
+_LARGEST = 1 << 28  # bytes, message
 
 
 @dataclass
@@ -95,6 +99,9 @@ class _Transfer:
         if handle is None:
             return False
         self.missing[channel.topic].count(sequence)
+        if raw.startswith(FRAME_HEADER):  # compressed by message, as metadata.yaml would say
+            with suppress(ZstdError):
+                raw = ZstdDecompressor().stream_reader(raw).read(_LARGEST)
         self.bag.write(handle, raw, log_time, publish_time, sequence)
         return True
 
