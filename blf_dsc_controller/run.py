@@ -19,8 +19,8 @@ class Series:
     """Values by name over stamps of their own."""
 
     names: tuple[str, ...]
-    stamp: Stamps  # (m,) ns, increasing
-    values: Floats  # (m, number of names)
+    stamp: Stamps  #: (m,) ns, increasing
+    values: Floats  #: (m, number of names)
 
     def select(self, names: Sequence[str]) -> Floats:
         """Columns of these names, (m, number of `names`)."""
@@ -46,12 +46,11 @@ class Series:
 class Stop(NamedTuple):
     """A safe stop of the controller."""
 
-    stamp: int  # ns, of the last joint state before it
-    reason: str
-    text: str  # with the figures
-    until: int | None = (
-        None  # ns, of the last joint state before the next start; the end of the run
-    )
+    stamp: int  #: ns, of the last joint state before it
+    reason: str  #: as `reason` on ~/state
+    text: str  #: with the figures
+    until: int | None = None
+    """ns, of the last joint state before the next start; the end of the run"""
 
 
 Regressor = Callable[[Floats, Floats, Floats, Floats, Floats], None]
@@ -74,27 +73,27 @@ class Run:
     """N samples of n joints, simulated, recorded or replayed; None or NaN where unknown."""
 
     joints: tuple[str, ...]
-    stamp: Stamps  # (N,) ns, of the joint states
-    received: Stamps  # (N,) ns, when the recorder got them
-    position: Floats  # (N, n) rad, q as measured
-    velocity: Floats  # (N, n) rad/s, as measured
-    torque: Floats  # (N, n) N m, applied from this sample to the next
-    reference: Floats | None  # (N, n) rad, qr
-    error: Floats | None  # (N, n) rad, xi1 = q - qr
-    bound: Floats | None  # (N, n) rad, k_c
-    torque_limit: Floats | None  # (N, n) N m
+    stamp: Stamps  #: (N,) ns, of the joint states
+    received: Stamps  #: (N,) ns, when the recorder got them
+    position: Floats  #: (N, n) rad, q as measured
+    velocity: Floats  #: (N, n) rad/s, as measured
+    torque: Floats  #: (N, n) N m, applied from this sample to the next
+    reference: Floats | None  #: (N, n) rad, qr
+    error: Floats | None  #: (N, n) rad, xi1 = q - qr
+    bound: Floats | None  #: (N, n) rad, k_c
+    torque_limit: Floats | None  #: (N, n) N m
     learning: Series | None = None
     truth: Series | None = None
     timing: Series | None = None
     monitor: Series | None = None
     message_counts: Mapping[str, int] = field(default_factory=dict)
-    rejected: Mapping[str, str] = field(default_factory=dict)  # disturbance columns, and why
+    rejected: Mapping[str, str] = field(default_factory=dict)  #: disturbance columns, and why
     stops: tuple[Stop, ...] = ()
-    arm: LearnedArm | None = None  # of a URDF
-    learns: bool = True  # from the prediction error; false for a law that does not use it
-    effort: Floats | None = None  # (N, n) N m, as measured
-    reference_velocity: Floats | None = None  # (N, n) rad/s
-    xi2: Floats | None = None  # (N, n) rad/s
+    arm: LearnedArm | None = None  #: of a URDF
+    learns: bool = True  #: from the prediction error; false for a law that does not use it
+    effort: Floats | None = None  #: (N, n) N m, as measured
+    reference_velocity: Floats | None = None  #: (N, n) rad/s
+    xi2: Floats | None = None  #: (N, n) rad/s
 
     @property
     def time(self) -> Floats:

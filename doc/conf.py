@@ -36,6 +36,8 @@ myst_heading_anchors = 3
 
 highlight_language = 'none'  # of indented blocks
 default_role = 'code'  # docstrings write `name`
+autodoc_member_order = 'bysource'
+autodoc_type_aliases = {name: name for name in ('Array', 'Floats', 'Stamps')}
 autodoc_typehints_format = 'short'
 python_use_unqualified_type_names = True
 nitpicky = True
@@ -72,6 +74,13 @@ def draw(translator: HTML5Translator, node: nodes.math | nodes.math_block) -> No
     raise nodes.SkipNode
 
 
+def escape(*given: list[str]) -> None:
+    """Take |x| in a docstring for the size of x, not for a substitution."""
+    lines = given[-1]
+    lines[:] = [line.replace('|', '\\|') for line in lines]
+
+
 def setup(app: Sphinx) -> None:
-    """Tell Sphinx of the renderer."""
+    """Tell Sphinx of the two."""
+    app.connect('autodoc-process-docstring', escape)
     app.add_html_math_renderer('drawn', (draw, None), (draw, None))

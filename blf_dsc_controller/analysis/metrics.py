@@ -172,21 +172,21 @@ def first_violation(run: Run) -> tuple[float, str]:
 class Metrics:
     """Metrics of n joints; NaN for what is unknown or has not happened."""
 
-    max_error: tuple[float, ...]  # (n,) rad, of |xi1|
-    rms_error: tuple[float, ...]  # (n,) rad
-    bound: tuple[float, ...]  # (n,) rad, the smallest
-    peak_torque: tuple[float, ...]  # (n,) N m
-    rms_torque: tuple[float, ...]  # (n,) N m
-    torque_limit: tuple[float, ...]  # (n,) N m, the smallest
-    torque_rate: tuple[float, ...]  # (n,) N m/s, rms of the change per sample time
-    max_error_ratio: float  # of |xi1| / k_c
-    first_violation: float  # s
+    max_error: tuple[float, ...]  #: (n,) rad, of |xi1|
+    rms_error: tuple[float, ...]  #: (n,) rad
+    bound: tuple[float, ...]  #: (n,) rad, the smallest
+    peak_torque: tuple[float, ...]  #: (n,) N m
+    rms_torque: tuple[float, ...]  #: (n,) N m
+    torque_limit: tuple[float, ...]  #: (n,) N m, the smallest
+    torque_rate: tuple[float, ...]  #: (n,) N m/s, rms of the change per sample time
+    max_error_ratio: float  #: of |xi1| / k_c
+    first_violation: float  #: s
     violating_joint: str
-    latch_time: float  # s
-    parameter_error: dict[int, float]  # `Estimates.relative_error` at MOMENTS
+    latch_time: float  #: s
+    parameter_error: dict[int, float]  #: `Estimates.relative_error` at MOMENTS
     final_parameter_error: float
-    tail_parameter_error: float  # rms over the last ten seconds
-    time_to_1_percent: float  # s, from which on the parameter error stays below
+    tail_parameter_error: float  #: rms over the last ten seconds
+    time_to_1_percent: float  #: s, from which on the parameter error stays below
 
     @property
     def held(self) -> bool | None:

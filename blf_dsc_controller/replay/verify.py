@@ -32,13 +32,13 @@ _TURNS = (EventType.ACTIVATE, EventType.DEACTIVATE, EventType.RESET, EventType.S
 class Verification(NamedTuple):
     """What a replay found."""
 
-    stamp: Stamps  # (N,) ns, of the states that the law used
-    passed_over: int  # number of states that it did not use
-    comparisons: tuple[Comparison, ...]  # one for each topic of the controller
-    events: tuple[Event, ...]  # that were replayed
-    safe_torques: int  # number of replayed torques that are not the law's
-    remarks: tuple[str, ...]  # what limits the result
-    difference: Difference | None  # the earliest, in a topic or in an event
+    stamp: Stamps  #: (N,) ns, of the states that the law used
+    passed_over: int  #: number of states that it did not use
+    comparisons: tuple[Comparison, ...]  #: one for each topic of the controller
+    events: tuple[Event, ...]  #: that were replayed
+    safe_torques: int  #: number of replayed torques that are not the law's
+    remarks: tuple[str, ...]  #: what limits the result
+    difference: Difference | None  #: the earliest, in a topic or in an event
 
     @property
     def compared(self) -> float:
