@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from harness import Contestant, ContestantError, Ratio, Watched, own_graph, ratio, wait_for
 
-from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.controller import ControllerConfig, Telemetry
 from blf_dsc_controller.configuration.nodes import CONTROLLER, LoopConfig
 from blf_dsc_controller.configuration.params_file import dump, load_loop
 from blf_dsc_controller.messages import topics
@@ -41,9 +41,10 @@ _NULL = 'null node, serialised messages'
 _NULL_TYPED = 'null node'
 _QUIET = 'controller, telemetry off'
 _TELLING = 'controller, telemetry on'
+_SPARSE = 'controller, telemetry of every 10th sample'
 _RECORDED = 'controller, telemetry and recorder on'
-_PROCESSES = (_NULL, _NULL_TYPED, _QUIET, _TELLING, _RECORDED)
-_GUESTS = (_NULL, _QUIET, _TELLING)
+_PROCESSES = (_NULL, _NULL_TYPED, _QUIET, _SPARSE, _TELLING, _RECORDED)
+_GUESTS = (_NULL, _QUIET, _SPARSE, _TELLING)
 _PRESETS = {'recommended': 'node', 'panda': 'node with seven joints'}
 _HERE = Path(__file__).parent
 
@@ -54,6 +55,10 @@ class Run(NamedTuple):
     latency: np.ndarray  # (_STEPS,) s, state published to torque received
     elapsed: float  # s
     cpu: float  # s of the node's process
+
+
+def _telemetry_of(name: str) -> Telemetry:
+    return Telemetry(enabled=name != _QUIET, decimation=10 if name == _SPARSE else 1)
 
 
 def _silent(context: Any) -> dict[str, Any]:
@@ -77,8 +82,9 @@ class Guest:
             echo(self.node, 'raw')
         else:
             parameter: Any = Parameter  # rclpy's, without types
-            telemetry = parameter('telemetry.enabled', value=name != _QUIET)
-            self.node = ControllerNode(parameter_overrides=[telemetry], **_silent(context))
+            telemetry = vars(_telemetry_of(name)).items()
+            overrides = [parameter(f'telemetry.{key}', value=value) for key, value in telemetry]
+            self.node = ControllerNode(parameter_overrides=overrides, **_silent(context))
 
     def check(self) -> None:
         """Nothing to be seen: an error of the node is one of this process."""
@@ -281,7 +287,7 @@ def _started(name: str, config: ControllerConfig, path: Path) -> Iterator[list[C
 def _command(name: str, config: ControllerConfig, params: Path) -> list[str]:
     if name in (_NULL, _NULL_TYPED):
         return [str(_HERE / 'null_node.py'), 'raw' if name == _NULL else 'typed']
-    telemetry = replace(config.telemetry, enabled=name != _QUIET)
+    telemetry = _telemetry_of(name)
     observers = int(name == _RECORDED)
     dump(params, {CONTROLLER: replace(config, telemetry=telemetry, wait_for_subscribers=observers)})
     module = 'blf_dsc_controller.nodes.controller_node'

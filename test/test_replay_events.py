@@ -29,7 +29,7 @@ class Recorder(Rig):
     def __init__(self, given=None, **options):
         self.entries = []
         super().__init__(given, **options)
-        self.telemetry = ControllerTelemetry(JOINTS, estimate_names(self.config))
+        self.telemetry = ControllerTelemetry(JOINTS, estimate_names(self.config), 1)
         self.drops = ()  # numbers of the joint states that the controller does not get
         self.count = 0
 

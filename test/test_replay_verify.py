@@ -61,6 +61,22 @@ def rewritten(bag, entries, tmp_path):
     return write
 
 
+def test_decimated_telemetry_replays_bit_for_bit(bag, tmp_path):
+    """The tracking error of each sample stays: by it the replay knows the states of the law."""
+    sparse = recorded_run.record(tmp_path / 'sparse', **{'telemetry.decimation': 7})
+    result, all_of_it = verify(sparse), verify(bag)
+    assert result.difference is None
+    assert result.compared == 1.0
+    counts, full = compared(result), compared(all_of_it)
+    assert counts['learning'] < full['learning'] / 6.9
+    assert counts['tracking_error'] == full['tracking_error']
+    assert counts['commands'] == full['commands']
+    run, whole = read_run(sparse), read_run(bag)
+    np.testing.assert_array_equal(run.error, whole.error)
+    np.testing.assert_allclose(run.reference, whole.reference, rtol=0.0, atol=1e-15)
+    assert run.learning.stamp.size == -(-SAMPLES // 7)
+
+
 def test_every_number_is_the_same(bag):
     result = verify(bag)
     assert result.difference is None
@@ -202,7 +218,7 @@ def retuned(bag):
     config = recorded_run.loop_config().controller
     content = read_content(bag)
     states = content.topics[JOINT_STATES].joint_states(config.joints)
-    telemetry = ControllerTelemetry(config.joints, estimate_names(config))
+    telemetry = ControllerTelemetry(config.joints, estimate_names(config), 1)
     law = controller_of(config)
     before = START - MILLISECOND
     yield from journal_of(bag)

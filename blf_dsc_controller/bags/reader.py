@@ -43,6 +43,8 @@ def read_run(path: str | Path, namespace: str = '', names: NameMap = NO_NAMES) -
     error = None if errors is None else errors.position.exact(states.stamp)
     if error is None and reference is not None:
         error = states.values[:, 0] - reference
+    elif error is not None and reference is not None:  # which may come less often
+        reference = np.where(np.isnan(reference), states.values[:, 0] - error, reference)
     return Run(
         joints=joints,
         stamp=states.stamp,

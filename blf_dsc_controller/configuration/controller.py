@@ -110,6 +110,12 @@ class Telemetry:
     enabled: bool = parameter(
         True, 'publish reference, errors, estimates and monitors', read_only=_TOPICS
     )
+    decimation: int = parameter(
+        1,
+        'samples from one message of reference and estimates to the next; errors come with each',
+        at_least=1,
+        read_only=_TOPICS,
+    )
 
 
 @dataclass(frozen=True)

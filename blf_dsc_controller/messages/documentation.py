@@ -27,19 +27,20 @@ This page is generated: `python -m blf_dsc_controller.messages.documentation doc
 """
 
 _NAMED = 'by name: '
+_OFTEN = 'every `telemetry.decimation`-th sample'
 _ABOUT = {
     topics.JOINT_STATES: (
         'each sample',
         'position and velocity as measured; effort: torque applied over the last sample',
     ),
     topics.COMMANDS: ('each sample', 'torque [N m], in the order of `joints`'),
-    topics.REFERENCE: ('each sample', 'position and velocity of the reference'),
+    topics.REFERENCE: (_OFTEN, 'position and velocity of the reference'),
     topics.TRACKING_ERROR: (
         'each sample',
         r'position: $\xi_1$ [rad], velocity: $\xi_2$ [rad/s], effort: torque after its limit',
     ),
     topics.LEARNING: (
-        'each sample',
+        _OFTEN,
         (
             f'{_NAMED}each estimate, `{topics.DISTURBANCE}<joint>` (with the learned friction), '
             f'`{topics.LAMBDA_MIN}`, `{topics.LATCHED}`, `{topics.MODEL_CHANGES}` (times that the '

@@ -43,9 +43,12 @@ def disturbance_names(joints: Sequence[str]) -> tuple[str, ...]:
 
 
 class ControllerTelemetry:
-    """Messages of the controller of n joints and `estimates`, the m entries of theta^."""
+    """Messages of the controller of n joints and `estimates`, the m entries of theta^.
 
-    def __init__(self, joints: Sequence[str], estimates: Sequence[str]) -> None:
+    Reference and estimates come with every `decimation`-th sample.
+    """
+
+    def __init__(self, joints: Sequence[str], estimates: Sequence[str], decimation: int) -> None:
         learning = (*learning_names(estimates, joints), topics.COMPUTE_TIME)
         self._command = Float64MultiArrayEncoder(len(joints))
         self._reference = JointStateEncoder(joints, ('position', 'velocity'))
@@ -53,6 +56,7 @@ class ControllerTelemetry:
         self._bound = JointStateEncoder(joints, ('position', 'effort'))
         self._learning = JointStateEncoder(learning, ('position',))
         self._values = np.zeros(len(learning))
+        self._decimation, self._samples = decimation, 0
 
     def command(self, torque: np.ndarray) -> Message:
         """Commanded torque (n,) [N m]."""
@@ -64,12 +68,16 @@ class ControllerTelemetry:
         return topics.BOUND, message
 
     def sample(self, stamp: int, sample: Sample, compute_time: float) -> Iterator[Message]:
-        """Messages of the sample of a joint state: its stamp [ns], telemetry, update time [s]."""
+        """Messages of the sample of a joint state: its stamp [ns], telemetry, update time [s].
+
+        The tracking error comes with each: by it a replay knows which states the law has used.
+        """
+        error = self._error.encode(stamp, sample.xi1, sample.xi2, sample.torque)
+        yield topics.TRACKING_ERROR, error
+        self._samples += 1
+        if (self._samples - 1) % self._decimation:
+            return
         yield topics.REFERENCE, self._reference.encode(stamp, sample.qr, sample.dqr)
-        yield (
-            topics.TRACKING_ERROR,
-            self._error.encode(stamp, sample.xi1, sample.xi2, sample.torque),
-        )
         figures = sample.lambda_min, sample.latched, sample.changes, (compute_time,)
         np.concatenate((sample.estimate, sample.disturbance, *figures), out=self._values)
         yield topics.LEARNING, self._learning.encode(stamp, self._values)

@@ -47,7 +47,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self.guard: Guard | None = None
         joints = self.config.joints
         self._estimates = assembly.estimate_names(self.config)
-        self._telemetry = ControllerTelemetry(joints, self._estimates)
+        self._telemetry = ControllerTelemetry(
+            joints, self._estimates, self.config.telemetry.decimation
+        )
         self._monitor: Monitor | None = None
         self._learning_events = (0.0, 0.0, 0.0)  # columns checked, columns in use, model changes
         self._published_bound = np.zeros(len(joints))

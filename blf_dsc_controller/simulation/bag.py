@@ -59,7 +59,8 @@ def write_bag(
 
 def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, Message]]:
     plant = PlantTelemetry(config.joints, record.parameters)
-    controller = ControllerTelemetry(config.joints, estimate_names(config))
+    decimation = config.telemetry.decimation
+    controller = ControllerTelemetry(config.joints, estimate_names(config), decimation)
     monitor = Monitor(config.joints, estimate_names(config), record.controller.settings)
     limit = np.array(config.torque.limit)
     events = deque(record.journal.pending)
