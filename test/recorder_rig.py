@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import rclpy
 from own_domain import own_domain
@@ -20,6 +21,7 @@ from blf_dsc_controller.messages.codecs import JointStateEncoder
 
 PATIENCE = 300.0  # s, until a test gives up on what should take a moment
 RECORDER = (sys.executable, '-m', 'blf_dsc_controller.nodes.recorder_node', '--ros-args')
+ODD_PARTICIPANT = Path(__file__).with_name('odd_participant.py')
 ENCODER = JointStateEncoder(['joint1', 'joint2'])
 # Kept for the recorder, which may match a moment after the publisher has.
 KEPT = QoSProfile(depth=5000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -53,6 +55,12 @@ class Rig:
         )
         self.processes.append(process)
         return process
+
+    def start_odd(self, *topics):
+        """Start a participant that publishes topics such as `b=foo::bar::Name`; see there."""
+        command = [sys.executable, ODD_PARTICIPANT, *topics]
+        environment = {**os.environ, 'ROS_DOMAIN_ID': str(self.domain)}
+        self.processes.append(subprocess.Popen(command, env=environment))
 
     def record(self, output, **parameters):
         """Start a recorder and wait until it listens."""

@@ -11,12 +11,14 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from foreign_readers import read
-from recorder_rig import PATIENCE, Rig
+from recorder_rig import ENCODER, PATIENCE, Rig
 from small_disk import small_disk
 from std_srvs.srv import Trigger
 
 from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.recover import recover
+
+ENCODED = ENCODER.encode(1, [1, 2], [3, 4], [5, 6])[12:]  # behind the stamp
 
 
 @pytest.fixture
@@ -68,3 +70,31 @@ def test_the_parameters_of_who_publishes_are_in_the_bag(rig, tmp_path):
     context = read_context(tmp_path / 'bag')
     assert '/source:\n  ros__parameters:\n    gain: [1.0, 2.0]\n' in context.configuration
     assert context.facts['messages /a'].startswith('0 written, 0 missed')
+
+
+def test_names_that_no_ros_package_has_import_nothing_and_end_nothing(rig, tmp_path):
+    process = rig.record(tmp_path / 'bag', topics='[a, b, c, d, e]')
+    names = {'b': 'unittest::__main__::X', 'c': 'foo::X', 'd': 'unittest::msg::X', 'e': 'X'}
+    rig.start_odd(*(f'{topic}={name}' for topic, name in names.items()))
+    said = wait_for_lines(process, [f'/{topic} is not recorded: its type' for topic in names])
+    assert '/b is not recorded: its type unittest/__main__/X is not installed here' in said
+    assert '/c is not recorded: its type foo/X is not installed here' in said
+    rig.publish(1)
+    rig.start_odd('f=std_msgs::msg::\udce4')  # not UTF-8
+    wait_for_lines(process, ['the name of a topic or type is not UTF-8'])
+    rig.publish(2)
+    rig.wait_for(lambda: (tmp_path / 'bag' / 'bag_0.mcap').read_bytes().count(ENCODED) == 2)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0
+    assert [topic for topic, _, _ in read(tmp_path / 'bag')] == ['/a', '/a']
+
+
+def wait_for_lines(process, expected):
+    """Read what a recorder says until all of this was said; return it."""
+    said = ''
+    while not all(text in said for text in expected):
+        line = process.stderr.readline()
+        assert line, f'it has ended: {said}'
+        said += line
+    return said

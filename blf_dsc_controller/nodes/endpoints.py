@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sysconfig
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -23,14 +24,28 @@ from rosbags.typesys import get_types_from_msg
 from blf_dsc_controller.messages.topics import Quality, Topic
 from blf_dsc_controller.messages.types import UnknownTypeError, typestore
 
+_MESSAGE = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)')
+
 
 def message_class(type_name: str) -> Any:
     """Class of a message type such as `sensor_msgs/msg/JointState`.
 
-    Raises ImportError if its package is not installed, AttributeError if that has no such type.
+    Only packages of ROS are imported: the name may come from a bag, or from any DDS participant.
+
+    Raises ImportError if there is no such package, AttributeError if that has no such type.
     """
-    package, kind, name = type_name.split('/')
-    return getattr(importlib.import_module(f'{package}.{kind}'), name)
+    match = _MESSAGE.fullmatch(type_name)
+    if match is None or not (_share(match[1]) / 'package.xml').is_file():
+        raise ImportError(f'{type_name} is not a message of an installed ROS package')
+    return getattr(importlib.import_module(f'{match[1]}.msg'), match[2])
+
+
+def _share(package: str) -> Path:
+    """Folder of a package's data files, if there is one."""
+    try:
+        return Path(get_package_share_directory(package))
+    except (LookupError, OSError):  # a pip install sets no AMENT_PREFIX_PATH
+        return Path(sysconfig.get_path('data'), 'share', package)
 
 
 def register_definition(type_name: str) -> None:
@@ -40,13 +55,11 @@ def register_definition(type_name: str) -> None:
     """
     if type_name in typestore().fielddefs:
         return
-    package, kind, name = type_name.split('/')
+    match = _MESSAGE.fullmatch(type_name)
+    if match is None:
+        raise UnknownTypeError(type_name)
     try:
-        share = Path(get_package_share_directory(package))
-    except (LookupError, OSError):  # a pip install sets no AMENT_PREFIX_PATH
-        share = Path(sysconfig.get_path('data'), 'share', package)
-    try:
-        text = (share / kind / f'{name}.msg').read_text(encoding='utf-8')
+        text = (_share(match[1]) / 'msg' / f'{match[2]}.msg').read_text(encoding='utf-8')
     except OSError:
         raise UnknownTypeError(type_name) from None
     found = get_types_from_msg(text, type_name)

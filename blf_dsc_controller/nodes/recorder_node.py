@@ -34,6 +34,7 @@ from blf_dsc_controller.nodes.raw_subscriptions import RawSubscriptions, quality
 _DISCOVERY_PERIOD = 0.1  # s
 _TAKE_PERIOD = 0.01  # s
 _FLUSH_INTERVAL = 0.05  # s; with that of taking less than 0.1 s, unless the computer is overloaded
+_REPEAT = 60.0  # s between the same warning
 _MEGABYTE = 1_000_000
 _UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'  # of rmw
 _OF_EVERY_NODE = ('/parameter_events', '/rosout')
@@ -108,7 +109,15 @@ class BagRecorderNode(PlainNode):
             self.get_logger().info(line)
 
     def _discover(self) -> None:
-        for topic, types in self.get_topic_names_and_types():
+        try:
+            found = self.get_topic_names_and_types()
+        except UnicodeDecodeError:  # of one participant, but rclpy then tells of none
+            self.get_logger().warning(
+                'new topics cannot be found: the name of a topic or type is not UTF-8',
+                throttle_duration_sec=_REPEAT,
+            )
+            return
+        for topic, types in found:
             if topic in self._losses:
                 self._losses[topic].publishers_seen(self.count_publishers(topic))
                 if topic in self._anonymous:
