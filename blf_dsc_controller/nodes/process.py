@@ -91,9 +91,11 @@ def run(make_node: Callable[[], PlainNode]) -> int:
     except (BlfDscError, RCLError, OSError) as error:
         problem = str(error)
     finally:
-        if node is not None:
-            _close(node)
-        rclpy.try_shutdown()
+        try:
+            if node is not None:
+                _close(node)
+        finally:
+            rclpy.try_shutdown()
     if problem:  # last, so that it stands at the end of the output
         print(problem, file=sys.stderr)  # noqa: T201
         return 1
@@ -114,9 +116,10 @@ def spin_once(executor: Any, node: PlainNode) -> None:
 def _close(node: PlainNode) -> None:
     try:
         node.close()
-    except OSError as error:  # such as a full disk, already reported if it ended the node
+    except (BlfDscError, OSError, RCLError) as error:  # such as a full disk, or ROS shut down
         print(f'{node.get_name()} could not shut down cleanly: {error}', file=sys.stderr)  # noqa: T201
-    node.destroy_node()
+    finally:
+        node.destroy_node()
 
 
 def drain(publishers: Iterable[Publisher]) -> None:
