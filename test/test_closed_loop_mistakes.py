@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 
@@ -113,6 +114,17 @@ def test_offline_needs_no_ros(tmp_path):
     run = finished(sys.executable, '-c', WITHOUT_ROS, *offline)
     assert run.returncode == 0, run.stderr
     assert (out / 'bag' / 'metadata.yaml').is_file()
+
+
+def test_a_run_in_which_the_controller_stopped_says_so_by_its_exit_code(tmp_path):
+    path = written(tmp_path, controller='safety.velocity_limit: 0.0001')
+    out = tmp_path / 'out'
+    run = closed_loop('--config', path, '--offline', '--duration', 0.1, '--out', out)
+    assert run.returncode == 4, run.stderr
+    assert 'bound       held by every joint until the stop' in run.stdout
+    assert 'stopped     at 0.001 s, velocity not plausible' in run.stdout
+    (stop,) = json.loads((out / 'summary.json').read_text())['tracking']['stops']
+    assert stop['reason'] == 'velocity not plausible'
 
 
 @pytest.mark.parametrize(

@@ -33,8 +33,12 @@ from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.simulation.record import Record
 from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.supervision.supervisor import Reason
 from blf_dsc_controller.view.page import LOCAL, free_port, open_to_others, require_viser
 from sim_plant import kernels as plant_kernels
+
+STOPPED = 4
+"""Exit code where the controller stopped before the end."""
 
 _FOLDER = 'closed_loop'
 _DURATION = 60.0  # s, where neither the file nor an option gives one
@@ -56,14 +60,16 @@ def run(options: Namespace) -> int:
             _run_offline(config, out / 'bag')
         completed = options.offline or _run_over_ros(config, out, options)
         try:
-            _report(out)
+            stopped = _report(out)
         except BlfDscError as error:
             if completed:
                 raise
             print(f'blf_dsc run: interrupted, and nothing to draw: {error}', file=sys.stderr)
     except OSError as error:
         raise unwritable(Path(error.filename or out), error) from error
-    return 0 if completed else INTERRUPTED
+    if not completed:
+        return INTERRUPTED
+    return STOPPED if stopped else 0
 
 
 def make_folder(chosen: Path | None) -> Path:
@@ -182,8 +188,8 @@ def _print_notice() -> None:
     print(COMPILATION_NOTICE, file=sys.stderr, flush=True)
 
 
-def _report(out: Path) -> None:
-    """Draw and summarise the bag of a run."""
+def _report(out: Path) -> bool:
+    """Draw and summarise the bag of a run; return whether the controller stopped in it."""
     recorded = read_run(out / 'bag')
     summary = summarize(recorded)
     write_summary(summary, out / 'summary.json')
@@ -192,3 +198,5 @@ def _report(out: Path) -> None:
     for topic, text in read_context(out / 'bag').losses.items():
         print(f'warning: messages of {topic} are missing in the bag: {text}')
     print(f'wrote       {out}: bag, summary.json, {", ".join(path.name for path in pictures)}')
+    last = recorded.stamp[-1]  # after it the plant has ended, and the controller waits in vain
+    return any(stop.stamp < last or stop.reason != Reason.STATE_TIMEOUT for stop in recorded.stops)
