@@ -26,6 +26,7 @@ from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia, rotation
 from blf_dsc_controller.errors import BlfDscError
 
 MOVING = ('revolute', 'continuous', 'prismatic')
+_MOST = 500  # links, or joints
 
 
 Elements = Mapping[str, ET.Element]
@@ -109,7 +110,9 @@ def chain_joints(
     """
     links, elements = _parse(text)
     moved = {_link(element, 'child') for element in elements.values()}
-    base = base or next(link for link in links if link not in moved)
+    base = base or next((link for link in links if link not in moved), '')
+    if not base:
+        raise UrdfError(f'no link is the root: the links are {_listed(links)}, each below a joint')
     if not tip and not joints:
         raise UrdfError('neither a tip nor joints were given: set robot.tip')
     if not tip and joints[-1] not in elements:
@@ -185,8 +188,10 @@ def _body(
 def _parse(text: str) -> tuple[Elements, Elements]:
     """Links and joints of a URDF by name."""
     expand = 'expand it first: `xacro FILE > robot.urdf` (of ROS, or by `pip install xacro`)'
+    if '<!DOCTYPE' in text:  # whose entities could stand for gigabytes
+        raise UrdfError('a URDF has no <!DOCTYPE ...>: remove it, and write out its entities')
     try:
-        robot = ET.fromstring(text)  # noqa: S314 - as trusted as the robot that it describes
+        robot = ET.fromstring(text)  # noqa: S314 - without entities
     except ET.ParseError as error:
         hint = f'; this looks like xacro, {expand}' if 'xacro:' in text else ''
         raise UrdfError(f'not a URDF, which is XML: {error}{hint}') from error
@@ -198,6 +203,8 @@ def _parse(text: str) -> tuple[Elements, Elements]:
     named = []
     for tag in ('link', 'joint'):
         elements = robot.findall(tag)
+        if len(elements) > _MOST:
+            raise UrdfError(f'the URDF has {len(elements)} of <{tag}>; at most {_MOST} can be read')
         named.append({element.get('name', ''): element for element in elements})
         if len(named[-1]) < len(elements):
             raise UrdfError(f'each {tag} needs a name of its own; got {_listed(named[-1])}')

@@ -20,7 +20,7 @@ from blf_dsc_controller.configuration.nodes import (
 )
 from blf_dsc_controller.configuration.ros_yaml import Section, parse
 from blf_dsc_controller.configuration.schema import Value, build, flatten, parameters, unknown
-from blf_dsc_controller.configuration.share import share_folder
+from blf_dsc_controller.configuration.share import read_text, share_folder
 from blf_dsc_controller.errors import ConfigurationError
 
 Config = TypeVar('Config')
@@ -48,7 +48,7 @@ def locate(given: str | Path) -> Path:
 def read(path: str | Path) -> list[Section]:
     """Read the sections of a parameter file; ConfigurationError names the file and the line."""
     try:
-        return parse(Path(path).read_text(encoding='utf-8'))
+        return parse(read_text(Path(path)))
     except (UnicodeDecodeError, OSError) as error:
         raise ConfigurationError([str(error)], str(path)) from error
     except ConfigurationError as error:

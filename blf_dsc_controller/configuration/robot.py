@@ -15,7 +15,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.urdf import Chain, UrdfError, chain_joints, moving_joints, read_chain
 from blf_dsc_controller.configuration.schema import build, counted, parameter
-from blf_dsc_controller.configuration.share import resolve
+from blf_dsc_controller.configuration.share import read_text, resolve
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ def read_urdf(given: str) -> str:
             'robot.urdf`) and give that'
         )
     try:
-        return resolve(given).read_text(encoding='utf-8')
+        return read_text(resolve(given))
     except (OSError, UnicodeDecodeError) as error:
         raise BlfDscError(f'{given!r} cannot be read: {error}') from error
 

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, cast
 
 import yaml
 
+from blf_dsc_controller.configuration.bounded_yaml import UnreasonableYamlError, check_yaml
 from blf_dsc_controller.errors import ConfigurationError
 
 _TRUE = ('Y', 'y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON')
@@ -64,11 +65,13 @@ def parse(text: str) -> list[Section]:
     Raises ConfigurationError, with the line, if the text is not YAML or not a parameter file.
     """
     try:
+        check_yaml(text)
         root = _Composer(text).get_single_node()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f'line {mark.line + 1}: ' if mark else ''
-        raise ConfigurationError([f'{line}not valid YAML: {error.problem}']) from error
+        kind = '' if isinstance(error, UnreasonableYamlError) else 'not valid YAML: '
+        raise ConfigurationError([f'{line}{kind}{error.problem}']) from error
     except yaml.YAMLError as error:
         raise ConfigurationError([f'not valid YAML: {error}']) from error
     if root is None:
@@ -97,16 +100,9 @@ def parse_scalar(word: str) -> bool | int | float | str:
 
 
 class _Composer(yaml.BaseLoader):
-    """Keeps each word as written, and rejects aliases, as rcl does."""
+    """Keeps each word as written."""
 
     DEFAULT_SCALAR_TAG = '?'  # type: ignore[misc] # not that of an explicit !!str
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        """Compose a node, which must not be an alias."""
-        if self.check_event(yaml.AliasEvent):
-            event: Any = self.get_event()  # type: ignore[no-untyped-call]
-            raise _error(_line(event), f'ROS does not support the reference *{event.anchor}')
-        return super().compose_node(parent, index)
 
 
 def _sections(node: yaml.Node, name: str) -> Iterator[Section]:

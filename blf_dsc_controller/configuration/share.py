@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import stat
 import sysconfig
 from contextlib import suppress
 from pathlib import Path
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
 _PACKAGE = 'blf_dsc_controller'
 _CHECKOUT = Path(__file__).resolve().parents[2]
+_LARGEST = 1 << 24  # bytes of a parameter file, a URDF or a metadata.yaml
 
 
 def share_folder() -> Path:
@@ -50,6 +52,16 @@ def resolve(url: str) -> Path:
     if path.is_file() or not own.is_file():
         return path
     return own
+
+
+def read_text(path: Path) -> str:
+    """Text of a file; OSError if it is not a regular one or too large, or UnicodeDecodeError."""
+    state = path.stat()
+    if not stat.S_ISREG(state.st_mode):
+        raise OSError(f'{path} is not a regular file: give a file')
+    if state.st_size > _LARGEST:
+        raise OSError(f'{path} has {state.st_size} bytes; expected text of at most {_LARGEST}')
+    return path.read_text(encoding='utf-8')
 
 
 def _share_of(package: str) -> Path:
