@@ -14,10 +14,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mcap.reader import make_reader
+from mcap.records import Metadata
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.mcap_reader import mcap_files
+from blf_dsc_controller.bags.folder import checked
+from blf_dsc_controller.bags.mcap_index import context_records
+from blf_dsc_controller.bags.mcap_reader import MalformedRecordError, mcap_files
 from blf_dsc_controller.bags.sources import BagError, open_bag
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import is_builtin
@@ -188,11 +190,10 @@ def read_context(path: Path) -> Context:
     facts: dict[str, str] = {}
     texts: dict[tuple[int, str], None] = {}
     for file in mcap_files(path):
-        with suppress(Exception), file.open('rb') as stream:
-            reader = make_reader(stream)
-            for record in reader.iter_metadata():
-                facts.update(record.metadata if record.name == RECORD else {})
-            for one in reader.iter_attachments():
-                if one.name == ATTACHMENT:
+        with suppress(MalformedRecordError, OSError):
+            for one in context_records(*checked(path, [file])):
+                if isinstance(one, Metadata):
+                    facts.update(one.metadata if one.name == RECORD else {})
+                elif one.name == ATTACHMENT:
                     texts[one.log_time, one.data.decode(errors='replace')] = None
     return Context(path, tuple(texts), facts)

@@ -23,16 +23,21 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
+    AttachmentIndex,
     Channel,
     Chunk,
+    ChunkIndex,
     DataEnd,
     Footer,
     Metadata,
+    MetadataIndex,
     Schema,
+    Statistics,
     SummaryOffset,
 )
-from mcap.stream_reader import get_chunk_data_stream
 from zstandard import ZstdError
+
+from blf_dsc_controller.bags.unpacking import LARGEST_CHUNK, Unpacker
 
 Data: TypeAlias = bytes | mmap
 
@@ -43,20 +48,27 @@ INDEX = Struct('<BQHI')
 """Opcode, length, channel number, bytes of the entries, of a message index."""
 
 _CHUNK_BYTE = bytes([Opcode.CHUNK])
-_MAGIC = b'\x89MCAP0\r\n'
+MAGIC = b'\x89MCAP0\r\n'
+_SMALLEST = 45  # bytes: the magic twice, and a footer
 _HEAD = Struct('<BQ')  # opcode and length of the content, before each record
 _MESSAGE = Struct('<BQHIQQ')
+_CHUNK = Struct('<BQQQQII')  # up to the length of the name of its compression
 _COMPRESSIONS = ('', 'zstd', 'lz4')
+_COMPRESSION_BYTES = tuple(name.encode() for name in _COMPRESSIONS)
 _OPCODES = frozenset(Opcode)
 _CHANNEL, _MESSAGE_CODE, _SCHEMA = int(Opcode.CHANNEL), int(Opcode.MESSAGE), int(Opcode.SCHEMA)
 _KINDS: dict[int, Any] = {
     Opcode.ATTACHMENT: Attachment,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
     Opcode.CHANNEL: Channel,
     Opcode.CHUNK: Chunk,
+    Opcode.CHUNK_INDEX: ChunkIndex,
     Opcode.DATA_END: DataEnd,
     Opcode.FOOTER: Footer,
     Opcode.METADATA: Metadata,
+    Opcode.METADATA_INDEX: MetadataIndex,
     Opcode.SCHEMA: Schema,
+    Opcode.STATISTICS: Statistics,
     Opcode.SUMMARY_OFFSET: SummaryOffset,
 }
 
@@ -72,7 +84,7 @@ class Piece(NamedTuple):
     size: int
     opcode: int
     raw: bytes = b''  # the record with its head; empty for a gap
-    record: Any = None  # attachment, channel, chunk, metadata or schema
+    record: Any = None  # of one of _KINDS
     reason: str = ''  # of a gap
 
 
@@ -87,19 +99,23 @@ def _file_number(path: Path) -> tuple[int, str]:
     return (int(number) if number.isdecimal() else -1, path.name)
 
 
-def read_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+def read_messages(
+    path: Path, topics: Collection[str], unpacker: Unpacker
+) -> Iterator[tuple[str, int, bytes]]:
     """Topic, log time [ns] and content of each message of `topics`, in the order of the file.
 
     Raises:
         MalformedRecordError: the file is damaged.
+        BlfDscError: it unpacks to too much.
     """
     channels: dict[int, Channel] = {}
     with path.open('rb') as stream, mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
+        require_ends(data)
         for piece in scan(data):
             records = b''
             if piece.opcode == Opcode.CHUNK:
                 try:
-                    records = unpack(piece.record)
+                    records = unpack(piece.record, unpacker)
                 except MalformedRecordError as error:
                     reason = f'the chunk at byte {piece.at} is damaged: {error}'
                     raise MalformedRecordError(reason) from error
@@ -152,13 +168,19 @@ def messages_in(
         at = end
 
 
-def scan(data: Data) -> Iterator[Piece]:
-    """Whole records and gaps of a file, in its order; together all but the magic bytes."""
-    at = len(_MAGIC) if data[: len(_MAGIC)] == _MAGIC else 0
+def require_ends(data: Data) -> None:
+    """Raise MalformedRecordError unless a file begins and ends as MCAP."""
+    if len(data) < _SMALLEST or data[: len(MAGIC)] != MAGIC or data[-len(MAGIC) :] != MAGIC:
+        raise MalformedRecordError('it does not begin and end as an MCAP file')
+
+
+def scan(data: Data, begin: int = 0) -> Iterator[Piece]:
+    """Whole records and gaps of a file from a byte on, in order; all but the magic bytes."""
+    at = begin or (len(MAGIC) if data[: len(MAGIC)] == MAGIC else 0)
     is_chunked = False
-    while at < len(data) and not (at == len(data) - len(_MAGIC) and data[at:] == _MAGIC):
+    while at < len(data) and not (at == len(data) - len(MAGIC) and data[at:] == MAGIC):
         try:
-            piece = _piece(data, at, is_chunked=is_chunked)
+            piece = record_at(data, at, is_chunked=is_chunked)
         except MalformedRecordError as error:
             end = data.find(_CHUNK_BYTE, at + 1)
             while end >= 0 and not _is_chunk(data, end):
@@ -170,19 +192,22 @@ def scan(data: Data) -> Iterator[Piece]:
         at += piece.size
 
 
-def unpack(chunk: Chunk) -> bytes:
+def unpack(chunk: Chunk, unpacker: Unpacker) -> bytes:
     """Uncompressed records of a chunk.
 
     Raises:
         MalformedRecordError: they are not what was written.
+        BlfDscError: the bag unpacks to too much.
     """
+    written = chunk.uncompressed_size
+    if written > LARGEST_CHUNK:
+        raise MalformedRecordError(f'{written} bytes, unpacked; at most {LARGEST_CHUNK} are read')
     try:
-        stream, size = get_chunk_data_stream(chunk)
-        records = stream.read(size)
-    except (McapError, ZstdError, RuntimeError, ValueError, OverflowError, MemoryError) as error:
+        records = unpacker.unpack(chunk.data, chunk.compression, written)
+    except (ZstdError, RuntimeError, ValueError, EOFError) as error:
         raise MalformedRecordError(f'cannot be decompressed: {error}') from error
-    if size != chunk.uncompressed_size:
-        raise MalformedRecordError(f'{size} bytes where {chunk.uncompressed_size} were written')
+    if len(records) != written:
+        raise MalformedRecordError(f'{len(records)} bytes where {written} were written')
     if chunk.uncompressed_crc and zlib.crc32(records) != chunk.uncompressed_crc:
         raise MalformedRecordError('the checksum differs')
     return records
@@ -201,7 +226,7 @@ def _head(data: Data, at: int) -> tuple[int, int]:
     return int(opcode), int(end)
 
 
-def _piece(data: Data, at: int, *, is_chunked: bool = False) -> Piece:
+def record_at(data: Data, at: int, *, is_chunked: bool = False) -> Piece:
     """Record at an offset, or MalformedRecordError if its content does not fit its length.
 
     Where the content does not determine its length, another record must follow. In a file that is
@@ -222,10 +247,16 @@ def _piece(data: Data, at: int, *, is_chunked: bool = False) -> Piece:
 
 
 def _is_chunk(data: Data, at: int) -> bool:
-    try:
-        return _piece(data, at).opcode == Opcode.CHUNK
-    except MalformedRecordError:
+    """Whether a chunk begins here, as far as its lengths tell, without a copy of it."""
+    if at + _CHUNK.size > len(data):
         return False
+    _, length, *_, name = _CHUNK.unpack_from(data, at)
+    named = at + _CHUNK.size
+    begin = named + name + 8  # of the records
+    if begin > len(data) or data[named : begin - 8] not in _COMPRESSION_BYTES:
+        return False
+    size = int.from_bytes(data[begin - 8 : begin], 'little')
+    return bool(begin + size == at + _HEAD.size + length <= len(data))
 
 
 def _parse(raw: bytes) -> Any:

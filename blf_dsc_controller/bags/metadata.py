@@ -9,8 +9,6 @@ from typing import Any, TypeAlias
 
 import yaml
 from rosbags.interfaces import (
-    ConnectionExtRosbag1,
-    ConnectionExtRosbag2,
     Qos,
     QosDurability,
     QosHistory,
@@ -20,7 +18,9 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
+from yaml import YAMLError
 
+from blf_dsc_controller.configuration.bounded_yaml import check_yaml
 from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.topics import FOREVER, HISTORY, STREAM, Quality
 from blf_dsc_controller.messages.types import Definition
@@ -125,26 +125,16 @@ def profile_of(quality: Quality) -> Profile:
 
 def parse_profiles(text: str) -> list[Profile]:
     """Profiles in such a text of any rosbag2; none, if it is something else."""
-    try:
-        return [{**profile} for profile in dump_qos_v9(parse_qos(text))]
-    except (ReaderError, KeyError, TypeError, AttributeError):
-        return []
+    return [{**profile} for profile in dump_qos_v9(_parsed(text))]
 
 
-def strongest_quality(
-    publishers: Iterable[ConnectionExtRosbag1 | ConnectionExtRosbag2],
-) -> Quality:
+def strongest_quality(profiles: Any, *, is_latched: bool = False) -> Quality:
     """Quality of service that every subscriber accepts who accepted one of the publishers.
 
-    The depth of a latched topic is as recorded, else that of a stream: none is lost in a burst.
+    Their `profiles` are as any rosbag2 stores them, as text or plain data. The depth of a latched
+    topic is as recorded, else that of a stream: none is lost in a burst.
     """
-    offered: list[Qos] = []
-    is_latched = False
-    for one in publishers:
-        if isinstance(one, ConnectionExtRosbag1):
-            is_latched |= bool(one.latching)
-        else:
-            offered += one.offered_qos_profiles
+    offered = _parsed(profiles)
     is_latched |= any(one.durability is QosDurability.TRANSIENT_LOCAL for one in offered)
     depth = max((one.depth for one in offered if one.history is QosHistory.KEEP_LAST), default=0)
     return replace(
@@ -159,6 +149,15 @@ def strongest_quality(
         if any(one.liveliness is QosLiveliness.MANUAL_BY_TOPIC for one in offered)
         else 'automatic',
     )
+
+
+def _parsed(profiles: Any) -> list[Qos]:
+    try:
+        if isinstance(profiles, str):
+            check_yaml(profiles)
+        return parse_qos(profiles)
+    except (ReaderError, YAMLError, KeyError, TypeError, ValueError, AttributeError):
+        return []
 
 
 def _shortest(times: Iterable[QosTime]) -> int:

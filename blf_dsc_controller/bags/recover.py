@@ -12,10 +12,12 @@ from mcap.records import Channel
 from zstandard import FRAME_HEADER, ZstdDecompressor, ZstdError
 
 from blf_dsc_controller.bags.context import ATTACHMENT, MESSAGES, RECORD, Losses, statistics
+from blf_dsc_controller.bags.folder import checked
 from blf_dsc_controller.bags.mcap_reader import StoredMessage, mcap_files
 from blf_dsc_controller.bags.metadata import parse_profiles
 from blf_dsc_controller.bags.salvage import Loss, Salvage
 from blf_dsc_controller.bags.sources import BagError
+from blf_dsc_controller.bags.unpacking import Unpacker
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.messages.types import Definition, UnknownTypeError, definition
 
@@ -49,15 +51,18 @@ def recover(path: Path, out: Path) -> Recovery:
 
     Raises:
         BagError: there is no MCAP file, or `out` exists already.
+        BlfDscError: it unpacks to too much.
+        OSError: a file is not a regular one, or is outside of the folder.
     """
-    files = [file for file in mcap_files(path) if file.is_file()]
+    files = [file for file in mcap_files(path) if file.exists()]
     if not files:
         raise BagError(f'{path} cannot be read as a bag: there is no MCAP file to recover')
+    unpacker = Unpacker(checked(path, files))
     recovery = Recovery(out)
     with BagWriter(out, flush_interval=None) as bag:
         transfer = _Transfer(bag, recovery.missing)
         for file in files:
-            salvage = Salvage(file)
+            salvage = Salvage(file, unpacker)
             recovery.unknown += transfer.copy(salvage)
             recovery.losses += salvage.losses
             if not salvage.is_complete:

@@ -21,6 +21,7 @@ from blf_dsc_controller.bags.mcap_reader import (
     scan,
     unpack,
 )
+from blf_dsc_controller.bags.unpacking import Unpacker
 from blf_dsc_controller.bags.writer import CHANNEL_RECORD, channel_checksum
 from blf_dsc_controller.messages.cdr import NANOSECONDS
 
@@ -57,6 +58,7 @@ class Salvage:
     """The content of one damaged file; complete once its `messages` have been read."""
 
     path: Path
+    unpacker: Unpacker | None = None  # of the whole bag, if this is one of its files
     schemas: dict[int, Schema] = field(default_factory=dict)  # by number in the file
     channels: dict[int, Channel] = field(default_factory=dict)
     attachments: list[Attachment] = field(default_factory=list)
@@ -68,12 +70,13 @@ class Salvage:
     def messages(self, data: Data) -> Iterator[StoredMessage]:
         """Every whole message of the file's content, in its order."""
         lost_chunk: Loss | None = None
+        unpacker = self.unpacker or Unpacker([self.path])
         counts: list[tuple[Loss, int, int]] = []
         for piece in scan(data):
             if piece.opcode == Opcode.CHUNK:
                 chunk, lost_chunk = piece.record, None
                 try:
-                    records = unpack(chunk)
+                    records = unpack(chunk, unpacker)
                 except MalformedRecordError as error:
                     lost_chunk = self._lose(piece, f'chunk: {error}')
                     lost_chunk.start = chunk.message_start_time

@@ -3,23 +3,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import TypeAlias
 
-import yaml
 from rosbags.rosbag1 import Reader as Reader1
-from rosbags.rosbag2 import Reader as Reader2
-from rosbags.rosbag2.storage_mcap import McapReader
+from rosbags.rosbag1.reader import decompressors
 
-from blf_dsc_controller.bags.mcap_reader import read_messages
+from blf_dsc_controller.bags import mcap_index, mcap_reader, sqlite_reader
+from blf_dsc_controller.bags.folder import METADATA, BagFolder, StoredTopic, checked, read_folder
 from blf_dsc_controller.bags.metadata import strongest_quality
+from blf_dsc_controller.bags.unpacking import Unpacker
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages.topics import FOREVER
 from blf_dsc_controller.messages.types import typestore
 
-_NEWEST = 9  # version of rosbag2's metadata.yaml that is known
-_STORAGES = ('mcap', 'sqlite3')
+Messages: TypeAlias = Iterator[tuple[str, int, bytes]]
+"""Topic, time of reception [ns] and content in CDR."""
+
+_FILES = {'.mcap': ('mcap', mcap_index.topics_of), '.db3': ('sqlite3', sqlite_reader.topics_of)}
+
+
+Read: TypeAlias = Callable[[Collection[str], 'tuple[int, int] | None'], Messages]
+"""Messages of these topics: all, or those of a span of time [ns] in their order."""
 
 
 class BagError(BlfDscError):
@@ -27,51 +37,34 @@ class BagError(BlfDscError):
 
 
 class OpenBag:
-    """An open bag. rosbags' AnyReader would reject bags with one bad type definition.
+    """An open bag.
 
-    `held` is name and type, empty where unknown, of each topic; `counts` its number of messages,
-    `offered` the quality of service that its publishers offered. `times` [ns] are those of the
-    first message and after the last.
+    Attributes:
+        held: name and type, empty where unknown, of each topic.
+        counts: number of messages of each topic.
+        offered: quality of service that the publishers of each topic offered.
+        times: of the first message and after the last [ns].
     """
 
-    def __init__(self, reader: Reader1 | Reader2) -> None:
-        self._reader = reader
-        held = dict.fromkeys((one.topic, one.msgtype) for one in reader.connections)
-        self.held = [(name, kind.replace('__schemaless__', '')) for name, kind in held]
-        self.counts = {name: reader.topics[name].msgcount for name, _ in self.held}
-        self.offered = {
-            name: strongest_quality([one.ext for one in reader.topics[name].connections])
-            for name, _ in self.held
-        }
-        self.times = (reader.start_time, reader.end_time)
+    def __init__(self, topics: Iterable[StoredTopic], times: tuple[int, int], read: Read) -> None:
+        self.held = list(dict.fromkeys((one.name, one.type) for one in topics))
+        self.counts: Counter[str] = Counter()
+        for one in topics:
+            self.counts[one.name] += one.message_count
+        self.offered = {one.name: one.offered for one in topics}
+        self.times = times
+        self._read = read
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, time of reception [ns] and content in CDR of every message of `topics`.
+    def messages(self, topics: Collection[str]) -> Messages:
+        """Every message of `topics`; those of one topic nearly in the order of their reception."""
+        return self._read(topics, None)
 
-        Those of one topic come nearly in the order of their reception.
-        """
-        files = _mcap_files(self._reader)
-        if files:
-            for file in files:
-                yield from read_messages(file, topics)
-        else:
-            yield from self.in_order(topics)
-
-    def in_order(
-        self, topics: Collection[str], start: int | None = None, stop: int | None = None
-    ) -> Iterator[tuple[str, int, bytes]]:
+    def in_order(self, topics: Collection[str], start: int = 0, stop: int = FOREVER) -> Messages:
         """The same from `start` on and before `stop` [ns], in the order of reception.
 
         Slower by half, but only a few chunks of the bag are in memory at a time.
         """
-        is_ros1 = isinstance(self._reader, Reader1)
-        # The common types serialise alike in ROS 1 and 2 but for padding and `seq` of the header.
-        chosen = [one for one in self._reader.connections if one.topic in topics]
-        for connection, received, raw in (
-            self._reader.messages(chosen, start, stop) if chosen else ()
-        ):
-            cdr = typestore().ros1_to_cdr(raw, connection.msgtype) if is_ros1 else raw
-            yield connection.topic, received, bytes(cdr)
+        return self._read(topics, (start, stop))
 
 
 @contextmanager
@@ -80,56 +73,99 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
 
     Raises:
         BagError: there is no bag, or it is damaged; also while it is read.
+        BlfDscError: it unpacks to too much.
     """
     try:
-        if path.suffix == '.bag':
-            with Reader1(path) as reader1:
-                yield OpenBag(reader1)
-        else:
-            with Reader2(path) as reader2:
-                yield OpenBag(reader2)
+        if path.suffix == '.bag' and not path.is_dir():
+            with Reader1(checked(path, [path])[0]) as reader1:
+                yield _ros1_bag(path, reader1)
+            return
+        bag = _described(path)
+        temporary = TemporaryDirectory() if bag.compression == 'file' else nullcontext('')
+        with temporary as folder:
+            yield _ros2_bag(bag, Path(folder))
     except BlfDscError:
         raise
-    except Exception as error:  # a damaged file makes the library raise nearly anything
+    except Exception as error:  # a damaged file makes libraries raise nearly anything
         raise BagError(f'{path} cannot be read as a bag: {_reason(path, error)}') from error
 
 
-def _mcap_files(reader: Reader1 | Reader2) -> list[Path]:
-    """Files of a bag in their order, if all are plain MCAP; else none."""
-    if isinstance(reader, Reader1) or reader.compression_mode:
-        return []
-    storages: list[Any] = getattr(reader.storage, 'storages', [reader.storage])
-    return [Path(str(one.path)) for one in storages if isinstance(one, McapReader)]
+def _described(path: Path) -> BagFolder:
+    """Files and topics of a folder, or of a storage file alone."""
+    if path.is_dir():
+        return read_folder(path)
+    (file,) = checked(path, [path])
+    if file.suffix not in _FILES:
+        raise ValueError(f'it is neither a folder nor one of {", ".join([*_FILES, ".bag"])}')
+    storage, topics_of = _FILES[file.suffix]
+    return BagFolder(storage, '', [file], *topics_of(file))
+
+
+def _ros2_bag(bag: BagFolder, temporary: Path) -> OpenBag:
+    """Bag of files that are unpacked into a folder first, if they are compressed as a whole."""
+    files = bag.files
+    if bag.compression == 'file':
+        files = [temporary / f'{k}' for k in range(len(files))]
+        unpacker = Unpacker(bag.files)
+        for packed, file in zip(bag.files, files, strict=True):
+            with packed.open('rb') as source, file.open('xb') as target:
+                unpacker.unpack_file(source, target)
+
+    def read(topics: Collection[str], span: tuple[int, int] | None) -> Messages:
+        unpacker = Unpacker(bag.files)
+        for file in files:
+            if bag.storage == 'sqlite3':
+                found = sqlite_reader.read_messages(file, topics, unpacker)
+            elif span is None:
+                found = mcap_reader.read_messages(file, topics, unpacker)
+            else:
+                found = mcap_index.read_in_order(file, topics, *span)
+            for topic, received, raw in found:
+                if span is None or span[0] <= received < span[1]:
+                    is_packed = bag.compression == 'message'
+                    yield topic, received, unpacker.unpack(raw, 'zstd') if is_packed else raw
+
+    return OpenBag(bag.topics, bag.times, read)
+
+
+def _ros1_bag(path: Path, reader: Reader1) -> OpenBag:
+    unpacker = Unpacker([path])
+    names = {function: name for name, function in decompressors.items()}
+    for at, chunk in reader.chunks.items():
+        unpack = partial(unpacker.unpack, compression=names[chunk.decompressor])
+        reader.chunks[at] = chunk._replace(decompressor=unpack)
+    topics = [
+        StoredTopic(
+            one.topic,
+            one.msgtype,
+            one.msgcount,
+            strongest_quality('', is_latched=bool(getattr(one.ext, 'latching', 0))),
+        )
+        for one in reader.connections
+    ]
+
+    def read(topics: Collection[str], span: tuple[int, int] | None) -> Messages:
+        # The common types serialise alike in ROS 1 and 2 but for padding and `seq` of the header.
+        chosen = [one for one in reader.connections if one.topic in topics]
+        for one, received, raw in reader.messages(chosen, *(span or ())) if chosen else ():
+            yield one.topic, received, bytes(typestore().ros1_to_cdr(raw, one.msgtype))
+
+    return OpenBag(topics, (reader.start_time, reader.end_time), read)
 
 
 def _reason(path: Path, error: Exception) -> str:
     if not path.exists():
         return 'there is no such folder'
     text = str(error).rstrip('.') or type(error).__name__
-    metadata = path / 'metadata.yaml'
     is_mcap = path.suffix == '.mcap'
     if path.is_dir():
         is_mcap = any(path.glob('*.mcap'))
-        if not metadata.exists():
+        if not (path / METADATA).exists():
             if not is_mcap:
                 return 'the folder has no metadata.yaml: it is not a bag'
             return (
                 'the folder has no metadata.yaml; was the recording interrupted? '
                 f'Recover it: bag_recover {path}'
             )
-        text = _other_format(metadata) or text
-    return f'{text}; to save the undamaged part: bag_recover {path}' if is_mcap else text
-
-
-def _other_format(metadata: Path) -> str:
-    """Why a metadata.yaml is not understood; empty if it is."""
-    try:
-        tree = yaml.safe_load(metadata.read_text(encoding='utf-8'))['rosbag2_bagfile_information']
-        version, storage = tree['version'], tree['storage_identifier']
-    except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError):
-        return 'its metadata.yaml does not describe a bag'
-    if isinstance(version, int) and version > _NEWEST:
-        return f'its rosbag2 version is {version}, but only versions up to {_NEWEST} are supported'
-    if storage not in _STORAGES:
-        return f'its storage is {storage!r}, but only {" and ".join(_STORAGES)} are supported'
-    return ''
+    is_damaged = is_mcap and not isinstance(error, OSError)
+    return f'{text}; to save the undamaged part: bag_recover {path}' if is_damaged else text
