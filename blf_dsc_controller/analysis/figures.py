@@ -30,6 +30,9 @@ from blf_dsc_controller.analysis.thinning import thin
 from blf_dsc_controller.messages.topics import DISTURBANCE
 from blf_dsc_controller.run import Run
 
+NAMES = ('tracking.png', 'parameters.png', 'monitors.png')
+"""Of the files that `draw` can write."""
+
 _SIZE = (6.2, 2.6)  # inches
 _LOW = (4.3, 1.75)
 _ABREAST = 3  # joints in columns; more of them in rows
@@ -63,7 +66,7 @@ def draw(run: Run, folder: Path) -> list[Path]:
         title = f'Tracking over {run.duration:.4g} s: bound {kept}'
     for time, stop in run.timed_stops[:1]:
         title += f', stopped at {time:.3f} s ({stop.reason})'
-    paths = [folder / 'tracking.png']
+    paths = [folder / NAMES[0]]
     if n <= _ABREAST:
         draw_panels(paths[0], title, motion, n, _SIZE)
     else:
@@ -79,11 +82,11 @@ def draw(run: Run, folder: Path) -> list[Path]:
             shown = [_overlaid('estimates', [panel for panel in parameters if not panel.log])]
             shown += [panel for panel in parameters if panel.log]
         shown += [_overlaid('disturbance estimates', disturbances)] if disturbances else []
-        paths.append(folder / 'parameters.png')
+        paths.append(folder / NAMES[1])
         draw_panels(paths[-1], title, [*shown, *excitation], 2, _HIGH)
     if monitors:
         shown = monitors if parameters else [*monitors, *excitation]
-        paths.append(folder / 'monitors.png')
+        paths.append(folder / NAMES[2])
         draw_panels(paths[-1], 'Monitors', shown, 2, _HIGH)
     return paths
 

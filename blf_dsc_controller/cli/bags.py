@@ -15,10 +15,12 @@ from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.salvage import format_time
 from blf_dsc_controller.bags.table import described
 from blf_dsc_controller.bags.table import export as export_run
+from blf_dsc_controller.cli.output import make_room
 
 
 def report(options: Namespace) -> None:
     """Write the HTML page of one or several bags."""
+    make_room(options.out, force=options.force)
     bags = read_bags(options.bags, options.namespace, NameMap.parse(options.map))
     write_report(bags, options.out)
     print(f'wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB)')
@@ -26,6 +28,8 @@ def report(options: Namespace) -> None:
 
 def export(options: Namespace) -> None:
     """Write the table of a bag."""
+    out = options.out
+    make_room(out, *([described(out)] if out.suffix == '.csv' else ()), force=options.force)
     run = read_run(options.bag, options.namespace, NameMap.parse(options.map))
     columns = export_run(run, options.out)
     print(f'wrote {options.out}: {run.stamp.size} rows of {columns} columns')
@@ -35,6 +39,8 @@ def export(options: Namespace) -> None:
 
 def plot(options: Namespace) -> None:
     """Draw and summarise a bag."""
+    names = ('summary.json', *figures.NAMES)
+    make_room(*(options.out / name for name in names), force=options.force)
     run = read_run(options.bag, options.namespace, NameMap.parse(options.map))
     metrics = summary.summarize(run)
     options.out.mkdir(parents=True, exist_ok=True)

@@ -14,6 +14,7 @@ from argparse import Namespace
 import numpy as np
 from tqdm import tqdm
 
+from blf_dsc_controller.cli.output import make_room
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.params_file import format_value, load, locate
@@ -31,8 +32,7 @@ _WIDTH = 98
 
 def excite(options: Namespace) -> None:
     """Search, and write the preset."""
-    if options.out.exists():
-        raise BlfDscError(f'{options.out} exists already: choose another name')
+    make_room(options.out, force=options.force)
     text = _preset(options)
     options.out.write_text(text, encoding='utf-8')
     print(text[: text.index('\n\n')])

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from blf_dsc_controller.bags.content import NameMap
+from blf_dsc_controller.cli.output import make_room
 from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.identify import Identified, identify_bag
 from blf_dsc_controller.identification.prior import JOINT_TERMS, columns_of
@@ -22,8 +22,7 @@ _POOR = 0.2  # of the torque, error on the part held back
 
 def identify(options: Namespace) -> None:
     """Identify the arm, print what changed and write the corrected URDF."""
-    if options.out.exists():
-        raise BlfDscError(f'{options.out} exists already: choose another name')
+    make_room(options.out, force=options.force)
     robot = Robot(
         urdf=options.urdf,
         base=options.base,

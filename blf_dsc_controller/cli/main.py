@@ -14,6 +14,7 @@ import sys
 import textwrap
 import warnings
 from collections.abc import Sequence
+from contextvars import copy_context
 from functools import partial
 from math import inf
 from pathlib import Path
@@ -33,21 +34,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, partial(_interrupt, options.command))
-    module, function = options.handler
     # Infinity in a bag, and names in letters that the pictures' font does not have.
     warnings.filterwarnings('ignore', category=RuntimeWarning)
     warnings.filterwarnings('ignore', 'Glyph .* missing')
     try:
-        handler = getattr(importlib.import_module(f'blf_dsc_controller.cli.{module}'), function)
-        code: int | None = handler(options)
+        code = copy_context().run(_handle, options)
     except (BlfDscError, OSError) as error:
         print(f'blf_dsc {options.command}: {_sentence(error, options)}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        remedy = '; the same command resumes the study' if function == 'monte_carlo' else ''
+        remedy = '; the same command resumes the study' if options.command == 'monte-carlo' else ''
         print(f'blf_dsc {options.command}: interrupted{remedy}', file=sys.stderr)
         return INTERRUPTED
     return code or 0
+
+
+def _handle(options: argparse.Namespace) -> int | None:
+    if 'max_unpacked' in options:
+        unpacking = importlib.import_module('blf_dsc_controller.bags.unpacking')
+        unpacking.MAX_UNPACKED.set(options.max_unpacked * 1e9)
+    module, function = options.handler
+    code: int | None = getattr(
+        importlib.import_module(f'blf_dsc_controller.cli.{module}'), function
+    )(options)
+    return code
 
 
 def _interrupt(command: str, _number: int, _frame: object) -> None:
@@ -150,7 +160,8 @@ def _parser() -> argparse.ArgumentParser:
             'run',
             'run the closed loop and plot the results',
             'Run the simulated arm, the controller and the recorder over ROS 2, and leave a '
-            'bag, pictures and summary.json in a new folder.',
+            'bag, pictures and summary.json in a new folder. '
+            'Exit code: 0 done, 4 the controller stopped before the end, 1 an error.',
             '--config noisy --duration 30 --mode realtime --out first',
         )
     )
@@ -231,6 +242,9 @@ def _parser() -> argparse.ArgumentParser:
     for one in (report, view, export, plot):
         _map(one)
         _namespace(one)
+        _force(one)
+    for one in (report, recover, export, plot):
+        _max_unpacked(one)
     _excite_options(
         command(
             'excite',
@@ -296,6 +310,20 @@ def _namespace(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--namespace', default='', help='of the robot, if a bag holds several')
 
 
+def _force(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--force', action='store_true', help='overwrite what exists already')
+
+
+def _max_unpacked(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        '--max-unpacked',
+        type=float,
+        default=1.0,
+        metavar='GB',
+        help='that a compressed bag may unpack to, if more than 100 times its size (1)',
+    )
+
+
 def _map(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--map',
@@ -327,6 +355,7 @@ def _replay_options(parser: argparse.ArgumentParser) -> None:
     )
     _map(parser)
     _namespace(parser)
+    _max_unpacked(parser)
     parser.add_argument(
         '--learn',
         action='store_true',
@@ -347,7 +376,8 @@ def _replay_options(parser: argparse.ArgumentParser) -> None:
 
 def _excite_options(parser: argparse.ArgumentParser) -> None:
     option = parser.add_argument
-    option('out', type=Path, help='parameter file to write; it must not exist yet')
+    option('out', type=Path, help='parameter file to write')
+    _force(parser)
     option('--config', default='recommended', help='parameter file, or a preset (recommended)')
     option(
         '--guess',
@@ -380,7 +410,8 @@ def _identify_options(parser: argparse.ArgumentParser) -> None:
     option = parser.add_argument
     option('bag', type=Path, help=_BAG_OF_ANY_KIND)
     option('--urdf', required=True, help='URDF: a file, package://name/path, or a file of config/')
-    option('--out', type=Path, required=True, help='URDF to write; it must not exist yet')
+    option('--out', type=Path, required=True, help='URDF to write')
+    _force(parser)
     option('--base', default='', help='link that stands still (the root)')
     option('--tip', default='', help='last link (of the last joint in the bag)')
     option(
@@ -399,6 +430,7 @@ def _identify_options(parser: argparse.ArgumentParser) -> None:
     )
     _map(parser)
     _namespace(parser)
+    _max_unpacked(parser)
 
 
 def _monte_carlo_options(parser: argparse.ArgumentParser) -> None:

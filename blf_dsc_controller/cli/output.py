@@ -1,0 +1,23 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files that commands write: none is overwritten by accident."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from blf_dsc_controller.errors import BlfDscError
+
+
+def make_room(*paths: Path, force: bool) -> None:
+    """Let `paths` be written anew; a link is replaced, not followed to where it leads.
+
+    Raises BlfDscError if one of them exists, unless `force` is set.
+    """
+    existing = [path for path in paths if os.path.lexists(path)]
+    if existing and not force:
+        names = ', '.join(str(path) for path in existing)
+        raise BlfDscError(f'{names} exists already: choose another --out, or overwrite by --force')
+    for path in existing:
+        if path.is_symlink():
+            path.unlink()

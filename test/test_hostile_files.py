@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files that mean harm: one clear line from each command, within seconds and a little memory."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from itertools import pairwise
+
+import pytest
+import recorded_run
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.records import Chunk
+
+from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.bags.mcap_reader import scan
+from blf_dsc_controller.bags.sources import open_bag
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.errors import BlfDscError
+
+pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
+
+MAGIC = b'\x89MCAP0\r\n'
+BOMB = '- &a [x, x]\n' + ''.join(f'- &{b} [*{a}, *{a}]\n' for a, b in pairwise('abcdefghi'))
+ZEROS = bytes(20_000_000)
+LITTLE = ('--max-unpacked', '0.001')  # GB
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    return recorded_run.record(tmp_path_factory.mktemp('recorded') / 'bag', 0.1)
+
+
+@pytest.fixture
+def copy(bag, tmp_path):
+    """A copy of the bag, to be changed."""
+    return shutil.copytree(bag, tmp_path / 'copy')
+
+
+@pytest.fixture
+def refused(tmp_path, capsys):
+    """Asserts that every command that reads bags ends with these words in one line."""
+
+    def check(bag, words, *options, but=()):
+        for command in (
+            ('replay', bag),
+            ('replay', bag, '--config', 'recommended'),
+            ('replay', bag, '--learn'),
+            ('report', bag, '--out', tmp_path / 'page.html'),
+            ('export', bag, '--out', tmp_path / 'table.csv'),
+            ('plot', bag, '--out', tmp_path / 'plots'),
+            ('identify', bag, '--urdf', 'panda.urdf', '--out', tmp_path / 'new.urdf'),
+            ('recover', bag, '--out', tmp_path / 'recovered'),
+        ):
+            if {command[0], command[-1]} & {*but}:
+                continue
+            assert main([str(word) for word in (*command, *options)]) == 1, command
+            said = capsys.readouterr().err
+            assert words in said, (command, said)
+            assert said.count('\n') == 1, said
+            shutil.rmtree(tmp_path / 'recovered', ignore_errors=True)
+
+    return check
+
+
+def chunk(data, announced, compression='zstd'):
+    """Record of a chunk."""
+    builder = RecordBuilder()
+    Chunk(compression, data, 0, 0, 0, announced).write(builder)
+    return builder.end()
+
+
+def with_chunks(file, *added):
+    """Put chunks behind the header of a file, which loses its index thereby."""
+    _, *others = (piece.raw for piece in scan(file.read_bytes()))
+    header = next(scan(file.read_bytes())).raw
+    footer = others[-1][:9] + bytes(20)
+    file.write_bytes(MAGIC + b''.join([header, *added, *others[:-1], footer]) + MAGIC)
+    return file
+
+
+# Where files lead.
+
+
+@pytest.mark.parametrize('is_link', [False, True])
+def test_files_outside_of_the_folder_are_not_read(bag, copy, refused, tmp_path, is_link):
+    other = tmp_path / 'elsewhere'
+    other.mkdir()
+    shutil.copy(bag / 'bag_0.mcap', other / 'secret.mcap')
+    (copy / 'bag_0.mcap').unlink()
+    if is_link:
+        (copy / 'bag_0.mcap').symlink_to(other / 'secret.mcap')
+    else:
+        metadata = copy / 'metadata.yaml'
+        text = metadata.read_text()
+        metadata.write_text(text.replace('- bag_0.mcap', '- ../elsewhere/secret.mcap'))
+    refused(copy, 'outside of the folder', but=() if is_link else ('recover',))
+    assert read_context(copy).configurations == ()
+
+
+@pytest.mark.parametrize('name', ['bag_0.mcap', 'metadata.yaml'])
+def test_a_pipe_is_not_waited_for(copy, refused, name):
+    (copy / name).unlink()
+    os.mkfifo(copy / name)
+    refused(copy, 'is not a regular file', but=('recover',) if name == 'metadata.yaml' else ())
+    if name == 'bag_0.mcap':
+        refused(copy / name, 'is not a regular file')
+
+
+def test_a_pipe_is_neither_a_parameter_file_nor_a_urdf(tmp_path, capsys):
+    os.mkfifo(tmp_path / 'pipe')
+    assert main(['run', '--offline', '--config', str(tmp_path / 'pipe')]) == 1
+    with pytest.raises(BlfDscError, match='is not a regular file'):
+        _ = Robot(urdf=str(tmp_path / 'pipe')).text
+    capsys.readouterr()
+
+
+# How much they become.
+
+
+def test_a_chunk_is_not_unpacked_further_than_it_announces(copy, refused):
+    (copy / 'metadata.yaml').unlink()
+    file = with_chunks(copy / 'bag_0.mcap', chunk(zstandard.compress(ZEROS), 100))
+    refused(file, 'more than 100 bytes, unpacked', but=('recover',))
+    assert main(['recover', str(file), '--out', str(copy.parent / 'out')]) == 0
+
+
+@pytest.mark.parametrize('announced', [1 << 29 | 1, 1 << 62])
+def test_a_chunk_that_announces_too_much_is_not_unpacked(copy, refused, announced):
+    file = with_chunks(copy / 'bag_0.mcap', chunk(zstandard.compress(b''), announced))
+    refused(file, f'{announced} bytes, unpacked; at most', but=('recover',))
+
+
+def test_a_bag_does_not_unpack_to_more_than_is_allowed(copy, refused):
+    bomb = chunk(zstandard.compress(ZEROS), len(ZEROS))
+    file = with_chunks(copy / 'bag_0.mcap', *[bomb] * 3)
+    assert file.stat().st_size < 600_000
+    for path in (file, copy):
+        refused(path, 'if it is one that you trust, raise --max-unpacked', *LITTLE)
+    # As much as is announced, and not too much by default; but there is no record in it.
+    refused(file, 'there is no record of kind 0', but=('recover',))
+    with pytest.raises(BlfDscError, match='no record'), open_bag(file) as opened:
+        list(opened.in_order({'/joint_states'}))
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+@pytest.mark.parametrize('mode', ['file', 'message'])
+def test_nor_do_files_and_messages_that_rosbag2_compressed(tmp_path, refused, storage, mode):
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+    from blf_dsc_controller.messages.types import typestore
+
+    writer = Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin[storage.upper()])
+    writer.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
+    with writer:
+        topic = writer.add_connection(
+            '/joint_states', 'sensor_msgs/msg/JointState', typestore=typestore()
+        )
+        for k in range(3):
+            writer.write(topic, k, ZEROS)
+    refused(tmp_path / 'bag', 'raise --max-unpacked', *LITTLE, but=('recover', '--learn'))
+
+
+def test_nor_does_a_bag_of_ros_1(tmp_path, refused):
+    from rosbags.rosbag1 import Writer
+
+    from blf_dsc_controller.messages.types import typestore
+
+    writer = Writer(tmp_path / 'one.bag')
+    writer.set_compression(writer.CompressionFormat.BZ2)
+    with writer:
+        topic = writer.add_connection(
+            '/joint_states', 'sensor_msgs/msg/JointState', typestore=typestore()
+        )
+        writer.write(topic, 1, ZEROS)
+    assert (tmp_path / 'one.bag').stat().st_size < 10_000
+    refused(tmp_path / 'one.bag', 'raise --max-unpacked', *LITTLE, but=('recover', '--learn'))
+
+
+# YAML and XML.
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [('[' * 100_000, 'nested more than 50 deep'), (BOMB, 'does not support the reference')],
+)
+def test_unreasonable_yaml_is_refused_wherever_it_is(copy, refused, tmp_path, text, words):
+    (copy / 'metadata.yaml').write_text(text)
+    refused(copy, words, but=('recover',))
+    path = tmp_path / 'given.yaml'
+    path.write_text(text)
+    with pytest.raises(BlfDscError, match=words):
+        load_loop(path)
+    entries = recorded_run.messages(copy / 'bag_0.mcap')
+    told = recorded_run.write(tmp_path / 'told', entries, text)
+    assert main(['report', str(told), '--out', str(tmp_path / 'page.html')]) == 0
+
+
+@pytest.mark.parametrize(
+    ('inner', 'words'),
+    [
+        ('<!DOCTYPE r [<!ENTITY a "x">]>', 'DOCTYPE'),
+        ('<robot name="x">' + '<link name="a"/>' * 100_000 + '</robot>', 'at most 500'),
+        (
+            '<robot name="x">' + '<a>' * 100_000 + '</a>' * 100_000 + '</robot>',
+            'no link is the root',
+        ),
+    ],
+    ids=['entities', 'large', 'deep'],
+)
+def test_an_unreasonable_urdf_is_refused(inner, words):
+    with pytest.raises(BlfDscError, match=words):
+        Robot(urdf=inner).chain(('joint1',))
+
+
+# What is written.
+
+
+def test_nothing_is_overwritten_without_force(bag, tmp_path, capsys):
+    kept = tmp_path / 'kept'
+    for command in (
+        ('report', bag, '--out', tmp_path / 'out'),
+        ('export', bag, '--out', tmp_path / 'out.csv'),
+        ('plot', bag, '--out', tmp_path),
+        ('identify', bag, '--urdf', 'panda.urdf', '--out', tmp_path / 'out'),
+        ('excite', tmp_path / 'out'),
+    ):
+        out = tmp_path / {'plot': 'tracking.png', 'export': 'out.csv'}.get(command[0], 'out')
+        for lead in (kept, tmp_path / 'nowhere'):
+            kept.write_text('kept')
+            out.symlink_to(lead)
+            words = [str(word) for word in command]
+            assert main(words) == 1
+            assert f'{out} exists already' in capsys.readouterr().err
+            assert not (tmp_path / 'nowhere').exists()
+            if command[0] in ('report', 'export', 'plot'):
+                assert main([*words, '--force']) == 0
+                assert not out.is_symlink()
+                assert main([*words, '--force']) == 0
+            assert kept.read_text() == 'kept'
+            out.unlink()
+            (tmp_path / 'summary.json').unlink(missing_ok=True)
+            for name in ('parameters.png', 'monitors.png'):
+                (tmp_path / name).unlink(missing_ok=True)
