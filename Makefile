@@ -42,7 +42,7 @@ PIP_FAILED := { echo 'The installation failed: see above. It needs a package ind
   'set HTTPS_PROXY, for a mirror PIP_INDEX_URL, without a network PIP_FIND_LINKS and' \
   'PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
 
-.PHONY: help venv demo paper arms changes expect test test-long test-browser test-nightly soak docs lint clean bench release
+.PHONY: help venv demo paper arms changes expect test test-long test-browser test-nightly soak fuzz docs lint clean bench release
 
 help: ## List what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' Makefile
@@ -103,6 +103,9 @@ release: $(RELEASE_READY) ## Check versions and metadata, and build sdist and wh
 	$(VENV)/bin/python -m twine check --strict out/dist/*
 	@! grep -q '@.*[.]invalid' package.xml || echo 'package.xml has no maintainer that can be' \
 	    'reached, and so has what is in out/dist: see CONTRIBUTING.md before you publish it.'
+fuzz: MINUTES := 5
+fuzz: $(READY) ## Feed files and names at random to everything that reads them (MINUTES)
+	@$(RUN) test/fuzzing.py --minutes "$(MINUTES)"
 
 lint: $(LINT_READY) ## Check style, types and layers
 	@good=1; for check in 'ruff check' 'ruff format --check' mypy; do \

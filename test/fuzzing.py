@@ -1,0 +1,492 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Input from outside at random: names, metadata, MCAP files, messages, parameter files, URDFs.
+
+Each property holds that a command ends with its result or with an error of its own: no other
+exception, no hang, no memory without end, nothing opened outside of the folder, nothing imported.
+`python fuzzing.py --minutes 5` looks for what breaks one of them; test_fuzzing.py tries a few.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import itertools
+import os
+import resource
+import signal
+import struct
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import hypothesis
+import recorded_run
+import yaml
+from hypothesis import HealthCheck, Phase, given
+from hypothesis import strategies as st
+from mcap.data_stream import RecordBuilder
+from mcap.exceptions import McapError
+from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+
+from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.bags.mcap_reader import scan
+from blf_dsc_controller.bags.sources import open_bag
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.share import share_folder
+from blf_dsc_controller.errors import BlfDscError
+
+MOST_SECONDS = 60.0  # of computing
+MOST_MEMORY = 3 << 30  # bytes beside what the process had before
+ASIDE = 'elsewhere'
+
+tried: Counter[str] = Counter()
+_folder = Path(tempfile.mkdtemp(prefix='fuzzing_'))
+_opened: list[str] = []
+
+
+def _watch(event, arguments):
+    if event == 'open' and ASIDE in str(arguments[0]):
+        _opened.append(str(arguments[0]))
+
+
+sys.addaudithook(_watch)
+
+
+class HangError(BaseException):
+    """It took too long."""
+
+
+def _hang(*_):
+    raise HangError
+
+
+@contextlib.contextmanager
+def bounded(name):
+    """Run what is tested within limits, counted under this name."""
+    tried[name] += 1
+    before = set(sys.modules)
+    _opened.clear()
+    used = int(Path('/proc/self/statm').read_text().split()[0]) * os.sysconf('SC_PAGE_SIZE')
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    handler = signal.signal(signal.SIGPROF, _hang)
+    resource.setrlimit(resource.RLIMIT_AS, (used + MOST_MEMORY, limits[1]))
+    signal.setitimer(signal.ITIMER_PROF, MOST_SECONDS)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore', RuntimeWarning)  # of infinite numbers
+            yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+        signal.signal(signal.SIGPROF, handler)
+    assert not _opened, _opened
+    odd = {one for one in set(sys.modules) - before if one.split('.')[0] in ODD_MODULES}
+    assert not odd, odd
+
+
+def command(*words):
+    """Run a command and return its exit code; what it says must not be a traceback."""
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        code = main([str(word) for word in words])
+    assert 'Traceback' not in said.getvalue()
+    assert code in (0, 1, 3, 4), said.getvalue()
+    return code
+
+
+# Names.
+
+ODD_MODULES = ('unittest', 'this', 'antigravity', 'idlelib', 'turtle', 'test')
+PARTS = st.one_of(
+    st.sampled_from(('std_msgs', 'msg', 'srv', 'String', '__main__', *ODD_MODULES, '..', '')),
+    st.text(max_size=8),
+)
+
+
+@given(name=st.one_of(st.lists(PARTS, max_size=5).map('/'.join), st.text(max_size=30)))
+def names(name):
+    """Names of types, topics and joints."""
+    from blf_dsc_controller.bags.content import NameMap
+    from blf_dsc_controller.messages.types import UnknownTypeError
+    from blf_dsc_controller.nodes.endpoints import message_class, register_definition
+
+    with bounded('names'):
+        with contextlib.suppress(ImportError, AttributeError):
+            assert message_class(name).__module__.split('.')[0] == name.split('/')[0]
+        with contextlib.suppress(UnknownTypeError):
+            register_definition(name)
+        with contextlib.suppress(BlfDscError):
+            NameMap.parse([name, f'joint1={name}'])
+
+
+# Bags.
+
+
+def _once(make):
+    """Result of the first call, made in the folder of this process."""
+    kept = []
+
+    def get():
+        if not kept:
+            kept.append(make())
+        return kept[0]
+
+    return get
+
+
+@_once
+def base():
+    """Bag of a short run, of which the other ones are changed."""
+    return recorded_run.record(_folder / 'base', 0.1)
+
+
+@_once
+def entries():
+    """Its messages."""
+    return recorded_run.messages(base())
+
+
+@_once
+def pieces():
+    """Records of its file."""
+    (file,) = base().glob('*.mcap')
+    return [piece.raw for piece in scan(file.read_bytes())]
+
+
+@_once
+def secret():
+    """A file that no bag may lead to."""
+    folder = _folder / ASIDE
+    folder.mkdir()
+    (folder / 'secret.mcap').write_bytes((base() / 'base_0.mcap').read_bytes())
+    return folder
+
+
+READ = ('export', 'replay', 'replay --config', 'replay --learn', 'recover', 'in order', 'context')
+DRAW = ('report', 'plot')
+WAYS = st.sampled_from((*READ * 5, *DRAW))
+
+
+def read(bag, way):
+    """Read a bag in one of many ways."""
+    out = bag.parent / f'out_{len(tried)}'
+    name, _, option = way.partition(' ')
+    if way == 'in order':
+        with contextlib.suppress(BlfDscError), open_bag(bag) as opened:
+            list(opened.in_order(opened.counts))
+    elif way == 'context':
+        with contextlib.suppress(BlfDscError):
+            read_context(bag)
+    elif name == 'replay':
+        words = {'': (), '--config': (option, 'recommended'), '--learn': (option,)}[option]
+        command('replay', bag, *words)
+    elif way == 'report':
+        command('report', bag, '--out', out / 'page.html')
+    elif way == 'export':
+        command('export', bag, '--out', bag.parent / 'out.csv')
+    else:
+        command(way, bag, '--out', out)
+
+
+@contextlib.contextmanager
+def folder():
+    """A folder for one example, beside the secret."""
+    secret()
+    with tempfile.TemporaryDirectory(dir=_folder) as one:
+        (Path(one) / 'bag').mkdir()
+        yield Path(one) / 'bag'
+
+
+SCALARS = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=12),
+    st.sampled_from(('mcap', 'sqlite3', 'zstd', 'file', 'message', f'../../{ASIDE}/secret.mcap')),
+)
+
+
+def _places(tree):
+    """Each place in nested data, as the container and the key."""
+    items = list(tree.items() if isinstance(tree, dict) else enumerate(tree))
+    for key, value in items:
+        yield tree, key
+        if isinstance(value, (dict, list)):
+            yield from _places(value)
+
+
+@given(data=st.data(), way=WAYS)
+def metadata(data, way):
+    """metadata.yaml: other values, missing entries, other text."""
+    tree = yaml.safe_load((base() / 'metadata.yaml').read_text())
+    for _ in range(data.draw(st.integers(1, 3))):
+        container, key = data.draw(st.sampled_from(list(_places(tree)) or [({0: 0}, 0)]))
+        if data.draw(st.booleans()):
+            container[key] = data.draw(st.one_of(SCALARS, st.lists(SCALARS, max_size=3)))
+        else:
+            del container[key]
+    text = yaml.safe_dump(tree)
+    if data.draw(st.integers(0, 3)) == 0:
+        at = data.draw(st.integers(0, len(text)))
+        text = text[:at] + data.draw(st.text('[]{}&*!|>-:# \n\tab\0é', max_size=20)) + text[at:]
+    with folder() as bag:
+        (bag / 'base_0.mcap').write_bytes((base() / 'base_0.mcap').read_bytes())
+        (bag / 'metadata.yaml').write_text(text, encoding='utf-8')
+        with bounded('metadata'):
+            read(bag, way)
+
+
+def _record(record):
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
+
+
+NUMBERS = st.one_of(st.integers(0, 3), st.integers(0, 2**64 - 1), st.just(2**63))
+SMALL = st.one_of(st.integers(0, 3), st.just(65535))
+ODD_YAML = '- &a [1]\n- &b [*a, *a]\n- [*b, *b]'
+RECORDS = st.one_of(
+    st.builds(Schema, SMALL, st.binary(max_size=9), st.text(max_size=9), st.text(max_size=30)),
+    st.builds(
+        Channel,
+        SMALL,
+        st.sampled_from(('/joint_states', '/x', '')),
+        st.sampled_from(('cdr', 'json', '')),
+        st.dictionaries(
+            st.just('offered_qos_profiles'),
+            st.one_of(st.text(max_size=20), st.just('[' * 5000), st.just(ODD_YAML)),
+        ),
+        SMALL,
+    ),
+    st.builds(
+        Metadata, st.text(max_size=9), st.dictionaries(st.text(max_size=9), st.text(max_size=9))
+    ),
+    st.builds(
+        Attachment,
+        NUMBERS,
+        NUMBERS,
+        st.just('configuration.yaml'),
+        st.just(''),
+        st.one_of(st.binary(max_size=30), st.just(b'[' * 5000), st.just(ODD_YAML.encode())),
+    ),
+    st.builds(
+        Chunk,
+        st.sampled_from(('', 'zstd', 'lz4')),
+        st.binary(max_size=60),
+        NUMBERS,
+        NUMBERS,
+        st.just(0),
+        NUMBERS,
+    ),
+)
+
+
+@given(data=st.data(), way=WAYS)
+def records(data, way):
+    """MCAP files: records changed, added, left out, in another order; bytes flipped; cut off."""
+    found = list(pieces())
+    for _ in range(data.draw(st.integers(0, 3))):
+        at = data.draw(st.integers(0, len(found) - 1))
+        action = data.draw(st.sampled_from(('add', 'remove', 'move', 'flip', 'length')))
+        if action == 'add':
+            with contextlib.suppress(McapError, OverflowError, ValueError, struct.error):
+                found.insert(at, _record(data.draw(RECORDS)))
+        elif action == 'remove' and len(found) > 1:
+            del found[at]
+        elif action == 'move':
+            found.insert(data.draw(st.integers(0, len(found))), found[at])
+        elif action == 'flip' and found[at]:
+            raw = bytearray(found[at])
+            for place in data.draw(st.lists(st.integers(0, len(raw) - 1), max_size=4)):
+                raw[place] = data.draw(st.integers(0, 255))
+            found[at] = bytes(raw)
+        elif action == 'length':
+            length = data.draw(NUMBERS).to_bytes(8, 'little')
+            found[at] = found[at][:1] + length + found[at][9:]
+    magic = b'\x89MCAP0\r\n'
+    content = magic + b''.join(found) + magic
+    if data.draw(st.integers(0, 9)) == 0:
+        content = content[: data.draw(st.integers(0, len(content)))]
+    with folder() as bag:
+        (bag / 'base_0.mcap').write_bytes(content)
+        (bag / 'metadata.yaml').write_bytes((base() / 'metadata.yaml').read_bytes())
+        with bounded('records'):
+            read(data.draw(st.sampled_from((bag, bag / 'base_0.mcap'))), way)
+
+
+@given(data=st.data(), way=WAYS)
+def messages(data, way):
+    """Serialised messages: bytes changed, added and left out, and others' content."""
+    changed = [list(one) for one in entries()]
+    topics = sorted({one[0] for one in changed})
+    for _ in range(data.draw(st.integers(1, 3))):
+        topic = data.draw(st.sampled_from(topics))
+        numbers = [k for k, one in enumerate(changed) if one[0] == topic]
+        k = data.draw(st.sampled_from(numbers))
+        raw = bytearray(changed[k][3])
+        place = data.draw(st.integers(0, len(raw)))
+        action = data.draw(st.sampled_from(('flip', 'number', 'cut', 'add', 'other', 'random')))
+        if action == 'flip' and place < len(raw):
+            raw[place] = data.draw(st.integers(0, 255))
+        elif action == 'number':
+            place -= place % 4
+            number = data.draw(st.sampled_from((0, 1, 2**31 - 1, 2**32 - 1, 0x7FF00000)))
+            raw[place : place + 4] = number.to_bytes(4, 'little')
+        elif action == 'cut':
+            del raw[place:]
+        elif action == 'add':
+            raw[place:place] = data.draw(st.binary(max_size=12))
+        elif action == 'other':
+            raw = bytearray(data.draw(st.sampled_from(changed))[3])
+        else:
+            raw = bytearray(b'\0\1\0\0' + data.draw(st.binary(max_size=60)))
+        changed[k][3] = bytes(raw)
+        if data.draw(st.integers(0, 4)) == 0:
+            changed[k][2] = data.draw(st.integers(0, 2**63 - 1))
+    configuration = read_context(base()).configuration
+    with folder() as bag:
+        bag.rmdir()
+        recorded_run.write(bag, changed, configuration)
+        with bounded('messages'):
+            read(bag, way)
+
+
+# Parameter files and URDFs.
+
+WORDS = st.one_of(
+    st.sampled_from(('nan', '.inf', '-1', '1e308', '0', '[]', '[[1.0]]', '{}', 'null', '""', '*a')),
+    st.sampled_from(('&a [1]', '!!binary x', '[' * 200, '0x', '"\\0"', '2.0e-320', '1e999', '~')),
+    st.integers().map(str),
+    st.floats().map(str),
+    st.lists(st.floats(), max_size=4).map(str),
+    st.text(max_size=12),
+)
+
+
+@given(data=st.data(), preset=st.sampled_from(('recommended', 'noisy', 'payload', 'panda')))
+def parameters(data, preset):
+    """Parameter files: other values, lines moved, left out and added."""
+    lines = (share_folder() / 'config' / f'{preset}.yaml').read_text().splitlines()
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(lines) - 1))
+        action = data.draw(st.sampled_from(('value', 'value', 'remove', 'move', 'text')))
+        if action == 'value' and ':' in lines[at]:
+            lines[at] = f'{lines[at].partition(":")[0]}: {data.draw(WORDS)}'
+        elif action == 'remove' and len(lines) > 1:
+            del lines[at]
+        elif action == 'move':
+            lines.insert(data.draw(st.integers(0, len(lines))), lines[at])
+        else:
+            lines[at] += data.draw(WORDS)
+    with folder() as one:
+        path = one / 'given.yaml'
+        path.write_bytes('\n'.join(lines).encode('utf-8', 'surrogatepass'))
+        with bounded('parameters'):
+            command('replay', base(), '--config', path)
+            from blf_dsc_controller.configuration.params_file import load_loop
+
+            with contextlib.suppress(BlfDscError):
+                load_loop(path)
+
+
+NUMBERS_OF_XML = st.one_of(
+    st.sampled_from(('', 'nan', 'inf', '-1', '0', '1e308', '1e-320', '0 0 0', '1 0', 'x', '1_0')),
+    st.lists(st.floats(), min_size=1, max_size=4).map(lambda x: ' '.join(map(str, x))),
+    st.text(max_size=8),
+)
+
+
+XML = (
+    '<!DOCTYPE r [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]>',
+    f'{"<a>" * 20_000}{"</a>" * 20_000}',
+    ''.join(f'<link name="x{k}"/>' for k in range(400))
+    + ''.join(
+        f'<joint name="y{k}" type="fixed"><parent link="x{k}"/><child link="x{k + 1}"/></joint>'
+        for k in range(399)
+    ),
+)
+
+
+@given(data=st.data(), arm=st.sampled_from(('panda', 'ur5e')))
+def urdfs(data, arm):
+    """URDFs: other attributes, elements moved, left out, nested and repeated."""
+    root = ET.fromstring((share_folder() / 'config' / f'{arm}.urdf').read_text())  # noqa: S314 - ours
+    for _ in range(data.draw(st.integers(1, 4))):
+        every = list(root.iter())
+        one, other = (data.draw(st.sampled_from(every)) for _ in range(2))
+        action = data.draw(st.sampled_from(('value', 'value', 'name', 'remove', 'move', 'nest')))
+        if action == 'value' and one.attrib:
+            key = data.draw(st.sampled_from(sorted(one.attrib)))
+            one.set(key, data.draw(NUMBERS_OF_XML))
+        elif action == 'name' and one.attrib and other.attrib:
+            key = data.draw(st.sampled_from(sorted(one.attrib)))
+            one.set(key, data.draw(st.sampled_from(sorted(other.attrib.values()))))
+        elif action == 'remove' and len(one):
+            one.remove(data.draw(st.sampled_from(list(one))))
+        elif action == 'move' and one is not other and other not in one.iter():
+            one.append(other)
+        elif action == 'nest':
+            tag = data.draw(st.sampled_from(('link', 'origin')))
+            ET.SubElement(other, tag, one.attrib)
+    text = ET.tostring(root, encoding='unicode')
+    if data.draw(st.integers(0, 9)) == 0:
+        at = data.draw(st.integers(0, len(text)))
+        text = (
+            text[:at] + data.draw(st.one_of(st.text(max_size=9), st.sampled_from(XML))) + text[at:]
+        )
+    with folder() as one:
+        path = one / 'arm.urdf'
+        path.write_bytes(text.encode('utf-8', 'surrogatepass'))
+        given_file = one / 'given.yaml'
+        given_file.write_text(
+            f'/**:\n  ros__parameters:\n    robot: {{urdf: {path}, lag: 0.005}}\n'
+            '/**/blf_dsc_controller:\n  ros__parameters:\n'
+            f'    barrier: {{bound: {[0.005] * (7 if arm == "panda" else 6)}}}\n'
+        )
+        with bounded('urdfs'):
+            from blf_dsc_controller.configuration.params_file import load_loop
+
+            with contextlib.suppress(BlfDscError):
+                load_loop(given_file)
+            command('identify', base(), '--urdf', path, '--out', one / 'out.urdf')
+
+
+PROPERTIES = (names, metadata, records, messages, parameters, urdfs)
+
+
+def run_for(minutes, examples=50):
+    """Try the properties in turn, and return those that failed."""
+    end, failed = time.monotonic() + 60.0 * minutes, set()
+    quick = hypothesis.settings(
+        max_examples=examples,
+        deadline=None,
+        phases=(Phase.reuse, Phase.generate),
+        suppress_health_check=list(HealthCheck),
+    )
+    for one in itertools.cycle([quick(each) for each in PROPERTIES]):
+        if time.monotonic() >= end:
+            return failed
+        try:
+            one()
+        except BaseException as error:  # noqa: BLE001 - every kind is what is looked for
+            if isinstance(error, KeyboardInterrupt):
+                return failed
+            failed.add(one.__name__)
+            traceback.print_exc()
+    raise AssertionError
+
+
+if __name__ == '__main__':
+    parser = argparse.ArgumentParser()
+    parser.add_argument('--minutes', type=float, default=5.0)
+    chosen = parser.parse_args()
+    wrong = run_for(chosen.minutes)
+    print(', '.join(f'{count} {name}' for name, count in tried.items()))  # noqa: T201
+    sys.exit(f'failed: {", ".join(sorted(wrong))}' if wrong else 0)
