@@ -120,7 +120,7 @@ def test_a_run_in_which_the_controller_stopped_says_so_by_its_exit_code(tmp_path
     path = written(tmp_path, controller='safety.velocity_limit: 0.0001')
     out = tmp_path / 'out'
     run = closed_loop('--config', path, '--offline', '--duration', 0.1, '--out', out)
-    assert run.returncode == 4, run.stderr
+    assert run.returncode == 5, run.stderr
     assert 'bound       held by every joint until the stop' in run.stdout
     assert 'stopped     at 0.001 s, velocity not plausible' in run.stdout
     (stop,) = json.loads((out / 'summary.json').read_text())['tracking']['stops']

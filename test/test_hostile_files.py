@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from itertools import pairwise
 
 import pytest
 import recorded_run
+import synthetic_bag
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk
@@ -245,3 +247,15 @@ def test_nothing_is_overwritten_without_force(bag, tmp_path, capsys):
             (tmp_path / 'summary.json').unlink(missing_ok=True)
             for name in ('parameters.png', 'monitors.png'):
                 (tmp_path / name).unlink(missing_ok=True)
+
+
+def test_a_name_ends_no_script_of_the_page(tmp_path, monkeypatch):
+    monkeypatch.setattr(synthetic_bag, 'JOINTS', ('<!--<script>', '</script><b>x'))
+    bag = synthetic_bag.write(tmp_path / 'bag', synthetic_bag.Synthetic(200).messages())
+    assert main(['report', str(bag), '--out', str(tmp_path / 'page.html')]) == 0
+    _, _, rest = (tmp_path / 'page.html').read_text().partition('id="data">')
+    data, _, after = rest.partition('</script>')
+    assert '<' not in data
+    titles = {panel['title'] for panel in json.loads(data)['panels']}
+    assert {'position of <!--<script>', 'position of </script><b>x'} <= titles
+    assert '<b>x' not in after

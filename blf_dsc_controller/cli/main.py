@@ -161,7 +161,7 @@ def _parser() -> argparse.ArgumentParser:
             'run the closed loop and plot the results',
             'Run the simulated arm, the controller and the recorder over ROS 2, and leave a '
             'bag, pictures and summary.json in a new folder. '
-            'Exit code: 0 done, 4 the controller stopped before the end, 1 an error.',
+            'Exit code: 0 done, 5 the controller stopped before the end, 1 an error.',
             '--config noisy --duration 30 --mode realtime --out first',
         )
     )

@@ -37,7 +37,7 @@ from blf_dsc_controller.supervision.supervisor import Reason
 from blf_dsc_controller.view.page import LOCAL, free_port, open_to_others, require_viser
 from sim_plant import kernels as plant_kernels
 
-STOPPED = 4
+STOPPED = 5
 """Exit code where the controller stopped before the end."""
 
 _FOLDER = 'closed_loop'
