@@ -242,9 +242,10 @@ def _parser() -> argparse.ArgumentParser:
     for one in (report, view, export, plot):
         _map(one)
         _namespace(one)
-        _force(one)
-    for one in (report, recover, export, plot):
+    for one in (report, view, recover, export, plot):
         _max_unpacked(one)
+    for one in (report, export, plot):
+        _force(one)
     _excite_options(
         command(
             'excite',
