@@ -244,8 +244,7 @@ def test_nothing_is_overwritten_without_force(bag, tmp_path, capsys):
                 assert main([*words, '--force']) == 0
             assert kept.read_text() == 'kept'
             out.unlink()
-            (tmp_path / 'summary.json').unlink(missing_ok=True)
-            for name in ('parameters.png', 'monitors.png'):
+            for name in ('summary.json', 'parameters.png', 'monitors.png', 'out.datapackage.json'):
                 (tmp_path / name).unlink(missing_ok=True)
 
 

@@ -17,7 +17,8 @@ def make_room(*paths: Path, force: bool) -> None:
     existing = [path for path in paths if os.path.lexists(path)]
     if existing and not force:
         names = ', '.join(str(path) for path in existing)
-        raise BlfDscError(f'{names} exists already: choose another --out, or overwrite by --force')
+        exist = 'exists' if len(existing) == 1 else 'exist'
+        raise BlfDscError(f'{names} {exist} already: choose another --out, or overwrite by --force')
     for path in existing:
         if path.is_symlink():
             path.unlink()
