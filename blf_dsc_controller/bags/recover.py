@@ -9,7 +9,7 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
 from mcap.records import Channel
-from zstandard import FRAME_HEADER, ZstdDecompressor, ZstdError
+from zstandard import FRAME_HEADER, ZstdError
 
 from blf_dsc_controller.bags.context import ATTACHMENT, MESSAGES, RECORD, Losses, statistics
 from blf_dsc_controller.bags.folder import checked
@@ -20,8 +20,6 @@ from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.unpacking import Unpacker
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.messages.types import Definition, UnknownTypeError, definition
-
-_LARGEST = 1 << 28  # bytes, message
 
 
 @dataclass
@@ -60,7 +58,7 @@ def recover(path: Path, out: Path) -> Recovery:
     unpacker = Unpacker(checked(path, files))
     recovery = Recovery(out)
     with BagWriter(out, flush_interval=None) as bag:
-        transfer = _Transfer(bag, recovery.missing)
+        transfer = _Transfer(bag, recovery.missing, unpacker)
         for file in files:
             salvage = Salvage(file, unpacker)
             recovery.unknown += transfer.copy(salvage)
@@ -78,6 +76,7 @@ class _Transfer:
 
     bag: BagWriter
     missing: dict[str, Losses]
+    unpacker: Unpacker
     handles: dict[str, int] = field(default_factory=dict)
 
     def copy(self, salvage: Salvage) -> int:
@@ -105,8 +104,8 @@ class _Transfer:
             return False
         self.missing[channel.topic].count(sequence)
         if raw.startswith(FRAME_HEADER):  # compressed by message, as metadata.yaml would say
-            with suppress(ZstdError):
-                raw = ZstdDecompressor().stream_reader(raw).read(_LARGEST)
+            with suppress(ZstdError, ValueError):
+                raw = self.unpacker.unpack(raw, 'zstd')
         self.bag.write(handle, raw, log_time, publish_time, sequence)
         return True
 
