@@ -19,6 +19,7 @@ from blf_dsc_controller.analysis.metrics import (
     true_change_times,
 )
 from blf_dsc_controller.analysis.style import ALARM, INK, MUTED
+from blf_dsc_controller.analysis.thinning import drawable
 from blf_dsc_controller.messages.topics import (
     COMPUTE_TIME,
     DISTURBANCE,
@@ -46,7 +47,6 @@ _LEARNING = GROUPS[3:7]
 _LEAST = 1e-12  # J, the smallest value on a logarithmic axis
 _ROOM = 1.2  # of the largest value shown, to either side
 _LEAST_ERROR = 1e-5  # %
-_MOST = 1e100
 _PIECES = 300  # of a run, each with its largest error
 
 
@@ -107,10 +107,7 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
                 marks = (*marks, *(Mark(*one, INK) for one in zip(changes, texts, strict=False)))
             found[panel.group, panel.title] = replace(
                 before,
-                lines=(
-                    *before.lines,
-                    *(line._replace(run=k, values=_drawn(line.values)) for line in panel.lines),
-                ),
+                lines=(*before.lines, *(line._replace(run=k) for line in panel.lines)),
                 marks=(*before.marks, *(mark._replace(run=k) for mark in marks)),
                 note=panel.note if len(runs) == 1 else '',
                 span=panel.span if len(runs) == 1 else 0.0,
@@ -126,11 +123,6 @@ def _stops(run: Run) -> Iterator[Mark]:
         if one.until is not None:
             until = (one.until - int(run.stamp[0])) * 1e-9
         yield Mark(time, f'stop: {one.reason}', ALARM, until=until)
-
-
-def _drawn(values: Floats) -> Floats:
-    """Values with gaps for what no axis can show, such as infinity."""
-    return np.where(np.abs(values) < _MOST, values, np.nan)
 
 
 def _motion(run: Run) -> Iterator[Panel]:
@@ -174,7 +166,7 @@ def _span(run: Run, i: int, error: Floats) -> float:
     """What is shown of a funnel, whose mouth would leave nothing to see of the error; else 0."""
     if run.bound is None or run.bound[0, i] <= run.bound[-1, i]:
         return 0.0
-    return float(_ROOM * np.nanmax(np.abs(_drawn(error)), initial=1e3 * run.bound[-1, i]))
+    return float(_ROOM * np.nanmax(np.abs(drawable(error)), initial=1e3 * run.bound[-1, i]))
 
 
 def _error_size(run: Run, i: int, error: Floats) -> Panel:
@@ -184,8 +176,8 @@ def _error_size(run: Run, i: int, error: Floats) -> Panel:
     size[size == 0.0] = np.nan
     lines = [Line('error', run.time[begins], size)]
     if run.bound is not None:
-        bound = 1e3 * run.bound[:, i]
-        lines.append(Line('bound', run.time, bound, MUTED, dashed=True))
+        bound = 1e3 * run.bound[begins, i]
+        lines.append(Line('bound', run.time[begins], bound, MUTED, dashed=True))
     known = size[np.isfinite(size)]
     note = f'end {known[-1]:.2g}' if known.size else ''
     title = f'|error| of {run.joints[i]}'

@@ -8,10 +8,17 @@ import numpy as np
 from blf_dsc_controller.run import Floats
 
 PIECES = 1500
+_MOST = 1e100
+
+
+def drawable(values: Floats) -> Floats:
+    """Values with gaps for what no axis can show, such as infinity."""
+    return np.where(np.abs(values) < _MOST, values, np.nan)
 
 
 def thin(time: Floats, values: Floats, pieces: int = PIECES) -> tuple[Floats, Floats]:
     """Thin a series without losing a peak; of a mostly constant one the corners remain."""
+    values = drawable(values)
     changes = np.flatnonzero(np.diff(values) != 0.0)
     if changes.size < values.size // 100:
         kept = np.unique(np.concatenate([[0], changes, changes + 1, [values.size - 1]]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +40,7 @@ _VALUES = {  # beginning of a name in the vectors: unit
     **dict.fromkeys((topics.LATCHED, topics.MODEL_CHANGES, topics.LATE_STEPS), '1'),
     **dict.fromkeys((topics.COMPUTE_TIME, topics.LATENCY, topics.LATENESS), 's'),
 }
+_ROWS = 1 << 16
 _PARAMETER = 'kg m^2'  # of arms without a URDF
 
 
@@ -116,7 +118,9 @@ def _write_csv(columns: dict[str, Column], path: Path) -> None:
     with path.open('w', encoding='utf-8', newline='') as stream:
         writer = csv.writer(stream)
         writer.writerow(columns)
-        writer.writerows(zip(*(one.values.tolist() for one in columns.values()), strict=True))
+        for rows in _blocks(columns):
+            parts = (one.values[rows].tolist() for one in columns.values())
+            writer.writerows(zip(*parts, strict=True))
     fields = [
         {
             'name': name,
@@ -141,9 +145,21 @@ def _write_parquet(columns: dict[str, Column], path: Path) -> None:
         from pyarrow import parquet
     except ImportError:
         raise MissingExtraError('pyarrow', 'parquet', 'writing Parquet') from None
-    arrays = [pa.array(one.values) for one in columns.values()]
-    fields = [
-        pa.field(name, array.type, metadata={'unit': one.unit} if one.unit else None)
-        for (name, one), array in zip(columns.items(), arrays, strict=True)
-    ]
-    parquet.write_table(pa.table(arrays, schema=pa.schema(fields)), path)
+    schema = pa.schema(
+        pa.field(
+            name,
+            pa.from_numpy_dtype(one.values.dtype),
+            metadata={'unit': one.unit} if one.unit else None,
+        )
+        for name, one in columns.items()
+    )
+    with parquet.ParquetWriter(path, schema) as writer:
+        for rows in _blocks(columns):
+            arrays = [pa.array(one.values[rows]) for one in columns.values()]
+            writer.write_table(pa.table(arrays, schema=schema))
+
+
+def _blocks(columns: dict[str, Column]) -> Iterator[slice]:
+    """Rows that are written at a time, so that not all of them are in memory twice."""
+    for begin in range(0, columns['stamp'].values.size, _ROWS):
+        yield slice(begin, begin + _ROWS)
