@@ -9,6 +9,7 @@ from setuptools import find_packages, setup
 
 NAME = 'blf_dsc_controller'
 SHARE = f'share/{NAME}'
+HERE = Path(__file__).resolve().parent  # colcon --symlink-install runs a link to this file
 # The site of doc/, which the tests build, too. ziamath draws its equations.
 DOCS = ['sphinx>=8', 'myst-parser>=4', 'furo', 'ziamath>=0.12']
 
@@ -28,14 +29,14 @@ def files(folder: str) -> list[str]:
 
 
 # Who maintains it, and its addresses, are written in package.xml alone.
-MANIFEST = ET.parse('package.xml').getroot()  # noqa: S314 - our own file
+MANIFEST = ET.parse(HERE / 'package.xml').getroot()  # noqa: S314 - our own file
 (MAINTAINER,) = MANIFEST.findall('maintainer')
 
 setup(
     name=NAME,
     version=version(),
     description='Output-constrained tracking of robot arms with unknown dynamics, for ROS 2',
-    long_description=Path('README.md').read_text(encoding='utf-8'),
+    long_description=(HERE / 'README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     keywords=[
         'ROS 2',

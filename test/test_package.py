@@ -192,6 +192,14 @@ def test_every_executable_has_its_main(entry_points):
         assert callable(entry.load())
 
 
+def test_setup_runs_in_the_folder_of_links_of_colcon_symlink_install(tmp_path):
+    for name in ('setup.py', 'setup.cfg', 'package.xml', *PACKAGES):
+        (tmp_path / name).symlink_to(ROOT / name)
+    run = [sys.executable, 'setup.py', '--version']
+    told = subprocess.run(run, cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+    assert told.split()[-1] == blf_dsc_controller.__version__
+
+
 def test_executables_go_where_ros2_run_looks():
     setup = configparser.ConfigParser()
     setup.read(ROOT / 'setup.cfg')
