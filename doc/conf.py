@@ -6,17 +6,21 @@ import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import ziamath
 from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.logging import getLogger
 from sphinx.writers.html5 import HTML5Translator
 
+try:
+    import ziamath
+except ImportError:  # as where ROS runs rosdoc2
+    ziamath = None
+
 # rosdoc2 runs a conf.py of its own, in a copy of doc/, which executes this one by its path.
 HERE = Path(__file__).resolve()
 executed = re.search(r'exec\(open\("(.+)"\)', HERE.read_text(encoding='utf-8'))
 ROOT = (Path(executed[1]) if executed else HERE).parents[1]
-for shown in ('CHANGELOG.rst', 'benchmark', 'config', 'examples'):  # by the pages
+for shown in ('CHANGELOG.rst', 'benchmark', 'config'):  # by the pages
     if not (HERE.parents[1] / shown).exists():
         (HERE.parents[1] / shown).symlink_to(ROOT / shown)
 sys.path.insert(0, str(ROOT))  # the docstrings of this checkout
@@ -48,9 +52,10 @@ html_theme = 'furo'
 html_title = f'{project} {release}'
 html_show_copyright = False
 # Drawn when the site is made: no script, no font, no request, in any browser.
-html_math_renderer = 'drawn'
-ziamath.config.svg2 = False
-ziamath.config.precision = 2
+html_math_renderer = 'drawn' if ziamath else 'mathjax'
+if ziamath:
+    ziamath.config.svg2 = False
+    ziamath.config.precision = 2
 html_static_path = ['_static']
 html_css_files = ['site.css']
 
