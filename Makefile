@@ -42,7 +42,7 @@ PIP_FAILED := { echo 'The installation failed: see above. It needs a package ind
   'set HTTPS_PROXY, for a mirror PIP_INDEX_URL, without a network PIP_FIND_LINKS and' \
   'PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
 
-.PHONY: help venv demo paper arms changes expect test test-long test-browser test-nightly soak fuzz docs lint clean bench release
+.PHONY: help venv demo paper arms changes expect test test-long test-browser pictures test-nightly soak fuzz docs lint clean bench release
 
 help: ## List what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' Makefile
@@ -76,8 +76,11 @@ test-long: $(READY) ## Kill the recorder ten times within a minute; record a min
 	@LONG_TESTS=1 $(RUN) -m pytest -rP test/test_bag_recorder_killed.py \
 	    test/test_bag_recorder_beside_loop.py test/test_changed_arm.py
 
-test-browser: $(READY) ## Open the page of bag_report in a headless Chromium, if there is one
-	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_analysis_report_page.py
+test-browser: $(READY) ## Open the pages of bag_report and view in a headless Chromium, if there is one
+	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_analysis_report_page.py test/test_view_page.py
+
+pictures: $(READY) ## Make README's moving picture, doc/view.webp, with a headless Chromium
+	@PYTHONPATH="$(CURDIR):$(CURDIR)/test" $(VENV)/bin/python test/view_pictures.py
 
 test-nightly: $(READY) ## Run ten thousand examples of each property of the nodes
 	@BLF_DSC_EXAMPLES=10000 $(RUN) -m pytest -q test/test_nodes_properties.py

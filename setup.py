@@ -103,7 +103,7 @@ setup(
         # Only for `bag_report`: what draws its pages, 40 MB.
         'report': ['plotly>=6'],
         # Only for `view`: what serves its page, 130 MB, most of it to read meshes.
-        'view': ['viser>=1.1', 'yourdfpy>=0.0.57'],
+        'view': ['viser>=1.1', 'yourdfpy>=0.0.57', 'trimesh'],
         'parquet': ['pyarrow'],  # only for `bag_export` into Parquet
         # setuptools: test_package.py builds a wheel without going to the network.
         'test': [

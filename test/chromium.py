@@ -23,8 +23,17 @@ FLAGS = (
     '--remote-debugging-pipe',
     '--window-size=1400,1000',
 )
+# Pictures in space are drawn by the processor.
+WEBGL = ('--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist')
 NAMES = ('chromium', 'chromium-browser', 'google-chrome')
 PATIENCE = 300.0  # s, until a test gives up on what should take seconds
+_PLACE = """(() => {{
+    const found = [...document.querySelectorAll('*')].find(
+        one => one.children.length === 0 && one.textContent.trim() === {text!r});
+    if (!found) return null;
+    const box = found.getBoundingClientRect();
+    return [box.left + box.width / 2, box.top + box.height / 2];
+}})()"""
 
 
 def find():
@@ -33,14 +42,19 @@ def find():
 
 
 class Browser:
-    """One page in a browser of its own; `complaints` gathers errors of console and scripts."""
+    """One page in a browser of its own.
 
-    def __init__(self, profile):
+    Attributes:
+        complaints: errors of console and scripts.
+        requests: addresses of all that the page asked for.
+    """
+
+    def __init__(self, profile, *flags):
         theirs_in, self._to = os.pipe()
         self._from, theirs_out = os.pipe()
         launch = f'exec {find()} "$@" 3<&{theirs_in} 4>&{theirs_out}'
         self._process = subprocess.Popen(
-            ['/bin/bash', '-c', launch, 'chromium', *FLAGS, f'--user-data-dir={profile}'],
+            ['/bin/bash', '-c', launch, 'chromium', *FLAGS, *flags, f'--user-data-dir={profile}'],
             pass_fds=(theirs_in, theirs_out),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -51,10 +65,11 @@ class Browser:
         self._pending = b''
         self._session = None
         self.complaints = []
+        self.requests = []
         target = self.call('Target.createTarget', url='about:blank')['targetId']
         attached = self.call('Target.attachToTarget', targetId=target, flatten=True)
         self._session = attached['sessionId']
-        for domain in ('Page', 'Runtime', 'Log'):
+        for domain in ('Page', 'Runtime', 'Log', 'Network'):
             self.call(f'{domain}.enable')
 
     def call(self, method, **parameters):
@@ -95,6 +110,13 @@ class Browser:
             buttons=0 if kind == 'mouseReleased' else 1,
             clickCount=1,
         )
+
+    def click(self, text):
+        """Click on what has this text, once it is there."""
+        self.wait(_PLACE.format(text=text))
+        x, y = self.value(_PLACE.format(text=text))
+        self.mouse('mousePressed', x, y)
+        self.mouse('mouseReleased', x, y)
 
     def drag(self, start, end):
         """Drag from one place of the window to another."""
@@ -137,5 +159,7 @@ class Browser:
         elif message.get('method') == 'Runtime.consoleAPICalled':
             if told['type'] in ('error', 'warning', 'assert'):
                 self.complaints.append(told['args'])
+        elif message.get('method') == 'Network.requestWillBeSent':
+            self.requests.append(told['request']['url'])
         elif message.get('method') == 'Log.entryAdded' and told['entry']['level'] == 'error':
             self.complaints.append(told['entry'])

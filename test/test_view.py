@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
+
 import numpy as np
 import pytest
 import recorded_run
 import view_rig
 from random_arm import random_urdf
+from scipy.spatial.transform import Rotation
 
 pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
 
@@ -17,7 +20,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import chain_of
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.view import page as page_module
-from blf_dsc_controller.view.arm import Arm, planar_urdf
+from blf_dsc_controller.view.arm import Arm, planar_urdf, with_cylinders
 from blf_dsc_controller.view.bag import BagPlayer
 from blf_dsc_controller.view.moment import Confidence, Moment
 from blf_dsc_controller.view.page import Page, free_port
@@ -45,7 +48,8 @@ def test_a_bag_is_played_and_stops_at_its_end(player):
     now = max(one.time for one in player.moments if one.time <= 1.0)
     assert f't = {now:.2f} s' in shown
     player.speed.value = '10'
-    player.update(0.5)
+    player.update(0.05)
+    assert player.slider.value == 1.5
     player.update(0.5)
     assert player.slider.value == player.moments[-1].time == pytest.approx(2.0, abs=1e-3)
     view_rig.click(player.button)
@@ -92,14 +96,34 @@ def test_links_without_shapes_become_cylinders_where_the_links_are(seed):
     assert len(model.scene.geometry) > 4
     q = np.random.default_rng(seed).uniform(-1.0, 1.0, 4)
     model.update_cfg(dict(zip(('j1', 'j2', 'j3', 'j4'), q, strict=True)))
-    corners = np.array([frame[:3, 3] for frame in frames(chain, q)])
     for number, frame in enumerate(frames(chain, q)[1:-1], 1):
         placed = model.get_transform(f'l{number}', 'base')
         assert placed == pytest.approx(frame, abs=1e-9)
-    low, high = model.scene.bounds
-    thickness = 0.1 * Arm(text, chain).reach
-    assert (corners >= low - thickness).all()
-    assert (corners <= high + thickness).all()
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_cylinders_begin_at_a_joint_and_end_at_the_next(seed):
+    robot = ET.fromstring(with_cylinders(random_urdf(4, seed)[0], 2.0))  # noqa: S314 - our own
+    joints = {}
+    for joint in robot.findall('joint'):
+        end = joint.find('origin').get('xyz').split()
+        joints.setdefault(joint.find('parent').get('link'), []).append(np.array(end, dtype=float))
+    drawn = 0
+    for link in robot.findall('link'):
+        for visual in link.findall('visual'):
+            cylinder = visual.find('geometry/cylinder')
+            if cylinder is not None:
+                at, rpy = (np.array(visual.find('origin').get(k).split(), float) for k in _ORIGIN)
+                along = Rotation.from_euler('xyz', rpy).apply((0, 0, 1))
+                half = 0.5 * float(cylinder.get('length')) * along
+                assert at - half == pytest.approx(np.zeros(3), abs=1e-9)
+                ends = joints[link.get('name')]
+                assert min(np.abs(at + half - end).max() for end in ends) < 1e-9
+                drawn += 1
+    assert drawn > 8
+
+
+_ORIGIN = ('xyz', 'rpy')
 
 
 def test_a_chain_of_any_number_of_planar_links_is_drawn():

@@ -3,6 +3,13 @@
 
 from __future__ import annotations
 
+import re
+import signal
+import subprocess
+from subprocess import PIPE, STDOUT
+from urllib.error import URLError
+from urllib.request import urlopen
+
 import numpy as np
 import pytest
 import view_rig
@@ -10,8 +17,11 @@ import view_rig
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
 
+from command import COMMAND, wait_for
 from ros_rig import RosRig, activate, configure
 
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.cli.main import INTERRUPTED
 from blf_dsc_controller.view.node import ViewNode
 
 EVENT = {'events.begin': [1.0], 'events.duration': [0.5], 'events.payload': [0.25]}
@@ -120,3 +130,23 @@ def test_a_controller_that_died_is_missed(rig, loop):
     _, law, view = loop
     rig.kill(law)
     rig.until(lambda: view.page._state[0] == 'ERROR' and 'gone' in view.page._state[1])
+
+
+def test_a_run_has_its_page_until_it_ends(tmp_path):
+    out = tmp_path / 'run'
+    command = (*COMMAND, '--view', '--mode', 'lockstep', '--duration', '100000', '--out', str(out))
+    with subprocess.Popen(command, stdout=PIPE, stderr=STDOUT, text=True) as process:
+        said = ''
+        while not (found := re.search(r'the page: (http://localhost:\d+)', said)):
+            said += process.stdout.readline()
+            assert process.poll() is None, said
+        wait_for(lambda: 'open http' in (out / 'logs' / 'view.log').read_text())
+        with urlopen(found[1]) as page:  # noqa: S310 - an address of our own
+            assert b'<html' in page.read()
+        process.send_signal(signal.SIGINT)
+        said += process.communicate()[0]
+    assert process.returncode == INTERRUPTED, said
+    run = read_run(out / 'bag')
+    assert np.isfinite(run.error[0]).all()  # the recorder was there before the page was
+    with pytest.raises(URLError):
+        urlopen(found[1])  # noqa: S310

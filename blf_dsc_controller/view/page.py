@@ -37,8 +37,9 @@ _PORTS = 100  # tried from the wanted one on
 _NOT_SHOWN = 0.5  # a deviation that is more than this of the prior's: not identified
 _PLAIN = (86, 110, 150)  # of an arm without colours
 _GHOST = (0, 200, 120, 0.35)
+_HALO = 0.005  # of the reach
 _LEVELS = {'OK': GREEN, 'WARN': ORANGE, 'ERROR': ALARM, 'STALE': MUTED, 'BAG': MUTED}
-_CELL = 'padding:1px 7px;text-align:right;font-variant-numeric:tabular-nums'
+_CELL = 'padding:1px 6px;text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums'
 
 
 class Page:
@@ -72,12 +73,13 @@ class Page:
         gui.reset()
         gui.configure_theme(show_logo=False, show_share_button=False, control_width='large')
         gui.main_panel.dock_right()
-        server.scene.configure_default_lights(cast_shadow=True)
+        server.scene.configure_default_lights(cast_shadow=False)  # costly without a GPU
         self._header = gui.add_html('')
         self.state(*self._state)
 
     def draw_arm(self, arm: Arm, estimates: Mapping[str, str]) -> Any:
         """Draw an arm with the units of its estimates by name; returns the page's tabs."""
+        from trimesh import Trimesh
         from viser.extras import ViserUrdf
 
         self._arm, self._units = arm, {escape(k): v for k, v in estimates.items()}
@@ -89,6 +91,10 @@ class Page:
         colour = None if 'rgba' in arm.text or '<mesh' in arm.text else _PLAIN
         self._drawn = ViserUrdf(server, model, root_node_name='/arm', mesh_color_override=colour)
         ghost = arm.model()
+        shapes = ghost.scene.geometry
+        for name, shape in list(shapes.items()):  # around the arm where both are in one place
+            corners = shape.vertices + _HALO * reach * shape.vertex_normals
+            shapes[name] = Trimesh(corners, shape.faces, process=False)
         self._ghost = ViserUrdf(
             server, ghost, root_node_name='/reference', mesh_color_override=_GHOST
         )
@@ -98,19 +104,19 @@ class Page:
         server.scene.add_grid(
             '/floor', 4 * reach, 4 * reach, cell_size=0.25, position=(0, 0, floor)
         )
-        server.initial_camera.position = tuple(np.array((0.55, -1.25, 0.55)) * reach)
-        server.initial_camera.look_at = (0.15 * reach, 0.0, 0.25 * reach)
+        server.initial_camera.position = tuple(np.array((0.45, -1.05, 0.5)) * reach)
+        server.initial_camera.look_at = (0.15 * reach, 0.0, 0.28 * reach)
         tabs = gui.add_tab_group()
         with tabs.add_tab('Plots'):
-            self._table = gui.add_html('')
             self._plots = [
                 self._plot('tracking error [% of the bound]', self._joints, ('bound',), 110.0),
                 self._plot('torque [N m]', self._joints, ()),
                 self._plot(
-                    'estimates less the truth [% of their scale]', tuple(estimates), (), 100.0
+                    'estimates less the truth [% of the prior]', tuple(estimates), (), 100.0
                 ),
                 self._plot('excitation: log10 of lambda_min', ('lambda_min',), ()),
             ]
+            self._table = gui.add_html('')
         with tabs.add_tab('Estimates'):
             self._estimates = gui.add_html('')
         with tabs.add_tab('Events'):
@@ -194,7 +200,9 @@ class Page:
             if len(recent) > 1:
                 path = self._at(frames(chain, recent)[-1])
                 points = np.stack((path[:-1], path[1:]), axis=1)
-                scene.add_line_segments('/path', points, (0, 114, 178), thickness=3.0)
+                scene.add_line_segments(
+                    '/path', points, (0, 114, 178), thickness=3.0, thickness_units='screen'
+                )
 
     def plot(self, past: Sequence[Moment]) -> None:
         """Draw the plots and tables of the last of some moments."""
@@ -204,12 +212,10 @@ class Page:
         edge = np.full(t.size, 100.0)
         error = np.array([100.0 * one.error / one.bound for one in shown]).T
         torque = np.array([one.torque for one in shown]).T
-        truth = np.nan_to_num(now.truth)
-        scale = np.where(truth == 0.0, self._prior, np.minimum(self._prior, np.abs(truth)))
         off = np.array([100.0 * (one.estimate - np.nan_to_num(one.truth)) for one in shown]).T
         with np.errstate(divide='ignore', invalid='ignore'):
             excitation = np.log10(np.array([[one.lambda_min for one in shown]]))
-            curves = error, torque, off / scale[:, np.newaxis], excitation
+            curves = error, torque, off / self._prior[:, np.newaxis], excitation
         with self.server.atomic():
             for plot, values in zip(self._plots, curves, strict=True):
                 edges = (edge, -edge) if plot is self._plots[0] else ()
