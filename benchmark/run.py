@@ -20,7 +20,16 @@ from matplotlib.figure import Figure
 
 from blf_dsc_controller import __version__
 
-_GROUPS = ('offline', 'montecarlo', 'growth', 'node', 'recording', 'replay', 'startup')
+_GROUPS = (
+    'offline',
+    'montecarlo',
+    'growth',
+    'node',
+    'view',
+    'recording',
+    'replay',
+    'startup',
+)
 _HERE = Path(__file__).parent
 _PACKAGES = ('numpy', 'numba', 'scipy', 'mujoco', 'drake', 'pin', 'ros-jazzy-rclpy')
 

@@ -115,6 +115,17 @@ def test_node_beside_null_node_in_two_processes_and_in_one(monkeypatch):
     ]
 
 
+def test_view_beside_the_controller(monkeypatch):
+    pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
+    tiny(monkeypatch, 'node', _STEPS=20, _WARM_UP=2, _SETTLING=0.05)
+    view = tiny(monkeypatch, 'view')
+    assert contestants(list(view.measure())) == [
+        'controller, telemetry and view on: median latency',
+        'controller, telemetry and view on: p99.9 latency',
+        'controller, telemetry and view on: CPU',
+    ]
+
+
 def test_recorder_beside_raw_subscriber(monkeypatch):
     sizes = {'_TOPICS': 2, '_MESSAGES': 20, '_SETTLING': 0.0, '_RECORDERS': {'recorder': 'none'}}
     recording = tiny(monkeypatch, 'recording', **sizes)

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The controller node with the live view beside it, and without.
+
+The page is closed: what the controller pays for are the subscriptions; the view draws in a process
+of its own, and only while somebody looks.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import numpy as np
+from harness import Contestant, Ratio, own_graph, ratio
+from node import _TELLING, Run, StandIn, _recorded_states, _started
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.params_file import load_loop
+
+_ROUNDS = 7
+_VIEWED = 'controller, telemetry and view on'
+_COMMAND = ('-m', 'blf_dsc_controller.view.node', '--ros-args', '-p', 'port:=8480')
+
+
+def measure() -> Iterator[Ratio]:
+    """Latency and CPU of the controller beside the view relative to those of the controller."""
+    loop = load_loop('recommended')
+    runs: dict[str, list[Run]] = {_TELLING: [], _VIEWED: []}
+    states = _recorded_states(loop)
+    with own_graph(), tempfile.TemporaryDirectory() as folder, closing(StandIn(states)) as arm:
+        for k in range(_ROUNDS):
+            for name, each in runs.items():
+                path = Path(folder, f'{k}-{name}'.replace(' ', '_'))
+                with _viewed(name, loop.controller, path) as these:
+                    each.append(arm.play(these, 1e-3))
+                arm.left_alone()
+    group = 'view, real time at 1 kHz'
+    for what, percentile in (('median', 50.0), ('p99.9', 99.9)):
+        latency = {
+            name: np.array([np.percentile(run.latency, percentile) for run in each])
+            for name, each in runs.items()
+        }
+        title = f'{_VIEWED}: {what} latency'
+        yield ratio(group, title, _TELLING, latency[_VIEWED], latency[_TELLING])
+    cpu = {name: np.array([run.cpu for run in each]) for name, each in runs.items()}
+    yield ratio(group, f'{_VIEWED}: CPU', _TELLING, cpu[_VIEWED], cpu[_TELLING])
+
+
+@contextmanager
+def _viewed(name: str, config: ControllerConfig, path: Path) -> Iterator[list[Contestant]]:
+    """Processes of the controller, after that of the view if it is to have one."""
+    views = [Contestant('view', _COMMAND)] if name == _VIEWED else []
+    try:
+        with _started(_TELLING, config, path) as nodes:
+            yield [*views, *nodes]
+    finally:
+        for view in views:
+            view.end()
