@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""README's moving picture: the live view of a Panda that picks up 2 kg. `make pictures`.
+
+The run is offline and played as a bag, so that the picture does not depend on the computer.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import tempfile
+import time
+from pathlib import Path
+
+import chromium
+import numpy as np
+from PIL import Image
+
+from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.simulation.bag import write_bag
+from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.view.bag import BagPlayer
+from blf_dsc_controller.view.page import Page
+
+TIMES = np.arange(17.0, 26.0, 0.25)  # s; it picks up 2 kg at 20 s
+SETTLE = 1.5  # s, until the browser has drawn a picture without a GPU
+RATE = 8.0  # pictures a second
+WINDOW = (1200, 880)
+NOTICE = "document.querySelectorAll('[class*=Notification]').forEach(one => one.remove())"
+
+
+def pictures(bag, folder):
+    """Pictures of the page at each of the times."""
+    page = Page('127.0.0.1', 18380)
+    size = f'--window-size={WINDOW[0]},{WINDOW[1]}'
+    browser = chromium.Browser(folder / 'profile', *chromium.WEBGL, size)
+    try:
+        player = BagPlayer(page, bag)
+        player.slider.value = TIMES[0]
+        player.update(0.0)
+        browser.call('Page.navigate', url=page.url)
+        browser.wait("(document.body?.innerText ?? '').includes('t = ')")
+        time.sleep(10 * SETTLE)  # it fades in
+        browser.value(NOTICE)
+        for at in TIMES:
+            player.slider.value = float(at)
+            player.update(0.0)
+            time.sleep(SETTLE)
+            browser.screenshot(folder / 'shot.png')
+            yield Image.open(io.BytesIO((folder / 'shot.png').read_bytes())).convert('RGB')
+    finally:
+        browser.close()
+        page.close()
+
+
+def main():
+    """Write the picture."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--out', type=Path, default=Path('doc/view.webp'))
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
+        folder = Path(name)
+        bag = folder / 'panda'
+        loop = load_loop('panda', {'sim_plant': {'duration': 27.0}})
+        record = simulate(loop.controller, loop.plant)
+        write_bag(bag, record, loop.controller, 'none', loop.plant)
+        first, *others = pictures(bag, folder)
+        first.save(
+            options.out,
+            save_all=True,
+            append_images=others,
+            duration=round(1000.0 / RATE),
+            loop=0,
+            quality=60,
+            method=6,
+        )
+    print(f'{options.out}: {options.out.stat().st_size / 1e6:.2f} MB')
+
+
+if __name__ == '__main__':
+    main()
