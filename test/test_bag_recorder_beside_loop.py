@@ -17,6 +17,7 @@ from command import closed_loop
 from mcap.reader import make_reader
 
 from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.cli.run import STOPPED
 from blf_dsc_controller.messages import topics
 
 DURATION = 60 if os.environ.get('LONG_TESTS') else 3  # s
@@ -42,7 +43,8 @@ def numbers(bag):
 
 def test_every_message_of_a_loop_in_real_time_is_in_the_bag(tmp_path):
     run = closed_loop('--mode', 'realtime', '--duration', DURATION, '--out', tmp_path / 'out')
-    assert run.returncode == 0, run.stderr
+    # On a busy machine the controller may stop: all is recorded nevertheless.
+    assert run.returncode in (0, STOPPED), run.stderr
     recorded = numbers(tmp_path / 'out' / 'bag')
     facts = read_context(tmp_path / 'out' / 'bag').facts
     for topic in EACH_SAMPLE:

@@ -100,15 +100,18 @@ def _file_number(path: Path) -> tuple[int, str]:
 
 
 def read_messages(
-    path: Path, topics: Collection[str], unpacker: Unpacker
+    path: Path, topics: Collection[str], unpacker: Unpacker | None = None
 ) -> Iterator[tuple[str, int, bytes]]:
     """Topic, log time [ns] and content of each message of `topics`, in the order of the file.
+
+    The `unpacker` is that of the bag, if this is one of its files.
 
     Raises:
         MalformedRecordError: the file is damaged.
         BlfDscError: it unpacks to too much.
     """
     channels: dict[int, Channel] = {}
+    unpacker = unpacker or Unpacker([path])
     with path.open('rb') as stream, mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
         require_ends(data)
         for piece in scan(data):
