@@ -33,7 +33,6 @@ from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import create_publisher, create_steady_timer
 from blf_dsc_controller.nodes.lifecycle import LoopNode
-from sim_plant import kernels as plant_kernels
 from sim_plant.arms import parameter_names_of, urdf_of
 from sim_plant.command_input import Latency, TorqueInput
 from sim_plant.handshake import Handshake
@@ -81,7 +80,6 @@ class PlantNode(LoopNode[PlantConfig]):
 
     def configure(self) -> None:
         """Put the arm at its start; create its topics the first time."""
-        process.log_compilation(self.get_logger(), *plant_kernels.KERNELS)
         self.plant = plant_of(self.config)
         self._changed.clear()
         self.plant.compile()
@@ -213,7 +211,9 @@ class PlantNode(LoopNode[PlantConfig]):
         self._apply_changes()
         self._publish_state()
         if self._stale and not was_stale:
-            self.get_logger().error('the torque is too old and is no longer applied')
+            self.get_logger().error(
+                'the torque is too old and is no longer applied', throttle_duration_sec=1.0
+            )
             self._report()
 
     def _step(self) -> None:

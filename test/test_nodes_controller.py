@@ -148,3 +148,15 @@ def test_a_gain_that_will_not_do_changes_nothing_and_says_why(ros):
     assert '-10.0' in reasons[0]
     torque = arm.torque_for(1, START, VELOCITY)
     np.testing.assert_array_equal(torque, law_torques(*[(START, VELOCITY)] * 2)[1])
+
+
+def test_a_gain_that_the_start_would_warn_of_is_refused_while_it_runs(ros):
+    node = ros.add(ControllerNode)
+    arm = Arm(ros)
+    arm.torque_for(0, START, VELOCITY)
+    accepted, reasons = set_parameters(ros, node, feedback__gain=[4000.0, 15.0])
+    assert not accepted
+    assert reasons[0].startswith('feedback.gain: K_p over the inertia is ')
+    assert reasons[0].endswith('; to have it all the same, start with it')
+    torque = arm.torque_for(1, START, VELOCITY)
+    np.testing.assert_array_equal(torque, law_torques(*[(START, VELOCITY)] * 2)[1])

@@ -9,12 +9,14 @@ from paper_case import EXACT, NO_DISTURBANCE, P, configured, run
 
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.simulation.loop import simulate_law
 from blf_dsc_controller.supervision.config_warnings import (
     config_warnings,
     reference_load,
     windows_along,
+    worsened,
 )
 
 BOUND = 0.002  # rad
@@ -54,6 +56,20 @@ def test_presets_are_not_warned_of(preset):
 def test_gains_that_cannot_work_are_named(parameter, changes):
     (warning,) = warnings(changes)
     assert warning.startswith(parameter)
+
+
+@pytest.mark.parametrize(
+    ('gain', 'accepted'),
+    [((60.0, 120.0), True), ((60.0, 110.0), True), ((60.0, 121.0), False), ((4000.0, 15.0), False)],
+)
+def test_a_change_must_not_make_worse_what_is_warned_of(gain, accepted):
+    """From gains that are warned of, chosen by their user, the way back is open."""
+    before = configured('recommended', 1.0, {'feedback.gain': [60.0, 120.0]}).controller
+    load = reference_load(before, settings_of_config(before))
+    assert len(config_warnings(before, load=load)) == 1
+    found = worsened(before, change(before, {'feedback.gain': gain}), load)
+    assert (found == []) == accepted
+    assert all(one.startswith('feedback.gain: K_p over the inertia is ') for one in found)
 
 
 def test_a_start_close_to_the_bound_is_named_with_its_joint():
@@ -120,7 +136,7 @@ def test_too_high_a_feedback_chatters_from_twice_the_inertia_s_rate_on():
             config.controller, settings._replace(initial_estimate=np.array([*P, 0, 0]))
         )
         torque = run(config).torque
-        calm[true.rate * 0.002] = np.abs(np.diff(torque[-1000:], axis=0)).max() < 0.1
+        calm[true.rate(settings) * 0.002] = np.abs(np.diff(torque[-1000:], axis=0)).max() < 0.1
     assert all(is_calm == (product < 2.0) for product, is_calm in calm.items()), calm
     assert set(calm.values()) == {True, False}
 

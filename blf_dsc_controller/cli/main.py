@@ -114,6 +114,8 @@ monte_carlo = partial(_alias, 'monte-carlo')
 
 
 def _node(module: str) -> int:
+    for number in (signal.SIGINT, signal.SIGTERM):  # while it imports; then it has its own way
+        signal.signal(number, lambda *_: os._exit(0))
     try:
         require_ros()
     except BlfDscError as error:

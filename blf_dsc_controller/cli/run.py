@@ -6,12 +6,10 @@ from __future__ import annotations
 import itertools
 import sys
 from argparse import Namespace
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba.core import event
 
 from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.summary import format_table, summarize, write_summary
@@ -19,13 +17,11 @@ from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import INTERRUPTED, require_ros, unwritable
 from blf_dsc_controller.cli.progress import LoopProgress
-from blf_dsc_controller.compiled import COMPILATION_NOTICE
-from blf_dsc_controller.compiled.jit import is_compiled
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
 from blf_dsc_controller.configuration.params_file import dump, load_loop, locate
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.controller import update
+from blf_dsc_controller.law.compilation import announced_compilation
 from blf_dsc_controller.law.factory import estimate_names, model_of
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.reference.approach import plan_start
@@ -35,7 +31,6 @@ from blf_dsc_controller.simulation.record import Record
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.supervisor import Reason
 from blf_dsc_controller.view.page import LOCAL, free_port, open_to_others, require_viser
-from sim_plant import kernels as plant_kernels
 
 STOPPED = 5
 """Exit code where the controller stopped before the end."""
@@ -129,7 +124,7 @@ def _run_offline(config: LoopConfig, bag: Path) -> None:
         estimate = record.controller.state.estimate[: len(parameters)]
         progress.show_loop(record.stamps[rows - 1] * 1e-9, np.nanmax(errors), estimate)
 
-    with announced_compilation():
+    with announced_compilation(print_notice):
         record = simulate(config.controller, config.plant, show)
     progress.close()
     for rejected in rejected_columns(record.controller, estimate_names(config.controller)):
@@ -141,8 +136,6 @@ def _run_over_ros(config: LoopConfig, out: Path, options: Namespace) -> bool:
     """Run the three nodes; False if a signal ended the run."""
     from blf_dsc_controller.cli.session import run_session
 
-    if not is_compiled(update, *plant_kernels.KERNELS):
-        _print_notice()
     return run_session(config, out, options.domain, options.view_host if options.view else '')
 
 
@@ -159,33 +152,9 @@ def _check_view(options: Namespace) -> None:
         print(f'warning: {open_to_others(options.view_host)}', file=sys.stderr)
 
 
-class _CompilationListener(event.Listener):  # type: ignore[misc]
-    """Prints a notice when numba begins to compile what it does not find in its cache."""
-
-    announced = False
-
-    def on_start(self, _event: object) -> None:
-        if not self.announced:
-            _print_notice()
-        self.announced = True
-
-    def on_end(self, _event: object) -> None:
-        pass
-
-
-def announced_compilation() -> AbstractContextManager[object]:
-    """Print a notice if a kernel is compiled in this context, a wait that would look like a hang.
-
-    Kernels have a version for each type of arguments, of which some may be in the cache.
-    """
-    listener: AbstractContextManager[object] = event.install_listener(
-        'numba:compile', _CompilationListener()
-    )
-    return listener
-
-
-def _print_notice() -> None:
-    print(COMPILATION_NOTICE, file=sys.stderr, flush=True)
+def print_notice(notice: str) -> None:
+    """Print what is not a part of the results."""
+    print(notice, file=sys.stderr, flush=True)
 
 
 def _report(out: Path) -> bool:

@@ -21,6 +21,7 @@ from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import JointState
 
 from blf_dsc_controller.cli.progress import LoopProgress
+from blf_dsc_controller.compiled import COMPILATION_NOTICE
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, VIEW, LoopConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import model_of
@@ -114,6 +115,11 @@ class NodeProcess:
     def is_running(self) -> bool:
         """Whether the process is alive."""
         return self._process.poll() is None
+
+    @property
+    def is_compiling(self) -> bool:
+        """Whether the node has said that it compiles the kernels."""
+        return COMPILATION_NOTICE in self._log.read_text(encoding='utf-8', errors='replace')
 
     def check(self, remark: str = '') -> None:
         """Raise NodeFailedError, with the end of the log, if the node ended with an error."""
@@ -249,11 +255,14 @@ def _monitor(
     is to be the recorder.
     """
     recorder, *loop = nodes
-    ended, warned = inf, False
+    ended, warned, announced = inf, False, False
     with Monitor(config, interrupts) as monitor:
         while loop[-1].is_running and not interrupts:
             for node in loop:
                 node.check()
+            if not (announced or monitor.has_begun) and any(node.is_compiling for node in loop):
+                announced = True
+                monitor.progress.write(COMPILATION_NOTICE)
             if not recorder.is_running:
                 ended = min(ended, time.monotonic())
                 if monitor.has_begun and not warned:

@@ -12,9 +12,10 @@ from tqdm import tqdm
 
 from blf_dsc_controller.analysis.summary import format_table
 from blf_dsc_controller.arm_comparison.study import compare as compare_arms
-from blf_dsc_controller.cli.run import announced_compilation, make_folder
+from blf_dsc_controller.cli.run import make_folder, print_notice
 from blf_dsc_controller.configuration.params_file import locate
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.law.compilation import announced_compilation
 from blf_dsc_controller.monte_carlo import executors
 from blf_dsc_controller.monte_carlo.report import (
     headline,
@@ -40,7 +41,7 @@ def paper(options: Namespace) -> None:
 def arms(options: Namespace) -> None:
     """Tune and run every law on arms of URDFs, write the page and print who is best at what."""
     folder = make_folder(options.out)
-    with announced_compilation():
+    with announced_compilation(print_notice):
         rows = compare_arms(folder, options.config, options.truths, options.generations)
     for arm, figure, best, least, *ours in rows:
         print(f'{arm:<6} {figure:<36} {best}: {least} (proposed {ours[0]}, tuned {ours[1]})')
@@ -72,7 +73,7 @@ def _run_study(options: Namespace) -> None:
         size = options.chunk or executors.chunk_size(study.settings.runs, engine.workers)
         spans = store.missing(size)
         if spans:
-            with announced_compilation():
+            with announced_compilation(print_notice):
                 warm_up(study)
             _compute(store, spans, engine)
         _report(store)

@@ -12,7 +12,6 @@ import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law import factory as assembly
-from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.cdr import MessageError
@@ -22,7 +21,12 @@ from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.controller_status import ControllerStatus
 from blf_dsc_controller.nodes.lifecycle import POLL_PERIOD, LoopNode
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
-from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.supervision.config_warnings import (
+    ReferenceLoad,
+    config_warnings,
+    reference_load,
+    worsened,
+)
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Phase
 
@@ -45,6 +49,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def __init__(self, **options: Any) -> None:
         super().__init__(topics.CONTROLLER, ControllerConfig, **options)
         self.guard: Guard | None = None
+        self._load: ReferenceLoad | None = None
         joints = self.config.joints
         self._estimates = assembly.estimate_names(self.config)
         self._telemetry = ControllerTelemetry(
@@ -57,6 +62,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._pending: bytes | None = None
         self._warned_at = -1  # stamp of the start that was warned of
         self._observed = self._started = False
+        self._phase = Phase.INACTIVE  # that was logged last
         self._status = ControllerStatus(self, joints)
         parameters.on_change(self, ControllerConfig, self._retune, self._problems)
         self.start()
@@ -65,10 +71,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def configure(self) -> None:
         """Compile the law; create the topics of the loop the first time."""
-        process.log_compilation(self.get_logger(), update)
         self.guard = Guard(self.config, self._steady, self._wall)
         self.guard.compile()
-        for warning in config_warnings(self.config):
+        self._load = reference_load(self.config, self.guard.controller.settings)
+        for warning in config_warnings(self.config, load=self._load):
             self.get_logger().warning(warning)
         outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
         if self.connect(outputs, topics.JOINT_STATES, self._on_joint_state):
@@ -88,6 +94,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         """Go to the safe torque on its ramp, and command it for the joint states from then on."""
         if self.guard is not None:
             self.guard.deactivate()
+        self.get_logger().info(f'deactivated: {self.config.safety.torque} torque')
         self._report()
 
     def release(self) -> None:
@@ -103,9 +110,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _command_zero(self) -> None:
         """Command zero torque, as drivers hold the last command, and release the guard."""
-        guard, states = self.guard, self.resolve_topic_name(topics.JOINT_STATES.relative)
+        guard = self.guard
         if guard is not None:
-            if guard.commanding and self.count_publishers(states):
+            if guard.commanding and self._is_fed():
                 self._command(np.zeros(len(self.config.joints)))
             guard.release()
             self._status.publish_events(guard)
@@ -211,7 +218,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             if self._pending is not None and self._is_observed():
                 raw, self._pending = self._pending, None
                 self._on_joint_state(raw)
-            self._command(guard.watch())
+            self._command(guard.watch(self._is_fed))
             self._report_if_changed(guard)
             if self._pending is None:
                 wait = guard.watchdog.next_check
@@ -221,7 +228,11 @@ class ControllerNode(LoopNode[ControllerConfig]):
     # Changes of the configuration, and reports.
 
     def _problems(self, config: ControllerConfig) -> list[str]:
-        return self.guard.problems(config) if self.guard else []
+        if self.guard is None or self._load is None:
+            return []
+        remedy = '; to have it all the same, start with it'
+        doubts = [text + remedy for text in worsened(self.config, config, self._load)]
+        return self.guard.problems(config) + doubts
 
     def _retune(self, config: ControllerConfig) -> None:
         self.config, guard = config, self.guard
@@ -235,8 +246,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if not self._status.has_news(guard):
             return
         supervisor = guard.supervisor
-        if supervisor.phase is Phase.SAFE_STOP:
-            self.get_logger().fatal(f'{self.config.safety.torque} torque: {supervisor.text}')
+        self._log_phase(guard)
         if guard.watchdog.why_off and guard.start_stamp != self._warned_at:
             self._warned_at = guard.start_stamp
             self.get_logger().warning(guard.watchdog.why_off)
@@ -244,6 +254,32 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if guard.start_error is not None and self.config.autostart and not self._started:
             self.failure, self.finished = guard.start_error, True
         self._report()
+
+    def _log_phase(self, guard: Guard) -> None:
+        before, self._phase = self._phase, guard.supervisor.phase
+        if self._phase is Phase.SAFE_STOP:
+            stop = f'{self.config.safety.torque} torque: {guard.supervisor.text}'
+            self.get_logger().fatal(f'{stop}; {self._way_back()}')
+        elif self._phase is before:
+            return
+        elif self._phase is Phase.APPROACHING:
+            left = guard.settled - guard.time
+            self.get_logger().info(f'approaching the reference, for {left:.3g} s')
+        elif self._phase is Phase.TRACKING:
+            self.get_logger().info('tracking the reference')
+        elif self._phase is Phase.INACTIVE and self.state_label == 'active':
+            self.get_logger().info('nobody publishes joint states any more: out of command')
+
+    def _way_back(self) -> str:
+        """How to start again after a stop."""
+        plant = f'{self.get_namespace().rstrip("/")}/{topics.PLANT}/reset'
+        if plant in dict(self.get_service_names_and_types()):
+            return f'{plant} takes the arm to its start and begins anew'
+        return f'{self.get_fully_qualified_name()}/reset begins anew from where the arm is then'
+
+    def _is_fed(self) -> bool:
+        """Whether anybody publishes joint states."""
+        return self.count_publishers(self.resolve_topic_name(topics.JOINT_STATES.relative)) > 0
 
     def _report(self) -> None:
         self._status.report(self.state_label, self.guard)

@@ -17,6 +17,7 @@ from std_srvs.srv import Trigger
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.law.compilation import announced_compilation
 from blf_dsc_controller.messages.telemetry import Message
 from blf_dsc_controller.messages.topics import Topic
 from blf_dsc_controller.nodes import parameters, process
@@ -73,7 +74,8 @@ class ManagedNode(LifecycleNode, process.PlainNode):
                 raise BlfDscError(f'{self.get_name()} could not {name}: {error!r}') from error
 
     def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:  # noqa: D102
-        return self._try(self.configure)
+        with announced_compilation(self.get_logger().info):
+            return self._try(self.configure)
 
     def on_activate(self, _state: LifecycleState) -> TransitionCallbackReturn:  # noqa: D102
         return self._try(self.activate)

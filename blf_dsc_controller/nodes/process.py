@@ -22,8 +22,6 @@ from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from blf_dsc_controller.compiled import COMPILATION_NOTICE
-from blf_dsc_controller.compiled.jit import is_compiled
 from blf_dsc_controller.configuration.common import Realtime
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.nodes.arguments import refuse_unknown
@@ -96,6 +94,9 @@ def run(make_node: Callable[[], PlainNode]) -> int:
                 _close(node)
         finally:
             rclpy.try_shutdown()
+            # A launch passes on the signal that the terminal has sent: the second one comes now.
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, signal.SIG_IGN)
     if problem:  # last, so that it stands at the end of the output
         print(problem, file=sys.stderr)  # noqa: T201
         return 1
@@ -131,12 +132,6 @@ def drain(publishers: Iterable[Publisher]) -> None:
             get_logger('end').warning(
                 f'{publisher.topic_name}: the last messages did not reach every subscriber'
             )
-
-
-def log_compilation(logger: RcutilsLogger, *kernels: Callable[..., object]) -> None:
-    """Log that kernels are about to be compiled, before a wait that would look like a fault."""
-    if not is_compiled(*kernels):
-        logger.info(COMPILATION_NOTICE)
 
 
 def request_realtime(realtime: Realtime, logger: RcutilsLogger) -> None:

@@ -38,48 +38,69 @@ class ReferenceLoad(NamedTuple):
     """What the reference demands, followed exactly with the initial estimate."""
 
     torque: Floats  # largest magnitude (n,), N m
-    rate: float  # largest eigenvalue of M^-1 K_p + omega_v, 1/s
-    damping: Floats  # of each joint with the others free, at least (n,), N m s/rad
+    inertia: Floats  # M along it, where it is positive definite (k, n, n), kg m^2
+
+    def rate(self, settings: Settings) -> float:
+        """Largest eigenvalue of M^-1 K_p + omega_v, 1/s."""
+        roots = np.linalg.eigvals(np.linalg.solve(self.inertia, np.diag(settings.Kp)))
+        return float(np.abs(roots).max(initial=0.0)) + settings.damping_rate
+
+    def damping(self, settings: Settings) -> Floats:
+        """Damping of each joint with the others free, at least (n,), N m s/rad."""
+        free = 1.0 / np.diagonal(np.linalg.inv(self.inertia), axis1=1, axis2=2)
+        inertia: Floats = free.min(axis=0, initial=np.inf)
+        damped = settings.damping_rate * inertia if settings.damping_rate > 0.0 else 0.0
+        return settings.Kp + damped
 
 
-def config_warnings(config: ControllerConfig, q: Floats | None = None) -> list[str]:
+class Finding(NamedTuple):
+    """Gains that cannot work well: of what, by how much beyond 1, and a sentence."""
+
+    of: str
+    excess: float
+    text: str
+
+
+def config_warnings(
+    config: ControllerConfig, q: Floats | None = None, load: ReferenceLoad | None = None
+) -> list[str]:
     """Warnings, a sentence each that begins with the parameter to change first.
 
-    `q` (n,) [rad] are the measured positions at the start, if known.
+    `q` (n,) [rad] are the measured positions at the start, and `load` that of the reference, if
+    known.
     """
     settings = settings_of_config(config)
-    load = reference_load(config, settings)
-    found = [*_of_start(config, q), *_of_torque(config, settings, load)]
-    if settings.surface != LINEAR:
-        found += _of_surface(config, settings, load)
-        if settings.kappa > 0.0 and settings.Gamma.any():
-            windows = windows_along(config, settings)
-            found += _of_update(config, settings, windows)
-            found += _of_window(config, settings, windows)
+    load = load or reference_load(config, settings)
+    found = [*_of_start(config, q), *(one.text for one in _of_gains(config, load))]
+    if settings.surface != LINEAR and settings.kappa > 0.0 and settings.Gamma.any():
+        windows = windows_along(config, settings)
+        found += _of_update(config, settings, windows)
+        found += _of_window(config, settings, windows)
     return found
+
+
+def worsened(before: ControllerConfig, after: ControllerConfig, load: ReferenceLoad) -> list[str]:
+    """Warnings of gains after a change that were not warned of before it, or less."""
+    known = {one.of: one.excess for one in _of_gains(before, load)}
+    return [one.text for one in _of_gains(after, load) if one.excess > known.get(one.of, 1.0)]
 
 
 def reference_load(config: ControllerConfig, settings: Settings) -> ReferenceLoad:
     """Evaluate the dynamics along the reference, over its slowest period."""
     P = settings.initial_estimate[: settings.p]
     H, Yp, Yr = np.zeros((3, settings.n, settings.p))
-    torque, rate, inertia = np.zeros(settings.n), 0.0, np.full(settings.n, np.inf)
+    torque, inertia = np.zeros(settings.n), []
     moments = np.linspace(0.0, _horizon(config), _POINTS, endpoint=False)
-    M = np.zeros((settings.n, settings.n))
     for q, dq, ddq in sampled(reference_of(config), moments):
         settings.model.regressor(q, dq, dq, ddq, H)
         torque = np.maximum(torque, np.abs(H @ P))
+        M = np.zeros((settings.n, settings.n))
         for i, unit in enumerate(np.eye(settings.n)):
             settings.model.momentum_regressor(q, unit, Yp, Yr)
             M[:, i] = Yp @ P
         if np.linalg.eigvalsh(M)[0] > 0.0:
-            roots = np.linalg.eigvals(np.linalg.solve(M, np.diag(settings.Kp)))
-            rate = max(rate, float(np.abs(roots).max()) + settings.damping_rate)
-            inertia = np.minimum(inertia, 1.0 / np.diag(np.linalg.inv(M)))
-    damping = settings.Kp.copy()
-    if settings.damping_rate > 0.0:
-        damping += settings.damping_rate * inertia
-    return ReferenceLoad(torque, rate, damping)
+            inertia.append(M)
+    return ReferenceLoad(torque, np.reshape(inertia, (-1, settings.n, settings.n)))
 
 
 def windows_along(config: ControllerConfig, settings: Settings) -> Floats:
@@ -129,52 +150,72 @@ def _of_start(config: ControllerConfig, q: Floats | None) -> Iterator[str]:
             )
 
 
-def _of_torque(config: ControllerConfig, settings: Settings, load: ReferenceLoad) -> Iterator[str]:
+def _of_gains(config: ControllerConfig, load: ReferenceLoad) -> list[Finding]:
+    settings = settings_of_config(config)
+    damping = np.maximum(load.damping(settings), 1e-12)
+    found = [*_of_torque(config, load), *_of_feedback(config, settings, load, damping)]
+    if settings.surface != LINEAR:
+        found += _of_surface(config, settings, damping)
+    return [one for one in found if one.excess > 1.0]
+
+
+def _of_torque(config: ControllerConfig, load: ReferenceLoad) -> Iterator[Finding]:
     for joint, need, limit in zip(config.joints, load.torque, config.torque.limit, strict=True):
-        if limit < _MARGIN * need:
-            yield (
-                f'torque.limit: {joint} has {limit:g} N m, but with learning.initial_estimate the '
-                f'reference alone needs up to {need:.3g} N m: no bound can be kept with less, and '
-                f'a quarter more is recommended for errors and disturbances'
-            )
-    product = load.rate * config.sample_time
-    if product > 1.0:
-        yield (
-            f'feedback.gain: K_p over the inertia is {load.rate:.3g} 1/s with '
-            f'learning.initial_estimate, {product:.2g} times the inverse of the sample time of '
-            f'{config.sample_time:g} s: above 1 the sampled loop has little margin for delays, and '
-            f'above 2 it chatters between the limits: lower the gain or the sample time'
-        )
-    fraction = float(np.max(settings.gamma * config.sample_time / np.maximum(load.damping, 1e-12)))
-    if fraction > 0.5:
-        yield (
-            f'disturbance.gain: in each sample the disturbance estimate absorbs {fraction:.2g} of '
-            f'the velocity feedback, more than half: it will oscillate against feedback.gain'
+        yield Finding(
+            f'torque of {joint}',
+            _MARGIN * need / limit,
+            f'torque.limit: {joint} has {limit:g} N m, but with learning.initial_estimate the '
+            f'reference alone needs up to {need:.3g} N m: no bound can be kept with less, and '
+            f'a quarter more is recommended for errors and disturbances',
         )
 
 
-def _of_surface(config: ControllerConfig, settings: Settings, load: ReferenceLoad) -> Iterator[str]:
+def _of_feedback(
+    config: ControllerConfig, settings: Settings, load: ReferenceLoad, damping: Floats
+) -> Iterator[Finding]:
+    rate = load.rate(settings)
+    product = rate * config.sample_time
+    yield Finding(
+        'feedback',
+        product,
+        f'feedback.gain: K_p over the inertia is {rate:.3g} 1/s with '
+        f'learning.initial_estimate, {product:.2g} times the inverse of the sample time of '
+        f'{config.sample_time:g} s: above 1 the sampled loop has little margin for delays, and '
+        f'above 2 it chatters between the limits: lower the gain or the sample time',
+    )
+    fraction = float(np.max(settings.gamma * config.sample_time / damping))
+    yield Finding(
+        'disturbance',
+        2.0 * fraction,
+        f'disturbance.gain: in each sample the disturbance estimate absorbs {fraction:.2g} of '
+        f'the velocity feedback, more than half: it will oscillate against feedback.gain',
+    )
+
+
+def _of_surface(config: ControllerConfig, settings: Settings, damping: Floats) -> Iterator[Finding]:
     T, filtering = config.sample_time, config.surface.time_constant
     rate = float(np.max(settings.K / 2.0 + settings.mu))
-    if filtering < T:
-        yield (
-            f'surface.time_constant: {filtering:g} s is shorter than the sample time of {T:g} s: '
-            f'alpha2 then follows the measurement noise, and its derivative enters the torque'
+    yield Finding(
+        'filter',
+        T / filtering,
+        f'surface.time_constant: {filtering:g} s is shorter than the sample time of {T:g} s: '
+        f'alpha2 then follows the measurement noise, and its derivative enters the torque',
+    )
+    yield Finding(
+        'surface',
+        filtering * rate,
+        f'surface.gain, surface.mu: K/2 + mu is {rate:.3g} 1/s, but the filter of '
+        f'{filtering:g} s follows only {0.25 / filtering:.3g} 1/s without ringing: lower '
+        f'surface.time_constant or the gains',
+    )
+    for joint, ratio in zip(config.joints, settings.slope_limit * T / damping, strict=True):
+        yield Finding(
+            f'barrier of {joint}',
+            ratio / 2.0,
+            f'barrier.slope_limit: past the knee of its barrier {joint} is corrected by '
+            f'{ratio:.2g} times its error in one sample, and above 2 the error grows: lower '
+            f'barrier.slope_limit below 2 feedback.gain / sample_time',
         )
-    if filtering * rate > 1.0:
-        yield (
-            f'surface.gain, surface.mu: K/2 + mu is {rate:.3g} 1/s, but the filter of '
-            f'{filtering:g} s follows only {0.25 / filtering:.3g} 1/s without ringing: lower '
-            f'surface.time_constant or the gains'
-        )
-    stiff = settings.slope_limit * T / np.maximum(load.damping, 1e-12)
-    for joint, ratio in zip(config.joints, stiff, strict=True):
-        if ratio > 2.0:
-            yield (
-                f'barrier.slope_limit: past the knee of its barrier {joint} is corrected by '
-                f'{ratio:.2g} times its error in one sample, and above 2 the error grows: lower '
-                f'barrier.slope_limit below 2 feedback.gain / sample_time'
-            )
 
 
 def _of_update(config: ControllerConfig, settings: Settings, windows: Floats) -> Iterator[str]:

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the nodes say of what they do, of how to go on, and how their processes end."""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+
+import numba
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+
+from command import finished
+from fake_clock import FakeClock
+from rcl_interfaces.msg import Log
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from ros_rig import START, Arm, deactivate
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from blf_dsc_controller.compiled import COMPILATION_NOTICE
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
+from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.supervision.supervisor import Phase
+from sim_plant.node import PlantNode
+
+KEPT = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+FATAL = int.from_bytes(Log.FATAL, 'little') if isinstance(Log.FATAL, bytes) else Log.FATAL
+
+
+@pytest.fixture
+def log(ros):
+    """What the nodes in a namespace have logged; each test has one of its own (see KEPT)."""
+    heard = []
+    ros.tester.create_subscription(Log, '/rosout', heard.append, KEPT)
+
+    def said(namespace, words, level=0):
+        return [
+            one.msg
+            for one in heard
+            if one.name.startswith(namespace) and words in one.msg and one.level >= level
+        ]
+
+    return said
+
+
+def test_each_phase_is_said_and_after_a_stop_how_to_go_on(ros, log):
+    away = {'initial.position': [START[0] - 0.01, START[1]]}
+    arm, law = ros.loop(plant=away, namespace='phases')
+    said = partial(log, 'phases')
+    ros.until(lambda: said('tracking the reference'))
+    assert len(said('approaching the reference, for ')) == 1
+
+    states = ros.tester.create_publisher(JointState, '/phases/joint_states', 1)
+    ros.until(states.get_subscription_count)
+    states.publish(b'')
+    ros.until(lambda: said('zero torque: ', FATAL))
+    (stop,) = said('zero torque: ', FATAL)
+    assert stop.endswith('/phases/sim_plant/reset takes the arm to its start and begins anew')
+    ros.reset(arm)
+    ros.until(lambda: len(said('tracking the reference')) == 2)
+    deactivate(ros, law)
+    ros.until(lambda: said('deactivated: zero torque'))
+
+
+def test_without_a_simulated_arm_the_controller_itself_is_reset(ros, log):
+    ros.add(ControllerNode, namespace='real')
+    driver = (Float64MultiArray, '/real/blf_dsc_controller/commands', lambda _: None, 1)
+    ros.tester.create_subscription(*driver)
+    states = ros.tester.create_publisher(JointState, '/real/joint_states', 1)
+    ros.until(states.get_subscription_count)
+    states.publish(b'')
+    ros.until(lambda: log('real', '', FATAL))
+    (stop,) = log('real', '', FATAL)
+    assert stop.endswith('/real/blf_dsc_controller/reset begins anew from where the arm is then')
+
+
+def test_where_the_states_end_with_their_publisher_there_is_no_fault(ros, log):
+    """A plant whose time is over; one that is killed is a fault, for it is missed later."""
+    clock = FakeClock()
+    node = ros.add(ControllerNode, {'safety.watchdog': 'on'}, clock=clock)
+    arm = Arm(ros)
+    assert arm.torque_for(0, START).any()
+    ros.tester.destroy_publisher(arm._publisher)
+    ros.until(lambda: not node.count_publishers('/joint_states'))
+    clock.advance(0.1)
+    ros.until(lambda: clock.advance(0.01) or not node.guard.supervisor.running)
+    assert node.guard.supervisor.phase is Phase.INACTIVE
+    ros.until(lambda: log('blf_dsc_controller', 'nobody publishes joint states any more'))
+    assert not log('blf_dsc_controller', '', FATAL)
+    assert node.guard.supervisor.stops == 0
+
+
+def test_a_compilation_is_announced_by_the_node_that_waits_for_it(ros, log):
+    class Compiling(PlantNode):
+        def configure(self):
+            super().configure()
+            numba.njit(lambda x: x + 1)(1)
+            numba.njit(lambda x: x + 2)(1)
+
+    ros.add(Compiling, namespace='compiles')
+    ros.until(lambda: log('compiles', 'realtime, waiting for a controller'))
+    assert log('compiles', COMPILATION_NOTICE) == [COMPILATION_NOTICE]
+
+
+def test_a_torque_that_is_too_old_again_and_again_does_not_fill_the_log(ros, log):
+    clock = FakeClock()
+    states = ros.listen(topics.JOINT_STATES)
+    commands = ros.publisher(topics.COMMANDS)
+    arm = ros.add(PlantNode, clock=clock)
+    ros.until(lambda: clock.advance(0.01) or states)
+    for _ in range(30):
+        before = arm.input.stale_steps
+        commands.publish(Float64MultiArrayEncoder(2).encode(np.zeros(2)))
+        ros.until(lambda: arm._has_torque)
+        ros.until(lambda before=before: clock.advance(0.01) or arm.input.stale_steps > before)
+    ros.until(lambda: log('sim_plant', 'the torque is too old'))
+    ros.spin(0.1)
+    assert len(log('sim_plant', 'the torque is too old')) < 30
+
+
+INTERRUPTED = """
+import os, signal, sys
+
+class Interrupting:
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        if name == 'numba':
+            os.kill(os.getpid(), signal.{})
+
+sys.meta_path.insert(0, Interrupting)
+from blf_dsc_controller.cli.main import {}
+sys.exit({}())
+"""
+SECOND = """
+import os, signal, sys
+
+class Last:
+    def __del__(self, kill=os.kill, pid=os.getpid(), number=signal.{}):
+        kill(pid, number)
+
+last = Last()  # goes when Python has taken back the handlers of signals
+from blf_dsc_controller.cli.main import {}
+sys.argv.append('--unknown')
+sys.exit({}())
+"""
+
+
+@pytest.mark.parametrize('number', ['SIGINT', 'SIGTERM'])
+@pytest.mark.parametrize('node', ['sim_plant', 'blf_dsc_controller'])
+def test_a_signal_during_the_imports_ends_a_node_without_a_word(node, number):
+    run = finished(sys.executable, '-c', INTERRUPTED.format(number, node, node))
+    assert (run.returncode, run.stdout, run.stderr) == (0, '', '')
+
+
+@pytest.mark.parametrize('number', ['SIGINT', 'SIGTERM'])
+def test_a_second_signal_does_not_kill_a_node_that_is_ending(number):
+    run = finished(sys.executable, '-c', SECOND.format(number, 'sim_plant', 'sim_plant'))
+    assert run.returncode == 1
+    assert run.stderr.startswith('unknown arguments --unknown')
