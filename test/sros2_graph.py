@@ -28,7 +28,7 @@ HEAD = """\
 <?xml version="1.0" encoding="UTF-8"?>
 <!-- SPDX-License-Identifier: Apache-2.0 -->
 <!-- What each node may do, for SROS 2: made by `python test/sros2_graph.py config/sros2_policy.xml`
-     from the running nodes in the root namespace. See the README for how to use it. -->
+     from the running nodes in the root namespace. See doc/operation.md for how to use it. -->
 """
 
 
@@ -74,6 +74,10 @@ def live():
                 'bag_recorder': ['bag_recorder', '_bag_recorder_subscriptions'],
             }
             found = {name: granted(ros, parts) for name, parts in nodes.items()}
+            # With robot.urdf: topic://robot_description it waits for it, by a node of its own.
+            found['blf_dsc_controller']['subscribe'].append('/robot_description')
+            hidden = '/_blf_dsc_controller_subscriptions/get_type_description'
+            found['blf_dsc_controller']['reply'].insert(0, hidden)
             ros.executor.remove_node(recorder)
             ros.spin(0.1)
             recorder.close()

@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
+import yaml
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.params_file import load, load_loop, locate, read
@@ -114,7 +116,9 @@ def test_overrides_count_more_than_the_file(file):
     assert (plant.seed, plant.duration) == (3, 5.0)
     with pytest.raises(ConfigurationError) as caught:
         load(path, 'sim_plant', PlantConfig, {'duration': -2.0})
-    assert caught.value.problems == ['duration: got -2.0, but it must be at least 0 s']
+    assert caught.value.problems == [
+        'duration: got -2.0, but it must be at least 0 s (given beside the file)'
+    ]
 
 
 def test_an_unknown_name_in_the_section_of_the_node_is_rejected(file):
@@ -238,3 +242,13 @@ def test_a_misspelt_node_is_named(file):
     with pytest.raises(ConfigurationError, match='/left/bag_recorder is not /bag_recorder: write'):
         load_loop(file(section('/left/bag_recorder', 'output: here')))
     assert load_loop(file(section('robot_state_publisher', 'a: 1'))).plant == PlantConfig()
+
+
+def test_the_file_for_a_real_arm_in_the_documentation_is_whole(file):
+    page = (Path(__file__).parents[1] / 'doc/real_arm.md').read_text()
+    of_ros2_control, own = re.findall(r'```yaml\n(.*?)```', page, re.DOTALL)[:2]
+    path = file(own.replace('topic://robot_description', 'ur5e.urdf'))
+    config = load(path, 'blf_dsc_controller', ControllerConfig)
+    effort_controller = yaml.safe_load(of_ros2_control)['effort_controller']
+    assert list(config.joints) == effort_controller['ros__parameters']['joints']
+    assert config.safety.torque == 'hold_gravity'

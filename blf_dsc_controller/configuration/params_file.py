@@ -148,8 +148,11 @@ def _load(
         problems = []
         for problem in error.problems:
             name = problem.split(':', 1)[0]
-            in_file = name in entries and name not in overrides
-            problems.append(f'line {entries[name].line}: {problem}' if in_file else problem)
+            if name in overrides:
+                problems.append(f'{problem} (given beside the file)')
+            else:
+                line = f'line {entries[name].line}: ' if name in entries else ''
+                problems.append(f'{line}{problem}')
         raise ConfigurationError(problems) from None
 
 
