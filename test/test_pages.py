@@ -41,6 +41,7 @@ FOREIGN = {
     'pytest',
     'rosdoc2',
     'source',
+    'sudo',
     'xacro',
 }
 
