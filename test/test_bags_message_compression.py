@@ -55,6 +55,12 @@ def test_it_is_read_reported_exported_and_learned_from(bag, packed, tmp_path, ca
     assert (tmp_path / 'packed.csv').read_bytes() == (tmp_path / 'plain.csv').read_bytes()
 
 
+def test_its_file_alone_is_read(bag, packed):
+    """Only metadata.yaml says that the messages are compressed."""
+    (file,) = {*packed.glob('*.mcap'), *packed.glob('*.db3')}
+    np.testing.assert_array_equal(read_run(file).error, read_run(bag).error)
+
+
 def test_it_is_recovered_as_a_bag_that_needs_no_unpacking(bag, tmp_path, capsys):
     packed = pack(bag, tmp_path / 'bag', StoragePlugin.MCAP)
     (packed / 'metadata.yaml').unlink()  # as a killed recorder leaves it

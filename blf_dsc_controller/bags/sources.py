@@ -13,6 +13,7 @@ from typing import TypeAlias
 
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1.reader import decompressors
+from zstandard import FRAME_HEADER
 
 from blf_dsc_controller.bags import mcap_index, mcap_reader, sqlite_reader
 from blf_dsc_controller.bags.folder import METADATA, BagFolder, StoredTopic, checked, read_folder
@@ -122,7 +123,7 @@ def _ros2_bag(bag: BagFolder, temporary: Path) -> OpenBag:
                 found = mcap_index.read_in_order(file, topics, *span)
             for topic, received, raw in found:
                 if span is None or span[0] <= received < span[1]:
-                    is_packed = bag.compression == 'message'
+                    is_packed = raw.startswith(FRAME_HEADER)  # by message; no CDR begins so
                     yield topic, received, unpacker.unpack(raw, 'zstd') if is_packed else raw
 
     return OpenBag(bag.topics, bag.times, read)
