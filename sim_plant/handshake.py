@@ -36,6 +36,11 @@ class Handshake:
         self._response: Any = None
         self._requested = 0.0
 
+    def reset_controller(self) -> Any:
+        """Request a reset of the controller; return its future, None if it has no such service."""
+        ready = self._client.service_is_ready()
+        return self._client.call_async(Trigger.Request()) if ready else None
+
     def is_done(self, *, observed: bool) -> bool:
         """Whether the state can be sent; `observed`: whether all topics have subscribers now."""
         now = self._clock()
@@ -48,9 +53,8 @@ class Handshake:
             return False
         if self._to_reset:
             self._to_reset = False
-            if self._client.service_is_ready():
-                self._response = self._client.call_async(Trigger.Request())
-                self._requested = now
+            self._response = self.reset_controller()
+            self._requested = now
         if self._response is None:
             return True
         if self._response.done():

@@ -10,7 +10,8 @@ Load, wall, events, disturbance and encoder offsets can change while it runs, fr
 on; `~/changes` says from which, so that an event at that time repeats the run.
 
 A reset takes the arm back to its start, which no real arm does by itself: therefore this node also
-resets the controller, if there is one, before it sends the first state.
+resets the controller, if there is one, before it sends the first state; and
+in real time when its own time is over.
 """
 
 from __future__ import annotations
@@ -227,7 +228,10 @@ class PlantNode(LoopNode[PlantConfig]):
             self._report()
 
     def _is_over(self) -> bool:
-        self.finished = self.finished or 0 < self._steps <= self.plant.sample
+        if 0 < self._steps <= self.plant.sample and not self.finished:
+            self.finished = True
+            if not self._lockstep:  # a controller would take the silence for a fault
+                self._handshake.reset_controller()
         return self.finished
 
     def _is_stale(self) -> bool:

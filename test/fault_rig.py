@@ -116,7 +116,7 @@ class Rig:
             self.steady += MILLISECOND
             self.wall += MILLISECOND
             if self.steady >= self.next_watch:
-                self._command(self.guard.watch(lambda: True))
+                self._command(self.guard.watch())
                 self.next_watch = self.steady + self.guard.watchdog.next_check * 1e9
 
     def mend(self):

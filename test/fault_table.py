@@ -169,7 +169,7 @@ def silence(milliseconds: int, *, queued: bool = False) -> Callable[[Rig], None]
 def stalled(rig: Rig) -> None:
     """The process sleeps for 200 ms: the watch wakes first, then the queued states arrive."""
     rig.steady += 200 * MILLISECOND
-    rig.guard.watch(lambda: True)
+    rig.guard.watch()
 
 
 def sparse(period: int) -> Callable[[Rig], None]:

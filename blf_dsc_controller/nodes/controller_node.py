@@ -110,9 +110,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _command_zero(self) -> None:
         """Command zero torque, as drivers hold the last command, and release the guard."""
-        guard = self.guard
+        guard, states = self.guard, self.resolve_topic_name(topics.JOINT_STATES.relative)
         if guard is not None:
-            if guard.commanding and self._is_fed():
+            if guard.commanding and self.count_publishers(states):
                 self._command(np.zeros(len(self.config.joints)))
             guard.release()
             self._status.publish_events(guard)
@@ -218,7 +218,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             if self._pending is not None and self._is_observed():
                 raw, self._pending = self._pending, None
                 self._on_joint_state(raw)
-            self._command(guard.watch(self._is_fed))
+            self._command(guard.watch())
             self._report_if_changed(guard)
             if self._pending is None:
                 wait = guard.watchdog.next_check
@@ -267,8 +267,6 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.get_logger().info(f'approaching the reference, for {left:.3g} s')
         elif self._phase is Phase.TRACKING:
             self.get_logger().info('tracking the reference')
-        elif self._phase is Phase.INACTIVE and self.state_label == 'active':
-            self.get_logger().info('nobody publishes joint states any more: out of command')
 
     def _way_back(self) -> str:
         """How to start again after a stop."""
@@ -276,10 +274,6 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if plant in dict(self.get_service_names_and_types()):
             return f'{plant} takes the arm to its start and begins anew'
         return f'{self.get_fully_qualified_name()}/reset begins anew from where the arm is then'
-
-    def _is_fed(self) -> bool:
-        """Whether anybody publishes joint states."""
-        return self.count_publishers(self.resolve_topic_name(topics.JOINT_STATES.relative)) > 0
 
     def _report(self) -> None:
         self._status.report(self.state_label, self.guard)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,21 +58,6 @@ class Guard(GuardedLaw):
         self.watchdog.restart()
         if self._resumable:
             self._safe_torque.begin_ramp(self.config.safety.deactivation_ramp)
-
-    def watch(self, is_fed: Callable[[], bool]) -> np.ndarray | None:
-        """Return a torque during a silence; to be called when `watchdog.next_check` is over.
-
-        `is_fed`: whether anybody publishes joint states. Where nobody does any more the run has
-        ended, and the law leaves command.
-        """
-        limit = self.config.sample_time + self.config.safety.state_timeout
-        silent = self.watchdog.silence(limit)
-        if silent == 0.0 or not (self.watchdog.on and self.commanding):
-            return None
-        if self.supervisor.running and not is_fed():
-            self.deactivate()
-            return None
-        return self.time_out(f'no joint state has come for {silent:.3g} s')
 
     def reset(self) -> None:
         """Forget all estimates and faults, and start with the next state."""

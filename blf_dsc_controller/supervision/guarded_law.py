@@ -209,6 +209,14 @@ class GuardedLaw:
         self._stop(_REASONS.get(type(error), Reason.BAD_MESSAGE), str(error))
         return self._safe_without_state(self.config.sample_time)
 
+    def watch(self) -> Vector | None:
+        """Return a torque during a silence; to be called when `watchdog.next_check` is over."""
+        limit = self.config.sample_time + self.config.safety.state_timeout
+        silent = self.watchdog.silence(limit)
+        if silent == 0.0 or not (self.watchdog.on and self.commanding):
+            return None
+        return self.time_out(f'no joint state has come for {silent:.3g} s')
+
     def time_out(self, text: str) -> Vector | None:
         """Return the torque of one watchdog period without a joint state."""
         if self.supervisor.phase is not Phase.STARTING:  # which waits for a state
