@@ -43,7 +43,7 @@ def read_run(path: str | Path, namespace: str = '', names: NameMap = NO_NAMES) -
     error = None if errors is None else errors.position.exact(states.stamp)
     if error is None and reference is not None:
         error = states.values[:, 0] - reference
-    elif error is not None and reference is not None:  # which may come less often
+    elif error is not None and reference is not None and _is_decimated(events):
         reference = np.where(np.isnan(reference), states.values[:, 0] - error, reference)
     return Run(
         joints=joints,
@@ -149,6 +149,12 @@ def _stops(events: Iterable[Event], first: int) -> Iterator[Stop]:
             starts = [one.stamp for one in ordered[k:] if one.type is EventType.START]
             what = event.content['reason'], event.content['text']
             yield Stop(max(event.stamp, first), *what, until=starts[0] if starts else None)
+
+
+def _is_decimated(events: Iterable[Event]) -> bool:
+    """Whether the reference was published for some samples only."""
+    known = (event.content.get('parameters', {}) for event in events)
+    return any(one.get('telemetry.decimation', 1) > 1 for one in known)
 
 
 def _learns(events: Iterable[Event]) -> bool:
