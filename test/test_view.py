@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -27,6 +28,12 @@ from blf_dsc_controller.view.page import Page, free_port
 
 HOST = '127.0.0.1'
 PORT = 18080
+
+
+CONNECTIONS = []
+sys.addaudithook(
+    lambda event, args: CONNECTIONS.append(args[1]) if event == 'socket.connect' else None
+)
 
 
 @pytest.fixture(scope='module')
@@ -80,12 +87,20 @@ def test_arm_ghost_bound_and_path_are_drawn(player):
     assert (plot[3] == 100.0).all()
 
 
+def test_the_server_connects_to_nobody(player):
+    player.slider.value = 1.0
+    player.update(0.0)
+    assert [at for at in CONNECTIONS if isinstance(at, tuple) and at[0] != HOST] == []
+
+
 def test_a_bag_without_configuration_is_rejected_in_one_line(tmp_path, capsys):
     bare = recorded_run.write(
         tmp_path / 'bare', recorded_run.messages(recorded_run.record(tmp_path / 'whole', 0.05))
     )
     assert main(['view', str(bare), '--port', str(PORT)]) == 1
-    assert 'does not hold the configuration of a controller' in capsys.readouterr().err
+    printed = capsys.readouterr()
+    assert 'does not hold the configuration of a controller' in printed.err
+    assert 'is on http' not in printed.out
 
 
 @pytest.mark.parametrize('seed', range(4))

@@ -23,14 +23,15 @@ def view(options: Namespace) -> int:
             words += ['-r', f'__ns:=/{options.namespace.strip("/")}']
         sys.argv[1:] = ['--ros-args', *words]
         return main()
-    from blf_dsc_controller.view.bag import play
+    from blf_dsc_controller.view.bag import BagPlayer
 
     page = Page(options.host, options.port)
     try:
+        player = BagPlayer(page, options.bag, options.namespace, NameMap.parse(options.map))
         print(f'{options.bag} is on {page.url}  (Ctrl-C ends it)', flush=True)
         if options.host not in LOCAL:
             print(f'warning: {open_to_others(options.host)}', file=sys.stderr)
-        play(page, options.bag, options.namespace, NameMap.parse(options.map))
+        player.play()
     finally:
         page.close()
     return 0

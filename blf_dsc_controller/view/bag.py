@@ -9,7 +9,6 @@ from typing import NoReturn
 
 import numpy as np
 
-from blf_dsc_controller.analysis.metrics import true_change_times
 from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.bags.context import read_context
@@ -83,16 +82,14 @@ class BagPlayer:
             self._page.plot(past)
             self._page.events([one for one in self._events if one[0] <= self._times[k]])
 
-
-def play(page: Page, path: Path, namespace: str, names: NameMap) -> NoReturn:
-    """Play a bag on a page until Ctrl-C."""
-    player = BagPlayer(page, path, namespace, names)
-    before = time.monotonic()
-    while True:
-        now = time.monotonic()
-        player.update(now - before)
-        before = now
-        time.sleep(_PERIOD)
+    def play(self) -> NoReturn:
+        """Follow the buttons and the slider until Ctrl-C."""
+        before = time.monotonic()
+        while True:
+            now = time.monotonic()
+            self.update(now - before)
+            before = now
+            time.sleep(_PERIOD)
 
 
 def moments(run: Run, estimates: tuple[str, ...]) -> list[Moment]:
@@ -106,12 +103,12 @@ def moments(run: Run, estimates: tuple[str, ...]) -> list[Moment]:
         return unknown if values is None else values[rows]
 
     stamps = run.stamp[rows]
-    changed = np.searchsorted(np.array(true_change_times(run)), run.time[rows], side='right')
     figures = _held(run.learning, stamps, (*estimates, LAMBDA_MIN))
     truth = _held(run.truth, stamps, estimates)
+    loaded = (np.abs(truth - truth[0]) > 0.0).any(axis=1)
     arrays = (run.position, run.error, run.bound, run.torque, run.torque_limit)
     columns = (run.time[rows].tolist(), *map(at, arrays), figures[:, :-1], truth)
-    each = zip(*columns, figures[:, -1].tolist(), (changed % 2 == 1).tolist(), strict=True)
+    each = zip(*columns, figures[:, -1].tolist(), loaded.tolist(), strict=True)
     return [Moment(*one) for one in each]
 
 
