@@ -21,6 +21,7 @@ from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.configuration.share import share_folder
 from blf_dsc_controller.errors import BlfDscError
 
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
@@ -216,6 +217,14 @@ def test_unreasonable_yaml_is_refused_wherever_it_is(copy, refused, tmp_path, te
 def test_an_unreasonable_urdf_is_refused(inner, words):
     with pytest.raises(BlfDscError, match=words):
         Robot(urdf=inner).chain(('joint1',))
+
+
+@pytest.mark.parametrize(('name', 'value'), [('izz', '1e308'), ('xyz', '1e200 0 0')])
+def test_figures_of_no_arm_are_refused(name, value):
+    text = (share_folder() / 'config' / 'ur5e.urdf').read_text()
+    robot = Robot(urdf=text.replace(f' {name}="', f' {name}="{value}" was="'), tip='tool0')
+    with pytest.raises(BlfDscError, match=r'of at most 1e\+06 in magnitude'):
+        robot.chain(())
 
 
 # What is written.

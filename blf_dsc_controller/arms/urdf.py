@@ -18,7 +18,8 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import cos, inf, isfinite, sin
+from math import cos, inf, sin
+from sys import float_info
 
 import numpy as np
 
@@ -27,6 +28,8 @@ from blf_dsc_controller.errors import BlfDscError
 
 MOVING = ('revolute', 'continuous', 'prismatic')
 _MOST = 500  # links, or joints
+_LIMITS = ('lower', 'upper', 'velocity', 'effort')
+_LARGEST = 1e6  # m, kg, kg m^2 and so on, of what is no limit
 
 
 Elements = Mapping[str, ET.Element]
@@ -335,8 +338,12 @@ def _numbers(element: ET.Element | None, key: str, default: str, count: int = 3)
         numbers = [float(word) for word in text.split()]
     except ValueError:
         numbers = []
-    if len(numbers) != count or not all(map(isfinite, numbers)):
-        raise UrdfError(f'<{element.tag} {key}="{text}">: expected {count} finite number(s)')
+    largest = float_info.max if key in _LIMITS else _LARGEST
+    if len(numbers) != count or not all(abs(number) <= largest for number in numbers):
+        raise UrdfError(
+            f'<{element.tag} {key}="{text}">: expected {count} finite number(s) of at most '
+            f'{largest:g} in magnitude'
+        )
     return np.array(numbers)
 
 
