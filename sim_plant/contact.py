@@ -75,7 +75,8 @@ def subtract_contact_torque(
         for i in range(3):
             force[i] = push[i] + size * wall.normal[i]
     else:
-        force[:] = push
+        for i in range(3):
+            force[i] = push[i]
     for j in range(torque.size):
         for i in range(3):
             torque[j] -= state.jacobian[i, j] * force[i]

@@ -65,6 +65,13 @@ def add(total: np.ndarray, fraction: float, one: np.ndarray) -> None:
         total[i] += fraction * one[i]
 
 
+@inner
+def put(target: np.ndarray, values: np.ndarray) -> None:
+    """Copy a vector; `target[:] = values` compiles ten functions for a message on their shapes."""
+    for i in range(target.size):
+        target[i] = values[i]
+
+
 @called
 def update_acting(
     disturbance: JointDisturbance, load: Load, events: Events, sample: float, acting: Acting
@@ -74,11 +81,11 @@ def update_acting(
         return
     acting.sample[0] = sample
     acting.payload[0] = load.payload
-    acting.force[:] = load.force
-    acting.offset[:] = load.offset
-    acting.constant[:] = disturbance.constant
-    acting.viscous[:] = disturbance.viscous
-    acting.coulomb[:] = disturbance.coulomb
+    put(acting.force, load.force)
+    put(acting.offset, load.offset)
+    put(acting.constant, disturbance.constant)
+    put(acting.viscous, disturbance.viscous)
+    put(acting.coulomb, disturbance.coulomb)
     add(acting.constant, -1.0, load.torque)
     for e in range(events.begin.size):
         fraction = come(sample, events.begin[e], events.ramp[e])
