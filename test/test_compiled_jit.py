@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
 
 import blf_dsc_controller
@@ -49,3 +50,29 @@ def test_a_kernel_depends_on_its_constants():
 def test_the_cache_of_a_kernel_is_where_its_dependencies_say(kernel):
     """What a kernel calls is defined before it, or an edit would run on stale machine code."""
     assert str(jit.cache_folder(kernel)) in kernel._cache.cache_path
+
+
+@jit.inner
+def root(x):
+    if x < 0.0:
+        raise ValueError('no root of a negative number')
+    return np.sqrt(x)
+
+
+@jit.called
+def sum_of_roots(values):
+    total = 0.0
+    for value in values:
+        total += root(value)
+    return total
+
+
+@jit.kernel
+def mean_root(values):
+    return sum_of_roots(values) / values.size
+
+
+def test_functions_that_are_only_linked_compute_and_raise():
+    assert mean_root(np.array([1.0, 9.0])) == 2.0
+    with pytest.raises(ValueError, match='no root of a negative number'):
+        mean_root(np.array([1.0, -9.0]))

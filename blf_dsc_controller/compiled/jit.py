@@ -27,9 +27,16 @@ from numba.core import config
 from numba.core.types.containers import BaseNamedTuple
 from numba.extending import overload_method, register_jitable
 
+from blf_dsc_controller.compiled.linked import KernelCompiler, LinkedCompiler
+
 F = TypeVar('F', bound=Callable[..., object])
 
-INLINED = {'error_model': 'numpy', 'forceinline': True, 'no_cfunc_wrapper': True}
+INLINED = {
+    'error_model': 'numpy',
+    'forceinline': True,
+    'no_cfunc_wrapper': True,
+    'pipeline_class': LinkedCompiler,
+}
 """Compiler options of functions that are compiled into kernels."""
 
 _PACKAGES = ('blf_dsc_controller.', 'sim_plant.')
@@ -107,18 +114,6 @@ def _writable(folder: Path) -> Path:
         return folder
 
 
-def is_compiled(*functions: Callable[..., object]) -> bool:
-    """Whether the machine code of all these kernels is in the cache already."""
-    return bool(config.DISABLE_JIT) or all(
-        any(cache_folder(function).glob(f'*/{_file_stem(function)}-*.nbi'))
-        for function in functions
-    )
-
-
-def _file_stem(function: Callable[..., object]) -> str:
-    return f'{function.__module__.rpartition(".")[2]}.{function.__name__}'
-
-
 def inner(function: F) -> F:
     """Let kernels call `function`, which is compiled into them; in Python it stays what it is."""
     register_jitable(**INLINED)(function)
@@ -155,7 +150,12 @@ def kernel(function: F) -> F:
     config.CACHE_DIR = str(cache_folder(function))
     try:
         compiled = numba.njit(
-            function, cache=True, error_model='numpy', nogil=True, no_cfunc_wrapper=True
+            function,
+            cache=True,
+            error_model='numpy',
+            nogil=True,
+            no_cfunc_wrapper=True,
+            pipeline_class=KernelCompiler,
         )
         return cast('F', compiled)
     finally:

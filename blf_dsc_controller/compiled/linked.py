@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Functions that are compiled into kernels, and not by themselves.
+
+Numba optimises every function that a kernel calls and makes machine code of it, before it links it
+into its caller, which it optimises anew: what is called five calls deep is compiled six times.
+Here such a function is translated only, and the kernel optimised as a whole: in 0.6 of the time.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler_machinery import PassManager, register_pass
+from numba.core.environment import lookup_environment
+from numba.core.typed_passes import NativeLowering
+
+_ENVIRONMENT = '_ZN08NumbaEnv'
+
+
+class _Linked(JITCodeLibrary):  # type: ignore[misc]
+    """LLVM code of a function for its callers; it has no machine code and no address."""
+
+    def _optimize_final_module(self) -> None:
+        """Leave it to the kernel."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def get_pointer_to_function(self, _name: str) -> int:
+        self._ensure_finalized()
+        return 0
+
+    @property
+    def codegen(self) -> _Linked:
+        return self
+
+    def set_env(self, _name: str, _environment: object) -> None:
+        """Leave it to the kernel."""
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _LowerLinked(NativeLowering):  # type: ignore[misc]
+    _name = 'lower_linked'
+
+    def run_pass(self, state: Any) -> bool:
+        state.library = _Linked(state.targetctx.codegen(), state.func_id.func_qualname)
+        return bool(super().run_pass(state))
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _LowerKernel(NativeLowering):  # type: ignore[misc]
+    _name = 'lower_kernel'
+
+    def run_pass(self, state: Any) -> bool:
+        """Let the functions in a kernel find their environments, too."""
+        changed = bool(super().run_pass(state))
+        library = state.library
+        for variable in library._final_module.global_variables:  # noqa: SLF001 - as numba's cache
+            if variable.name.startswith(_ENVIRONMENT):
+                environment = lookup_environment(variable.name)
+                if environment is not None:
+                    library.codegen.set_env(variable.name, environment)
+        return changed
+
+
+class _Compiler(CompilerBase):  # type: ignore[misc]
+    lowering: type
+
+    def define_pipelines(self) -> list[Any]:
+        pipeline = PassManager(self.lowering.__name__)
+        for one, about in DefaultPassBuilder.define_nopython_pipeline(self.state).passes:
+            pipeline.add_pass(self.lowering if one is NativeLowering else one, about)
+        pipeline.finalize()
+        return [pipeline]
+
+
+class LinkedCompiler(_Compiler):
+    """Of a function that only kernels call."""
+
+    lowering = _LowerLinked
+
+
+class KernelCompiler(_Compiler):
+    """Of a kernel."""
+
+    lowering = _LowerKernel
