@@ -164,3 +164,13 @@ def test_the_page_draws_the_arm_in_space():
     np.testing.assert_allclose(tip, [0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.2104], atol=1e-5)
     assert drawn.joints[3].axis == [0.0, 0.0, 1.0]
     assert not any(joint.slides for joint in drawn.joints)
+
+
+def test_a_page_says_where_it_cannot_draw_the_recorded_arm(tmp_path):
+    messages = recorded_run.messages(recorded_run.record(tmp_path / 'two_links', 0.1))
+    text = '/**:\n  ros__parameters:\n    robot: {urdf: gone.urdf, tip: tool0}\n'
+    (reported,) = read_bags([recorded_run.write(tmp_path / 'bag', messages, text, model='urdf')])
+    (problem,) = [event.text for event in reported.events if event.kind == 'arm']
+    assert 'drawn as links in a plane' in problem
+    assert 'gone.urdf' in problem
+    assert len(reported.arm.joints) == 2

@@ -106,6 +106,7 @@ def test_node_beside_null_node_in_two_processes_and_in_one(monkeypatch):
     monkeypatch.setattr(node, '_rates', counting)
     assert contestants(list(node.measure())) == [
         'controller, telemetry off: steps a second',
+        'controller, telemetry of every 10th sample: steps a second',
         'controller, telemetry on: steps a second',
     ]
     assert played == [

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -13,6 +14,7 @@ from blf_dsc_controller.configuration.params_file import dump, format_value, loa
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.ros_yaml import parse
 from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.errors import ConfigurationError
 
 CHANGED = LoopConfig(
     build(
@@ -42,7 +44,8 @@ def test_a_node_in_a_namespace_is_written_under_its_full_name(tmp_path):
     path = tmp_path / 'run.yaml'
     dump(path, {'/left/sim_plant': CHANGED.plant})
     assert load(path, '/left/sim_plant', PlantConfig) == CHANGED.plant
-    assert load(path, '/right/sim_plant', PlantConfig) == PlantConfig()
+    with pytest.raises(ConfigurationError, match='/left/sim_plant is not /right/sim_plant'):
+        load(path, '/right/sim_plant', PlantConfig)
 
 
 @settings(max_examples=200, deadline=None)

@@ -20,7 +20,7 @@ from ros_rig import START, deactivate
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from blf_dsc_controller.compiled import COMPILATION_NOTICE
+from blf_dsc_controller.compiled.notice import COMPILATION_NOTICE
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode

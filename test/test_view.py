@@ -21,10 +21,11 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import chain_of
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.view import page as page_module
+from blf_dsc_controller.view.address import free_port
 from blf_dsc_controller.view.arm import Arm, planar_urdf, with_cylinders
 from blf_dsc_controller.view.bag import BagPlayer
 from blf_dsc_controller.view.moment import Confidence, Moment
-from blf_dsc_controller.view.page import Page, free_port
+from blf_dsc_controller.view.page import Page
 
 HOST = '127.0.0.1'
 PORT = 18080

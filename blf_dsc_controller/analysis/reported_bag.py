@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -85,7 +84,10 @@ def _read(path: Path, name: str, namespace: str, names: NameMap) -> ReportedBag:
         sections = []
     entries = {name: entry.value for section in sections for name, entry in section.entries.items()}
     lost = (Event(0.0, 'lost', f'{topic}: {text}') for topic, text in context.losses.items())
-    events = (*_events(run), *_diagnosed(path, run), *_changed(path, run, namespace), *lost)
+    arm, problem = _drawn(context, entries, len(run.joints))
+    unread = [Event(0.0, 'arm', problem)] if problem else []
+    changed = _changed(path, run, namespace)
+    events = (*unread, *_events(run), *_diagnosed(path, run), *changed, *lost)
     return ReportedBag(
         name,
         run,
@@ -95,20 +97,23 @@ def _read(path: Path, name: str, namespace: str, names: NameMap) -> ReportedBag:
             for section in sections
             for name, entry in sorted(section.entries.items())
         },
-        arm=_drawn(context, entries, len(run.joints)),
+        arm=arm,
         events=sorted(events, key=lambda event: event.time),
     )
 
 
-def _drawn(context: Context, entries: Mapping[str, Any], n: int) -> DrawnArm:
-    """Arm of the recorded URDF if it can be read, else links in a plane."""
+def _drawn(context: Context, entries: Mapping[str, Any], n: int) -> tuple[DrawnArm, str]:
+    """Arm of the recorded URDF, or links in a plane; with the reason if there should be a URDF."""
+    problem = ''
     if context.facts.get('model') == 'urdf':
-        with suppress(BlfDscError):
+        try:
             config = context.controller_config()
-            return arm_of_chain(config.robot.chain(config.joints))
+            return arm_of_chain(config.robot.chain(config.joints)), ''
+        except BlfDscError as error:
+            problem = f'drawn as links in a plane, as its URDF cannot be read: {error}'
     # A link without a length of its own has that of the first.
     lengths = (entries.get(f'arm.l{i + 1}', entries.get('arm.l1', 1.0)) for i in range(n))
-    return planar_arm([float(f'{length}') for length in lengths])
+    return planar_arm([float(f'{length}') for length in lengths]), problem
 
 
 def _events(run: Run) -> Iterator[Event]:

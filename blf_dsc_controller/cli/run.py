@@ -17,11 +17,11 @@ from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import INTERRUPTED, require_ros, unwritable
 from blf_dsc_controller.cli.progress import LoopProgress
+from blf_dsc_controller.compiled.notice import announced_compilation
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
 from blf_dsc_controller.configuration.params_file import dump, load_loop, locate
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.compilation import announced_compilation
 from blf_dsc_controller.law.factory import estimate_names, model_of
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.reference.approach import plan_start
@@ -30,7 +30,7 @@ from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.simulation.record import Record
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.supervisor import Reason
-from blf_dsc_controller.view.page import LOCAL, free_port, open_to_others, require_viser
+from blf_dsc_controller.view.address import LOCAL, free_port, open_to_others, require_viser
 
 STOPPED = 5
 """Exit code where the controller stopped before the end."""

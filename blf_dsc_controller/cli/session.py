@@ -21,7 +21,7 @@ from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import JointState
 
 from blf_dsc_controller.cli.progress import LoopProgress
-from blf_dsc_controller.compiled import COMPILATION_NOTICE
+from blf_dsc_controller.compiled.notice import COMPILATION_NOTICE
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, VIEW, LoopConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import model_of
@@ -29,7 +29,7 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.telemetry import DECIMATION
 from blf_dsc_controller.messages.topics import RATIO
 from blf_dsc_controller.nodes.endpoints import qos_profile
-from blf_dsc_controller.view.page import free_port, url_of
+from blf_dsc_controller.view.address import free_port, url_of
 
 # In the order in which they start. They end in reverse: the recorder last, to get every message.
 _MODULES = {

@@ -13,9 +13,9 @@ from tqdm import tqdm
 from blf_dsc_controller.analysis.summary import format_table
 from blf_dsc_controller.arm_comparison.study import compare as compare_arms
 from blf_dsc_controller.cli.run import make_folder, print_notice
+from blf_dsc_controller.compiled.notice import announced_compilation
 from blf_dsc_controller.configuration.params_file import locate
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.compilation import announced_compilation
 from blf_dsc_controller.monte_carlo import executors
 from blf_dsc_controller.monte_carlo.report import (
     headline,

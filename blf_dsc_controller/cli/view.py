@@ -8,7 +8,8 @@ from argparse import Namespace
 
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.cli.main import require_ros
-from blf_dsc_controller.view.page import LOCAL, Page, open_to_others
+from blf_dsc_controller.view.address import LOCAL, open_to_others
+from blf_dsc_controller.view.page import Page
 
 
 def view(options: Namespace) -> int:

@@ -14,10 +14,10 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
+from blf_dsc_controller.compiled.notice import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.compilation import announced_compilation
 from blf_dsc_controller.messages.telemetry import Message
 from blf_dsc_controller.messages.topics import Topic
 from blf_dsc_controller.nodes import parameters, process

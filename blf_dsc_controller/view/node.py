@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `view`: feeds the page from the topics, and does by services what its controls ask for.
+"""The node `view`: feeds the page from the topics.
 
 It is a process of its own that gives way to the control loop, takes the newest messages thirty
 times a second, and asks for none that is lost. The controller's configuration is in its journal.
@@ -11,44 +11,38 @@ import json
 import os
 import sys
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
-from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
-from rcl_interfaces.srv import SetParameters
-from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
-from std_srvs.srv import Trigger
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import VIEW, ViewConfig, is_builtin
-from blf_dsc_controller.configuration.schema import Value, build, change, flatten
+from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.cdr import MessageError, joint_state_layout
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.messages.journal import Event, EventType, decode
 from blf_dsc_controller.messages.topics import Quality, Topic
-from blf_dsc_controller.nodes.endpoints import create_steady_timer, message_class, qos_profile
+from blf_dsc_controller.nodes.endpoints import create_steady_timer, message_class
 from blf_dsc_controller.nodes.parameter_client import ParameterClient, Values
 from blf_dsc_controller.nodes.parameters import declare
 from blf_dsc_controller.nodes.process import PlainNode, run
 from blf_dsc_controller.nodes.raw_subscriptions import RawMessage, RawSubscriptions
-from blf_dsc_controller.nodes.rclpy_internals import take_response
 from blf_dsc_controller.run import Floats
+from blf_dsc_controller.view.address import LOCAL, open_to_others
 from blf_dsc_controller.view.arm import arm_of
 from blf_dsc_controller.view.controls import Controls
 from blf_dsc_controller.view.moment import Confidence, Moment, estimates_of
-from blf_dsc_controller.view.page import LOCAL, PAST, Page, open_to_others
+from blf_dsc_controller.view.page import PAST, Page
+from blf_dsc_controller.view.requests import Requests
 
 _PERIOD = 1.0 / 30.0  # s
 _PLOTTED = 6  # pictures from one plot to the next
 _CHECKED = 30  # pictures from one look at what is identified to the next
 _SILENCE = 30  # pictures without a joint state after which the page says so
-_PUSH = 0.5  # s
 _OUTDATED = 500_000_000  # ns
 _NICE = 10  # less urgent than the loop
 _NEWEST = Quality(depth=1, reliability='best_effort')
@@ -76,38 +70,22 @@ class ViewNode(PlainNode):
         self._plant: dict[str, Any] = {}  # parameters of the simulated one
         self._acting: set[int] = set()  # which of its events
         self._state = 'STALE', f'waiting for {self.resolve_topic_name(topics.JOURNAL.relative)}'
-        self._start = self._told = -1  # ns, stamps: of the start, of the last tracking error
+        self._start = self._sampled = -1  # ns, stamps: of the start, of the last tracking error
         self._pictures = self._silent = 0
         self._clients_seen: frozenset[int] = frozenset()
         self._rejected = -1  # trajectories; -1: not known
         self._worker = ThreadPoolExecutor(1, 'confidence')
         self._check: Future[tuple[Floats, Floats]] | None = None
-        self._asked: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self._gains: dict[str, Value] = {}  # moved and not yet sent
-        self._awaited: list[tuple[Any, Callable[[Any], None]]] = []
-        self._push_ends = np.inf
         self._newest = self._subscribe(_STREAMS, _NEWEST)
         self._kept = self._subscribe(_EVENTS)
-        node = self._newest.node
-        self._names = {one: self._resolved(one) for one in (topics.CONTROLLER, topics.PLANT)}
-        self._offered: dict[str, Any] = {
-            f'{name}/{service}': node.create_client(type_, f'{name}/{service}')
-            for name in self._names.values()
-            for service, type_ in (('reset', Trigger), ('set_parameters', SetParameters))
-        }
+        prefix = self.get_namespace().rstrip('/')
+        self._requests = Requests(self, self._newest.node, prefix, self.page.notify, self._restore)
         self._reader = ParameterClient(self._meet_plant)
-        self._reader.request(node, self._names[topics.PLANT])
-        trajectory = topics.JOINT_TRAJECTORY
-        self._trajectories = self.create_publisher(
-            JointTrajectory, trajectory.relative, qos_profile(trajectory.offered)
-        )
+        self._reader.request(self._newest.node, f'{prefix}/{topics.PLANT}')
         self.get_logger().info(f'open {self.page.url}')
         if config.host not in LOCAL:
             self.get_logger().warning(open_to_others(config.host))
         create_steady_timer(self, _PERIOD, self.update)
-
-    def _resolved(self, name: str) -> str:
-        return f'{self.get_namespace().rstrip("/")}/{name}'
 
     def _subscribe(self, of: Sequence[Topic], quality: Quality | None = None) -> RawSubscriptions:
         made = RawSubscriptions(self, (quality or topics.HISTORY).depth)
@@ -128,7 +106,7 @@ class ViewNode(PlainNode):
         self._reader.poll()
         for message in self._kept.take():
             self._note(_EVENTS[message.handle], message.raw)
-        self._serve()
+        self._requests.update(self.past[-1].time if self.past else 0.0)
         config = self._config
         has_state = config is not None and self._take(self._newest.take())
         self._silent = 0 if has_state else self._silent + 1
@@ -145,82 +123,6 @@ class ViewNode(PlainNode):
             if not self._newest.node.count_publishers(self.resolve_topic_name(topic.relative)):
                 return 'ERROR', f'the {node} is gone: nobody publishes {topic.relative} any more'
         return self._state[0], f'{self._state[1]} (no joint state comes)'
-
-    # What the page asks for, in its threads.
-
-    def reset(self) -> None:
-        """Reset the simulated plant, which resets the controller, or the controller alone."""
-
-        def done(response: Trigger.Response) -> None:
-            if not response.success:
-                self.page.notify('reset', response.message)
-
-        name = self._names[topics.PLANT if self._plant else topics.CONTROLLER]
-        self._asked.put(partial(self._call, f'{name}/reset', Trigger.Request(), done))
-
-    def push(self, torque: Sequence[float]) -> None:
-        """Push the joints [N m] for half a second of the plant's time."""
-
-        def begin() -> None:
-            self._push_ends = self.past[-1].time + _PUSH if self.past else 0.0
-            self._set(topics.PLANT, 'load.torque', tuple(torque))
-
-        self._asked.put(begin)
-
-    def payload(self, mass: float) -> None:
-        """Hang a mass on the tip of the simulated arm [kg]."""
-        self._asked.put(partial(self._set, topics.PLANT, 'load.payload', mass))
-
-    def go_to(self, position: Mapping[str, float], duration: float) -> None:
-        """Send a trajectory of one point: a position of each joint [rad] after a time [s]."""
-        point = JointTrajectoryPoint(positions=list(position.values()))
-        point.time_from_start.sec = int(duration)
-        point.time_from_start.nanosec = int(1e9 * (duration % 1.0))
-        message = JointTrajectory(joint_names=list(position), points=[point])
-        self._asked.put(partial(self._trajectories.publish, message))
-
-    def set_gain(self, name: str, value: Value) -> None:
-        """Set a parameter of the controller: the last value in the time of a picture."""
-        self._gains[name] = value
-
-    # Services.
-
-    def _serve(self) -> None:
-        while not self._asked.empty():
-            self._asked.get()()
-        for name in list(self._gains):
-            self._set(topics.CONTROLLER, name, self._gains.pop(name))
-        if self.past and self.past[-1].time >= self._push_ends:
-            self._push_ends = np.inf
-            self._set(topics.PLANT, 'load.torque', self._pushes)
-        for waiting in list(self._awaited):
-            client, done = waiting
-            response = take_response(client)
-            if response is not None:
-                self._awaited.remove(waiting)
-                done(response)
-
-    def _set(self, node: str, name: str, value: Value) -> None:
-        content = list(value) if isinstance(value, tuple) else value
-        parameters = [Parameter(name, value=content).to_parameter_msg()]
-
-        def done(response: Any) -> None:
-            (result,) = response.results
-            if not result.successful:
-                self.page.notify(f'{name} was rejected', result.reason)
-                if self._config is not None and self.controls is not None:
-                    self.controls.show(flatten(self._config))
-
-        service = f'{self._names[node]}/set_parameters'
-        self._call(service, SetParameters.Request(parameters=parameters), done)
-
-    def _call(self, service: str, request: Any, done: Callable[[Any], None]) -> None:
-        client = self._offered[service]
-        if client.service_is_ready():
-            client.call_async(request)
-            self._awaited.append((client, done))
-        else:
-            self.page.notify(service, 'nobody offers this service: has the node ended?')
 
     # What comes.
 
@@ -255,13 +157,12 @@ class ViewNode(PlainNode):
             return
         if event.type is EventType.PARAMETERS and self._config is not None:
             self._config = change(self._config, content['parameters'])
-            if self.controls is not None:
-                self.controls.show(flatten(self._config))
+            self._restore()
         if event.type is EventType.START:
             self._start = event.stamp
             self.past.clear()
-        told = [f'{content[k]}' for k in ('reason', 'text', 'parameters') if k in content]
-        self.page.event(self._time(event.stamp), event.type.value, ', '.join(told))
+        details = [f'{content[k]}' for k in ('reason', 'text', 'parameters') if k in content]
+        self.page.event(self._time(event.stamp), event.type.value, ', '.join(details))
 
     def _configure(self, config: ControllerConfig) -> None:
         self._config = config
@@ -277,7 +178,7 @@ class ViewNode(PlainNode):
 
     def _meet_plant(self, _: str, values: Values) -> None:
         self._plant = dict(values)
-        self._pushes = values.get('load.torque', ())
+        self._requests.meet_plant(values)
         self._draw_all()
 
     def _draw_all(self) -> None:
@@ -286,8 +187,17 @@ class ViewNode(PlainNode):
             lengths = [self._plant[name] for name in ('arm.l1', 'arm.l2') if name in self._plant]
             tabs = self.page.draw_arm(arm_of(self._config, lengths), self._estimates)
             self.controls = Controls(
-                self.page.server.gui, tabs, self._config, self, simulated=bool(self._plant)
+                self.page.server.gui,
+                tabs,
+                self._config,
+                self._requests,
+                simulated=bool(self._plant),
             )
+
+    def _restore(self) -> None:
+        """Let the sliders show the values in force."""
+        if self._config is not None and self.controls is not None:
+            self.controls.show(flatten(self._config))
 
     def _time(self, stamp: int) -> float:
         """Time [s] since the controller's start, or since the first stamp that is known."""
@@ -297,14 +207,14 @@ class ViewNode(PlainNode):
 
     def _take(self, messages: Sequence[RawMessage]) -> bool:
         """Take the newest of each topic; whether there was a joint state."""
-        stamp = told = -1
+        stamp = sampled = -1
         for message in messages:
             topic = _STREAMS[message.handle]
             try:
                 if topic in self._decoders:
                     at = self._decoders[topic].decode(message.raw)
                     stamp = at if topic is topics.JOINT_STATES else stamp
-                    told = at if topic is topics.TRACKING_ERROR else told
+                    sampled = at if topic is topics.TRACKING_ERROR else sampled
                 elif topic is topics.TRUTH:
                     self._truth = _named(message.raw, (*self._estimates,))
                 else:
@@ -312,9 +222,9 @@ class ViewNode(PlainNode):
                     self._learn(_named(message.raw, (*self._estimates, *figures)))
             except MessageError as error:
                 self.get_logger().warning(f'not shown: {error}', throttle_duration_sec=10.0)
-        self._told = max(told, self._told)
+        self._sampled = max(sampled, self._sampled)
         if stamp >= 0:
-            if stamp - self._told > _OUTDATED:  # the law does not run
+            if stamp - self._sampled > _OUTDATED:  # the law does not run
                 self._decoders[topics.TRACKING_ERROR].values[:] = np.nan
             self._keep(self._time(stamp))
         return stamp >= 0

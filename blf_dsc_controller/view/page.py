@@ -8,9 +8,7 @@ loaded from elsewhere.
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import io
-import socket
 from collections import deque
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -20,26 +18,21 @@ import numpy as np
 
 from blf_dsc_controller.analysis.style import ALARM, COLOURS, GREEN, MUTED, ORANGE
 from blf_dsc_controller.arms.chain_geometry import frames, tip_radius
-from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.run import Floats
+from blf_dsc_controller.view.address import free_port, require_viser, url_of
 from blf_dsc_controller.view.arm import Arm
 from blf_dsc_controller.view.moment import Moment
-
-LOCAL = ('127.0.0.1', 'localhost', '::1')
-"""Hosts that only this computer reaches."""
+from blf_dsc_controller.view.tables import estimate_table, event_table, joint_table
 
 PAST = 20.0
 """Time that the plots show [s]."""
 
 _TRAIL = 4.0  # s of the tip's path
 _EVENTS = 12
-_PORTS = 100  # tried from the wanted one on
-_NOT_SHOWN = 0.5  # a deviation that is more than this of the prior's: not identified
 _PLAIN = (86, 110, 150)  # of an arm without colours
 _GHOST = (0, 200, 120, 0.35)
 _HALO = 0.005  # of the reach
 _LEVELS = {'OK': GREEN, 'WARN': ORANGE, 'ERROR': ALARM, 'STALE': MUTED, 'BAG': MUTED}
-_CELL = 'padding:1px 6px;text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums'
 
 
 class Page:
@@ -82,7 +75,7 @@ class Page:
         from trimesh import Trimesh
         from viser.extras import ViserUrdf
 
-        self._arm, self._units = arm, {escape(k): v for k, v in estimates.items()}
+        self._arm, self._units = arm, dict(estimates)
         self._joints = [joint.name for joint in arm.chain.joints]
         self._deviation = self._prior = np.full(len(estimates), np.nan)
         server, gui, reach = self.server, self.server.gui, arm.reach
@@ -159,12 +152,8 @@ class Page:
         """Add an event at a time [s] to the list."""
         if kind:
             self._events.append((time, kind, text))
-        rows = (
-            f'<tr><td style="{_CELL}">{t:.2f} s</td><td><b>{escape(k)}</b> {escape(e)}</td></tr>'
-            for t, k, e in reversed(self._events)
-        )
         if self._list is not None:
-            self._list.content = _in_table(rows)
+            self._list.content = event_table(reversed(self._events))
 
     def events(self, events: Sequence[tuple[float, str, str]]) -> None:
         """Replace the list by the last of these events."""
@@ -220,33 +209,9 @@ class Page:
             for plot, values in zip(self._plots, curves, strict=True):
                 edges = (edge, -edge) if plot is self._plots[0] else ()
                 plot.data = (t, *(np.where(np.isfinite(v), v, np.nan) for v in values), *edges)
-            self._table.content = self._joint_table(now)
-            self._estimates.content = self._estimate_table(now)
-
-    def _joint_table(self, now: Moment) -> str:
-        head = _row('th', f't = {now.time:.2f} s', 'error [mrad]', 'bound', 'torque [N m]', 'limit')
-        columns = 1e3 * now.error, 1e3 * now.bound, now.torque, now.torque_limit
-        rows = zip(self._joints, *columns, strict=True)
-        return _in_table([head, *(_row('td', name, *map(_figure, row)) for name, *row in rows)])
-
-    def _estimate_table(self, now: Moment) -> str:
-        head = _row('th', 'estimate', '', '±', 'truth', 'unit', 'identified')
-        rows = [head]
-        each = zip(
-            self._units,
-            self._units.values(),
-            now.estimate,
-            self._deviation,
-            now.truth,
-            self._deviation / self._prior,
-            strict=True,
-        )
-        for name, unit, value, deviation, truth, left in each:
-            figures = map(_figure, (value, deviation, truth))
-            rejected = not np.isfinite(value)
-            bar = 'rejected' if rejected else _bar(1.0 - left)
-            rows.append(_row('td', name, *figures, unit, bar, pale=rejected or left > _NOT_SHOWN))
-        return _in_table(rows)
+            self._table.content = joint_table(self._joints, now)
+            deviations = self._prior, self._deviation
+            self._estimates.content = estimate_table(self._units, now, *deviations)
 
     def _posture(self, q: Floats) -> dict[str, float]:
         return self._held | dict(zip(self._joints, q.tolist(), strict=True))
@@ -261,67 +226,9 @@ class Page:
         self.server.stop()
 
 
-def url_of(host: str, port: int) -> str:
-    """Address to open in a browser."""
-    return f'http://{"localhost" if host in LOCAL else host}:{port}'
-
-
-def open_to_others(host: str) -> str:
-    """Warning about a page that is not served to this computer alone."""
-    return f'at {host} the page and its controls are open to other computers, without a password'
-
-
-def require_viser() -> None:
-    """Raise MissingExtraError unless viser is installed, with what it needs for URDFs."""
-    for module in ('viser', 'yourdfpy'):
-        if importlib.util.find_spec(module) is None:
-            raise MissingExtraError(module, 'view', 'the page')
-
-
-def free_port(host: str, port: int) -> int:
-    """First free port from the wanted one on; BlfDscError if the host is none of this computer."""
-    for candidate in range(port, min(port + _PORTS, 65536)):
-        family = socket.AF_INET6 if ':' in host else socket.AF_INET
-        with socket.socket(family) as claim:
-            claim.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                claim.bind((host, candidate))
-            except PermissionError as error:
-                reason = f'port {candidate} needs privileges: choose one above 1023'
-                raise BlfDscError(reason) from error
-            except OSError as error:
-                if isinstance(error, socket.gaierror) or error.errno == _NOT_HERE:
-                    reason = f'the page cannot be served at {host!r}: {error.strerror}; give an '
-                    raise BlfDscError(f'{reason}address of this computer') from error
-                continue
-            return candidate
-    raise BlfDscError(f'no free port from {port} to {port + _PORTS - 1}: choose another')
-
-
-_NOT_HERE = 99  # EADDRNOTAVAIL
 _NO_POINTS = {'show': False}
 
 
 def _hangs(arm: Arm) -> bool:
     """Whether links along x turn in a vertical plane, below their base as well."""
     return not any(joint.placement[2, 3] for joint in arm.chain.joints)
-
-
-def _figure(value: float) -> str:
-    return f'{value:.4g}' if np.isfinite(value) else '-'
-
-
-def _row(tag: str, *cells: str, pale: bool = False) -> str:
-    style = _CELL + (';opacity:0.55' if pale else '')
-    return '<tr>' + ''.join(f'<{tag} style="{style}">{cell}</{tag}>' for cell in cells) + '</tr>'
-
-
-def _bar(share: float) -> str:
-    percent = 100.0 * min(max(float(np.nan_to_num(share)), 0.0), 1.0)
-    colour = GREEN if share > 1.0 - _NOT_SHOWN else MUTED
-    fill = f'linear-gradient(to right,{colour} {percent:.0f}%,transparent 0)'
-    return f'<div style="width:60px;border:1px solid #bbb;background:{fill}">&nbsp;</div>'
-
-
-def _in_table(rows: Any) -> str:
-    return f'<table style="font-size:12px;margin:4px 8px">{"".join(rows)}</table>'

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 
 from numba.core import event
 
-from blf_dsc_controller.compiled import COMPILATION_NOTICE
+COMPILATION_NOTICE = 'compiling the kernels, once for this version: this takes 10 to 60 s'
 
 
 class _Listener(event.Listener):  # type: ignore[misc]

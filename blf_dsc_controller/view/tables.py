@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of the page, in HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+
+import numpy as np
+
+from blf_dsc_controller.analysis.style import GREEN, MUTED
+from blf_dsc_controller.run import Floats
+from blf_dsc_controller.view.moment import Moment
+
+_NOT_SHOWN = 0.5  # a deviation that is more than this of the prior's: not identified
+_CELL = 'padding:1px 6px;text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums'
+
+
+def joint_table(joints: Sequence[str], now: Moment) -> str:
+    """Error, bound, torque and limit of each joint, by its name."""
+    head = _row('th', f't = {now.time:.2f} s', 'error [mrad]', 'bound', 'torque [N m]', 'limit')
+    columns = 1e3 * now.error, 1e3 * now.bound, now.torque, now.torque_limit
+    rows = zip(joints, *columns, strict=True)
+    return _in_table([head, *(_row('td', escape(name), *map(_figure, row)) for name, *row in rows)])
+
+
+def estimate_table(units: Mapping[str, str], now: Moment, prior: Floats, deviation: Floats) -> str:
+    """Each estimate by name and unit, with its standard deviations before and now (m,)."""
+    rows = [_row('th', 'estimate', '', '±', 'truth', 'unit', 'identified')]
+    columns = now.estimate, deviation, now.truth, deviation / prior
+    for name, unit, value, spread, truth, left in zip(units, units.values(), *columns, strict=True):
+        figures = map(_figure, (value, spread, truth))
+        rejected = not np.isfinite(value)
+        bar = 'rejected' if rejected else _bar(1.0 - left)
+        rows.append(
+            _row('td', escape(name), *figures, unit, bar, pale=rejected or left > _NOT_SHOWN)
+        )
+    return _in_table(rows)
+
+
+def event_table(events: Iterable[tuple[float, str, str]]) -> str:
+    """Events: time [s], kind and text."""
+    return _in_table(
+        f'<tr><td style="{_CELL}">{t:.2f} s</td><td><b>{escape(k)}</b> {escape(e)}</td></tr>'
+        for t, k, e in events
+    )
+
+
+def _figure(value: float) -> str:
+    return f'{value:.4g}' if np.isfinite(value) else '-'
+
+
+def _row(tag: str, *cells: str, pale: bool = False) -> str:
+    style = _CELL + (';opacity:0.55' if pale else '')
+    return '<tr>' + ''.join(f'<{tag} style="{style}">{cell}</{tag}>' for cell in cells) + '</tr>'
+
+
+def _bar(share: float) -> str:
+    percent = 100.0 * min(max(float(np.nan_to_num(share)), 0.0), 1.0)
+    colour = GREEN if share > 1.0 - _NOT_SHOWN else MUTED
+    fill = f'linear-gradient(to right,{colour} {percent:.0f}%,transparent 0)'
+    return f'<div style="width:60px;border:1px solid #bbb;background:{fill}">&nbsp;</div>'
+
+
+def _in_table(rows: Iterable[str]) -> str:
+    return f'<table style="font-size:12px;margin:4px 8px">{"".join(rows)}</table>'
