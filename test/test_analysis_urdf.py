@@ -168,9 +168,9 @@ def test_the_page_draws_the_arm_in_space():
 
 def test_a_page_says_where_it_cannot_draw_the_recorded_arm(tmp_path):
     messages = recorded_run.messages(recorded_run.record(tmp_path / 'two_links', 0.1))
-    text = '/**:\n  ros__parameters:\n    robot: {urdf: gone.urdf, tip: tool0}\n'
+    text = dumps({'blf_dsc_controller': panda()}).replace('<robot', '<gone')
     (reported,) = read_bags([recorded_run.write(tmp_path / 'bag', messages, text, model='urdf')])
     (problem,) = [event.text for event in reported.events if event.kind == 'arm']
     assert 'drawn as links in a plane' in problem
-    assert 'gone.urdf' in problem
+    assert 'robot.urdf: not a URDF' in problem
     assert len(reported.arm.joints) == 2

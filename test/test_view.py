@@ -20,7 +20,7 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import chain_of
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
-from blf_dsc_controller.view import page as page_module
+from blf_dsc_controller.view import address
 from blf_dsc_controller.view.address import free_port
 from blf_dsc_controller.view.arm import Arm, planar_urdf, with_cylinders
 from blf_dsc_controller.view.bag import BagPlayer
@@ -178,7 +178,7 @@ def test_a_port_that_is_taken_is_left_to_its_owner(player):
 
 
 def test_without_viser_the_remedy_is_named(monkeypatch):
-    monkeypatch.setattr(page_module.importlib.util, 'find_spec', lambda _: None)
+    monkeypatch.setattr(address.importlib.util, 'find_spec', lambda _: None)
     with pytest.raises(MissingExtraError, match=r"pip install 'blf_dsc_controller\[view\]'"):
         Page(HOST, PORT)
 
