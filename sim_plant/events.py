@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.compiled.jit import called, inner
+from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from sim_plant.disturbance import JointDisturbance
 
@@ -72,7 +72,7 @@ def put(target: np.ndarray, values: np.ndarray) -> None:
         target[i] = values[i]
 
 
-@called
+@inner
 def update_acting(
     disturbance: JointDisturbance, load: Load, events: Events, sample: float, acting: Acting
 ) -> None:
