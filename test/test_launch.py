@@ -23,6 +23,7 @@ from rcl_interfaces.srv import GetParameters, ListParameters
 
 from blf_dsc_controller.configuration.params_file import dump, locate
 from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.nodes.arguments import assigned
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.markers_node import MarkersNode
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
@@ -197,3 +198,8 @@ def test_a_node_answers_a_request_for_all_of_its_parameters(ros, tmp_path, name)
     assert all(value.type for value in values)
     if name == 'bag_recorder':
         node.close()
+
+
+def test_a_value_with_a_comma_or_a_brace_is_one_value():
+    argv = ['node', '--ros-args', '-p', 'output:=run, 1 {a}', '-p', 'topics:=[/a, /b]']
+    assert assigned(argv) == {'output': 'run, 1 {a}', 'topics': ['/a', '/b']}

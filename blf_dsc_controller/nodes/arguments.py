@@ -39,7 +39,7 @@ def assigned(argv: Sequence[str]) -> dict[str, object]:
     for option, rule in _ros_options(argv):
         name, _, value = rule.partition(':=')
         if option != '--params-file' and ':' not in name:
-            (section,) = parse(f'/**: {{ros__parameters: {{{name}: {value}}}}}')
+            (section,) = parse(f'/**:\n  ros__parameters:\n    {name}: {value}\n')
             given |= {one: entry.value for one, entry in section.entries.items()}
     return given
 
