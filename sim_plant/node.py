@@ -10,8 +10,8 @@ Load, wall, events, disturbance and encoder offsets can change while it runs, fr
 on; `~/changes` says from which, so that an event at that time repeats the run.
 
 A reset takes the arm back to its start, which no real arm does by itself: therefore this node also
-resets the controller, if there is one, before it sends the first state; and
-in real time when its own time is over.
+resets the controller, if there is one, before it sends the first state, and in real time when its
+own time is over.
 """
 
 from __future__ import annotations
