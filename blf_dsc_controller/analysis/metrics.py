@@ -230,7 +230,8 @@ def measure(run: Run) -> Metrics:
 def rms(values: Floats) -> float:
     """Root of the mean square of the known values."""
     known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
+    with np.errstate(over='ignore'):  # a bag may hold 1e308: the root is infinite then
+        return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
 
 
 def _columns(reduce: Callable[[Floats], float], values: Floats | None, n: int) -> tuple[float, ...]:

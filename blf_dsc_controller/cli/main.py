@@ -34,8 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, partial(_interrupt, options.command))
-    # Infinity in a bag, and names in letters that the pictures' font does not have.
-    warnings.filterwarnings('ignore', category=RuntimeWarning)
+    # Names in letters that the pictures' font does not have.
     warnings.filterwarnings('ignore', 'Glyph .* missing')
     try:
         code = copy_context().run(_handle, options)
