@@ -167,9 +167,10 @@ def test_a_restored_loop_continues_bit_for_bit():
 
 
 @numba.njit
-def many_updates(model, settings, reference, state, signals, measurement, sample, count):
+def many_updates(model, settings, law, state, signals, measurement, sample, checks, count):
     for k in range(count):
-        update(model, settings, reference, state, signals, k * 1e-3, 1e-3, measurement, sample)
+        t = k * 1e-3
+        update(model, settings, law, state, signals, t, 1e-3, measurement, sample, checks)
 
 
 def test_updates_in_a_compiled_loop_allocate_nothing():
@@ -183,7 +184,7 @@ def test_updates_in_a_compiled_loop_allocate_nothing():
         law.state_vector,
         law.signals_vector,
     )
-    arguments = (*vectors, measurement, law.sample_vector)
+    arguments = (*vectors, measurement, law.sample_vector, law.checks_vector)
     many_updates(*arguments, 1)
     allocations = []
     _nrt_python.memsys_enable_stats()

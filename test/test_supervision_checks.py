@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.controller import Safety
-from blf_dsc_controller.supervision.checks import OUTSIDE, SUSPECT, check_sample, is_valid_state
+from blf_dsc_controller.law.checks import INVALID, OUTSIDE, SUSPECT, check_sample
+from blf_dsc_controller.law.settings import EFFORT
 from blf_dsc_controller.supervision.state_check import StateCheck
 from blf_dsc_controller.supervision.supervisor import Reason
 
@@ -23,23 +24,24 @@ DT = 1e-3
 def law():
     """A controller that has processed one sample, inside its bound and below its limit."""
     law = controller(recommended())
+    law.checks.velocity_limit[0] = 50.0
     law.update(0.0, DT, plant().measure())
+    assert law.flags == 0
     return law
 
 
-def verdict(law, ratio=None, kept=None, error_ratio=1.0):
-    vectors = law.settings_vector, law.state_vector, law.signals_vector, law.sample_vector
-    ratio = np.zeros(2) if ratio is None else ratio
-    return check_sample(*vectors, error_ratio, ratio, np.zeros(7) if kept is None else kept)
+def verdict(law, error_ratio=1.0):
+    law.checks.error_ratio[0] = error_ratio
+    return check_sample(law.settings, law.checks, law.state, law.signals, law.sample)
 
 
 def test_estimates_of_a_valid_sample_are_kept(law):
-    ratio, kept = np.array([0.9, 0.0]), np.zeros(7)
-    assert verdict(law, ratio, kept) == 0
-    np.testing.assert_array_equal(kept, [*law.state.estimate, *law.state.disturbance])
+    law.checks.ratio[:], law.checks.kept[:] = (0.9, 0.0), 0.0
+    assert verdict(law) == 0
+    np.testing.assert_array_equal(law.checks.kept, [*law.state.estimate, *law.state.disturbance])
     # The largest ratio so far stays; a smaller one is overtaken.
-    assert ratio[0] == 0.9
-    assert ratio[1] == abs(law.sample.xi1[1]) / law.sample.bound[1]
+    assert law.checks.ratio[0] == 0.9
+    assert law.checks.ratio[1] == abs(law.sample.xi1[1]) / law.sample.bound[1]
 
 
 @pytest.mark.parametrize('bad', [nan, inf, -inf])
@@ -49,9 +51,9 @@ def test_estimates_of_a_valid_sample_are_kept(law):
 )
 def test_values_that_are_not_finite_are_suspect_and_not_kept(law, part, name, i, bad):
     getattr(getattr(law, part), name)[i] = bad
-    kept = np.full(7, 3.0)
-    assert verdict(law, kept=kept) & SUSPECT
-    assert (kept == 3.0).all()
+    law.checks.kept[:] = 3.0
+    assert verdict(law) & SUSPECT
+    assert (law.checks.kept == 3.0).all()
 
 
 def test_a_demand_past_the_limit_is_suspect(law):
@@ -72,17 +74,37 @@ def test_the_nan_of_a_rejected_column_is_no_fault(law):
     assert verdict(law) == 0
 
 
-@pytest.mark.parametrize('value', [nan, inf, 50.1])
-def test_a_state_is_valid_if_finite_and_slow(value):
-    still = np.zeros(2)
-    assert is_valid_state(still, still, 50.0)
-    assert not is_valid_state(still, np.array([0.0, -value]), 50.0)
-    assert is_valid_state(still, np.array([50.0, 0.0]), 50.0)
-    if value != 50.1:
-        assert not is_valid_state(np.array([value, 0.0]), still, 50.0)
+STATES = [
+    (0, nan, Reason.NOT_FINITE),
+    (1, -inf, Reason.NOT_FINITE),
+    (3, nan, Reason.NOT_FINITE),
+    (2, 50.0, None),
+    (3, -50.1, Reason.VELOCITY),
+    (5, nan, None),
+]
 
 
-STILL = np.zeros(2)
+@pytest.mark.parametrize(('place', 'value', 'reason'), STATES)
+@pytest.mark.parametrize('learns_from', [0, EFFORT])
+def test_a_state_is_used_if_finite_and_slow_and_the_reason_is_the_same(
+    place, value, reason, learns_from
+):
+    """The efforts must be finite if learning uses them."""
+    law = controller(recommended()._replace(torque_source=learns_from))
+    law.checks.velocity_limit[0] = 50.0
+    measurement = plant().measure()
+    measurement[place] = value
+    before = law.save()
+    law.update(0.0, DT, measurement)
+    if place == 5 and learns_from == EFFORT:
+        reason = Reason.NOT_FINITE
+    assert (law.flags == INVALID) == bool(reason)
+    assert (law.save() == before).all() == bool(reason)
+    if reason:
+        states = StateCheck(['joint1', 'joint2'], DT)
+        assert states.invalid(Safety(velocity_limit=50.0), measurement).reason is reason
+
+
 SAFETY = Safety()
 # Repeated, early, usual, jittering, missed and much too late; now and then backwards.
 STEPS = st.sampled_from([0, 1, 499_999, 500_001, 1_000_000, 1_000_001, 1_499_999, 1_500_001])
@@ -98,19 +120,10 @@ class FullCheck(StateCheck):
 
 @given(steps=st.lists(STEPS | RARE_STEPS | st.just(1_000_000), max_size=60))
 def test_the_short_check_of_a_stamp_is_the_full_one(steps):
-    short, full = StateCheck(['joint1', 'joint2'], DT), FullCheck(['joint1', 'joint2'], DT)
+    short, full = (cls(['joint1', 'joint2'], DT) for cls in (StateCheck, FullCheck))
     stamp = 1_000_000_000
     for step in steps:
         stamp += step
-        faults = [one.check(SAFETY, stamp, STILL, STILL) for one in (short, full)]
+        faults = [one.check(SAFETY, stamp) for one in (short, full)]
         assert faults[0] == faults[1]
         assert vars(short) == vars(full)
-
-
-def test_velocities_are_checked_after_the_short_check_too():
-    states = StateCheck(['joint1', 'joint2'], DT)
-    assert states.check(SAFETY, 1_000_000_000, STILL, STILL) is None
-    too_fast = np.array([0.0, 2.0 * SAFETY.velocity_limit])
-    fault = states.check(SAFETY, 1_001_000_000, STILL, too_fast)
-    assert fault is not None
-    assert fault.reason is Reason.VELOCITY

@@ -69,13 +69,14 @@ def test_a_ramp_is_straight_and_ends_at_a_goal_that_moves():
 
 def test_missed_states_are_averaged():
     """Every second state missed is a fraction of a half, after a few windows."""
-    states, safety = StateCheck(JOINTS, 1e-3), Safety(overrun_window=0.1, overrun_fraction=1.0)
+    states = StateCheck(JOINTS, 1e-3)
+    safety = Safety(overrun_window=0.1, overrun_fraction=1.0)
     for k in range(1001):
-        assert states.check(safety, (1 + 2 * k) * MILLISECOND, Q, DQ) is None
+        assert states.check(safety, (1 + 2 * k) * MILLISECOND) is None
     assert states.missed == 1000
     assert states.missed_fraction == pytest.approx(0.5, abs=0.01)
     for k in range(1000):
-        assert states.check(safety, (2002 + k) * MILLISECOND, Q, DQ) is None
+        assert states.check(safety, (2002 + k) * MILLISECOND) is None
     assert states.missed_fraction < 1e-4
 
 

@@ -31,7 +31,7 @@ def precompile(options: argparse.Namespace) -> None:
 
 
 def _compile_law(config: ControllerConfig) -> None:
-    Guard(config).compile()
+    Guard(config)
 
 
 def _compile_plant(config: PlantConfig) -> None:

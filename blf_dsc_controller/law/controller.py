@@ -10,6 +10,13 @@ from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.compiled.views import part
 from blf_dsc_controller.law import barrier
+from blf_dsc_controller.law.checks import (
+    INVALID,
+    check_sample,
+    checks_of,
+    checks_size,
+    is_valid_state,
+)
 from blf_dsc_controller.law.lyapunov import fill_energies
 from blf_dsc_controller.law.settings import Settings, settings_of
 from blf_dsc_controller.law.state import (
@@ -36,14 +43,23 @@ def update(
     dt: float,
     measurement: np.ndarray,
     sample_vector: np.ndarray,
-) -> None:
-    """One sample of the law with its whole telemetry, on packed vectors: see `step`."""
+    checks_vector: np.ndarray,
+) -> int:
+    """One sample of the law with its whole telemetry, on packed vectors: see `step`.
+
+    Returns the flags of its checks (see `checks`), 0 without them.
+    """
     settings = settings_of(settings_vector, model)
     state = state_of(state_vector, settings)
     signals = signals_of(signals_vector, settings)
     sample = sample_of(sample_vector, settings)
+    checks = checks_of(checks_vector, settings)
+    is_checked = checks.velocity_limit[0] > 0.0
+    if is_checked and not is_valid_state(settings, checks, measurement):
+        return INVALID
     step(settings, reference_vector, state, signals, t, dt, measurement, sample)
     fill_energies(settings, state, signals, part(measurement, 0, (settings.n,)), sample)
+    return check_sample(settings, checks, state, signals, sample) if is_checked else 0
 
 
 class Controller:
@@ -54,6 +70,8 @@ class Controller:
         state: views on `state_vector`, the whole state of the controller.
         signals: views on what the last update computed.
         sample: telemetry of the last update.
+        checks: views on `checks_vector`: limits of the checks, which are off at first.
+        flags: of the checks of the last update.
     """
 
     def __init__(self, settings: Settings, reference_vector: np.ndarray) -> None:
@@ -67,6 +85,9 @@ class Controller:
         self.signals = signals_of(self.signals_vector, self.settings)
         self.sample_vector = np.zeros(sample_size(self.settings))
         self.sample = sample_of(self.sample_vector, self.settings)
+        self.checks_vector = np.zeros(checks_size(self.settings))
+        self.checks = checks_of(self.checks_vector, self.settings)
+        self.flags = 0
         self.reset()
         self.reference_at(0.0)
         self.update(0.0, 1e-3, np.zeros(3 * self.settings.n))
@@ -103,9 +124,10 @@ class Controller:
         """Torque (n,) [N m] for a measurement; a view that the next update overwrites.
 
         The measurement is [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,)
-        N m], t [s] the time since the start and dt [s] since the last sample.
+        N m], t [s] the time since the start and dt [s] since the last sample. With INVALID among
+        the `flags` nothing has changed, the torque neither.
         """
-        update(
+        self.flags = update(
             self.settings.model,
             self.settings_vector,
             self.reference_vector,
@@ -115,6 +137,7 @@ class Controller:
             dt,
             measurement,
             self.sample_vector,
+            self.checks_vector,
         )
         return self.sample.torque
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import sys
 import traceback
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -20,6 +21,7 @@ from blf_dsc_controller.messages.telemetry import DECIMATION, ControllerTelemetr
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.controller_status import ControllerStatus
 from blf_dsc_controller.nodes.lifecycle import POLL_PERIOD, LoopNode
+from blf_dsc_controller.nodes.rclpy_internals import subscription_count
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
 from blf_dsc_controller.supervision.config_warnings import (
     ReferenceLoad,
@@ -38,6 +40,8 @@ OUTPUTS = (
     topics.BOUND,
     topics.MONITOR,
 )
+STREAMS = topics.REFERENCE, topics.TRACKING_ERROR, topics.LEARNING
+"""Telemetry of each sample; nobody gets messages of these from before the subscription."""
 
 
 class ControllerNode(LoopNode[ControllerConfig]):
@@ -61,6 +65,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._decoder = JointStateDecoder(joints, assembly.required_fields(self.config))
         self._pending: bytes | None = None
         self._warned_at = -1  # stamp of the start that was warned of
+        self._listeners: list[Callable[[], int]] = []  # counts subscribers of the STREAMS
         self._observed = self._started = False
         self._phase = Phase.INACTIVE  # that was logged last
         self._status = ControllerStatus(self, joints)
@@ -72,12 +77,13 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def configure(self) -> None:
         """Compile the law; create the topics of the loop the first time."""
         self.guard = Guard(self.config, self._steady, self._wall)
-        self.guard.compile()
         self._load = reference_load(self.config, self.guard.controller.settings)
         for warning in config_warnings(self.config, load=self._load):
             self.get_logger().warning(warning)
         outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
         if self.connect(outputs, topics.JOINT_STATES, self._on_joint_state):
+            streams = [self._outputs[topic] for topic in STREAMS if topic in outputs]
+            self._listeners = [subscription_count(publisher) for publisher in streams]
             self._status.trajectories = TrajectoryInput(
                 self, len(self.config.joints), lambda: self.guard
             )
@@ -171,9 +177,11 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def _publish_telemetry(self, guard: Guard) -> None:
         controller, stamp = guard.controller, guard.last_stamp
         state, sample, samples = controller.state, controller.sample, controller.samples
-        events = (state.columns_checked[0], state.active.sum(), state.changes[0])
-        if events != self._learning_events:
-            self._report_learning(guard, events)
+        is_due = (samples - 1) % DECIMATION == 0
+        if is_due:
+            events = (state.columns_checked[0], state.active.sum(), state.changes[0])
+            if events != self._learning_events:
+                self._report_learning(guard, events)
         if not self.config.telemetry.enabled:
             return
         narrows = controller.settings.funnel_rate > 0.0
@@ -182,9 +190,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self._publish_bound(guard, stamp, sample.bound)
         elif narrows and not np.array_equal(sample.bound, self._published_bound):
             self._publish_bound(guard, stamp, sample.bound)
-        for message in self._telemetry.sample(stamp, sample, guard.compute_time):
-            self._publish(message)
-        if (samples - 1) % DECIMATION == 0:
+        if any(count() for count in self._listeners):
+            for message in self._telemetry.sample(stamp, sample, guard.compute_time):
+                self._publish(message)
+        if is_due:
             self._publish(self._monitor.message(stamp, sample, guard.samples.ratio, sample.bound))
 
     def _report_learning(self, guard: Guard, events: tuple[float, float, float]) -> None:

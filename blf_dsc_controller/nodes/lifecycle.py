@@ -26,7 +26,12 @@ from blf_dsc_controller.nodes.endpoints import (
     create_steady_timer,
     create_subscription,
 )
-from blf_dsc_controller.nodes.rclpy_internals import RCLError, lifecycle_state, wrap_change_state
+from blf_dsc_controller.nodes.rclpy_internals import (
+    RCLError,
+    lifecycle_state,
+    raw_publish,
+    wrap_change_state,
+)
 
 Config = TypeVar('Config', ControllerConfig, PlantConfig)
 
@@ -147,6 +152,7 @@ class LoopNode(ManagedNode, Generic[Config]):
         self._steady, self._wall = steady, wall
         self.config: Config = parameters.declare(self, cls)
         self._outputs: dict[Topic, Publisher] = {}
+        self._senders: dict[Topic, Callable[[bytes], None]] = {}
 
     def start(self) -> None:
         """Start timers and services, and the node itself if it is configured to."""
@@ -163,6 +169,7 @@ class LoopNode(ManagedNode, Generic[Config]):
         if self._outputs:
             return False
         self._outputs = {topic: create_publisher(self, topic) for topic in outputs}
+        self._senders = {topic: raw_publish(self._outputs[topic]) for topic in outputs}
         create_subscription(self, source, callback)
         process.request_realtime(self.config.realtime, self.get_logger())
         return True
@@ -186,7 +193,7 @@ class LoopNode(ManagedNode, Generic[Config]):
 
     def _publish(self, message: Message) -> None:
         topic, raw = message
-        self._outputs[topic].publish(raw)
+        self._senders[topic](raw)
 
     def _is_observed(self) -> bool:
         """Whether each output has its subscribers, the first the other node's beside them."""

@@ -103,12 +103,12 @@ def run_over(recorded_states: RecordedStates, config: ControllerConfig) -> WhatI
     samples = np.empty((len(stamps), controller.sample_vector.size))
     rows = np.zeros((len(stamps), n, m + 1))
     last = stamps[0] - config.sample_time_ns
-    velocity = Velocity(config.safety.velocity, n)
+    velocity = Velocity(n) if config.safety.velocity == 'estimated' else None
     for k, (stamp, measurement) in enumerate(zip(stamps, measurements, strict=True)):
-        q, dq = measurement[:n], measurement[n : 2 * n]
-        velocity.replace(stamp, q, dq)
+        if velocity is not None:
+            velocity.replace(stamp, measurement)
         if k == 0:
-            begin(controller, config, q, dq)
+            begin(controller, config, measurement[:n], measurement[n : 2 * n])
         controller.update((stamp - stamps[0]) * _NANO, (stamp - last) * _NANO, measurement)
         samples[k] = controller.sample_vector
         rows[k] = controller.signals.row

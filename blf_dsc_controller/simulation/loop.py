@@ -20,6 +20,7 @@ from blf_dsc_controller.compiled.views import part, view
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.law.checks import SUSPECT, check_sample, checks_of, is_valid_state
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.law.lyapunov import fill_energies
@@ -36,7 +37,6 @@ from blf_dsc_controller.simulation.metrics import (
     update_metrics,
 )
 from blf_dsc_controller.simulation.record import START, Record, new_record
-from blf_dsc_controller.supervision.checks import SUSPECT, check_sample, is_valid_state
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant import kernels as plants
 from sim_plant.arm import Arm
@@ -46,7 +46,6 @@ from sim_plant.plant import Plant, plant_of, steps_of
 _CHUNK = 1000  # samples; the guard takes some 20 ms for them
 _NOTHING = MetricsSettings(0, 0, 0, 0, 0, *np.zeros((3, 0)))
 _NO_METRICS = pack(_NOTHING), new_metrics(_NOTHING)
-_NO_CHECKS = np.zeros(2), np.zeros(0), np.zeros(0)
 
 
 @kernel
@@ -68,15 +67,11 @@ def run_loop(
     truths: np.ndarray | None,
     metrics_settings: np.ndarray,
     metrics: np.ndarray,
-    limits: np.ndarray,
-    ratio: np.ndarray,
-    kept: np.ndarray,
+    checks_vector: np.ndarray,
 ) -> bool:
     """Run the samples from number `first` to `last`; at the end, the torque is not applied.
 
-    With `limits` (velocity [rad/s], error as a multiple of the bound) each sample is checked as by
-    `supervision.guard`, with its `ratio` and `kept`; the first to object to ends this, and False is
-    returned.  A velocity of 0 is no check.
+    With checks (`law.checks`) the first sample to object to ends this, and False is returned.
 
     Without `truths`, `measurements` and `samples` have one row, which each sample overwrites, there
     are no energies, and a number that is not finite ends the run; numba compiles this apart.
@@ -90,6 +85,8 @@ def run_loop(
     rows = view(samples)
     chosen = metrics_settings_of(view(metrics_settings))
     found = metrics_of(view(metrics), chosen)
+    checks = checks_of(view(checks_vector), law)
+    is_checked = checks.velocity_limit[0] > 0.0
     dt = plant.period_ns * 1e-9
     for k in range(first, last + 1):
         row = 0 if truths is None else k - first
@@ -97,17 +94,15 @@ def run_loop(
         t = (k * plant.period_ns) * 1e-9
         plants.draw_noise(plant, now, rng)
         plants.observe(plant, now, measurement)
-        q, dq = part(measurement, 0, (law.n,)), part(measurement, law.n, (law.n,))
-        if limits[0] > 0.0 and not is_valid_state(q, dq, limits[0]):
+        if is_checked and not is_valid_state(law, checks, measurement):
             return False
         step(law, reference_view, law_state, law_signals, t, dt, measurement, sample)
         if truths is not None:
             plants.truth(plant, now, view(truths)[row])
+            q = part(measurement, 0, (law.n,))
             fill_energies(law, law_state, law_signals, q, sample)
-        if limits[0] > 0.0:
-            flags = check_sample(settings, state, signals, rows[row], limits[1], ratio, kept)
-            if flags & SUSPECT:
-                return False
+        if is_checked and check_sample(law, checks, law_state, law_signals, sample) & SUSPECT:
+            return False
         if chosen.n > 0:
             if found.finite[0] == 1.0:
                 plants.true_parameters(plant, now, found.P)
@@ -152,23 +147,20 @@ def simulate(
 
 def _run_compiled(guard: Guard, plant: Plant, record: Record, chunk: range) -> bool:
     """Run a chunk of samples without a stop; False, with nothing changed, if there is to be one."""
-    safety, controller = guard.config.safety, guard.controller
-    if not guard.supervisor.running or safety.velocity != 'measured':
+    controller = guard.controller
+    if not guard.supervisor.running or guard.config.safety.velocity != 'measured':
         return False
-    checked = guard.samples.ratio, guard.samples.kept
-    checks = (np.array((safety.velocity_limit, safety.error_ratio)), *checked)
-    before = controller.save(), plant.save(), [array.copy() for array in checked]
+    before = controller.save(), plant.save(), controller.checks_vector.copy()
     rows = slice(chunk.start, chunk.stop)
     arrays = record.measurements[rows], record.samples[rows], record.truths[rows]
     samples = chunk.start, chunk.stop - 1, chunk.stop == record.stamps.size
-    if _run_samples(controller, plant, samples, arrays, _NO_METRICS, checks):
+    if _run_samples(controller, plant, samples, arrays, _NO_METRICS):
         last = chunk.stop - 1
         guard.advance(START + int(record.stamps[last]), record.measurements[last], len(chunk))
         return True
     controller.restore(before[0])
     plant.restore(before[1])
-    for array, saved in zip(checked, before[2], strict=True):
-        array[:] = saved
+    controller.checks_vector[:] = before[2]
     return False
 
 
@@ -239,7 +231,6 @@ def _run_samples(
     samples: tuple[int, int, bool],
     arrays: tuple[np.ndarray, np.ndarray, np.ndarray | None],
     metrics: tuple[np.ndarray, np.ndarray],
-    checks: tuple[np.ndarray, np.ndarray, np.ndarray] = _NO_CHECKS,
 ) -> bool:
     """Call `run_loop`: first, last, is_end; measurements, samples, truths; the rest as there."""
     return run_loop(
@@ -255,5 +246,5 @@ def _run_samples(
         *samples,
         *arrays,
         *metrics,
-        *checks,
+        controller.checks_vector,
     )

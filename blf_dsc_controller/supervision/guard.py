@@ -64,7 +64,8 @@ class Guard(GuardedLaw):
         self._note(EventType.RESET)
         self._resumable = False
         self.controller.reset()
-        self._velocity.reset()
+        if self._velocity is not None:
+            self._velocity.reset()
         self.samples.keep()
         self._start_over()
 
@@ -107,6 +108,7 @@ class Guard(GuardedLaw):
         else:
             retuning.apply(self.controller, config)
         self.config = config
+        self.samples.set_limits(config.safety)
 
     def problems(self, config: ControllerConfig) -> list[str]:
         """Why a configuration cannot be put in force now; empty if it can."""

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError, StartError
+from blf_dsc_controller.law.checks import INVALID, is_valid_state
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.messages import cdr
 from blf_dsc_controller.messages.journal import EventType, Journal
@@ -32,7 +33,6 @@ from blf_dsc_controller.supervision.watchdog import PERIOD, Watchdog
 
 Vector = NDArray[np.float64]
 _NANO = 1e-9
-_ANY_STAMP = 1  # ns
 
 _REASONS: dict[type[cdr.MessageError], Reason] = {
     cdr.MissingJointError: Reason.JOINT_MISSING,
@@ -74,7 +74,7 @@ class GuardedLaw:
         self.controller = controller_of(config)
         self.supervisor = Supervisor()
         self.states = StateCheck(config.joints, config.sample_time)
-        self.samples = SampleCheck(config.joints, self.controller)
+        self.samples = SampleCheck(config.safety, config.joints, self.controller)
         self.watchdog = Watchdog(steady, wall)
         self.journal = Journal()
         self.has_sample = False
@@ -82,20 +82,11 @@ class GuardedLaw:
         self.foreign = 0
         self.start_stamp = self.last_stamp = -1
         self.settled = self.compute_time = 0.0
-        self._velocity = Velocity(config.safety.velocity, n)
-        self._learns_from_effort = config.learning.torque_source == 'effort'
+        self._velocity = Velocity(n) if config.safety.velocity == 'estimated' else None
         self._safe_torque = SafeTorque(n)
         self._clean = True  # whether the window holds valid samples only
         self._resumable = False  # whether the law may continue along its reference
         self.journal.note(EventType.CONFIGURE, parameters=flatten(config))
-
-    def compile(self) -> None:
-        """Compile what the first joint state would otherwise wait for."""
-        at_rest = np.zeros(len(self.config.joints))
-        self.states.check(self.config.safety, _ANY_STAMP, at_rest, at_rest)
-        self.states.restart()
-        self.samples.check(self.config.safety, self.config.sample_time)
-        self.samples.restart()
 
     @property
     def commanding(self) -> bool:
@@ -115,33 +106,38 @@ class GuardedLaw:
         self._begin_message()
         self.journal.stamp = stamp
         self.watchdog.restart()
-        n, safety, last = len(self.config.joints), self.config.safety, self._safe_torque.last
-        q, dq = measurement[:n], measurement[n : 2 * n]
-        self._velocity.replace(stamp, q, dq)
+        if self._velocity is not None:
+            self._velocity.replace(stamp, measurement)
         if self.supervisor.uses_states:
-            effort = measurement[2 * n :] if self._learns_from_effort else None
-            fault = self.states.check(safety, stamp, q, dq, effort)
+            fault = self.states.check(self.config.safety, stamp)
             if fault is SKIP:
                 return None
             if fault is None:
                 return self._use(stamp, measurement)
             self._stop(*fault)
-        last.salvage(stamp, q, dq, safety.velocity_limit, self.config.sample_time)
-        return self._safe(self.config.sample_time)
+        return self._safe_at(stamp, measurement)
 
     def _use(self, stamp: int, measurement: Vector) -> Vector | None:
-        """Give a valid state to the law."""
-        self._safe_torque.last.take(stamp, measurement)
-        if self.supervisor.phase is Phase.STARTING and not self._start(stamp, measurement):
-            return self._safe(self.config.sample_time) if self.commanding else None
+        """Give a state to the law, which does not use invalid ones."""
+        law, last = self.controller, self._safe_torque.last
+        is_first = self.supervisor.phase is Phase.STARTING
+        if is_first:
+            if not is_valid_state(law.settings, law.checks, measurement):
+                return self._reject(stamp, measurement)
+            last.take(stamp, measurement)
+            if not self._start(stamp, measurement):
+                return self._safe(self.config.sample_time) if self.commanding else None
         dt = (stamp - self.last_stamp) * _NANO
-        self._advance_to(stamp)
         before = perf_counter()
-        torque = self.controller.update(self.time, dt, measurement)
+        torque = law.update(self._time_of(stamp), dt, measurement)
         self.compute_time = perf_counter() - before
-        if self.controller.samples == 1 and self.commanding:
-            limit_first_torque(self.controller, self._safe_torque.commanded, dt)
-        fault = self.samples.check(self.config.safety, dt)
+        if law.flags & INVALID:
+            return self._reject(stamp, measurement)
+        last.take(stamp, measurement)
+        self._advance_to(stamp)
+        if is_first and self.commanding:
+            limit_first_torque(law, self._safe_torque.commanded, dt)
+        fault = self.samples.check(dt)
         if fault is not None:
             self._stop(*fault)
             return self._safe(self.config.sample_time)
@@ -149,6 +145,17 @@ class GuardedLaw:
         self.has_sample = True
         self.journal.commands += 1
         return torque
+
+    def _reject(self, stamp: int, measurement: Vector) -> Vector | None:
+        """Stop at a state that is not valid."""
+        self._stop(*self.states.invalid(self.config.safety, measurement))
+        return self._safe_at(stamp, measurement)
+
+    def _safe_at(self, stamp: int, measurement: Vector) -> Vector | None:
+        """Safe torque at a state that the law has not used."""
+        limit, dt = self.config.safety.velocity_limit, self.config.sample_time
+        self._safe_torque.last.salvage(stamp, measurement, limit, dt)
+        return self._safe(dt)
 
     def _start(self, stamp: int, measurement: Vector) -> bool:
         """Resume along the running reference if the law can take over, or else start at t = 0."""

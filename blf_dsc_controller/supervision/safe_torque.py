@@ -39,12 +39,13 @@ class LastState:
         self._stamp = stamp
 
     def salvage(
-        self, stamp: int, q: Vector, dq: Vector, velocity_limit: float, period: float
+        self, stamp: int, measurement: Vector, velocity_limit: float, period: float
     ) -> None:
         """Take what can be used of any other state, `period` [s] after the last.
 
         Positions that are not finite and a repeated stamp say nothing of where the arm is now.
         """
+        q, dq, _ = measurement.reshape(3, -1)
         if stamp == self._stamp or not np.isfinite(q).all():
             self.miss(period)
             return

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The check of every sample of the law before its torque is commanded."""
+"""What follows from the compiled checks of a sample, before its torque is commanded."""
 
 from __future__ import annotations
 
@@ -9,32 +9,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import Safety
+from blf_dsc_controller.law.checks import OUTSIDE, SUSPECT
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import LINEAR
-from blf_dsc_controller.supervision import checks
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
 
 
 class SampleCheck:
-    """Checks each sample of a controller, and keeps the estimates of the last valid one.
+    """Judges each sample of a controller, and keeps the estimates of the last valid one.
 
     Attributes:
         ratio: largest |xi1| / k_c of each joint since the start (n,).
         outside: samples past the bound since the start.
         saturated: samples with a torque at its limit since the start.
         saturated_time: time that they have lasted without a break [s].
-        kept: estimates and d^3 (m + n,) of the last valid sample.
     """
 
-    def __init__(self, joints: Sequence[str], controller: Controller) -> None:
+    def __init__(self, safety: Safety, joints: Sequence[str], controller: Controller) -> None:
+        """Switch on the checks of the controller."""
         self._joints = tuple(joints)
         self._controller = controller
-        self.ratio = np.zeros(len(self._joints))
-        self.kept = np.zeros(controller.settings.m + len(self._joints))
+        self.ratio = controller.checks.ratio
+        self._kept = controller.checks.kept
+        self.set_limits(safety)
         self.keep()
         self.restart()
+
+    def set_limits(self, safety: Safety) -> None:
+        """Check the next samples by these limits."""
+        self._safety, checks = safety, self._controller.checks
+        checks.velocity_limit[0], checks.error_ratio[0] = safety.velocity_limit, safety.error_ratio
 
     def restart(self) -> None:
         """Count from the next sample on."""
@@ -45,40 +51,31 @@ class SampleCheck:
     @property
     def estimate(self) -> Vector:
         """The kept estimate (m,)."""
-        return self.kept[: self._controller.settings.m]
+        return self._kept[: self._controller.settings.m]
 
     def keep(self) -> None:
         """Keep the present estimates."""
         state = self._controller.state
-        np.concatenate((state.estimate, state.disturbance), out=self.kept)
+        np.concatenate((state.estimate, state.disturbance), out=self._kept)
 
     def restore(self) -> None:
         """Reset the controller but for its estimates, which are the kept ones then."""
         self._controller.reset()
         state = self._controller.state
-        state.estimate[:], state.disturbance[:] = self.estimate, self.kept[state.estimate.size :]
+        state.estimate[:], state.disturbance[:] = self.estimate, self._kept[state.estimate.size :]
 
-    def check(self, safety: Safety, dt: float) -> Fault | None:
+    def check(self, dt: float) -> Fault | None:
         """Return why the torque of a sample, `dt` [s] after the one before, must not be used."""
-        controller = self._controller
-        flags = checks.check_sample(
-            controller.settings_vector,
-            controller.state_vector,
-            controller.signals_vector,
-            controller.sample_vector,
-            safety.error_ratio,
-            self.ratio,
-            self.kept,
-        )
-        if flags & checks.OUTSIDE:
+        flags = self._controller.flags
+        if flags & OUTSIDE:
             self.outside += 1
-        if not flags & checks.SUSPECT:
+        if not flags & SUSPECT:
             self.saturated_time = 0.0
             return None
         fault = self._not_finite()
         if fault is None:
-            saturated = self._saturated(safety, dt)
-            fault = self._outside(safety) or saturated
+            saturated = self._saturated(dt)
+            fault = self._outside() or saturated
         if fault is None:
             self.keep()
         return fault
@@ -93,7 +90,8 @@ class SampleCheck:
             return Fault(Reason.TORQUE, f'the demanded torque is not finite: {demand}')
         return None
 
-    def _outside(self, safety: Safety) -> Fault | None:
+    def _outside(self) -> Fault | None:
+        safety = self._safety
         if safety.error_ratio == 0.0 or self._controller.settings.surface == LINEAR:
             return None
         xi1, bound = self._controller.sample.xi1, self._controller.sample.bound
@@ -108,13 +106,13 @@ class SampleCheck:
         )
         return Fault(Reason.OUTSIDE_BOUND, text)
 
-    def _saturated(self, safety: Safety, dt: float) -> Fault | None:
+    def _saturated(self, dt: float) -> Fault | None:
         demand, limit = self._controller.signals.demand, self._controller.settings.torque_limit
         worst = int(np.argmax(np.abs(demand) - limit))
         is_saturated = bool(np.abs(demand[worst]) > limit[worst])
         self.saturated += is_saturated
         self.saturated_time = self.saturated_time + dt if is_saturated else 0.0
-        if self.saturated_time <= safety.saturation_time:
+        if self.saturated_time <= self._safety.saturation_time:
             return None
         text = (
             f'joint {self._joints[worst]!r} needs {demand[worst]:+.4g} N m and has been at '

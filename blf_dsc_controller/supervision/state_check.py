@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import Safety
-from blf_dsc_controller.supervision.checks import is_valid_state
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
@@ -51,22 +50,15 @@ class StateCheck:
         """Take all states up to a stamp [ns] for checked."""
         self._last_stamp = stamp
 
-    def check(
-        self, safety: Safety, stamp: int, q: Vector, dq: Vector, effort: Vector | None = None
-    ) -> Fault | None:
+    def check(self, safety: Safety, stamp: int) -> Fault | None:
         """Return why the controller must stop, SKIP to ignore the state, or None to use it.
 
-        Units are ns, rad, rad/s; `effort` are the applied torques (n,) [N m] if learning uses them.
+        The stamp is in ns; the values are checked by the law (`law.checks.is_valid_state`).
         """
         fault = None if self._is_next(stamp) else self._check_stamp(safety, stamp)
-        if fault is not None:
-            return fault
-        if not is_valid_state(q, dq, safety.velocity_limit):
-            return self._invalid(safety, q, dq)
-        if effort is not None and not np.isfinite(effort).all():
-            return Fault(Reason.NOT_FINITE, f'the efforts used for learning are {effort}')
-        self._last_stamp = stamp
-        return None
+        if fault is None:
+            self._last_stamp = stamp
+        return fault
 
     def _is_next(self, stamp: int) -> bool:
         """Whether a stamp is one sample after the last, with nothing to count."""
@@ -122,11 +114,15 @@ class StateCheck:
         )
         return Fault(Reason.OVERRUN, text)
 
-    def _invalid(self, safety: Safety, q: Vector, dq: Vector) -> Fault:
+    def invalid(self, safety: Safety, measurement: Vector) -> Fault:
+        """Return why the invalid [q (n,) rad, dq (n,) rad/s, effort (n,) N m] must not be used."""
+        q, dq, effort = measurement.reshape(3, -1)
         if not (np.isfinite(q).all() and np.isfinite(dq).all()):
             text = f'the joint state is not finite: positions {q}, velocities {dq}'
             return Fault(Reason.NOT_FINITE, text)
         worst = int(np.argmax(np.abs(dq)))
+        if abs(dq[worst]) <= safety.velocity_limit:
+            return Fault(Reason.NOT_FINITE, f'the efforts used for learning are {effort}')
         text = (
             f'the velocity of joint {self._joints[worst]!r} is {dq[worst]:+.6g} rad/s: more '
             f'than safety.velocity_limit, {safety.velocity_limit:g} rad/s'

@@ -62,21 +62,13 @@ class Supervisor:
         reason, text: why it stopped; `NONE` and empty if it did not.
         stops: since the controller was configured.
         revision: how often phase, reason or text have been set.
+        running: whether the law is in command.
+        uses_states: whether joint states are for the law, which runs or is about to start.
     """
 
     def __init__(self) -> None:
         self.stops = self.revision = 0
         self.enter(Phase.INACTIVE)
-
-    @property
-    def running(self) -> bool:
-        """Whether the law is in command."""
-        return self.phase in (Phase.TRACKING, Phase.APPROACHING)
-
-    @property
-    def uses_states(self) -> bool:
-        """Whether joint states are for the law, which runs or is about to start."""
-        return self.phase not in (Phase.SAFE_STOP, Phase.INACTIVE)
 
     def enter(self, phase: Phase) -> None:
         """Begin a phase other than the safe stop, and clear the reason."""
@@ -92,4 +84,6 @@ class Supervisor:
 
     def _set(self, phase: Phase, reason: Reason, text: str) -> None:
         self.phase, self.reason, self.text = phase, reason, text
+        self.running = phase in (Phase.TRACKING, Phase.APPROACHING)
+        self.uses_states = self.running or phase is Phase.STARTING
         self.revision += 1

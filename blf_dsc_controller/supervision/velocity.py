@@ -10,10 +10,9 @@ Vector = NDArray[np.float64]
 
 
 class Velocity:
-    """Replaces velocities by difference quotients if the source is `estimated`, not `measured`."""
+    """Replaces velocities by difference quotients."""
 
-    def __init__(self, source: str, n: int) -> None:
-        self._estimated = source == 'estimated'
+    def __init__(self, n: int) -> None:
         self._stamp = -1
         self._q = np.zeros(n)
         self._dq = np.zeros(n)
@@ -22,10 +21,9 @@ class Velocity:
         """Forget the last state: the arm is taken to be at rest in the next one."""
         self._stamp = -1
 
-    def replace(self, stamp: int, q: Vector, dq: Vector) -> None:
-        """Overwrite dq (n,) [rad/s] by the difference quotient of q (n,) [rad]; stamp in ns."""
-        if not self._estimated:
-            return
+    def replace(self, stamp: int, measurement: Vector) -> None:
+        """Overwrite dq in [q (n,) rad, dq (n,) rad/s, torque (n,)], which has a stamp [ns]."""
+        q, dq, _ = measurement.reshape(3, -1)
         if self._stamp < 0 or stamp < self._stamp:
             self._dq[:] = 0.0
         elif stamp > self._stamp:

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiled checks of every joint state and every sample: flags only.
+
+The supervisor derives the reason of each flag.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
+from blf_dsc_controller.law.settings import EFFORT, LINEAR, Settings
+from blf_dsc_controller.law.state import Sample, Signals, State
+
+SUSPECT = 1
+"""A value that is not finite, a torque at its limit, or an error too large."""
+
+OUTSIDE = 2
+"""An error past its bound."""
+
+INVALID = 4
+"""A joint state that is not finite or too fast; the law has not used it."""
+
+
+class Checks(NamedTuple):
+    """Limits of the checks, and what they keep of the samples so far."""
+
+    velocity_limit: Cell  # rad/s, of each joint; 0 switches all checks off
+    error_ratio: Cell  # |xi1| / k_c from which on an error is suspect; 0: never
+    ratio: Annotated[Array, 'n']  # largest |xi1| / k_c so far
+    kept: Annotated[Array, 'm + n']  # estimates and d^3 of the last sample that was not suspect
+
+
+checks_of, checks_size = view_of(Checks), size_of(Checks)
+
+
+@inner
+def is_valid_state(settings: Settings, checks: Checks, measurement: np.ndarray) -> bool:
+    """Whether [q, dq, applied torque] (3 n,) is finite, as far as used, and no joint too fast."""
+    n = settings.n
+    for i in range(n):
+        if not (isfinite(measurement[i]) and abs(measurement[n + i]) <= checks.velocity_limit[0]):
+            return False
+        if settings.torque_source == EFFORT and not isfinite(measurement[2 * n + i]):
+            return False
+    return True
+
+
+@inner
+def check_error(settings: Settings, checks: Checks, xi1: np.ndarray, bound: np.ndarray) -> int:
+    """Return the flags of the errors (n,) [rad]; update the largest ratio."""
+    flags = 0
+    error_ratio = checks.error_ratio[0] if settings.surface != LINEAR else 0.0
+    for i in range(settings.n):
+        now = abs(xi1[i]) / bound[i]
+        if now == now:  # noqa: PLR0124 - not NaN
+            checks.ratio[i] = max(checks.ratio[i], now)
+        if not now < 1.0:
+            flags |= OUTSIDE
+        if error_ratio > 0.0 and not now < error_ratio:
+            flags |= SUSPECT
+    return flags
+
+
+@inner
+def check_sample(
+    settings: Settings, checks: Checks, state: State, signals: Signals, sample: Sample
+) -> int:
+    """Return the flags of what the law computed in a sample; update what is kept.
+
+    The estimate of a rejected column is finite in the state, and NaN in the sample.
+    """
+    flags = check_error(settings, checks, sample.xi1, sample.bound)
+    for i in range(settings.n):
+        within = abs(signals.demand[i]) <= settings.torque_limit[i]
+        if not (within and isfinite(sample.torque[i]) and isfinite(state.disturbance[i])):
+            flags |= SUSPECT
+    for j in range(settings.m):
+        if not isfinite(state.estimate[j]):
+            flags |= SUSPECT
+    if flags & SUSPECT == 0:
+        for j in range(settings.m):
+            checks.kept[j] = state.estimate[j]
+        for i in range(settings.n):
+            checks.kept[settings.m + i] = state.disturbance[i]
+    return flags
