@@ -40,11 +40,13 @@ _GREETINGS = 40
 _NULL = 'null node, serialised messages'
 _NULL_TYPED = 'null node'
 _QUIET = 'controller, telemetry off'
-_TELLING = 'controller, telemetry on'
-_SPARSE = 'controller, telemetry of every 10th sample'
-_RECORDED = 'controller, telemetry and recorder on'
-_PROCESSES = (_NULL, _NULL_TYPED, _QUIET, _SPARSE, _TELLING, _RECORDED)
-_GUESTS = (_NULL, _QUIET, _SPARSE, _TELLING)
+_UNHEARD = 'controller, telemetry on, no subscriber'
+_SPARSE = 'controller, telemetry of every 10th sample, a subscriber'
+_HEARD = 'controller, telemetry on, a subscriber'
+_RECORDED = 'controller, telemetry on, recorder'
+_LISTENED = (_SPARSE, _HEARD)
+_PROCESSES = (_NULL, _NULL_TYPED, _QUIET, _UNHEARD, _SPARSE, _HEARD, _RECORDED)
+_GUESTS = (_NULL, _QUIET, _UNHEARD, _SPARSE, _HEARD)
 _PRESETS = {'recommended': 'node', 'panda': 'node with seven joints'}
 _HERE = Path(__file__).parent
 
@@ -71,12 +73,16 @@ class Guest:
 
     def __init__(self, name: str, context: Any) -> None:
         import rclpy
-        from null_node import echo
+        from null_node import echo, listen
         from rclpy.parameter import Parameter
 
         from blf_dsc_controller.nodes.controller_node import ControllerNode
 
         self.name = name
+        self.listener: Any = None
+        if name in _LISTENED:
+            self.listener = rclpy.create_node('listener', **_silent(context))
+            listen(self.listener)
         if name == _NULL:
             self.node: Any = rclpy.create_node(topics.CONTROLLER, **_silent(context))
             echo(self.node, 'raw')
@@ -182,14 +188,18 @@ class StandIn:
     def host(self, name: str) -> Iterator[list[Guest]]:
         """A contestant as a node of this process."""
         guest = Guest(name, self.context)
-        self.executor.add_node(guest.node)
+        nodes = [node for node in (guest.listener, guest.node) if node is not None]
+        for node in nodes:
+            self.executor.add_node(node)
         try:
-            yield [guest]
+            yield [guest] * len(nodes)
         finally:
-            self.executor.remove_node(guest.node)
+            for node in nodes:
+                self.executor.remove_node(node)
             self.executor.spin_once(timeout_sec=0.1)  # what was on its way to the node runs out
-            guest.node.destroy_node()
-            guest.node = None
+            for node in nodes:
+                node.destroy_node()
+            guest.node = guest.listener = None
 
     def close(self) -> None:
         """End the arm's node, and leave no participant to be heard in a later round."""
@@ -270,11 +280,13 @@ def _pairs(runs: Collection[str]) -> Iterator[tuple[str, str]]:
 
 @contextmanager
 def _started(name: str, config: ControllerConfig, path: Path) -> Iterator[list[Contestant]]:
-    """Processes of a contestant: its node, after the recorder if it is to have one."""
+    """Processes of a contestant: its node, after the subscriber or recorder that it is to have."""
     commands = [_command(name, config, path.with_suffix('.yaml'))]
     if name == _RECORDED:
         module = 'blf_dsc_controller.nodes.recorder_node'
         commands.insert(0, ['-m', module, '--ros-args', '-p', f'output:={path}'])
+    elif name in _LISTENED:
+        commands.insert(0, [str(_HERE / 'null_node.py'), 'listen'])
     contestants: list[Contestant] = []
     try:
         contestants.extend(Contestant(name, command) for command in commands)
@@ -288,7 +300,7 @@ def _command(name: str, config: ControllerConfig, params: Path) -> list[str]:
     if name in (_NULL, _NULL_TYPED):
         return [str(_HERE / 'null_node.py'), 'raw' if name == _NULL else 'typed']
     telemetry = _telemetry_of(name)
-    observers = int(name == _RECORDED)
+    observers = int(name == _RECORDED)  # of all outputs
     dump(params, {CONTROLLER: replace(config, telemetry=telemetry, wait_for_subscribers=observers)})
     module = 'blf_dsc_controller.nodes.controller_node'
     return ['-m', module, '--ros-args', '--params-file', str(params)]

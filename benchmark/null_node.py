@@ -2,6 +2,7 @@
 """The least a node can do: echo a torque at once, or throw messages away.
 
 Usage: python null_node.py typed|raw      echo, typed as usual in rclpy, or serialised
+       python null_node.py listen         subscribe to states and telemetry in serialised form
        python null_node.py drop TOPICS    subscribe to as many topics in serialised form
 """
 
@@ -19,6 +20,7 @@ from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.messages import topics
+from blf_dsc_controller.nodes.controller_node import STREAMS
 from blf_dsc_controller.nodes.endpoints import qos_profile
 from blf_dsc_controller.nodes.raw_subscriptions import compatible_profile
 
@@ -48,6 +50,13 @@ def echo(node: Any, kind: str) -> None:
     )
 
 
+def listen(node: Any) -> None:
+    """Let a node subscribe to joint states and the controller's streams, and do nothing."""
+    for topic in (topics.JOINT_STATES, *STREAMS):
+        profile = compatible_profile([topic.offered], topic.offered.depth)
+        node.create_subscription(JointState, topic.relative, lambda _: None, profile, raw=True)
+
+
 def drop(node: Any, count: int) -> None:
     """Let a node subscribe to topics, with the QoS of the recorder, and do nothing."""
     profile = compatible_profile([topics.STREAM], RecorderConfig().queue_depth)
@@ -59,9 +68,11 @@ def main() -> None:
     """Run until the process is ended."""
     rclpy.init(args=sys.argv)
     kind, *arguments = sys.argv[1:]
-    node = rclpy.create_node(topics.CONTROLLER)
+    node = rclpy.create_node('listener' if kind == 'listen' else topics.CONTROLLER)
     if kind == 'drop':
         drop(node, int(arguments[0]))
+    elif kind == 'listen':
+        listen(node)
     else:
         echo(node, kind)
     executor = EventsExecutor()

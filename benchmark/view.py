@@ -14,20 +14,21 @@ from pathlib import Path
 
 import numpy as np
 from harness import Contestant, Ratio, own_graph, ratio
-from node import _TELLING, Run, StandIn, _recorded_states, _started
+from node import _HEARD, _UNHEARD, Run, StandIn, _recorded_states, _started
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.params_file import load_loop
 
 _ROUNDS = 7
 _VIEWED = 'controller, telemetry and view on'
+_BESIDE = _UNHEARD, _HEARD
 _COMMAND = ('-m', 'blf_dsc_controller.view.node', '--ros-args', '-p', 'port:=8480')
 
 
 def measure() -> Iterator[Ratio]:
-    """Latency and CPU of the controller beside the view relative to those of the controller."""
+    """Latency and CPU of the controller beside the view relative to those without it."""
     loop = load_loop('recommended')
-    runs: dict[str, list[Run]] = {_TELLING: [], _VIEWED: []}
+    runs: dict[str, list[Run]] = {name: [] for name in (*_BESIDE, _VIEWED)}
     states = _recorded_states(loop)
     with own_graph(), tempfile.TemporaryDirectory() as folder, closing(StandIn(states)) as arm:
         for k in range(_ROUNDS):
@@ -37,15 +38,16 @@ def measure() -> Iterator[Ratio]:
                     each.append(arm.play(these, 1e-3))
                 arm.left_alone()
     group = 'view, real time at 1 kHz'
-    for what, percentile in (('median', 50.0), ('p99.9', 99.9)):
-        latency = {
-            name: np.array([np.percentile(run.latency, percentile) for run in each])
-            for name, each in runs.items()
-        }
-        title = f'{_VIEWED}: {what} latency'
-        yield ratio(group, title, _TELLING, latency[_VIEWED], latency[_TELLING])
-    cpu = {name: np.array([run.cpu for run in each]) for name, each in runs.items()}
-    yield ratio(group, f'{_VIEWED}: CPU', _TELLING, cpu[_VIEWED], cpu[_TELLING])
+    percentiles = {'median': 50.0, 'p99.9': 99.9}
+    for base in _BESIDE:
+        for what, percentile in percentiles.items():
+            latency = {
+                name: np.array([np.percentile(run.latency, percentile) for run in each])
+                for name, each in runs.items()
+            }
+            yield ratio(group, f'{_VIEWED}: {what} latency', base, latency[_VIEWED], latency[base])
+        cpu = {name: np.array([run.cpu for run in each]) for name, each in runs.items()}
+        yield ratio(group, f'{_VIEWED}: CPU', base, cpu[_VIEWED], cpu[base])
 
 
 @contextmanager
@@ -53,7 +55,7 @@ def _viewed(name: str, config: ControllerConfig, path: Path) -> Iterator[list[Co
     """Processes of the controller, after that of the view if it is to have one."""
     views = [Contestant('view', _COMMAND)] if name == _VIEWED else []
     try:
-        with _started(_TELLING, config, path) as nodes:
+        with _started(_UNHEARD if views else name, config, path) as nodes:
             yield [*views, *nodes]
     finally:
         for view in views:
