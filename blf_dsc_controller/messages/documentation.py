@@ -18,7 +18,8 @@ _PREFACE = """\
 Names are the defaults, those with the name of a node are private to it. Joints are matched by name,
 stamps are the plant's time. The values of a JointState that has no joints are in `position`, by the
 names in `name`. *Kept* is how many messages a publisher keeps (of `joint_trajectory`: the
-subscriber), and *latched* that late subscribers get them; all are reliable.
+subscriber), and *latched* that late subscribers get them; all are reliable. `reference`,
+`tracking_error` and `learning` are sent while any of the three has a subscriber.
 
 This page is generated: `python -m blf_dsc_controller.messages.documentation doc/topics.md`.
 
@@ -79,6 +80,10 @@ _ABOUT = {
         f'{_NAMED}`{topics.LATENCY}` and `{topics.LATENESS}` [s], `{topics.LATE_STEPS}`',
     ),
     topics.ROBOT_DESCRIPTION: ('at the start', 'URDF of the simulated arm'),
+    topics.MARKERS: (
+        'each `period`',
+        'reference as a ghost, bound around its tip, torques: for RViz and Foxglove',
+    ),
     topics.CLOCK: ('each sample, if `publish_clock`', "the plant's time"),
     topics.DIAGNOSTICS: ('each second, on change', 'health of controller and plant'),
 }

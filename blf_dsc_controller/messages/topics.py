@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 CONTROLLER = 'blf_dsc_controller'
 PLANT = 'sim_plant'
+MARKERS_NODE = 'arm_markers'
 
 FOREVER = 2**63 - 1  # ns
 
@@ -103,6 +104,8 @@ JOINT_TRAJECTORY = Topic(
     DIAGNOSTIC,
 )
 """Published by other nodes for the controller."""
+MARKERS = Topic(MARKERS_NODE, '~/markers', 'visualization_msgs/msg/MarkerArray', LATEST, LATEST)
+"""For RViz and Foxglove."""
 JOURNAL = Topic(CONTROLLER, '~/journal', 'std_msgs/msg/String', HISTORY, HISTORY)
 """Every event of the controller, also for late recorders: see messages.journal."""
 

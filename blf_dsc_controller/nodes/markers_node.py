@@ -25,7 +25,6 @@ from blf_dsc_controller.nodes.parameters import declare
 from blf_dsc_controller.nodes.process import PlainNode, run
 from blf_dsc_controller.nodes.raw_subscriptions import RawSubscriptions
 
-NAME = 'arm_markers'
 _DEPTH = 1  # only the newest counts
 _GHOST = ColorRGBA(r=0.2, g=0.8, b=0.3, a=0.5)
 _BOUND = ColorRGBA(r=0.9, g=0.7, b=0.1, a=0.5)
@@ -37,7 +36,7 @@ class MarkersNode(PlainNode):
     """Publishes `~/markers`; ConfigurationError if a parameter is wrong."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(NAME, **options)
+        super().__init__(topics.MARKERS_NODE, **options)
         self._config = declare(self, MarkersConfig)
         joints = self._config.joints
         self._chain = self._config.chain
@@ -47,7 +46,8 @@ class MarkersNode(PlainNode):
         for handle, topic in enumerate(watched):
             name = self.resolve_topic_name(topic.relative)
             self._raw_subscriptions.subscribe(name, topic.type, [topic.offered], handle)
-        self._markers = self.create_publisher(MarkerArray, '~/markers', qos_profile(topics.LATEST))
+        quality = qos_profile(topics.MARKERS.offered)
+        self._markers = self.create_publisher(MarkerArray, topics.MARKERS.name, quality)
         create_steady_timer(self, self._config.period, self._draw)
 
     def close(self) -> None:
