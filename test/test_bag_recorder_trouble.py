@@ -72,6 +72,23 @@ def test_the_parameters_of_who_publishes_are_in_the_bag(rig, tmp_path):
     assert context.facts['messages /a'].startswith('0 written, 0 missed')
 
 
+def test_parameters_are_read_before_the_first_message_when_they_are_waited_for(rig, tmp_path):
+    process = rig.record(tmp_path / 'bag', wait_for_parameters=PATIENCE)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=PATIENCE)
+    assert 'gain: [1.0, 2.0]' in read_context(tmp_path / 'bag').configuration
+
+
+def test_a_node_that_never_responds_is_recorded_after_the_wait(rig, tmp_path):
+    process = rig.start(tmp_path / 'bag', wait_for_parameters=0.3)
+    while not rig.publishers[0].get_subscription_count():  # its parameter services are not served
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=PATIENCE)
+    assert '/source: its parameters could not be read' in said
+
+
 def test_names_that_no_ros_package_has_import_nothing_and_end_nothing(rig, tmp_path):
     process = rig.record(tmp_path / 'bag', topics='[a, b, c, d, e]')
     names = {'b': 'unittest::__main__::X', 'c': 'foo::X', 'd': 'unittest::msg::X', 'e': 'X'}

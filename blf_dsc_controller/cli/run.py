@@ -37,6 +37,7 @@ STOPPED = 5
 
 _FOLDER = 'closed_loop'
 _DURATION = 60.0  # s, where neither the file nor an option gives one
+_PARAMETERS_TIMEOUT = 60.0  # s; a bag without its configuration cannot be replayed
 
 
 def run(options: Namespace) -> int:
@@ -48,7 +49,7 @@ def run(options: Namespace) -> int:
         _check_view(options)
     out = make_folder(options.out)
     try:
-        recorder = {'output': str(out / 'bag')}
+        recorder = {'output': str(out / 'bag'), 'wait_for_parameters': _PARAMETERS_TIMEOUT}
         config = config._replace(recorder=change(config.recorder, recorder))
         dump(out / 'config.yaml', config.by_node)
         if options.offline:

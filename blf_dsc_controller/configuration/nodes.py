@@ -52,6 +52,12 @@ class RecorderConfig:
         's',
         at_least=0.0,
     )
+    wait_for_parameters: float = _of_bag(
+        0.0,
+        'longest time until the parameters of its publishers are read and a topic is recorded',
+        's',
+        at_least=0.0,
+    )
 
     def problems(self) -> list[str]:
         """Check that the folder has a name."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterator
 from functools import partial
 from math import inf
@@ -55,6 +56,7 @@ class BagRecorderNode(PlainNode):
         self._losses_by_handle: dict[int, Losses] = {}
         self._skipped: set[str] = set()
         self._anonymous: set[str] = set()
+        self._found_at: dict[str, float] = {}
         self._parameter_client = ParameterClient(self._on_parameters)
         self.parameters_of: dict[str, Values] = {}
         create_steady_timer(self, _DISCOVERY_PERIOD, self._discover)
@@ -125,8 +127,11 @@ class BagRecorderNode(PlainNode):
             elif topic not in self._skipped and self._wanted(topic):
                 self._consider(topic, types)
 
-    def _request_parameters(self, topic: str) -> None:
-        """Request those of the publishers; a node's name may be discovered after its publishers."""
+    def _request_parameters(self, topic: str) -> bool:
+        """Request those of the publishers; return whether all of them have been read.
+
+        A node's name may be discovered after its publishers.
+        """
         names = [
             f'{one.node_namespace.rstrip("/")}/{one.node_name}'
             for one in self.get_publishers_info_by_topic(topic)
@@ -136,6 +141,16 @@ class BagRecorderNode(PlainNode):
             self._parameter_client.request(self._raw_subscriptions.node, name)
         if known == names:
             self._anonymous.discard(topic)
+        return known == names and not {*known}.intersection(self._parameter_client.pending)
+
+    def _waits(self, topic: str) -> bool:
+        """Whether the topic is recorded later: a short run may end before its parameters are read."""
+        limit = self._config.wait_for_parameters
+        if not limit or topic in _OF_EVERY_NODE:
+            return False
+        now = time.monotonic()
+        found_at = self._found_at.setdefault(topic, now)
+        return not self._request_parameters(topic) and now < found_at + limit
 
     def _on_parameters(self, node: str, values: Values) -> None:
         self.parameters_of[node] = values
@@ -148,7 +163,7 @@ class BagRecorderNode(PlainNode):
 
     def _consider(self, topic: str, types: list[str]) -> None:
         publishers = self.get_publishers_info_by_topic(topic)
-        if not publishers:
+        if not publishers or self._waits(topic):
             return
         if len(types) > 1:
             self._skip(topic, f'it has several types, {" and ".join(types)}')
