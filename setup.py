@@ -71,18 +71,19 @@ setup(
         (f'{SHARE}/launch', files('launch')),
     ],
     install_requires=[
-        'numpy',
-        'numba',
+        # Lower bounds: what Ubuntu 24.04 has, which is beneath a sourced Jazzy.
+        'numpy>=1.26',
+        'numba>=0.58',
         'mcap>=1.6',
         'rosbags>=0.11',
         # What the chunks of MCAP files are packed with; mcap brings both.
         'lz4',
         'zstandard',
-        'matplotlib',
+        'matplotlib>=3.6',
         'pyyaml',
         'tqdm',
         'jinja2',
-        'scipy>=1.15',
+        'scipy>=1.11',
     ],
     extras_require={
         # ROS 2 Jazzy itself, as wheels. An extra, because a sourced Jazzy has its own.

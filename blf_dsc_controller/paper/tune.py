@@ -161,7 +161,7 @@ def search(
     Differential evolution of one seed from points evenly spread, as many for every law; `options`
     are scipy's.
     """
-    points = qmc.LatinHypercube(len(ranges), rng=np.random.default_rng(SEED)).random(population)
+    points = qmc.LatinHypercube(len(ranges), seed=np.random.default_rng(SEED)).random(population)
     found = differential_evolution(
         cost,
         ranges,
@@ -169,7 +169,7 @@ def search(
         maxiter=generations,
         tol=0.0,
         polish=False,
-        rng=np.random.default_rng(SEED),
+        seed=np.random.default_rng(SEED),
         **options,
     )
     return found.x, float(found.fun), int(found.nfev)

@@ -42,7 +42,8 @@ class ReferenceLoad(NamedTuple):
 
     def rate(self, settings: Settings) -> float:
         """Largest eigenvalue of M^-1 K_p + omega_v, 1/s."""
-        roots = np.linalg.eigvals(np.linalg.solve(self.inertia, np.diag(settings.Kp)))
+        Kp = np.diag(settings.Kp)[np.newaxis]  # numpy 1 takes a matrix beside a stack for vectors
+        roots = np.linalg.eigvals(np.linalg.solve(self.inertia, Kp))
         return float(np.abs(roots).max(initial=0.0)) + settings.damping_rate
 
     def damping(self, settings: Settings) -> Floats:
