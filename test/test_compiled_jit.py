@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
+from numba.core.errors import UnsupportedError
 
 import blf_dsc_controller
 from blf_dsc_controller.compiled import jit
@@ -75,3 +77,29 @@ def test_functions_that_are_only_linked_compute_and_raise():
     assert mean_root(np.array([1.0, 9.0])) == 2.0
     with pytest.raises(ValueError, match='no root of a negative number'):
         mean_root(np.array([1.0, -9.0]))
+
+
+@jit.kernel
+def allocating(x):
+    return np.zeros(3)[0] + x
+
+
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='Python may allocate')
+def test_a_kernel_that_allocates_is_refused_as_nothing_would_free_its_array():
+    with pytest.raises(UnsupportedError, match='the kernel allocating allocates an array'):
+        allocating(1.0)
+
+
+@jit.kernel
+def fill_with_noise(rng, out):
+    for i in range(out.size):
+        out[i] = rng.standard_normal()
+
+
+def test_a_kernel_gives_back_the_references_to_its_arguments():
+    arguments = np.random.default_rng(1), np.zeros(3)
+    fill_with_noise(*arguments)
+    before = [sys.getrefcount(one) for one in arguments]
+    for _ in range(3):
+        fill_with_noise(*arguments)
+    assert [sys.getrefcount(one) for one in arguments] == before

@@ -17,6 +17,8 @@ from numba.extending import intrinsic, overload
 from numba.np.arrayobj import populate_array
 from numpy.typing import NDArray
 
+from blf_dsc_controller.compiled.jit import INLINED
+
 
 def view(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the same vector; its slices are not reference-counted in compiled code.
@@ -67,11 +69,11 @@ def _part(_typing: Any, vector: Any, at: Any, shape: Any) -> Any:
     return view(vector, at, shape), generate
 
 
-@overload(view, strict=False)
+@overload(view, strict=False, jit_options=INLINED)
 def _compiled_view(vector: Any) -> Any:  # noqa: ARG001 - numba looks at the names
     return lambda vector: _view(vector)  # noqa: PLW0108
 
 
-@overload(part, strict=False)
+@overload(part, strict=False, jit_options=INLINED)
 def _compiled_part(vector: Any, at: Any, shape: Any) -> Any:  # noqa: ARG001
     return lambda vector, at, shape: _part(vector, at, shape)  # noqa: PLW0108

@@ -80,7 +80,8 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
     g, slope = g / g.sum(), slope / g.sum()
     q, dq = (savgol_filter(recording.q, width, 3, k, h, axis=0) for k in (0, 1))
     X = np.zeros((starts.size, n, model.p + 3 * n))
-    add_windows(model, q, dq, g, slope, starts, X[:, :, : model.p])
+    regressors = np.zeros((2, n, model.p))
+    add_windows(model, q, dq, g, slope, starts, regressors, X[:, :, : model.p])
     rows = Rows(
         time=(starts + 0.5 * (length - 1)) * h,
         X=X,
@@ -109,11 +110,14 @@ def add_windows(
     g: np.ndarray,
     slope: np.ndarray,
     starts: np.ndarray,
+    regressors: np.ndarray,
     X: np.ndarray,
 ) -> None:
-    """Add g Yr - g' Yp of the samples (N, n) in each window to X (R, n, p)."""
-    Yp = np.zeros((model.n, model.p))
-    Yr = np.zeros((model.n, model.p))
+    """Add g Yr - g' Yp of the samples (N, n) in each window to X (R, n, p).
+
+    `regressors` (2, n, p) are overwritten.
+    """
+    Yp, Yr = regressors[0], regressors[1]
     first = 0
     for k in range(q.shape[0]):
         while first < starts.size and starts[first] + g.size <= k:

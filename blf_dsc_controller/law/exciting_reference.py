@@ -154,9 +154,7 @@ class ExcitationProblem:
     def _rows(self, parameters: dict[str, tuple[float, ...]]) -> tuple[np.ndarray, np.ndarray]:
         """Motion (k, 3, n) and [H | D] (k, n, m) over a period."""
         motion = sampled(pack(self.n, [sinusoids_term(**parameters)]), self._times)
-        rows = np.zeros((self._times.size, self.n, self._settings.m))
-        rows_along(self._settings.model, self._vector, self._times, motion, rows)
-        return motion, rows
+        return motion, rows_along(self._settings, self._vector, self._times, motion)
 
     def _relative_excitation(self, dq: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """L^T Phi L (m, m) where R^-1 = L L^T: its eigenvalues are those of Phi relative to R."""

@@ -186,20 +186,29 @@ def form_row(
     remember(settings, state, signals)
 
 
-@kernel
 def rows_along(
+    settings: Settings, settings_vector: np.ndarray, times: np.ndarray, motion: np.ndarray
+) -> np.ndarray:
+    """Rows [H(q, dq, dq, ddq) | D] (k, n, m) of packed settings.
+
+    `times` (k,) [s], `motion` (k, 3, n) q, dq, ddq at each time.
+    """
+    H = np.zeros((settings.n, settings.p))
+    rows = np.zeros((times.size, settings.n, settings.m))
+    _fill_rows(settings.model, settings_vector, times, motion, H, rows)
+    return rows
+
+
+@kernel
+def _fill_rows(
     model: ArmModel,
     settings_vector: np.ndarray,
     times: np.ndarray,
     motion: np.ndarray,
+    H: np.ndarray,
     rows: np.ndarray,
 ) -> None:
-    """Fill `rows` (k, n, m) with [H(q, dq, dq, ddq) | D].
-
-    `times` (k,) [s], `motion` (k, 3, n) q, dq, ddq at each time.
-    """
     settings = settings_of(settings_vector, model)
-    H = np.zeros((settings.n, settings.p))
     for k in range(times.size):
         q = motion[k, 0]
         dq = motion[k, 1]

@@ -144,7 +144,7 @@ class BagRecorderNode(PlainNode):
         return known == names and not {*known}.intersection(self._parameter_client.pending)
 
     def _waits(self, topic: str) -> bool:
-        """Whether the topic is recorded later: a short run may end before its parameters are read."""
+        """Whether it is recorded later, as a short run may end before its parameters are read."""
         limit = self._config.wait_for_parameters
         if not limit or topic in _OF_EVERY_NODE:
             return False

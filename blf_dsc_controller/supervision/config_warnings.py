@@ -114,9 +114,8 @@ def windows_along(config: ControllerConfig, settings: Settings) -> Floats:
     step = max(step, config.sample_time)
     window, start = round(learning.window / step), round(settings.learning_start / step)
     times = np.arange(start + round(_horizon(config) / step) + 1) * step
-    rows = np.zeros((times.size, settings.n, settings.m))
     motion = sampled(reference_of(config), times)
-    rows_along(settings.model, pack(settings), times, motion, rows)
+    rows = rows_along(settings, pack(settings), times, motion)
     if settings.prediction == FILTERED:
         gain = 1.0 - np.exp(-learning.filter_pole * step)
         first, second = np.zeros((2, settings.n, settings.m))

@@ -73,8 +73,7 @@ class Confidence:
         qr = np.array([one.position - one.error for one in recent])
         dqr = np.gradient(qr, times, axis=0)
         motion = np.stack((qr, dqr, np.gradient(dqr, times, axis=0)), axis=1)
-        X = np.zeros((times.size, settings.n, settings.m))
-        rows_along(settings.model, self._vector, times, motion, X)
+        X = rows_along(settings, self._vector, times, motion)
         X *= settings.row_weight[:, np.newaxis]
         share = min(1.0, (times[-1] - times[0]) / self.window)
         Phi = np.einsum('kia,kib->ab', X, X) * (share / times.size)
