@@ -94,6 +94,7 @@ def main() -> None:
     options.add_argument('groups', nargs='*', metavar='GROUP', help=', '.join(_GROUPS))
     options.add_argument('--out', type=Path, default=_HERE, help='folder for the results')
     chosen = options.parse_args()
+    chosen.out.mkdir(parents=True, exist_ok=True)
     rows: list[Ratio] = []
     for name in chosen.groups or _GROUPS:
         print(f'measuring: {name}', flush=True)
