@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 
 import numpy as np
 import pytest
@@ -55,7 +56,9 @@ def out(tmp_path_factory):
     folder = tmp_path_factory.mktemp('run')
     mode = ['--mode', 'lockstep'] if importlib.util.find_spec('rclpy') else ['--offline']
     arguments = ['--config', written(folder / 'my.yaml'), '--duration', DURATION]
+    before = dict(os.environ)
     assert main(['run', *mode, *map(str, [*arguments, '--out', folder / 'out'])]) == 0
+    assert dict(os.environ) == before  # not in the domain of the run, which the next may take
     return folder / 'out'
 
 

@@ -23,6 +23,7 @@ from sensor_msgs.msg import JointState
 from blf_dsc_controller.cli.progress import LoopProgress
 from blf_dsc_controller.compiled.notice import COMPILATION_NOTICE
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, VIEW, LoopConfig
+from blf_dsc_controller.configuration.share import share_folder
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import model_of
 from blf_dsc_controller.messages import topics
@@ -38,6 +39,7 @@ _MODULES = {
     PLANT: 'sim_plant.node',
     VIEW: 'blf_dsc_controller.view.node',  # only on request, once the loop runs
 }
+_MIDDLEWARE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 _DOMAINS = range(1, 101)  # 0 is the default; above 101 are the ports that the system hands out
 _FIRST_SIGN = 5.0  # s, at most, until a running loop is seen to run, also on a busy machine
 _LAST = 1.0  # s without a message after which no more is expected, also on a busy machine
@@ -60,17 +62,38 @@ def run_session(config: LoopConfig, out: Path, domain: int | None, view_host: st
     logs = out / 'logs'
     logs.mkdir()
     with own_domain() if domain is None else nullcontext(domain) as chosen:
-        os.environ['ROS_DOMAIN_ID'] = str(chosen)
-        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-        os.environ['ROS_LOG_DIR'] = str(logs / 'ros')
+        environment = {
+            'ROS_DOMAIN_ID': str(chosen),
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+            'ROS_LOG_DIR': str(logs / 'ros'),
+            _MIDDLEWARE: os.environ.get(_MIDDLEWARE, str(share_folder() / 'config/fastdds.xml')),
+        }
         try:
-            return _run_nodes(config, out / 'config.yaml', logs, view_host)
+            with _environment(environment):
+                return _run_nodes(config, out / 'config.yaml', logs, view_host)
         except NodeFailedError:
             if shutil.disk_usage(out).free < _ROOM:
                 print(f'no space left on the disk of {out}', file=sys.stderr)
             if (out / 'bag' / 'metadata.yaml').exists():
                 print(f'the recording up to then is in {out / "bag"}', file=sys.stderr)
             raise
+
+
+@contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    """Change the environment of this process and its children for a while.
+
+    Whoever called this from Python must not be left in a domain that another run may take next.
+    """
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
 
 
 @contextmanager
