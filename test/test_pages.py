@@ -19,6 +19,7 @@ import pytest
 from markdown_it import MarkdownIt
 
 from blf_dsc_controller.cli import main as command_line
+from blf_dsc_controller.cli.parser import make_parser
 from blf_dsc_controller.configuration.nodes import NODES, known_names
 from blf_dsc_controller.configuration.params_file import load, read
 from blf_dsc_controller.monte_carlo.study import load_study
@@ -158,7 +159,7 @@ def check_own(program, rest):
 
 def parse(words):
     try:
-        command_line._parser().parse_args(words)
+        make_parser().parse_args(words)
     except SystemExit as end:
         if end.code:
             pytest.fail(f'{shlex.join(words)}: {end}')  # argparse has printed why
@@ -221,7 +222,7 @@ def test_commands_in_the_text_of_a_page_exist(page):
 
 
 def subcommand(name):
-    for action in command_line._parser()._actions:
+    for action in make_parser()._actions:
         if isinstance(action, argparse._SubParsersAction):
             return action.choices[name]
     raise AssertionError
