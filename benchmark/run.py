@@ -14,6 +14,7 @@ import platform
 from itertools import groupby
 from pathlib import Path
 
+import numpy as np
 from harness import Ratio
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -68,23 +69,24 @@ def table(rows: list[Ratio]) -> str:
 
 
 def draw(rows: list[Ratio], path: Path) -> None:
-    """Bars of all ratios on a logarithmic axis, with their ranges."""
-    figure = Figure(figsize=(11.0, 1.5 + 0.27 * len(rows)), layout='constrained')
+    """All ratios with their ranges on a logarithmic axis, a panel for each group and baseline."""
+    panels = [list(panel) for _, panel in groupby(rows, key=lambda row: (row.group, row.baseline))]
+    heights = [len(panel) + 1.0 for panel in panels]
+    figure = Figure(figsize=(11.0, 0.25 * sum(heights) + 0.3 * len(panels)), layout='constrained')
     FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    places = range(len(rows))
-    axes.barh(places, [row.median for row in rows], color='#0072b2', height=0.6)
-    spread = [[row.median - row.low for row in rows], [row.high - row.median for row in rows]]
-    axes.errorbar(
-        [row.median for row in rows], places, xerr=spread, fmt='none', ecolor='#404040', capsize=2
-    )
-    axes.axvline(1.0, color='#404040', linewidth=1.0)
-    axes.set_xscale('log')
-    axes.set_yticks(places, [f'{row.what}  (to {row.baseline})' for row in rows], fontsize=8)
-    axes.invert_yaxis()
-    axes.set_xlabel('ratio, median and range of the rounds')
-    axes.grid(visible=True, axis='x', which='both', alpha=0.2)
-    axes.spines[['top', 'right']].set_visible(False)
+    grid = figure.subplots(len(panels), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    for axes, panel in zip(grid, panels, strict=True):
+        median = np.array([row.median for row in panel])
+        spread = [median - [row.low for row in panel], [row.high for row in panel] - median]
+        axes.errorbar(median, range(len(panel)), xerr=spread, fmt='o', capsize=2, color='#0072b2')
+        axes.axvline(1.0, color='#404040', linewidth=1.0)
+        axes.set_xscale('log')
+        axes.set_yticks(range(len(panel)), [row.what for row in panel], fontsize=8)
+        axes.set_ylim(len(panel) - 0.4, -0.6)
+        axes.set_title(f'{panel[0].group}: times {panel[0].baseline}', fontsize=9, loc='left')
+        axes.grid(visible=True, axis='x', which='both', alpha=0.2)
+        axes.spines[['top', 'right']].set_visible(False)
+    grid[-1].set_xlabel('ratio, median and range of the rounds')
     figure.savefig(path, dpi=110)
 
 
