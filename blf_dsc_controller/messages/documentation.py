@@ -19,7 +19,8 @@ Names are the defaults, those with the name of a node are private to it. Joints 
 stamps are the plant's time. The values of a JointState that has no joints are in `position`, by the
 names in `name`. *Kept* is how many messages a publisher keeps (of `joint_trajectory`: the
 subscriber), and *latched* that late subscribers get them; all are reliable. `reference`,
-`tracking_error` and `learning` are sent while any of the three has a subscriber.
+`tracking_error` and `learning` are sent while any of the three has a subscriber (looked for every
+10th sample).
 
 This page is generated: `python -m blf_dsc_controller.messages.documentation doc/topics.md`.
 

@@ -66,6 +66,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._pending: bytes | None = None
         self._warned_at = -1  # stamp of the start that was warned of
         self._listeners: list[Callable[[], int]] = []  # counts subscribers of the STREAMS
+        self._heard = False  # when they were counted last
         self._observed = self._started = False
         self._phase = Phase.INACTIVE  # that was logged last
         self._status = ControllerStatus(self, joints)
@@ -190,7 +191,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self._publish_bound(guard, stamp, sample.bound)
         elif narrows and not np.array_equal(sample.bound, self._published_bound):
             self._publish_bound(guard, stamp, sample.bound)
-        if any(count() for count in self._listeners):
+        if is_due:
+            self._heard = any(count() for count in self._listeners)
+        if self._heard:
             for message in self._telemetry.sample(stamp, sample, guard.compute_time):
                 self._publish(message)
         if is_due:
