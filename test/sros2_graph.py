@@ -16,6 +16,7 @@ from ros_rig import RosRig
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.markers_node import MarkersNode
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
+from blf_dsc_controller.view.node import ViewNode
 from sim_plant.node import PlantNode
 
 KINDS = (
@@ -62,6 +63,7 @@ def live():
             ros.add(PlantNode, publish_clock=True, sample_time=0.02)
             ros.add(ControllerNode, sample_time=0.02)
             ros.add(MarkersNode)
+            ros.add(ViewNode)
             recorder = ros.add(BagRecorderNode, output=bag)
             recorder._parameter_client.request = lambda *_: (
                 None
@@ -71,6 +73,7 @@ def live():
                 'sim_plant': ['sim_plant'],
                 'blf_dsc_controller': ['blf_dsc_controller'],
                 'arm_markers': ['arm_markers', '_arm_markers_subscriptions'],
+                'view': ['view', '_view_subscriptions'],
                 'bag_recorder': ['bag_recorder', '_bag_recorder_subscriptions'],
             }
             found = {name: granted(ros, parts) for name, parts in nodes.items()}

@@ -123,6 +123,17 @@ def test_no_panel_is_drawn_twice_and_every_line_of_monitors_is_named(run, tmp_pa
     assert names == ['shoulder', 'elbow', 'bound']
 
 
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('level', [0.0001, np.nan])
+def test_a_level_alone_on_a_logarithmic_axis_is_drawn(run, tmp_path, level):
+    learning = run.learning
+    values = learning.values.copy()
+    values[:, learning.names.index('lambda_min')] = level
+    values[-1, learning.names.index('lambda_min')] *= 1.0 - 6e-16
+    unknown = dataclasses.replace(run, learning=dataclasses.replace(learning, values=values))
+    assert tmp_path / 'parameters.png' in draw(unknown, tmp_path)
+
+
 def test_gaps_and_a_single_sample_are_drawn(run, tmp_path):
     error = run.error.copy()
     error[100:200] = np.nan

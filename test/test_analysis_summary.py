@@ -133,6 +133,14 @@ def test_compute_time_that_was_not_measured_is_null(run):
     assert summarize(unmeasured)['compute_time_us'] is None
 
 
+def test_a_bound_that_was_wider_is_in_the_table(run):
+    bound = run.bound.copy()
+    bound[:100, 1] = 0.0123
+    table = format_table(summarize(dataclasses.replace(run, bound=bound)))
+    assert '\nat widest   elbow 12.3 mrad\n' in table
+    assert 'at widest' not in format_table(summarize(run))
+
+
 def test_the_table_shows_the_summary(run):
     table = format_table(summarize(run))
     for words in (

@@ -226,3 +226,8 @@ def test_a_configuration_that_is_damaged(entries, readers, tmp_path, capsys):
     for name in ('replay', 'report', 'export', 'plot', 'replay --config'):
         assert readers[name](path) == 0, name
     assert '<p>not recorded in the bag</p>' in (tmp_path / 'page.html').read_text()
+
+
+def test_the_bag_in_the_folder_of_a_run_is_named(copy, capsys):
+    assert main(['replay', str(copy.parent)]) == 1
+    assert f'did you mean {copy}?' in capsys.readouterr().err

@@ -216,9 +216,8 @@ def test_a_loop_collects_the_problems_of_all_nodes(file):
     with pytest.raises(ConfigurationError) as caught:
         load_loop(path)
     assert [problem.split(', but')[0] for problem in caught.value.problems] == [
-        'sim_plant: line 2: sample_time: got 1',
+        'sim_plant, blf_dsc_controller: line 2: sample_time: got 1',
         'sim_plant: line 4: seed: got -1',
-        'blf_dsc_controller: line 2: sample_time: got 1',
         "bag_recorder: line 6: compression: got 'zip'",
     ]
 
@@ -242,6 +241,19 @@ def test_a_misspelt_node_is_named(file):
     with pytest.raises(ConfigurationError, match='/left/bag_recorder is not /bag_recorder: write'):
         load_loop(file(section('/left/bag_recorder', 'output: here')))
     assert load_loop(file(section('robot_state_publisher', 'a: 1'))).plant == PlantConfig()
+
+
+def test_a_problem_of_several_nodes_is_told_once(file):
+    path = file(section('/**', 'robot: {urdf: panda.urdf, tip: tol}'))
+    with pytest.raises(ConfigurationError) as caught:
+        load_loop(path)
+    (problem,) = caught.value.problems
+    assert problem.startswith('sim_plant, blf_dsc_controller, arm_markers: line 2: robot.urdf: no ')
+
+
+def test_a_misspelt_preset_is_guessed():
+    with pytest.raises(ConfigurationError, match=r'did you mean recommended\? give a parameter'):
+        load_loop('recomended')
 
 
 def test_the_file_for_a_real_arm_in_the_documentation_is_whole(file):

@@ -8,7 +8,9 @@ import pytest
 from paper_case import EXACT, NO_DISTURBANCE, P, configured, run
 
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.params_file import load, load_loop, locate
+from blf_dsc_controller.configuration.robot import read_urdf
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.simulation.loop import simulate_law
@@ -161,6 +163,27 @@ def test_too_small_a_torque_limit_breaks_the_bound():
     assert warnings(changes)[0].startswith('torque.limit: joint1')
     changes['approach.enabled'] = False
     assert np.abs(run(configured('recommended', 1.0, changes)).xi1).max() > BOUND
+
+
+def panda(changes):
+    return load(locate('panda'), 'blf_dsc_controller', ControllerConfig, changes)
+
+
+def test_a_bound_that_begins_far_wider_than_asked_for_is_named():
+    assert config_warnings(panda({})) == []
+    found = [one for one in config_warnings(panda({'robot.lag': 0.1})) if 'initial' in one]
+    assert found[0].startswith('barrier.initial_bound: panda_joint2 begins with a bound of ')
+    assert 'robot.lag of 0.1 s' in found[0]
+
+
+def test_an_assumed_torque_limit_is_named():
+    urdf = read_urdf('panda.urdf').replace('effort="12"', 'effort="0"')
+    found = config_warnings(panda({'robot.urdf': urdf}))
+    assert [one.split(' has no effort')[0] for one in found if 'effort' in one] == [
+        f'torque.limit: panda_joint{k}' for k in (5, 6, 7)
+    ]
+    given = [20.0] * 7
+    assert config_warnings(panda({'robot.urdf': urdf, 'torque.limit': given})) != found
 
 
 def test_closed_loop_warns_before_it_runs(tmp_path, capsys):

@@ -154,14 +154,13 @@ def _draw_panel(axes: Axes, panel: Panel, runs: Sequence[str], until: float) -> 
 
 def _set_scale(axes: Axes, panel: Panel) -> None:
     """Scale the axis of values; over two decades where there is next to nothing to see."""
-    if panel.log:
+    low, high = axes.dataLim.minposy, axes.dataLim.ymax
+    if panel.log and math.isfinite(low):  # else no value is known
+        if high < _FLAT * low:
+            axes.set_ylim(low / _DECADE, high * _DECADE)
         axes.set_yscale('log')
     if panel.span:
         axes.set_ylim(None if panel.log else -panel.span, panel.span)
-    if panel.log:
-        low, high = axes.get_ylim()
-        if high < _FLAT * low:
-            axes.set_ylim(low / _DECADE, high * _DECADE)
     if panel.unit == '%':
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g} %'))
     axes.set_ylabel(panel.symbol or f'[{panel.unit}]')

@@ -175,6 +175,7 @@ class Metrics:
     max_error: tuple[float, ...]  #: (n,) rad, of |xi1|
     rms_error: tuple[float, ...]  #: (n,) rad
     bound: tuple[float, ...]  #: (n,) rad, the smallest
+    widest_bound: tuple[float, ...]  #: (n,) rad, of a funnel or before a change
     peak_torque: tuple[float, ...]  #: (n,) N m
     rms_torque: tuple[float, ...]  #: (n,) N m
     torque_limit: tuple[float, ...]  #: (n,) N m, the smallest
@@ -215,6 +216,7 @@ def measure(run: Run) -> Metrics:
         _columns(_peak, error, n),
         _columns(rms, error, n),
         _columns(_least, run.bound, n),
+        _columns(_peak, run.bound, n),
         _columns(_peak, torque, n),
         _columns(rms, torque, n),
         _columns(_least, run.torque_limit, n),

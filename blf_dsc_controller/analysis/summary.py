@@ -34,6 +34,7 @@ _JOINT = {  # entry of the summary: metric; title, unit, units to 1 and decimals
     'torque_limit_nm': ('torque_limit', 'limit', 'N m', 1.0, 2),
 }
 
+_WIDEST = 'widest_bound_rad'
 _MEASURED = {  # comparison with the truth: entry of the summary, its line of the table
     'relative_error': 'parameters  error',
     'torque_error': 'model       torque error of the learned model',
@@ -47,6 +48,8 @@ def summarize(run: Run) -> Summary:
     """
     metrics = measure(run)
     estimates = estimates_of(run)
+    entries = {entry: metric for entry, (metric, *_) in _JOINT.items()}
+    entries[_WIDEST] = 'widest_bound'
     violated = {'time_s': metrics.first_violation, 'joint': metrics.violating_joint}
     return {
         'duration_s': run.duration,
@@ -59,10 +62,7 @@ def summarize(run: Run) -> Summary:
                 for time, stop in run.timed_stops
             ],
             'joints': {
-                joint: {
-                    entry: plain(getattr(metrics, metric)[i])
-                    for entry, (metric, *_) in _JOINT.items()
-                }
+                joint: {entry: plain(getattr(metrics, name)[i]) for entry, name in entries.items()}
                 for i, joint in enumerate(run.joints)
             },
         },
@@ -164,6 +164,13 @@ def _sentences(summary: Summary) -> Iterator[str]:
     if stops and held:
         kept += ' until the stop'
     yield f'bound       {kept}'
+    wider = [
+        f'{name} {1e3 * joint[_WIDEST]:.3g} mrad'
+        for name, joint in summary['tracking']['joints'].items()
+        if joint[_WIDEST] is not None and joint[_WIDEST] > joint['bound_rad']
+    ]
+    if wider:
+        yield f'at widest   {", ".join(wider)}'
     for stop in stops:
         yield f'stopped     at {stop["time_s"]:.3f} s, {stop["reason"]}: {stop["text"]}'
     if summary['learning'] is not None:

@@ -163,7 +163,9 @@ def _reason(path: Path, error: Exception) -> str:
         is_mcap = any(path.glob('*.mcap'))
         if not (path / METADATA).exists():
             if not is_mcap:
-                return 'the folder has no metadata.yaml: it is not a bag'
+                within = sorted(path.glob(f'*/{METADATA}'))
+                guess = f'; did you mean {within[0].parent}?' if within else ': it is not a bag'
+                return f'the folder has no metadata.yaml{guess}'
             return (
                 'the folder has no metadata.yaml; was the recording interrupted? '
                 f'Recover it: bag_recover {path}'

@@ -21,9 +21,7 @@ def make_parser() -> argparse.ArgumentParser:
         'study it.',
         epilog='blf_dsc COMMAND --help lists the options of a command, with an example.',
     )
-    commands = parser.add_subparsers(
-        title='commands', dest='command', metavar='COMMAND', required=True
-    )
+    commands = parser.add_subparsers(title='commands', dest='command', metavar='COMMAND')
 
     def command(
         name: str, module: str, summary: str, about: str, example: str

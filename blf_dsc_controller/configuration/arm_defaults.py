@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from blf_dsc_controller.arms.urdf import Chain
     from blf_dsc_controller.configuration.schema import Value
 
+UNKNOWN_EFFORT = 100.0
+"""Torque limit [N m] of a joint without one in the URDF."""
 _SAG = 1.5  # standard deviations of gravity over m omega_v^2; measured: at most 1
 _PHASE = 0.5  # rad that is lost to the delay at omega_v
 _BOUND = 0.002  # rad
@@ -46,7 +48,7 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
     """
     robot, chain = given_robot(given, given.get('joints', ()))
     n = len(chain.joints)
-    effort = _finite([joint.effort for joint in chain.joints], 100.0)
+    effort = _finite([joint.effort for joint in chain.joints], UNKNOWN_EFFORT)
     velocity = _finite([joint.velocity for joint in chain.joints], 2.0)
     lower = _finite([joint.lower for joint in chain.joints], -_FREE)
     upper = _finite([joint.upper for joint in chain.joints], _FREE)

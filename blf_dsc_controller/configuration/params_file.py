@@ -41,8 +41,10 @@ def locate(given: str | Path) -> Path:
     if name.removesuffix('.yaml') in presets:
         return presets[name.removesuffix('.yaml')]
     what = 'is a folder' if path.is_dir() else 'does not exist'
+    close = difflib.get_close_matches(name.removesuffix('.yaml'), presets, n=1)
+    guess = f'did you mean {close[0]}? ' if close else ''
     remedy = f'give a parameter file, or a preset: {", ".join(presets)}'
-    raise ConfigurationError([f'{name} {what}: {remedy}'])
+    raise ConfigurationError([f'{name} {what}: {guess}{remedy}'])
 
 
 def read(path: str | Path) -> list[Section]:
@@ -87,11 +89,14 @@ def load_loop(
     sections = read(path)
     problems = [*_unknown_names(sections), *unmatched_sections(sections, NODES)]
     configs: dict[str, Any] = {}
+    nodes_with: dict[str, list[str]] = {}
     for node, cls in NODES.items():
         try:
             configs[node] = _load(sections, node, cls, (overrides or {}).get(node, {}))
         except ConfigurationError as error:
-            problems += [f'{node}: {problem}' for problem in error.problems]
+            for problem in error.problems:
+                nodes_with.setdefault(problem, []).append(node)
+    problems += [f'{", ".join(nodes)}: {problem}' for problem, nodes in nodes_with.items()]
     if not problems:
         loop = LoopConfig(configs[PLANT], configs[CONTROLLER], configs[RECORDER])
         problems = loop.problems()

@@ -123,7 +123,8 @@ def read_urdf(given: str) -> str:
     try:
         return read_text(resolve(given))
     except (OSError, UnicodeDecodeError) as error:
-        raise BlfDscError(f'{given!r} cannot be read: {error}') from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise BlfDscError(f'{given!r} cannot be read: {reason}') from error
 
 
 @functools.lru_cache(maxsize=16)

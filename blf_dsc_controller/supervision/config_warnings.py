@@ -6,6 +6,7 @@ They rest on the initial estimate of the parameters, which is a guess. doc/tunin
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.compiled.layout import pack
+from blf_dsc_controller.configuration.arm_defaults import UNKNOWN_EFFORT
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.prediction import rows_along
@@ -30,6 +32,7 @@ _WINDOWS = 8  # that begin within the length of one
 _MARGIN = 1.25  # of torque beyond what the reference needs
 _PERIODS = 0.02  # by which a window may miss a whole number of periods
 _CLOSE = 0.8  # of the bound
+_FUNNEL = 20.0  # times the bound
 _SETTLED = 10.0  # time constants of the filter (8) ...
 _FILTERED = 4.0  # ... and of the regressor's, which both sides of the identity pass
 
@@ -72,7 +75,8 @@ def config_warnings(
     """
     settings = settings_of_config(config)
     load = load or reference_load(config, settings)
-    found = [*_of_start(config, q), *(one.text for one in _of_gains(config, load))]
+    found = [*_of_start(config, q), *_of_urdf(config)]
+    found += [one.text for one in _of_gains(config, load)]
     if settings.surface != LINEAR and settings.kappa > 0.0 and settings.Gamma.any():
         windows = windows_along(config, settings)
         found += _of_update(config, settings, windows)
@@ -147,6 +151,26 @@ def _of_start(config: ControllerConfig, q: Floats | None) -> Iterator[str]:
             yield (
                 f'barrier.bound: {joint} starts {error:+.4g} rad from the reference, close to its '
                 f'bound of {bound:g} rad: the first error of the estimate may push it outside'
+            )
+
+
+def _of_urdf(config: ControllerConfig) -> Iterator[str]:
+    """Defaults that follow from the URDF, and are hardly what was meant."""
+    if config.model != 'urdf':
+        return
+    robot, barrier = config.robot, config.barrier
+    for joint, limit in zip(robot.chain(config.joints).joints, config.torque.limit, strict=True):
+        if math.isinf(joint.effort) and limit == UNKNOWN_EFFORT:
+            yield (
+                f'torque.limit: {joint.name} has no effort in the URDF: {limit:g} N m are assumed; '
+                f'give what its drive can bear'
+            )
+    for name, widest, bound in zip(config.joints, barrier.widest, barrier.bound, strict=True):
+        if widest > _FUNNEL * bound:
+            yield (
+                f'barrier.initial_bound: {name} begins with a bound of {widest:.3g} rad, which '
+                f'narrows to {bound:g}: with gains for robot.lag of {robot.lag:g} s it would sag '
+                f'so far under an undeclared load of {robot.payload:g} kg (robot.payload)'
             )
 
 

@@ -223,7 +223,8 @@ class Page:
 
     def close(self) -> None:
         """End the server."""
-        self.server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):  # its own farewell
+            self.server.stop()
 
 
 _NO_POINTS = {'show': False}
