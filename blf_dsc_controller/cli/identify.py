@@ -113,5 +113,6 @@ def _errors(found: Identified) -> Iterator[str]:
     if total[2] > min(100.0 * _POOR, total[0]):
         yield (
             'DO NOT USE this URDF: it does not explain the torques held back. Are the efforts in '
-            'N m (not currents), with gravity in them, and is the gravity that of the base?'
+            'N m (not currents), with gravity in them, is the gravity that of the base, and was '
+            'the load the same throughout?'
         )
