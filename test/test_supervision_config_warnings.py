@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
+
 import numpy as np
 import pytest
 from paper_case import EXACT, NO_DISTURBANCE, P, configured, run
@@ -184,6 +186,14 @@ def test_an_assumed_torque_limit_is_named():
     ]
     given = [20.0] * 7
     assert config_warnings(panda({'robot.urdf': urdf, 'torque.limit': given})) != found
+
+
+def test_an_inertia_of_no_body_is_named():
+    urdf = read_urdf('panda.urdf')
+    mass = ET.fromstring(urdf).find('link[@name="panda_link2"]/inertial/inertia')
+    wrong = urdf.replace(f'ixx="{mass.get("ixx")}"', 'ixx="3.0"')
+    (warning,) = config_warnings(panda({'robot.urdf': wrong}))
+    assert 'no body has the inertia of what panda_joint2 moves (panda_link2)' in warning
 
 
 def test_closed_loop_warns_before_it_runs(tmp_path, capsys):

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.arms.inertia import pseudo_inertia
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.arm_defaults import UNKNOWN_EFFORT
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -33,6 +34,7 @@ _MARGIN = 1.25  # of torque beyond what the reference needs
 _PERIODS = 0.02  # by which a window may miss a whole number of periods
 _CLOSE = 0.8  # of the bound
 _FUNNEL = 20.0  # times the bound
+_IMPOSSIBLE = 1e-3  # of the largest eigenvalue of the pseudo-inertia
 _SETTLED = 10.0  # time constants of the filter (8) ...
 _FILTERED = 4.0  # ... and of the regressor's, which both sides of the identity pass
 
@@ -155,11 +157,18 @@ def _of_start(config: ControllerConfig, q: Floats | None) -> Iterator[str]:
 
 
 def _of_urdf(config: ControllerConfig) -> Iterator[str]:
-    """Defaults that follow from the URDF, and are hardly what was meant."""
+    """Inertias that no body has; defaults that follow from the URDF and are hardly meant."""
     if config.model != 'urdf':
         return
     robot, barrier = config.robot, config.barrier
     for joint, limit in zip(robot.chain(config.joints).joints, config.torque.limit, strict=True):
+        moments = np.linalg.eigvalsh(pseudo_inertia(joint.inertia))
+        if moments[0] < -_IMPOSSIBLE * moments[-1]:
+            yield (
+                f'robot.urdf: no body has the inertia of what {joint.name} moves ({joint.link}): '
+                f'one of its moments is larger than the sum of the other two: are they in kg m^2, '
+                f'about the centre of mass?'
+            )
         if math.isinf(joint.effort) and limit == UNKNOWN_EFFORT:
             yield (
                 f'torque.limit: {joint.name} has no effort in the URDF: {limit:g} N m are assumed; '
