@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
+import re
 
 import numpy as np
 import pytest
@@ -188,12 +188,17 @@ def test_an_assumed_torque_limit_is_named():
     assert config_warnings(panda({'robot.urdf': urdf, 'torque.limit': given})) != found
 
 
-def test_an_inertia_of_no_body_is_named():
+def test_inertias_that_cannot_be_meant_are_named():
     urdf = read_urdf('panda.urdf')
-    mass = ET.fromstring(urdf).find('link[@name="panda_link2"]/inertial/inertia')
-    wrong = urdf.replace(f'ixx="{mass.get("ixx")}"', 'ixx="3.0"')
+    wrong = urdf.replace('ixx="0.037242"', 'ixx="3.0"')
+    assert wrong != urdf
     (warning,) = config_warnings(panda({'robot.urdf': wrong}))
-    assert 'no body has the inertia of what panda_joint2 moves (panda_link2)' in warning
+    assert 'no body has the inertia of what panda_joint3 moves (panda_link3)' in warning
+    in_kg_mm2 = re.sub(
+        r'\b(i[xyz]{2})="(.+?)"', lambda found: f'{found[1]}="{1e6 * float(found[2])}"', urdf
+    )
+    found = config_warnings(panda({'robot.urdf': in_kg_mm2}))
+    assert 'with all its torque panda_joint7 accelerates by ' in ' '.join(found)
 
 
 def test_closed_loop_warns_before_it_runs(tmp_path, capsys):

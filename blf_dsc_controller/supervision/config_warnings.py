@@ -34,6 +34,7 @@ _MARGIN = 1.25  # of torque beyond what the reference needs
 _PERIODS = 0.02  # by which a window may miss a whole number of periods
 _CLOSE = 0.8  # of the bound
 _FUNNEL = 20.0  # times the bound
+_SLUGGISH = 1.0  # rad/s^2
 _IMPOSSIBLE = 1e-3  # of the largest eigenvalue of the pseudo-inertia
 _SETTLED = 10.0  # time constants of the filter (8) ...
 _FILTERED = 4.0  # ... and of the regressor's, which both sides of the identity pass
@@ -51,11 +52,17 @@ class ReferenceLoad(NamedTuple):
         roots = np.linalg.eigvals(np.linalg.solve(self.inertia, Kp))
         return float(np.abs(roots).max(initial=0.0)) + settings.damping_rate
 
+    @property
+    def free_inertia(self) -> Floats:
+        """Inertia of each joint with the others free, at least (n,), kg m^2."""
+        free = 1.0 / np.diagonal(np.linalg.inv(self.inertia), axis1=1, axis2=2)
+        least: Floats = free.min(axis=0, initial=np.inf)
+        return least
+
     def damping(self, settings: Settings) -> Floats:
         """Damping of each joint with the others free, at least (n,), N m s/rad."""
-        free = 1.0 / np.diagonal(np.linalg.inv(self.inertia), axis1=1, axis2=2)
-        inertia: Floats = free.min(axis=0, initial=np.inf)
-        damped = settings.damping_rate * inertia if settings.damping_rate > 0.0 else 0.0
+        rate = settings.damping_rate
+        damped = rate * self.free_inertia if rate > 0.0 else 0.0
         return settings.Kp + damped
 
 
@@ -77,7 +84,7 @@ def config_warnings(
     """
     settings = settings_of_config(config)
     load = load or reference_load(config, settings)
-    found = [*_of_start(config, q), *_of_urdf(config)]
+    found = [*_of_start(config, q), *_of_urdf(config, load)]
     found += [one.text for one in _of_gains(config, load)]
     if settings.surface != LINEAR and settings.kappa > 0.0 and settings.Gamma.any():
         windows = windows_along(config, settings)
@@ -156,7 +163,7 @@ def _of_start(config: ControllerConfig, q: Floats | None) -> Iterator[str]:
             )
 
 
-def _of_urdf(config: ControllerConfig) -> Iterator[str]:
+def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
     """Inertias that no body has; defaults that follow from the URDF and are hardly meant."""
     if config.model != 'urdf':
         return
@@ -173,6 +180,14 @@ def _of_urdf(config: ControllerConfig) -> Iterator[str]:
             yield (
                 f'torque.limit: {joint.name} has no effort in the URDF: {limit:g} N m are assumed; '
                 f'give what its drive can bear'
+            )
+    for name, acceleration in zip(
+        config.joints, config.torque.limit / load.free_inertia, strict=True
+    ):
+        if acceleration < _SLUGGISH:
+            yield (
+                f'robot.urdf: with all its torque {name} accelerates by {acceleration:.2g} rad/s^2 '
+                f'only: are masses in kg, moments of inertia in kg m^2 and lengths in m?'
             )
     for name, widest, bound in zip(config.joints, barrier.widest, barrier.bound, strict=True):
         if widest > _FUNNEL * bound:
