@@ -14,7 +14,7 @@ from synthetic_bag import BOUND_RAD, JOINTS, LATCH_S, LIMIT_NM, PARAMETERS, TRUE
 
 from blf_dsc_controller.analysis.summary import format_table, summarize, write_summary
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.messages.topics import BOUND, JOINT_STATES, LEARNING, TRUTH
+from blf_dsc_controller.messages.topics import BOUND, JOINT_STATES, LATE_STEPS, LEARNING, TRUTH
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -139,6 +139,16 @@ def test_a_bound_that_was_wider_is_in_the_table(run):
     table = format_table(summarize(dataclasses.replace(run, bound=bound)))
     assert '\nat widest   elbow 12.3 mrad\n' in table
     assert 'at widest' not in format_table(summarize(run))
+
+
+def test_a_computer_too_busy_for_real_time_is_named(run):
+    timing = run.timing
+    late = timing.values.copy()
+    late[-1, timing.names.index(LATE_STEPS)] = 0.02 * SAMPLES
+    slow = dataclasses.replace(run, timing=dataclasses.replace(timing, values=late))
+    table = format_table(summarize(slow))
+    assert '200 late steps: the computer was too busy for real time' in table
+    assert 'too busy' not in format_table(summarize(run))
 
 
 def test_the_table_shows_the_summary(run):

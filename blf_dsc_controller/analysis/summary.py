@@ -34,6 +34,7 @@ _JOINT = {  # entry of the summary: metric; title, unit, units to 1 and decimals
     'torque_limit_nm': ('torque_limit', 'limit', 'N m', 1.0, 2),
 }
 
+_OFTEN = 0.01  # of the samples
 _WIDEST = 'widest_bound_rad'
 _MEASURED = {  # comparison with the truth: entry of the summary, its line of the table
     'relative_error': 'parameters  error',
@@ -176,7 +177,10 @@ def _sentences(summary: Summary) -> Iterator[str]:
     if summary['learning'] is not None:
         yield from _learning_lines(summary['learning'])
     if summary['timing'] is not None:
-        yield f'real time   {", ".join(_real_time(summary["timing"]))}'
+        late = summary['timing']['late_steps']
+        is_slow = late is not None and late > _OFTEN * summary['samples']
+        busy = ': the computer was too busy for real time (--mode lockstep waits)'
+        yield f'real time   {", ".join(_real_time(summary["timing"]))}{busy if is_slow else ""}'
     if summary['compute_time_us'] is not None:
         yield f'law         {_microseconds(summary["compute_time_us"])}'
 
