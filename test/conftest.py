@@ -5,7 +5,6 @@ It is set here, before any test module imports rclpy: a domain that no other run
 likely to share, on this machine only, with the logs in a folder that goes away at the end.
 """
 
-import atexit
 import os
 import shutil
 import tempfile
@@ -27,8 +26,6 @@ os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_LOG_DIR'] = _LOG_FOLDER
 # As `blf_dsc run` sets it: nodes that end wait 0.1 s instead of 3 s for their last acknowledgement.
 os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(_FOLDER.parent / 'config' / 'fastdds.xml')
-
-atexit.register(shutil.rmtree, _LOG_FOLDER, ignore_errors=True)
 
 # They take longest, and first come first served: so no worker is left with one of them at the end.
 _FIRST = (
@@ -57,3 +54,8 @@ def ros():
 
 def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: not item.path.stem.startswith(_FIRST))
+
+
+def pytest_unconfigure():
+    """Remove the logs; workers of pytest-xdist run nothing at their exit."""
+    shutil.rmtree(_LOG_FOLDER, ignore_errors=True)
