@@ -202,3 +202,16 @@ def test_a_second_controller_in_a_bag_is_not_replayed(tmp_path):
     assert result.remarks[0] == 'another controller was started: the replay ends there'
     assert result.stamp.size == 40
     assert np.array_equal(result.stamp, LOCKSTEP + np.arange(40) * MILLISECOND)
+
+
+def test_the_state_at_which_a_controller_was_killed_is_the_next_ones(tmp_path):
+    """In lock-step the arm sends it again, until somebody answers."""
+    rig = Recorder()
+    rig.step(40)
+    rig.drops = (40,)
+    rig.deliver(rig.state().raw())
+    rig.guard = rig.controller()
+    rig.step(40)
+    result = rig.verify(tmp_path, clock='lockstep')
+    assert result.difference is None
+    assert result.stamp.size == 40

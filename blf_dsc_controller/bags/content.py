@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -75,6 +76,14 @@ class Content:
     path: Path
     topics: Mapping[Topic, TopicMessages]
     message_counts: Mapping[str, int]
+
+    def before(self, until: int) -> Content:
+        """What was received before a time [ns]; the counts stay those of the whole bag."""
+        topics = {}
+        for topic, one in self.topics.items():
+            count = bisect_left(one.received, until)
+            topics[topic] = replace(one, received=one.received[:count], raw=one.raw[:count])
+        return replace(self, topics=topics)
 
     def of_joints(self, joints: Sequence[str]) -> Content:
         """Content without the joint states of other joints alone, such as those of a gripper.

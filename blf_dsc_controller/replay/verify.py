@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +18,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import required_fields
 from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.journal import Event, EventType, decode
-from blf_dsc_controller.messages.topics import FOREVER, JOINT_STATES, JOURNAL
+from blf_dsc_controller.messages.topics import JOINT_STATES, JOURNAL
 from blf_dsc_controller.replay.comparison import Comparison, Difference, compare
 from blf_dsc_controller.replay.rerun import Rerun
 from blf_dsc_controller.replay.states import sampled_stamps
@@ -68,9 +66,9 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
             controller, or it cannot be read.
     """
     context, content = read_context(path), read_content(path, namespace, names)
-    events, until, end = _events(content)
+    events, content, end = _events(content)
     config = context.build_config(events[0].content['parameters'], JOURNAL.resolved)
-    states, errors = _states(content, config, names.joints_of(config.joints), until)
+    states, errors = _states(content, config, names.joints_of(config.joints))
     start = next((one.stamp for one in events if one.type is EventType.START), None)
     if start is not None and start not in states.stamp:
         reason = (
@@ -96,8 +94,8 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
     )
 
 
-def _events(content: Content) -> tuple[list[Event], int, str]:
-    """Events of the first controller of a bag, when [ns] another one was started, and that text."""
+def _events(content: Content) -> tuple[list[Event], Content, str]:
+    """Events of the first controller of a bag, what came before the next one, and that text."""
     recorded = content.topics.get(JOURNAL)
     if recorded is None:
         raise _nothing_to_compare(content)
@@ -105,30 +103,28 @@ def _events(content: Content) -> tuple[list[Event], int, str]:
     for received, raw in zip(recorded.received, recorded.raw, strict=True):
         event = decode(raw)
         if events and event.type is EventType.CONFIGURE:
-            return events, received, 'another controller was started'
+            return events, content.before(received), 'another controller was started'
         events.append(event)
     if events[0].type is not EventType.CONFIGURE:
         raise BlfDscError(
             f'{content.path} does not hold the beginning of {recorded.name}: start the recorder '
             'first'
         )
-    return events, FOREVER, ''
+    return events, content, ''
 
 
 def _states(
-    content: Content, config: ControllerConfig, joints: Sequence[str], until: int
+    content: Content, config: ControllerConfig, joints: Sequence[str]
 ) -> tuple[JointStates, dict[int, MessageError]]:
-    """Every joint state that was received before `until` [ns], and why some are unreadable.
+    """Every joint state, and why some are unreadable.
 
     Raises:
         UnreadableMessageError: not one of them can be read.
     """
     recorded = content.topics[JOINT_STATES]
-    count = bisect_left(recorded.received, until)
-    recorded = replace(recorded, received=recorded.received[:count], raw=recorded.raw[:count])
     errors: dict[int, MessageError] = {}
     states = recorded.joint_states(joints, required_fields(config), errors)
-    if len(errors) == count:
+    if len(errors) == len(recorded.received):
         raise UnreadableMessageError(recorded.name, 0, errors[0])
     return states, errors
 
