@@ -72,3 +72,27 @@ def test_stamps_that_switch_the_watchdog_off_are_warned_of_once(ros):
 
     ros.until(lambda: arm.finished and warned())
     assert len(warned()) == 1
+
+
+@pytest.mark.parametrize('kind', [ControllerNode, PlantNode])
+def test_a_second_node_on_the_same_topic_is_noticed(ros, kind):
+    space = f'rivals_{kind.__name__}'
+    log = listen(ros, Log, '/rosout', KEPT)
+    diagnostics = listen(ros, DiagnosticArray, '/diagnostics')
+    first = ros.add(kind, namespace=space)
+    second = ros.add(kind, namespace=space)
+    ros.until(lambda: first.rivals == second.rivals == 1)
+    name = 'joint_states' if kind is PlantNode else 'blf_dsc_controller/commands'
+    ros.until(
+        lambda: any(f'another node publishes on /{space}/{name}, too' in one.msg for one in log)
+    )
+    if kind is ControllerNode:
+        ros.until(
+            lambda: any(
+                status.message == 'another node commands torques, too'
+                for array in diagnostics
+                for status in array.status
+            )
+        )
+    ros.kill(second)
+    ros.until(lambda: first.rivals == 0)

@@ -288,7 +288,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         return f'{self.get_fully_qualified_name()}/reset begins anew from where the arm is then'
 
     def _report(self) -> None:
-        self._status.report(self.state_label, self.guard)
+        self._status.report(self.state_label, self.guard, self.rivals)
 
 
 main = partial(process.run, ControllerNode)

@@ -50,17 +50,20 @@ class ControllerStatus:
         """Whether there are events or a state to publish."""
         return bool(guard.journal.pending) or guard.supervisor.revision != self._revision
 
-    def report(self, life: str, guard: Guard | None) -> None:
+    def report(self, life: str, guard: Guard | None, rivals: int) -> None:
         """Publish diagnostics, new events and, if it has changed, the state.
 
         Args:
             life: lifecycle state of the node.
             guard: None while the node is not configured.
+            rivals: other publishers of torques.
         """
         if guard is not None:
             self.publish_events(guard)
         state = self._state(life, guard)
-        parts = [state] if guard is None else [state, self._loop(guard), self._learning(guard)]
+        parts = (
+            [state] if guard is None else [state, self._loop(guard, rivals), self._learning(guard)]
+        )
         self._diagnostics.publish(parts)
         stops = guard.supervisor.stops if guard else 0
         if (state.message, life, stops) != self._published:
@@ -87,7 +90,7 @@ class ControllerStatus:
             message += f': {supervisor.text}'
         return self._diagnostics.status('state', level, message, values)
 
-    def _loop(self, guard: Guard) -> DiagnosticStatus:
+    def _loop(self, guard: Guard, rivals: int) -> DiagnosticStatus:
         states, samples = guard.states, guard.samples
         values = {
             'samples': guard.controller.samples,
@@ -102,7 +105,9 @@ class ControllerStatus:
             **(self.trajectories.values if self.trajectories else {}),
         }
         level, message = WARN, 'torque{} at its limit: adaptation by the tracking error is frozen'
-        if samples.outside:
+        if rivals:
+            level, message = ERROR, 'another node commands torques, too'
+        elif samples.outside:
             message = 'the error has left its bound'
         elif samples.saturated_time > 0.0:
             message = message.format('')

@@ -137,6 +137,10 @@ class LoopNode(ManagedNode, Generic[Config]):
 
     `steady` [ns] is the clock of timeouts and of real time, `wall` [ns] that of live stamps.
     Raises ConfigurationError if a parameter is wrong.
+
+    Attributes:
+        config: in force.
+        rivals: other publishers of the output to the other node of the loop.
     """
 
     def __init__(
@@ -153,11 +157,12 @@ class LoopNode(ManagedNode, Generic[Config]):
         self.config: Config = parameters.declare(self, cls)
         self._outputs: dict[Topic, Publisher] = {}
         self._senders: dict[Topic, Callable[[bytes], None]] = {}
+        self.rivals = 0
 
     def start(self) -> None:
         """Start timers and services, and the node itself if it is configured to."""
         self._poll_timer = create_steady_timer(self, POLL_PERIOD, self._on_poll)
-        create_steady_timer(self, _DIAGNOSTICS_PERIOD, self._report)
+        create_steady_timer(self, _DIAGNOSTICS_PERIOD, self._on_second)
         self.create_service(Trigger, '~/reset', self._on_reset)
         if self.config.autostart:
             self.autostart()
@@ -184,6 +189,22 @@ class LoopNode(ManagedNode, Generic[Config]):
     @abstractmethod
     def _report(self) -> None:
         """Publish diagnostics."""
+
+    def _on_second(self) -> None:
+        self._look_for_rivals()
+        self._report()
+
+    def _look_for_rivals(self) -> None:
+        """Warn of others that publish what only this node should publish for the other one."""
+        if not self._outputs:
+            return
+        publisher = next(iter(self._outputs.values()))
+        before, self.rivals = self.rivals, self.count_publishers(publisher.topic_name) - 1
+        if self.rivals > before:
+            self.get_logger().warning(
+                f'another node publishes on {publisher.topic_name}, too: end one of the two '
+                '(one that was killed is seen for 20 s)'
+            )
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = self.state_label == 'active'
