@@ -87,7 +87,7 @@ def draw(rows: list[Ratio], path: Path) -> None:
         axes.grid(visible=True, axis='x', which='both', alpha=0.2)
         axes.spines[['top', 'right']].set_visible(False)
     grid[-1].set_xlabel('ratio, median and range of the rounds')
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=80)
 
 
 def main() -> None:
