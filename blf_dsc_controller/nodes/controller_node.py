@@ -61,7 +61,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         )
         self._monitor: Monitor | None = None
         self._learning_events = (0.0, 0.0, 0.0)  # columns checked, columns in use, model changes
-        self._published_bound = np.zeros(len(joints))
+        self._published_bound = b''  # the bytes of the array, which each sample is compared with
         self._decoder = JointStateDecoder(joints, assembly.required_fields(self.config))
         self._pending: bytes | None = None
         self._warned_at = -1  # stamp of the start that was warned of
@@ -185,11 +185,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 self._report_learning(guard, events)
         if not self.config.telemetry.enabled:
             return
-        narrows = controller.settings.funnel_rate > 0.0
         if samples == 1 or self._monitor is None:
             self._monitor = Monitor(self.config.joints, self._estimates, controller.settings)
-            self._publish_bound(guard, stamp, sample.bound)
-        elif narrows and not np.array_equal(sample.bound, self._published_bound):
+            self._published_bound = b''
+        if sample.bound.tobytes() != self._published_bound:
             self._publish_bound(guard, stamp, sample.bound)
         if is_due:
             self._heard = any(count() for count in self._listeners)
@@ -219,7 +218,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self._publish(self._telemetry.command(torque))
 
     def _publish_bound(self, guard: Guard, stamp: int, bound: np.ndarray) -> None:
-        self._published_bound[:] = bound
+        self._published_bound = bound.tobytes()
         limit = guard.controller.settings.torque_limit
         self._publish(self._telemetry.bound(stamp, bound, limit))
 
