@@ -96,3 +96,10 @@ def test_a_second_node_on_the_same_topic_is_noticed(ros, kind):
         )
     ros.kill(second)
     ros.until(lambda: first.rivals == 0)
+
+
+def test_states_that_come_too_often_are_noticed(ros):
+    log = listen(ros, Log, '/rosout', KEPT)
+    ros.add(ControllerNode, namespace='often')
+    ros.add(PlantNode, mode='lockstep', sample_time=0.0005, namespace='often')
+    ros.until(lambda: any('a joint state comes every 0.0005 s, but' in one.msg for one in log))

@@ -43,6 +43,9 @@ OUTPUTS = (
 STREAMS = topics.REFERENCE, topics.TRACKING_ERROR, topics.LEARNING
 """Telemetry of each sample; nobody gets messages of these from before the subscription."""
 
+_RATE_SAMPLES = 1001  # when the rate is checked
+_FAST = 0.9  # of the sample time
+
 
 class ControllerNode(LoopNode[ControllerConfig]):
     """Commands a torque on `~/commands` for each joint state, and publishes telemetry.
@@ -177,12 +180,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _publish_telemetry(self, guard: Guard) -> None:
         controller, stamp = guard.controller, guard.last_stamp
-        state, sample, samples = controller.state, controller.sample, controller.samples
+        sample, samples = controller.sample, controller.samples
         is_due = (samples - 1) % DECIMATION == 0
         if is_due:
-            events = (state.columns_checked[0], state.active.sum(), state.changes[0])
-            if events != self._learning_events:
-                self._report_learning(guard, events)
+            self._follow_progress(guard)
         if not self.config.telemetry.enabled:
             return
         if samples == 1 or self._monitor is None:
@@ -190,13 +191,25 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self._published_bound = b''
         if sample.bound.tobytes() != self._published_bound:
             self._publish_bound(guard, stamp, sample.bound)
-        if is_due:
-            self._heard = any(count() for count in self._listeners)
         if self._heard:
             for message in self._telemetry.sample(stamp, sample, guard.compute_time):
                 self._publish(message)
         if is_due:
             self._publish(self._monitor.message(stamp, sample, guard.samples.ratio, sample.bound))
+
+    def _follow_progress(self, guard: Guard) -> None:
+        """Look at what changes seldom: subscribers, the learning, the rate of the states."""
+        self._heard = any(count() for count in self._listeners)
+        state, samples = guard.controller.state, guard.controller.samples
+        events = (state.columns_checked[0], state.active.sum(), state.changes[0])
+        if events != self._learning_events:
+            self._report_learning(guard, events)
+        period, expected = guard.time / max(samples - 1, 1), self.config.sample_time
+        if samples == _RATE_SAMPLES and period < _FAST * expected:
+            self.get_logger().warning(
+                f'a joint state comes every {period:.3g} s, but sample_time is {expected:g} s: set '
+                'it to that of the arm, which gains and windows depend on'
+            )
 
     def _report_learning(self, guard: Guard, events: tuple[float, float, float]) -> None:
         before, self._learning_events = self._learning_events, events

@@ -110,7 +110,8 @@ class StateCheck:
             return None
         text = (
             f'{100.0 * self.missed_fraction:.0f} % of the joint states were missed: more than '
-            f'safety.overrun_fraction allows over {safety.overrun_window:g} s'
+            f'safety.overrun_fraction allows over {safety.overrun_window:g} s, or the arm sends '
+            f'them less often than every {self._sample_time:g} s (sample_time)'
         )
         return Fault(Reason.OVERRUN, text)
 
