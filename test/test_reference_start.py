@@ -14,7 +14,12 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import Initial, PlantConfig
 from blf_dsc_controller.configuration.reference import Approach, Reference
 from blf_dsc_controller.configuration.schema import build, change
-from blf_dsc_controller.errors import ConfigurationError, OutsideBarrierError, VelocityMismatchError
+from blf_dsc_controller.errors import (
+    ConfigurationError,
+    OutsideBarrierError,
+    StartError,
+    VelocityMismatchError,
+)
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.reference.approach import plan_start, reference_of
 from blf_dsc_controller.reference.terms import sampled, unpack
@@ -216,3 +221,14 @@ def test_a_new_bound_is_judged_by_how_wide_it_is_now():
     assert guard.problems(change(guard.config, narrow)) == []
     still = {'barrier.initial_bound': [0.0, 0.0], 'barrier.funnel_rate': 0.0}
     assert guard.problems(change(guard.config, narrow | still))
+
+
+@pytest.mark.parametrize('at', [120.0, -2.0 * np.pi - 0.11])
+def test_an_arm_far_past_its_limits_is_not_held(at):
+    """Such as one that sends degrees."""
+    config = replace(CONFIG, reference=Reference(type='hold'))
+    bound = np.array(config.barrier.bound)
+    with pytest.raises(StartError, match=r"joint 'joint2' is at .* rad, and its limits are -6.2"):
+        plan_start(config, bound, np.array([0.0, at]), np.zeros(2))
+    at_rest = np.array([0.0, 2.0 * np.pi + 0.09])
+    assert plan_start(config, bound, at_rest, np.zeros(2)).settled == 0.0

@@ -30,6 +30,7 @@ from blf_dsc_controller.reference.terms import (
 _SHORTEST = 0.02  # s
 _STEP = 1.1
 _BISECTIONS = 5
+_PAST = 0.1  # rad
 _BRAKE = 3.0
 """Braking from v in the time h takes up to 1.5 v / h: twice the time needs half the limit."""
 
@@ -172,6 +173,18 @@ def _by_way_of_the_middle(
     return motion if motion.settled <= t + config.approach.longest else None
 
 
+def _check_limits(config: ControllerConfig, q: np.ndarray) -> None:
+    """Check that the arm is to be held at q (n,) [rad]: it may rest a little past its limits."""
+    limits = zip(config.limits.position_lower, config.limits.position_upper, strict=True)
+    for joint, at, (lower, upper) in zip(config.joints, q, limits, strict=True):
+        if not lower - _PAST <= at <= upper + _PAST:
+            raise StartError(
+                f'joint {joint!r} is at {at:.6g} rad, and its limits are {lower:g} to {upper:g} '
+                'rad: if it really is there, change limits.position_lower or '
+                'limits.position_upper'
+            )
+
+
 def plan_start(
     config: ControllerConfig, bound: np.ndarray, q: np.ndarray, dq: np.ndarray, t: float = 0.0
 ) -> Motion:
@@ -181,11 +194,13 @@ def plan_start(
     [rad].
 
     Raises:
-        StartError: the law cannot take over (`check_takeover`), and approach.enabled is false.
+        StartError: the law cannot take over (`check_takeover`), and approach.enabled is false;
+            or the arm is to be held far past its limits.
         MotionError: no approach keeps the limits.
     """
     vector = reference_of(config)
     if config.reference.type == 'hold':
+        _check_limits(config, q)
         vector = pack(q.size, [hold(q)])
     try:
         check_takeover(config, bound, q, dq, vector, t)
