@@ -35,8 +35,7 @@ _STEPS = 5000
 _WARM_UP = 500
 _START = 1_000_000_000
 _SETTLING = 0.5  # s until both sides have found each other, or a message has come
-_PATIENCE = 10.0  # s for one torque
-_GREETINGS = 40
+_PATIENCE = 60.0  # s for one torque
 _NULL = 'null node, serialised messages'
 _NULL_TYPED = 'null node'
 _QUIET = 'controller, telemetry off'
@@ -171,7 +170,8 @@ class StandIn:
     def _greet(self, node: Watched) -> None:
         """Send the first state until its torque comes: a reader half matched loses messages."""
         self.has_torque = False
-        for _ in range(_GREETINGS):
+        end = time.perf_counter() + _PATIENCE
+        while time.perf_counter() < end:
             self.publisher.publish(self.messages[0])
             self._spin_for(_SETTLING)
             if self.has_torque:

@@ -123,7 +123,7 @@ def read_urdf(given: str) -> str:
     try:
         return read_text(resolve(given))
     except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
+        reason = getattr(error, 'strerror', None) or error
         raise BlfDscError(f'{given!r} cannot be read: {reason}') from error
 
 
