@@ -68,7 +68,7 @@ class ViewNode(PlainNode):
         self.past: deque[Moment] = deque()
         self._config: ControllerConfig | None = None
         self._plant: dict[str, Any] = {}  # parameters of the simulated one
-        self._acting: set[int] = set()  # which of its events
+        self._noted = -1.0  # s, up to which its events are on the page
         self._state = 'STALE', f'waiting for {self.resolve_topic_name(topics.JOURNAL.relative)}'
         self._start = self._sampled = -1  # ns, stamps: of the start, of the last tracking error
         self._pictures = self._silent = 0
@@ -159,7 +159,7 @@ class ViewNode(PlainNode):
             self._config = change(self._config, content['parameters'])
             self._restore()
         if event.type is EventType.START:
-            self._start = event.stamp
+            self._start, self._noted = event.stamp, -1.0
             self.past.clear()
         details = [f'{content[k]}' for k in ('reason', 'text', 'parameters') if k in content]
         self.page.event(self._time(event.stamp), event.type.value, ', '.join(details))
@@ -177,7 +177,7 @@ class ViewNode(PlainNode):
         self._draw_all()
 
     def _meet_plant(self, _: str, values: Values) -> None:
-        self._plant = dict(values)
+        self._plant, self._noted = dict(values), -1.0
         self._requests.meet_plant(values)
         self._draw_all()
 
@@ -248,20 +248,21 @@ class ViewNode(PlainNode):
             self.past.popleft()
 
     def _payload(self, time: float) -> float:
-        """Payload of the simulated arm [kg]; notes which of its events begin and end."""
+        """Payload of the simulated arm [kg]; notes its events that began or ended by now."""
         get = self._plant.get
-        begin, duration = get('events.begin', ()), get('events.duration', ())
-        masses = get('events.payload', ()) or (0.0,) * len(begin)
-        acting = {
-            k
-            for k, (at, lasts) in enumerate(zip(begin, duration, strict=False))
-            if at <= time < at + (lasts or np.inf)
-        }
-        for k in acting ^ self._acting:
-            what = f'payload of {masses[k]:g} kg' if masses[k] else f'event {k + 1}'
-            self.page.event(time, 'plant', f'{what} {"begins" if k in acting else "ends"}')
-        self._acting = acting
-        return float(get('load.payload', 0.0)) + sum(masses[k] for k in acting)
+        begin = get('events.begin', ())
+        none = (0.0,) * len(begin)
+        duration, masses = (get(f'events.{one}', ()) or none for one in ('duration', 'payload'))
+        payload = float(get('load.payload', 0.0))
+        for k, (at, lasts, mass) in enumerate(zip(begin, duration, masses, strict=False)):
+            end = at + (lasts or np.inf)
+            what = f'payload of {mass:g} kg' if mass else f'event {k + 1}'
+            for moment, verb in ((at, 'begins'), (end, 'ends')):
+                if self._noted < moment <= time:
+                    self.page.event(moment, 'plant', f'{what} {verb}')
+            payload += mass if at <= time < end else 0.0
+        self._noted = time
+        return payload
 
     def _draw(self, config: ControllerConfig, clients: frozenset[int]) -> None:
         self._pictures += 1
