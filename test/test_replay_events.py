@@ -200,6 +200,7 @@ def test_a_second_controller_in_a_bag_is_not_replayed(tmp_path):
     result = rig.verify(tmp_path)
     assert result.difference is None
     assert result.remarks[0] == 'another controller was started: the replay ends there'
+    assert result.compared == pytest.approx(0.5)
     assert result.stamp.size == 40
     assert np.array_equal(result.stamp, LOCKSTEP + np.arange(40) * MILLISECOND)
 
@@ -215,3 +216,4 @@ def test_the_state_at_which_a_controller_was_killed_is_the_next_ones(tmp_path):
     result = rig.verify(tmp_path, clock='lockstep')
     assert result.difference is None
     assert result.stamp.size == 40
+    assert result.compared == pytest.approx(0.5)

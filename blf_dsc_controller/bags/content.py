@@ -78,7 +78,7 @@ class Content:
     message_counts: Mapping[str, int]
 
     def before(self, until: int) -> Content:
-        """What was received before a time [ns]; the counts stay those of the whole bag."""
+        """What was received before a time [ns], with the counts of the whole bag."""
         topics = {}
         for topic, one in self.topics.items():
             count = bisect_left(one.received, until)

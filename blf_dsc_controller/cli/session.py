@@ -220,8 +220,12 @@ class Monitor:
         rclpy.try_shutdown(context=self._context)
 
     def _receive_last(self) -> None:
-        """Show what is still on its way, up to the message of the last sample."""
-        wait = _LINGER if self._interrupts else _LAST
+        """Show what is still on its way, up to the message of the last sample.
+
+        A short run in lock-step may be over before its controller has been found.
+        """
+        wait = _LAST if self.has_begun else _FIRST_SIGN
+        wait = _LINGER if self._interrupts else wait
         deadline = time.monotonic() + wait
         while self._elapsed < self._end and time.monotonic() < deadline:
             if self.wait(0.05) and not self._interrupts:

@@ -67,12 +67,21 @@ def compare(
     if messages is not None:
         names = _names(config.joints, ['effort'])
         is_gappy = messages.name in gappy
-        yield _compare_commands(messages, outputs.commands, names, is_gappy=is_gappy)
+        found = _compare_commands(messages, outputs.commands, names, is_gappy=is_gappy)
+        yield _of_the_whole_bag(found, messages, content)
     for topic, replayed in _replayed(config, outputs).items():
         messages = content.topics.get(topic)
         if messages is not None:
             recorded = _recorded(messages, is_vector=topic in (LEARNING, MONITOR))
-            yield _compare_series(messages.name, outputs.stamp, recorded, replayed)
+            found = _compare_series(messages.name, outputs.stamp, recorded, replayed)
+            yield _of_the_whole_bag(found, messages, content)
+
+
+def _of_the_whole_bag(found: Comparison, messages: TopicMessages, content: Content) -> Comparison:
+    """The comparison, with the outputs of later controllers among the recorded ones."""
+    count = len(messages.raw)
+    whole = found.recorded * content.message_counts[messages.name] // count if count else 0
+    return found._replace(recorded=whole)
 
 
 def _replayed(config: ControllerConfig, outputs: Outputs) -> dict[Topic, Series]:

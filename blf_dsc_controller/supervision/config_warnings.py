@@ -33,9 +33,9 @@ _WINDOWS = 8  # that begin within the length of one
 _MARGIN = 1.25  # of torque beyond what the reference needs
 _PERIODS = 0.02  # by which a window may miss a whole number of periods
 _CLOSE = 0.8  # of the bound
-_FUNNEL = 20.0  # times the bound
-_SLUGGISH = 1.0  # rad/s^2
-_IMPOSSIBLE = 1e-3  # of the largest eigenvalue of the pseudo-inertia
+_FUNNEL = 20.0  # times the bound; up to 5 with the presets
+_SLUGGISH = 1.0  # rad/s^2; the weakest joint of the presets has 60
+_IMPOSSIBLE = 1e-3  # of the largest eigenvalue of the pseudo-inertia: more than rounded figures
 _SETTLED = 10.0  # time constants of the filter (8) ...
 _FILTERED = 4.0  # ... and of the regressor's, which both sides of the identity pass
 
