@@ -23,13 +23,9 @@ from blf_dsc_controller.nodes.controller_status import ControllerStatus
 from blf_dsc_controller.nodes.lifecycle import POLL_PERIOD, LoopNode
 from blf_dsc_controller.nodes.rclpy_internals import subscription_count
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
-from blf_dsc_controller.supervision.config_warnings import (
-    ReferenceLoad,
-    config_warnings,
-    reference_load,
-    worsened,
-)
+from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
 from blf_dsc_controller.supervision.supervisor import Phase
 
 OUTPUTS = (

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the reference demands and excites, followed exactly with the initial estimate."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.compiled.layout import pack
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.prediction import rows_along
+from blf_dsc_controller.law.settings import FILTERED, Settings
+from blf_dsc_controller.reference.approach import reference_of
+from blf_dsc_controller.reference.terms import sampled
+
+Floats = NDArray[np.float64]
+
+_POINTS = 400  # on the reference
+_LONGEST = 120.0  # s of it
+_FINE = 0.1  # time constants of the regressor's filter between two points of a window ...
+_WINDOW_POINTS = 400  # ... of which it has at least so many
+_WINDOWS = 8  # that begin within the length of one
+
+
+class ReferenceLoad(NamedTuple):
+    """What the reference demands, followed exactly with the initial estimate."""
+
+    torque: Floats  # largest magnitude (n,), N m
+    inertia: Floats  # M along it, where it is positive definite (k, n, n), kg m^2
+
+    def rate(self, settings: Settings) -> float:
+        """Largest eigenvalue of M^-1 K_p + omega_v, 1/s."""
+        Kp = np.diag(settings.Kp)[np.newaxis]  # numpy 1 takes a matrix beside a stack for vectors
+        roots = np.linalg.eigvals(np.linalg.solve(self.inertia, Kp))
+        return float(np.abs(roots).max(initial=0.0)) + settings.damping_rate
+
+    @property
+    def free_inertia(self) -> Floats:
+        """Inertia of each joint with the others free, at least (n,), kg m^2."""
+        free = 1.0 / np.diagonal(np.linalg.inv(self.inertia), axis1=1, axis2=2)
+        least: Floats = free.min(axis=0, initial=np.inf)
+        return least
+
+    def damping(self, settings: Settings) -> Floats:
+        """Damping of each joint with the others free, at least (n,), N m s/rad."""
+        rate = settings.damping_rate
+        damped = rate * self.free_inertia if rate > 0.0 else 0.0
+        return settings.Kp + damped
+
+
+def reference_load(config: ControllerConfig, settings: Settings) -> ReferenceLoad:
+    """Evaluate the dynamics along the reference, over its slowest period."""
+    P = settings.initial_estimate[: settings.p]
+    H, Yp, Yr = np.zeros((3, settings.n, settings.p))
+    torque, inertia = np.zeros(settings.n), []
+    moments = np.linspace(0.0, _horizon(config), _POINTS, endpoint=False)
+    for q, dq, ddq in sampled(reference_of(config), moments):
+        settings.model.regressor(q, dq, dq, ddq, H)
+        torque = np.maximum(torque, np.abs(H @ P))
+        M = np.zeros((settings.n, settings.n))
+        for i, unit in enumerate(np.eye(settings.n)):
+            settings.model.momentum_regressor(q, unit, Yp, Yr)
+            M[:, i] = Yp @ P
+        if np.linalg.eigvalsh(M)[0] > 0.0:
+            inertia.append(M)
+    return ReferenceLoad(torque, np.reshape(inertia, (-1, settings.n, settings.n)))
+
+
+def windows_along(config: ControllerConfig, settings: Settings) -> Floats:
+    """Phi (21) of windows along the reference, followed exactly: (k, m, m), filters included.
+
+    The first is full after tau_d + T_a, as in the controller; the last ends a slowest period later.
+    """
+    learning = config.learning
+    step = learning.window / max(_WINDOW_POINTS, learning.window * learning.filter_pole / _FINE)
+    step = max(step, config.sample_time)
+    window, start = round(learning.window / step), round(settings.learning_start / step)
+    times = np.arange(start + round(_horizon(config) / step) + 1) * step
+    motion = sampled(reference_of(config), times)
+    rows = rows_along(settings, pack(settings), times, motion)
+    if settings.prediction == FILTERED:
+        gain = 1.0 - np.exp(-learning.filter_pole * step)
+        first, second = np.zeros((2, settings.n, settings.m))
+        for row in rows:
+            first += gain * (row - first)
+            second += gain * (first - second)
+            row[:] = second
+    found = []
+    for end in range(start, times.size, max(1, window // _WINDOWS)):
+        X = rows[end - window + 1 : end + 1].reshape(-1, settings.m)
+        found.append(X.T @ X / window)
+    return np.array(found)
+
+
+def _horizon(config: ControllerConfig) -> float:
+    """Time [s] in which the reference does all that it does, at most `_LONGEST`."""
+    if config.reference.type == 'waypoints':
+        return min(max(config.reference.times), _LONGEST)
+    frequencies = [w for w in config.reference.frequency if w > 0.0]
+    return min(float(2.0 * np.pi / min(frequencies, default=1.0)), _LONGEST)
