@@ -103,6 +103,7 @@ def test_gains_changed_elsewhere_move_the_sliders(rig, loop):
     _, law, view = loop
     result = law.set_parameters_atomically([_parameter('surface.gain', [140.0, 150.0])])
     assert result.successful, result.reason
+    rig.until(lambda: told(view, 'surface.gain'))
     rig.until(lambda: view.controls.sliders['surface.gain'][0].value == 140.0)
 
 
