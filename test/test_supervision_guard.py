@@ -349,6 +349,15 @@ def test_gains_that_a_running_law_cannot_take_are_rejected(given, said):
     assert rig.guard.problems(change(rig.guard.config, given)) == []
 
 
+def test_gains_can_change_while_the_projection_holds_the_estimate():
+    rig = Rig({'learning.radius': 0.7})
+    rig.step(200)
+    estimate = rig.guard.controller.state.estimate
+    estimate[:] *= np.nextafter(0.7, 1.0) / np.linalg.norm(estimate)
+    assert np.linalg.norm(estimate) > 0.7
+    assert rig.guard.problems(change(rig.guard.config, {'feedback.gain': (60.0, 25.0)})) == []
+
+
 def test_an_update_that_would_diverge_is_rejected():
     """Gradient: kappa Gamma lambda_max T >= 2; here kappa is 100 and lambda_max some 100."""
     rig = Rig(

@@ -24,6 +24,7 @@ from blf_dsc_controller.law.settings import LINEAR
 
 Vector = NDArray[np.float64]
 _STABLE = 2.0  # x += -a x diverges from a = 2 on
+_ROUNDED = 1.0 + 1e-9  # of the radius: an estimate that the projection holds lies on it
 
 
 def apply(controller: Controller, config: ControllerConfig) -> None:
@@ -77,7 +78,7 @@ def problems(controller: Controller, config: ControllerConfig, t: float) -> Iter
                 f'{limit:g} N m: choose a higher one'
             )
     norm = float(np.linalg.norm(state.estimate[:p]))
-    if norm > learning.radius:
+    if norm > _ROUNDED * learning.radius:
         yield (
             f'learning.radius: the estimate is at {norm:.4g} kg m^2 now, outside of a ball of '
             f'{learning.radius:g} kg m^2: choose a larger one'
