@@ -44,12 +44,12 @@ PIP_FAILED := { echo 'The installation failed: see above. It needs a package ind
 
 .PHONY: help venv demo paper arms changes expect test test-long test-browser pictures test-nightly soak fuzz docs lint clean bench release
 
-help: ## List what can be made
+help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' Makefile
 
-venv: $(READY) ## Install everything into .venv (the others do it when needed)
+venv: $(READY) ## Install everything into .venv (other targets do it when needed)
 
-demo: $(READY) ## Run the closed loop over ROS 2 (CONFIG, DURATION in s) and draw it, into out/
+demo: $(READY) ## Run the closed loop over ROS 2 (CONFIG, DURATION in s) and plot it, into out/
 	@mkdir -p out; out=out/demo; n=1; \
 	while [ -e "$$out" ]; do n=$$((n + 1)); out=out/demo-$$n; done; \
 	$(RUN) -m blf_dsc_controller run --mode lockstep --config "$(CONFIG)" \
@@ -61,7 +61,7 @@ paper: $(READY) ## Run the paper's simulation with every law and check its claim
 	while [ -e "$$out" ]; do n=$$((n + 1)); out=out/paper-$$n; done; \
 	$(RUN) -m blf_dsc_controller paper --out "$$out"
 
-arms: $(READY) ## Compare laws on a Panda and a UR5e whose URDF is wrong, into out/
+arms: $(READY) ## Compare laws on a Panda and a UR5e with wrong URDFs, into out/
 	@mkdir -p out; out=out/arms; n=1; \
 	while [ -e "$$out" ]; do n=$$((n + 1)); out=out/arms-$$n; done; \
 	$(RUN) -m blf_dsc_controller arms --out "$$out"
@@ -72,32 +72,32 @@ test: $(READY) ## Run the tests (TESTS=test/test_x.py for some, WORKERS=0 in one
 	@PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(RUN) -m pytest -p xdist -p _hypothesis_pytestplugin \
 	    -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(TESTS)
 
-test-long: $(READY) ## Kill the recorder ten times within a minute; record a minute; change arms
+test-long: $(READY) ## Run the long tests: recorder killed ten times, one-minute recording, changing arms
 	@LONG_TESTS=1 $(RUN) -m pytest -rP test/test_bag_recorder_killed.py \
 	    test/test_bag_recorder_beside_loop.py test/test_changed_arm.py
 
-test-browser: $(READY) ## Open the pages of bag_report and view in a headless Chromium, if there is one
+test-browser: $(READY) ## Test the pages of bag_report and view in a headless Chromium, if installed
 	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_analysis_report_page.py test/test_view_page.py
 
-pictures: $(READY) ## Make README's moving picture, doc/view.webp, with a headless Chromium
+pictures: $(READY) ## Make the README's animation, doc/view.webp, with a headless Chromium
 	@PYTHONPATH="$(CURDIR):$(CURDIR)/test" $(VENV)/bin/python test/view_pictures.py
 
-test-nightly: $(READY) ## Run ten thousand examples of each property of the nodes
+test-nightly: $(READY) ## Test each property of the nodes with ten thousand examples
 	@BLF_DSC_EXAMPLES=10000 $(RUN) -m pytest -q test/test_nodes_properties.py
 
-changes: $(READY) ## Change ten thousand arms at random, with and without learning, into out/changes
+changes: $(READY) ## Simulate ten thousand randomly changing arms, with and without learning, into out/changes
 	@$(RUN) benchmark/changing_arms.py
 
-expect: $(READY) ## Measure what doc/arms.md says of the presets panda and ur5e
+expect: $(READY) ## Recompute the figures of doc/arms.md for the presets panda and ur5e
 	@$(RUN) benchmark/what_to_expect.py
 
-bench: $(BENCH_READY) ## Measure everything side by side, into benchmark/RESULTS.md (GROUPS=offline)
+bench: $(BENCH_READY) ## Run the benchmarks (GROUPS=offline for one group), into benchmark/RESULTS.md
 	@$(RUN) benchmark/run.py $(GROUPS)
 
-soak: $(READY) ## Run half an hour of the plant's time with a fault every few seconds (MINUTES)
+soak: $(READY) ## Run half an hour of plant time (MINUTES) with a fault every few seconds
 	@$(RUN) test/soak.py --minutes "$(MINUTES)"
 
-docs: $(READY) ## Make the site of the documentation, into out/docs
+docs: $(READY) ## Build the documentation site, into out/docs
 	@$(RUN) -m sphinx -q -W --keep-going -n doc out/docs && echo 'Open out/docs/index.html'
 
 release: $(RELEASE_READY) ## Check versions and metadata, and build sdist and wheel into out/dist
@@ -107,7 +107,7 @@ release: $(RELEASE_READY) ## Check versions and metadata, and build sdist and wh
 	@! grep -q '@.*[.]invalid' package.xml || echo 'package.xml has no maintainer that can be' \
 	    'reached, and so has what is in out/dist: see CONTRIBUTING.md before you publish it.'
 fuzz: MINUTES := 5
-fuzz: $(READY) ## Feed files and names at random to everything that reads them (MINUTES)
+fuzz: $(READY) ## Feed random files and names to everything that reads them (MINUTES)
 	@$(RUN) test/fuzzing.py --minutes "$(MINUTES)"
 
 lint: $(LINT_READY) ## Check style, types and layers
@@ -115,7 +115,7 @@ lint: $(LINT_READY) ## Check style, types and layers
 	    $(VENV)/bin/python -m $$check || good=0; done; \
 	PYTHONPATH="$(CURDIR)" $(VENV)/bin/lint-imports || good=0; test $$good = 1
 
-clean: ## Remove what was installed and built; results in out/ stay
+clean: ## Remove everything installed and built; keep the results in out/
 	@rm -rf $(VENV) build install log *.egg-info .coverage .hypothesis .*_cache
 	@find blf_dsc_controller sim_plant test -name __pycache__ -prune -exec rm -rf {} +
 

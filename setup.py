@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The package for pip, colcon and ament: two Python packages, their commands and shared files."""
+"""Setup for pip, colcon and ament: two Python packages, their commands and share files."""
 
 import re
 import xml.etree.ElementTree as ET
@@ -10,12 +10,12 @@ from setuptools import find_packages, setup
 NAME = 'blf_dsc_controller'
 SHARE = f'share/{NAME}'
 HERE = Path(__file__).resolve().parent  # colcon --symlink-install runs a link to this file
-# The site of doc/, which the tests build, too. ziamath draws its equations.
+# For the documentation site, which the tests build too; ziamath renders its equations.
 DOCS = ['sphinx>=8', 'myst-parser>=4', 'furo', 'ziamath>=0.12']
 
 
 def version() -> str:
-    """Read the version from where it is written, without importing the package."""
+    """Read the version from the source, without importing the package."""
     text = Path(NAME, '__init__.py').read_text(encoding='utf-8')
     match = re.search(r"^__version__ = '(.+)'$", text, re.MULTILINE)
     if match is None:
@@ -28,7 +28,7 @@ def files(folder: str) -> list[str]:
     return sorted(str(path) for path in Path(folder).glob('*.*') if path.is_file())
 
 
-# Who maintains it, and its addresses, are written in package.xml alone.
+# Maintainer and URLs are given in package.xml only.
 MANIFEST = ET.parse(HERE / 'package.xml').getroot()  # noqa: S314 - our own file
 (MAINTAINER,) = MANIFEST.findall('maintainer')
 
@@ -71,12 +71,12 @@ setup(
         (f'{SHARE}/launch', files('launch')),
     ],
     install_requires=[
-        # Lower bounds: what Ubuntu 24.04 has, which is beneath a sourced Jazzy.
+        # Lower bounds: the versions of Ubuntu 24.04, which a sourced Jazzy runs on.
         'numpy>=1.26',
         'numba>=0.58',
         'mcap>=1.6',
         'rosbags>=0.11',
-        # What the chunks of MCAP files are packed with; mcap brings both.
+        # Compression of the chunks of MCAP files; mcap depends on both.
         'lz4',
         'zstandard',
         'matplotlib>=3.6',
@@ -97,16 +97,16 @@ setup(
             'ros-jazzy-rosgraph-msgs',
             'ros-jazzy-ament-index-python',
         ],
-        # Only for `monte_carlo`: its results are Parquet files; a robot has no use for 50 MB more.
+        # Only for `monte_carlo`, whose results are Parquet files: 50 MB that a robot does not need.
         'monte-carlo': ['pyarrow'],
         'dask': ['pyarrow', 'distributed'],
         'mpi': ['pyarrow', 'mpi4py'],
-        # Only for `bag_report`: what draws its pages, 40 MB.
+        # Only for `bag_report`, to draw its pages: 40 MB.
         'report': ['plotly>=6'],
-        # Only for `view`: what serves its page, 130 MB, most of it to read meshes.
+        # Only for `view`, to serve its page: 130 MB, most of it for reading meshes.
         'view': ['viser>=1.1', 'yourdfpy>=0.0.57', 'trimesh'],
         'parquet': ['pyarrow'],  # only for `bag_export` into Parquet
-        # setuptools: test_package.py builds a wheel without going to the network.
+        # setuptools: test_package.py builds a wheel offline.
         'test': [
             'pytest>=7',
             'pytest-xdist',
@@ -124,9 +124,9 @@ setup(
         ],
         'docs': DOCS,
         'release': ['build', 'twine'],
-        # The peers that `make bench` compares with; Octave and a C compiler are the system's.
+        # The peers of `make bench`; Octave and a C compiler come from the system.
         'bench': ['mujoco', 'drake', 'pin'],
-        # Fixed, because with nearly every rule on, each release of the linter finds something new.
+        # Pinned: with nearly all rules enabled, each release of the linter finds something new.
         'lint': [
             'ruff~=0.17.5',
             'mypy~=2.4.1',
@@ -157,6 +157,6 @@ setup(
             'monte_carlo = blf_dsc_controller.cli.main:monte_carlo',
         ],
     },
-    # The digest of the compiled kernels' cache is taken over the source files on disk.
+    # The cache of compiled kernels is keyed by a digest of the source files on disk.
     zip_safe=False,
 )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The C reference, compiled on the spot and called through ctypes."""
+"""The C reference, compiled on demand and called through ctypes."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from blf_dsc_controller.law.factory import settings_of_config
 from sim_plant.sensors import generator
 
 SOURCE = Path(__file__).with_name('reference.c')
-# The package's kernels are compiled for this very processor too; contraction would change the
-# numbers, which are compared.
+# The package's kernels are compiled for the native processor too; contraction would change the
+# numbers that are compared.
 FLAGS = ('-O3', '-march=native', '-ffp-contract=off')
 COLUMNS = 9
-"""Of a row: xi1 (2), torque (2), theta (5)."""
+"""Columns of a row: xi1 (2), torque (2), theta (5)."""
 
 _N, _P = 2, 3
 
 
 class Reference:
-    """The reference, compiled.
+    """The compiled reference.
 
     Raises:
-        FileNotFoundError: there is no C compiler called cc.
-        subprocess.CalledProcessError: it does not compile.
+        FileNotFoundError: there is no C compiler named cc.
+        subprocess.CalledProcessError: compilation fails.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class Reference:
         self._run.argtypes = (ctypes.c_void_p, ctypes.c_long, ctypes.c_long, *vectors)
 
     def rows(self, controller: ControllerConfig, plant: PlantConfig) -> np.ndarray:
-        """Rows (samples, COLUMNS) of a run without noise; the sample at `duration` is left out."""
+        """Return rows (samples, COLUMNS) of a noise-free run, without the sample at `duration`."""
         settings = _settings(controller, plant)
         rows = np.zeros((round(plant.duration / plant.sample_time), COLUMNS))
         self._call(settings, len(rows), 0, None, rows, None)
@@ -54,10 +54,10 @@ class Reference:
     def study(
         self, controller: ControllerConfig, plants: Sequence[PlantConfig], settled_after: float
     ) -> Callable[[], np.ndarray]:
-        """Runs of `duration` of many plants, to be called; it returns their figures (plants, 4).
+        """Return a function that runs many plants for `duration` and returns figures (plants, 4).
 
         These are the largest abs(xi1)/k_c and the rms of xi1 [rad] from `settled_after` [s] on, of
-        both joints.  The settings are laid out here; a call draws the noise, by numpy, and runs.
+        both joints. The settings are laid out here; a call draws the noise with numpy and runs.
         """
         laid_out = [(_settings(controller, plant), plant) for plant in plants]
 
@@ -83,7 +83,7 @@ class Reference:
 
 
 def _settings(controller: ControllerConfig, plant: PlantConfig) -> ctypes.Structure:
-    """Lay out `struct settings` of the C file: its fields in their order, integers as long."""
+    """Lay out `struct settings` of the C file: the same fields in order, integers as long."""
     law = settings_of_config(controller)
     arm, torque, reference = plant.arm, plant.disturbance, controller.reference
     values: dict[str, Any] = {

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ten thousand arms that change at random, each with learning and without it: `make changes`.
+"""Ten thousand arms that change at random, each with and without learning: `make changes`.
 
-The study `config/monte_carlo_events.yaml` twice, with the same arms and events.  It prints how many
-runs kept the bound, and each that did with one of the two alone; `changes.png` is the picture.  An
-interrupted study resumes.
+Runs the study `config/monte_carlo_events.yaml` twice, with the same arms and events. Prints how
+many runs kept the bound, and each run that kept it only with or only without learning; plots them
+in `changes.png`. An interrupted study resumes.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ PRESET = Path(__file__).parents[1] / 'config/monte_carlo_events.yaml'
 
 
 def studies(config: Path, overrides: dict[str, Any]) -> dict[str, Study]:
-    """Return the study of a file, with learning and without composite learning."""
+    """Return the study of a file, with and without composite learning."""
     study = load_study(config, overrides)
     without = change(study.controller, {'learning.weight': 0.0})
     return {WITH: study, WITHOUT: dataclasses.replace(study, controller=without)}
 
 
 def computed(study: Study, folder: Path) -> Columns:
-    """Results of a study, computed in a folder as far as they are missing."""
+    """Return the results of a study in a folder, computing those that are missing."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     file = folder.with_suffix('.yaml')
     write_study(study, file)
@@ -49,7 +49,7 @@ def computed(study: Study, folder: Path) -> Columns:
 
 
 def exceptions(results: dict[str, Columns]) -> dict[str, list[int]]:
-    """Runs that kept the bound only with learning, and only without."""
+    """Return the runs that kept the bound only with learning, and only without."""
     kept = {name: each['outcome'] == KEPT for name, each in results.items()}
     return {
         WITH: np.flatnonzero(kept[WITH] & ~kept[WITHOUT]).tolist(),
@@ -58,7 +58,7 @@ def exceptions(results: dict[str, Columns]) -> dict[str, list[int]]:
 
 
 def report(study: Study, results: dict[str, Columns], folder: Path) -> str:
-    """Sentences on the results: shares, and each run in which the two differ, with its events."""
+    """Return a text: runs that kept the bound, and each run that differs, with its events."""
     lines = []
     for name, each in results.items():
         kept = int((each['outcome'] == KEPT).sum())
@@ -78,7 +78,7 @@ def report(study: Study, results: dict[str, Columns], folder: Path) -> str:
 
 
 def draw(study: Study, results: dict[str, Columns], path: Path) -> None:
-    """Draw the largest errors of each run against each other, and the rms errors."""
+    """Plot the largest errors with and without learning against each other, and the rms errors."""
     shares = [
         f'{100 * (each["outcome"] == KEPT).mean():.4g} % {name}' for name, each in results.items()
     ]
@@ -119,7 +119,7 @@ def _histogram(axes: Axes, values: np.ndarray, label: str, colour: str) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Compute, print and draw."""
+    """Compute, print and plot the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--config', type=Path, default=PRESET)
     parser.add_argument('--runs', type=int)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the update grows: with joints and unknowns p, the window, and the disturbance columns.
+"""Growth of the update time with joints and unknowns p, window, and disturbance columns.
 
-Every window is full, and the learning has latched it, before anything is measured.
+Measurements begin when the window is full and latched.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from blf_dsc_controller.reference.terms import sampled
 _ROUNDS = 9
 _UPDATES = 2000
 _T = 1e-3  # s
-_NOISE = (1e-4, 0.05)  # rad, rad/s: beside the reference, so that every column is excited
+_NOISE = (1e-4, 0.05)  # rad, rad/s, added to the reference to excite every column
 _ANY_EXCITATION = 1e-12
-"""A threshold that every window passes: short ones and those of many columns, too."""
+"""A threshold that every window passes, even short ones and those with many columns."""
 
 
 def two_link(**changes: Any) -> ControllerConfig:
-    """Recommended settings that learn from any window."""
+    """Return recommended settings that learn from any window."""
     values = {
         'learning.excitation_threshold': _ANY_EXCITATION,
         'learning.change_detection': False,  # the states are noise, which no arm explains
@@ -38,7 +38,7 @@ def two_link(**changes: Any) -> ControllerConfig:
 
 
 def chain(n: int, **changes: Any) -> ControllerConfig:
-    """The same, spread over a planar arm of n links, with a window of 1 s."""
+    """Return the same settings for a planar arm of n links, with a window of 1 s."""
     default: Mapping[str, Any] = flatten(ControllerConfig())
     values: dict[str, Any] = {'model': 'planar_chain', 'joints': [f'joint{i}' for i in range(n)]}
     for one in parameters(ControllerConfig):
@@ -57,13 +57,13 @@ def chain(n: int, **changes: Any) -> ControllerConfig:
 
 
 def of_urdf(preset: str) -> ControllerConfig:
-    """Controller of a preset with the arm of a URDF, which learns from any window."""
+    """Return the controller of a preset with a URDF, which learns from any window."""
     config = load_loop(preset).controller
     return change(config, {'learning.change_detection': False})
 
 
 def label(config: ControllerConfig) -> str:
-    """Size of the problem; p counts everything that is estimated, as in m = p + columns."""
+    """Describe the size of the problem; its p counts all estimates, the m of the law."""
     law = controller_of(config).settings
     columns = f'{law.p} of the arm + {law.m - law.p} of disturbances'
     return f'n = {law.n} joints, p = {law.m} unknowns ({columns})'
@@ -73,9 +73,9 @@ BASE = 'two-link arm, p = 5'
 
 
 def updates(config: ControllerConfig) -> Callable[[], int]:
-    """Work of some thousand updates along the reference, begun when the window is full.
+    """Return a function that does some thousand updates along the reference with a full window.
 
-    Raises RuntimeError if nothing is learned from it then.
+    Raises RuntimeError if nothing is learned from that window.
     """
     controller: Controller = controller_of(config)
     law = controller.settings
@@ -100,7 +100,7 @@ def updates(config: ControllerConfig) -> Callable[[], int]:
 
 
 def measure() -> Iterator[Ratio]:
-    """Time per update relative to the two-link arm's."""
+    """Measure the time per update relative to the two-link arm's."""
     wide: dict[str, Any] = {'learning__viscous': True, 'learning__coulomb': True}
     tones = {'learning__viscous': True, 'learning__frequencies': [1.0, 2.0]}
     columns = (chain(7), chain(7, **wide), chain(7, **tones))

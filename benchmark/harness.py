@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ratios measured side by side, and contestants that are processes.
+"""Ratios of interleaved measurements, and contestants that run as processes.
 
-On a shared machine only what is measured in turns can be compared.
+On a shared machine only interleaved measurements can be compared.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ import numpy as np
 
 from blf_dsc_controller.errors import BlfDscError
 
-_START_UP = 120.0  # s, kernels may have to be compiled
+_START_UP = 120.0  # s, including compilation of kernels
 _ENDING = 20.0  # s from SIGINT to the end
-_TAIL = 2000  # characters of stderr that an error repeats
-_CPUCLOCK_SCHED = 2  # as clock_getcpuclockid(3) does it: nanoseconds, where /proc has hundredths
+_TAIL = 2000  # characters of stderr quoted in an error
+_CPUCLOCK_SCHED = 2  # as clock_getcpuclockid(3) does: in ns, where /proc has 10 ms
 
 
 class Ratio(NamedTuple):
-    """How much more than the baseline of its group something takes."""
+    """Ratio of a contestant's measurement to the baseline of its group."""
 
     group: str
     what: str  # the contestant
@@ -42,16 +42,16 @@ class Ratio(NamedTuple):
 def ratio(
     group: str, what: str, baseline: str, mine: np.ndarray, theirs: np.ndarray, note: str = ''
 ) -> Ratio:
-    """Ratio of two series (rounds,) that were measured in turns."""
+    """Return the ratio of two interleaved series (rounds,)."""
     each = mine / theirs
     median, low, high = float(np.median(each)), float(each.min()), float(each.max())
     return Ratio(group, what, baseline, median, low, high, note)
 
 
 def interleaved(contestants: Mapping[str, Callable[[], int]], rounds: int) -> dict[str, np.ndarray]:
-    """Seconds per unit of work (rounds,) of each contestant, all of them in each round.
+    """Return seconds per unit of work (rounds,) of each contestant, all run in each round.
 
-    A contestant does its work and returns how many units that was.  The first round is a warm-up.
+    A contestant does its work and returns the number of units. The first round is a warm-up.
     """
     seconds: dict[str, list[float]] = {name: [] for name in contestants}
     for counted in range(-1, rounds):
@@ -66,23 +66,23 @@ def interleaved(contestants: Mapping[str, Callable[[], int]], rounds: int) -> di
 
 
 class Watched(Protocol):
-    """What is waited for: a process, or a node in this one."""
+    """Contestant to wait for: a process, or a node in this one."""
 
     name: str
 
     def check(self) -> None:
-        """Raise ContestantError if it cannot go on."""
+        """Raise ContestantError if it cannot continue."""
 
     def cpu_time(self) -> float:
-        """CPU time so far [s]."""
+        """Return the CPU time so far [s]."""
 
 
 class ContestantError(BlfDscError):
-    """A contestant has ended too early, or does not respond."""
+    """A contestant has exited early, or does not respond."""
 
 
 class Contestant:
-    """A process of this Python: a script or `-m module`, and its arguments."""
+    """A process of this Python interpreter: a script or `-m module`, and its arguments."""
 
     def __init__(
         self, name: str, arguments: Sequence[str], environment: Mapping[str, str] | None = None
@@ -97,7 +97,7 @@ class Contestant:
         )
 
     def cpu_time(self) -> float:
-        """User and system time of the process so far [s]."""
+        """Return the user and system time of the process so far [s]."""
         return time.clock_gettime(~self._process.pid << 3 | _CPUCLOCK_SCHED)
 
     def check(self) -> None:
@@ -109,7 +109,7 @@ class Contestant:
             raise ContestantError(f'{self.name} ended with exit code {code}:\n{errors}')
 
     def end(self) -> None:
-        """End the process as Ctrl-C does, and by force where that is not enough."""
+        """End the process as Ctrl-C does, or kill it if that is not enough."""
         self._process.send_signal(signal.SIGINT)
         try:
             self._process.wait(_ENDING)
@@ -132,13 +132,13 @@ def wait_for(
         for contestant in contestants:
             contestant.check()
         if time.perf_counter() - begin > timeout:
-            raise ContestantError(f'waited {timeout:g} s for {what} in vain')
+            raise ContestantError(f'timed out after {timeout:g} s waiting for {what}')
         pause()
 
 
 @contextmanager
 def own_graph() -> Iterator[None]:
-    """Let the ROS nodes of this process and of its contestants hear nobody else."""
+    """Isolate the ROS nodes of this process and of its contestants from all others."""
     from blf_dsc_controller.cli.session import own_domain
 
     with own_domain() as domain:

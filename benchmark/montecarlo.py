@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A Monte Carlo study: throughput of a core beside C, and of two processes beside one.
+"""A Monte Carlo study: throughput of a core against C, and of two processes against one.
 
 Both sides run the same drawn plants, with friction, noise and delay, and keep the largest and the
-rms error of each run.  The package also draws the plants, and keeps the other figures of a study;
-the reference finds its settings laid out.  Neither writes anything.
+rms error of each run. The package also draws the plants and keeps the other figures of a study;
+the reference gets its settings already laid out. Neither writes anything.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from blf_dsc_controller.monte_carlo.study import (
 )
 
 _DURATION = 10.0  # s
-_RUNS = 50  # of each round beside C
-_CHUNKS = 100  # of each round of the engine
-_CHUNK = 4  # runs, few: who ends first waits for at most one chunk of the other
+_RUNS = 50  # per round against C
+_CHUNKS = 100  # per round of the engine
+_CHUNK = 4  # runs; few, so that the first to finish waits for at most one chunk
 _ROUNDS = 9
 _C = 'C -O3, in a loop'
 _PACKAGE = 'run_chunk'
@@ -42,7 +42,7 @@ _ERRORS = ('max_error_ratio', 'rms_error_rad')
 
 
 def measure() -> Iterator[Ratio]:
-    """Runs a second relative to C, and to one process."""
+    """Measure runs per second relative to C, and to one process."""
     study = preset()
     warm_up(study)
     yield from _beside_c(study)
@@ -50,7 +50,7 @@ def measure() -> Iterator[Ratio]:
 
 
 def preset() -> Study:
-    """The preset, with the duration of this benchmark, of which the last fifth has settled."""
+    """Return the preset with this benchmark's duration, settled in its last fifth."""
     study = load_study(locate('monte_carlo'))
     plant = replace(study.plant, duration=_DURATION)
     settings = replace(study.settings, settled_after=0.8 * _DURATION, moments=())
@@ -60,7 +60,7 @@ def preset() -> Study:
 
 
 def disagreement(study: Study) -> float:
-    """Largest relative difference of an error, the largest or rms, between the package and C."""
+    """Return the largest relative difference in largest and rms errors between package and C."""
     theirs = _reference(study)()
     columns = run_chunk(study, 0, _RUNS)
     names = [f'{of}.{joint}' for of in _ERRORS for joint in study.plant.joints]
@@ -99,7 +99,7 @@ def _processes(study: Study) -> Iterator[Ratio]:
 
 
 def _pool(study: Study, stack: ExitStack, workers: int) -> Callable[[], int]:
-    """Work of the engine with so many workers, which are there and have run something."""
+    """Return the engine's work on this many workers, which stay alive between rounds."""
     engine = engines.processes(workers)
     executor: Executor = stack.enter_context(engine.open())
     engine = engine._replace(open=lambda: nullcontext(executor))

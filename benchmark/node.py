@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller node beside a node that echoes a torque at once.
+"""The controller node against a null node, which echoes a torque immediately.
 
-This process stands in for the plant: it publishes the joint states of a recorded run and takes the
-torques.  Every contestant is started anew in each round: a process of its own, or a node of this
-process, on the same executor.
+This process stands in for the plant: it publishes the joint states of a recorded run and receives
+the torques. Every contestant is restarted in each round: as a process of its own, or as a node of
+this process, on the same executor.
 
-There are two null nodes: one as users of rclpy write it, and one that passes serialised messages
-without a look at them, which is the least that Python can do.
+There are two null nodes: a typical rclpy node, and one that passes serialised messages without
+decoding them, the least that Python can do.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _ROUNDS = 5
 _STEPS = 5000
 _WARM_UP = 500
 _START = 1_000_000_000
-_SETTLING = 0.5  # s until both sides have found each other, or a message has come
+_SETTLING = 0.5  # s for discovery, or for a message to arrive
 _PATIENCE = 60.0  # s for one torque
 _NULL = 'null node, serialised messages'
 _NULL_TYPED = 'null node'
@@ -53,7 +53,7 @@ _HERE = Path(__file__).parent
 class Run(NamedTuple):
     """One contestant in one round."""
 
-    latency: np.ndarray  # (_STEPS,) s, state published to torque received
+    latency: np.ndarray  # (_STEPS,) s, from state published to torque received
     elapsed: float  # s
     cpu: float  # s of the node's process
 
@@ -63,12 +63,12 @@ def _telemetry_of(name: str) -> Telemetry:
 
 
 def _silent(context: Any) -> dict[str, Any]:
-    """Options of a node whose log nobody follows; nodes of one name would quarrel over it."""
+    """Return options of a node without /rosout, on which nodes of one name would conflict."""
     return {'context': context, 'enable_rosout': False}
 
 
 class Guest:
-    """A contestant that is a node of this process; its CPU time is that of both sides."""
+    """A contestant that is a node of this process; its CPU time includes the stand-in's."""
 
     def __init__(self, name: str, context: Any) -> None:
         import rclpy
@@ -86,21 +86,21 @@ class Guest:
             self.node: Any = rclpy.create_node(topics.CONTROLLER, **_silent(context))
             echo(self.node, 'raw')
         else:
-            parameter: Any = Parameter  # rclpy's, without types
+            parameter: Any = Parameter  # untyped in rclpy
             telemetry = vars(_telemetry_of(name)).items()
             overrides = [parameter(f'telemetry.{key}', value=value) for key, value in telemetry]
             self.node = ControllerNode(parameter_overrides=overrides, **_silent(context))
 
     def check(self) -> None:
-        """Nothing to be seen: an error of the node is one of this process."""
+        """Do nothing: an error of the node is raised in this process."""
 
     def cpu_time(self) -> float:
-        """CPU time of this process [s]."""
+        """Return the CPU time of this process [s]."""
         return time.process_time()
 
 
 class StandIn:
-    """Stands in for the plant: publishes recorded states and waits for torques."""
+    """Stand-in for the plant that publishes recorded states and waits for torques."""
 
     def __init__(self, messages: Sequence[bytes]) -> None:
         import rclpy
@@ -132,11 +132,11 @@ class StandIn:
         self.has_torque = True
 
     def play(self, contestants: Sequence[Watched], period: float) -> Run:
-        """Play all states, each `period` [s] after the last; 0: each when the last has its torque.
+        """Publish all states, one per `period` [s] or, if 0, each after the previous torque.
 
-        The last of the contestants is the node; the others are beside it.
+        The last of the contestants is the measured node; the others run beside it.
         """
-        takers = len(contestants)  # a recorder takes the states, too
+        takers = len(contestants)  # a recorder subscribes to the states, too
         self._wait_for(lambda: self.publisher.get_subscription_count() == takers, contestants)
         self._wait_for(lambda: self.node.count_publishers(self.commands) == 1, contestants)
         self._spin_for(_SETTLING)
@@ -168,7 +168,7 @@ class StandIn:
         return Run(latency[_WARM_UP:], elapsed, node.cpu_time() - busy)
 
     def _greet(self, node: Watched) -> None:
-        """Send the first state until its torque comes: a reader half matched loses messages."""
+        """Send the first state until its torque arrives: a half-matched reader loses messages."""
         self.has_torque = False
         end = time.perf_counter() + _PATIENCE
         while time.perf_counter() < end:
@@ -186,7 +186,7 @@ class StandIn:
 
     @contextmanager
     def host(self, name: str) -> Iterator[list[Guest]]:
-        """A contestant as a node of this process."""
+        """Run a contestant as a node of this process."""
         guest = Guest(name, self.context)
         nodes = [node for node in (guest.listener, guest.node) if node is not None]
         for node in nodes:
@@ -196,13 +196,13 @@ class StandIn:
         finally:
             for node in nodes:
                 self.executor.remove_node(node)
-            self.executor.spin_once(timeout_sec=0.1)  # what was on its way to the node runs out
+            self.executor.spin_once(timeout_sec=0.1)  # drains pending events of the nodes
             for node in nodes:
                 node.destroy_node()
             guest.node = guest.listener = None
 
     def close(self) -> None:
-        """End the arm's node, and leave no participant to be heard in a later round."""
+        """Destroy the stand-in's node, so that no participant is left in a later round."""
         self.executor.remove_node(self.node)
         self.node.destroy_node()
         self.context.try_shutdown()
@@ -210,7 +210,7 @@ class StandIn:
         gc.collect()
 
     def left_alone(self) -> None:
-        """Wait until the last contestant has gone."""
+        """Wait until the last contestant has disappeared."""
         self._wait_for(lambda: self.publisher.get_subscription_count() == 0)
         self._wait_for(lambda: self.node.count_publishers(self.commands) == 0)
 
@@ -220,7 +220,7 @@ class StandIn:
 
 
 def measure() -> Iterator[Ratio]:
-    """Latency, CPU and lock-step rate of the controller node relative to the null node."""
+    """Measure latency, CPU and lock-step rate of the controller relative to the null nodes."""
     for preset, group in _PRESETS.items():
         yield from _measure(preset, group)
 
@@ -241,8 +241,8 @@ def _measure(preset: str, group: str) -> Iterator[Ratio]:
                         runs[name].append(arm.play(these, period))
                     arm.left_alone()
             for name, each in together.items():
-                # An arm of its own: readers within its process hear nothing from a publisher that
-                # has sent more than it keeps for those who come late.
+                # A new stand-in: readers within its process receive nothing from a publisher that
+                # has sent more than its history keeps for late joiners.
                 with closing(StandIn(states)) as here, here.host(name) as guests:
                     each.append(here.play(guests, 0.0))
     yield from _real_time(f'{group}, real time at 1 kHz', real)
@@ -272,7 +272,7 @@ def _rates(group: str, runs: dict[str, list[Run]]) -> Iterator[Ratio]:
 
 
 def _pairs(runs: Collection[str]) -> Iterator[tuple[str, str]]:
-    """Each contestant beside each null node."""
+    """Yield each contestant with each null node as its baseline."""
     for base in (_NULL_TYPED, _NULL):
         if base in runs:
             yield from ((name, base) for name in runs if name not in (_NULL_TYPED, _NULL))
@@ -280,7 +280,7 @@ def _pairs(runs: Collection[str]) -> Iterator[tuple[str, str]]:
 
 @contextmanager
 def _started(name: str, config: ControllerConfig, path: Path) -> Iterator[list[Contestant]]:
-    """Processes of a contestant: its node, after the subscriber or recorder that it is to have."""
+    """Start a contestant's processes: its subscriber or recorder, if it has one, then its node."""
     commands = [_command(name, config, path.with_suffix('.yaml'))]
     if name == _RECORDED:
         module = 'blf_dsc_controller.nodes.recorder_node'

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The least a node can do: echo a torque at once, or throw messages away.
+"""The least a node can do: echo a torque immediately, or discard messages.
 
 Usage: python null_node.py typed|raw      echo, typed as usual in rclpy, or serialised
        python null_node.py listen         subscribe to states and telemetry in serialised form
-       python null_node.py drop TOPICS    subscribe to as many topics in serialised form
+       python null_node.py drop TOPICS    subscribe to this many topics in serialised form
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from blf_dsc_controller.nodes.raw_subscriptions import compatible_profile
 
 
 def echo(node: Any, kind: str) -> None:
-    """Let a node respond to every joint state with the same torque, `typed` or `raw`."""
+    """Make a node respond to every joint state with the same torque, `typed` or `raw`."""
     publisher = node.create_publisher(
         Float64MultiArray, topics.COMMANDS.relative, qos_profile(topics.COMMANDS.offered)
     )
@@ -51,21 +51,21 @@ def echo(node: Any, kind: str) -> None:
 
 
 def listen(node: Any) -> None:
-    """Let a node subscribe to joint states and the controller's streams, and do nothing."""
+    """Make a node discard joint states and the controller's streams."""
     for topic in (topics.JOINT_STATES, *STREAMS):
         profile = compatible_profile([topic.offered], topic.offered.depth)
         node.create_subscription(JointState, topic.relative, lambda _: None, profile, raw=True)
 
 
 def drop(node: Any, count: int) -> None:
-    """Let a node subscribe to topics, with the QoS of the recorder, and do nothing."""
+    """Make a node discard the messages of `count` topics, with the recorder's QoS."""
     profile = compatible_profile([topics.STREAM], RecorderConfig().queue_depth)
     for i in range(count):
         node.create_subscription(JointState, f'topic{i}', lambda _: None, profile, raw=True)
 
 
 def main() -> None:
-    """Run until the process is ended."""
+    """Run until the process is interrupted."""
     rclpy.init(args=sys.argv)
     kind, *arguments = sys.argv[1:]
     node = rclpy.create_node('listener' if kind == 'listen' else topics.CONTROLLER)

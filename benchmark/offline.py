@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop offline, beside the same in C, numpy and other people's simulators."""
+"""The offline closed loop against the same in C, numpy and third-party simulators."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ GROUP = 'closed loop offline'
 PACKAGE = 'blf_dsc_controller'
 C = 'C -O3'
 _LONG = 60.0  # s
-_SHORT = 8.0  # s, past the moment where learning begins
+_SHORT = 8.0  # s, long enough for learning to begin
 _AGREEMENT = 10.0  # s
 _ROUNDS = 5
 
@@ -38,13 +38,13 @@ _PEERS = {
 
 
 def measure() -> Iterator[Ratio]:
-    """Time per closed-loop millisecond relative to the package; C and Octave where installed."""
+    """Measure the time per simulated millisecond against C and, where installed, the peers."""
     yield from _beside_c()
     yield from _beside_peers()
 
 
 def disagreement() -> float:
-    """Largest difference to the C reference over 10 s in errors [rad], torques and estimates."""
+    """Return the largest difference to C over 10 s in errors [rad], torques and estimates."""
     plant = replace(loops.PLANT, duration=_AGREEMENT)
     rows = Reference().rows(loops.CONTROLLER, plant)
     record = simulate_law(loops.CONTROLLER, plant)

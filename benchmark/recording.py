@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CPU of the recorder per message beside a raw subscriber that writes nothing."""
+"""CPU time of the recorder per message against a raw subscriber that writes nothing."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from blf_dsc_controller.messages.topics import STREAM
 
 _ROUNDS = 5
 _TOPICS = 5
-_MESSAGES = 5000  # of each topic, at 1 kHz
-_SETTLING = 1.0  # s until both sides have found each other
+_MESSAGES = 5000  # per topic, at 1 kHz
+_SETTLING = 1.0  # s for discovery
 _SUBSCRIBER = 'raw subscriber, nothing written'
 _RECORDERS = {'recorder': 'none', 'recorder, zstd': 'zstd'}
 
 
 def measure() -> Iterator[Ratio]:
-    """CPU time per message relative to the raw subscriber."""
+    """Measure the CPU time per message relative to the raw subscriber."""
     with own_graph():
         times = _cpu_times()
     for name in _RECORDERS:
@@ -33,7 +33,7 @@ def measure() -> Iterator[Ratio]:
 
 
 def _cpu_times() -> dict[str, np.ndarray]:
-    """CPU time (rounds,) [s] of each contestant."""
+    """Return the CPU time (rounds,) [s] of each contestant."""
     import rclpy
 
     context = rclpy.Context()
@@ -61,7 +61,7 @@ def _command(name: str, bag: Path) -> list[str]:
 
 
 def _play(node: Any, contestant: Contestant) -> float:
-    """CPU time [s] that a contestant spends on all messages."""
+    """Return the CPU time [s] that a contestant spends on all messages."""
     from sensor_msgs.msg import JointState
 
     from blf_dsc_controller.nodes.endpoints import qos_profile

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`bag_replay` beside the reader of the package mcap, which only hands out the messages."""
+"""`bag_replay` against the reader of the package mcap, which only yields the messages."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _REPLAY = 'bag replayed through the law and compared'
 
 
 def measure() -> Iterator[Ratio]:
-    """Messages a second relative to the reader alone, of a bag of all that a run says."""
+    """Measure messages per second relative to the reader alone, on a bag of all topics."""
     controller, plant = ControllerConfig(), PlantConfig(duration=_DURATION)
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder, 'bag')
@@ -52,7 +52,7 @@ def measure() -> Iterator[Ratio]:
 
 
 def _iterated(bag: Path) -> int:
-    """Messages of a bag of one file, handed out one after the other."""
+    """Iterate over the messages of a bag of one file and return their number."""
     (file,) = bag.glob('*.mcap')
     with file.open('rb') as stream:
         return sum(1 for _ in make_reader(stream).iter_messages(log_time_order=False))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All benchmarks: measured in turns in one run, written as a table and a picture.
+"""Run all benchmarks, with interleaved measurements, and write a table and a picture.
 
 Usage: python benchmark/run.py [GROUP ...]   (--help lists the groups)
 """
@@ -36,7 +36,7 @@ _PACKAGES = ('numpy', 'numba', 'scipy', 'mujoco', 'drake', 'pin', 'ros-jazzy-rcl
 
 
 def machine() -> str:
-    """What this is measured on, without its name."""
+    """Describe the machine and the versions, without the host name."""
     model = 'unknown processor'
     for line in Path('/proc/cpuinfo').read_text().splitlines():
         if line.startswith('model name'):
@@ -54,7 +54,7 @@ def machine() -> str:
 
 
 def table(rows: list[Ratio]) -> str:
-    """Markdown, a table for each group."""
+    """Return Markdown with a table for each group."""
     parts = []
     for group, members in groupby(rows, key=lambda row: row.group):
         parts.append(
@@ -69,7 +69,7 @@ def table(rows: list[Ratio]) -> str:
 
 
 def draw(rows: list[Ratio], path: Path) -> None:
-    """All ratios with their ranges on a logarithmic axis, a panel for each group and baseline."""
+    """Plot all ratios and ranges on a logarithmic axis, one panel per group and baseline."""
     panels = [list(panel) for _, panel in groupby(rows, key=lambda row: (row.group, row.baseline))]
     heights = [len(panel) + 1.0 for panel in panels]
     figure = Figure(figsize=(11.0, 0.25 * sum(heights) + 0.3 * len(panels)), layout='constrained')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the command to the first torque, with compiled kernels at hand and without."""
+"""Time from the command to the first torque, with and without cached kernels."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _POLL = 0.002  # s
 
 
 def measure() -> Iterator[Ratio]:
-    """Time to the first torque relative to the null node's."""
+    """Measure the time to the first torque relative to the null node's."""
     seconds: dict[str, list[float]] = {name: [] for name in (_NULL, _WARM, _COLD)}
     with own_graph(), tempfile.TemporaryDirectory() as caches:
         _first_torque(_WARM, f'{caches}/warm')

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller node with the live view beside it, and without.
+"""The controller node with and without the live view.
 
-The page is closed: what the controller pays for are the subscriptions; the view draws in a process
-of its own, and only while somebody looks.
+No browser has the page open: the controller pays only for the subscriptions; the view draws in a
+process of its own, and only while a page is open.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _COMMAND = ('-m', 'blf_dsc_controller.view.node', '--ros-args', '-p', 'port:=848
 
 
 def measure() -> Iterator[Ratio]:
-    """Latency and CPU of the controller beside the view relative to those without it."""
+    """Measure latency and CPU of the controller with the view relative to those without it."""
     loop = load_loop('recommended')
     runs: dict[str, list[Run]] = {name: [] for name in (*_BESIDE, _VIEWED)}
     states = _recorded_states(loop)
@@ -52,7 +52,7 @@ def measure() -> Iterator[Ratio]:
 
 @contextmanager
 def _viewed(name: str, config: ControllerConfig, path: Path) -> Iterator[list[Contestant]]:
-    """Processes of the controller, after that of the view if it is to have one."""
+    """Start the controller's processes, after that of the view if it is measured."""
     views = [Contestant('view', _COMMAND)] if name == _VIEWED else []
     try:
         with _started(_UNHEARD if views else name, config, path) as nodes:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The figures of doc/arms.md for the presets `panda` and `ur5e`: `make expect`.
 
-Largest errors of any joint, the worst of several truths with noise of their own; the law runs past
-its bound.
+Largest errors of any joint, the worst of several truths, each with its own noise; the law
+continues outside its bound.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ EXAMPLE = Path(__file__).parents[1] / 'examples/mujoco_plant'
 def loop_of(
     name: str, seed: int, pick_up: float, kg: float, changes: Mapping[str, Any]
 ) -> LoopConfig:
-    """Loop of a preset whose arm of this truth picks up so many kg 2 s before the end."""
+    """Return the loop of a preset whose arm, with this truth, picks up `kg` 2 s before the end."""
     loop = load_loop(name)
     plant = {
         'duration': pick_up + 2.0,
@@ -55,7 +55,7 @@ def loop_of(
 def simulated(
     name: str, seed: int, pick_up: float, kg: float, changes: Mapping[str, Any] | None = None
 ) -> tuple[Record, np.ndarray]:
-    """Run of such a loop, and the largest true error of any joint in each sample (k,) [mrad]."""
+    """Run such a loop; also return the largest true joint error of each sample (k,) [mrad]."""
     loop = loop_of(name, seed, pick_up, kg, changes or {})
     record = simulate_law(loop.controller, loop.plant)
     settings = record.controller.settings
@@ -66,7 +66,7 @@ def simulated(
 
 
 def in_mujoco(name: str, seed: int, changes: Mapping[str, Any]) -> np.ndarray:
-    """Largest measured error of any joint in each sample (k,) [mrad]; 2 kg at 15 s."""
+    """Return the largest measured joint error of each sample (k,) [mrad]; 2 kg at 15 s."""
     sys.path.insert(0, str(EXAMPLE))
     example = importlib.import_module('mujoco_plant')
     loop = loop_of(name, seed, 15.0, 2.0, changes)
@@ -80,14 +80,14 @@ def in_mujoco(name: str, seed: int, changes: Mapping[str, Any]) -> np.ndarray:
 
 
 def torque_error(record: Record, unseen: np.ndarray, row: int) -> float:
-    """Torque error of the learned model at a sample, on rows of H (k, p) [%]."""
+    """Return the torque error [%] of the learned model at a sample, on rows of H (k, p)."""
     p = unseen.shape[1]
     P, learned = record.truths[row, :p], record.sample(row).estimate[:p]
     return float(100.0 * np.linalg.norm(unseen @ (learned - P)) / np.linalg.norm(unseen @ P))
 
 
 def figures(name: str, seed: int) -> dict[str, float]:
-    """Figures of one truth."""
+    """Return the figures of one truth."""
     unseen = torque_rows(trial(name, 1).controller)
     record, errors = simulated(name, seed, 20.0, 2.0)
     _, ideal = simulated(name, seed, 13.0, 0.0, IDEAL)
@@ -109,7 +109,7 @@ def figures(name: str, seed: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Print the worst of each figure."""
+    """Print the worst case of each figure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--truths', type=int, default=5)
     truths = range(parser.parse_args().truths)

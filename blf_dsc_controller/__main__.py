@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m blf_dsc_controller` is the command `blf_dsc`."""
+"""Run the command `blf_dsc` with `python -m blf_dsc_controller`."""
 
 import sys
 

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The errors a user of the package can meet. One base, so one `except` catches them all."""
+"""Errors of the package; one `except` of their common base class catches them all."""
 
 from typing import Any
 
 
 class BlfDscError(Exception):
-    """Base of every error this package raises on purpose; it passes between processes."""
+    """Base class of all errors that this package raises on purpose; can be pickled."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Message and attributes, whatever the constructor takes."""
+        """Pickle message and attributes, whatever the signature of the constructor."""
         return Exception.__new__, (type(self), *self.args), self.__dict__
 
 
 class ConfigurationError(BlfDscError):
-    """A configuration that cannot be run; the message lists every problem found."""
+    """Invalid configuration; the message lists every problem found."""
 
     def __init__(self, problems: list[str], source: str = '') -> None:
         self.problems = problems
@@ -25,11 +25,11 @@ class ConfigurationError(BlfDscError):
 
 
 class StartError(BlfDscError):
-    """The law cannot take the arm over as it moves now."""
+    """The law cannot take over the arm in its present state."""
 
 
 class OutsideBarrierError(StartError):
-    """The tracking error of a joint is not inside its bound, where the law is not defined."""
+    """The tracking error of a joint is outside its bound, where the law is undefined."""
 
     def __init__(self, joint: str, error: float, bound: float) -> None:
         self.joint = joint
@@ -42,21 +42,21 @@ class OutsideBarrierError(StartError):
 
 
 class VelocityMismatchError(StartError):
-    """A joint differs too much from its reference in velocity: it would leave the bound."""
+    """The velocity of a joint is so far from the reference that it would leave the bound."""
 
     def __init__(self, joint: str, difference: float, limit: float) -> None:
         self.joint = joint
         self.difference = difference
         self.limit = limit
         super().__init__(
-            f'joint {joint!r} starts {difference:+.6g} rad/s faster than the reference, but only '
-            f'{limit:.6g} rad/s can be made up within its bound at limits.acceleration: start with '
+            f'joint {joint!r} starts {difference:+.6g} rad/s from the velocity of the reference; '
+            f'at limits.acceleration {limit:.6g} rad/s can be made up within its bound: start with '
             'the velocity of the reference, or enable the approach (approach.enabled)'
         )
 
 
 class MissingExtraError(BlfDscError):
-    """A package of one of the extras is not installed."""
+    """A package from one of the optional extras is not installed."""
 
     def __init__(self, module: str, extra: str, purpose: str) -> None:
         self.module = module

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One run of the closed loop as arrays over the samples of its joint states."""
+"""One run of the closed loop, as arrays over the samples of its joint states."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ Stamps = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Series:
-    """Values by name over stamps of their own."""
+    """Named values with their own stamps."""
 
     names: tuple[str, ...]
     stamp: Stamps  #: (m,) ns, increasing
     values: Floats  #: (m, number of names)
 
     def select(self, names: Sequence[str]) -> Floats:
-        """Columns of these names, (m, number of `names`)."""
+        """Return the columns of these names, (m, number of `names`)."""
         return self.values[:, [self.names.index(name) for name in names]]
 
     def column(self, name: str) -> Floats:
-        """Values of one name, (m,)."""
+        """Return the values of one name, (m,)."""
         return self.values[:, self.names.index(name)]
 
     def held(self, stamp: Stamps) -> Floats:
-        """Last values up to each of the given stamps; the first ones before they begin."""
+        """Return the last values at or before each stamp; the first values for earlier stamps."""
         index = np.searchsorted(self.stamp, stamp, side='right') - 1
         return self.values[np.maximum(index, 0)]
 
     def exact(self, stamp: Stamps) -> Floats:
-        """Values at exactly these stamps, NaN where there are none."""
+        """Return the values at exactly these stamps, NaN where there are none."""
         index = np.minimum(np.searchsorted(self.stamp, stamp), self.stamp.size - 1)
         values = self.values[index]
         values[self.stamp[index] != stamp] = np.nan
@@ -48,24 +48,24 @@ class Stop(NamedTuple):
 
     stamp: int  #: ns, of the last joint state before it
     reason: str  #: as `reason` on ~/state
-    text: str  #: with the figures
+    text: str  #: sentence with the numbers
     until: int | None = None
-    """ns, of the last joint state before the next start; the end of the run"""
+    """ns, of the last joint state before the next start; None: the end of the run"""
 
 
 Regressor = Callable[[Floats, Floats, Floats, Floats, Floats], None]
-"""Fills H (n, p) of (q, dq, v, a), (n,) each: H P = M(q) a + C(q, dq) v + G(q) [N m]."""
+"""Writes H (n, p) for (q, dq, v, a), (n,) each: H P = M(q) a + C(q, dq) v + G(q) [N m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class LearnedArm:
-    """What gives the estimates of an arm one scale, where they are kg beside kg m^2."""
+    """Scales of the estimates of an arm, whose units are mixed (kg and kg m^2)."""
 
     units: Mapping[str, str]  # of each estimate by name
     deviations: Mapping[str, float]  # standard deviations of their prior, in these units
     regressor: Regressor
     base: tuple[tuple[str, ...], Regressor] | None = None
-    """Base parameters and their regressor, if others are learned."""
+    """Names of the base parameters and their regressor, if other parameters are learned."""
 
 
 @dataclass(frozen=True)
@@ -89,8 +89,8 @@ class Run:
     message_counts: Mapping[str, int] = field(default_factory=dict)
     rejected: Mapping[str, str] = field(default_factory=dict)  #: disturbance columns, and why
     stops: tuple[Stop, ...] = ()
-    arm: LearnedArm | None = None  #: of a URDF
-    learns: bool = True  #: from the prediction error; false for a law that does not use it
+    arm: LearnedArm | None = None  #: from a URDF
+    learns: bool = True  #: whether the law uses the prediction error
     effort: Floats | None = None  #: (N, n) N m, as measured
     reference_velocity: Floats | None = None  #: (N, n) rad/s
     xi2: Floats | None = None  #: (N, n) rad/s
@@ -106,7 +106,7 @@ class Run:
         return float(self.time[-1])
 
     def time_of(self, stamp: Stamps) -> Floats:
-        """Time since the first sample of any stamps [s]."""
+        """Return the times of any stamps since the first sample [s]."""
         return np.asarray((stamp - self.stamp[0]) * 1e-9, dtype=np.float64)
 
     @property

@@ -38,13 +38,13 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 'namespace',
                 default_value='',
-                description='namespace of all nodes; a parameter file speaks to a node in any '
-                'namespace under the key /**/NODE',
+                description='namespace of all nodes; in a parameter file, the key /**/NODE '
+                'matches a node in any namespace',
             ),
             DeclareLaunchArgument(
                 'bag',
                 default_value='',
-                description='folder to record into, which must not exist; empty: no recording',
+                description='folder to record into, which must not exist yet; empty: no recording',
             ),
             DeclareLaunchArgument(
                 'markers',
@@ -56,7 +56,7 @@ def generate_launch_description() -> LaunchDescription:
                 'rviz',
                 default_value='false',
                 choices=['false', 'true'],
-                description='open RViz on the arm, with its markers',
+                description='show the arm and its markers in RViz',
             ),
             OpaqueFunction(function=nodes),
         ]
@@ -64,13 +64,13 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def nodes(context: LaunchContext) -> list[Node]:
-    """Make the nodes, once the arguments are known."""
+    """Create the nodes once the arguments are known."""
     config, mode, namespace, bag, markers, rviz = (
         LaunchConfiguration(name).perform(context)
         for name in ('config', 'mode', 'namespace', 'bag', 'markers', 'rviz')
     )
     file = str(locate(config))
-    # The first sample is to be recorded too: nobody starts before the recorder listens.
+    # The first sample must be recorded too, so the loop starts after the recorder subscribes.
     of_loop = {'wait_for_subscribers': 1} if bag else {}
     of_plant = of_loop | ({'mode': mode} if mode else {})
 
@@ -78,8 +78,8 @@ def nodes(context: LaunchContext) -> list[Node]:
         return Node(
             package=PACKAGE,
             executable=executable,
-            # With it, parameters are given to this very node: a section /**/NODE of the file would
-            # win over one for any node.
+            # With a name, `given` is for this node: a section /**/NODE of the file would override
+            # parameters for any node.
             name=executable,
             namespace=namespace,
             parameters=[file, given] if given else [file],
@@ -87,7 +87,7 @@ def nodes(context: LaunchContext) -> list[Node]:
             on_exit=Shutdown(reason=f'{executable} has ended') if required else None,
         )
 
-    # What shows the loop comes first: where it is not installed, nothing has been started yet.
+    # Viewers come first: if they are not installed, nothing has been started yet.
     started = view(namespace, file) if rviz == 'true' else []
     if 'true' in (markers, rviz):
         started.append(node('arm_markers', {}, required=False))
@@ -97,7 +97,7 @@ def nodes(context: LaunchContext) -> list[Node]:
 
 
 def view(namespace: str, config: str) -> list[Node]:
-    """RViz, and what turns the arm's states into frames for it; both are packages of their own."""
+    """Return RViz and the node that publishes the arm's frames; both are separate packages."""
     plant = load(config, f'{namespace}/{PLANT}', PlantConfig)
     robot = plant.robot
     frame = robot.chain(plant.joints).base if robot.urdf else 'base_link'

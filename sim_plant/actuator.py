@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The path of a commanded torque to the joint: a delay, a limit, a lag, and noise."""
+"""Path of a commanded torque to the joint: delay, limit, lag, and noise."""
 
 from math import exp
 from typing import Annotated, NamedTuple
@@ -11,20 +11,20 @@ from blf_dsc_controller.compiled.layout import Array
 
 
 class Drives(NamedTuple):
-    """What the drives of all joints are like.
+    """Properties of the drives of all joints.
 
-    The lag follows the held command exactly; the torque applied in a sample is its mean over it.
+    The lag is solved exactly for a held command; the torque applied in a sample is its mean.
     """
 
     torque_limit: Annotated[Array, 'n']  # N m, 0 = none
     delay: int  # samples
-    decay: float  # of the lag in a sample, exp(-T / time constant); 0: no lag
+    decay: float  # of the lag over a sample, exp(-T / time constant); 0: no lag
     mean_decay: float  # its mean over the sample
-    noise: float  # standard deviation, of the torque
+    noise: float  # standard deviation, relative to the torque
 
 
 class DriveState(NamedTuple):
-    """The torque applied last, that at the end of its sample, and a ring of those still delayed."""
+    """Last applied torque, motor torque at the end of the sample, and a ring of delayed torques."""
 
     applied: Annotated[Array, 'n']  # N m
     motor: Annotated[Array, 'n']  # N m
@@ -34,7 +34,7 @@ class DriveState(NamedTuple):
 
 @inner
 def limited(torque: float, limit: float) -> float:
-    """Torque within +-limit; a limit of 0 is none."""
+    """Clamp a torque to +-limit; 0 means no limit."""
     if limit == 0.0:
         return torque
     return min(max(torque, -limit), limit)
@@ -42,9 +42,9 @@ def limited(torque: float, limit: float) -> float:
 
 @inner
 def actuate(drives: Drives, sample: int, command: np.ndarray, state: DriveState) -> None:
-    """Take the command of this sample and write the torque applied in it into the state.
+    """Process the command of this sample and write the torque applied in it to the state.
 
-    Until the first command has come through the delay, the applied torque is zero.
+    Until the first command has passed the delay, the applied torque is zero.
     """
     for i in range(command.size):
         torque = command[i]
@@ -63,7 +63,7 @@ def actuate(drives: Drives, sample: int, command: np.ndarray, state: DriveState)
 
 
 def lag(time_constant: float, period: float) -> tuple[float, float]:
-    """Return decay and mean decay in a period [s] of a lag with a time constant [s]; 0: no lag."""
+    """Return decay and mean decay over a period [s] of a lag with a time constant [s] (0: none)."""
     if time_constant == 0.0:
         return 0.0, 0.0
     decay = exp(-period / time_constant)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The interface between the plant and the mechanics of an arm of n joints.
+"""Interface between the plant and the mechanics of an arm of n joints.
 
-An arm is a `NamedTuple` of numbers and arrays with the methods of `Arm`.  Kernels call them as
-Python does: those of the type that they are given are compiled into them, and of no other arm.
+An arm is a `NamedTuple` of numbers and arrays with the methods of `Arm`.  Kernels call
+them as plain Python does; each kernel is compiled for the type of arm that is passed to it.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ class Arm(Protocol):
         """Write the parameters P (p,) that the controller estimates."""
 
     def fill_tip(self, q: Array, position: Array, jacobian: Array) -> None:
-        """Write the position (3,) [m] of the tip in the base, and its Jacobian (3, n) [m/rad]."""
+        """Write the tip position (3,) [m] in the base frame and its Jacobian (3, n) [m/rad]."""
 
     def accelerate(self, payload: float, q: Array, dq: Array, torque: Array, ddq: Array) -> None:
-        """Write ddq (n,) [rad/s^2] of M ddq + C dq + G = torque; it may be the torque's vector."""
+        """Write ddq (n,) [rad/s^2] of M ddq + C dq + G = torque; `ddq` may alias `torque`."""
 
 
 compile_methods(Arm, ('fill_parameters', 'fill_tip', 'accelerate'), PointMassArm, RigidArm)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arm that a configuration describes: two point masses, or the arm of a URDF."""
+"""The arm of a configuration: two point masses, or the arm of a URDF."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sim_plant.rigid_arm import rigid_arm
 
 
 def arm_of(config: PlantConfig) -> Arm:
-    """Arm of a configuration."""
+    """Return the arm of a configuration."""
     robot = config.robot
     if not robot.urdf:
         return PointMassArm(*vars(config.arm).values())
@@ -30,7 +30,7 @@ def arm_of(config: PlantConfig) -> Arm:
 
 
 def true_inertias(chain: Chain, truth: Truth) -> np.ndarray:
-    """Ten of each body (n, 10), with the mass distribution of the URDF scaled and shifted."""
+    """Return the inertias (n, 10) of the URDF with each mass distribution scaled and shifted."""
     moved = np.eye(4)
     inertias = np.empty((len(chain.joints), 10))
     for i, (factor, shift) in enumerate(zip(*truth.changes(len(inertias)), strict=True)):
@@ -41,7 +41,7 @@ def true_inertias(chain: Chain, truth: Truth) -> np.ndarray:
 
 
 def parameter_names_of(config: PlantConfig) -> tuple[str, ...]:
-    """Names of the true parameters P of a configured arm."""
+    """Return the names of the true parameters P of a configured arm."""
     robot = config.robot
     if not robot.urdf:
         return PARAMETER_NAMES
@@ -49,7 +49,7 @@ def parameter_names_of(config: PlantConfig) -> tuple[str, ...]:
 
 
 def urdf_of(config: PlantConfig) -> str:
-    """URDF of a configured arm."""
+    """Return the URDF of a configured arm."""
     if config.robot.urdf:
         return config.robot.text
     arm, limits = config.arm, config.actuator.torque_limit

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The torques that reach the plant: which are applied, how old the last one is, how late it came.
+"""Torques received by the plant: their validity, age and latency.
 
-The counterpart of the controller's checks of joint states: a motor that applies a torque from long
-ago, or one that is not finite, is as dangerous as a law that does.
+The counterpart of the controller's checks of joint states: a motor that applies an outdated torque,
+or one that is not finite, is as dangerous as a law that commands one.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 LARGEST = 1e4
-"""Torque [N m] of a command, at most; a step with 1e6 N m takes the arm out of all numbers."""
+"""Largest valid torque [N m] of a command; a step with 1e6 N m makes the arm diverge."""
 
 
 class TorqueInput:
-    """The last valid `torque` (n,) [N m] of the n joints, and what was rejected.
+    """The last valid `torque` (n,) [N m] of the n joints, and counts of rejected commands.
 
     `wrong_length` and `impossible` count the rejected commands by cause, `problem` describes the
     last one; `stale_steps` counts the steps for which the torque was too old.
@@ -36,9 +36,9 @@ class TorqueInput:
         return self.wrong_length + self.impossible
 
     def take(self, size: int, torque: NDArray[np.float64], sample: int) -> bool:
-        """Take a command of `size` values, `torque` (n,), at a sample of the plant.
+        """Store a command of `size` values, `torque` (n,), at a sample of the plant.
 
-        Returns whether it is valid; `problem` describes why not.
+        Returns whether it is valid; if not, `problem` describes why.
         """
         if size != self.torque.size:
             self.wrong_length += 1
@@ -50,7 +50,7 @@ class TorqueInput:
             names = ', '.join(np.array(self._joints)[~possible])
             self.problem = (
                 f'command rejected: {torque} N m (for {names}): '
-                f'not finite, or more than {LARGEST:g} N m, which no joint has'
+                f'not finite, or above the limit of {LARGEST:g} N m'
             )
             return False
         self.torque[:] = torque
@@ -58,27 +58,27 @@ class TorqueInput:
         return True
 
     def is_stale(self, sample: int, limit: int) -> bool:
-        """Whether the torque is older than `limit` samples at `sample`; counted if so."""
+        """Return whether the torque is older than `limit` samples at `sample`, and count it."""
         stale = sample - self._taken_at > limit
         self.stale_steps += stale
         return stale
 
     def restart(self) -> None:
-        """Forget the torque; sample 0 comes next."""
+        """Clear the torque and restart at sample 0."""
         self.torque[:] = 0.0
         self.renew(0)
 
     def renew(self, sample: int) -> None:
-        """Count the age of the torque from `sample` on."""
+        """Measure the age of the torque from `sample` on."""
         self._taken_at = sample
 
 
 class Latency:
     """Time from a published state to the torque that follows it, and the number of late steps.
 
-    A torque does not say which state it belongs to. It is matched with the oldest state that has
-    had no torque yet, so that a late torque counts with its whole delay. Times are in s;
-    `late_steps` counts the steps taken before any torque had come for their state.
+    A torque does not identify its state. It is matched with the oldest state that has had no
+    torque yet, so that a late torque counts with its full delay. Times are in s; `late_steps`
+    counts the steps taken before a torque for their state had arrived.
     """
 
     def __init__(self) -> None:
@@ -87,7 +87,7 @@ class Latency:
         self._longest = 0.0
 
     def state_published(self, now: float) -> None:
-        """Start waiting, unless an older state still waits."""
+        """Start waiting, unless an older state has had no torque yet."""
         if self._since is None:
             self._since = now
 
@@ -98,7 +98,7 @@ class Latency:
             self._since = None
 
     def step(self, now: float) -> float:
-        """End a sample: the longest wait in it, or how long the oldest state has waited so far."""
+        """End a sample; return its longest wait, or the wait of the oldest state so far."""
         if self._since is not None:
             self.late_steps += 1
             return now - self._since

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Forces at the tip as torques of the joints: a push, and a wall that the tip runs into.
+"""Joint torques due to forces at the tip: a push, and a wall that the tip hits.
 
-Vectors are in the frame of the base: x to the right, z upwards.  A force f at the tip loads the
-joints with J^T f, J the Jacobian of the tip's position.
+Vectors are in the base frame: x to the right, z up.  A force f at the tip loads the joints with
+J^T f, where J is the Jacobian of the tip position.
 """
 
 from typing import Annotated, NamedTuple
@@ -24,7 +24,7 @@ class Wall(NamedTuple):
 
 
 class TipState(NamedTuple):
-    """Working memory: the tip of the arm."""
+    """Working memory for the tip of the arm."""
 
     position: Annotated[Array, '3']  # m
     jacobian: Annotated[Array, '3', 'n']  # m/rad
@@ -32,7 +32,7 @@ class TipState(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """What pushes the tip."""
+    """Sources of the force at the tip."""
 
     push: np.ndarray  # (3,) N
     wall: Wall
@@ -41,9 +41,9 @@ class Contact(NamedTuple):
 
 @inner
 def wall_force(wall: Wall, position: np.ndarray, velocity: np.ndarray) -> float:
-    """Force [N] along the normal on a tip at a position [m], (3,) with a velocity [m/s]: never < 0.
+    """Return the normal force [N], >= 0, on a tip with position (3,) [m] and velocity (3,) [m/s].
 
-    Kelvin and Voigt: k depth + d d(depth)/dt, inside the wall only.
+    Kelvin-Voigt model: k depth + d d(depth)/dt inside the wall, 0 outside.
     """
     depth = 0.0
     speed = 0.0
@@ -59,7 +59,7 @@ def wall_force(wall: Wall, position: np.ndarray, velocity: np.ndarray) -> float:
 def subtract_contact_torque(
     arm: Arm, contact: Contact, q: np.ndarray, dq: np.ndarray, torque: np.ndarray
 ) -> None:
-    """Subtract J^T f (n,) [N m] of the force at the tip from a torque, in place."""
+    """Subtract the contact torque J^T f (n,) [N m] from `torque`, in place."""
     push, wall, state = contact
     is_pushed = push[0] != 0.0 or push[1] != 0.0 or push[2] != 0.0
     if not is_pushed and wall.stiffness == 0.0:
@@ -67,7 +67,7 @@ def subtract_contact_torque(
     arm.fill_tip(q, state.position, state.jacobian)
     force = state.force
     if wall.stiffness > 0.0:
-        for i in range(3):  # the velocity of the tip, for now
+        for i in range(3):  # first used for the tip velocity
             force[i] = 0.0
             for j in range(dq.size):
                 force[i] += state.jacobian[i, j] * dq[j]

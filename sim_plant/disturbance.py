@@ -19,8 +19,8 @@ class JointDisturbance(NamedTuple):
     phase: Annotated[Array, 'n']  # rad
     viscous: Annotated[Array, 'n']  # N m s/rad
     coulomb: Annotated[Array, 'n']  # N m
-    coulomb_velocity: Annotated[Array, 'n']  # rad/s, where Coulomb friction reaches three quarters
-    stribeck: float  # of the Coulomb friction
+    coulomb_velocity: Annotated[Array, 'n']  # rad/s, at which tanh reaches three quarters
+    stribeck: float  # additional friction near rest, relative to Coulomb friction
     stribeck_velocity: float  # rad/s
     ripple: Annotated[Array, 'n']  # N m
     ripple_frequency: float  # rad/rad
@@ -32,8 +32,8 @@ def disturbance_torque(
 ) -> None:
     """Write tau_dist (n,) [N m] at time t [s].
 
-    Friction has the sign of the velocity; Coulomb friction is smoothed by tanh, so that a fixed
-    step keeps its order.
+    Friction has the sign of the velocity; Coulomb friction is smoothed by tanh, so that the
+    fixed-step integrator keeps its order.
     """
     for i in range(dq.size):
         angle = disturbance.frequency[i] * t + disturbance.phase[i]

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two-link arm in a vertical plane, a point mass at the end of each link (Section IV).
+"""Two-link arm in a vertical plane, with a point mass at the end of each link (Section IV).
 
 Derived from the Lagrangian, independently of the controller's regressor, so that each checks the
 other.  Joint 1 is measured from the horizontal, joint 2 from link 1:
 
     M(q) ddq + C(q, dq) dq + G(q) = torque,    (33), (34)
 
-with G the gradient of the potential: its first term has cos q1, where (34) prints cos q2.
+where G is the gradient of the potential; its first term has cos q1, where (34) prints cos q2.
 """
 
 from math import cos, sin
@@ -36,15 +36,15 @@ class PointMassArm(NamedTuple):
         return 3
 
     def fill_parameters(self, payload: float, P: Array) -> None:
-        """`parameters` with a payload [kg]."""
+        """Write `parameters` with a payload [kg]."""
         parameters(loaded(self, payload), P)
 
     def fill_tip(self, q: Array, position: Array, jacobian: Array) -> None:
-        """`tip`."""
+        """Write `tip`."""
         tip(self, q, position, jacobian)
 
     def accelerate(self, payload: float, q: Array, dq: Array, torque: Array, ddq: Array) -> None:
-        """`acceleration` with a payload [kg]."""
+        """Write `acceleration` with a payload [kg]."""
         acceleration(loaded(self, payload), q, dq, torque, ddq)
 
 
@@ -75,7 +75,7 @@ def tip(arm: PointMassArm, q: Array, position: Array, jacobian: Array) -> None:
 
 @inner
 def acceleration(arm: PointMassArm, q: Array, dq: Array, torque: Array, ddq: Array) -> None:
-    """Write ddq = M^-1 (torque - C dq - G) (2,) [rad/s^2]; it may be the torque's own vector."""
+    """Write ddq = M^-1 (torque - C dq - G) (2,) [rad/s^2]; `ddq` may alias `torque`."""
     outer = arm.m2 * arm.l2**2
     coupling = arm.m2 * arm.l1 * arm.l2 * cos(q[1])
     m11 = (arm.m1 + arm.m2) * arm.l1**2 + outer + 2.0 * coupling

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What acts on the arm in a sample: the standing load, and the events that are on.
+"""Load and active events acting on the arm in a sample.
 
-It is held over the sample, and independent of the kind of arm.
+They are held over the sample, and independent of the kind of arm.
 """
 
 from typing import Annotated, NamedTuple
@@ -14,19 +14,19 @@ from sim_plant.disturbance import JointDisturbance
 
 
 class Load(NamedTuple):
-    """What acts all the time."""
+    """Load that acts all the time."""
 
     payload: float  # kg, point mass at the tip
     torque: Annotated[Array, 'n']  # N m, pushes the joints
     force: Annotated[Array, '3']  # N, pushes the tip, in the frame of the base
-    offset: Annotated[Array, 'n']  # rad, measured position less the true one
+    offset: Annotated[Array, 'n']  # rad, measured minus true position
 
 
 class Events(NamedTuple):
-    """What each event adds to the load and to the friction; times are counted in samples."""
+    """Contribution of each event to load and friction; times are in samples."""
 
     begin: Annotated[Array, 'events']
-    end: Annotated[Array, 'events']  # infinite: it stays
+    end: Annotated[Array, 'events']  # infinite: permanent
     ramp: Annotated[Array, 'events']
     payload: Annotated[Array, 'events']
     torque: Annotated[Array, 'events', 'n']
@@ -37,20 +37,20 @@ class Events(NamedTuple):
 
 
 class Acting(NamedTuple):
-    """The sum of all in one sample."""
+    """Sum of load and events in one sample."""
 
-    sample: Cell  # of this sum; -1: none yet
+    sample: Cell  # of the sum; -1: none yet
     payload: Cell  # kg
     force: Annotated[Array, '3']  # N
     offset: Annotated[Array, 'n']  # rad
-    constant: Annotated[Array, 'n']  # N m, of the disturbance, less what pushes the joints
+    constant: Annotated[Array, 'n']  # N m, of the disturbance, less torques that push the joints
     viscous: Annotated[Array, 'n']  # N m s/rad, not below zero
     coulomb: Annotated[Array, 'n']  # N m, not below zero
 
 
 @inner
 def come(sample: float, at: float, ramp: float) -> float:
-    """Fraction, from 0 to 1, of what comes at one sample and takes `ramp` more for it."""
+    """Return the fraction, from 0 to 1, of a ramp of `ramp` samples that begins at sample `at`."""
     if sample < at:
         return 0.0
     if sample >= at + ramp:
@@ -60,14 +60,14 @@ def come(sample: float, at: float, ramp: float) -> float:
 
 @inner
 def add(total: np.ndarray, fraction: float, one: np.ndarray) -> None:
-    """Add a fraction of a vector to another."""
+    """Add a fraction of one vector to another."""
     for i in range(total.size):
         total[i] += fraction * one[i]
 
 
 @inner
 def put(target: np.ndarray, values: np.ndarray) -> None:
-    """Copy a vector; `target[:] = values` compiles ten functions for a message on their shapes."""
+    """Copy a vector; `target[:] = values` compiles ten functions just for a shape error."""
     for i in range(target.size):
         target[i] = values[i]
 
@@ -76,7 +76,7 @@ def put(target: np.ndarray, values: np.ndarray) -> None:
 def update_acting(
     disturbance: JointDisturbance, load: Load, events: Events, sample: float, acting: Acting
 ) -> None:
-    """Sum up what acts in a sample, unless that is known already."""
+    """Sum load and events of a sample, unless already done."""
     if acting.sample[0] == sample:
         return
     acting.sample[0] = sample

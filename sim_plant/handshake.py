@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Before the first state of a run: peers are discovered, and the controller is reset."""
+"""Handshake before the first state of a run: discover the peers and reset the controller."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from std_srvs.srv import Trigger
 
 from blf_dsc_controller.messages import topics
 
-_SETTLING_TIME = 0.2  # s from having found every peer until they have found this node too
-_RESET_TIMEOUT = 2.0  # s that a controller may take to respond
+_SETTLING_TIME = 0.2  # s from the discovery of all peers until they have discovered this node
+_RESET_TIMEOUT = 2.0  # s for the controller to respond
 
 
 class Handshake:
-    """Waits until the first state can be sent.
+    """Handshake that ends when the first state can be sent.
 
-    After a reset of the plant the wait also lets torques of the previous run expire, and the
-    controller is reset if it has the service; any other controller has to be reset by hand. `clock`
-    is steady [s].
+    After a reset of the plant, the wait also lets torques of the previous run expire, and the
+    controller is reset if it offers the service; any other controller must be reset by hand.
+    `clock` returns a steady time [s].
     """
 
     def __init__(self, node: LifecycleNode, clock: Callable[[], float]) -> None:
@@ -30,19 +30,19 @@ class Handshake:
         self.begin(reset=False)
 
     def begin(self, *, reset: bool) -> None:
-        """Start waiting; with `reset` the controller is reset when everybody is there."""
+        """Start waiting; with `reset`, reset the controller once all peers are present."""
         self._complete_since: float | None = None
         self._to_reset = reset
         self._response: Any = None
         self._requested = 0.0
 
     def reset_controller(self) -> Any:
-        """Request a reset of the controller; return its future, None if it has no such service."""
+        """Request a reset of the controller; return the future, or None without such a service."""
         ready = self._client.service_is_ready()
         return self._client.call_async(Trigger.Request()) if ready else None
 
     def is_done(self, *, observed: bool) -> bool:
-        """Whether the state can be sent; `observed`: whether all topics have subscribers now."""
+        """Return whether to send the state; `observed`: whether all topics have subscribers."""
         now = self._clock()
         if not observed:
             self._complete_since = None
@@ -64,5 +64,5 @@ class Handshake:
             return True
         if now - self._requested < _RESET_TIMEOUT:
             return False
-        self._log.warning('the controller did not respond to its reset: starting without')
+        self._log.warning('the controller did not respond to the reset request: starting anyway')
         return True

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sampled plant: a reading at sample k, then a held torque over [k, k + 1], and so on.
+"""The sampled plant: a reading at each sample k, then a torque held over [k, k + 1].
 
-Settings and state are a flat vector each.  Time is counted in whole nanoseconds,
-t_k = (k T_ns) 1e-9 s, so every caller computes the same floats.  The kernels serve the ROS 2 node
-and the compiled offline loop alike, bit for bit.
+Settings and state are one flat vector each.  Time is counted in whole nanoseconds,
+t_k = (k T_ns) 1e-9 s, so every caller computes the same floats.  The ROS 2 node and the compiled
+offline loop run the same kernels and agree bit for bit.
 """
 
 from typing import Annotated, NamedTuple
@@ -26,7 +26,7 @@ from sim_plant.sensors import EncoderReading, Encoders, draw, is_noisy, sense
 class PlantSettings(NamedTuple):
     """Everything that defines a plant except its seed and its initial state.
 
-    The arm is passed to kernels as it is, everything else in one vector.
+    The arm is passed to kernels as is, everything else in one vector.
     """
 
     arm: Arm
@@ -34,7 +34,7 @@ class PlantSettings(NamedTuple):
     p: int  # parameters of the arm
     period_ns: int
     integrator: int  # RK4 or DOPRI5
-    events: int  # how many
+    events: int  # number of events
     encoders: Encoders
     disturbance: JointDisturbance
     drives: Drives
@@ -63,7 +63,7 @@ state_of, state_size = view_of(PlantState), size_of(PlantState)
 def plant_views(
     arm: Arm, settings: np.ndarray, state: np.ndarray
 ) -> tuple[PlantSettings, PlantState]:
-    """Views of both vectors, not reference-counted."""
+    """Return views of both vectors, not reference-counted."""
     plant = settings_of(view(settings), arm)
     return plant, state_of(view(state), plant)
 
@@ -95,7 +95,7 @@ def update_motion(plant: PlantSettings, now: PlantState) -> Motion:
 
 @inner
 def draw_noise(plant: PlantSettings, now: PlantState, rng: np.random.Generator) -> None:
-    """Draw the noise of the next sample, of encoders and drives that have any, if it is unread."""
+    """Draw encoder and drive noise for this sample, unless it has been read already."""
     if now.reading.sample[0] != now.sample[0]:
         if is_noisy(plant.encoders):
             draw(rng, now.reading.noise)
@@ -141,14 +141,14 @@ def step(plant: PlantSettings, now: PlantState, command: np.ndarray) -> None:
 
 @inner
 def true_parameters(plant: PlantSettings, now: PlantState, out: np.ndarray) -> None:
-    """Write P (p,) of this sample, with the payload in it."""
+    """Write P (p,) of this sample, payload included."""
     motion = update_motion(plant, now)
     motion.arm.fill_parameters(motion.payload, out)
 
 
 @inner
 def truth(plant: PlantSettings, now: PlantState, out: np.ndarray) -> None:
-    """Write what no sensor measures, [P, tau_dist, q, dq] (p + 3n,) of this sample."""
+    """Write the noise-free truth [P, tau_dist, q, dq] (p + 3n,) of this sample."""
     n = plant.n
     t = now.sample[0] * plant.period_ns * 1e-9
     true_parameters(plant, now, out)
@@ -162,24 +162,24 @@ def truth(plant: PlantSettings, now: PlantState, out: np.ndarray) -> None:
 def observe_plant(
     arm: Arm, settings: np.ndarray, state: np.ndarray, measurement: np.ndarray
 ) -> None:
-    """`observe` of packed vectors."""
+    """Call `observe` with packed vectors."""
     plant, now = plant_views(arm, settings, state)
     observe(plant, now, measurement)
 
 
 @kernel
 def step_plant(arm: Arm, settings: np.ndarray, state: np.ndarray, command: np.ndarray) -> None:
-    """`step` of packed vectors."""
+    """Call `step` with packed vectors."""
     plant, now = plant_views(arm, settings, state)
     step(plant, now, command)
 
 
 @kernel
 def plant_truth(arm: Arm, settings: np.ndarray, state: np.ndarray, out: np.ndarray) -> None:
-    """`truth` of packed vectors."""
+    """Call `truth` with packed vectors."""
     plant, now = plant_views(arm, settings, state)
     truth(plant, now, out)
 
 
 KERNELS = (observe_plant, step_plant, plant_truth)
-"""The kernels that Python calls of a plant; compiled before the node starts."""
+"""Plant kernels that are called from Python; compiled before the node starts."""

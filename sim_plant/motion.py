@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The equation of motion of an arm under a torque, a disturbance, and what pushes its tip."""
+"""Equation of motion of an arm under a torque, a disturbance, and a force at its tip."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from sim_plant.disturbance import JointDisturbance, disturbance_torque
 
 
 class Motion(NamedTuple):
-    """What determines the acceleration beside the torque of the motors."""
+    """Everything that determines the acceleration besides state and motor torque."""
 
     arm: Arm
     payload: float  # kg

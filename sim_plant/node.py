@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `sim_plant`: the arm, and the owner of time.
+"""The node `sim_plant`: the simulated arm and the time base of the loop.
 
-Lock-step takes the next step when the torque for the last state has arrived: deterministic, as fast
-as the machine allows. Real time takes a step each sample time of the steady clock, holding the
-last torque where the new one is late, and publishes how late; a torque older than
-`actuator.command_timeout` is not applied. In both the arm is braked until the first torque comes.
+In lock-step, a step is taken when the torque for the last state has arrived: deterministic, and as
+fast as the machine allows. In real time, a step is taken each sample time of the steady clock; if
+the new torque is late, the last one is held and the delay published, but a torque older than
+`actuator.command_timeout` is not applied. The arm is braked until the first torque arrives.
 
-Load, wall, events, disturbance and encoder offsets can change while it runs, from the next sample
-on; `~/changes` says from which, so that an event at that time repeats the run.
+Load, wall, events, disturbance and encoder offsets can be changed at run time, from the next sample
+on; `~/changes` publishes the time, so that an event at that time repeats the run.
 
-A reset takes the arm back to its start, which no real arm does by itself: therefore this node also
-resets the controller, if there is one, before it sends the first state, and in real time when its
-own time is over.
+A reset returns the arm to its start, which no real arm does by itself. The node therefore also
+resets the controller, if there is one, before it sends the first state and, in real time, at the
+end of its duration.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ from sim_plant.handshake import Handshake
 from sim_plant.plant import FASTEST, Plant, plant_of, settings_of, steps_of
 
 LOCKSTEP_START = 1_000_000_000
-"""First stamp in lock-step [ns]: a zero stamp says 'not set' in ROS."""
+"""First stamp in lock-step [ns]: a zero stamp means 'not set' in ROS."""
 
-_REPEAT_PERIOD = 3.0  # s, for a state that has got no torque
-_EARLY = 0.05  # of a sample: a timer that fires this much early is on time
+_REPEAT_PERIOD = 3.0  # s, until a state without a torque is sent again
+_EARLY = 0.05  # fraction of a sample by which a timer may fire early
 _BETWEEN_RUNS = 1_000_000_000  # ns from the last stamp before a reset to the first after it
 
 
 class PlantNode(LoopNode[PlantConfig]):
-    """Publishes measured joint states and applies the torques that come back.
+    """Node that publishes measured joint states and applies the received torques.
 
-    `latency` is how long, in real time, the arm waits for its torques.
+    `latency` measures how long, in real time, the arm waits for its torques.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -80,7 +80,7 @@ class PlantNode(LoopNode[PlantConfig]):
     # Life cycle.
 
     def configure(self) -> None:
-        """Put the arm at its start; create its topics the first time."""
+        """Put the arm at its start; create the topics on the first call."""
         self.plant = plant_of(self.config)
         self._changed.clear()
         self.plant.compile()
@@ -93,7 +93,7 @@ class PlantNode(LoopNode[PlantConfig]):
             create_publisher(self, topics.ROBOT_DESCRIPTION).publish(description)
 
     def activate(self) -> None:
-        """Send the present state once a controller listens, and continue with its torque."""
+        """Send the present state once a controller subscribes, and continue with its torque."""
         self._handshake.begin(reset=False)
         self.get_logger().info(f'{self.config.mode}, waiting for a controller')
 
@@ -111,18 +111,18 @@ class PlantNode(LoopNode[PlantConfig]):
     release = deactivate
 
     def close(self) -> None:
-        """Wait until every subscriber has the last messages."""
+        """Wait until every subscriber has received the last messages."""
         process.drain(self._outputs.values())
 
     def reset(self) -> str:
-        """Take the arm to its start, braked, and reset the controller before the first state."""
+        """Return the arm to its start, braked, and reset the controller before the first state."""
         self._start_stamp = self.stamp + _BETWEEN_RUNS
         self.deactivate()
         self.plant.reset()
         self._apply_changes()
         self.input.restart()
         self._handshake.begin(reset=True)
-        return 'the arm is at its start, braked until the first torque comes'
+        return 'the arm is at its start, braked until the first torque arrives'
 
     @property
     def stamp(self) -> int:
@@ -186,8 +186,8 @@ class PlantNode(LoopNode[PlantConfig]):
             )
 
     def _on_step_timer(self) -> None:
-        """Take every step that is due: time does not wait for a late process."""
-        if not self._running:  # the timer was destroyed with this call on its way
+        """Integrate all steps that are due; a late process catches up."""
+        if not self._running:  # the timer was destroyed while this call was pending
             return
         elapsed = self._now() - self._began
         due = self._first + int(elapsed / self.config.sample_time + _EARLY)
@@ -257,7 +257,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self.config = config
 
     def _apply_changes(self) -> None:
-        """Let changed parameters take effect at the present sample, which nobody has seen yet."""
+        """Apply changed parameters at the present sample, which is not published yet."""
         if not self._changed:
             return
         self.plant.change(settings_of(self.config))

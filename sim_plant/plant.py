@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated plant in Python: it owns its vectors and its random generator."""
+"""The simulated plant in Python: owner of its vectors and its random generator."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from sim_plant.kernels import (
 from sim_plant.sensors import VELOCITY_SOURCES, Encoders, generator, is_noisy
 
 FASTEST = 1e3
-"""Speed [rad/s] that no arm survives, the norm over its joints: it stays where it was."""
+"""Norm of the joint velocities [rad/s] beyond which the arm breaks and stops where it was."""
 
 
 class SavedPlant(NamedTuple):
-    """A plant's state at one moment, random generator included."""
+    """Snapshot of a plant's state, random generator included."""
 
     state: np.ndarray
     is_broken: bool
@@ -40,10 +40,10 @@ class SavedPlant(NamedTuple):
 
 
 class Plant:
-    """A sampled arm: `measure()`, then `step(torque)`, and so on.
+    """A sampled arm: call `measure()`, then `step(torque)`, in turn.
 
-    It starts at `position` (n,) [rad] with `velocity` (n,) [rad/s]; `seed` is that of the sensor
-    noise: the same seed repeats the run.  `is_broken` once it was faster than `FASTEST`.
+    It starts at `position` (n,) [rad] with `velocity` (n,) [rad/s]; `seed` determines the noise, so
+    the same seed repeats the run.  `is_broken` is set once the arm exceeds `FASTEST`.
     """
 
     def __init__(
@@ -79,10 +79,10 @@ class Plant:
         return self.sample * self.period_ns
 
     def measure(self) -> np.ndarray:
-        """[q, dq, effort] (3n,) of this sample: a view, overwritten by the next call.
+        """Return [q, dq, effort] (3n,) of this sample: a view, overwritten by the next call.
 
-        The noise is drawn here and not by a kernel, which would draw the same numbers: passing a
-        generator to compiled code costs more than the rest of the call.
+        The noise is drawn here rather than in a kernel, which would draw the same numbers, because
+        passing a generator to compiled code costs more than the rest of the call.
         """
         if self._noises and self._now.reading.sample[0] != self.sample:
             for noise in self._noises:
@@ -93,7 +93,7 @@ class Plant:
     def step(self, torque: np.ndarray) -> None:
         """Apply the commanded torque (n,) [N m] and advance to the next sample.
 
-        An arm that breaks by it stands still from then on.
+        An arm that breaks stands still from then on.
         """
         if self.is_broken:
             self.hold()
@@ -106,24 +106,24 @@ class Plant:
             self._dq[:] = 0.0
 
     def change(self, settings: PlantSettings) -> None:
-        """Continue with other settings of as many joints and the same period and delay."""
+        """Switch to settings with the same number of joints, period and delay."""
         self.arm = settings.arm
         self.settings = pack(settings)
         self._now.acting.sample[0] = -1.0
 
     def hold(self) -> None:
-        """Stay at rest and without torque for one sample: the brakes are on."""
+        """Stay at rest for one sample, without torque, as with the brakes on."""
         self._dq[:] = 0.0
         self._now.drives.applied[:] = self._now.drives.motor[:] = 0.0
         self._now.sample[0] += 1.0
 
     def truth(self) -> np.ndarray:
-        """[P, tau_dist, q, dq] (p + 3n,) of this sample: a view, overwritten by the next call."""
+        """Return [P, tau_dist, q, dq] (p + 3n,) of this sample; the next call overwrites it."""
         plant_truth(self.arm, self.settings, self.state, self._truth)
         return self._truth
 
     def reset(self) -> None:
-        """Return to sample 0 and repeat the run of the same seed."""
+        """Return to sample 0 and reseed, so that the run is repeated."""
         self.state[:] = self._initial
         self.is_broken = False
         self.rng = generator(self._seed)
@@ -135,38 +135,38 @@ class Plant:
         self.reset()
 
     def save(self) -> SavedPlant:
-        """Copy of everything that changes."""
+        """Return a copy of everything that changes."""
         return SavedPlant(self.state.copy(), self.is_broken, self.rng.bit_generator.state)
 
     def restore(self, saved: SavedPlant) -> None:
-        """Resume from a saved moment of a plant of the same settings."""
+        """Restore a state saved by a plant with the same settings."""
         self.state[:] = saved.state
         self.is_broken = saved.is_broken
         self.rng.bit_generator.state = saved.generator
 
 
 def parameters_of(config: PlantConfig, t: float = 0.0) -> np.ndarray:
-    """True parameters P (p,) of a configured arm, with its payload at time t [s]."""
+    """Return the true parameters P (p,) of a configured arm, with its payload at time t [s]."""
     plant = plant_of(config)
     plant.state[0] = round(t / config.sample_time)
     return plant.truth()[: plant.arm.p]
 
 
 def parameter_order(names: Sequence[str], config: PlantConfig) -> np.ndarray:
-    """Place of each of a model's parameters in P; -1 for all if the model has other ones."""
+    """Return the index in P of each parameter of a model; all -1 if the model has others."""
     true = parameter_names_of(config)
     known = set(names) == set(true)
     return np.array([true.index(name) if known else -1 for name in names])
 
 
 def plant_of(config: PlantConfig) -> Plant:
-    """Plant of a configuration, at sample 0."""
+    """Return the plant of a configuration, at sample 0."""
     start = config.initial
     return Plant(settings_of(config), start.position, start.velocity, config.seed)
 
 
 def settings_of(config: PlantConfig) -> PlantSettings:
-    """Settings of a configured plant."""
+    """Return the settings of a configured plant."""
     arm, n = arm_of(config), len(config.joints)
     sensor, actuator, load, wall = config.sensor, config.actuator, config.load, config.wall
     return PlantSettings(
@@ -219,7 +219,7 @@ def _disturbance_of(config: PlantConfig) -> JointDisturbance:
 
 
 def _schedule_of(config: PlantConfig) -> Events:
-    """Events with their times in samples, and zeros for what is left out."""
+    """Return the events with times in samples, and zeros for what is not given."""
     events, count, n = config.events, len(config.events.begin), len(config.joints)
 
     def values(name: str, *shape: int) -> np.ndarray:
@@ -241,5 +241,5 @@ def _schedule_of(config: PlantConfig) -> Events:
 
 
 def steps_of(config: PlantConfig) -> int:
-    """Number of steps; 0 runs until stopped."""
+    """Return the number of steps; 0 means until stopped."""
     return round(config.duration / config.sample_time)

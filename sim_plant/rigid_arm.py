@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm of any serial chain, with a payload at its tip: an `Arm`."""
+"""An `Arm` for any serial chain, with a payload at its tip."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ motion_of, motion_size = view_of(Motion), size_of(Motion)
 
 
 class Content(NamedTuple):
-    """What an arm is."""
+    """Constants of an arm."""
 
     n: int
     p: int
     bodies: RigidBodies
     P: Annotated[Array, 'p']  # without payload
-    P_payload: Annotated[Array, 'p']  # of 1 kg at the tip
-    rest: Annotated[Array, 'n']  # velocities of an arm that stands still
+    P_payload: Annotated[Array, 'p']  # contribution of 1 kg at the tip
+    rest: Annotated[Array, 'n']  # zero velocities
 
 
 content_of = view_of(Content)
 
 
 class RigidArm(NamedTuple):
-    """It holds its working memory: two threads need one each."""
+    """A serial-chain arm with its working memory: threads must not share one."""
 
     n: int
     p: int
@@ -46,17 +46,17 @@ class RigidArm(NamedTuple):
             P[k] = content.P[k] + payload * content.P_payload[k]
 
     def fill_tip(self, q: Array, position: Array, jacobian: Array) -> None:
-        """`rigid_body.tip` at q (n,)."""
+        """Write `rigid_body.tip` at q (n,)."""
         fill_tip(self.content, self.memory, q, position, jacobian)
 
     def accelerate(self, payload: float, q: Array, dq: Array, torque: Array, ddq: Array) -> None:
-        """`rigid_body.acceleration` with a payload [kg] at q, dq (n,)."""
+        """Write `rigid_body.acceleration` with a payload [kg] at q, dq (n,)."""
         accelerate(self.content, self.memory, payload, q, dq, torque, ddq)
 
 
 @called
 def fill_tip(vector: Array, memory: Array, q: Array, position: Array, jacobian: Array) -> None:
-    """`RigidArm.fill_tip`."""
+    """Implement `RigidArm.fill_tip`."""
     content = content_of(vector)
     now = motion_of(memory, content.bodies)
     locate(content.bodies, q, content.rest, now)
@@ -67,7 +67,7 @@ def fill_tip(vector: Array, memory: Array, q: Array, position: Array, jacobian: 
 def accelerate(
     vector: Array, memory: Array, payload: float, q: Array, dq: Array, torque: Array, ddq: Array
 ) -> None:
-    """`RigidArm.accelerate`."""
+    """Implement `RigidArm.accelerate`."""
     bodies = content_of(vector).bodies
     now = motion_of(memory, bodies)
     locate(bodies, q, dq, now)
@@ -81,7 +81,7 @@ def rigid_arm(
     rotors: Array,
     parameters: BaseParameters,
 ) -> RigidArm:
-    """Arm with the geometry of a chain, these inertias (n, 10) and rotors (n,) [kg m^2, or kg]."""
+    """Return an arm with a chain's geometry, inertias (n, 10), rotors (n,) [kg m^2, or kg]."""
     bodies = rigid_bodies(chain, gravity, inertias, rotors)
     point = np.append(bodies.tip, 1.0)
     payload = np.zeros_like(inertias)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Any serial chain of rigid bodies: where it is, and how it accelerates.
+"""Kinematics and forward dynamics of any serial chain of rigid bodies.
 
-By Newton and Euler in the base's frame, independently of the controller's regressor, so that each
+Newton-Euler equations in the base frame, independent of the controller's regressor, so that each
 checks the other.  The bias C dq + G is the torque of the motion without acceleration; a column of M
 is the torque of a unit acceleration of one joint, which moves all bodies beyond it as one:
 
@@ -39,10 +39,10 @@ class RigidBodies(NamedTuple):
 
     n: int
     gravity: Annotated[Array, 3]  # m/s^2, in the base
-    rotation: Annotated[Array, 'n', 3, 3]  # of a joint's frame at q = 0, to the body before
-    offset: Annotated[Array, 'n', 3]  # of its origin in the body before, m
+    rotation: Annotated[Array, 'n', 3, 3]  # of a joint's frame at q = 0, to the previous body
+    offset: Annotated[Array, 'n', 3]  # of its origin in the previous body, m
     axis: Annotated[Array, 'n', 3]
-    prismatic: Annotated[Array, 'n']  # 1: the joint slides, 0: it turns
+    prismatic: Annotated[Array, 'n']  # 1: prismatic, 0: revolute
     mass: Annotated[Array, 'n']  # kg
     moment: Annotated[Array, 'n', 3]  # kg m, mass times centre of mass
     inertia: Annotated[Array, 'n', 3, 3]  # kg m^2, about the frame's origin
@@ -51,15 +51,15 @@ class RigidBodies(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Where the bodies are in the base's frame, and how they move; entry 0 of each is the base."""
+    """Pose and motion of the bodies in the base frame; entry 0 of each field is the base."""
 
     rotation: Annotated[Array, 'n + 1', 3, 3]
     origin: Annotated[Array, 'n + 1', 3]  # m
     axis: Annotated[Array, 'n + 1', 3]
-    turning: Annotated[Array, 'n + 1', 3]  # rad/s
-    turning_rate: Annotated[Array, 'n + 1', 3]  # rad/s^2, without ddq
+    turning: Annotated[Array, 'n + 1', 3]  # angular velocity, rad/s
+    turning_rate: Annotated[Array, 'n + 1', 3]  # angular acceleration without ddq, rad/s^2
     bias: Annotated[Array, 'n + 1', 3]  # acceleration of the origin without ddq and gravity, m/s^2
-    # Of all bodies from one on, about its origin: working memory.
+    # Working memory: sums over a body and all beyond it, about its origin.
     mass: Annotated[Array, 'n + 1']
     moment: Annotated[Array, 'n + 1', 3]
     inertia: Annotated[Array, 'n + 1', 3, 3]
@@ -72,7 +72,7 @@ class Motion(NamedTuple):
 def rigid_bodies(
     chain: Chain, gravity: tuple[float, ...], inertias: np.ndarray, rotors: np.ndarray
 ) -> RigidBodies:
-    """Bodies with the geometry of a chain and these inertias (n, 10) and rotors (n,)."""
+    """Return bodies with the geometry of a chain, inertias (n, 10) and rotors (n,)."""
     tensors = [pseudo_inertia(inertia) for inertia in inertias]
     return RigidBodies(
         n=len(chain.joints),
@@ -91,7 +91,7 @@ def rigid_bodies(
 
 @inner
 def locate(arm: RigidBodies, q: np.ndarray, dq: np.ndarray, now: Motion) -> None:
-    """Write where the bodies are at q (n,), and how they move at dq (n,)."""
+    """Write pose and motion of the bodies at q (n,) and dq (n,)."""
     for r in range(3):
         for c in range(3):
             now.rotation[0, r, c] = 1.0 if r == c else 0.0
@@ -121,7 +121,7 @@ def locate(arm: RigidBodies, q: np.ndarray, dq: np.ndarray, now: Motion) -> None
 
 @inner
 def turn(R: np.ndarray, axis: Vector, angle: float) -> None:
-    """Turn the columns of R (3, 3) about a unit vector by an angle [rad]."""
+    """Rotate the columns of R (3, 3) about a unit vector by an angle [rad]."""
     c, s = cos(angle), sin(angle)
     for k in range(3):
         column = vector(R[:, k])
@@ -133,7 +133,7 @@ def turn(R: np.ndarray, axis: Vector, angle: float) -> None:
 
 @inner
 def tip(arm: RigidBodies, now: Motion, position: np.ndarray, jacobian: np.ndarray) -> None:
-    """Write the tip (3,) [m] where `locate` left it, and its Jacobian (3, n) [m/rad, or 1]."""
+    """Write the tip position (3,) [m] after `locate`, and its Jacobian (3, n) [m/rad, or 1]."""
     lever = product(now.rotation[arm.n], vector(arm.tip))
     end = plus(vector(now.origin[arm.n]), lever)
     put(end, position)
@@ -149,9 +149,9 @@ def tip(arm: RigidBodies, now: Motion, position: np.ndarray, jacobian: np.ndarra
 def acceleration(
     arm: RigidBodies, now: Motion, payload: float, torque: np.ndarray, ddq: np.ndarray
 ) -> None:
-    """Write ddq (n,) where `locate` left the arm, with a point mass [kg] at its tip.
+    """Write ddq (n,) after `locate`, with a point mass `payload` [kg] at the tip.
 
-    It may be the vector of the joints' `torque` (n,) [N m, or N].
+    `ddq` may alias the joint `torque` (n,) [N m, or N].
     """
     add_up(arm, now, payload)
     for j in range(arm.n):
@@ -168,7 +168,7 @@ def acceleration(
 
 @inner
 def add_up(arm: RigidBodies, now: Motion, payload: float) -> None:
-    """From the tip to the base, add up inertias, and forces and moments of the bias."""
+    """Sum inertias, and forces and moments of the bias, from the tip to the base."""
     n = arm.n
     F = N = (0.0, 0.0, 0.0)
     for i in range(n, 0, -1):
@@ -212,7 +212,7 @@ def rotate(R: np.ndarray, A: np.ndarray, out: np.ndarray) -> None:
 
 @inner
 def add_inertia(I: np.ndarray, h: Vector, m: float, lever: Vector, out: np.ndarray) -> None:
-    """Add the inertia I (3, 3) of a mass m with the moment h, all about a point at `lever`."""
+    """Add the inertia I (3, 3) of a mass m with first moment h, both about a point at `lever`."""
     sphere = 2.0 * dot(h, lever) + m * dot(lever, lever)
     for r in range(3):
         for c in range(3):
@@ -222,7 +222,7 @@ def add_inertia(I: np.ndarray, h: Vector, m: float, lever: Vector, out: np.ndarr
 
 @inner
 def add_point(m: float, lever: Vector, out: np.ndarray) -> None:
-    """Add the inertia (3, 3) of a point mass."""
+    """Add the inertia (3, 3) of a point mass at `lever`."""
     for r in range(3):
         for c in range(3):
             sphere = dot(lever, lever) if r == c else 0.0
@@ -231,7 +231,7 @@ def add_point(m: float, lever: Vector, out: np.ndarray) -> None:
 
 @inner
 def fill_inertia(arm: RigidBodies, now: Motion) -> None:
-    """Fill M (n, n) with the inertia of the joints and their rotors."""
+    """Fill M (n, n), the inertia matrix of the joints, rotors included."""
     for j in range(arm.n):
         axis, h = vector(now.axis[j + 1]), vector(now.moment[j + 1])
         if arm.prismatic[j] == 1.0:
@@ -247,6 +247,6 @@ def fill_inertia(arm: RigidBodies, now: Motion) -> None:
 
 @inner
 def along_joint(arm: RigidBodies, now: Motion, i: int, F: Vector, N: Vector) -> float:
-    """Torque of joint i [N m], or its force [N], of a force F and a moment N about its origin."""
+    """Return the torque [N m], or force [N], of joint i under F and a moment N about its origin."""
     axis = vector(now.axis[i + 1])
     return dot(axis, F) if arm.prismatic[i] == 1.0 else dot(axis, N)

@@ -39,26 +39,26 @@ class EncoderReading(NamedTuple):
 
 
 def generator(seed: int) -> np.random.Generator:
-    """Generator of a seed: PCG64, on every version of numpy."""
+    """Return the generator of a seed: PCG64 on every version of numpy."""
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
 
 
 @inner
 def is_noisy(encoders: Encoders) -> bool:
-    """Whether a reading needs random numbers at all."""
+    """Return whether a reading needs random numbers at all."""
     return encoders.position_noise > 0.0 or encoders.velocity_noise > 0.0
 
 
 @inner
 def draw(rng: np.random.Generator, noise: np.ndarray) -> None:
-    """Fill with the same standard normal numbers as `rng.standard_normal(out=noise)`."""
+    """Fill `noise` with the same standard normal numbers as `rng.standard_normal(out=noise)`."""
     for i in range(noise.size):
         noise[i] = rng.standard_normal()
 
 
 @inner
 def quantised(angle: float, resolution: float) -> float:
-    """Nearest multiple of the resolution; a resolution of 0 is none."""
+    """Round to the nearest multiple of the resolution; 0 means no quantisation."""
     if resolution == 0.0:
         return angle
     return float(np.rint(angle / resolution) * resolution)
@@ -74,7 +74,7 @@ def sense(
     offset: np.ndarray,
     reading: EncoderReading,
 ) -> None:
-    """Write the reading of this sample, with the offset (n,) [rad] and the noise that are in it.
+    """Write the reading of this sample, including offset (n,) [rad] and noise.
 
     A differenced velocity spans the samples since the last reading, `period` seconds each; the
     first reading has no predecessor and gets the true velocity.

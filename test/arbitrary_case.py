@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings, state and signals full of random numbers, for kernels that know no arm: any n and p."""
+"""Random settings, state and signals for kernels that are independent of an arm: any n and p."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from blf_dsc_controller.law.state import (
 
 
 class Case(NamedTuple):
-    """What a kernel is called with."""
+    """Arguments of a kernel."""
 
     settings: Settings
     state: State
@@ -28,7 +28,7 @@ class Case(NamedTuple):
 
 
 def arbitrary_settings(random: np.random.Generator, n: int, p: int, **changes) -> Settings:
-    """Gains between 0.5 and 2 for n joints, p parameters and a bias column for each joint."""
+    """Return gains between 0.5 and 2 for n joints, p parameters and a bias column per joint."""
     settings = recommended()
     length = {settings.n: n, settings.p: p, settings.m: p + n}
     arrays = {
@@ -59,7 +59,7 @@ def arbitrary_settings(random: np.random.Generator, n: int, p: int, **changes) -
 
 
 def arbitrary(seed: int, n: int = 3, p: int = 4, **changes) -> Case:
-    """Case of a seed, its state and signals standard normal."""
+    """Return the case of a seed, with standard normal state and signals."""
     random = np.random.default_rng(seed)
     settings = arbitrary_settings(random, n, p, **changes)
     state = state_of(random.normal(size=state_size(settings)), settings)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arms that change while they are learned: payloads, releases and pushes, as events of the plant.
+"""Arms that change during learning: payloads, releases and pushes, as events of the plant.
 
-Each broke the bound of the recommended set before learning checked its windows.
+Each violated the bound of the preset `recommended` before learning checked its windows.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ BOUND = 2e-3  # rad
 WINDOW = 2.0 * np.pi  # s
 OFF = {'learning.weight': 0.0}
 CHANGED = 20.0  # s
-GENTLE = 0.25e-3  # rad, allowed after a ramp: small errors, of which 1.2 times is missed
+GENTLE = 0.25e-3  # rad, allowed after a ramp: errors so small that 1.2 times is too strict
 
 PUSHES = [(1, 1.0, 3.0), (1, 2.0, 2.0), (0, 3.0, 3.0)]  # joint, N m, s
 
 
 def payload(m2, begin=CHANGED):
-    """Parameters of a plant whose mass at the tip becomes `m2` [kg]; less is a release."""
+    """Return parameters of a plant whose tip mass becomes `m2` [kg]; a lower one is a release."""
     if m2 >= 0.5:
         return {'events.begin': [begin], 'events.payload': [m2 - 0.5]}
     released = {'events.begin': [0.0], 'events.duration': [begin], 'events.payload': [0.5 - m2]}
@@ -26,7 +26,7 @@ def payload(m2, begin=CHANGED):
 
 
 def push(joint, torque, seconds, begin=CHANGED):
-    """Parameters of a plant that is pushed by a torque [N m] on a joint for some seconds."""
+    """Return parameters of a plant with a torque [N m] on a joint for some seconds."""
     torques = [0.0, 0.0]
     torques[joint] = torque
     return {
@@ -37,7 +37,7 @@ def push(joint, torque, seconds, begin=CHANGED):
 
 
 def several(*events):
-    """Parameters of a plant with all of these events, given by name without `events.`."""
+    """Return parameters of a plant with all of these events, named without `events.`."""
     names = {name for event in events for name in event}
     return {
         f'events.{name}': [
@@ -70,26 +70,26 @@ ROWS = {
         {'begin': CHANGED + 9.0, 'duration': 2.0, 'torque': [0.0, -1.0]},
     ),
 }
-"""By name; two windows are left from the last change to `end_of`."""
+"""Changes by name; a run ends at `end_of`, two windows after the last change."""
 
 LIGHTER = {f'release to {m2} kg': payload(m2) for m2 in (0.25, 0.3)}
-"""The same with another arm, which is no event."""
+"""Releases that also change the arm itself, which is not an event."""
 
 
 def allowed(row, without):
-    """Largest error allowed with learning [rad], from the largest without it."""
+    """Return the largest error allowed with learning [rad], given the largest without it."""
     return np.maximum(1.2 * without, GENTLE if 'events.ramp' in row else 0.0)
 
 
 def begin_of(row):
-    """Time of the first change of a row after its start [s]."""
+    """Return the time of the first change of a row after its start [s]."""
     begin = np.array(row['events.begin'])
     times = np.concatenate([begin, begin + row.get('events.duration', 0.0 * begin)])
     return float(times[times > 0.0].min())
 
 
 def end_of(row):
-    """Time of the last change of a row, and two windows more [s], in whole samples."""
+    """Return the time two windows after the last change of a row [s], in whole samples."""
     begin = np.array(row['events.begin'])
     duration = np.array(row.get('events.duration', 0.0 * begin))
     ramp = np.array(row.get('events.ramp', 0.0 * begin))

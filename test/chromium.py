@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A headless Chromium, told what to do over the pipe of its DevTools: no driver is needed."""
+"""A headless Chromium, controlled over its DevTools pipe: no driver is needed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FLAGS = (
     '--remote-debugging-pipe',
     '--window-size=1400,1000',
 )
-# Pictures in space are drawn by the processor.
+# 3D scenes are rendered by the CPU.
 WEBGL = ('--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist')
 NAMES = ('chromium', 'chromium-browser', 'google-chrome')
 PATIENCE = 300.0  # s, until a test gives up on what should take seconds
@@ -37,7 +37,7 @@ _PLACE = """(() => {{
 
 
 def find():
-    """Path of a Chromium, None if there is none."""
+    """Return the path of a Chromium, or None."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
 
 
@@ -45,8 +45,8 @@ class Browser:
     """One page in a browser of its own.
 
     Attributes:
-        complaints: errors of console and scripts.
-        requests: addresses of all that the page asked for.
+        complaints: errors of the console and of scripts.
+        requests: URLs that the page requested.
     """
 
     def __init__(self, profile, *flags):
@@ -73,7 +73,7 @@ class Browser:
             self.call(f'{domain}.enable')
 
     def call(self, method, **parameters):
-        """Let the browser do something and return what it answers."""
+        """Call a method of DevTools and return its result."""
         self._number += 1
         request = {'id': self._number, 'method': method, 'params': parameters}
         if self._session:
@@ -86,13 +86,13 @@ class Browser:
                 return answer['result']
 
     def value(self, expression):
-        """Value of an expression in the page."""
+        """Return the value of an expression in the page."""
         told = self.call('Runtime.evaluate', expression=expression, returnByValue=True)
         assert 'exceptionDetails' not in told, told
         return told['result'].get('value')
 
     def wait(self, expression):
-        """Wait until an expression in the page is true, and return it."""
+        """Wait until an expression in the page is true, and return its value."""
         deadline = time.monotonic() + PATIENCE
         while not (value := self.value(expression)):
             assert time.monotonic() < deadline, f'still waiting for {expression}'
@@ -100,7 +100,7 @@ class Browser:
         return value
 
     def mouse(self, kind, x, y):
-        """Move, press or release the left button at a place of the window."""
+        """Move the mouse, or press or release its left button, at a position in the window."""
         self.call(
             'Input.dispatchMouseEvent',
             type=kind,
@@ -112,14 +112,14 @@ class Browser:
         )
 
     def click(self, text):
-        """Click on what has this text, once it is there."""
+        """Click on the element with this text, once it exists."""
         self.wait(_PLACE.format(text=text))
         x, y = self.value(_PLACE.format(text=text))
         self.mouse('mousePressed', x, y)
         self.mouse('mouseReleased', x, y)
 
     def drag(self, start, end):
-        """Drag from one place of the window to another."""
+        """Drag from one position in the window to another."""
         (x0, y0), (x1, y1) = start, end
         self.mouse('mousePressed', x0, y0)
         for k in range(1, 6):
@@ -127,12 +127,12 @@ class Browser:
         self.mouse('mouseReleased', x1, y1)
 
     def screenshot(self, path, *, whole=False):
-        """Write what the window shows, or the whole page, as PNG."""
+        """Write the visible part of the page, or the whole page, as PNG."""
         told = self.call('Page.captureScreenshot', captureBeyondViewport=whole, format='png')
         path.write_bytes(base64.b64decode(told['data']))
 
     def close(self):
-        """End the browser."""
+        """Kill the browser."""
         self._process.kill()
         self._process.wait()
         os.close(self._to)

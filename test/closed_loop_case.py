@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the core's tests share: Section IV with the recommended gains, and its sampled loop."""
+"""Common case of the law's tests: Section IV with the recommended gains, in a sampled loop."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ QUIET = (0.0, 0.0)
 
 
 def recommended(*, bias: bool = True, **changes) -> Settings:
-    """Settings of the default configuration, with changes; the knee follows the barrier's.
+    """Return the settings of the default configuration with changes, and the knee for them.
 
-    Without change detection, which is not the paper's: test_law_consistency.py is about it.
+    Change detection is off, since the paper has none: test_law_consistency.py covers it.
     """
     config = ControllerConfig()
     config = replace(config, learning=replace(config.learning, bias=bias))
@@ -46,12 +46,12 @@ def recommended(*, bias: bool = True, **changes) -> Settings:
 
 
 def quick(**changes) -> Settings:
-    """Settings that learn within seconds: a window of 1 s, which this excites less."""
+    """Return settings that learn within seconds: a window of 1 s, which is less excited."""
     return recommended(**{'window': 1000, 'learning_start': 1.2, 'sigma': 1e-6} | changes)
 
 
 def controller(settings: Settings) -> Controller:
-    """Controller of the paper's reference."""
+    """Return a controller that tracks the paper's reference."""
     return Controller(settings, REFERENCE)
 
 
@@ -68,7 +68,7 @@ def plant(
     start: tuple[float, float] = START,
     seed: int = 0,
 ) -> Plant:
-    """Section IV's arm at its start, with its disturbance 0.1 + 0.1 sin t on each joint."""
+    """Return Section IV's arm at its start, with disturbance 0.1 + 0.1 sin t on each joint."""
     return plants.plant(
         period_ns=round(sample_time * 1e9),
         position_noise=noise,
@@ -82,7 +82,7 @@ def plant(
 
 
 class Sample(NamedTuple):
-    """One sample of a loop, answered by the controller and not yet applied to the plant."""
+    """One sample of a loop, whose torque is computed but not yet applied to the plant."""
 
     k: int
     t: float  # s
@@ -90,7 +90,7 @@ class Sample(NamedTuple):
 
 
 def closed_loop(law: Controller, arm: Plant, duration: float) -> Iterator[Sample]:
-    """Run the loop for `duration` [s], stopping at each sample to let the test look."""
+    """Run the loop for `duration` [s], yielding each sample so that the test can inspect it."""
     dt = arm.period_ns * 1e-9
     for k in range(round(duration / dt)):
         t = k * arm.period_ns * 1e-9
@@ -101,7 +101,7 @@ def closed_loop(law: Controller, arm: Plant, duration: float) -> Iterator[Sample
 
 
 class Record(NamedTuple):
-    """A whole loop; the first axis is the sample."""
+    """A whole run; the first axis is the sample."""
 
     t: np.ndarray  # s
     xi1: np.ndarray  # (., 2) rad
@@ -115,7 +115,7 @@ class Record(NamedTuple):
 
 
 def record(law: Controller, arm: Plant, duration: float) -> Record:
-    """Run a loop and keep what the tests ask of it."""
+    """Run a loop and record what the tests need."""
     rows = [
         (
             sample.t,
@@ -130,5 +130,5 @@ def record(law: Controller, arm: Plant, duration: float) -> Record:
 
 @cache
 def recommended_minute() -> Record:
-    """Sixty noise-free seconds of the recommended configuration, run once for all tests."""
+    """Return 60 noise-free seconds of the recommended configuration, run once for all tests."""
     return record(controller(recommended()), plant(), 60.0)

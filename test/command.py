@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc run` as a process of its own, as a user starts it, and the processes it starts."""
+"""`blf_dsc run` in its own process, as a user starts it, and the processes it starts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 PATIENCE = 300.0  # s, until a test gives up on what should take seconds
-# For real time on a machine too slow for it, where a controller otherwise stops, and rightly so.
+# For real time on a machine too slow for it, where a controller would rightly stop.
 PATIENT = """blf_dsc_controller:
   ros__parameters:
     safety:
@@ -25,12 +25,12 @@ COMMAND = (sys.executable, '-m', 'blf_dsc_controller', 'run')
 
 
 def closed_loop(*arguments, **options):
-    """Run the command to its end."""
+    """Run the command to completion."""
     return finished(*COMMAND, *arguments, **options)
 
 
 def finished(*command, **options):
-    """Run any command to its end."""
+    """Run any command to completion."""
     return subprocess.run(
         [*map(str, command)],
         capture_output=True,
@@ -49,7 +49,7 @@ def wait_for(condition):
 
 
 class Running:
-    """A run without end, until the test ends it."""
+    """An endless run, until the test ends it."""
 
     def __init__(self, out):
         self.out = out
@@ -60,7 +60,7 @@ class Running:
             text=True,
         )
         bag = out / 'bag' / 'bag_0.mcap'
-        # 500 kB: some 200 samples are recorded, of about 2 kB with all topics.
+        # 500 kB: some 200 samples have been recorded, each about 2 kB with all topics.
         wait_for(lambda: bag.exists() and bag.stat().st_size > 500_000)
         self.children = [
             int(child)
@@ -71,7 +71,7 @@ class Running:
         assert len(self.children) == 3
 
     def child(self, module):
-        """Process id of the child that runs a module."""
+        """Return the process id of the child that runs a module."""
         (found,) = (
             child for child in self.children if module in Path(f'/proc/{child}/cmdline').read_text()
         )
@@ -83,11 +83,11 @@ class Running:
         return self.process.returncode, out, err
 
     def wait_for_children(self):
-        """Wait until none of the nodes is left."""
+        """Wait until all nodes have exited."""
         wait_for(lambda: not any(_is_alive(child) for child in self.children))
 
     def close(self):
-        """Leave nothing behind."""
+        """Kill all processes that are left."""
         if self.process.poll() is None:
             self.process.kill()
             self.process.communicate()

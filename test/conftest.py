@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS environment of the test process and of the processes that tests start; no deadlines.
+"""ROS environment of the test process and its child processes; hypothesis without deadlines.
 
 It is set here, before any test module imports rclpy: a domain that no other run on this machine is
-likely to share, on this machine only, with the logs in a folder that goes away at the end.
+likely to share, discovery on this machine only, and a log folder that is removed at the end.
 """
 
 import os
@@ -14,7 +14,7 @@ import hypothesis
 import pytest
 from own_domain import own_domain
 
-# How long an example takes says something of the machine, not of the package.
+# The time that an example takes depends on the machine, not on the package.
 hypothesis.settings.register_profile('patient', deadline=None)
 hypothesis.settings.load_profile('patient')
 
@@ -24,10 +24,10 @@ _LOG_FOLDER = tempfile.mkdtemp(prefix='blf_dsc_controller_test_log_')
 os.environ['ROS_DOMAIN_ID'] = str(own_domain())
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_LOG_DIR'] = _LOG_FOLDER
-# As `blf_dsc run` sets it: nodes that end wait 0.1 s instead of 3 s for their last acknowledgement.
+# As in `blf_dsc run`: exiting nodes wait 0.1 s instead of 3 s for their last acknowledgement.
 os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(_FOLDER.parent / 'config' / 'fastdds.xml')
 
-# They take longest, and first come first served: so no worker is left with one of them at the end.
+# The longest tests start first, so that no worker is left with one of them at the end.
 _FIRST = (
     'test_closed_loop',
     'test_presets',
@@ -44,7 +44,7 @@ _FIRST = (
 
 @pytest.fixture
 def ros():
-    """Nodes of the package in this process."""
+    """Provide nodes of the package in this process."""
     from ros_rig import RosRig
 
     rig = RosRig()
@@ -57,5 +57,5 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_unconfigure():
-    """Remove the logs; workers of pytest-xdist run nothing at their exit."""
+    """Remove the logs here, as workers of pytest-xdist run no atexit handlers."""
     shutil.rmtree(_LOG_FOLDER, ignore_errors=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A clock for nodes whose time only the test advances, however slow the machine is."""
+"""A clock for nodes that only the test advances, however slow the machine is."""
 
 from __future__ import annotations
 

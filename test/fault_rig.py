@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A closed loop to break: arm, messages, guarded controller, and clocks that the test turns.
+"""A closed loop for fault injection: arm, messages, guarded law, and clocks that the test sets.
 
 Everything passes through the same decoders, supervisor and torque input as in the nodes.
 """
@@ -40,13 +40,13 @@ class State(NamedTuple):
     effort: np.ndarray
 
     def raw(self, encoder=PLAIN, **changes):
-        """Message of the state, with changes."""
+        """Return the state, with changes, as a message."""
         told = self._replace(**changes)
         return encoder.encode(told.stamp, told.q, told.dq, told.effort)
 
 
 class Rig:
-    """A loop of a millisecond a step, stamped in lock-step's time or, `live`, in today's."""
+    """A loop with steps of 1 ms, stamped in lock-step time or, if `live`, in wall time."""
 
     def __init__(self, given=None, *, live=False, plant=None):
         self.config = build(ControllerConfig, given or {})
@@ -59,8 +59,8 @@ class Rig:
         self.input = TorqueInput(JOINTS)
         self.commands = []  # all torques commanded
         self.push = np.zeros(2)
-        self.sense = lambda state: [state.raw()]  # messages that a state becomes
-        self.actuate = lambda raw: [raw]  # commands that a torque becomes
+        self.sense = lambda state: [state.raw()]  # messages sent for a state
+        self.actuate = lambda raw: [raw]  # commands sent for a torque
 
     def controller(self):
         """Start a controller process: activated, with nothing learned."""
@@ -78,12 +78,12 @@ class Rig:
         return self.guard.supervisor
 
     def state(self):
-        """Return the true state of now."""
+        """Return the current true state."""
         q, dq, effort = self.plant.measure().copy().reshape(3, 2)
         return State(self.base + self.plant.elapsed_ns, q, dq, effort)
 
     def deliver(self, raw):
-        """Hand one message to the controller; return the torque it commands, or None."""
+        """Pass one message to the controller; return the torque it commands, or None."""
         try:
             stamp = self._decoder.decode(raw)
         except MessageError as error:
@@ -103,7 +103,7 @@ class Rig:
             self.input.take(size, decoder.values, self.plant.sample)
 
     def step(self, count=1):
-        """Go on by milliseconds: measure, deliver, look at the clock now and then, move."""
+        """Advance by `count` milliseconds: measure, deliver, run the watchdog if due, move."""
         for _ in range(count):
             for raw in self.sense(self.state()):
                 self.deliver(raw)
@@ -111,7 +111,7 @@ class Rig:
             self.plant.step(self.input.torque + self.push)
 
     def wait(self, milliseconds=1):
-        """Let the clocks go on, and the watch look at them when it wants to."""
+        """Advance the clocks, and run the watchdog when it is due."""
         for _ in range(milliseconds):
             self.steady += MILLISECOND
             self.wall += MILLISECOND
@@ -120,7 +120,7 @@ class Rig:
                 self.next_watch = self.steady + self.guard.watchdog.next_check * 1e9
 
     def mend(self):
-        """Take the fault away, and reset arm and controller as the nodes' services do."""
+        """Remove the fault, and reset arm and controller as the nodes' services do."""
         self.sense = lambda state: [state.raw()]
         self.actuate = lambda raw: [raw]
         self.push = np.zeros(2)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Input from outside at random: names, metadata, MCAP files, messages, parameter files, URDFs.
+"""Random external input: names, metadata, MCAP files, messages, parameter files, URDFs.
 
-Each property holds that a command ends with its result or with an error of its own: no other
-exception, no hang, no memory without end, nothing opened outside of the folder, nothing imported.
-`python fuzzing.py --minutes 5` looks for what breaks one of them; test_fuzzing.py tries a few.
+Each property states that a command ends with its result or an error of the package: no other
+exception, no hang, bounded memory, nothing opened outside of the folder, nothing imported.
+`python fuzzing.py --minutes 5` looks for counterexamples; test_fuzzing.py tries a few.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.share import share_folder
 from blf_dsc_controller.errors import BlfDscError
 
-MOST_SECONDS = 60.0  # of computing
-MOST_MEMORY = 3 << 30  # bytes beside what the process had before
+MOST_SECONDS = 60.0  # of CPU time
+MOST_MEMORY = 3 << 30  # bytes on top of what the process had before
 ASIDE = 'elsewhere'
 
 tried: Counter[str] = Counter()
@@ -59,7 +59,7 @@ sys.addaudithook(_watch)
 
 
 class HangError(BaseException):
-    """It took too long."""
+    """A command took too long."""
 
 
 def _hang(*_):
@@ -68,7 +68,7 @@ def _hang(*_):
 
 @contextlib.contextmanager
 def bounded(name):
-    """Run what is tested within limits, counted under this name."""
+    """Run the tested code within limits, counted under this name."""
     tried[name] += 1
     before = set(sys.modules)
     _opened.clear()
@@ -79,7 +79,7 @@ def bounded(name):
     signal.setitimer(signal.ITIMER_PROF, MOST_SECONDS)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter('ignore', RuntimeWarning)  # of infinite numbers
+            warnings.simplefilter('ignore', RuntimeWarning)  # from infinite numbers
             yield
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
@@ -91,7 +91,7 @@ def bounded(name):
 
 
 def command(*words):
-    """Run a command and return its exit code; what it says must not be a traceback."""
+    """Run a command and return its exit code; its output must not contain a traceback."""
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         code = main([str(word) for word in words])
@@ -129,7 +129,7 @@ def names(name):
 
 
 def _once(make):
-    """Result of the first call, made in the folder of this process."""
+    """Cache the result of the first call, made in the folder of this process."""
     kept = []
 
     def get():
@@ -142,26 +142,26 @@ def _once(make):
 
 @_once
 def base():
-    """Bag of a short run, of which the other ones are changed."""
+    """Return the bag of a short run, from which all others are derived."""
     return recorded_run.record(_folder / 'base', 0.1)
 
 
 @_once
 def entries():
-    """Its messages."""
+    """Return its messages."""
     return recorded_run.messages(base())
 
 
 @_once
 def pieces():
-    """Records of its file."""
+    """Return the records of its file."""
     (file,) = base().glob('*.mcap')
     return [piece.raw for piece in scan(file.read_bytes())]
 
 
 @_once
 def secret():
-    """A file that no bag may lead to."""
+    """Create a file that no bag may lead to; return its folder."""
     folder = _folder / ASIDE
     folder.mkdir()
     (folder / 'secret.mcap').write_bytes((base() / 'base_0.mcap').read_bytes())
@@ -174,7 +174,7 @@ WAYS = st.sampled_from((*READ * 5, *DRAW))
 
 
 def read(bag, way):
-    """Read a bag in one of many ways."""
+    """Read a bag in one of several ways."""
     out = bag.parent / f'out_{len(tried)}'
     name, _, option = way.partition(' ')
     if way == 'in order':
@@ -196,7 +196,7 @@ def read(bag, way):
 
 @contextlib.contextmanager
 def folder():
-    """A folder for one example, beside the secret."""
+    """Provide a folder for one example, beside the secret one."""
     secret()
     with tempfile.TemporaryDirectory(dir=_folder) as one:
         (Path(one) / 'bag').mkdir()
@@ -214,7 +214,7 @@ SCALARS = st.one_of(
 
 
 def _places(tree):
-    """Each place in nested data, as the container and the key."""
+    """Yield each place in nested data as its container and key."""
     items = list(tree.items() if isinstance(tree, dict) else enumerate(tree))
     for key, value in items:
         yield tree, key
@@ -290,7 +290,7 @@ RECORDS = st.one_of(
 
 @given(data=st.data(), way=WAYS)
 def records(data, way):
-    """MCAP files: records changed, added, left out, in another order; bytes flipped; cut off."""
+    """MCAP files: records changed, added, removed or repeated; bytes flipped; files truncated."""
     found = list(pieces())
     for _ in range(data.draw(st.integers(0, 3))):
         at = data.draw(st.integers(0, len(found) - 1))
@@ -323,7 +323,7 @@ def records(data, way):
 
 @given(data=st.data(), way=WAYS)
 def messages(data, way):
-    """Serialised messages: bytes changed, added and left out, and others' content."""
+    """Serialised messages: bytes changed, added or removed, or another message's content."""
     changed = [list(one) for one in entries()]
     topics = sorted({one[0] for one in changed})
     for _ in range(data.draw(st.integers(1, 3))):
@@ -372,7 +372,7 @@ WORDS = st.one_of(
 
 @given(data=st.data(), preset=st.sampled_from(('recommended', 'noisy', 'payload', 'panda')))
 def parameters(data, preset):
-    """Parameter files: other values, lines moved, left out and added."""
+    """Parameter files: other values; lines repeated, removed or extended."""
     lines = (share_folder() / 'config' / f'{preset}.yaml').read_text().splitlines()
     for _ in range(data.draw(st.integers(1, 4))):
         at = data.draw(st.integers(0, len(lines) - 1))
@@ -416,7 +416,7 @@ XML = (
 
 @given(data=st.data(), arm=st.sampled_from(('panda', 'ur5e')))
 def urdfs(data, arm):
-    """URDFs: other attributes, elements moved, left out, nested and repeated."""
+    """URDFs: other attributes; elements removed, nested or repeated."""
     root = ET.fromstring((share_folder() / 'config' / f'{arm}.urdf').read_text())  # noqa: S314 - ours
     for _ in range(data.draw(st.integers(1, 4))):
         every = list(root.iter())
@@ -475,7 +475,7 @@ def run_for(minutes, examples=50):
             return failed
         try:
             one()
-        except BaseException as error:  # noqa: BLE001 - every kind is what is looked for
+        except BaseException as error:  # noqa: BLE001 - any exception is a finding
             if isinstance(error, KeyboardInterrupt):
                 return failed
             failed.add(one.__name__)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A small study for tests: runs of a third of a second in which everything happens."""
+"""A small study for tests: runs of 0.3 s with all kinds of variations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from blf_dsc_controller.monte_carlo.study import load_study
 
 RUNS = 24
 
-# A window of 0.1 s has next to no excitation, but it latches: learning within 0.3 s.
+# A window of 0.1 s is hardly excited, but it latches: learning within 0.3 s.
 LOOP = """\
 sim_plant:
   ros__parameters:
@@ -44,24 +44,24 @@ monte_carlo:
 
 
 def write(folder, text=LOOP + STUDY):
-    """File of a study."""
+    """Write the file of a study and return its path."""
     path = folder / 'study.yaml'
     path.write_text(text)
     return path
 
 
 def study(folder, text=LOOP + STUDY, **overrides):
-    """The study of a file of this text."""
+    """Return the study of a file with this text."""
     return load_study(write(folder, text), overrides)
 
 
 def whole(a_study):
-    """Results of all runs, computed in one go, in this process."""
+    """Return the results of all runs, computed at once in this process."""
     return run_chunk(a_study, 0, a_study.settings.runs)
 
 
 def same(one, other):
-    """Whether two results are the same, bit for bit."""
+    """Return True if two results are the same, bit for bit; fail otherwise."""
     assert list(one) == list(other)
     for name, values in one.items():
         np.testing.assert_array_equal(values, other[name], err_msg=name)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A DDS participant that publishes types which no ROS package has, until it is killed.
+"""A DDS participant that publishes types of no ROS package until it is killed.
 
-`python odd_participant.py a=foo::bar::X` publishes `foo::bar::dds_::X_` on /a. The middleware makes
-the name of the type support of a message, where it is replaced here.
+`python odd_participant.py a=foo::bar::X` publishes `foo::bar::dds_::X_` on /a. The middleware
+derives the name from the type support of a message, where it is replaced here.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import time
 import rclpy
 from std_msgs.msg import String
 
-_KEPT = []  # names that the middleware reads
+_KEPT = []  # names that the middleware reads, kept alive
 _IDENTIFIER = b'rosidl_typesupport_fastrtps_c'
 _get_pointer = ctypes.pythonapi.PyCapsule_GetPointer
 _get_pointer.restype, _get_pointer.argtypes = ctypes.c_void_p, (ctypes.py_object, ctypes.c_char_p)
@@ -24,7 +24,7 @@ _get_name.restype, _get_name.argtypes = ctypes.c_char_p, (ctypes.py_object,)
 
 
 class TypeSupport(ctypes.Structure):
-    """Begin of rosidl_message_type_support_t."""
+    """First fields of rosidl_message_type_support_t."""
 
 
 TypeSupport._fields_ = (
@@ -38,7 +38,7 @@ TypeSupport._fields_ = (
 
 
 def rename(namespace, name):
-    """Let std_msgs/String have another name in this process."""
+    """Rename std_msgs/String in this process."""
     String.__class__.__import_type_support__()
     capsule = String.__class__._TYPE_SUPPORT
     found = ctypes.cast(_get_pointer(capsule, _get_name(capsule)), ctypes.POINTER(TypeSupport))

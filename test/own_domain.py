@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS domains of this test process: claimed as a run claims its own, so that none meets another.
+"""ROS domains of this test process, claimed as a run claims its own, so that none is shared.
 
-A context takes the next of them, for nodes of the last test leave the graph slowly.
+Each context takes the next one, because nodes of the last test leave the graph slowly.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ _MINE = []
 
 
 def _claim():
-    """Domain that no other process holds, None if there is none left.
+    """Claim a domain that no other process holds; return None if none is left.
 
-    The system lets go of it when this process ends.
+    The system releases it when this process exits.
     """
     first = os.getpid() % _DOMAINS
     for k in range(_DOMAINS):
@@ -35,13 +35,13 @@ def _claim():
 
 
 def own_domain() -> int:
-    """Domain that this process has not used lately."""
+    """Return a domain that this process has not used recently."""
     if len(_MINE) < _WANTED:
         claimed = _claim()
         if claimed is not None:
             _MINE.append(claimed)
             return claimed
-    if not _MINE:  # on a very crowded machine one is shared
+    if not _MINE:  # on a crowded machine, share one
         _MINE.append(1 + os.getpid() % _DOMAINS)
-    _MINE.append(_MINE.pop(min(1, len(_MINE) - 1)))  # the first is that of the environment
+    _MINE.append(_MINE.pop(min(1, len(_MINE) - 1)))  # the first is the environment's
     return _MINE[-1]

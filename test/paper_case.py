@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Presets as configurations, and their runs, for the tests of the paper's variants."""
+"""Configurations and runs of presets, for the tests of the paper's variants."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def configured(
     law: Mapping[str, object] | None = None,
     arm: Mapping[str, object] | None = None,
 ) -> LoopConfig:
-    """A preset, with changes to the controller (`law`) and to the plant (`arm`)."""
+    """Return a preset with changes to the controller (`law`) and to the plant (`arm`)."""
     config = load_loop(preset, {'sim_plant': {'duration': duration}})
     return config._replace(
         controller=change(config.controller, law or {}), plant=change(config.plant, arm or {})
@@ -37,7 +37,7 @@ def configured(
 
 
 class Loop(NamedTuple):
-    """A whole loop; the first axis is the sample."""
+    """A whole run; the first axis is the sample."""
 
     t: np.ndarray  # s
     xi1: np.ndarray  # (., 2) rad
@@ -53,7 +53,7 @@ class Loop(NamedTuple):
         return np.linalg.norm(self.estimate[:, :3] - P, axis=1) / np.linalg.norm(P)
 
     def error_at(self, t: float) -> float:
-        """Relative parameter error at a time [s]."""
+        """Return the relative parameter error at a time [s]."""
         return float(self.parameter_error[np.abs(self.t - t).argmin()])
 
 

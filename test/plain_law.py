@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The law in plain numpy, as a control engineer would write it, sharing nothing with the package.
 
-The tests' oracle, and the law of every peer in benchmark/ that brings only a simulator.
+It is the tests' oracle, and the law of every peer in benchmark/ that is only a simulator.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 
 def dynamics(P, r, q, dq):
-    """M, C, G of the two-link arm."""
+    """Return M, C, G of the two-link arm."""
     c = P[2] * np.sin(q[1])
     coupling = P[2] * np.cos(q[1])
     M = np.array([[P[0] + P[1] + 2.0 * coupling, P[1] + coupling], [P[1] + coupling, P[1]]])
@@ -21,7 +21,7 @@ def dynamics(P, r, q, dq):
 
 
 class PlainLaw:
-    """Answers samples as the law is written, with settings under the package's names."""
+    """The law as it is written, with settings under the package's names."""
 
     def __init__(self, settings):
         self.gains = settings
@@ -40,13 +40,13 @@ class PlainLaw:
         self.pole1 = self.pole2 = np.zeros((2, settings.m + 1))
 
     def bound(self, t):
-        """k(t), and its derivative."""
+        """Return k(t) and its derivative."""
         g = self.gains
         wider = (g.initial_bound - g.bound) * np.exp(-g.funnel_rate * t)
         return g.bound + wider, -g.funnel_rate * wider
 
     def barrier_torque(self, xi1, t):
-        """tau_c of (16) with its weight, a straight line from the knee on."""
+        """Return tau_c of (16) with its weight, a straight line beyond the knee."""
         g = self.gains
         k, _ = self.bound(t)
         edge = np.minimum(np.abs(xi1), g.knee / g.bound * k)
@@ -54,7 +54,7 @@ class PlainLaw:
         return -np.sign(xi1) * (inside + g.slope_limit * (np.abs(xi1) - edge))
 
     def virtual_control(self, xi1, dqr, t):
-        """beta2 of (18) with (15) as printed: it needs an error that is not zero."""
+        """Return beta2 of (18) with (15) as printed, which needs a nonzero error."""
         g = self.gains
         k, dk = self.bound(t)
         s = np.pi * xi1**2 / (2.0 * k**2)
@@ -62,7 +62,7 @@ class PlainLaw:
         return np.where(np.abs(xi1) < k, tau_aux, 0.0) - g.mu * xi1 + dqr + xi1 * dk / k
 
     def regressor(self, q, dq, v, a):
-        """H of Section IV, with cos q1 in its first gravity term."""
+        """Return H of Section IV, with cos q1 in its first gravity term."""
         r = self.gains.model.r
         c2, s2, c12 = np.cos(q[1]), np.sin(q[1]), np.cos(q[0] + q[1])
         coriolis = s2 * (dq[1] * v[0] + (dq[0] + dq[1]) * v[1])
@@ -74,7 +74,7 @@ class PlainLaw:
         )
 
     def momentum_regressors(self, q, dq):
-        """Yp and [Yr | bias columns]."""
+        """Return Yp and [Yr | bias columns]."""
         r = self.gains.model.r
         c2, s2, c12 = np.cos(q[1]), np.sin(q[1]), np.cos(q[0] + q[1])
         both = dq[0] + dq[1]
@@ -83,7 +83,7 @@ class PlainLaw:
         return Yp, np.column_stack([Yr, np.eye(2)[:, : self.gains.m - 3]])
 
     def learn(self, t, dt, q, dq, applied):
-        """Filter the row of the last interval into the window; latch the window when it is time."""
+        """Filter the row of the last interval into the window; when due, latch the window."""
         g = self.gains
         Yp, Yr = self.momentum_regressors(q, dq)
         if self.previous is not None:
@@ -101,14 +101,14 @@ class PlainLaw:
         self.previous = Yp, Yr
 
     def latch_if_excited(self):
-        """(21), (22), (26), (27)."""
+        """Latch the window if it is excited, by (21), (22), (26), (27)."""
         mean = self.total / min(self.rows, self.gains.window)
         Phi, b = mean[:-1, :-1], mean[:-1, -1]
         if np.linalg.eigvalsh(Phi)[0] >= self.gains.sigma:
             self.latched = Phi.copy(), b.copy()
 
     def adapt(self, dt, H, xi2, *, saturated):
-        """(20) with its sign corrected and projected in the Gamma metric, (30)."""
+        """Update by (20), its sign corrected and projected in the Gamma metric, and by (30)."""
         g = self.gains
         v = np.zeros(g.m)
         if self.latched is not None:
@@ -129,14 +129,14 @@ class PlainLaw:
         self.theta = self.theta + dt * v
         w, gain = self.theta[:3].copy(), np.array(g.Gamma[:3])
         if np.linalg.norm(w) > g.radius:
-            # Nearest point of the ball: the multiplier that ends the way out on the sphere.
+            # Nearest point of the ball, from the multiplier that puts it on the sphere.
             out = lambda nu: np.linalg.norm(w / (1.0 + nu * gain)) - g.radius  # noqa: E731
             self.theta[:3] = w / (1.0 + brentq(out, 0.0, 1e9, xtol=1e-18) * gain)
         if g.bumpless and self.latched is not None:
             self.d3 = self.d3 - H @ (self.theta - by_tracking)[:3]
 
     def update(self, t, dt, qr, dqr, measurement):
-        """Torque (28) for a measurement; `tau`, what went out last, is the caller's to set."""
+        """Return the torque (28) for a measurement; the caller sets `tau`, the last one sent."""
         g = self.gains
         q, dq, effort = np.reshape(measurement, (3, 2)).copy()
         xi1 = q - qr

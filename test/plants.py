@@ -15,13 +15,13 @@ from sim_plant.plant import Plant
 from sim_plant.sensors import MEASURED, Encoders
 
 ARM = PointMassArm(l1=1.0, l2=0.8, m1=0.5, m2=0.5, g=9.8)
-ODD_ARM = PointMassArm(l1=0.7, l2=1.1, m1=1.3, m2=0.4, g=9.81)  # no two of its numbers are the same
+ODD_ARM = PointMassArm(l1=0.7, l2=1.1, m1=1.3, m2=0.4, g=9.81)  # all of its numbers differ
 PERIOD = 1e-3  # s
 START = (2.293, 1.696)  # rad
 
 
 def energies(arm, q, dq):
-    """Kinetic and potential energy of the arm's two point masses [J]."""
+    """Return the kinetic and potential energy of the arm's two point masses [J]."""
     (s1, c1), (s12, c12) = ((np.sin(angle), np.cos(angle)) for angle in np.cumsum(q))
     v1 = arm.l1 * dq[0] * np.array([-s1, c1])
     v2 = v1 + arm.l2 * (dq[0] + dq[1]) * np.array([-s12, c12])
@@ -31,14 +31,14 @@ def energies(arm, q, dq):
 
 
 def points(l1, l2, q):
-    """Base, elbow and tip [m] at the joint positions q [rad]."""
+    """Return base, elbow and tip [m] at the joint positions q [rad]."""
     elbow = l1 * np.array([np.cos(q[0]), 0.0, np.sin(q[0])])
     angle = q[0] + q[1]
     return np.zeros(3), elbow, elbow + l2 * np.array([np.cos(angle), 0.0, np.sin(angle)])
 
 
 def disturbance(**terms):
-    """Disturbance of two joints, none unless asked for; each term for both, or one by one."""
+    """Return a disturbance of two joints, zero by default; each term for both or per joint."""
     none = dict.fromkeys(JointDisturbance._fields, 0.0) | {'frequency': 1.0}
     terms = none | {'coulomb_velocity': 0.01, 'stribeck_velocity': 0.1} | terms
     scalars = ('stribeck', 'stribeck_velocity', 'ripple_frequency')
@@ -47,7 +47,7 @@ def disturbance(**terms):
 
 
 def rough_disturbance():
-    """Every kind of disturbance at once, different on each joint."""
+    """Return every kind of disturbance at once, different on each joint."""
     return disturbance(
         constant=[0.1, -0.2],
         amplitude=[0.1, 0.3],
@@ -65,7 +65,7 @@ UNEVENTFUL = Events(*np.zeros((4, 0)), *(np.zeros((0, size)) for size in (2, 3, 
 
 
 def motion(arm=ARM, load=None, force=(0.0, 0.0, 0.0), wall=NOWHERE):
-    """Equation of motion of an arm, with a disturbance, and a force at its tip."""
+    """Return the equation of motion of an arm with a disturbance and a force at its tip."""
     tip = TipState(np.zeros(3), np.zeros((3, 2)), np.zeros(3))
     return Motion(arm, 0.0, load or disturbance(), Contact(np.array(force), wall, tip))
 
@@ -85,7 +85,7 @@ def settings(
     time_constant=0.0,
     torque_noise=0.0,
 ):
-    """Settings of the arm of Section IV at 1 kHz."""
+    """Return settings of the arm of Section IV, by default at 1 kHz."""
     return PlantSettings(
         arm=ARM,
         n=2,
@@ -107,17 +107,17 @@ def settings(
 
 
 def plant(*, seed=0, start=START, velocity=(0.0, 0.0), **changes):
-    """A plant at the paper's initial position."""
+    """Return a plant, by default at the paper's initial position."""
     return Plant(settings(**changes), start, velocity, seed)
 
 
 def commands(samples, seed=5):
-    """Torques, (samples, 2), about what gravity asks for, so that the arm stays where it is."""
+    """Return torques (samples, 2) around those of gravity, so that the arm stays in place."""
     return np.random.default_rng(seed).normal([-6.0, -2.0], 3.0, (samples, 2))
 
 
 def run(a_plant, torques):
-    """Measurements, (samples, 6), of a plant that answers with the given torques."""
+    """Return the measurements (samples, 6) of a plant under the given torques."""
     rows = np.empty((len(torques), 6))
     for row, torque in zip(rows, torques, strict=True):
         row[:] = a_plant.measure()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random serial arms as URDFs, and the same arms as pinocchio reads them."""
+"""Random serial arms as URDFs, and the same arms as read by pinocchio."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def words(numbers):
 
 
 def link(name, random):
-    """A link with the inertia of a random cloud of points: a possible body, whatever it draws."""
+    """Return a link with the inertia of a random cloud of points, which is always physical."""
     if random is None:
         return f'<link name="{name}" />'
     points = random.normal(size=(5, 3)) * random.uniform(0.02, 0.2, 3)
@@ -53,9 +53,9 @@ def joint(name, kind, parent, child, random):
 
 
 def random_urdf(n, seed):
-    """URDF of a chain from `base` to `tip` by joints j1 .. jn, of all kinds.
+    """Return the URDF of a chain from `base` to `tip`, and its joints j1 .. jn of all kinds.
 
-    Between two joints and beyond the last are fixed joints, and masses hang aside.
+    Each joint is followed by a fixed joint, and links with mass branch off.
     """
     random = np.random.default_rng(seed)
     text, at = [link('base', random)], 'base'
@@ -72,12 +72,12 @@ def random_urdf(n, seed):
 
 
 def pinocchio_model(text, joints):
-    """The arm of these joints; all others are held at 0."""
+    """Return the arm with these joints; all others are fixed at 0."""
     model = pinocchio.buildModelFromXML(text)
     others = [model.getJointId(name) for name in model.names[1:] if name not in joints]
     return pinocchio.buildReducedModel(model, others, pinocchio.neutral(model))
 
 
 def configuration(model, q):
-    """Configuration vector of pinocchio, which has cosine and sine of continuous joints."""
+    """Return pinocchio's configuration, with cosine and sine of continuous joints."""
     return pinocchio.integrate(model, pinocchio.neutral(model), q)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of short offline runs of the real law, and what tests do to their messages."""
+"""Bags of short offline runs of the real law, and helpers for their messages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 
-# Learns within the second: a window of half a second, which this excites less.
+# Learns within a second: a window of half a second, which is less excited.
 QUICK = {
     'learning.window': 0.5,
     'learning.settling_time': 0.1,
@@ -19,7 +19,7 @@ QUICK = {
 
 
 def loop_config(duration=1.0, **controller):
-    """Recommended configuration that learns quickly."""
+    """Return the recommended configuration, set to learn quickly."""
     overrides = {PLANT: {'duration': duration}, CONTROLLER: {**QUICK, **controller}}
     return load_loop('recommended', overrides)
 
@@ -33,7 +33,7 @@ def record(path, duration=1.0, compression='none', **controller):
 
 
 def messages(path):
-    """Every message as [topic, type, time, bytes]."""
+    """Return every message as [topic, type, time, bytes]."""
     with open_bag(path) as bag:
         types = dict(bag.held)
         return [[topic, types[topic], at, raw] for topic, at, raw in bag.messages(types)]
@@ -55,10 +55,10 @@ def write(path, entries, configuration='', **facts):
 
 
 def of(entries, topic):
-    """Entries of one topic."""
+    """Return the entries of one topic."""
     return [entry for entry in entries if entry[0] == topic.resolved]
 
 
 def compared(result):
-    """Number of values that a verification compared, by the last part of the topic."""
+    """Return the number of values that a verification compared, by last part of the topic."""
     return {one.topic.rsplit('/', 1)[-1]: one.values for one in result.comparisons}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A publisher in the test's process, and recorders as processes of their own beside it."""
+"""A publisher in the test's process, and recorders in processes of their own."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ PATIENCE = 300.0  # s, until a test gives up on what should take a moment
 RECORDER = (sys.executable, '-m', 'blf_dsc_controller.nodes.recorder_node', '--ros-args')
 ODD_PARTICIPANT = Path(__file__).with_name('odd_participant.py')
 ENCODER = JointStateEncoder(['joint1', 'joint2'])
-# Kept for the recorder, which may match a moment after the publisher has.
+# Kept for the recorder, which may match slightly later than the publisher.
 KEPT = QoSProfile(depth=5000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Rig:
-    """A node that publishes, and the recorders; `close` it."""
+    """A node that publishes, and the recorders; call `close` at the end."""
 
     def __init__(self, topics=('a',), quality=KEPT):
         self.context = Context()
@@ -57,13 +57,13 @@ class Rig:
         return process
 
     def start_odd(self, *topics):
-        """Start a participant that publishes topics such as `b=foo::bar::Name`; see there."""
+        """Start an odd_participant.py that publishes topics such as `b=foo::bar::Name`."""
         command = [sys.executable, ODD_PARTICIPANT, *topics]
         environment = {**os.environ, 'ROS_DOMAIN_ID': str(self.domain)}
         self.processes.append(subprocess.Popen(command, env=environment))
 
     def record(self, output, **parameters):
-        """Start a recorder and wait until it listens."""
+        """Start a recorder and wait until it has subscribed."""
         process = self.start(output, **parameters)
         self.wait_for(lambda: all(one.get_subscription_count() for one in self.publishers))
         return process
@@ -75,13 +75,13 @@ class Rig:
             rclpy.spin_once(self.node, timeout_sec=0.01, executor=self._executor)
 
     def publish(self, number):
-        """Publish a message of this number as its stamp [ns] on every topic."""
+        """Publish a message with this number as its stamp [ns] on every topic."""
         raw = ENCODER.encode(number, [1, 2], [3, 4], [5, 6])
         for publisher in self.publishers:
             publisher.publish(raw)
 
     def publish_for(self, seconds):
-        """Publish about each millisecond."""
+        """Publish about once per millisecond."""
         end, number = time.monotonic() + seconds, 0
         while time.monotonic() < end:
             self.publish(number)

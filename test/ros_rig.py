@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes of the package in one process, with topics and services as a test uses them."""
+"""Nodes of the package in one process, with helpers for topics and services."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.simulation.loop import simulate
 from sim_plant.node import PlantNode
 
-PATIENCE = 300.0  # s until a test that waits in vain is given up
+PATIENCE = 300.0  # s, until a test gives up waiting
 JOINTS = ('joint1', 'joint2')
 START = (2.293, 1.696)  # rad, inside the bound at the reference's start
 
 
 class RosRig:
-    """A context of its own; `close` it."""
+    """A ROS context of its own; call `close` at the end."""
 
     def __init__(self):
         self.context = rclpy.Context()
@@ -55,20 +55,20 @@ class RosRig:
         while self.nodes:
             self.kill(self.nodes[-1])
         rclpy.try_shutdown(context=self.context)
-        # A node's services hold its participant until it is collected, for others to hear.
+        # A node's services keep its participant, visible to others, until it is collected.
         self.tester = self.executor = None
         self._clients.clear()
         gc.collect()
 
     def kill(self, node):
-        """End a node without a word to the others."""
+        """Destroy a node without notifying the others."""
         self.nodes.remove(node)
         self.executor.remove_node(node)
-        self.spin(0.05)  # what was on its way to the node runs out before its handles are gone
+        self.spin(0.05)  # drains the node's pending events before its handles are gone
         node.destroy_node()
 
     def add(self, make, values=None, *, namespace='', clock=time.monotonic_ns, **given):
-        """Start a node with parameters: `values` by dotted name, or with `__` for the dot."""
+        """Start a node with parameters: `values` by dotted name, keywords with `__` for a dot."""
         given = {k.replace('__', '.'): v for k, v in given.items()} | (values or {})
         overrides = [Parameter(k, value=v) for k, v in given.items()]
         node = make(
@@ -100,7 +100,7 @@ class RosRig:
             self.executor.spin_once(timeout_sec=0.01)
 
     def run(self, arm, samples):
-        """Let the loop go on by so many samples."""
+        """Let the loop run for this many samples."""
         goal = arm.plant.sample + samples
         self.until(lambda: arm.plant.sample >= goal)
 
@@ -114,7 +114,7 @@ class RosRig:
         return heard
 
     def publisher(self, topic):
-        """Publisher of the test's own on a topic of another node."""
+        """Return a publisher of the test on a topic of another node."""
         return self.tester.create_publisher(
             message_class(topic.type), topic.relative, qos_profile(topic.offered)
         )
@@ -142,7 +142,7 @@ class RosRig:
 
 
 class Arm:
-    """Joint states sent by hand to a controller, and the torques that come back."""
+    """A stand-in for the arm: sends joint states to a controller and receives its torques."""
 
     def __init__(self, ros, names=JOINTS):
         self._ros = ros
@@ -151,7 +151,7 @@ class Arm:
         self._encoder = JointStateEncoder(names)
 
     def torque_for(self, k, position, velocity=None, *, encoder=None):
-        """Send the state of sample k and return the torque that comes back, (2,) N m."""
+        """Send the state of sample k and return the torque received (2,) [N m]."""
         size = len(position)
         velocity = np.zeros(size) if velocity is None else velocity
         raw = (encoder or self._encoder).encode(
@@ -165,7 +165,7 @@ class Arm:
 
 
 def torques(heard):
-    """Values of commands as an array."""
+    """Return the values of commands as an array."""
     return np.array([message.data for message in heard])
 
 
@@ -180,13 +180,13 @@ def states(messages, names=JOINTS):
 
 
 def simulated_torques(plant, controller=None):
-    """Torques of the compiled loop on the same parameters, (k, 2) N m."""
+    """Return the torques (k, 2) [N m] of the compiled loop with the same parameters."""
     record = simulate(build(ControllerConfig, controller or {}), build(PlantConfig, plant))
     return np.array([record.sample(row).torque for row in range(record.stamps.size)])
 
 
 def values(status):
-    """Key-value pairs of a status as a dict."""
+    """Return the key-value pairs of a status as a dict."""
     return {pair.key: pair.value for pair in status.values}
 
 

@@ -14,7 +14,7 @@ SECOND = 1_000_000_000
 
 
 def two_tones(t, shift):
-    """Position, velocity and acceleration (3, 2) at t [s] of two tones on each joint."""
+    """Return position, velocity and acceleration (3, 2) at t [s] of two tones on each joint."""
     rates, phases = np.array([1.0, 2.3]), np.array([0.2, -0.9])
     sizes = np.array([[0.2, 0.08], [0.25, -0.05]])
     angle = rates * t + phases
@@ -29,7 +29,7 @@ def two_tones(t, shift):
 
 
 def trajectory(joints, shift, *, duration, names=None, period=0.05, lead=1.0, fields=3, stamp=0):
-    """Trajectory that leads to two tones within `lead` [s], and rests a second after them."""
+    """Return a trajectory into two tones within `lead` [s], at rest a second after them."""
     sent = JointTrajectory(joint_names=names or joints)
     sent.header.stamp = Time(sec=stamp // SECOND, nanosec=stamp % SECOND)
     times = lead + np.arange(round(duration / period)) * period
@@ -48,12 +48,12 @@ def trajectory(joints, shift, *, duration, names=None, period=0.05, lead=1.0, fi
 
 
 def inputs(law):
-    """What came of the trajectories that a controller was sent."""
+    """Return the status of the trajectories that a controller was sent."""
     return law._status.trajectories
 
 
 def send(ros, law, sent):
-    """Send a trajectory; return why it is refused, or nothing."""
+    """Send a trajectory; return the reason of the last rejection, empty if there was none."""
     name = '/' + topics.JOINT_TRAJECTORY.relative
     publisher = ros.tester.create_publisher(JointTrajectory, name, 10)
     ros.until(lambda: publisher.get_subscription_count() > 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arms that are moved about, as bags of joint states with efforts."""
+"""Arms in motion, as bags of joint states with efforts."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ motion_of, motion_size = view_of(Motion), size_of(Motion)
 
 
 class Truth(NamedTuple):
-    """What a URDF does not tell: n bodies, rotors and frictions."""
+    """The true values that a URDF lacks: n bodies, rotors and friction."""
 
     inertias: np.ndarray  # (n, 10)
     rotors: np.ndarray  # (n,) kg m^2
@@ -35,7 +35,7 @@ class Truth(NamedTuple):
 
 
 def changed(chain, random, share=0.3, centre=0.01):
-    """Inertias (n, 10) with other masses and spreads by a share, and other centres of mass [m]."""
+    """Return inertias (n, 10), scaled at random by `share`, moved at random by `centre` [m]."""
     bodies = []
     for joint in chain.joints:
         T = np.eye(4)
@@ -65,7 +65,7 @@ class Reference(NamedTuple):
     phase: np.ndarray  # (k, n) rad
 
     def at(self, t):
-        """Position and velocity (2, n) at a time [s]."""
+        """Return position and velocity (2, n) at a time [s]."""
         angle = self.frequency * t + self.phase
         swing = self.frequency * self.amplitude * np.cos(angle)
         return np.array([self.offset + (self.amplitude * np.sin(angle)).sum(0), swing.sum(0)])
@@ -83,7 +83,7 @@ def reference_of(chain, seed, tones=3):
 
 @njit(error_model='numpy')
 def _shake(arm, vector, viscous, coulomb, motion, q, gains, states):
-    """Follow (N, 2, n) by PD from rest at q, torques held over a period; fill states (N, 3, n)."""
+    """Follow `motion` (N, 2, n) by PD from q, torques held for a period; fill states (N, 3, n)."""
     now = motion_of(vector, arm)
     n = q.size
     dq = motion[0, 1].copy()
@@ -107,7 +107,7 @@ def _shake(arm, vector, viscous, coulomb, motion, q, gains, states):
 
 
 def shake(chain, truth, reference, duration):
-    """States (N, 3, n) of our own plant: position, velocity, torque of the period before."""
+    """Return states (N, 3, n) of our own plant: position, velocity, previous torque."""
     arm = rigid_bodies(chain, GRAVITY, truth.inertias, truth.rotors)
     times = np.arange(round(duration / PERIOD)) * PERIOD
     motion = np.array([reference.at(t) for t in times])
@@ -120,7 +120,7 @@ def shake(chain, truth, reference, duration):
 
 
 def measured(states, seed, encoder=2.0 * np.pi / 2**20, noise=0.01):
-    """The states as an encoder and a torque sensor with noise (of the rms torque) see them."""
+    """Return the states as measured by encoders and torque sensors; noise is of the rms torque."""
     random = np.random.default_rng(seed)
     seen = states.copy()
     seen[:, 0] = np.round(states[:, 0] / encoder) * encoder

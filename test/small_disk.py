@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A disk of a few megabytes, for as long as a test lasts."""
+"""A disk of a few megabytes for the duration of a test."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 @contextmanager
 def small_disk(path, megabytes):
-    """Mount a disk of this size at a new folder; skip the test where that is not allowed."""
+    """Mount a disk of this size at a new folder; skip the test if that is not allowed."""
     path.mkdir()
     command = ['mount', '-t', 'tmpfs', '-o', f'size={megabytes}m', 'tmpfs', str(path)]
     try:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A loop of both nodes for a long time, with something breaking every few seconds.
+"""A long run of both nodes in a loop, with a fault every few seconds.
 
-`python test/soak.py --minutes 30` (or `make soak`) runs half an hour of the plant's time.
+`python test/soak.py --minutes 30` (or `make soak`) runs half an hour of plant time.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ PAGE = os.sysconf('SC_PAGE_SIZE')
 
 
 def memory():
-    """Resident memory of this process [MB]."""
+    """Return the resident memory of this process [MB]."""
     gc.collect()
     return int(Path('/proc/self/statm').read_text().split()[1]) * PAGE / 1e6
 
 
 def handles():
-    """Open files and sockets of this process."""
+    """Return the number of open files and sockets of this process."""
     return len(list(Path('/proc/self/fd').iterdir()))
 
 
 @dataclass
 class Report:
-    """What came of it."""
+    """Result of a soak test."""
 
     samples: int = 0
     faults: Counter = field(default_factory=Counter)
@@ -60,7 +60,7 @@ class Report:
 
 
 class Soak:
-    """The loop, and what is done to it."""
+    """The loop and its faults."""
 
     def __init__(self, seed):
         self.ros = RosRig()
@@ -77,7 +77,7 @@ class Soak:
         return node.create_publisher(kind, topic.relative, qos_profile(topic.offered))
 
     def run(self, samples):
-        """Run for a total of so many samples, faults not counted."""
+        """Run for a total of `samples`, not counting those during faults."""
         while self.report.samples < samples:
             count = int(self.rng.integers(1000, 4000))
             self.ros.run(self.arm, count)
@@ -94,7 +94,7 @@ class Soak:
         return self.report
 
     def recover(self):
-        """Reset what has stopped; the loop runs from its start."""
+        """Reset the loop if it has stopped, and wait until it tracks."""
         supervisor = self.law.guard.supervisor
         self.report.reasons[supervisor.reason] += 1
         if supervisor.phase is Phase.SAFE_STOP or self.arm.plant.sample == 0:
@@ -106,7 +106,7 @@ class Soak:
 
 
 def rogue_state(soak):
-    """A joint state from elsewhere."""
+    """Publish a joint state from another source."""
     rng = soak.rng
     q = np.array(START) + rng.normal(0.0, 1.0, 2)
     if rng.random() < 0.3:
@@ -118,19 +118,19 @@ def rogue_state(soak):
 
 
 def rogue_command(soak):
-    """A torque from elsewhere, that will not do."""
+    """Publish invalid torques from another source."""
     values = soak.rng.choice([1.0, np.nan, np.inf], int(soak.rng.choice([0, 1, 3, 5])))
     soak.commands.publish(Float64MultiArrayEncoder(values.size).encode(values))
     soak.commands.publish(Float64MultiArrayEncoder(2).encode([np.nan, 1.0]))
 
 
 def push(soak):
-    """A blow to the arm."""
+    """Strike the arm: its velocities jump."""
     soak.arm.plant.state[3:5] += soak.rng.normal(0.0, 1.0, 2)
 
 
 def new_gains(soak):
-    """Twenty requests for other gains."""
+    """Request twenty changes of gains."""
     name = f'{soak.law.get_fully_qualified_name()}/set_parameters_atomically'
     for _ in range(20):
         gain = (np.array([60.0, 20.0]) * soak.rng.uniform(0.5, 1.5, 2)).tolist()
@@ -201,7 +201,7 @@ def main():
     print(f'largest error against the bound outside of them: {report.worst:.2f}', file=sys.stderr)
     print(f'since the first quarter: {growth:+.1f} MB, {extra:+d} handles', file=sys.stderr)
     assert report.worst < 1.0
-    # Every node that is started anew costs the middleware some 50 kB; and the heap settles.
+    # Every restarted node costs the middleware about 50 kB, and the heap takes time to settle.
     assert growth < 0.02 * len(report.memory) + 10.0
     assert extra <= 0
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The SROS 2 policy of the nodes: what each of them really has, no more and no less.
+"""The SROS 2 policy of the nodes, which grants each of them exactly what it uses.
 
-`python test/sros2_graph.py config/sros2_policy.xml` starts the nodes and writes it anew.
+`python test/sros2_graph.py config/sros2_policy.xml` starts the nodes and rewrites it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ HEAD = """\
 
 
 def granted(ros, names):
-    """Names of the topics or services that nodes have, by kind of access."""
+    """Return the names of the topics or services of nodes, by kind of access."""
     ask = ros.tester
     found = {}
     for _, access, _, method in KINDS:
@@ -46,7 +46,7 @@ def granted(ros, names):
 
 
 def is_recording_all(ros):
-    """Whether the recorder has found every topic."""
+    """Return whether the recorder has found every topic."""
     there = {name for name, _ in ros.tester.get_topic_names_and_types()}
     found = ros.tester.get_subscriber_names_and_types_by_node('_bag_recorder_subscriptions', '/')
     published = {name for name in there if ros.tester.count_publishers(name)}
@@ -54,12 +54,12 @@ def is_recording_all(ros):
 
 
 def live():
-    """What the running nodes have, by enclave and kind of access."""
+    """Return the topics and services of the running nodes, by enclave and kind of access."""
     ros = RosRig()
     try:
         with tempfile.TemporaryDirectory() as folder:
             bag = str(Path(folder, 'bag'))
-            # One thread serves them all: the arm must leave it time for the rest.
+            # One thread serves all nodes: the arm must leave time for the others.
             ros.add(PlantNode, publish_clock=True, sample_time=0.02)
             ros.add(ControllerNode, sample_time=0.02)
             ros.add(MarkersNode)
@@ -67,7 +67,7 @@ def live():
             recorder = ros.add(BagRecorderNode, output=bag)
             recorder._parameter_client.request = lambda *_: (
                 None
-            )  # no clients that come and go in one process
+            )  # no short-lived clients in one process
             ros.until(lambda: is_recording_all(ros))
             nodes = {
                 'sim_plant': ['sim_plant'],
@@ -77,14 +77,14 @@ def live():
                 'bag_recorder': ['bag_recorder', '_bag_recorder_subscriptions'],
             }
             found = {name: granted(ros, parts) for name, parts in nodes.items()}
-            # With robot.urdf: topic://robot_description it waits for it, by a node of its own.
+            # With robot.urdf: topic://robot_description, a separate node waits for that topic.
             found['blf_dsc_controller']['subscribe'].append('/robot_description')
             hidden = '/_blf_dsc_controller_subscriptions/get_type_description'
             found['blf_dsc_controller']['reply'].insert(0, hidden)
             ros.executor.remove_node(recorder)
             ros.spin(0.1)
             recorder.close()
-            # It asks each node, once and for a moment, for its parameters.
+            # It requests the parameters of each node once, by short-lived clients.
             found['bag_recorder']['request'] = sorted(
                 f'/{name}/{service}'
                 for name in nodes
@@ -96,7 +96,7 @@ def live():
 
 
 def policy(found):
-    """Write the policy as XML."""
+    """Return the policy as XML."""
     root = ET.Element('policy', version='0.2.0')
     enclaves = ET.SubElement(root, 'enclaves')
     for node, access in found.items():
@@ -113,7 +113,7 @@ def policy(found):
 
 
 def read(path):
-    """What a policy grants, in the form of `live`."""
+    """Return what a policy grants, in the form of `live`."""
     found = {}
     for enclave in ET.parse(path).getroot().iter('enclave'):  # noqa: S314 - our own file
         (profile,) = enclave.iter('profile')

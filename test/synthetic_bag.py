@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of a made-up run whose every number is known in advance."""
+"""Bags of a made-up run in which every number is known in advance."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ TIME_CONSTANT_S = 1.0  # of the parameter error from the latch on
 
 
 def relative_error(time):
-    """Parameter error over the norm of the true parameters."""
+    """Return the parameter error relative to the norm of the true parameters."""
     return 0.5 * np.exp(-np.maximum(time - LATCH_S, 0.0) / TIME_CONSTANT_S)
 
 
 class Synthetic:
-    """What happens in the run, as arrays over its samples (n = 2 joints)."""
+    """Signals of the run, as arrays over its samples (n = 2 joints)."""
 
     def __init__(self, samples):
         self.stamp = START + MILLISECOND * np.arange(samples)
@@ -50,9 +50,9 @@ class Synthetic:
         self.disturbance = 0.1 + 0.1 * wave
 
     def messages(self, *, with_timing=False):
-        """Every message as (topic, stamp, bytes)."""
+        """Yield every message as (topic, stamp, bytes)."""
         columns = (*PARAMETERS, *(f'disturbance {joint}' for joint in JOINTS))
-        states = JointStateEncoder(JOINTS[::-1])  # the joints in another order than elsewhere
+        states = JointStateEncoder(JOINTS[::-1])  # in a different joint order than elsewhere
         commands = Float64MultiArrayEncoder(2)
         reference = JointStateEncoder(JOINTS, ('position', 'velocity'))
         tracking = JointStateEncoder(JOINTS)
@@ -78,7 +78,7 @@ class Synthetic:
 
 
 def write(path, messages, rename=lambda topic: topic.resolved, **options):
-    """Write messages into a bag, received when they were stamped."""
+    """Write messages into a bag, with their stamps as times of receipt."""
     handles = {}
     with BagWriter(path, flush_interval=None, **options) as bag:
         for topic, stamp, raw in messages:

@@ -68,7 +68,7 @@ def test_events_are_violations_saturation_the_latch_and_changes_of_the_plant(fol
     (bag,) = read_bags([folder / 'synthetic'])
     events = {(event.kind, round(event.time, 3)): event.text for event in bag.events}
     assert events == {
-        ('violation', 1.234): 'shoulder outside of its bound for 1 samples',
+        ('violation', 1.234): 'shoulder outside its bound for 1 samples',
         ('learning', 1.5): 'first excited window: learning began',
         ('saturation', 2.0): 'elbow at its torque limit for 10 samples',
         ('plant', 2.5): 'load.torque: [1.0, 0.0]',

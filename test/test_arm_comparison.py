@@ -192,7 +192,7 @@ def test_best_is_the_law_whose_worst_run_is_the_least_whoever_it_is():
     }
     rows = {row[1]: row[2:] for row in least_errors({'arm': laws})}
     assert rows['pick-up [mrad]'] == ['PD + gravity + integrator', '1.5', '3', '2.5']
-    assert rows['at the end [%]'] == ['proposed, gains by the URDF', '1', '1', '4']
+    assert rows['at the end [%]'] == ['proposed, gains from the URDF', '1', '1', '4']
     header, _, tuned, baseline = table_of(laws)
     column = header.index('pick-up [mrad]')
     assert tuned[column] == ('2.50 / 2.50', 'number', '')

@@ -117,13 +117,13 @@ WRONG = {
         {'text': changed('<link name="panda_link8" />', '<xacro:hand />')},
         'xacro FILE > robot.urdf',
     ),
-    'a file that is no XML': ({'text': 'l1: 1.0'}, 'not a URDF, which is XML'),
-    'an SDF': ({'text': '<sdf />'}, 'this is a <sdf>'),
+    'a file that is no XML': ({'text': 'l1: 1.0'}, 'not a URDF, as it is not valid XML'),
+    'an SDF': ({'text': '<sdf />'}, 'is <robot>, not <sdf>'),
     'an unknown tip': ({'tip': 'tool'}, "no link 'tool' for the tip: the links are panda_link0, "),
     'an unknown base': ({'base': 'world'}, "no link 'world' for the base"),
     'a tip that the base does not carry': (
         {'base': 'panda_leftfinger', 'tip': 'panda_rightfinger'},
-        "ends at 'panda_link0' without passing",
+        "ends at 'panda_link0' without reaching",
     ),
     'an unknown joint': (
         {'joints': ('elbow', *PANDA[1:])},
@@ -152,7 +152,7 @@ WRONG = {
         {
             'text': WEIGHTLESS.replace('<mass value="0.015" />', '<mass value="0" />'),
         },
-        "link 'panda_link7', which joint 'panda_joint7' moves, has no mass",
+        "link 'panda_link7', moved by joint 'panda_joint7', has no mass",
     ),
     'a negative mass': (
         {'text': changed('<mass value="0.73" />', '<mass value="-0.73" />')},
@@ -163,7 +163,7 @@ WRONG = {
         'none can be negative',
     ),
     'no axis': ({'text': changed('<axis xyz="0 0 1" />', '<axis xyz="0 0 0" />')}, 'is zero'),
-    'no range': ({'text': changed('upper="2.8973"', 'upper="-3"')}, 'from -2.8973 to -3 only'),
+    'no range': ({'text': changed('upper="2.8973"', 'upper="-3"')}, 'empty range, -2.8973 to -3'),
     'a word as a number': (
         {'text': changed('<mass value="0.73" />', '<mass value="heavy" />')},
         '<mass value="heavy">: expected 1 finite number',
@@ -174,11 +174,11 @@ WRONG = {
     ),
     'two links of a name': (
         {'text': changed('<link name="panda_link8" />', '<link name="panda_link7" />')},
-        'each link needs a name of its own',
+        'each link needs a unique name',
     ),
     'a link that is not there': (
         {'text': changed('<link name="panda_link8" />', '')},
-        "has the child 'panda_link8', and the links are",
+        "has the child 'panda_link8', but the links are",
     ),
     'a closed chain': (
         {
@@ -186,7 +186,7 @@ WRONG = {
                 '<child link="panda_rightfinger" />', '<child link="panda_leftfinger" />'
             )
         },
-        "'panda_leftfinger' has two joints above it",
+        "'panda_leftfinger' is the child of two joints",
     ),
 }
 

@@ -289,7 +289,7 @@ def test_a_beginning_that_was_not_heard_is_told_in_the_bag_and_by_what_reads_it(
         publisher.publish(encoder.encode(k, [k], [0], [0]))
     run.spin_until_recorded(joint_states=3)
     run.close()
-    lost = '0 missed, 7 sent before the recorder heard them'
+    lost = '0 missed, 7 sent before the recorder connected'
     assert f'/joint_states: 3 messages, {lost}' in capfd.readouterr().err
     assert read_context(run.bag).losses == {'/joint_states': lost}
     (subject,) = read_bags([run.bag])
@@ -302,7 +302,7 @@ def test_losses_are_gaps_in_the_numbers():
     losses = Losses(publishers=1)
     for sequence in (4, 5, 8, 9, 2, 3):  # the 2 is of a new publisher
         losses.count(sequence)
-    assert losses.text() == ', 2 missed, 4 sent before the recorder heard them'
+    assert losses.text() == ', 2 missed, 4 sent before the recorder connected'
     losses.publishers_seen(2)
     losses.count(100)
     assert losses.text() == ''

@@ -225,7 +225,7 @@ def test_lost_messages_are_recorded_in_the_clean_bag_too(tmp_path, capsys):
     said = capsys.readouterr().out
     assert '3 messages, 1 numbers missing in between, 5 numbers missing before the first' in said
     assert read_context(tmp_path / 'clean').losses == {
-        '/joint_states': '1 missed, 5 sent before the recorder heard them'
+        '/joint_states': '1 missed, 5 sent before the recorder connected'
     }
 
 
@@ -273,7 +273,7 @@ def test_where_all_is_lost_the_exit_code_says_so(plain, tmp_path, capsys):
     for k, data in enumerate([b'', plain.read_bytes()[: chunks(plain.read_bytes())[0][0]]]):
         folder = damaged(tmp_path / f'{k}', data)
         assert main(['recover', str(folder)]) == 1
-        assert 'ALL is lost' in capsys.readouterr().out
+        assert 'ALL LOST' in capsys.readouterr().out
 
 
 def test_a_record_of_a_damaged_kind_neither_hides_messages_nor_invents_one(plain, tmp_path):

@@ -164,7 +164,7 @@ def test_contestant_that_dies_ends_the_measurement(monkeypatch):
 
 def test_contestant_that_does_not_answer_is_not_waited_for_for_ever():
     harness = importlib.import_module('harness')
-    with pytest.raises(harness.ContestantError, match=r'waited 0\.1 s for a torque in vain'):
+    with pytest.raises(harness.ContestantError, match=r'after 0\.1 s waiting for a torque'):
         harness.wait_for(lambda: False, 'a torque', timeout=0.1)
 
 

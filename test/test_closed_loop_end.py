@@ -49,7 +49,7 @@ def test_a_node_that_is_killed_ends_the_others_and_is_named(running):
     os.kill(running.child('controller_node'), signal.SIGKILL)
     code, _, errors = running.end()
     assert code == 1
-    assert 'blf_dsc run: blf_dsc_controller was ended by SIGKILL' in errors
+    assert 'blf_dsc run: blf_dsc_controller was terminated by SIGKILL' in errors
     assert f'the recording up to then is in {running.out / "bag"}' in errors
     assert 'Traceback' not in errors
     running.wait_for_children()
@@ -81,7 +81,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_loop(tmp_path, mode, duratio
         assert recorded.returncode == 1
         said = recorded.stderr
         assert 'bag_recorder has ended: the loop continues unrecorded' in said
-        assert 'bag_recorder ended with exit code 1 while the loop continued without it' in said
+        assert 'bag_recorder exited with code 1 while the loop continued without it' in said
         assert said.count('the disk is full') == 1
         assert f'the recording up to then is in {disk / "out" / "bag"}' in said
         assert 'Traceback' not in said

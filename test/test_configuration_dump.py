@@ -44,7 +44,7 @@ def test_a_node_in_a_namespace_is_written_under_its_full_name(tmp_path):
     path = tmp_path / 'run.yaml'
     dump(path, {'/left/sim_plant': CHANGED.plant})
     assert load(path, '/left/sim_plant', PlantConfig) == CHANGED.plant
-    with pytest.raises(ConfigurationError, match='/left/sim_plant is not /right/sim_plant'):
+    with pytest.raises(ConfigurationError, match='/left/sim_plant does not match /right/sim'):
         load(path, '/right/sim_plant', PlantConfig)
 
 

@@ -122,11 +122,11 @@ def test_joints_have_names_of_their_own_and_the_arm_has_two(cls):
         # |P^(0)| = |(3, 0, 4)| = 5 by Pythagoras: on the ball is not inside it.
         (
             {'learning.initial_estimate': [3.0, 0.0, 4.0], 'learning.radius': 5.0},
-            'learning.radius: got 5 kg m^2, but learning.initial_estimate lies at 5 kg m^2',
+            'learning.radius: got 5 kg m^2, but learning.initial_estimate has a norm of 5 kg',
         ),
         (
             {'law': 'model_based', 'truth.parameters': [1.0, 0.32, 0.4], 'learning.radius': 1.1},
-            'learning.radius: got 1.1 kg m^2, but truth.parameters lie at 1.12357 kg m^2',
+            'learning.radius: got 1.1 kg m^2, but truth.parameters have a norm of 1.12357 kg',
         ),
         (
             {'learning.window': 0.009},

@@ -80,7 +80,7 @@ def test_a_section_that_matches_counts(file, pattern, node):
 def test_a_section_that_does_not_match_does_not_count(file, pattern, node):
     path, own = file(section(pattern, 'seed: 7')), pattern.endswith('sim_plant')
     if own:  # it is meant for the node, and would be ignored
-        remedy = f'is not {node}: write /**/sim_plant for the node in any namespace'
+        remedy = f'does not match {node}: write /**/sim_plant for the node in any namespace'
         assert problems_of(path, node) == [f'line 2: /{pattern.removeprefix("/")} {remedy}']
         path = file(section(pattern, 'seed: 7') + section(f'{node}', 'duration: 2.0'))
     assert seed_of(path, node) == 0
@@ -117,7 +117,7 @@ def test_overrides_count_more_than_the_file(file):
     with pytest.raises(ConfigurationError) as caught:
         load(path, 'sim_plant', PlantConfig, {'duration': -2.0})
     assert caught.value.problems == [
-        'duration: got -2.0, but it must be at least 0 s (given beside the file)'
+        'duration: got -2.0, but it must be at least 0 s (given as an override)'
     ]
 
 
@@ -166,9 +166,9 @@ def test_the_parameters_of_ros_itself_are_accepted(file):
         ('n:\n  ros__parameters: {a: 1}\nn:\n  ros__parameters: {b: 1}\n', 'line 3: n is repeated'),
         ('n:\n  ros__parameters: {a: [1, 2.0]}\n', 'line 2: a mixes types'),
         ('n:\n  ros__parameters: {a: [[1]]}\n', 'line 2: a has a list in a list'),
-        ('n:\n  ros__parameters: {a: &x 1, b: *x}\n', 'line 2: ROS does not support the ref'),
+        ('n:\n  ros__parameters: {a: &x 1, b: *x}\n', 'line 2: ROS does not support the alias'),
         ('n-1:\n  ros__parameters: {a: 1}\n', 'line 2: /n-1 is not a valid node name'),
-        ('n:\n  ros__parameters: {a: 1}\n  m: {}\n', 'line 3: m cannot stand beside ros__para'),
+        ('n:\n  ros__parameters: {a: 1}\n  m: {}\n', 'line 3: m cannot be next to ros__para'),
         ('n:\n  ros__parameters: {a: {}}\n', 'line 2: a has no parameters'),
         ('n:\n  ros__parameters: {a: 1}\n---\nm: {}\n', 'line 3: not valid YAML'),
     ],
@@ -238,7 +238,7 @@ def test_a_misspelt_node_is_named(file):
     assert caught.value.problems == ['line 2: unknown node sim_plnat, did you mean sim_plant?']
     loop = load_loop(file(section('sim_plant', 'seed: 1') + section('sim_plant2', 'seed: 2')))
     assert loop.plant.seed == 1
-    with pytest.raises(ConfigurationError, match='/left/bag_recorder is not /bag_recorder: write'):
+    with pytest.raises(ConfigurationError, match='/left/bag_recorder does not match /bag_rec'):
         load_loop(file(section('/left/bag_recorder', 'output: here')))
     assert load_loop(file(section('robot_state_publisher', 'a: 1'))).plant == PlantConfig()
 

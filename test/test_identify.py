@@ -291,7 +291,7 @@ def test_an_arm_at_rest_is_rejected(states, tmp_path):
 
 
 def test_stamps_that_stand_still_are_rejected(states, tmp_path):
-    with pytest.raises(BagError, match='a stamp of its own'):
+    with pytest.raises(BagError, match='a unique stamp'):
         read_recording(write_states(tmp_path / 'b', PANDA, states[:99], period=0.0), PANDA_TEXT)
 
 

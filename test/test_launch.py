@@ -158,7 +158,7 @@ def test_a_parameter_on_the_command_line_wins_over_a_file(start):
         ('sim_plnat', 'line 2: unknown node sim_plnat, did you mean sim_plant?'),
         (
             '/right/sim_plant',
-            'line 2: /right/sim_plant is not /left/sim_plant: write /**/sim_plant',
+            'line 2: /right/sim_plant does not match /left/sim_plant: write /**/sim_plant',
         ),
     ],
 )

@@ -109,7 +109,7 @@ def test_rejected_columns_reach_the_summary_with_their_reason(rejecting_run):
     learning = summarize(rejecting_run)['learning']
     ((refused, reason),) = learning['rejected_columns'].items()
     assert refused.startswith('cos 1 rad/s ')
-    assert reason.startswith(f'{refused} is not estimated: on this window it cannot be told from ')
+    assert reason.startswith(f'{refused} is not estimated: this window cannot distinguish it from ')
     assert f'rejected    {reason}' in format_table(summarize(rejecting_run))
     assert learning['final_relative_error'] < 0.5
 

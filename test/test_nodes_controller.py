@@ -81,7 +81,7 @@ def test_an_arm_that_falls_silent_gets_the_safe_torque_again_and_again(ros):
     assert not node.guard.supervisor.text
     clock.advance(0.1)
     ros.until(lambda: node.guard.supervisor.text)  # with the clock as its only reason
-    assert 'no joint state has come for' in node.guard.supervisor.text
+    assert 'no joint state received for' in node.guard.supervisor.text
     before = len(heard)
     ros.until(lambda: clock.advance(0.01) or len(heard) >= before + 20)
     np.testing.assert_array_equal(torques(heard)[-1], NOTHING)
@@ -157,6 +157,6 @@ def test_a_gain_that_the_start_would_warn_of_is_refused_while_it_runs(ros):
     accepted, reasons = set_parameters(ros, node, feedback__gain=[4000.0, 15.0])
     assert not accepted
     assert reasons[0].startswith('feedback.gain: K_p over the inertia is ')
-    assert reasons[0].endswith('; to have it all the same, start with it')
+    assert reasons[0].endswith('; to use it anyway, start the node with it')
     torque = arm.torque_for(1, START, VELOCITY)
     np.testing.assert_array_equal(torque, law_torques(*[(START, VELOCITY)] * 2)[1])

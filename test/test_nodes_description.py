@@ -58,7 +58,5 @@ def test_where_none_comes_the_node_says_what_to_do(ros, monkeypatch, publishers,
 
 
 def test_without_a_node_a_topic_is_rejected():
-    with pytest.raises(
-        ConfigurationError, match=r'robot.urdf: .* is a topic, for which only a node'
-    ):
+    with pytest.raises(ConfigurationError, match=r'robot.urdf: .* is a topic, which only a node'):
         build(ControllerConfig, ON_TOPIC)

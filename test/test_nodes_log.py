@@ -59,7 +59,7 @@ def test_each_phase_is_said_and_after_a_stop_how_to_go_on(ros, log):
     states.publish(b'')
     ros.until(lambda: said('zero torque: ', FATAL))
     (stop,) = said('zero torque: ', FATAL)
-    assert stop.endswith('/phases/sim_plant/reset takes the arm to its start and begins anew')
+    assert stop.endswith('/phases/sim_plant/reset returns the arm to its start and starts again')
     ros.reset(arm)
     ros.until(lambda: len(said('tracking the reference')) == 2)
     deactivate(ros, law)
@@ -75,7 +75,7 @@ def test_without_a_simulated_arm_the_controller_itself_is_reset(ros, log):
     states.publish(b'')
     ros.until(lambda: log('real', '', FATAL))
     (stop,) = log('real', '', FATAL)
-    assert stop.endswith('/real/blf_dsc_controller/reset begins anew from where the arm is then')
+    assert stop.endswith('/real/blf_dsc_controller/reset starts again from where the arm is')
 
 
 def test_the_end_of_a_run_in_real_time_is_no_fault(ros, log):

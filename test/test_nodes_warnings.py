@@ -50,10 +50,10 @@ def test_rejected_columns_are_logged_and_diagnosed_with_what_they_are_like(ros):
     ros.until(lambda: arm.finished and rejected())
     message, value = rejected()[-1]
     assert message.startswith('not estimated: cos 1 rad/s')
-    assert 'cannot be told from m2*l2^2' in value.value
+    assert 'cannot distinguish it from m2*l2^2' in value.value
     warned = [one.msg for one in log if 'is not estimated' in one.msg]
     assert len(warned) == 1  # once, not in every sample
-    assert 'cannot be told from m2*l2^2' in warned[0]
+    assert 'cannot distinguish it from m2*l2^2' in warned[0]
 
 
 def test_config_warnings_are_logged_before_the_first_state(ros):
@@ -68,7 +68,7 @@ def test_stamps_that_switch_the_watchdog_off_are_warned_of_once(ros):
     arm = ros.add(PlantNode, {'mode': 'lockstep', 'duration': 0.1}, namespace='unwatched')
 
     def warned():
-        return [one.msg for one in log if 'a silence is not noticed' in one.msg]
+        return [one.msg for one in log if 'a silence is not detected' in one.msg]
 
     ros.until(lambda: arm.finished and warned())
     assert len(warned()) == 1
@@ -102,4 +102,4 @@ def test_states_that_come_too_often_are_noticed(ros):
     log = listen(ros, Log, '/rosout', KEPT)
     ros.add(ControllerNode, namespace='often')
     ros.add(PlantNode, mode='lockstep', sample_time=0.0005, namespace='often')
-    ros.until(lambda: any('a joint state comes every 0.0005 s, but' in one.msg for one in log))
+    ros.until(lambda: any('joint states arrive every 0.0005 s, but' in one.msg for one in log))

@@ -55,7 +55,7 @@ def test_what_is_given_comes_before_what_the_urdf_says():
     [
         ({'robot.urdf': 'panda.urdf'}, 'robot.urdf: neither a tip nor joints were given'),
         (PANDA_GIVEN | {'joints': ['panda_joint1']}, 'the moving joints from base to tip are'),
-        ({'truth.mass_factor': 1.1}, 'truth: it changes the arm of a URDF: give robot.urdf'),
+        ({'truth.mass_factor': 1.1}, 'truth: it applies only to a URDF: give robot.urdf'),
         ({'actuator.ripple': 0.1}, 'actuator.ripple: .* give actuator.torque_limit'),
         (PANDA_GIVEN | {'load.torque': [1.0]}, 'load.torque: got 1 entry, but 7 are needed'),
     ],

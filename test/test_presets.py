@@ -56,7 +56,7 @@ def test_offline_run_warns_of_a_refused_column_and_what_it_is_like(tmp_path, cap
     assert offline(str(path), tmp_path / 'out', 7.5) == 0
     printed = capsys.readouterr().out
     assert 'warning: cos 1 rad/s joint1 is not estimated' in printed
-    assert 'cannot be told from m2*l2^2 + cos 1 rad/s joint2' in printed
+    assert 'cannot distinguish it from m2*l2^2 + cos 1 rad/s joint2' in printed
     assert 'rejected    cos 1 rad/s joint1' in printed
 
 

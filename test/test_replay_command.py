@@ -64,7 +64,7 @@ def test_another_configuration_is_said_to_be_open_loop(bag, capsys):
     assert main(['replay', str(bag), '--config', 'recommended']) == 0
     said = capsys.readouterr().out
     assert 'OPEN LOOP' in said
-    assert 'joint2: torque differs from the recorded by rms' in said
+    assert 'joint2: torque differs from the recorded one by rms' in said
 
 
 @pytest.mark.parametrize(

@@ -213,5 +213,5 @@ def test_an_entry_with_one_side_is_rejected(entry):
 
 
 def test_a_name_given_twice_is_rejected():
-    with pytest.raises(BlfDscError, match='given before'):
+    with pytest.raises(BlfDscError, match='given twice'):
         NameMap.parse(['joint1=a', 'joint2=a'])

@@ -188,9 +188,9 @@ def test_a_recording_that_began_late_is_recognised(entries, rewritten):
 
 
 def test_what_the_recorder_missed_is_remarked(entries, rewritten):
-    said = '800 written, 0 missed, 201 sent before the recorder heard them'
+    said = '800 written, 0 missed, 201 sent before the recorder connected'
     result = verify(rewritten(entries, **{'messages /joint_states': said}))
-    lost = '/joint_states: 0 missed, 201 sent before the recorder heard them'
+    lost = '/joint_states: 0 missed, 201 sent before the recorder connected'
     assert result.remarks == (f'the recorder missed messages of {lost}',)
 
 
@@ -245,7 +245,7 @@ def test_parameters_changed_on_the_way_are_replayed_where_they_took_effect(bag, 
     assert [one.type for one in result.events].count(EventType.PARAMETERS) == 2
     assert result.difference is None
     assert main(['replay', str(path)]) == 0
-    assert '2 changes of parameters replayed' in capsys.readouterr().out
+    assert '2 parameter changes replayed' in capsys.readouterr().out
 
 
 def test_an_event_that_the_recorder_lost_ends_the_replay(bag, rewritten):

@@ -337,7 +337,7 @@ def test_nor_does_the_bump_come_later(given):
     [
         ({'barrier.bound': (1e-6, 0.002)}, 'barrier.bound: joint1 is'),
         ({'torque.limit': (20.0, 1.0)}, 'torque.limit: joint2 is held with'),
-        ({'learning.radius': 0.58}, 'learning.radius: the estimate is at'),
+        ({'learning.radius': 0.58}, 'learning.radius: the norm of the estimate is'),
     ],
 )
 def test_gains_that_a_running_law_cannot_take_are_rejected(given, said):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""README's moving picture: the live view of a Panda that picks up 2 kg. `make pictures`.
+"""The README's animation: the live view of a Panda that picks up 2 kg. `make pictures`.
 
-The run is offline and played as a bag, so that the picture does not depend on the computer.
+The run is offline and played from a bag, so that the animation does not depend on the computer.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from blf_dsc_controller.view.bag import BagPlayer
 from blf_dsc_controller.view.page import Page
 
 TIMES = np.arange(17.0, 26.0, 0.25)  # s; it picks up 2 kg at 20 s
-SETTLE = 1.5  # s, until the browser has drawn a picture without a GPU
-RATE = 8.0  # pictures a second
+SETTLE = 1.5  # s, until the browser has drawn a frame without a GPU
+RATE = 8.0  # frames per second
 WINDOW = (1200, 880)
 NOTICE = "document.querySelectorAll('[class*=Notification]').forEach(one => one.remove())"
 
 
 def pictures(bag, folder):
-    """Pictures of the page at each of the times."""
+    """Yield screenshots of the page at each of `TIMES`."""
     page = Page('127.0.0.1', 18380)
     size = f'--window-size={WINDOW[0]},{WINDOW[1]}'
     browser = chromium.Browser(folder / 'profile', *chromium.WEBGL, size)
@@ -40,7 +40,7 @@ def pictures(bag, folder):
         player.update(0.0)
         browser.call('Page.navigate', url=page.url)
         browser.wait("(document.body?.innerText ?? '').includes('t = ')")
-        time.sleep(10 * SETTLE)  # it fades in
+        time.sleep(10 * SETTLE)  # the page fades in
         browser.value(NOTICE)
         for at in TIMES:
             player.slider.value = float(at)
@@ -54,7 +54,7 @@ def pictures(bag, folder):
 
 
 def main():
-    """Write the picture."""
+    """Write the animation."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--out', type=Path, default=Path('doc/view.webp'))
     options = parser.parse_args()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The closed loop of the recommended configuration with each peer's simulator.
 
-Each function runs `duration` and returns the tracking errors (samples, 2) [rad].  All hold the
-torque over the sample and have the disturbance; what differs is who integrates the arm.
+Each function runs for `duration` and returns the tracking errors (samples, 2) [rad]. All hold the
+torque over the sample and apply the disturbance; only the integration of the arm differs.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _ARM = PLANT.arm
 
 
 def disturbance(t: float) -> np.ndarray:
-    """tau_dist (2,) [N m]."""
+    """Return tau_dist (2,) [N m]."""
     d = PLANT.disturbance
     wave = np.sin(np.multiply(d.frequency, t) + d.phase)
     return np.add(d.constant, np.multiply(d.amplitude, wave))
@@ -56,12 +56,12 @@ def run(duration: float, state: State, step: Step) -> np.ndarray:
 
 
 def numpy_loop(duration: float) -> np.ndarray:
-    """Arm and Dormand-Prince step in numpy too."""
+    """Run the arm and a Dormand-Prince step in numpy, too."""
     return _integrated(duration, _numpy_acceleration)
 
 
 def pinocchio_loop(duration: float) -> np.ndarray:
-    """Arm by pinocchio's articulated-body algorithm, Dormand-Prince step in numpy."""
+    """Run the arm by pinocchio's articulated-body algorithm, a Dormand-Prince step in numpy."""
     import pinocchio
 
     model = pinocchio.Model()
@@ -84,7 +84,7 @@ def pinocchio_loop(duration: float) -> np.ndarray:
 
 
 def scipy_loop(duration: float) -> np.ndarray:
-    """Arm by scipy's adaptive RK45, a call a sample, at its default tolerances."""
+    """Run the arm by scipy's adaptive RK45, one call per sample, at default tolerances."""
     from scipy.integrate import solve_ivp
 
     x = np.concatenate((PLANT.initial.position, PLANT.initial.velocity))
@@ -100,7 +100,7 @@ def scipy_loop(duration: float) -> np.ndarray:
 
 
 def mujoco_loop(duration: float) -> np.ndarray:
-    """Arm by MuJoCo's RK4 at the sample time, the disturbance held over it."""
+    """Run the arm by MuJoCo's RK4 at the sample time, with the disturbance held over it."""
     import mujoco
 
     model = mujoco.MjModel.from_xml_string(
@@ -122,7 +122,7 @@ def mujoco_loop(duration: float) -> np.ndarray:
 
 
 def drake_loop(duration: float) -> np.ndarray:
-    """Arm by Drake's MultibodyPlant with a fixed Runge-Kutta 3 step of the sample time."""
+    """Run the arm by Drake's MultibodyPlant, a fixed Runge-Kutta 3 step of the sample time."""
     from pydrake.math import RigidTransform
     from pydrake.multibody.plant import MultibodyPlant
     from pydrake.multibody.tree import (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm as lines from joint to joint, in space, for the page to move."""
+"""An arm as lines from joint to joint in 3D, to be animated on the page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from blf_dsc_controller.arms.urdf import Chain
 
 
 class DrawnJoint(NamedTuple):
-    """A joint in the frame of the one before, where its position is 0."""
+    """A joint at position 0, in the frame of the joint before."""
 
     rotation: list[list[float]]  # (3, 3)
     offset: list[float]  # (3,) m
@@ -19,14 +19,14 @@ class DrawnJoint(NamedTuple):
 
 
 class DrawnArm(NamedTuple):
-    """Joints from the base, and the tip [m] in the frame of the last."""
+    """Joints from the base on, and the tip [m] in the frame of the last."""
 
     joints: list[DrawnJoint]
     tip: list[float]
 
 
 def planar_arm(lengths: Sequence[float]) -> DrawnArm:
-    """Arm in the plane of x and z whose links of these lengths [m] are along x at position 0."""
+    """Return an arm in the x-z plane whose links of these lengths [m] lie along x at 0 rad."""
     unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     before = (0.0, *lengths[:-1])
     joints = [DrawnJoint(unit, [x, 0.0, 0.0], [0.0, -1.0, 0.0], slides=False) for x in before]
@@ -34,7 +34,7 @@ def planar_arm(lengths: Sequence[float]) -> DrawnArm:
 
 
 def arm_of_chain(chain: Chain) -> DrawnArm:
-    """Arm of a URDF."""
+    """Return the arm of a URDF."""
     joints = [
         DrawnJoint(
             joint.placement[:3, :3].round(6).tolist(),

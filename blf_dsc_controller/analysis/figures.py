@@ -31,11 +31,11 @@ from blf_dsc_controller.messages.topics import DISTURBANCE
 from blf_dsc_controller.run import Run
 
 NAMES = ('tracking.png', 'parameters.png', 'monitors.png')
-"""Of the files that `draw` can write."""
+"""Names of the files that `draw` can write."""
 
 _SIZE = (6.2, 2.6)  # inches
 _LOW = (4.3, 1.75)
-_ABREAST = 3  # joints in columns; more of them in rows
+_ABREAST = 3  # joints, at most, in columns; more are in rows
 _HIGH = (6.2, 3.2)
 _ALONE = {'Torque': ORANGE, 'Excitation': GREEN}  # colour of one line
 _WIDE = {'Motion': (3.2, 0.55), 'Estimates': (2.4, 0.75)}  # width and opacity
@@ -45,10 +45,10 @@ _WIDTHS_UPON_EACH_OTHER = (5.0, 2.4)
 
 
 def draw(run: Run, folder: Path) -> list[Path]:
-    """Draw tracking.png and what else the run has data for, and return the paths.
+    """Draw tracking.png and the other files that the run has data for, and return the paths.
 
-    parameters.png if parameters were learned, monitors.png if the monitor was recorded; the folder
-    is made if need be.
+    These are parameters.png if parameters were learned, and monitors.png if the monitor was
+    recorded. The folder is created if necessary.
     """
     folder.mkdir(parents=True, exist_ok=True)
     found = panels([run])
@@ -92,7 +92,7 @@ def draw(run: Run, folder: Path) -> list[Path]:
 
 
 def _overlaid(title: str, shown: Sequence[Panel]) -> Panel:
-    """One panel with the lines of several: all parameters, or all disturbances."""
+    """Return one panel with the lines of several: all parameters, or all disturbances."""
     lines = []
     for panel in shown:
         name = panel.title.removeprefix(DISTURBANCE)
@@ -112,10 +112,10 @@ def draw_panels(
     *,
     legend_above: bool = False,
 ) -> None:
-    """Draw panels of this size [inches] row by row, up to a time [s].
+    """Draw panels of this size [inches] row by row, up to the time `until` [s].
 
-    `runs` are the names of several runs, which the legends then show. Where each column has one
-    legend, it is above the first row.
+    `runs` are the names of several runs, to be shown in the legends. With `legend_above`, each
+    column has a single legend above its first row.
     """
     columns = min(columns, len(shown))
     picture = Picture(-(-len(shown) // columns), columns, title, size)
@@ -153,7 +153,7 @@ def _draw_panel(axes: Axes, panel: Panel, runs: Sequence[str], until: float) -> 
 
 
 def _set_scale(axes: Axes, panel: Panel) -> None:
-    """Scale the axis of values; over two decades where there is next to nothing to see."""
+    """Scale the value axis; a logarithmic one spans two decades if the values hardly change."""
     low, high = axes.dataLim.minposy, axes.dataLim.ymax
     if panel.log and math.isfinite(low):  # else no value is known
         if high < _FLAT * low:

@@ -28,7 +28,7 @@ MOMENTS = (5, 10, 20, 40, 60)
 """Times at which the parameter error is reported [s]."""
 
 _LEARNED = 0.01
-_POSTURES = 400  # of the reference, where torques are compared
+_POSTURES = 400  # of the reference, at which torques are compared
 _TAIL = 10.0  # s
 _OTHERS = (LAMBDA_MIN, LATCHED, MODEL_CHANGES, COMPUTE_TIME)
 _NO_PARAMETERS = (*COLUMNS, DISTURBANCE, POSITION, VELOCITY, *_OTHERS)
@@ -42,13 +42,13 @@ class Estimates:
     time: Floats  # (m,) s since the first sample of the run
     estimate: Floats  # (m, p)
     true: Floats | None  # (m, p); None if unknown, or if the plant's parameters have other names
-    unlike: tuple[str, ...] = ()  # those names
+    unlike: tuple[str, ...] = ()  # the plant's names, if they differ
     torques: Floats | None = None  # (k, p) rows of H along the reference, for an arm of a URDF
     base: tuple[Floats, Floats] | None = None  # true P (m, q) and its rows (k, q) of H
 
     @property
     def relative_error(self) -> Floats | None:
-        """|P^ - P| / |P|, (m,); of the torques H P^ and H P, where P has no unit of its own."""
+        """|P^ - P| / |P|, (m,); of the torques H P^ and H P if P has mixed units."""
         if self.base is not None and self.torques is not None:
             true, rows = self.base
             R: Any = np.linalg.qr(np.hstack((self.torques, rows)), 'r')
@@ -62,15 +62,15 @@ class Estimates:
 
     @property
     def is_known(self) -> bool:
-        """Whether the truth is known to compare with."""
+        """Whether the true parameters are known."""
         return self.true is not None or self.base is not None
 
 
 def estimates_of(run: Run) -> Estimates | None:
-    """Estimates of the model parameters, None if nothing was learned.
+    """Return the estimates of the model parameters, None if nothing was learned.
 
-    They are compared with the truth by name, and only if the plant has the same parameters; or, of
-    an arm of a URDF, by their torques.
+    They are compared with the truth by name, and only if the plant has the same parameters; those
+    of a URDF arm are compared by their torques.
     """
     if run.learning is None:
         return None
@@ -96,9 +96,9 @@ def estimates_of(run: Run) -> Estimates | None:
 
 
 def _torques(run: Run, regressor: Regressor, p: int) -> Floats:
-    """Rows of H(q, dq, dq, ddq) (k n, p) along the reference, or the motion without one.
+    """Return rows of H(q, dq, dq, ddq) (k n, p) along the reference, else along the motion.
 
-    Differences of three samples are the derivatives.
+    The derivatives are three-point differences.
     """
     q = run.position if run.reference is None else run.reference
     middle = np.arange(1, q.shape[0] - 1)
@@ -115,12 +115,12 @@ def _torques(run: Run, regressor: Regressor, p: int) -> Floats:
 
 
 def _parameters(names: Iterable[str]) -> tuple[str, ...]:
-    """Those names that are parameters of an arm."""
+    """Return the names that are parameters of an arm."""
     return tuple(name for name in names if not name.startswith(_NO_PARAMETERS))
 
 
 def latch_time(run: Run) -> float | None:
-    """Time at which learning began [s], None if it never did or is not recorded."""
+    """Return the time at which learning began [s], None if it never did or is not recorded."""
     if not run.learns or run.learning is None or LATCHED not in run.learning.names:
         return None
     latched = np.flatnonzero(run.learning.column(LATCHED) > 0.5)
@@ -128,7 +128,7 @@ def latch_time(run: Run) -> float | None:
 
 
 def change_times(run: Run) -> list[float]:
-    """Times [s] at which the controller found that the arm had changed."""
+    """Return the times [s] at which the controller detected a change of the arm."""
     if run.learning is None or MODEL_CHANGES not in run.learning.names:
         return []
     rises = np.flatnonzero(np.diff(run.learning.column(MODEL_CHANGES), prepend=0.0) > 0.0)
@@ -136,7 +136,7 @@ def change_times(run: Run) -> list[float]:
 
 
 def true_change_times(run: Run) -> list[float]:
-    """Times [s] at which the true parameters of the plant began to change, as by a payload."""
+    """Return the times [s] at which the plant's true parameters began to change."""
     if run.truth is None:
         return []
     true = run.truth.select(_parameters(run.truth.names))
@@ -146,16 +146,16 @@ def true_change_times(run: Run) -> list[float]:
 
 
 def outside(run: Run) -> NDArray[np.bool_] | None:
-    """Where |xi1| >= k_c, (N, n); None if error or bound is unknown."""
+    """Return where |xi1| >= k_c, (N, n); None if error or bound is unknown."""
     if run.error is None or run.bound is None:
         return None
     return np.asarray(np.abs(run.error) >= run.bound)
 
 
 def first_violation(run: Run) -> tuple[float, str]:
-    """Time [s] at which a joint first left its bound, and the joint; NaN and empty if none did.
+    """Return when [s] a joint first left its bound, and which; NaN and empty if none did.
 
-    The sample that leads to the stop is not published with its error: the stop counts instead.
+    The error of the sample that causes a stop is not published, so the stop itself counts.
     """
     found = [
         (time, next((joint for joint in run.joints if f'{joint!r}' in stop.text), ''))
@@ -187,7 +187,7 @@ class Metrics:
     parameter_error: dict[int, float]  #: `Estimates.relative_error` at MOMENTS
     final_parameter_error: float
     tail_parameter_error: float  #: rms over the last ten seconds
-    time_to_1_percent: float  #: s, from which on the parameter error stays below
+    time_to_1_percent: float  #: s, after which the parameter error stays below 1 %
 
     @property
     def held(self) -> bool | None:
@@ -198,7 +198,7 @@ class Metrics:
 
 
 def measure(run: Run) -> Metrics:
-    """Metrics of a run."""
+    """Compute the metrics of a run."""
     error, torque = run.error, run.torque
     step = float(run.time[1]) if run.stamp.size > 1 else math.nan
     violation, joint = first_violation(run)
@@ -230,7 +230,7 @@ def measure(run: Run) -> Metrics:
 
 
 def rms(values: Floats) -> float:
-    """Root of the mean square of the known values."""
+    """Return the root mean square of the known values."""
     known = values[np.isfinite(values)]
     with np.errstate(over='ignore'):  # a bag may hold 1e308: the root is infinite then
         return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
@@ -253,7 +253,7 @@ def _least(values: Floats) -> float:
 
 
 def _at_moments(time: Floats, error: Floats) -> dict[int, float]:
-    """Error at the sample next to each moment that the run has reached, to within a sample."""
+    """Return the error at the sample nearest to each moment; NaN where the run did not reach it."""
     end = time[-1] + 1.5 * (float(np.median(np.diff(time))) if time.size > 1 else 0.0)
     return {
         moment: float(error[np.abs(time - moment).argmin()])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""HTML pages that need nothing beside them, from the templates of the package."""
+"""Self-contained HTML pages from the templates of the package."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _TEMPLATES.filters['embedded'] = lambda png: (
 
 
 class Cell(NamedTuple):
-    """Cell of a table that is not plain text.
+    """Table cell that is more than plain text.
 
     Styles: number, code, good, partly, bad; marked highlights the row.
     """
@@ -35,6 +35,6 @@ class Cell(NamedTuple):
 
 
 def write_page(path: Path, template: str, title: str, **values: object) -> None:
-    """Write a page by its template, with the variables that this names."""
+    """Render a template with its variables and write the page."""
     text = _TEMPLATES.get_template(template).render(title=title, **values)
     path.write_text(text, encoding='utf-8')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The panels of runs: what is plotted, by matplotlib in `figures` and by plotly in `report`."""
+"""The panels of runs, plotted by matplotlib in `figures` and by plotly in `report`."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ _STOPPED = GROUPS[:3]
 _CHANGED = ('Tracking', 'Parameters')
 _LEARNING = GROUPS[3:7]
 _LEAST = 1e-12  # J, the smallest value on a logarithmic axis
-_ROOM = 1.2  # of the largest value shown, to either side
+_ROOM = 1.2  # limit of an axis as a multiple of the largest value
 _LEAST_ERROR = 1e-5  # %
 _PIECES = 300  # of a run, each with its largest error
 
 
 class Line(NamedTuple):
-    """A line of a panel; without a colour it has that of its run."""
+    """A line of a panel; without a colour of its own it has that of its run."""
 
     name: str  # in the legend
     time: Floats  # s
@@ -64,7 +64,7 @@ class Line(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """A vertical line; shaded from there until a later time, if there is one."""
+    """A vertical line, with the area up to `until` shaded if that is later."""
 
     time: float
     text: str
@@ -81,16 +81,16 @@ class Panel:
     title: str
     unit: str
     lines: tuple[Line, ...]
-    note: str = ''  # on the one run that is shown
+    note: str = ''  # only if a single run is shown
     symbol: str = ''  # label of the axis in mathematical type, instead of the unit
     log: bool = False
     histogram: bool = False
     marks: tuple[Mark, ...] = ()
-    span: float = 0.0  # pictures show so much of both signs; 0: everything
+    span: float = 0.0  # limit of the axis in pictures, in both directions; 0: everything
 
 
 def panels(runs: Sequence[Run]) -> list[Panel]:
-    """Every panel that some of the runs have data for, several runs over each other."""
+    """Return every panel that any of the runs has data for, with several runs overlaid."""
     found: dict[tuple[str, str], Panel] = {}
     for k, run in enumerate(runs):
         latched = latch_time(run)
@@ -117,7 +117,7 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
 
 
 def _stops(run: Run) -> Iterator[Mark]:
-    """Safe stops, each until the next start or the end."""
+    """Yield the safe stops, each until the next start or the end."""
     for time, one in run.timed_stops:
         until = run.duration
         if one.until is not None:
@@ -163,14 +163,14 @@ def _error(run: Run, i: int, error: Floats) -> Panel:
 
 
 def _span(run: Run, i: int, error: Floats) -> float:
-    """What is shown of a funnel, whose mouth would leave nothing to see of the error; else 0."""
+    """Return the axis limit for a funnel, whose wide start would hide the error; 0 otherwise."""
     if run.bound is None or run.bound[0, i] <= run.bound[-1, i]:
         return 0.0
     return float(_ROOM * np.nanmax(np.abs(drawable(error)), initial=1e3 * run.bound[-1, i]))
 
 
 def _error_size(run: Run, i: int, error: Floats) -> Panel:
-    """Largest error of each piece of the run: the first transient and the last microradian."""
+    """Return the panel of the largest error in each piece of the run, on a logarithmic axis."""
     begins = np.linspace(0, error.size, _PIECES, endpoint=False).astype(np.intp)
     size = np.fmax.reduceat(np.abs(error), begins)
     size[size == 0.0] = np.nan
@@ -204,7 +204,7 @@ def _learning(run: Run) -> Iterator[Panel]:
         if name.startswith(DISTURBANCE):
             estimate = _column(run, run.learning, name, 'estimate')
             true = _column(run, run.truth, name, 'true', colour=INK, dashed=True)
-            true = true if run.arm is None else []  # it has the friction that is learned beside
+            true = true if run.arm is None else []  # it includes the learned friction
             yield Panel('Disturbance', name, 'N m', (*estimate, *true))
 
 
@@ -221,7 +221,7 @@ def _relative_error(estimates: Estimates) -> Iterator[Panel]:
 
 
 def _of_links(run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel]:
-    """Errors of the parameters of each link in deviations of the prior."""
+    """Yield the parameter errors of each link, in deviations of the prior."""
     origin, what = estimates.true, 'errors'
     if origin is None:
         origin, what = estimates.estimate[:1], 'changes'
@@ -236,7 +236,7 @@ def _of_links(run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel
 
 
 def _by_kind(_run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel]:
-    """Few parameters as they are: those of one kind and unit together."""
+    """Yield the parameters themselves, those of one kind and unit in a panel."""
     kinds: dict[str, list[int]] = {}
     for j, name in enumerate(estimates.names):
         kind = re.sub(r'\d+$', '', name.split(' ')[0])

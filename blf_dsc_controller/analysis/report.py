@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of one or several bags, drawn by plotly, whose script (4.8 MB) is part of the page."""
+"""HTML page of one or several bags, with the script of plotly (4.8 MB) embedded."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from blf_dsc_controller.run import Floats, Run
 _BINS = 200
 _TAIL = 99.9  # percentile up to which a histogram is drawn
 _DIGITS = 7
-_RATE = 50.0  # pictures of the arm a second
+_RATE = 50.0  # pictures of the arm per second
 _MOST_PICTURES = 6000
 _ALARMING = ('violation', 'stop', 'ERROR', 'lost')
 
 
 def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
-    """Write the page of these bags.
+    """Write the page of some bags.
 
     Raises:
         MissingExtraError: plotly is not installed.
@@ -80,7 +80,7 @@ def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
 
 
 def plots(shown: Sequence[Panel], bags: Sequence[ReportedBag]) -> list[dict[str, Any]]:
-    """Panels as data for plotly, whose traces are thinned without losing a peak."""
+    """Return panels as data for plotly, with traces thinned without losing a peak."""
     prefixes = [f'{bag.name}: ' for bag in bags] if len(bags) > 1 else []
     return [
         {
@@ -100,7 +100,7 @@ def plots(shown: Sequence[Panel], bags: Sequence[ReportedBag]) -> list[dict[str,
 
 
 def _period(run: Run) -> float:
-    """Time of which two samples are drawn [ms]; 0 if all are."""
+    """Return the interval [ms] of which two samples are drawn; 0 if all samples are."""
     return 1e3 * run.duration / PIECES if run.stamp.size > 2 * PIECES else 0.0
 
 
@@ -119,13 +119,13 @@ def _traces(panel: Panel, prefixes: Sequence[str]) -> Iterator[dict[str, Any]]:
                 'x': _numbers(time),
                 'y': _numbers(sign * values),
                 'line': {'width': 1.3, 'color': shade, 'dash': 'dash' if line.dashed else 'solid'},
-                # What has a colour of its own looks alike in all bags.
+                # Lines with a colour of their own look the same in all bags.
                 'showlegend': bool(line.name) and sign > 0.0 and not (line.colour and line.run),
             }
 
 
 def _histograms(panel: Panel, prefixes: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Counts up to the tail; values beyond it fall into the last bin."""
+    """Yield histograms up to the tail; values beyond it are counted in the last bin."""
     for line in panel.lines:
         values = line.values[np.isfinite(line.values)]
         counts, edges = np.histogram(np.minimum(values, np.percentile(values, _TAIL)), _BINS)
@@ -144,12 +144,12 @@ def _numbers(values: Floats) -> list[float | None]:
 
 
 def colour(k: int) -> str:
-    """Colour of the k-th bag."""
+    """Return the colour of the k-th bag."""
     return COLOURS[k % len(COLOURS)]
 
 
 def arm(bag: ReportedBag, k: int) -> dict[str, Any]:
-    """Joints of an arm and their positions, at a rate that the eye can follow."""
+    """Return the joints of an arm and their positions, sampled for the animation."""
     run = bag.run
     pictures = int(min(_MOST_PICTURES, max(2.0, run.duration * _RATE)))
     times = np.linspace(0.0, run.duration, pictures)

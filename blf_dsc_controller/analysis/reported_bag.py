@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One bag as the page shows it: the run, its configuration, and what happened in it."""
+"""One bag as shown on the page: the run, its configuration and its events."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from blf_dsc_controller.run import Run
 
 _LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 _MOST_OF_A_KIND = 50
-_LONGEST = 1000  # characters of a parameter that are shown
+_LONGEST = 1000  # characters of a parameter that is shown in full
 _AT_LIMIT = 1.0 - 1e-9
 
 
 class Event(NamedTuple):
-    """Something that happened."""
+    """An event of a run."""
 
     time: float  # s since the first sample
     kind: str
@@ -40,11 +40,11 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True)
 class ReportedBag:
-    """A bag under the name that the page gives it."""
+    """A bag with its name on the page."""
 
     name: str
     run: Run
-    version: str  # that recorded it, empty if it was another recorder
+    version: str  # that recorded it, empty for another recorder
     parameters: dict[str, str]  # `node name: parameter` to its value as text
     arm: DrawnArm
     events: list[Event]  # by time
@@ -53,7 +53,7 @@ class ReportedBag:
 def read_bags(
     paths: Sequence[Path], namespace: str = '', names: NameMap = NO_NAMES
 ) -> list[ReportedBag]:
-    """Read bags; each is named by its folder, and those above it where that is not enough.
+    """Read bags; each is named by its folder, with parent folders if that is ambiguous.
 
     Raises:
         BlfDscError: one of them cannot be read.
@@ -80,7 +80,7 @@ def _read(path: Path, name: str, namespace: str, names: NameMap) -> ReportedBag:
     run, context = read_run(path, namespace, names), read_context(path)
     try:
         sections = parse(context.configuration)
-    except ConfigurationError:  # not there, or it cannot be read
+    except ConfigurationError:  # missing or unreadable
         sections = []
     entries = {name: entry.value for section in sections for name, entry in section.entries.items()}
     lost = (Event(0.0, 'lost', f'{topic}: {text}') for topic, text in context.losses.items())
@@ -103,7 +103,7 @@ def _read(path: Path, name: str, namespace: str, names: NameMap) -> ReportedBag:
 
 
 def _drawn(context: Context, entries: Mapping[str, Any], n: int) -> tuple[DrawnArm, str]:
-    """Arm of the recorded URDF, or links in a plane; with the reason if there should be a URDF."""
+    """Return the arm of the recorded URDF, else a planar one; and why a URDF cannot be read."""
     problem = ''
     if context.facts.get('model') == 'urdf':
         try:
@@ -111,7 +111,7 @@ def _drawn(context: Context, entries: Mapping[str, Any], n: int) -> tuple[DrawnA
             return arm_of_chain(config.robot.chain(config.joints)), ''
         except BlfDscError as error:
             problem = f'drawn as links in a plane, as its URDF cannot be read: {error}'
-    # A link without a length of its own has that of the first.
+    # Links without a length take that of the first.
     lengths = (entries.get(f'arm.l{i + 1}', entries.get('arm.l1', 1.0)) for i in range(n))
     return planar_arm([float(f'{length}') for length in lengths]), problem
 
@@ -128,7 +128,7 @@ def _events(run: Run) -> Iterator[Event]:
     for t, stop in run.timed_stops:
         yield Event(t, 'stop', f'{stop.reason}: {stop.text}')
     if violated is not None:
-        yield from _spells(run, violated, 'violation', 'outside of its bound')
+        yield from _spells(run, violated, 'violation', 'outside its bound')
     if run.torque_limit is not None:
         limited = np.abs(run.torque) >= _AT_LIMIT * run.torque_limit
         yield from _spells(run, limited, 'saturation', 'at its torque limit')
@@ -148,7 +148,7 @@ def _spells(run: Run, holds: np.ndarray, kind: str, what: str) -> Iterator[Event
 
 
 def _diagnosed(path: Path, run: Run) -> Iterator[Event]:
-    """Each change of a level or a message, at the time of the sample received last."""
+    """Yield each change of a level or message, at the time of the last sample received."""
     shown: dict[str, tuple[int, str]] = {}
     with open_bag(path) as bag:
         if (DIAGNOSTICS.resolved, DIAGNOSTICS.type) not in bag.held:
@@ -166,7 +166,7 @@ def _diagnosed(path: Path, run: Run) -> Iterator[Event]:
 
 
 def _changed(path: Path, run: Run, namespace: str) -> Iterator[Event]:
-    """Each change of the simulated plant's parameters while it ran."""
+    """Yield each change of the simulated plant's parameters during the run."""
     name = f'/{namespace.strip("/")}'.rstrip('/') + CHANGES.resolved
     with open_bag(path) as bag:
         if (name, CHANGES.type) not in bag.held:

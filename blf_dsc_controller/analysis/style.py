@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Style of the figures: colours for the colour-blind, legends beside the data."""
+"""Style of the figures: colour-blind safe colours, and legends beside the data."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ SHADE = '#DCE9F5'
 ALARM = '#B3001B'
 
 _DPI = 130
-_CHARACTER = 0.085  # inches, about, of a title and a legend
+_CHARACTER = 0.085  # inches, approximate width in a title or legend
 _HANDLE = 0.5
-_MARGIN = 0.75  # of a panel, beside its axes
+_MARGIN = 0.75  # inches of a panel, beside its axes
 _SETTINGS: Any = {
     'font.family': 'DejaVu Sans',
     'font.size': 11,
@@ -82,9 +82,9 @@ class Picture:
 
 
 def head(axes: Axes, title: str) -> None:
-    """Put the title above a panel and its legend off the data: above as well, or beside it.
+    """Put the title above a panel and the legend off the data: above as well, or beside it.
 
-    A single line without another needs no legend but the title.
+    A single line that the title names needs no legend.
     """
     axes.set_title(title, loc='left', fontsize=11.5)
     labels = axes.get_legend_handles_labels()[1]
@@ -108,7 +108,7 @@ def head(axes: Axes, title: str) -> None:
 
 
 def head_of_column(axes: Axes, title: str, *, first: bool) -> None:
-    """Put the title above a panel; above the first of a column also the legend of all of them."""
+    """Put the title above a panel; the first of a column also gets the legend of the column."""
     axes.set_title(title, loc='left', fontsize=11)
     entries = len(axes.get_legend_handles_labels()[1])
     if first and entries:
@@ -124,7 +124,7 @@ def head_of_column(axes: Axes, title: str, *, first: bool) -> None:
 
 
 def formula(name: str) -> str:
-    """Name of a parameter in mathematical type if it is a formula such as `m2*l1*l2`."""
+    """Return the name of a parameter, as mathtext if it is a formula such as `m2*l1*l2`."""
     if not re.fullmatch(r'(?:[A-Za-z]\d*|[()+*^-]|\d)+', name) or not re.search(r'\d', name):
         return name
     indexed = re.sub(r'([A-Za-z])(\d+)', r'\1_{\2}', name)

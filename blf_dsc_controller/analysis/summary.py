@@ -25,7 +25,7 @@ Summary = dict[str, Any]
 
 _PERCENTILES = {'p50': 50.0, 'p99': 99.0, 'p99.9': 99.9, 'max': 100.0}
 _MICROSECONDS = 1e6
-_JOINT = {  # entry of the summary: metric; title, unit, units to 1 and decimals in the table
+_JOINT = {  # entry of the summary: metric; title, unit, factor and decimals in the table
     'max_abs_error_rad': ('max_error', 'max |xi1|', 'mrad', 1e3, 3),
     'rms_error_rad': ('rms_error', 'rms xi1', 'mrad', 1e3, 3),
     'bound_rad': ('bound', 'bound', 'mrad', 1e3, 3),
@@ -43,9 +43,9 @@ _MEASURED = {  # comparison with the truth: entry of the summary, its line of th
 
 
 def summarize(run: Run) -> Summary:
-    """Summary of a run as plain data for JSON; units are part of the names.
+    """Return the summary of a run as plain data for JSON; units are part of the names.
 
-    What is unknown or has not happened is None.
+    Values that are unknown or were not reached are None.
     """
     metrics = measure(run)
     estimates = estimates_of(run)
@@ -80,7 +80,7 @@ def write_summary(summary: Summary, path: Path) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Data for JSON: lists and dictionaries, None instead of NaN and infinity."""
+    """Convert to data for JSON: lists and dictionaries, None instead of NaN and infinity."""
     if isinstance(value, dict):
         return {str(key): plain(each) for key, each in value.items()}
     if isinstance(value, (list, tuple)):
@@ -114,10 +114,10 @@ def _named(estimates: Estimates, values: Floats) -> dict[str, float]:
 
 
 def _timing(run: Run) -> Summary | None:
-    """Real time: how fast the samples came, and how late the torques."""
+    """Return the sample rate and the latency of the torques of a run in real time."""
     if run.timing is None or LATENCY not in run.timing.names:
         return None
-    moving = run.received[1:]  # the first state waits, braked, for the controller
+    moving = run.received[1:]  # the first state waits, with brakes on, for the controller
     elapsed = float(moving[-1] - moving[0]) * 1e-9 if moving.size else 0.0
     late = run.timing.column(LATE_STEPS)[-1] if LATE_STEPS in run.timing.names else None
     return {

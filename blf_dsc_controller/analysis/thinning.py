@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Long series with fewer samples, for pictures that lose no peak."""
+"""Thinning of long series for plotting, without losing a peak."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ _MOST = 1e100
 
 
 def drawable(values: Floats) -> Floats:
-    """Values with gaps for what no axis can show, such as infinity."""
+    """Return the values, with NaN for those that no axis can show, such as infinity."""
     return np.where(np.abs(values) < _MOST, values, np.nan)
 
 
 def thin(time: Floats, values: Floats, pieces: int = PIECES) -> tuple[Floats, Floats]:
-    """Thin a series without losing a peak; of a mostly constant one the corners remain."""
+    """Thin a series without losing a peak; a mostly constant one is reduced to its corners."""
     values = drawable(values)
     changes = np.flatnonzero(np.diff(values) != 0.0)
     if changes.size < values.size // 100:
@@ -27,10 +27,10 @@ def thin(time: Floats, values: Floats, pieces: int = PIECES) -> tuple[Floats, Fl
 
 
 def envelope(time: Floats, values: Floats, pieces: int = PIECES) -> tuple[Floats, Floats]:
-    """Lowest and highest sample of each piece of a series (N,), in their order.
+    """Return the lowest and highest sample of each piece of a series (N,), in order of time.
 
-    NaN is unknown; a piece in which nothing is known stays a gap. At most two samples of each piece
-    remain, all of them if they are so few.
+    NaN is unknown; a piece without known values stays a gap. A series of at most two samples per
+    piece is returned unchanged.
     """
     if values.size <= 2 * pieces:
         return time, values
@@ -42,7 +42,7 @@ def envelope(time: Floats, values: Floats, pieces: int = PIECES) -> tuple[Floats
 
 
 def _extreme(values: Floats, edges: np.ndarray, reduction: np.ufunc) -> np.ndarray:
-    """Index of the first sample of each piece that is its extreme one."""
+    """Return the index of the first extreme sample of each piece."""
     extremes = np.repeat(reduction.reduceat(values, edges), np.diff([*edges, values.size]))
     found = np.where(values == extremes, np.arange(values.size), values.size)
     return np.asarray(np.minimum.reduceat(found, edges))

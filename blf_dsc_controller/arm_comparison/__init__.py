@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Laws side by side on arms whose URDF is wrong, tuned by one procedure."""
+"""Comparison of laws, tuned by one procedure, on arms whose URDF is wrong."""

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Computed torque and PD with gravity compensation, by the model of a URDF, in a compiled loop.
+"""Computed torque and PD with gravity compensation, from a URDF model, in a compiled loop.
 
     u   = -k_p e - k_d e' - k_i int e,   e = q - qr
     tau = M0 (qr'' + u) + C0 q' + G0 + F0(qr')                               computed torque
     tau = m u + G0 + F0(qr')                                                 PD with gravity
 
-M0, C0, G0 are those of P0, the first estimate of the law, and m is the inertia of each joint with
-the others free.  F0 is the friction that the controller knows, at the velocity of the reference as
-in the law.  While a torque is cut at its limit, nothing is integrated.
+M0, C0, G0 are those of P0, the initial estimate of the law, and m is the inertia of each joint with
+the others free.  F0 is the friction known to the controller, at the velocity of the reference as in
+the law.  The integrators are held while any torque is saturated.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from sim_plant.plant import plant_of, steps_of
 
 
 class Gains(NamedTuple):
-    """Gains of a baseline, and what it knows of the arm."""
+    """Gains of a baseline, and its model of the arm."""
 
     n: int
     p: int
@@ -41,14 +41,14 @@ class Gains(NamedTuple):
     integral: float  # k_i, 1/s^3
     coulomb_velocity: float  # rad/s
     inertia: Annotated[Array, 'n']  # m, kg m^2
-    viscous: Annotated[Array, 'n']  # N m s/rad, that are compensated
+    viscous: Annotated[Array, 'n']  # N m s/rad, compensated
     coulomb: Annotated[Array, 'n']  # N m, likewise
     limit: Annotated[Array, 'n']  # N m
     P: Annotated[Array, 'p']  # P0
 
 
 class Memory(NamedTuple):
-    """What a baseline remembers, and computes in a sample."""
+    """State of a baseline, and what it computes in a sample."""
 
     integrated: Annotated[Array, 'n']  # int e, rad s
     measurement: Annotated[Array, '3 * n']  # [q, dq, effort]
@@ -107,7 +107,7 @@ def run_baseline(
 ) -> None:
     """Run as many samples as `errors` (k, n) [rad] and `torques` (k, n) [N m] have rows.
 
-    The errors are those of the arm, not of its sensors.
+    The errors are those of the true state, not of the measured one.
     """
     plant, now = plants.plant_views(arm, plant_settings, plant_state)
     gains = gains_of(view(gains_vector))
@@ -133,9 +133,9 @@ def simulate_baseline(
     computed: bool,
     friction: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Errors (k, n) [rad] and torques (k, n) [N m] of a loop, from the start of its law on.
+    """Return errors (k, n) [rad] and torques (k, n) [N m] of a loop that starts as its law does.
 
-    `inertia` (n,) is m, `values` are gains by name; those that are not named are zero.
+    `inertia` (n,) is m, `values` are gains by name; gains that are not given are zero.
 
     Raises MotionError if there is no approach within the limits.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The laws that are compared: what each is, which gains are tuned, and one run of it in figures."""
+"""The laws that are compared, their tuned gains, and the figures of one run."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ INTERVALS = {
     'pick-up': (PICK_UP, 17.0),
     'from 20 s': (20.0, DURATION),
 }
-_BEFORE = PICK_UP - 0.01  # s, when the model is looked at for the first time
+_BEFORE = PICK_UP - 0.01  # s, when the model is evaluated for the first time
 _ROWS = 200
-_STIFFEST = 4.0  # times the barrier's weight, at least: its slope limit
+_STIFFEST = 4.0  # least slope limit of the barrier, as a multiple of its weight
 
 
 class Gain(NamedTuple):
@@ -43,7 +43,7 @@ class Gain(NamedTuple):
 
 
 class Contender(NamedTuple):
-    """A law with the gains that are tuned; with none they are those that follow from the URDF."""
+    """A law and its tuned gains; without any, all gains follow from the URDF."""
 
     label: str
     gains: tuple[Gain, ...] = ()
@@ -73,7 +73,7 @@ _PD = (Gain('position', 100.0, 3e4), Gain('velocity', 10.0, 200.0))
 _PID = (*_PD, Gain('integral', 100.0, 3e6))
 
 CONTENDERS = {
-    'proposed': Contender('proposed, gains by the URDF'),
+    'proposed': Contender('proposed, gains from the URDF'),
     'no_learning': Contender('the same without learning', learns=False),
     'slotine_li': Contender('Slotine-Li, the same gains', law='slotine_li'),
     'proposed_tuned': Contender('proposed, tuned', (*_FEEDBACK, _ADAPTATION)),
@@ -89,18 +89,18 @@ CONTENDERS = {
 
 
 class Figures(NamedTuple):
-    """One run: the largest true error of any joint in each of INTERVALS, the torque, the model."""
+    """Figures of one run: largest true error of any joint in each of INTERVALS, torque, model."""
 
     errors: tuple[float, ...]  # rad
-    ratio: float  # largest error of the whole run, of the bound
-    roughness: float  # rms change of the torque from sample to sample, of its limit
+    ratio: float  # largest error of the whole run, relative to the bound
+    roughness: float  # rms change of the torque from sample to sample, relative to its limit
     model: tuple[float, ...]  # torque error on another motion: before the pick-up, at the end
 
 
 def law_changes(
     contender: Contender, config: ControllerConfig, values: Mapping[str, float]
 ) -> dict[str, object]:
-    """Parameters that make the configured law the contender, with these values of its gains."""
+    """Return the parameters that turn the configured law into a contender with these gains."""
     changes: dict[str, object] = {'law': contender.law}
     if contender.law == 'slotine_li':  # the slope of the proposed law's surface at zero
         slope = np.array(config.surface.gain) / 2.0 + config.surface.mu
@@ -125,16 +125,16 @@ def law_changes(
 
 
 def joint_inertia(config: ControllerConfig) -> np.ndarray:
-    """The m of the gains, (n,) [kg m^2]: the least inertia of a joint, the others being free."""
+    """Return m (n,) [kg m^2] of the gains: the least inertia of a joint with the others free."""
     robot, limits = config.robot, (config.limits.position_lower, config.limits.position_upper)
     chain, P0 = robot.chain(config.joints), config.learning.initial_estimate
     return over_postures(chain, parameters_of(robot, chain), robot.payload, P0, *limits)[0]
 
 
 def run(name: str, loop: LoopConfig, values: Mapping[str, float], unseen: np.ndarray) -> Figures:
-    """Run a contender with these values of its gains, by their names.
+    """Run a contender with `values` of its gains by name.
 
-    `unseen` (k, p) are the rows of H on which the learned model is judged.
+    `unseen` (k, p) are the rows of H on which the learned model is evaluated.
     """
     contender = CONTENDERS[name]
     with np.errstate(all='ignore'):  # a run that diverges has figures too
@@ -179,7 +179,7 @@ def _simulate_law(
 
 
 def torque_rows(config: ControllerConfig) -> np.ndarray:
-    """Rows of H(q, q', q', q'') (k, p) along the configured reference."""
+    """Return the rows of H(q, q', q', q'') (k, p) along the configured reference."""
     model = model_of(config)
     times = np.linspace(0.0, PICK_UP, _ROWS)
     H = np.zeros((_ROWS, model.n, len(config.learning.initial_estimate)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The study: each contender tuned on one truth, then run on others, and a page of the figures."""
+"""The study: tuning of each contender on one truth, runs on others, and a page of figures."""
 
 from __future__ import annotations
 
@@ -32,33 +32,33 @@ from blf_dsc_controller.run import Floats
 
 POPULATION = 16
 ROUGHEST = 0.05
-"""rms change of a torque from sample to sample, of its limit, that a motor is to be spared."""
+"""rms change of a torque per sample, relative to its limit, beyond which it is penalised."""
 
-_UNSEEN = 1000  # seed of a motion that nobody runs
+_UNSEEN = 1000  # seed of a motion that is never run
 _COLUMNS = (*INTERVALS, 'torque error before the pick-up', 'at the end')
 _OURS = ('proposed', 'proposed_tuned')
 
 
 class Result(NamedTuple):
-    """A contender on one arm: gains found and their cost (None if not tuned), validation runs."""
+    """A contender on one arm: tuned gains and their cost (None if not tuned), validation runs."""
 
     gains: dict[str, float]
     cost: float | None
     runs: list[Figures]
 
     def columns(self) -> Floats:
-        """Of each of _COLUMNS the values of all runs, in mrad or %; NaN if there is no model."""
+        """Return the values of all runs for each of _COLUMNS, in mrad or %; NaN without a model."""
         rows = [(*one.errors, *(one.model or (np.nan, np.nan))) for one in self.runs]
         units = np.where(np.arange(len(_COLUMNS)) < len(INTERVALS), 1e3, 1e2)
         return np.asarray((np.array(rows) * units).T)
 
 
 Results = dict[str, dict[str, Result]]
-"""By arm and contender."""
+"""Results by arm and contender."""
 
 
 def trial(name: str, seed: int) -> LoopConfig:
-    """Loop of a preset: seed 0 has its own truth and motion, every other seed has others.
+    """Return the loop of a preset: seed 0 keeps its truth and motion, other seeds vary them.
 
     Raises BlfDscError if it has no arm of a URDF that follows sinusoids.
     """
@@ -77,7 +77,7 @@ def trial(name: str, seed: int) -> LoopConfig:
         'events.duration': [0.0],
         'events.payload': [max(events.payload, default=0.0)],
     }
-    # No funnel, which the others do not have: all approach the motion from rest.
+    # No funnel, since the other laws have none: all approach the motion from rest.
     motion: dict[str, object] = {'barrier.initial_bound': [0.0] * len(loop.plant.joints)}
     if seed > 0:
         random = np.random.default_rng(seed)
@@ -90,15 +90,15 @@ def trial(name: str, seed: int) -> LoopConfig:
 
 
 def values_of(name: str, exponents: Floats) -> dict[str, float]:
-    """Gains of a contender, whose decimal logarithms are the coordinates of a point."""
+    """Return the gains of a contender from their decimal logarithms."""
     pairs = zip(CONTENDERS[name].gains, exponents, strict=True)
     return {gain.name: float(f'{10.0**exponent:.3g}') for gain, exponent in pairs}
 
 
 def cost_of(figures: Figures) -> float:
-    """Mean over the intervals of the decades of the largest error, in mrad; less is more.
+    """Return the mean over the intervals of log10 of the largest error in mrad; lower is better.
 
-    A torque rougher than ROUGHEST costs ten decades a decade.
+    Each decade of torque roughness beyond ROUGHEST adds ten.
     """
     rough = max(np.log10(figures.roughness / ROUGHEST), 0.0)
     cost = float(np.mean(np.log10(1e3 * np.array(figures.errors))) + 10.0 * rough)
@@ -106,7 +106,7 @@ def cost_of(figures: Figures) -> float:
 
 
 def tuning_cost(exponents: Floats, name: str, loop: LoopConfig, unseen: Floats) -> float:
-    """`cost_of` a contender with a sample of delay more than it will have: none is at its edge."""
+    """Return `cost_of` a contender with one more sample of delay, to keep a stability margin."""
     delayed = change(loop.plant, {'actuator.delay': loop.plant.actuator.delay + 1})
     values = values_of(name, exponents)
     return cost_of(run(name, loop._replace(plant=delayed), values, unseen))
@@ -121,7 +121,7 @@ def compare(folder: Path, names: Sequence[str], truths: int, generations: int) -
     with tqdm(total=len(names) * each, unit='run') as bar, ProcessPoolExecutor() as pool:
         for name in names:
             unseen = torque_rows(trial(name, _UNSEEN).controller)
-            if not results:  # compiles, which the workers then inherit or load
+            if not results:  # compile now; the workers inherit or load the result
                 for contender in ('proposed', 'computed_torque'):
                     run(contender, loops[name][0], {}, unseen)
 
@@ -155,7 +155,7 @@ def compare(folder: Path, names: Sequence[str], truths: int, generations: int) -
 
 
 def least_errors(results: Results) -> list[list[str]]:
-    """Of each arm and column, whose worst run is best, and the worst of the proposed law."""
+    """Return rows of arm, column, law with the best worst run, its value, and those of _OURS."""
     rows = []
     for arm, laws in results.items():
         worst = {name: one.columns().max(axis=1) for name, one in laws.items()}
@@ -168,13 +168,13 @@ def least_errors(results: Results) -> list[list[str]]:
 
 
 def label_of(name: str) -> str:
-    """Label of a contender that says what an addition is added to."""
+    """Return the label of a contender; that of an addition includes the basic law."""
     label = CONTENDERS[name].label
     return f'{CONTENDERS[name.rpartition("_")[0]].label} {label}' if label[0] == '+' else label
 
 
 def table_of(laws: dict[str, Result]) -> list[list[str | Cell]]:
-    """A header, and a row for each contender: median / worst of its runs, the best marked."""
+    """Return a header and a row for each contender: median / worst of its runs, best marked."""
     rows: list[list[str | Cell]] = [['law', *_titles(), 'bound kept', 'roughness [%]', 'gains']]
     best = np.nanmin([one.columns().max(axis=1) for one in laws.values()], axis=0)
     for name, one in laws.items():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the joints and the tip of a chain are."""
+"""Forward kinematics of a chain: placements of its joints and its tip."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from blf_dsc_controller.arms.urdf import Chain
 
 
 def frames(chain: Chain, q: np.ndarray) -> list[np.ndarray]:
-    """Placements (..., 4, 4) in the base of the base, of each joint's frame and of the tip.
+    """Return the placements (..., 4, 4), in the base frame, of the base, each joint and the tip.
 
-    `q` is (..., n): one posture, or an array of them.
+    `q` is (..., n): one posture or an array of postures.
     """
     placements = [np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))]
     for i, joint in enumerate(chain.joints):
@@ -28,7 +28,7 @@ def frames(chain: Chain, q: np.ndarray) -> list[np.ndarray]:
 
 
 def skeleton(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Base, joints and tip (n + 2, 3) [m], and the axes of the joints (n, 3), at q (n,)."""
+    """Return base, joints and tip (n + 2, 3) [m], and the joint axes (n, 3), at q (n,)."""
     placements = np.array(frames(chain, q))
     axes = [
         placement[:3, :3] @ joint.axis
@@ -38,9 +38,9 @@ def skeleton(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tip_radius(chain: Chain, q: np.ndarray, bound: np.ndarray) -> float:
-    """Largest distance [m] of the tip from its reference while all joints keep their bounds (n,).
+    """Return the largest distance [m] of the tip from its reference while all bounds (n,) hold.
 
-    To first order: each joint swings the tip about its axis, or slides it.
+    To first order: each joint rotates the tip about its axis, or slides it.
     """
     corners, axes = skeleton(chain, q)
     reach = np.linalg.norm(np.cross(axes, corners[-1] - corners[1:-1]), axis=1)

@@ -11,8 +11,8 @@ alpha_i = sum_j (S_j a_j + S_j' v_j) - gravity with S_j' = v_j x S_j.  Over the 
     (G - C^T dq)_j = -sum_i (S_j' . I_i v_i + S_j . weight_i)
 
 (Echeandia and Wensing, Numerical methods to compute the Coriolis matrix and Christoffel symbols for
-rigid-body systems, 2021.)  All of it is linear in the ten of each body (`inertia.INERTIA_NAMES`) in
-its joint's frame.  A rotor inertia J, reflected to its joint, adds J a_j and J dq_j.
+rigid-body systems, 2021.)  All of it is linear in the ten parameters (`inertia.INERTIA_NAMES`) of
+each body in its joint's frame.  A rotor inertia J, reflected to its joint, adds J a_j and J dq_j.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from blf_dsc_controller.compiled.layout import Array, view_of
 from blf_dsc_controller.compiled.vectors import Vector, cross, dot, plus
 
 ROTOR = len(INERTIA_NAMES)
-"""Entry of a column after the ten."""
+"""Entry of the rotor inertia, after the ten inertial parameters of a body."""
 
 # Rows of `Bodies.motions`; after them, S and S' of each joint.
 VELOCITY, REFERENCE, ACCELERATION, GRAVITY, AXES = range(5)
@@ -39,13 +39,13 @@ class Bodies(NamedTuple):
     p: int
     gravity: Annotated[Array, 3]  # m/s^2, in the base
     rotation: Annotated[Array, 'n', 3, 3, 3]  # R0, R1, R2 of R0 + cos q R1 + sin q R2
-    offset: Annotated[Array, 'n', 3]  # of a body's origin in the body before, m
-    slide: Annotated[Array, 'n', 3]  # the same per q, of prismatic joints
+    offset: Annotated[Array, 'n', 3]  # of a body's origin in the previous body, m
+    slide: Annotated[Array, 'n', 3]  # change of the offset per q, for prismatic joints
     axis: Annotated[Array, 'n', 6]  # S in the joint's own frame
-    first: Annotated[Array, 'n + 1']  # column of each body, and p
-    entry: Annotated[Array, 'p']  # of each column: of its body's ten, or ROTOR
-    motions: Annotated[Array, '4 + 2 * n', 6]  # in the frame of the body at hand
-    products: Annotated[Array, 3, ROTOR + 1]  # of an axis with what each entry of a body gives
+    first: Annotated[Array, 'n + 1']  # first column of each body, then p
+    entry: Annotated[Array, 'p']  # of each column: index among its body's ten, or ROTOR
+    motions: Annotated[Array, '4 + 2 * n', 6]  # in the frame of the current body
+    products: Annotated[Array, 3, ROTOR + 1]  # of an axis with each entry's contribution
 
 
 bodies_of = view_of(Bodies)
@@ -53,7 +53,7 @@ bodies_of = view_of(Bodies)
 
 @called
 def fill_regressor(vector: Array, q: Array, dq: Array, v: Array, a: Array, H: Array) -> None:
-    """`SerialChain.regressor`."""
+    """Implement `SerialChain.regressor`."""
     bodies = bodies_of(vector)
     begin(bodies)
     for i in range(bodies.n):
@@ -63,7 +63,7 @@ def fill_regressor(vector: Array, q: Array, dq: Array, v: Array, a: Array, H: Ar
 
 @called
 def fill_momentum_regressor(vector: Array, q: Array, dq: Array, Yp: Array, Yr: Array) -> None:
-    """`SerialChain.momentum_regressor`."""
+    """Implement `SerialChain.momentum_regressor`."""
     bodies = bodies_of(vector)
     begin(bodies)
     for i in range(bodies.n):
@@ -75,7 +75,7 @@ def fill_momentum_regressor(vector: Array, q: Array, dq: Array, Yp: Array, Yr: A
 def fill_regressors(
     vector: Array, q: Array, dq: Array, v: Array, a: Array, H: Array, Yp: Array, Yr: Array
 ) -> None:
-    """`SerialChain.regressors`."""
+    """Implement `SerialChain.regressors`."""
     bodies = bodies_of(vector)
     begin(bodies)
     for i in range(bodies.n):
@@ -86,13 +86,13 @@ def fill_regressors(
 
 @inner
 def angular(motion: Array) -> Vector:
-    """Angular part of a motion (6,)."""
+    """Return the angular part of a motion (6,)."""
     return motion[0], motion[1], motion[2]
 
 
 @inner
 def linear(motion: Array) -> Vector:
-    """Linear part of a motion (6,)."""
+    """Return the linear part of a motion (6,)."""
     return motion[3], motion[4], motion[5]
 
 
@@ -109,7 +109,7 @@ def begin(bodies: Bodies) -> None:
 
 @inner
 def advance(bodies: Bodies, i: int, q: float, dq: float, v: float, a: float) -> None:
-    """Move all motions from the frame of body i - 1 to that of body i, and add its joint's."""
+    """Transform all motions from the frame of body i - 1 to that of i; add those of joint i."""
     motions, rotation = bodies.motions, bodies.rotation[i]
     c, s = cos(q), sin(q)
     column0 = turned(rotation, c, s, 0)
@@ -142,7 +142,7 @@ def advance(bodies: Bodies, i: int, q: float, dq: float, v: float, a: float) -> 
 
 @inner
 def turned(rotation: Array, c: float, s: float, k: int) -> Vector:
-    """Column k of R0 + c R1 + s R2 (3, 3, 3)."""
+    """Return column k of R0 + c R1 + s R2 (3, 3, 3)."""
     return (
         rotation[0, 0, k] + c * rotation[1, 0, k] + s * rotation[2, 0, k],
         rotation[0, 1, k] + c * rotation[1, 1, k] + s * rotation[2, 1, k],
@@ -152,7 +152,7 @@ def turned(rotation: Array, c: float, s: float, k: int) -> Vector:
 
 @inner
 def add_torque(bodies: Bodies, i: int, a: float, H: Array) -> None:
-    """Fill the columns of body i of M a + C v + G."""
+    """Fill the columns of body i in M a + C v + G."""
     motions, products = bodies.motions, bodies.products[0]
     w, u = angular(motions[VELOCITY]), linear(motions[VELOCITY])
     reference = angular(motions[REFERENCE])
@@ -166,7 +166,7 @@ def add_torque(bodies: Bodies, i: int, a: float, H: Array) -> None:
 
 @inner
 def add_momentum(bodies: Bodies, i: int, dq: float, Yp: Array, Yr: Array) -> None:
-    """Fill the columns of body i of M dq and of G - C^T dq."""
+    """Fill the columns of body i in M dq and in G - C^T dq."""
     motions, momenta, rest = bodies.motions, bodies.products[1], bodies.products[2]
     w, u = angular(motions[VELOCITY]), linear(motions[VELOCITY])
     g = linear(motions[GRAVITY])
@@ -189,7 +189,7 @@ def add_momentum(bodies: Bodies, i: int, dq: float, Yp: Array, Yr: Array) -> Non
 
 @inner
 def choose(bodies: Bodies, i: int, j: int, products: Array, Y: Array) -> None:
-    """Copy what is a column of body i from the eleven to row j; below row i there is nothing."""
+    """Copy the products that are columns of body i to row j of Y; zero the rows below i."""
     for k in range(int(bodies.first[i]), int(bodies.first[i + 1])):
         Y[j, k] = products[int(bodies.entry[k])]
         if j == i:
@@ -199,12 +199,12 @@ def choose(bodies: Bodies, i: int, j: int, products: Array, Y: Array) -> None:
 
 @inner
 def torque_products(S: Array, alpha: Vector, A: Vector, v: Vector, w: Vector, out: Array) -> None:
-    """Fill S . (I alpha + B(I, v) w) of a unit of each of the ten, h = m c being the moments.
+    """Fill S . (I alpha + B(I, v) w) for a unit of each of the ten; h = m c are the moments.
 
         force = m A + alpha x h + w x (v x h)
         moment = h x A + I (alpha - v x w / 2) + (v x I w + w x I v) / 2
 
-    alpha, v and w are angular here; A is alpha's linear part + w x (v's linear part).
+    Here alpha, v and w are the angular parts; A is alpha's linear part + w x (v's linear part).
     """
     s, t = angular(S), linear(S)
     turn, lever, along, speed = cross(t, alpha), cross(A, s), dot(t, v), dot(v, w)
@@ -228,7 +228,7 @@ def torque_products(S: Array, alpha: Vector, A: Vector, v: Vector, w: Vector, ou
 
 @inner
 def momentum_products(S: Array, w: Vector, u: Vector, out: Array) -> None:
-    """Fill S . I v of a unit of each of the ten; w and u are v's angular and linear part."""
+    """Fill S . I v for a unit of each of the ten; w and u are v's angular and linear parts."""
     s, t = angular(S), linear(S)
     turn, lever = cross(t, w), cross(u, s)
     out[0] = dot(t, u)

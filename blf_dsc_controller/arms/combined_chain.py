@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A serial chain of which only some combinations of the inertias are unknown: an `ArmModel`.
+"""Serial chain with only some combinations of the inertias unknown: an `ArmModel`.
 
 Its regressors are those of all inertias of the chain times a constant matrix, H = Y T^T; a row of T
-(p, 11 n) is the inertia that goes with one parameter, of one body or of all.
+(p, 11 n) holds the inertias of one or all bodies that a unit of one parameter contributes.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ class Combination(NamedTuple):
     n: int
     p: int
     width: int  # of Y, 11 n
-    entries: int  # of T that are not zero
-    column: Annotated[Array, 'p']  # place among `column_names`
-    row: Annotated[Array, 'entries']  # of an entry of T
-    at: Annotated[Array, 'entries']  # its column, and that of Y
+    entries: int  # number of nonzero entries of T
+    column: Annotated[Array, 'p']  # index in `column_names`
+    row: Annotated[Array, 'entries']  # of each entry of T
+    at: Annotated[Array, 'entries']  # its column, in T and in Y
     value: Annotated[Array, 'entries']
     Y: Annotated[Array, 3, 'n', 'width']
 
@@ -44,7 +44,7 @@ combination_of = view_of(Combination)
 class CombinedChain(NamedTuple):
     """Arm of any serial chain with few unknowns: an `ArmModel`.
 
-    It holds its working memory: two threads need one each.
+    It contains its working memory, so each thread needs its own.
     """
 
     n: int
@@ -61,7 +61,7 @@ class CombinedChain(NamedTuple):
 
     @property
     def parameter_units(self) -> tuple[str, ...]:
-        """Units of the entries of P: factors have none; the rotor of a prismatic joint has kg."""
+        """Units of the entries of P: none for factors, kg for the rotor of a prismatic joint."""
         units = ['kg m^2' if axis[:3].any() else 'kg' for axis in bodies_of(self.bodies).axis]
         units += [*INERTIA_UNITS, ''] if self.loads else [''] * self.n
         return tuple(units[int(k)] for k in combination_of(self.combination).column)
@@ -82,7 +82,7 @@ class CombinedChain(NamedTuple):
     def regressors(
         self, q: Array, dq: Array, v: Array, a: Array, H: Array, Yp: Array, Yr: Array
     ) -> None:
-        """`regressor` and `momentum_regressor` from one pass along the chain."""
+        """Compute `regressor` and `momentum_regressor` in one pass along the chain."""
         c = combination_of(self.combination)
         fill_regressors(self.bodies, q, dq, v, a, c.Y[0], c.Y[1], c.Y[2])
         combine(c, c.Y[0], H)
@@ -92,7 +92,7 @@ class CombinedChain(NamedTuple):
 
 @called
 def combine(c: Combination, Y: Array, out: Array) -> None:
-    """Fill Y T^T (n, p); in row i, Y (n, width) is zero for the bodies before i."""
+    """Fill `out` (n, p) with Y T^T; row i of Y (n, width) is zero for the bodies before i."""
     for i in range(c.n):
         for j in range(c.p):
             out[i, j] = 0.0
@@ -103,7 +103,7 @@ def combine(c: Combination, Y: Array, out: Array) -> None:
 
 
 def column_names(n: int, loads: int) -> tuple[str, ...]:
-    """Names of all that may be unknown: rotors, then load and the links' factor, or each body's."""
+    """Return the names of all possible unknowns: rotors, then load and links, or body factors."""
     rotors = tuple(f'rotor{i + 1}' for i in range(n))
     if loads:
         return (*rotors, *(f'load {name}' for name in INERTIA_NAMES), 'links')
@@ -111,7 +111,7 @@ def column_names(n: int, loads: int) -> tuple[str, ...]:
 
 
 def combined_chain(whole: SerialChain, loads: int, columns: Array, T: Array) -> CombinedChain:
-    """Model of the unknowns `columns` (p,) of `column_names`; T (p, 11 n) their inertias."""
+    """Return the model of the unknowns `columns` (p,) of `column_names`; T (p, 11 n): inertias."""
     p, width = T.shape
     row, at = np.nonzero(T)
     combination = Combination(

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is learned of a chain: all that torques show, the load, or one factor for each body.
+"""Learned parameters of a chain: all base parameters, the load, or one factor for each body.
 
-Of the forms `payload` and `scale` the inertias of all bodies are phi = D c, with rotor inertias in
-c first, and then
+In the forms `payload` and `scale` the inertias of all bodies are phi = D c, where c starts with the
+rotor inertias, followed by
 
-    payload   the ten of a load in the frame of the tip, 0 by the URDF, and one factor of all bodies
-    scale     a factor for each body, 1 by the URDF
+    payload   the ten of a load in the tip frame, 0 in the URDF, and one factor for all bodies
+    scale     a factor for each body, 1 in the URDF
 
-As few as are independent are learned, P = K c, and the others count with them.
+Only an independent set of them is learned, P = K c; the others are grouped with it.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ from blf_dsc_controller.arms.serial_chain import SerialChain, serial_chain
 from blf_dsc_controller.arms.urdf import Chain
 
 TRUSTED = 0.001
-"""Standard deviation of the factor of all bodies where only the load is unknown: next to none."""
+"""Standard deviation of the factor for all bodies where only the load is unknown: almost zero."""
 
 
 @dataclass(frozen=True, eq=False)
 class LearnedParameters:
-    """The parameters P of a model.
+    """Learned parameters P of a model.
 
     Attributes:
-        initial: (p,) P of the URDF.
-        L: (p, r) of P = initial + L theta, where theta has mean zero and covariance one.
-        load: (p,) that 1 kg at the tip adds to P, of `scale` nearly.
+        initial: (p,) P according to the URDF.
+        L: (p, r) of P = initial + L theta, where theta has zero mean and unit covariance.
+        load: (p,) what 1 kg at the tip adds to P; approximate for `scale`.
     """
 
     model: SerialChain | CombinedChain
@@ -59,7 +59,7 @@ class LearnedParameters:
 def learned_parameters(
     chain: Chain, base: BaseParameters, form: str, payload: float, rotors: np.ndarray
 ) -> LearnedParameters:
-    """Parameters of a form; rated payload [kg], rotors (n,) [kg m^2, or kg]."""
+    """Return the parameters of a form for a rated payload [kg] and rotors (n,) [kg m^2, or kg]."""
     n, tip = len(chain.joints), chain.tip_placement
     phi = np.column_stack((chain.inertias, np.zeros(n)))
     ten = np.array([inertia_of(tip @ pseudo_inertia(one) @ tip.T) for one in np.eye(ROTOR)])

@@ -4,15 +4,15 @@
 import numpy as np
 
 INERTIA_NAMES = ('m', 'm*cx', 'm*cy', 'm*cz', 'Ixx', 'Ixy', 'Iyy', 'Ixz', 'Iyz', 'Izz')
-"""The ten, in order; moments of inertia are about the frame's origin (as pinocchio has them)."""
+"""The ten, in order; moments of inertia are about the frame's origin, as in Pinocchio."""
 
 INERTIA_UNITS = ('kg', *('kg m',) * 3, *('kg m^2',) * 6)
 
 
 def pseudo_inertia(inertia: np.ndarray) -> np.ndarray:
-    """Pseudo-inertia J (4, 4) of the ten: in a frame whose placement is T (4, 4) it is T J T^T.
+    """Return the pseudo-inertia J (4, 4) of the ten; a placement T (4, 4) maps it to T J T^T.
 
-    J >= 0 is what physics asks of a body (Wensing, Kim and Slotine, Linear matrix inequalities for
+    Physical consistency requires J >= 0 (Wensing, Kim and Slotine, Linear matrix inequalities for
     physically consistent inertial parameter identification, 2018).
     """
     m, hx, hy, hz, xx, xy, yy, xz, yz, zz = inertia
@@ -28,12 +28,12 @@ def pseudo_inertia(inertia: np.ndarray) -> np.ndarray:
 
 
 def rotational_inertia(J: np.ndarray) -> np.ndarray:
-    """Matrix (3, 3) of the moments of inertia in a pseudo-inertia [kg m^2]."""
+    """Return the matrix (3, 3) of the moments of inertia [kg m^2] of a pseudo-inertia."""
     I: np.ndarray = np.trace(J[:3, :3]) * np.eye(3) - J[:3, :3]
     return I
 
 
 def inertia_of(J: np.ndarray) -> np.ndarray:
-    """Ten (10,) of a pseudo-inertia (4, 4)."""
+    """Return the ten (10,) of a pseudo-inertia (4, 4)."""
     I = rotational_inertia(J)
     return np.array([J[3, 3], *J[:3, 3], I[0, 0], I[0, 1], I[1, 1], I[0, 2], I[1, 2], I[2, 2]])

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The interface between the laws and an arm whose dynamics are linear in p parameters.
+"""Interface between the laws and an arm whose dynamics are linear in p parameters.
 
-An arm is a `NamedTuple` of what its regressors know of the geometry (numbers and arrays), with the
-properties and methods of `ArmModel`.  Kernels call the methods as Python does: `regressor` of the
-type that they are given is compiled into them, and of no other arm.  To add an arm, write its class
-in a file of its own and its name into `arm_model` and into the choices of the parameter `model`.
+An arm is a `NamedTuple` of the geometry that its regressors need (numbers and arrays), with the
+properties and methods of `ArmModel`.  Kernels call the methods as Python does: only those of the
+type that a kernel receives are compiled into it.  To add an arm, write its class in a file of its
+own, and add it to `arm_model`, to `compile_methods` below and to the choices of the parameter
+`model`.
 """
 
 from __future__ import annotations
@@ -46,11 +47,11 @@ class ArmModel(Protocol):
     def regressors(
         self, q: Array, dq: Array, v: Array, a: Array, H: Array, Yp: Array, Yr: Array
     ) -> None:
-        """`regressor` and `momentum_regressor` of one state."""
+        """Compute `regressor` and `momentum_regressor` for one state."""
 
 
 def arm_model(name: str, n: int, l1: float, gravity: float) -> ArmModel:
-    """Model of this name for n joints, with known l1 [m] and gravity [m/s^2], all else unknown."""
+    """Return the named model for n joints, with known l1 [m] and gravity [m/s^2]."""
     r = gravity / l1
     return PlanarChain(n, r) if name == 'planar_chain' else TwoLink(r)
 

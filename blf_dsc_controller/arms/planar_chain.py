@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A planar arm of n links with point masses at their ends, linear in its parameters.
+"""Planar arm of n links with point masses at their ends, linear in its parameters.
 
 In the absolute link angles phi_i = q1 + ... + qi, with w = phi' and mu_i the mass beyond joint i,
 
@@ -7,8 +7,8 @@ In the absolute link angles phi_i = q1 + ... + qi, with w = phi' and mu_i the ma
     P_ij = mu_max(i,j) l_i l_j   [kg m^2],   i <= j,   p = n (n + 1) / 2,   r = g / l1  [1/s^2]
 
 and the joint torques are tau_i = Q_i + ... + Q_n.  C_ij = P_ij sin(phi_i - phi_j) w_j is the
-Christoffel form, and stays so under the constant change of coordinates.  For n = 2 this is the arm
-of Section IV, with the names of its parameters in the order 11, 12, 22.
+Christoffel form, and remains so under the constant change of coordinates.  For n = 2 this is the
+arm of Section IV, with its parameters in the order 11, 12, 22.
 """
 
 from __future__ import annotations
@@ -94,16 +94,16 @@ class PlanarChain(NamedTuple):
     def regressors(
         self, q: Array, dq: Array, v: Array, a: Array, H: Array, Yp: Array, Yr: Array
     ) -> None:
-        """`regressor` and `momentum_regressor` of one state."""
+        """Compute `regressor` and `momentum_regressor` for one state."""
         self.regressor(q, dq, v, a, H)
         self.momentum_regressor(q, dq, Yp, Yr)
 
 
 @inner
 def add_column(Y: Array, column: int, i: int, j: int, Q_i: float, Q_j: float) -> None:
-    """Add the torques Q_i, Q_j of P_ij on the absolute angles to the joint torques of a column.
+    """Add the torques Q_i, Q_j of P_ij about the absolute angles to the joint torques of a column.
 
-    On the diagonal both are the same angle's, and Q_j counts alone.
+    On the diagonal both belong to the same angle, and only Q_j counts.
     """
     for k in range(j + 1):
         Y[k, column] += Q_j

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far the inertias of a URDF may be off: the scale and the directions of what is learned.
+"""Prior on the inertias of a URDF: how far they may be off, and in which directions.
 
-Each body by itself, in terms of its pseudo-inertia: its mass with all that goes with it, where its
-centre of mass is, and how its mass is spread around that.  The last body carries a payload, too.
+Bodies vary independently, in terms of their pseudo-inertia: the mass with all that scales with it,
+the centre of mass, and the spread of the mass around it.  The last body also carries a payload.
 """
 
 from __future__ import annotations
@@ -15,32 +15,32 @@ from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.urdf import Chain
 
 LINKS = 0.3
-"""Standard deviation of the mass of a body and of its spread, of their values."""
+"""Standard deviation of the mass of a body and of its spread, relative to their values."""
 
 CENTRE = 0.01
-"""Standard deviation of the centre of mass [m]; also the least extent that a body is taken for."""
+"""Standard deviation of the centre of mass [m]; also the least assumed extent of a body."""
 
 PAYLOAD_SIZE = 0.05
 """Extent of a payload, and standard deviation of its centre of mass from the tip [m]."""
 
 ROTORS = 0.5
-"""Standard deviation of the inertia of a drive, of its value ..."""
+"""Standard deviation of the inertia of a drive, relative to its value ..."""
 
 UNKNOWN_ROTOR = 0.01
-"""... and where it is 0, because neither the effort nor the inertia is known [kg m^2, or kg]."""
+"""... and absolute where that is 0, as neither effort nor inertia is known [kg m^2, or kg]."""
 
 
 def prior_factor(
     chain: Chain, parameters: BaseParameters, payload: float, rotors: np.ndarray
 ) -> np.ndarray:
-    """Lower triangular L (p, p) of P = P0 + L theta; theta (p,) has mean zero and covariance one.
+    """Return lower triangular L (p, p) of P = P0 + L theta, with theta of mean 0 and covariance 1.
 
-    P0 are the base parameters of the URDF, `payload` is what the arm is rated for [kg], and
-    `rotors` (n,) are the standard deviations of the rotor inertias [kg m^2, or kg], which no URDF
-    tells.
+    P0 are the base parameters of the URDF, `payload` is the rated payload of the arm [kg], and
+    `rotors` (n,) are the standard deviations of the rotor inertias [kg m^2, or kg], which a URDF
+    does not contain.
     """
     n = len(chain.joints)
-    blocks: list[tuple[int, np.ndarray]] = []  # of a body, directions (11, k) of its entries
+    blocks: list[tuple[int, np.ndarray]] = []  # body, directions (11, k) of its entries
     for i, joint in enumerate(chain.joints):
         J = pseudo_inertia(joint.inertia)
         blocks.append((i, _of_ten(deviations(J, LINKS, CENTRE))))
@@ -49,24 +49,24 @@ def prior_factor(
     blocks += [(i, rotors[i] * np.eye(ROTOR + 1)[:, ROTOR:]) for i in range(n)]
     K = parameters.K.reshape(-1, n, ROTOR + 1)
     L = np.column_stack([K[:, i] @ block for i, block in blocks])
-    R = np.linalg.qr(L.T, mode='r')  # Cholesky's factor of L L^T, without squaring the rounding
+    R = np.linalg.qr(L.T, mode='r')  # Cholesky factor of L L^T, without squaring rounding
     return np.transpose(R * np.copysign(1.0, np.diag(R))[:, None])
 
 
 def payload_inertia(payload: float) -> np.ndarray:
-    """Pseudo-inertia (4, 4) of a payload [kg] about its centre."""
+    """Return the pseudo-inertia (4, 4) of a payload [kg] about its centre."""
     return payload * np.diag((*(PAYLOAD_SIZE**2,) * 3, 1.0))
 
 
 def _of_ten(directions: np.ndarray) -> np.ndarray:
-    """Directions (10, k) of the ten as (11, k), with the rotor."""
+    """Append a rotor entry of zero to directions (10, k) of the ten, giving (11, k)."""
     return np.vstack((directions, np.zeros((1, directions.shape[1]))))
 
 
 def deviations(J: np.ndarray, share: float, centre: float) -> np.ndarray:
-    """One standard deviation of the ten (10, 10) along each of ten independent directions.
+    """Return one standard deviation of the ten along each of ten independent directions (10, 10).
 
-    `share` is that of the mass and of the spread, `centre` that of the centre of mass [m].
+    `share` is that of mass and spread, relative to them, `centre` that of the centre of mass [m].
     """
     if J[3, 3] == 0.0:
         return np.zeros((10, 10))

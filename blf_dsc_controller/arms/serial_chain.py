@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The model of a serial chain of rigid bodies, linear in its inertial parameters: an `ArmModel`."""
+"""Model of a serial chain of rigid bodies, linear in its inertial parameters: an `ArmModel`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from blf_dsc_controller.compiled.layout import Array, pack
 class SerialChain(NamedTuple):
     """Arm of any serial chain: an `ArmModel`.
 
-    It holds its working memory: two threads need one each.
+    It contains its working memory, so each thread needs its own.
     """
 
     n: int
@@ -62,7 +62,7 @@ class SerialChain(NamedTuple):
     def regressors(
         self, q: Array, dq: Array, v: Array, a: Array, H: Array, Yp: Array, Yr: Array
     ) -> None:
-        """`regressor` and `momentum_regressor` from one pass along the chain."""
+        """Compute `regressor` and `momentum_regressor` in one pass along the chain."""
         fill_regressors(self.vector, q, dq, v, a, H, Yp, Yr)
 
 
@@ -71,10 +71,10 @@ def serial_chain(
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
     columns: list[tuple[int, int]] | None = None,
 ) -> SerialChain:
-    """Model of a chain whose gravity [m/s^2] is given in its base.
+    """Return the model of a chain; `gravity` [m/s^2] is given in its base.
 
-    `columns` are the parameters as (body, entry), in ascending order of the bodies, both from 0,
-    ROTOR the entry after the ten; None for all (n * 11).
+    `columns` are the parameters as (body, entry), both counted from 0, in ascending order of the
+    bodies; ROTOR is the entry after the ten. None selects all n * 11.
     """
     n = len(chain.joints)
     if columns is None:

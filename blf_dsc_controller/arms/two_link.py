@@ -6,8 +6,8 @@ Point masses at the link ends, angles from the horizontal, q2 relative to q1:
     P = [(m1 + m2) l1^2, m2 l2^2, m2 l1 l2]   [kg m^2]
     r = g / l1                                [1/s^2]
 
-The masses and l2 appear in P alone; of the arm's geometry the regressor needs only r.  Equation
-(34) prints cos q2 in the first gravity term; it is cos q1 (doc/errata.md).
+The masses and l2 appear in P alone; the only geometry that the regressor needs is r.  Equation (34)
+prints cos q2 in the first gravity term, which must be cos q1 (doc/errata.md).
 """
 
 from math import cos, sin
@@ -53,7 +53,7 @@ class TwoLink(NamedTuple):
     def regressors(
         self, q: Array, dq: Array, v: Array, a: Array, H: Array, Yp: Array, Yr: Array
     ) -> None:
-        """Both regressors from one computation of the sines and cosines, which cost most."""
+        """Compute both regressors from one evaluation of the sines and cosines, which cost most."""
         angles = angles_of(q)
         fill_regressor(self.r, angles, dq, v, a, H)
         fill_momentum_regressor(self.r, angles, dq, Yp, Yr)
@@ -61,13 +61,13 @@ class TwoLink(NamedTuple):
 
 @inner
 def angles_of(q: Array) -> Angles:
-    """Sines and cosines that the regressors are made of."""
+    """Return the sines and cosines in the regressors."""
     return cos(q[0]), cos(q[1]), sin(q[1]), cos(q[0] + q[1])
 
 
 @inner
 def fill_regressor(r: float, angles: Angles, dq: Array, v: Array, a: Array, H: Array) -> None:
-    """`regressor` from the angles' sines and cosines."""
+    """Compute `regressor` from the angles' sines and cosines."""
     c1, c2, s2, c12 = angles
     H[0, 0] = a[0] + r * c1
     H[0, 1] = a[0] + a[1]
@@ -79,7 +79,7 @@ def fill_regressor(r: float, angles: Angles, dq: Array, v: Array, a: Array, H: A
 
 @inner
 def fill_momentum_regressor(r: float, angles: Angles, dq: Array, Yp: Array, Yr: Array) -> None:
-    """`momentum_regressor` from the angles' sines and cosines."""
+    """Compute `momentum_regressor` from the angles' sines and cosines."""
     c1, c2, s2, c12 = angles
     Yp[0, 0] = dq[0]
     Yp[0, 1] = dq[0] + dq[1]

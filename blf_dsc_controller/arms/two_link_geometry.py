@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two-link arm in space, in the vertical x-z plane: its URDF.
+"""URDF of the two-link arm, in the vertical x-z plane.
 
-URDF turns joints counterclockwise about their axis, and q1 counts from the horizontal upwards: from
+URDF joints turn counterclockwise about their axis, and q1 counts from the horizontal upwards: from
 x to z, which is about -y.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from xml.sax.saxutils import quoteattr
 
-# The inertia of a point mass: most readers reject zero.
+# A point mass, with a tiny inertia: most parsers reject zero.
 _LINK = """\
   <link name="link{number}">
     <inertial>
@@ -54,10 +54,10 @@ def urdf(
     masses: Sequence[float],
     effort: Sequence[float],
 ) -> str:
-    """URDF of a robot of this name, whose tip is the link `tip`.
+    """Return the URDF of a robot of this name, whose tip is the link `tip`.
 
-    Lengths [m], masses [kg] at the ends of the links, torque limits [N m] of the joints, 0 for
-    none.
+    `lengths` and `masses` are those of the links [m] and at their ends [kg], `effort` the torque
+    limits of the joints [N m], 0 for none.
     """
     text = f'<robot name={quoteattr(name)}>\n  <link name="base_link" />\n'
     links = zip(lengths, masses, ('0.2 0.4 0.8 1', '0.8 0.4 0.2 1'), strict=True)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The serial chain between two links of a URDF: placements, axes, limits and inertias.
+"""Serial chain between two links of a URDF: placements, axes, limits and inertias.
 
-A body is what one joint moves: its link, with everything that hangs on it rigidly.  The rules:
+A body is what one joint moves: its link, with everything that is fixed to it.  The rules:
 
-- Fixed joints are merged, those beyond the tip as well.
-- Joints that move but lie aside of the chain or beyond its tip, as a gripper's fingers, are held at
+- Fixed joints are merged, including those beyond the tip.
+- Moving joints beside the chain or beyond its tip, such as a gripper's fingers, are held at
   position 0 and their links merged; `Chain.held` names them.
-- A link without `<inertial>` weighs nothing, but each body must have a mass.
-- Continuous joints, and joints without `<limit>`, have infinite limits; so has an effort or a
-  velocity of 0.
+- A link without `<inertial>` has no mass, but each body must have one.
+- Continuous joints, and joints without `<limit>`, have infinite limits; an effort or a velocity of
+  0 means no limit.
 
 Not supported: `floating`, `planar` and `mimic` joints in the chain, and closed chains.
 """
@@ -27,16 +27,16 @@ from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia, rotation
 from blf_dsc_controller.errors import BlfDscError
 
 MOVING = ('revolute', 'continuous', 'prismatic')
-_MOST = 500  # links, or joints
+_MOST = 500  # at most, of links and of joints
 _LIMITS = ('lower', 'upper', 'velocity', 'effort')
-_LARGEST = 1e6  # m, kg, kg m^2 and so on, of what is no limit
+_LARGEST = 1e6  # m, kg, kg m^2 and so on; limits may be larger
 
 
 Elements = Mapping[str, ET.Element]
 
 
 class UrdfError(BlfDscError):
-    """A URDF without a serial chain of the wanted joints, or one with impossible figures."""
+    """A URDF without a serial chain of the given joints, or with impossible values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +44,12 @@ class Joint:
     """A moving joint, with the body that it moves.
 
     Attributes:
-        placement: (4, 4) of its frame at position 0, in the frame of the joint before (of the first
-            joint: in the base).
-        axis: (3,) unit vector, in its own frame.
-        lower, upper: limits of the position [rad or m].
+        placement: (4, 4) of its frame at position 0, in the frame of the previous joint (for the
+            first joint: in the base).
+        axis: (3,) unit vector, in that frame.
+        lower, upper: position limits [rad or m].
         velocity, effort: limits [rad/s or m/s, N m or N].
-        damping, friction: of `<dynamics>`: viscous [N m s/rad or N s/m], Coulomb [N m or N].
+        damping, friction: from `<dynamics>`: viscous [N m s/rad or N s/m], Coulomb [N m or N].
         link: the link that it moves; its frame is the joint's.
         inertia: (10,) of the body in that frame, in the order of `inertia.INERTIA_NAMES`.
     """
@@ -70,7 +70,7 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """The joints from `base` to `tip`, and where the tip is (4, 4) in the last joint's frame."""
+    """Joints from `base` to `tip`, and placement of the tip (4, 4) in the last joint's frame."""
 
     base: str
     tip: str
@@ -80,14 +80,14 @@ class Chain:
 
     @property
     def inertias(self) -> np.ndarray:
-        """Ten of each body (n, 10)."""
+        """Ten inertial parameters of each body (n, 10)."""
         return np.array([joint.inertia for joint in self.joints])
 
 
 def read_chain(text: str, base: str, tip: str, joints: Sequence[str]) -> Chain:
-    """Serial chain of the moving `joints`, in order, between two links of a URDF's text.
+    """Return the serial chain of the moving `joints`, in order, between two links of a URDF text.
 
-    Raises UrdfError with what was found and what to do about it.
+    Raises UrdfError, which says what was found and how to correct it.
     """
     links, elements = _parse(text)
     path = _path(links, elements, base, tip)
@@ -107,9 +107,9 @@ def read_chain(text: str, base: str, tip: str, joints: Sequence[str]) -> Chain:
 def chain_joints(
     text: str, base: str, tip: str, joints: Sequence[str]
 ) -> tuple[str, str, tuple[str, ...]]:
-    """Base, tip and moving joints between them, each as given or else as the URDF has it.
+    """Return base, tip and the moving joints between them, as given or else from the URDF.
 
-    An empty base is the root, an empty tip the link of the last joint; no joints are all that move.
+    An empty base means the root, an empty tip the link of the last joint, no joints all that move.
     """
     links, elements = _parse(text)
     moved = {_link(element, 'child') for element in elements.values()}
@@ -127,16 +127,16 @@ def chain_joints(
 
 
 def moving_joints(text: str) -> tuple[str, ...]:
-    """Names of all joints of a URDF that move."""
+    """Return the names of all moving joints of a URDF."""
     return tuple(name for name, one in _parse(text)[1].items() if one.get('type') in MOVING)
 
 
 def attached(
     text: str, link: str, joints: Sequence[str], *, moves: bool = False
 ) -> tuple[list[str], np.ndarray]:
-    """Links fixed to a link, and the pseudo-inertia (4, 4) of those that are held at position 0.
+    """Return the links fixed to a link, and the pseudo-inertia (4, 4) of those held at position 0.
 
-    `joints` are those of the chain; the pseudo-inertia is in the frame of the link.
+    `joints` are the joints of the chain; the pseudo-inertia is in the frame of the link.
     """
     links, elements = _parse(text)
     names: list[str] = []
@@ -152,7 +152,7 @@ def attached(
 
 
 def _path(links: Elements, elements: Elements, base: str, tip: str) -> list[ET.Element]:
-    """Joints from the base down to the tip."""
+    """Return the joints from the base to the tip."""
     for role, link in (('base', base), ('tip', tip)):
         if link not in links:
             raise UrdfError(f'no link {link!r} for the {role}: the links are {_listed(links)}')
@@ -162,8 +162,8 @@ def _path(links: Elements, elements: Elements, base: str, tip: str) -> list[ET.E
     while link != base:
         if link not in above or len(path) > len(elements):
             raise UrdfError(
-                f'the way up from the tip {tip!r} ends at {link!r} without passing the base '
-                f'{base!r}: choose a tip that the base carries'
+                f'the path up from the tip {tip!r} ends at {link!r} without reaching the base '
+                f'{base!r}: choose a tip below the base'
             )
         path.insert(0, above[link])
         link = _link(path[0], 'parent')
@@ -173,7 +173,7 @@ def _path(links: Elements, elements: Elements, base: str, tip: str) -> list[ET.E
 def _body(
     links: Elements, elements: Elements, link: str, joints: Sequence[str], held: list[str]
 ) -> np.ndarray:
-    """Pseudo-inertia (4, 4) of a link and what hangs on it rigidly; notes the joints `held`."""
+    """Return the pseudo-inertia (4, 4) of a link and all fixed to it; add held joints to `held`."""
     J = _link_inertia(links[link])
     for name, element in elements.items():
         if _link(element, 'parent') != link or name in joints:
@@ -189,28 +189,28 @@ def _body(
 
 
 def _parse(text: str) -> tuple[Elements, Elements]:
-    """Links and joints of a URDF by name."""
-    expand = 'expand it first: `xacro FILE > robot.urdf` (of ROS, or by `pip install xacro`)'
-    if '<!DOCTYPE' in text:  # whose entities could stand for gigabytes
-        raise UrdfError('a URDF has no <!DOCTYPE ...>: remove it, and write out its entities')
+    """Return the links and joints of a URDF by name."""
+    expand = 'expand it first: `xacro FILE > robot.urdf` (from ROS or `pip install xacro`)'
+    if '<!DOCTYPE' in text:  # its entities could expand to gigabytes
+        raise UrdfError('a URDF must not have a <!DOCTYPE ...>: remove it and expand its entities')
     try:
         robot = ET.fromstring(text)  # noqa: S314 - without entities
     except ET.ParseError as error:
         hint = f'; this looks like xacro, {expand}' if 'xacro:' in text else ''
-        raise UrdfError(f'not a URDF, which is XML: {error}{hint}') from error
+        raise UrdfError(f'not a URDF, as it is not valid XML: {error}{hint}') from error
     for element in robot.iter():
         if 'xacro' in element.tag or any('${' in value for value in element.attrib.values()):
-            raise UrdfError(f'<{element.tag}> is xacro and no URDF yet: {expand}')
+            raise UrdfError(f'<{element.tag}> is xacro, not URDF: {expand}')
     if robot.tag != 'robot':
-        raise UrdfError(f'a URDF is a <robot>, and this is a <{robot.tag}>: give another file')
+        raise UrdfError(f'the root of a URDF is <robot>, not <{robot.tag}>: give another file')
     named = []
     for tag in ('link', 'joint'):
         elements = robot.findall(tag)
         if len(elements) > _MOST:
-            raise UrdfError(f'the URDF has {len(elements)} of <{tag}>; at most {_MOST} can be read')
+            raise UrdfError(f'the URDF has {len(elements)} {tag}s; at most {_MOST} can be read')
         named.append({element.get('name', ''): element for element in elements})
         if len(named[-1]) < len(elements):
-            raise UrdfError(f'each {tag} needs a name of its own; got {_listed(named[-1])}')
+            raise UrdfError(f'each {tag} needs a unique name; got {_listed(named[-1])}')
     _check_tree(*named)
     return named[0], named[1]
 
@@ -221,13 +221,13 @@ def _check_tree(links: Elements, joints: Elements) -> None:
         for role in ('parent', 'child'):
             if _link(joint, role) not in links:
                 raise UrdfError(
-                    f'joint {name!r} has the {role} {_link(joint, role)!r}, and the links are '
+                    f'joint {name!r} has the {role} {_link(joint, role)!r}, but the links are '
                     f'{_listed(links)}: correct its <{role}>'
                 )
         if children.count(_link(joint, 'child')) > 1:
             raise UrdfError(
-                f'link {_link(joint, "child")!r} has two joints above it: a closed chain is not '
-                'supported; open it by removing a joint'
+                f'link {_link(joint, "child")!r} is the child of two joints: closed chains are not '
+                'supported; open the chain by removing a joint'
             )
 
 
@@ -245,7 +245,7 @@ def _check_joints(path: Sequence[ET.Element], elements: Elements, joints: Sequen
     if not moving or list(joints) != moving:
         raise UrdfError(
             f'the moving joints from base to tip are {_listed(moving)}, in this order; got '
-            f'{_listed(joints)}: name them so, or choose another base or tip'
+            f'{_listed(joints)}: list them like this, or choose another base or tip'
         )
 
 
@@ -261,14 +261,14 @@ def _joint(element: ET.Element, placement: np.ndarray, J: np.ndarray) -> Joint:
         lower, upper = _number(limit, 'lower'), _number(limit, 'upper')
         if lower >= upper:
             raise UrdfError(
-                f'joint {name!r} can move from {lower:g} to {upper:g} only: correct its <limit>'
+                f'joint {name!r} has an empty range, {lower:g} to {upper:g}: correct its <limit>'
             )
     dynamics = element.find('dynamics')
     link = _link(element, 'child')
     if J[3, 3] <= 0.0:
         raise UrdfError(
-            f'link {link!r}, which joint {name!r} moves, has no mass, nor has what hangs on it: '
-            'write its <inertial>, if only roughly'
+            f'link {link!r}, moved by joint {name!r}, has no mass, nor has anything fixed to it: '
+            'add its <inertial>, even a rough one'
         )
     return Joint(
         name=name,
@@ -287,7 +287,7 @@ def _joint(element: ET.Element, placement: np.ndarray, J: np.ndarray) -> Joint:
 
 
 def _link_inertia(link: ET.Element) -> np.ndarray:
-    """Pseudo-inertia (4, 4) of a link in its own frame."""
+    """Return the pseudo-inertia (4, 4) of a link in its own frame."""
     inertial = link.find('inertial')
     if inertial is None:
         return np.zeros((4, 4))
@@ -308,7 +308,7 @@ def _link_inertia(link: ET.Element) -> np.ndarray:
 
 
 def _origin(element: ET.Element) -> np.ndarray:
-    """Placement (4, 4) by an <origin>: roll, pitch, yaw about fixed axes, then xyz."""
+    """Return the placement (4, 4) of an <origin>: roll, pitch, yaw about fixed axes, then xyz."""
     origin = element.find('origin')
     frame = np.eye(4)
     frame[:3, 3] = _numbers(origin, 'xyz', '0 0 0')

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MCAP bags: write, read, recover; without a ROS installation."""
+"""Writing, reading and recovery of MCAP bags, without a ROS installation."""

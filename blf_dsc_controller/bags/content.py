@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of a bag, its topics and joints matched to ours by name."""
+"""Messages of a bag, with its topics and joints matched by name to those of the package."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ _OF_INTEREST = tuple(one for one in TOPICS if one is not CLOCK)
 
 @dataclass(frozen=True)
 class NameMap:
-    """Other names in a bag: of a topic by the last part of our name, of a joint by its name."""
+    """Names that differ in a bag: topics by the last part of our name, joints by our name."""
 
     topics: Mapping[str, str] = field(default_factory=dict)
     joints: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def parse(cls, entries: Iterable[str]) -> NameMap:
-        """Read entries such as `commands=/arm/torque` and `joint1=shoulder`.
+        """Parse entries such as `commands=/arm/torque` and `joint1=shoulder`.
 
         Raises:
-            BlfDscError: an entry has no two sides, or one side is there twice.
+            BlfDscError: an entry lacks a side, or one side appears twice.
         """
         leaves = [topic.leaf for topic in TOPICS]
         topics: dict[str, str] = {}
@@ -49,12 +49,12 @@ class NameMap:
                 raise _bad_entry(entry, 'one side is missing')
             side = topics if ours in leaves else joints
             if ours in side or theirs in side.values():
-                raise _bad_entry(entry, 'a name was given before')
+                raise _bad_entry(entry, 'a name is given twice')
             side[ours] = theirs
         return cls({leaf: '/' + name.lstrip('/') for leaf, name in topics.items()}, joints)
 
     def joints_of(self, joints: Sequence[str]) -> tuple[str, ...]:
-        """Names that these joints have in the bag.
+        """Return the names that these joints have in the bag.
 
         Raises:
             BlfDscError: a name is mapped that is neither a topic nor one of `joints`.
@@ -71,14 +71,14 @@ NO_NAMES = NameMap()
 
 @dataclass(frozen=True)
 class Content:
-    """The messages of the package's topics in a bag, and the number of messages of every topic."""
+    """Messages of the package's topics in a bag, and the number of messages of every topic."""
 
     path: Path
     topics: Mapping[Topic, TopicMessages]
     message_counts: Mapping[str, int]
 
     def before(self, until: int) -> Content:
-        """What was received before a time [ns], with the counts of the whole bag."""
+        """Return the content received before a time [ns], with the counts of the whole bag."""
         topics = {}
         for topic, one in self.topics.items():
             count = bisect_left(one.received, until)
@@ -86,10 +86,10 @@ class Content:
         return replace(self, topics=topics)
 
     def of_joints(self, joints: Sequence[str]) -> Content:
-        """Content without the joint states of other joints alone, such as those of a gripper.
+        """Return the content without joint states that name only other joints, such as a gripper's.
 
         Raises:
-            BagError: the joint states have no stamps.
+            BagError: all joint states have the same stamp.
         """
         states = self.topics[JOINT_STATES].of_joints(joints)
         return replace(self, topics={**self.topics, JOINT_STATES: states})
@@ -99,8 +99,8 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
     """Read the messages of the package's topics from a folder, a storage file or a ROS 1 `.bag`.
 
     Raises:
-        BagError: there is no bag, it is damaged, it holds no joint states or not a topic of
-            `names`, or it holds the topics of several robots.
+        BagError: there is no bag, it is damaged, it lacks the joint states or a topic of `names`,
+            or it holds the topics of several robots.
     """
     with open_bag(path) as bag:
         found = {topic: _find(topic, bag.held, namespace, names) for topic in _OF_INTEREST}
@@ -132,10 +132,10 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
 
 
 def _find(topic: Topic, held: list[tuple[str, str]], namespace: str, names: NameMap) -> str | None:
-    """Name of a topic in a bag, None if it is not there.
+    """Return the name of a topic in a bag, None if it is missing.
 
-    Searched by type and by the full name, then, unless that is absolute, by the name behind a
-    namespace, then by the last part of the name.
+    Type and full name must match; unless the name is absolute, it may also follow any namespace,
+    or match in its last part only.
     """
     name = names.topics.get(topic.leaf)
     if name is not None:

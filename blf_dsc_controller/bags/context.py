@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a bag records of its run beside the messages: version, configuration, lost messages.
+"""Context of a recorded run besides its messages: version, configuration, lost messages.
 
-The configuration is a ROS 2 parameter file of every node, stored as an MCAP attachment; the main
-facts are also a metadata record, and custom data of metadata.yaml.
+The configuration is a ROS 2 parameter file of all nodes, stored as an MCAP attachment; the main
+facts are also stored in a metadata record and in the custom data of metadata.yaml.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ RECORD = 'blf_dsc_controller'
 ATTACHMENT = 'configuration.yaml'
 VERSION = 'package_version'
 MESSAGES = 'messages '
-"""Start of the name of a fact on how many messages of a topic were written and lost."""
+"""Prefix of the names of facts that count the written and lost messages of a topic."""
 
 _NOTHING_MISSED = '0 missed'
 _FACTS = {'law': 'law', 'model': 'model', 'seed': 'seed', 'mode': 'clock'}
@@ -43,9 +43,9 @@ _OF_CONTROLLER = frozenset(('law', 'model', 'barrier.bound', 'learning.window'))
 
 
 class Losses:
-    """Counts messages of one topic that were published but not recorded, by sequence number.
+    """Counter of one topic's published but unrecorded messages, by sequence number.
 
-    Each publisher has its own numbers, so that nothing is known of a topic that ever had several.
+    Each publisher numbers its own messages: losses of a topic that ever had several are unknown.
     """
 
     def __init__(self, publishers: int) -> None:
@@ -69,15 +69,15 @@ class Losses:
         self._last = sequence
 
     def text(self) -> str:
-        """Text to follow the number of recorded messages."""
+        """Return the text that follows the number of recorded messages."""
         if self.missed is None:
             return ''
-        earlier = f', {self.before} sent before the recorder heard them' if self.before else ''
+        earlier = f', {self.before} sent before the recorder connected' if self.before else ''
         return f', {self.missed} missed{earlier}'
 
 
 def statistics(written: Mapping[str, int], losses: Mapping[str, Losses]) -> dict[str, str]:
-    """Facts on how many messages of each topic were written and lost."""
+    """Return facts that state how many messages of each topic were written and lost."""
     return {
         f'{MESSAGES}{topic}': f'{count} written{losses[topic].text()}'
         for topic, count in written.items()
@@ -86,10 +86,10 @@ def statistics(written: Mapping[str, int], losses: Mapping[str, Losses]) -> dict
 
 @dataclass(frozen=True)
 class Context:
-    """What a bag records of its run; empty, if another recorder made it.
+    """Recorded context of a run; empty if another recorder made the bag.
 
-    Each of the configurations, time of storage [ns] and text of a parameter file, holds the nodes
-    known by then. Facts are such as `package_version`, `law`, `model`, `seed`, `clock`.
+    Each configuration, a time of storage [ns] and the text of a parameter file, covers the nodes
+    known by then. Facts are `package_version`, `law`, `model`, `seed`, `clock` and others.
     """
 
     path: Path
@@ -98,7 +98,7 @@ class Context:
 
     @property
     def version(self) -> str:
-        """Version of this package that recorded the bag, empty if it was another recorder."""
+        """Version of this package that recorded the bag, empty for another recorder."""
         return self.facts.get(VERSION, '')
 
     @property
@@ -107,13 +107,13 @@ class Context:
         return self.configurations[-1][1] if self.configurations else ''
 
     def missed(self, topic: str) -> int:
-        """Number of messages of a topic that the recorder knows it missed."""
+        """Return the number of messages of a topic that the recorder knows it missed."""
         found = re.search(r'(\d+) missed', self.facts.get(f'{MESSAGES}{topic}', ''))
         return int(found[1]) if found else 0
 
     @property
     def losses(self) -> dict[str, str]:
-        """Text of the recorder on what it missed, by topic.
+        """Recorder's notes on the messages it missed, by topic.
 
         Topics that keep only their last message are left out.
         """
@@ -125,7 +125,7 @@ class Context:
         return {topic: text for topic, text in texts.items() if text not in ('', _NOTHING_MISSED)}
 
     def controller_config(self) -> ControllerConfig:
-        """Configuration of the controller, as it was first recorded.
+        """Return the configuration of the controller as first recorded.
 
         Raises:
             BagError: there is no bag, it is damaged, or it holds no configuration.
@@ -153,10 +153,10 @@ class Context:
             'something else, or without the controller'
         )
         with open_bag(self.path):  # raises if there is no bag
-            raise BagError(f'{reason}; name one, as in --config recommended')
+            raise BagError(f'{reason}; pass one, as in --config recommended')
 
     def build_config(self, values: Mapping[str, Any], place: str) -> ControllerConfig:
-        """Configuration of the controller from its parameters, recorded in this place of the bag.
+        """Build the controller's configuration from parameters recorded at this place of the bag.
 
         Raises:
             ConfigurationError: this version of the package cannot run the configuration.
@@ -168,11 +168,11 @@ class Context:
 
 
 def facts_of(configuration: str) -> dict[str, str]:
-    """Version of the package and the main facts of a configuration."""
+    """Return the version of the package and the main facts of a configuration."""
     facts = {VERSION: __version__}
     try:
         sections = parse(configuration)
-    except ConfigurationError:  # of a node with parameters that no file can hold
+    except ConfigurationError:  # a node has parameters that no file can hold
         return facts
     for section in sections:
         for name, fact in _FACTS.items():
@@ -184,8 +184,8 @@ def facts_of(configuration: str) -> dict[str, str]:
 def read_context(path: Path) -> Context:
     """Read the context from all MCAP files of a bag (folder or file); empty without any.
 
-    A recording that is split may know its configuration in a later file only, and what was missed
-    in the last. A damaged file is left out: reading the messages reports the damage.
+    A split recording may hold its configuration in a later file only, and its losses in the last.
+    Damaged files are skipped: reading the messages reports the damage.
     """
     facts: dict[str, str] = {}
     texts: dict[tuple[int, str], None] = {}

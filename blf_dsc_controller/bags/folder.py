@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files of a bag: regular ones, inside its folder, as its metadata.yaml names them."""
+"""Files of a bag: regular files inside its folder, as named in its metadata.yaml."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from blf_dsc_controller.configuration.share import read_text
 from blf_dsc_controller.messages.topics import Quality
 
 METADATA = 'metadata.yaml'
-_NEWEST = 9  # version of rosbag2's metadata.yaml that is known
-_NAMES_ONLY = 4  # version before which paths began with the folder's name
+_NEWEST = 9  # latest supported version of rosbag2's metadata.yaml
+_NAMES_ONLY = 4  # paths of earlier versions begin with the folder's name
 _STORAGES = ('mcap', 'sqlite3')
 
 
@@ -30,10 +30,10 @@ class StoredTopic(NamedTuple):
 
 
 class BagFolder(NamedTuple):
-    """What metadata.yaml says of a bag."""
+    """Description of a bag in its metadata.yaml."""
 
     storage: str  # mcap or sqlite3
-    compression: str  # by zstd of each `file` or `message`; empty: none beside that of MCAP itself
+    compression: str  # zstd, per `file` or `message`; empty: none but that of MCAP itself
     files: list[Path]
     topics: list[StoredTopic]
     times: tuple[int, int]  # of the first message, and after the last [ns]
@@ -43,8 +43,8 @@ def read_folder(path: Path) -> BagFolder:
     """Read the metadata.yaml of a bag.
 
     Raises:
-        ValueError: it does not describe a bag that can be read here.
-        OSError: as `checked`.
+        ValueError: it does not describe a supported bag.
+        OSError: as in `checked`.
     """
     (metadata,) = checked(path, [path / METADATA])
     try:
@@ -82,17 +82,17 @@ def read_folder(path: Path) -> BagFolder:
         )
     if compression not in ('', 'file', 'message') or (compression and packing != 'zstd'):
         raise ValueError(
-            f'its {mode}s are compressed by {packing!r}; only files or messages by zstd can be read'
+            f'its {mode} compression is {packing!r}; only zstd files or messages are supported'
         )
     files = [path / (name.name if version < _NAMES_ONLY else name) for name in names]
     return BagFolder(storage, compression, checked(path, files), topics, (begin, end))
 
 
 def checked(path: Path, files: Iterable[Path]) -> list[Path]:
-    """These files of the bag at `path`, a folder or the file itself.
+    """Check the files of the bag at `path`, a folder or the file itself, and return them.
 
     Raises:
-        OSError: one of them is not a regular file, or is outside of the folder.
+        OSError: one of them is missing, not a regular file, or outside of the folder.
     """
     found = list(files)
     for file in found:

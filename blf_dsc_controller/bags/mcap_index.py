@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the end of a whole MCAP file says of it: topics, number of messages, where the rest is."""
+"""Index at the end of a complete MCAP file: topics, message counts, offsets of records."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ _INDEXES = (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
 
 
 def topics_of(path: Path) -> tuple[list[StoredTopic], tuple[int, int]]:
-    """Topics, time of the first message, and time after the last [ns].
+    """Return topics, time of the first message, and time after the last [ns].
 
-    By the index at the end, or by all records of the file.
+    They are from the index at the end or, if that is incomplete, from all records of the file.
 
     Raises:
         MalformedRecordError: the file is damaged.
@@ -62,7 +62,7 @@ def topics_of(path: Path) -> tuple[list[StoredTopic], tuple[int, int]]:
 
 @dataclass
 class _Content:
-    """Channels of a file, with their messages counted by number."""
+    """Channels of a file, with message counts by channel number."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -109,13 +109,13 @@ def _read(data: mmap, unpacker: Unpacker) -> _Content:
 def read_in_order(
     path: Path, topics: Collection[str], start: int, stop: int
 ) -> Iterator[tuple[str, int, bytes]]:
-    """Topic, log time [ns] and content of messages from `start` on, before `stop`, by their times.
+    """Yield topic, log time [ns] and content of messages from `start` to before `stop`, by time.
 
-    Only chunks that overlap are in memory at a time; but all, if the file has no index.
+    Only overlapping chunks are in memory at a time; without an index, all messages are.
 
     Raises:
         MalformedRecordError: the file is damaged.
-        BlfDscError: it unpacks to too much.
+        BlfDscError: it unpacks to more than the limit.
     """
     unpacker, waiting, count = Unpacker([path]), list[tuple[int, int, str, bytes]](), 0
     with _mapped(path) as data:
@@ -134,27 +134,27 @@ def read_in_order(
                 continue
             packed = record_at(data, chunk.chunk_start_offset).record
             if not isinstance(packed, Chunk):
-                raise MalformedRecordError('the index leads to something else than a chunk')
+                raise MalformedRecordError('the index does not point to a chunk')
             unpacked = unpack(packed, unpacker)
             for number, _, at, _, raw in messages_in(unpacked, {}, channels, topics):
                 if start <= at < stop:
                     heappush(waiting, (at, count, channels[number].topic, raw))
                     count += 1
-            data.madvise(MADV_DONTNEED)  # what was read may leave the memory
+            data.madvise(MADV_DONTNEED)  # release the pages read
         while waiting:
             at, _, topic, raw = heappop(waiting)
             yield topic, at, raw
 
 
 def context_records(path: Path) -> list[Attachment | Metadata]:
-    """Attachments and metadata of a whole file; MalformedRecordError if it is damaged."""
+    """Return attachments and metadata of a file; MalformedRecordError if it is damaged."""
     unpacker, found = Unpacker([path]), []
     with _mapped(path) as data:
         pieces = _summary(data)
         indexed = (record_at(data, one.record.offset) for one in pieces if one.opcode in _INDEXES)
         for piece in indexed if pieces else scan(data):
             if isinstance(piece.record, (Attachment, Metadata)):
-                unpacker.count(piece.size)  # an index can lead to one place a thousand times
+                unpacker.count(piece.size)  # an index may point to one record a thousand times
                 found.append(piece.record)
     return found
 
@@ -169,7 +169,7 @@ def _mapped(path: Path) -> Iterator[mmap]:
 
 
 def _summary(data: mmap) -> list[Piece]:
-    """Records of the index at the end, none if there is no such thing."""
+    """Return the records of the index at the end, none if there is no valid index."""
     require_ends(data)
     at = len(data) - len(MAGIC) - _FOOTER.size
     opcode, length, start, _, _ = _FOOTER.unpack_from(data, at)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MCAP files as raw records, whole or damaged.
+"""Raw records of complete or damaged MCAP files.
 
-Neither lengths nor the index are trusted: a record that does not fit its length is a gap. It ends
-at the next chunk, searched for byte by byte: a chunk holds its length three times, so that hardly
-anything else looks like one. The reader of rosbags, which goes by the index, misses messages
-without a word in 3 % of small files with one wrong bit, and takes four times as long.
+Neither lengths nor the index are trusted: a record that does not match its length starts a gap,
+which ends at the next chunk. Chunks are searched for byte by byte; a chunk holds its length three
+times, so false matches are rare. The reader of rosbags relies on the index: it silently misses
+messages in 3 % of small files with one flipped bit, and takes four times as long.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ StoredMessage: TypeAlias = tuple[int, int, int, int, bytes]
 """Channel number, sequence number, log time [ns], publish time [ns], content."""
 
 INDEX = Struct('<BQHI')
-"""Opcode, length, channel number, bytes of the entries, of a message index."""
+"""Head of a message index: opcode, length, channel number, bytes of the entries."""
 
 _CHUNK_BYTE = bytes([Opcode.CHUNK])
 MAGIC = b'\x89MCAP0\r\n'
 _SMALLEST = 45  # bytes: the magic twice, and a footer
-_HEAD = Struct('<BQ')  # opcode and length of the content, before each record
+_HEAD = Struct('<BQ')  # opcode and content length, at the start of each record
 _MESSAGE = Struct('<BQHIQQ')
-_CHUNK = Struct('<BQQQQII')  # up to the length of the name of its compression
+_CHUNK = Struct('<BQQQQII')  # up to the length of the compression's name
 _COMPRESSIONS = ('', 'zstd', 'lz4')
 _COMPRESSION_BYTES = tuple(name.encode() for name in _COMPRESSIONS)
 _OPCODES = frozenset(Opcode)
@@ -74,22 +74,22 @@ _KINDS: dict[int, Any] = {
 
 
 class MalformedRecordError(ValueError):
-    """A record whose content does not fit its length."""
+    """A damaged record or file."""
 
 
 class Piece(NamedTuple):
-    """A whole record of a file, or a gap: bytes that make no sense (opcode 0)."""
+    """A complete record of a file, or a gap of unreadable bytes (opcode 0)."""
 
     at: int
     size: int
     opcode: int
     raw: bytes = b''  # the record with its head; empty for a gap
-    record: Any = None  # of one of _KINDS
+    record: Any = None  # parsed, if it is one of _KINDS
     reason: str = ''  # of a gap
 
 
 def mcap_files(path: Path) -> list[Path]:
-    """MCAP files of a folder in the order of their numbers, bag_10 after bag_9, or the one file."""
+    """Return the MCAP files of a folder by number (bag_10 after bag_9), or the one file."""
     files = sorted(path.glob('*.mcap'), key=_file_number) if path.is_dir() else [path]
     return [file for file in files if file.suffix == '.mcap']
 
@@ -102,13 +102,13 @@ def _file_number(path: Path) -> tuple[int, str]:
 def read_messages(
     path: Path, topics: Collection[str], unpacker: Unpacker | None = None
 ) -> Iterator[tuple[str, int, bytes]]:
-    """Topic, log time [ns] and content of each message of `topics`, in the order of the file.
+    """Yield topic, log time [ns] and content of each message of `topics`, in file order.
 
-    The `unpacker` is that of the bag, if this is one of its files.
+    The `unpacker` is that of the bag if this is one of its files.
 
     Raises:
         MalformedRecordError: the file is damaged.
-        BlfDscError: it unpacks to too much.
+        BlfDscError: it unpacks to more than the limit.
     """
     channels: dict[int, Channel] = {}
     unpacker = unpacker or Unpacker([path])
@@ -130,7 +130,7 @@ def read_messages(
                 raise MalformedRecordError(piece.reason)
             for number, _, log_time, _, raw in messages_in(records, {}, channels, topics):
                 yield channels[number].topic, log_time, raw
-            data.madvise(MADV_DONTNEED, 0, piece.at + piece.size)  # read: not kept in memory
+            data.madvise(MADV_DONTNEED, 0, piece.at + piece.size)  # release the pages read
 
 
 def messages_in(
@@ -139,12 +139,12 @@ def messages_in(
     channels: dict[int, Channel],
     topics: Collection[str] | None = None,
 ) -> Iterator[StoredMessage]:
-    """Messages among the records of a chunk, of all topics or the given ones.
+    """Yield the messages among the records of a chunk, of all topics or the given ones.
 
-    Schemas and channels are added to the dictionaries by their numbers.
+    Schemas and channels are added to the dictionaries by number.
 
     Raises:
-        MalformedRecordError: a record does not fit its length.
+        MalformedRecordError: a record does not match its length.
     """
     at, size, before_content = 0, len(records), _MESSAGE.size
     last = size - before_content
@@ -156,7 +156,7 @@ def messages_in(
             _, length, number, sequence, log_time, publish_time = unpack_from(records, at)
             end = at + 9 + length
             if end > size or end < at + before_content:
-                raise MalformedRecordError('a message does not fit its length')
+                raise MalformedRecordError('a message does not match its length')
             if topics is None or number in channels:
                 yield number, sequence, log_time, publish_time, records[at + before_content : end]
         else:
@@ -172,13 +172,13 @@ def messages_in(
 
 
 def require_ends(data: Data) -> None:
-    """Raise MalformedRecordError unless a file begins and ends as MCAP."""
+    """Raise MalformedRecordError unless a file begins and ends with MCAP's magic bytes."""
     if len(data) < _SMALLEST or data[: len(MAGIC)] != MAGIC or data[-len(MAGIC) :] != MAGIC:
-        raise MalformedRecordError('it does not begin and end as an MCAP file')
+        raise MalformedRecordError('it does not begin and end like an MCAP file')
 
 
 def scan(data: Data, begin: int = 0) -> Iterator[Piece]:
-    """Whole records and gaps of a file from a byte on, in order; all but the magic bytes."""
+    """Yield the records and gaps of a file from a byte on, without the magic bytes."""
     at = begin or (len(MAGIC) if data[: len(MAGIC)] == MAGIC else 0)
     is_chunked = False
     while at < len(data) and not (at == len(data) - len(MAGIC) and data[at:] == MAGIC):
@@ -196,11 +196,11 @@ def scan(data: Data, begin: int = 0) -> Iterator[Piece]:
 
 
 def unpack(chunk: Chunk, unpacker: Unpacker) -> bytes:
-    """Uncompressed records of a chunk.
+    """Return the uncompressed records of a chunk.
 
     Raises:
-        MalformedRecordError: they are not what was written.
-        BlfDscError: the bag unpacks to too much.
+        MalformedRecordError: they differ from what was written.
+        BlfDscError: the bag unpacks to more than the limit.
     """
     written = chunk.uncompressed_size
     if written > LARGEST_CHUNK:
@@ -210,14 +210,14 @@ def unpack(chunk: Chunk, unpacker: Unpacker) -> bytes:
     except (ZstdError, RuntimeError, ValueError, EOFError) as error:
         raise MalformedRecordError(f'cannot be decompressed: {error}') from error
     if len(records) != written:
-        raise MalformedRecordError(f'{len(records)} bytes where {written} were written')
+        raise MalformedRecordError(f'{len(records)} bytes, unpacked, instead of {written}')
     if chunk.uncompressed_crc and zlib.crc32(records) != chunk.uncompressed_crc:
-        raise MalformedRecordError('the checksum differs')
+        raise MalformedRecordError('the checksum does not match')
     return records
 
 
 def _head(data: Data, at: int) -> tuple[int, int]:
-    """Opcode and end of the record at an offset, or MalformedRecordError."""
+    """Return opcode and end of the record at an offset; MalformedRecordError if invalid."""
     if at + _HEAD.size > len(data):
         raise MalformedRecordError('cut off')
     opcode, length = _HEAD.unpack_from(data, at)
@@ -225,15 +225,15 @@ def _head(data: Data, at: int) -> tuple[int, int]:
     if end > len(data):
         raise MalformedRecordError('cut off')
     if opcode not in _OPCODES:
-        raise MalformedRecordError(f'there is no record of kind {opcode}')
+        raise MalformedRecordError(f'unknown record type {opcode}')
     return int(opcode), int(end)
 
 
 def record_at(data: Data, at: int, *, is_chunked: bool = False) -> Piece:
-    """Record at an offset, or MalformedRecordError if its content does not fit its length.
+    """Return the record at an offset; MalformedRecordError if it does not match its length.
 
-    Where the content does not determine its length, another record must follow. In a file that is
-    chunked, a message between the chunks is an index with a damaged opcode.
+    Where the content does not determine its length, another record must follow. In a chunked file,
+    a message between the chunks is an index with a damaged opcode.
     """
     opcode, end = _head(data, at)
     if is_chunked and opcode == Opcode.MESSAGE:
@@ -243,14 +243,14 @@ def record_at(data: Data, at: int, *, is_chunked: bool = False) -> Piece:
         record = _parse(raw)
     elif opcode == Opcode.MESSAGE_INDEX:
         if len(raw) < INDEX.size or INDEX.size + INDEX.unpack_from(raw)[-1] != len(raw):
-            raise MalformedRecordError('the record does not fit its length')
+            raise MalformedRecordError('the record does not match its length')
     elif end + _HEAD.size < len(data):
         _head(data, end)
     return Piece(at, end - at, opcode, raw, record)
 
 
 def _is_chunk(data: Data, at: int) -> bool:
-    """Whether a chunk begins here, as far as its lengths tell, without a copy of it."""
+    """Check by its lengths whether a chunk begins here, without copying it."""
     if at + _CHUNK.size > len(data):
         return False
     _, length, *_, name = _CHUNK.unpack_from(data, at)
@@ -263,9 +263,9 @@ def _is_chunk(data: Data, at: int) -> bool:
 
 
 def _parse(raw: bytes) -> Any:
-    """Record of one of _KINDS, or MalformedRecordError: written again, it must be the same.
+    """Parse a record of one of _KINDS; MalformedRecordError unless it is rewritten identically.
 
-    A checksum of an attachment may be left out, as zero.
+    The checksum of an attachment may be omitted, as zero.
     """
     stream = ReadDataStream(BytesIO(raw))
     builder = RecordBuilder()
@@ -276,7 +276,7 @@ def _parse(raw: bytes) -> Any:
         raise MalformedRecordError('the record is too short') from error
     again = builder.end()  # type: ignore[no-untyped-call]
     if raw not in (again, again[:-4] + bytes(4)):
-        raise MalformedRecordError('the record does not fit its length or checksum')
+        raise MalformedRecordError('the record does not match its length or checksum')
     if isinstance(record, Chunk) and record.compression not in _COMPRESSIONS:
-        raise MalformedRecordError('the compression of a chunk is not known')
+        raise MalformedRecordError('the compression of a chunk is unknown')
     return record

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What rosbag2 writes about a bag: metadata.yaml, version 9 (that of Jazzy)."""
+"""Description of a bag as rosbag2 writes it: metadata.yaml, version 9 (that of Jazzy)."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ class TopicInformation:
     message_count: int = 0
 
     def offered_text(self) -> str:
-        """Text for the entry `offered_qos_profiles` of a channel."""
+        """Return the text for the entry `offered_qos_profiles` of a channel."""
         return _dump(self.offered)
 
 
 @dataclass
 class FileInformation:
-    """One file of a bag; times [ns], an empty file starts at the end of time."""
+    """One file of a bag; times in ns, with FOREVER as the start of an empty file."""
 
     path: str
     starting_time: int = FOREVER
@@ -61,22 +61,22 @@ class FileInformation:
 
 @dataclass
 class BagInformation:
-    """A whole bag."""
+    """Description of a whole bag."""
 
     topics: list[TopicInformation] = field(default_factory=list)
     files: list[FileInformation] = field(default_factory=list)
     custom_data: dict[str, str] = field(default_factory=dict)
 
     def record_text(self) -> str:
-        """Text for the record `rosbag2` inside an MCAP file."""
+        """Return the text for the record `rosbag2` inside an MCAP file."""
         return _dump(self._tree())
 
     def file_text(self) -> str:
-        """Text of metadata.yaml."""
+        """Return the text of metadata.yaml."""
         return _dump({'rosbag2_bagfile_information': self._tree()})
 
     def _tree(self) -> dict[str, Any]:
-        """Plain data as rosbag2 arranges it.
+        """Return plain data in rosbag2's layout.
 
         The compression fields are those of rosbag2's own compression of whole files.
         """
@@ -115,7 +115,7 @@ class BagInformation:
 
 
 def profile_of(quality: Quality) -> Profile:
-    """Plain data of a quality of service, in the order of rosbag2."""
+    """Return a quality of service as plain data, in the order of rosbag2."""
     profile = {'history': quality.history, **asdict(quality)}
     for name in _DURATIONS:
         seconds, nanoseconds = divmod(profile[name], NANOSECONDS)
@@ -124,15 +124,15 @@ def profile_of(quality: Quality) -> Profile:
 
 
 def parse_profiles(text: str) -> list[Profile]:
-    """Profiles in such a text of any rosbag2; none, if it is something else."""
+    """Parse the profiles in a text of any rosbag2 version; none if it is something else."""
     return [{**profile} for profile in dump_qos_v9(_parsed(text))]
 
 
 def strongest_quality(profiles: Any, *, is_latched: bool = False) -> Quality:
-    """Quality of service that every subscriber accepts who accepted one of the publishers.
+    """Return a quality of service compatible with each subscriber that any publisher matched.
 
-    Their `profiles` are as any rosbag2 stores them, as text or plain data. The depth of a latched
-    topic is as recorded, else that of a stream: none is lost in a burst.
+    The publishers' `profiles` are text or plain data of any rosbag2 version. A latched topic keeps
+    its recorded depth; others get that of a stream, so that no message is lost in a burst.
     """
     offered = _parsed(profiles)
     is_latched |= any(one.durability is QosDurability.TRANSIENT_LOCAL for one in offered)
@@ -161,7 +161,7 @@ def _parsed(profiles: Any) -> list[Qos]:
 
 
 def _shortest(times: Iterable[QosTime]) -> int:
-    """Shortest of some times [ns]; zero is unspecified."""
+    """Return the shortest of the times [ns]; zero means unspecified."""
     return min(
         (time for one in times if (time := one.sec * NANOSECONDS + one.nsec)), default=FOREVER
     )

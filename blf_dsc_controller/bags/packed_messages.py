@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of one topic in memory: those of a block differ in few of their bytes."""
+"""Compact storage of one topic's messages, which differ in few bytes within a block."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class _Block(NamedTuple):
 
 
 class PackedMessages(Sequence[bytes]):
-    """A list of messages that can be read and appended to; what is alike in a block is kept once.
+    """Append-only list of messages that stores the bytes common to a block once.
 
     Joint states need a third of the memory, since names and lengths are the same in all of them.
     """
@@ -32,7 +32,7 @@ class PackedMessages(Sequence[bytes]):
             self.append(raw)
 
     def append(self, raw: bytes) -> None:
-        """Add a message."""
+        """Append a message."""
         self._last.append(raw)
         if len(self._last) == BLOCK:
             self._blocks.append(_pack(self._last))

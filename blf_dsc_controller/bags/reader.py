@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag as one run: decoded, joints matched by name, samples matched by their stamps."""
+"""Reader of a bag as one run: decoded, joints matched by name, samples by stamp."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from blf_dsc_controller.run import Floats, LearnedArm, Run, Series, Stop
 
 
 def read_run(path: str | Path, namespace: str = '', names: NameMap = NO_NAMES) -> Run:
-    """Read a bag, of the robot in `namespace` if it holds several, with other `names`.
+    """Read the run of a bag; `namespace` selects one of several robots, `names` maps its names.
 
     Raises:
         BagError: there is no bag, it is damaged, it holds no joint states, or the topics of several
@@ -72,7 +72,7 @@ def read_run(path: str | Path, namespace: str = '', names: NameMap = NO_NAMES) -
 
 
 def _joints(content: Content, names: NameMap) -> tuple[str, ...]:
-    """Joints of the controller, in its order; if it is not in the bag, those named, or all."""
+    """Return the controller's joints in its order; without it, those of `names`, or all."""
     sources = (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
     of_controller = [content.topics[one] for one in sources if one in content.topics]
     if not of_controller and names.joints:
@@ -81,7 +81,7 @@ def _joints(content: Content, names: NameMap) -> tuple[str, ...]:
 
 
 def _decode(content: Content, topic: topics.Topic, joints: Sequence[str]) -> JointStates | None:
-    """Messages of a topic by stamp, of these joints; None without any."""
+    """Decode a topic's messages of these joints, by stamp; None if there are none."""
     messages = content.topics.get(topic)
     return None if messages is None else messages.joint_states(joints, ('position',)).by_stamp()
 
@@ -99,7 +99,7 @@ def _torque(content: Content, states: JointStates) -> Floats:
 
 
 def _rejected_columns(content: Content, learning: Series | None, namespace: str) -> dict[str, str]:
-    """Columns that are NaN at the end of the learning, with the reason given in /diagnostics."""
+    """Return columns that are NaN at the end of learning, with the reason in /diagnostics."""
     if learning is None:
         return {}
     last = dict(zip(learning.names, learning.values[-1], strict=True))
@@ -123,7 +123,7 @@ def _rejected_columns(content: Content, learning: Series | None, namespace: str)
 
 
 def _events(content: Content) -> Iterator[Event]:
-    """Events of the journal; messages of another node's topic of that name are left out."""
+    """Yield the events of the journal, without messages of other nodes' topics of that name."""
     journal = content.topics.get(topics.JOURNAL)
     for raw in journal.raw if journal is not None else ():
         with suppress(BlfDscError):
@@ -131,10 +131,10 @@ def _events(content: Content) -> Iterator[Event]:
 
 
 def _arm(path: Path) -> LearnedArm | None:
-    """Arm of the recorded configuration, None if it is not from a URDF that can still be read."""
+    """Return the arm of the recorded configuration; None unless its URDF can still be read."""
     context = read_context(path)
     if context.facts.get('model') == 'urdf':
-        from blf_dsc_controller.messages.samples import learned_arm  # compiles
+        from blf_dsc_controller.messages.samples import learned_arm  # slow: compiles
 
         with suppress(BlfDscError):
             return learned_arm(context.controller_config())
@@ -142,7 +142,7 @@ def _arm(path: Path) -> LearnedArm | None:
 
 
 def _stops(events: Iterable[Event], first: int) -> Iterator[Stop]:
-    """Stops in the journal; one before the first state gets its stamp [ns]."""
+    """Yield the stops in the journal; one before the first state gets that state's stamp [ns]."""
     ordered = list(events)
     for k, event in enumerate(ordered):
         if event.type is EventType.STOP:
@@ -152,13 +152,13 @@ def _stops(events: Iterable[Event], first: int) -> Iterator[Stop]:
 
 
 def _is_decimated(events: Iterable[Event]) -> bool:
-    """Whether the reference was published for some samples only."""
+    """Return whether the reference was published for some samples only."""
     known = (event.content.get('parameters', {}) for event in events)
     return any(one.get('telemetry.decimation', 1) > 1 for one in known)
 
 
 def _learns(events: Iterable[Event]) -> bool:
-    """Whether the law ever used the prediction error; true if the journal does not tell."""
+    """Return whether the law ever used the prediction error; true if the journal does not say."""
     known = [event.content.get('parameters', {}) for event in events]
     laws = {one['law'] for one in known if 'law' in one}
     weights = [one['learning.weight'] for one in known if 'learning.weight' in one]

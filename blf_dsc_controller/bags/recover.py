@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make a clean bag of what a damaged one still holds; the damaged one is only read."""
+"""Recovery of a clean bag from a damaged one, which is only read."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Recovery:
 
     path: Path  # of the clean bag
     messages: dict[str, int] = field(default_factory=dict)  # recovered, by topic
-    missing: dict[str, Losses] = field(default_factory=dict)  # sequence numbers, by topic
+    missing: dict[str, Losses] = field(default_factory=dict)  # from sequence numbers, by topic
     losses: list[Loss] = field(default_factory=list)
     unfinished: list[tuple[str, int | None]] = field(default_factory=list)  # file, last time [ns]
     unknown: int = 0  # messages of topics whose name or type is lost
@@ -40,17 +40,17 @@ class Recovery:
 
     @property
     def is_empty(self) -> bool:
-        """Whether all is lost."""
+        """Whether everything is lost."""
         return not (self.is_whole or any(self.messages.values()))
 
 
 def recover(path: Path, out: Path) -> Recovery:
-    """Make a clean bag `out` of a folder or an MCAP file.
+    """Write what a damaged folder or MCAP file still holds to a clean bag `out`.
 
     Raises:
         BagError: there is no MCAP file, or `out` exists already.
-        BlfDscError: it unpacks to too much.
-        OSError: a file is not a regular one, or is outside of the folder.
+        BlfDscError: it unpacks to more than the limit.
+        OSError: a file is not a regular file, or is outside of the folder.
     """
     files = [file for file in mcap_files(path) if file.exists()]
     if not files:
@@ -72,7 +72,7 @@ def recover(path: Path, out: Path) -> Recovery:
 
 @dataclass
 class _Transfer:
-    """Copies the content of damaged files into a clean bag."""
+    """Transfer of the content of damaged files to a clean bag."""
 
     bag: BagWriter
     missing: dict[str, Losses]
@@ -103,7 +103,7 @@ class _Transfer:
         if handle is None:
             return False
         self.missing[channel.topic].count(sequence)
-        if raw.startswith(FRAME_HEADER):  # compressed by message, as metadata.yaml would say
+        if raw.startswith(FRAME_HEADER):  # compressed per message, as metadata.yaml would state
             with suppress(ZstdError, ValueError):
                 raw = self.unpacker.unpack(raw, 'zstd')
         self.bag.write(handle, raw, log_time, publish_time, sequence)

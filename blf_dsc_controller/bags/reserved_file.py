@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A file that can still be ended when its disk is full."""
+"""File that can still be completed when its disk is full."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ _LARGEST_BUFFER = 1 << 20  # bytes
 
 
 class ReservedFile:
-    """A file, buffered until `flush`, that can still be ended when its disk is full.
+    """File, buffered until `flush`, that can still be completed when its disk is full.
 
     A second file of zeros reserves room for what is not written yet: the current chunk, the index,
-    metadata.yaml. It is removed when the disk is full, `is_full`, and the file should be ended.
+    metadata.yaml. It is removed when the disk is full; `is_full` then means: complete the file.
 
     Raises:
-        OSError: the file cannot be made, or there is not even room for the reserve.
+        OSError: the file cannot be created, or there is no room for the reserve.
     """
 
     def __init__(self, path: Path) -> None:
@@ -49,18 +49,18 @@ class ReservedFile:
             self._reserved = reserved
 
     def write(self, data: bytes) -> int:
-        """Take bytes; OSError if they cannot be written for another reason than a full disk."""
+        """Buffer bytes; OSError if writing fails for a reason other than a full disk."""
         self._buffer += data
         if len(self._buffer) >= _LARGEST_BUFFER:
             self.flush()
         return len(data)
 
     def tell(self) -> int:
-        """Bytes taken so far."""
+        """Return the number of bytes received so far."""
         return self._written + len(self._buffer)
 
     def flush(self) -> None:
-        """Pass all bytes to the operating system, at the cost of the reserve if need be."""
+        """Pass all bytes to the operating system, giving up the reserve if needed."""
         waiting = memoryview(self._buffer)
         while waiting:
             try:
@@ -77,7 +77,7 @@ class ReservedFile:
         self._buffer = bytearray()
 
     def close(self) -> None:
-        """Flush and close the file; the reserve is free for metadata.yaml from here on."""
+        """Flush and close the file, and release the reserve for metadata.yaml."""
         self._remove_reserve()
         self.flush()
         self._file.close()

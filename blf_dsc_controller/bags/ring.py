@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A black box: the last seconds in memory, written as a bag on demand."""
+"""Black-box recorder: the last seconds in memory, written as a bag on demand."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.topics import Quality
 
 _Message: TypeAlias = tuple[int, bytes, int, int, int]
-"""As `write` takes it."""
+"""Arguments of `write`."""
 
 
 class Ring:
-    """The messages of the last `seconds`.
+    """Buffer of the messages of the last `seconds`.
 
-    It also keeps the last message of each latched topic however old it is. It takes the place of a
-    BagWriter; `message_counts` are all messages written so far, by topic.
+    It also keeps the last message of each latched topic, however old. It can replace a BagWriter;
+    `message_counts` counts all messages written so far, by topic.
     """
 
     closed = False
@@ -44,7 +44,7 @@ class Ring:
     def write(
         self, handle: int, raw: bytes, log_time: int, publish_time: int, sequence: int
     ) -> None:
-        """Keep a message, and drop those that are too old by now."""
+        """Store a message, and drop those that are now too old."""
         self.message_counts[self._topics[handle - 1][0]] += 1
         self._messages.append((handle, raw, log_time, publish_time, sequence))
         while self._messages[0][2] < log_time - self._span:
@@ -53,11 +53,11 @@ class Ring:
                 self._latched[old[0]] = old
 
     def configure(self, configuration: str, known_at: int | None = None) -> None:
-        """Keep the configuration of the run, as in BagWriter."""
+        """Store the configuration of the run, as in BagWriter."""
         self._configuration = configuration, time.time_ns() if known_at is None else known_at
 
     def note(self, facts: dict[str, str]) -> None:
-        """Do nothing: each dump has facts of its own."""
+        """Do nothing: each dump is given its own facts."""
 
     def flush_if_due(self) -> None:
         """Do nothing: the messages stay in memory."""
@@ -66,7 +66,7 @@ class Ring:
         """Do nothing: the messages stay in memory."""
 
     def close(self) -> None:
-        """Do nothing: what was not dumped is dropped."""
+        """Do nothing: messages not yet dumped are discarded."""
 
     def dump(self, path: Path, facts: dict[str, str]) -> int:
         """Write the kept messages as a bag and return their number; the ring continues.

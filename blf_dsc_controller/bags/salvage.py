@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one damaged MCAP file still holds, and what it has lost."""
+"""Recoverable content of one damaged MCAP file, and its losses."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class Loss:
     reason: str
     start: int | None = None  # earliest time of its messages [ns], None if unknown
     end: int | None = None  # latest
-    messages: dict[str, int] = field(default_factory=dict)  # by topic, as far as the index counts
+    messages: dict[str, int] = field(default_factory=dict)  # by topic, where the index counts them
 
     def __str__(self) -> str:
         if self.start is None:
-            span = 'of unknown time' if self.end is None else f'before {format_time(self.end)}'
+            span = 'at an unknown time' if self.end is None else f'before {format_time(self.end)}'
         elif self.end is None:
             span = f'after {format_time(self.start)}'
         else:
@@ -55,20 +55,20 @@ class Loss:
 
 @dataclass
 class Salvage:
-    """The content of one damaged file; complete once its `messages` have been read."""
+    """Content of one damaged file; complete once its `messages` have been read."""
 
     path: Path
     unpacker: Unpacker | None = None  # of the whole bag, if this is one of its files
     schemas: dict[int, Schema] = field(default_factory=dict)  # by number in the file
     channels: dict[int, Channel] = field(default_factory=dict)
     attachments: list[Attachment] = field(default_factory=list)
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # the later over the earlier
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # later entries override
     losses: list[Loss] = field(default_factory=list)
-    is_complete: bool = False  # the recording was ended properly
+    is_complete: bool = False  # the recording was closed properly
     last: int | None = None  # latest time of a message [ns]
 
     def messages(self, data: Data) -> Iterator[StoredMessage]:
-        """Every whole message of the file's content, in its order."""
+        """Yield every complete message of the file's content, in order."""
         lost_chunk: Loss | None = None
         unpacker = self.unpacker or Unpacker([self.path])
         counts: list[tuple[Loss, int, int]] = []
@@ -98,7 +98,7 @@ class Salvage:
             loss.messages[topic] = count
 
     def channel(self, number: int) -> Channel | None:
-        """Channel of a number, or what a record of its own says of it; None if both are damaged."""
+        """Return a channel by number, or its copy in the metadata; None if both are damaged."""
         channel = self.channels.get(number)
         if channel is not None and self._is_intact(channel):
             return channel
@@ -107,12 +107,12 @@ class Salvage:
         return channel if channel.topic and self._is_intact(channel) else None
 
     def type_of(self, channel: Channel) -> str:
-        """Type of a channel's messages; empty if it is lost."""
+        """Return the type of a channel's messages; empty if it is lost."""
         schema = self.schemas.get(channel.schema_id)
         return channel.metadata.get('topic_type', '') if schema is None else str(schema.name)
 
     def _is_intact(self, channel: Channel) -> bool:
-        """Whether the checksum of a channel fits; bags of other recorders have none."""
+        """Return whether a channel matches its checksum; bags of other recorders have none."""
         checksum = channel.metadata.get('checksum')
         expected = channel_checksum(channel.topic, self.type_of(channel), channel.metadata)
         return checksum is None or checksum == expected
@@ -145,7 +145,7 @@ class Salvage:
 
 
 def format_time(stamp: int) -> str:
-    """Log time [ns] as a plain number and as UTC; one out of range as the number alone."""
+    """Format a log time [ns] as seconds and UTC; as seconds only if UTC is out of range."""
     plain = f'{stamp // NANOSECONDS}.{stamp % NANOSECONDS:09d} s'
     try:
         moment = datetime.fromtimestamp(stamp // NANOSECONDS, tz=timezone.utc)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of any kind as topics and CDR messages: rosbag2 (MCAP, sqlite3) and ROS 1."""
+"""Reader of all kinds of bags as topics and CDR messages: rosbag2 (MCAP, sqlite3), ROS 1."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _FILES = {'.mcap': ('mcap', mcap_index.topics_of), '.db3': ('sqlite3', sqlite_re
 
 
 Read: TypeAlias = Callable[[Collection[str], 'tuple[int, int] | None'], Messages]
-"""Messages of these topics: all, or those of a span of time [ns] in their order."""
+"""Messages of these topics: all, or those of a time span [ns], ordered by time."""
 
 
 class BagError(BlfDscError):
@@ -57,13 +57,13 @@ class OpenBag:
         self._read = read
 
     def messages(self, topics: Collection[str]) -> Messages:
-        """Every message of `topics`; those of one topic nearly in the order of their reception."""
+        """Return all messages of `topics`; those of one topic nearly in order of reception."""
         return self._read(topics, None)
 
     def in_order(self, topics: Collection[str], start: int = 0, stop: int = FOREVER) -> Messages:
-        """The same from `start` on and before `stop` [ns], in the order of reception.
+        """Return the messages from `start` to before `stop` [ns], in order of reception.
 
-        Slower by half, but only a few chunks of the bag are in memory at a time.
+        This takes half as long again, but only a few chunks of the bag are in memory at a time.
         """
         return self._read(topics, (start, stop))
 
@@ -73,8 +73,8 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     """Open a bag for reading: a folder, one of its storage files, or a ROS 1 `.bag`.
 
     Raises:
-        BagError: there is no bag, or it is damaged; also while it is read.
-        BlfDscError: it unpacks to too much.
+        BagError: there is no bag, or it is damaged; also raised while it is read.
+        BlfDscError: it unpacks to more than the limit.
     """
     try:
         if path.suffix == '.bag' and not path.is_dir():
@@ -87,12 +87,12 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
             yield _ros2_bag(bag, Path(folder))
     except BlfDscError:
         raise
-    except Exception as error:  # a damaged file makes libraries raise nearly anything
+    except Exception as error:  # libraries raise nearly anything on damaged files
         raise BagError(f'{path} cannot be read as a bag: {_reason(path, error)}') from error
 
 
 def _described(path: Path) -> BagFolder:
-    """Files and topics of a folder, or of a storage file alone."""
+    """Return files and topics of a folder, or of a single storage file."""
     if path.is_dir():
         return read_folder(path)
     (file,) = checked(path, [path])
@@ -103,7 +103,7 @@ def _described(path: Path) -> BagFolder:
 
 
 def _ros2_bag(bag: BagFolder, temporary: Path) -> OpenBag:
-    """Bag of files that are unpacked into a folder first, if they are compressed as a whole."""
+    """Open the files of a bag; those compressed as a whole are first unpacked to `temporary`."""
     files = bag.files
     if bag.compression == 'file':
         files = [temporary / f'{k}' for k in range(len(files))]
@@ -123,7 +123,7 @@ def _ros2_bag(bag: BagFolder, temporary: Path) -> OpenBag:
                 found = mcap_index.read_in_order(file, topics, *span)
             for topic, received, raw in found:
                 if span is None or span[0] <= received < span[1]:
-                    is_packed = raw.startswith(FRAME_HEADER)  # by message; no CDR begins so
+                    is_packed = raw.startswith(FRAME_HEADER)  # per message; CDR never does
                     yield topic, received, unpacker.unpack(raw, 'zstd') if is_packed else raw
 
     return OpenBag(bag.topics, bag.times, read)
@@ -146,7 +146,7 @@ def _ros1_bag(path: Path, reader: Reader1) -> OpenBag:
     ]
 
     def read(topics: Collection[str], span: tuple[int, int] | None) -> Messages:
-        # The common types serialise alike in ROS 1 and 2 but for padding and `seq` of the header.
+        # ROS 1 and 2 serialise the common types alike, except for padding and the header's `seq`.
         chosen = [one for one in reader.connections if one.topic in topics]
         for one, received, raw in reader.messages(chosen, *(span or ())) if chosen else ():
             yield one.topic, received, bytes(typestore().ros1_to_cdr(raw, one.msgtype))

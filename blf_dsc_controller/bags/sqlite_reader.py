@@ -23,7 +23,7 @@ _MESSAGES = """SELECT topics.name, messages.timestamp, messages.data
 
 
 def topics_of(path: Path) -> tuple[list[StoredTopic], tuple[int, int]]:
-    """Topics, time of the first message, and time after the last [ns].
+    """Return topics, time of the first message, and time after the last [ns].
 
     Raises:
         sqlite3.Error, TypeError, ValueError: the file is damaged.
@@ -47,22 +47,22 @@ def topics_of(path: Path) -> tuple[list[StoredTopic], tuple[int, int]]:
 def read_messages(
     path: Path, topics: Collection[str], unpacker: Unpacker
 ) -> Iterator[tuple[str, int, bytes]]:
-    """Topic, time [ns] and content of each message, in their order; errors as of `topics_of`.
+    """Yield topic, time [ns] and content of each message, by time; errors as in `topics_of`.
 
-    Each counts as if it had been unpacked: several can lie in the same place of a file.
+    Each counts as unpacked data, because several can share the same bytes of a file.
     """
     places = ', '.join('?' * len(topics))
     with closing(_open(path)) as database:
         for name, received, raw in database.execute(_MESSAGES.format(places), (*topics,)):
             if not isinstance(received, int) or not isinstance(raw, bytes):
-                raise TypeError(f'a message of {name} is not one')
+                raise TypeError(f'a row of {name} is not a message')
             unpacker.count(len(raw))
             yield name, received, raw
 
 
 def _open(path: Path) -> sqlite3.Connection:
     database = sqlite3.connect(f'{path.resolve().as_uri()}?immutable=1', uri=True)
-    if database.execute(_TABLES).fetchone() != (2,):  # a view can have rows without end
+    if database.execute(_TABLES).fetchone() != (2,):  # a view can have endless rows
         database.close()
         raise ValueError('it lacks the tables of a bag')
     return database

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run as one table, a row for each joint state: for spreadsheets, pandas, MATLAB."""
+"""Run as one table with a row per joint state, for spreadsheets, pandas and MATLAB."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.run import Run
 
-_FIELDS = {  # of a run, a column for each joint: unit
+_FIELDS = {  # fields of a run with a column per joint: unit
     'position': 'rad',
     'velocity': 'rad/s',
     'effort': 'N m',
@@ -28,7 +28,7 @@ _FIELDS = {  # of a run, a column for each joint: unit
     'bound': 'rad',
     'torque_limit': 'N m',
 }
-_VALUES = {  # beginning of a name in the vectors: unit
+_VALUES = {  # prefix of names in the vectors: unit
     topics.DISTURBANCE: 'N m',
     'viscous ': 'N m s/rad',
     **dict.fromkeys(('bias ', 'coulomb ', 'sin ', 'cos '), 'N m'),
@@ -45,16 +45,16 @@ _PARAMETER = 'kg m^2'  # of arms without a URDF
 
 
 class Column(NamedTuple):
-    """Values (N,), NaN where unknown, with their unit; empty if they have none of their own."""
+    """Values (N,), NaN where unknown, and their unit, empty if they have none."""
 
     values: NDArray[Any]
     unit: str
 
 
 def table(run: Run) -> dict[str, Column]:
-    """Every series of a run aligned on the stamps of its joint states, by name.
+    """Return every series of a run by name, aligned to the stamps of its joint states.
 
-    `stamp` and `received` are of integers, all else of floats. Values published with each sample
+    `stamp` and `received` are integers, all others floats. Values published with each sample
     are in the row of its stamp; those published less often (truth, timing, monitor) are held until
     the next message.
     """
@@ -78,7 +78,7 @@ def table(run: Run) -> dict[str, Column]:
 
 
 def _unit(name: str, run: Run) -> str:
-    """Unit of a value of the vectors; parameters of a URDF have their own."""
+    """Return the unit of a named value; parameters of a URDF have their own."""
     if name == topics.LAMBDA_MIN:
         return '' if run.arm is not None else 's^-4'
     if run.arm is not None and name in run.arm.units:
@@ -88,13 +88,13 @@ def _unit(name: str, run: Run) -> str:
 
 
 def export(run: Run, path: Path) -> int:
-    """Write the table as CSV or Parquet, by the ending of `path`; return the number of columns.
+    """Write the table as CSV or Parquet, by the suffix of `path`; return the number of columns.
 
-    Numbers read back equal. Units are metadata of Parquet's fields; of a CSV they are in the data
-    package beside it (see `described`).
+    Numbers are read back exactly. Units are field metadata in Parquet; those of a CSV are in the
+    data package beside it (see `described`).
 
     Raises:
-        BlfDscError: the ending is neither .csv nor .parquet.
+        BlfDscError: the suffix is neither .csv nor .parquet.
         MissingExtraError: pyarrow is not installed.
     """
     columns = table(run)
@@ -104,13 +104,13 @@ def export(run: Run, path: Path) -> int:
         _write_parquet(columns, path)
     else:
         raise BlfDscError(
-            f'{path} ends in neither .csv nor .parquet: the ending of the name sets the format'
+            f'{path} ends in neither .csv nor .parquet: the file extension selects the format'
         )
     return len(columns)
 
 
 def described(path: Path) -> Path:
-    """Data package (Frictionless) of a CSV: names, types and units of its columns, as JSON."""
+    """Return the path of a CSV's Frictionless data package: columns' names, types and units."""
     return path.with_suffix('.datapackage.json')
 
 
@@ -160,6 +160,6 @@ def _write_parquet(columns: dict[str, Column], path: Path) -> None:
 
 
 def _blocks(columns: dict[str, Column]) -> Iterator[slice]:
-    """Rows that are written at a time, so that not all of them are in memory twice."""
+    """Yield blocks of rows to write, so that not all of them are in memory twice."""
     for begin in range(0, columns['stamp'].values.size, _ROWS):
         yield slice(begin, begin + _ROWS)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of one topic of a bag, decoded at once where they differ only in numbers."""
+"""Messages of one topic of a bag, decoded in bulk where they differ only in numbers."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ class JointStates(NamedTuple):
     values: Floats  # (N, 3, n) position, velocity, effort; NaN where empty
 
     def select(self, rows: NDArray[np.generic]) -> JointStates:
-        """Some of the states."""
+        """Return the states of these rows."""
         return JointStates(self.names, self.stamp[rows], self.received[rows], self.values[rows])
 
     def by_stamp(self) -> JointStates:
-        """States ordered by stamp, one of each stamp."""
+        """Return the states ordered by stamp, one per stamp."""
         if (self.stamp[1:] > self.stamp[:-1]).all():
             return self
         return self.select(np.unique(self.stamp, return_index=True)[1])
@@ -75,7 +75,7 @@ class JointStates(NamedTuple):
 
 @dataclass
 class TopicMessages:
-    """All messages of one topic, undecoded, in the order of their reception."""
+    """All messages of one topic, undecoded, in order of reception."""
 
     name: str
     type: str = ''
@@ -90,17 +90,17 @@ class TopicMessages:
     ) -> JointStates:
         """Decode sensor_msgs/JointState.
 
-        Messages that cannot be decoded are added to `errors` by their number, and zero.
+        Messages that cannot be decoded are added to `errors` by index; their values are zero.
 
         Raises:
-            UnreadableMessageError: there are no `errors` to add them to.
+            UnreadableMessageError: a message cannot be decoded and `errors` is None.
         """
         stamp, values = self._decode(JointStateDecoder(names, required), errors)
         received = np.array(self.received, dtype=np.int64)
         return JointStates(tuple(names), stamp, received, values.reshape(stamp.size, 3, len(names)))
 
     def vectors(self) -> Series:
-        """Decode named values, in the positions of sensor_msgs/JointState, by stamp.
+        """Decode named values, sent as positions of sensor_msgs/JointState, ordered by stamp.
 
         Raises:
             UnreadableMessageError: a message cannot be decoded.
@@ -111,7 +111,7 @@ class TopicMessages:
         return JointStates(names, stamp, received, values[:, np.newaxis]).by_stamp().position
 
     def arrays(self, size: int) -> Floats | None:
-        """Values (N, size) of Float64MultiArrays, None if one of them has another size.
+        """Decode Float64MultiArrays as values (N, size); None if one of them has another size.
 
         Raises:
             UnreadableMessageError: a message cannot be decoded.
@@ -120,7 +120,7 @@ class TopicMessages:
         return values if (sizes == size).all() else None
 
     def layout(self) -> Layout:
-        """Layout of the first message; UnreadableMessageError if it has none."""
+        """Return the layout of the first message; UnreadableMessageError if it has none."""
         find = array_layout if self.type == FLOAT64_MULTI_ARRAY else joint_state_layout
         try:
             return find(self.raw[0])
@@ -128,9 +128,9 @@ class TopicMessages:
             raise UnreadableMessageError(self.name, 0, error) from error
 
     def of_joints(self, joints: Sequence[str]) -> TopicMessages:
-        """Messages without those for other joints alone, as the controller ignores them.
+        """Return the messages without those of only other joints, which the controller ignores.
 
-        All of them if none is left.
+        All are returned if none would be left.
 
         Raises:
             BagError: all have the same stamp.
@@ -155,7 +155,7 @@ class TopicMessages:
         return replace(self, received=received, raw=raw)
 
     def joint_names(self) -> tuple[str, ...]:
-        """Names in the message that has most of them; UnreadableMessageError if there are none."""
+        """Return the longest list of names in a message; UnreadableMessageError if it is empty."""
         names = self.layout().names
         for raw in {len(raw): raw for raw in self.raw}.values():
             with suppress(UnreadableMessageError):
@@ -171,7 +171,7 @@ class TopicMessages:
         errors: dict[int, MessageError] | None = None,
         size: int | None = None,
     ) -> tuple[NDArray[np.int64], Floats]:
-        """What `decoder` returns of each message, and all or the first `size` of its values."""
+        """Return the result of `decoder` per message, and all or the first `size` of its values."""
         count = len(self.raw)
         returned = np.zeros(count, dtype=np.int64)
         values = np.zeros((count, decoder.values[:size].size))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The torques of a bag that acted on the arm."""
+"""Torques applied to the arm, as recorded in a bag."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from blf_dsc_controller.run import Floats
 
 
 class TorqueError(BlfDscError):
-    """The torques of a bag are not known."""
+    """The torques of a bag are unknown."""
 
 
 def applied_torque(content: Content, states: JointStates) -> tuple[Floats, str]:
-    """Torque from each of the states to the next (N, n) [N m], and its topic.
+    """Return the torque from each state to the next (N, n) [N m], and its topic.
 
-    In this order: commands, if there is one for each state; the saturated torque of the
+    The first available of: commands, if there is one for each state; the saturated torque of the
     controller's telemetry; commands; the effort of the next state.
 
     Raises:
@@ -36,19 +36,19 @@ def applied_torque(content: Content, states: JointStates) -> tuple[Floats, str]:
     effort = next_effort(states)
     if np.isnan(effort).all():
         raise TorqueError(
-            f'{content.path} does not hold the torques: there is no topic of commands (name it: '
+            f'{content.path} does not hold the torques: there is no command topic (map it: '
             '--map commands=/its/name) and the effort of the joint states is empty'
         )
     return effort, f'effort of {content.topics[JOINT_STATES].name}'
 
 
 def next_effort(states: JointStates) -> Floats:
-    """Effort (N, n) that is measured with the next state; NaN for the last one."""
+    """Return the effort (N, n) measured with the next state; NaN for the last one."""
     return np.vstack([states.values[1:, 2], np.full((1, len(states.names)), np.nan)])
 
 
 def _commanded(content: Content, commands: TopicMessages, states: JointStates) -> Floats:
-    """Command after each state: the k-th, or the last before the next state if counts differ."""
+    """Return the command after each state: k-th, or last before the next if counts differ."""
     torque = _by_joint(content, commands, states.names)
     if len(torque) == states.stamp.size:
         return torque
@@ -60,7 +60,7 @@ def _commanded(content: Content, commands: TopicMessages, states: JointStates) -
 
 
 def _by_joint(content: Content, commands: TopicMessages, joints: Sequence[str]) -> Floats:
-    """Commands (m, n): by name, or in the order of the joints, or in that of the joint states."""
+    """Return commands (m, n): by name, or in the order of `joints` or of the joint states."""
     if commands.type == JOINT_STATE:
         return commands.joint_states(joints, ('effort',)).values[:, 2]
     size = commands.layout().arrays[0].size

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a bag has compressed, unpacked within a limit: a few kilobytes can hold gigabytes."""
+"""Decompression of a bag within a limit: a few kilobytes can unpack to gigabytes."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from zstandard import ZstdDecompressor
 from blf_dsc_controller.errors import BlfDscError
 
 MAX_UNPACKED: ContextVar[float] = ContextVar('MAX_UNPACKED', default=1e9)
-"""Bytes that a bag may unpack to; `--max-unpacked` sets it, in GB."""
+"""Bytes that a bag may unpack to; set by `--max-unpacked`, in GB."""
 
 LARGEST_CHUNK = 1 << 29  # bytes, unpacked
-_EXPECTED = 100  # times the size of its files that any bag may unpack to
+_EXPECTED = 100  # multiple of the size of its files that any bag may unpack to
 _STEP = 1 << 17  # bytes
 
 
 class Unpacker:
-    """Unpacks what is compressed in one bag of these `files`, up to a limit in all."""
+    """Decompressor for one bag of these `files`, with a limit on the total size."""
 
     def __init__(self, files: Iterable[Path]) -> None:
         files = list(files)
@@ -37,7 +37,7 @@ class Unpacker:
         Raises:
             BlfDscError: the bag unpacks to more than its limit.
             ValueError: `data` holds more than announced.
-            Exception: of the library of this compression, if `data` is damaged.
+            Exception: from the compression library, if `data` is damaged.
         """
         largest = min(announced, LARGEST_CHUNK)
         unpacked = _UNPACK[compression](data, min(largest, self._left))
@@ -47,19 +47,19 @@ class Unpacker:
         return unpacked
 
     def unpack_file(self, source: BinaryIO, target: BinaryIO) -> None:
-        """Unpack a file compressed by zstd; errors as of `unpack`."""
+        """Unpack a file compressed with zstd; errors as in `unpack`."""
         stream = ZstdDecompressor().stream_reader(source, read_across_frames=True)
         while part := stream.read(_STEP):
             self.count(len(part))
             target.write(part)
 
     def count(self, size: int) -> None:
-        """Count unpacked bytes; BlfDscError if they are too many."""
+        """Count unpacked bytes; BlfDscError if there are too many."""
         self._left -= size
         if self._left < 0:
             raise BlfDscError(
-                f'{self._name} unpacks to more than {self._limit / 1e9:.3g} GB, which is not what '
-                'recordings do: if it is one that you trust, raise --max-unpacked'
+                f'{self._name} unpacks to more than {self._limit / 1e9:.3g} GB, which is '
+                'unusual for a recording: if you trust it, raise --max-unpacked'
             )
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag as `ros2 bag record` writes it: a folder of metadata.yaml and MCAP files."""
+"""Writer of bags like those of `ros2 bag record`: a folder of metadata.yaml and MCAP files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from blf_dsc_controller.messages.topics import Quality
 from blf_dsc_controller.messages.types import Definition, definition
 
 CHANNEL_RECORD = 'blf_dsc_controller channel '
-"""Start of the name of a metadata record that repeats a topic outside of the chunks."""
+"""Prefix of the names of metadata records that repeat a topic outside of the chunks."""
 
 _COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
 _CHUNK_SIZE = 1 << 20
@@ -36,7 +36,7 @@ _CHANNEL_ENTRY = 16  # ... and for each channel
 
 
 class DiskFullError(BagError):
-    """The disk is full; the bag was ended in order before."""
+    """The disk is full; the bag has been completed and closed."""
 
     def __init__(self, path: Path, messages: int) -> None:
         self.messages = messages
@@ -47,12 +47,12 @@ class DiskFullError(BagError):
 
 
 class BagWriter:
-    """Writes serialised messages into a new bag.
+    """Writer of serialised messages to a new bag.
 
     Data leaves the process within `flush_interval` [s] plus the time to the next call of `write` or
-    `flush_if_due`; then it survives the process being killed. Without an interval it leaves when a
-    chunk is full. The chunks are compressed by `none` or `zstd`. The next file of the bag is begun
-    by the first message after `split_size` [bytes] or `split_duration` [s]: none is without any.
+    `flush_if_due`, and then survives a kill of the process. Without an interval it leaves when a
+    chunk is full. The compression of chunks is `none` or `zstd`. The first message after
+    `split_size` [bytes] or `split_duration` [s] starts the next file, so no file is empty.
 
     Raises:
         BagError: `path` exists already.
@@ -95,10 +95,10 @@ class BagWriter:
         """Add a topic by its full name, with the quality of service of each publisher.
 
         Returns:
-            the handle to write to it.
+            the handle for `write`.
 
         Raises:
-            UnknownTypeError: the definition is left out and the type is no common one of Jazzy.
+            UnknownTypeError: no definition is given and the type is not one of Jazzy's common ones.
         """
         found = definition(type_name) if known is None else known
         profiles = [profile_of(one) if isinstance(one, Quality) else one for one in offered]
@@ -142,7 +142,7 @@ class BagWriter:
         self._store_context()
 
     def note(self, facts: dict[str, str]) -> None:
-        """Store facts of the run by name."""
+        """Store facts about the run by name."""
         self._bag.custom_data.update(facts)
         self._writer.add_metadata(RECORD, self._bag.custom_data)
 
@@ -181,13 +181,13 @@ class BagWriter:
 
     @property
     def _is_due(self) -> bool:
-        """Whether the next message is one for the next file."""
+        """Whether the next message starts a new file."""
         is_long = self._flushed - self._began >= self._split_duration
         is_full = is_long or self._stream.tell() >= self._split_size
         return is_full and self._bag.files[-1].message_count > 0
 
     def _begin_file(self) -> None:
-        """Begin the next file, with the topics of the one before it."""
+        """Begin the next file, with the topics of the previous one."""
         file = FileInformation(f'{self.path.name}_{len(self._bag.files)}.mcap')
         self._bag.files.append(file)
         self._stream = ReservedFile(self.path / file.path)
@@ -204,14 +204,14 @@ class BagWriter:
         self._began = self._clock()
 
     def _describe(self) -> None:
-        """Store what is known of the bag; rosbag2 reads the last such record of a file."""
+        """Store the metadata so far; rosbag2 reads the last such record of a file."""
         self._writer.add_metadata('rosbag2', {'serialized_metadata': self._bag.record_text()})
 
     def _add_channel(self, topic: TopicInformation) -> int:
         """Add a topic to the file and return its number, the same in each file.
 
-        It is stored in the chunk of its first message, in the index at the end, and in a record of
-        its own, for a file that has lost both.
+        It is stored in the chunk of its first message, in the index at the end, and in a metadata
+        record, for files that have lost both.
         """
         text, hash_, encoding = topic.definition
         if topic.type not in self._schemas:
@@ -245,6 +245,6 @@ class BagWriter:
 
 
 def channel_checksum(topic: str, type_name: str, metadata: Mapping[str, str]) -> str:
-    """CRC-32 of a channel, which is repeated where no checksum of MCAP protects it."""
+    """Return the CRC-32 of a channel, whose copy is not protected by a checksum of MCAP."""
     profiles, type_hash = metadata.get('offered_qos_profiles'), metadata.get('topic_type_hash')
     return f'{crc32(repr((topic, type_name, profiles, type_hash)).encode()):08x}'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc report`, `recover`, `export` and `plot`: what is made of bags."""
+"""`blf_dsc report`, `recover`, `export` and `plot`: outputs made from bags."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def report(options: Namespace) -> None:
 
 
 def export(options: Namespace) -> None:
-    """Write the table of a bag."""
+    """Write a bag as a table."""
     out = options.out
     make_room(out, *([described(out)] if out.suffix == '.csv' else ()), force=options.force)
     run = read_run(options.bag, options.namespace, NameMap.parse(options.map))
@@ -38,7 +38,7 @@ def export(options: Namespace) -> None:
 
 
 def plot(options: Namespace) -> None:
-    """Draw and summarise a bag."""
+    """Plot and summarise a bag."""
     names = ('summary.json', *figures.NAMES)
     make_room(*(options.out / name for name in names), force=options.force)
     run = read_run(options.bag, options.namespace, NameMap.parse(options.map))
@@ -51,7 +51,7 @@ def plot(options: Namespace) -> None:
 
 
 def recover(options: Namespace) -> int:
-    """Make a clean bag of a damaged one and list what was lost; 1 if that is all of it."""
+    """Make a clean bag from a damaged one and list the losses; return 1 if nothing is left."""
     bag = options.bag.resolve()
     out = options.out or bag.with_name(f'{bag.stem}_recovered')
     recovery = recovering.recover(options.bag, out)
@@ -70,13 +70,13 @@ def _losses(recovery: recovering.Recovery) -> Iterator[str]:
     for name, last in recovery.unfinished:
         after = 'nothing in it could be read' if last is None else f'it ends at {format_time(last)}'
         yield (
-            f'{name}: the recording was not closed; {after}. What came later is not in the file: '
-            'usually 0.1 s before a kill, more where the computer was overloaded or lost its power'
+            f'{name}: the recording was not closed; {after}. Later messages are lost: usually the '
+            'last 0.1 s before a kill, more if the computer was overloaded or lost power'
         )
     if recovery.unknown:
         yield f'LOST {recovery.unknown} messages of topics whose name or type is unknown'
     if recovery.is_empty:
-        yield 'ALL is lost: no message could be recovered'
+        yield 'ALL LOST: no message could be recovered'
     if recovery.is_whole:
         yield 'none of the recorded messages was lost'
     yield f'wrote {recovery.path}'

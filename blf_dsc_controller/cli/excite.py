@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 
-# Before numpy is imported: threads cost more than they bring to matrices of this size.
+# Set before numpy is imported: for matrices of this size, threads cost more than they gain.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import textwrap
@@ -24,14 +24,14 @@ from blf_dsc_controller.law import exciting_reference
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.reference.clearance import Clearance
 
-_DIGITS = 4  # of a radian, in the file
+_DIGITS = 4  # decimals of an angle [rad] in the file
 _UNITS = {'frequency': 'rad/s, of the cosines, then of the sines'}
-_UNSHOWN = 0.8  # of the deviation of the prior
+_UNSHOWN = 0.8  # of the prior's deviation; parameters that keep more are hardly shown
 _WIDTH = 98
 
 
 def excite(options: Namespace) -> None:
-    """Search, and write the preset."""
+    """Search for the reference and write the preset."""
     make_room(options.out, force=options.force)
     text = _preset(options)
     options.out.write_text(text, encoding='utf-8')
@@ -73,7 +73,7 @@ def _preset(options: Namespace) -> str:
         unshown = []
     about = (
         'The reference that excites the learning most within the limits of joints and torque: '
-        f'{figures} with the reference of that file.'
+        f'{figures} with the configured reference.'
     )
     command = (
         f'blf_dsc excite PRESET.yaml --config {options.config} --torque-fraction '
@@ -100,9 +100,9 @@ def _preset(options: Namespace) -> str:
 
 
 def _guess(config: ControllerConfig, given: list[float] | None) -> np.ndarray:
-    """Parameters P (k, p) that the torque is computed with: as given, or else those of the start.
+    """Return parameters P (k, p) to compute the torque with: as given, or the initial estimate.
 
-    An arm of a URDF must also be able to carry its payload.
+    A URDF arm must also be able to carry its payload, which a second row includes.
     """
     start = config.learning.initial_estimate
     if given and len(given) != len(start):
@@ -134,7 +134,7 @@ def _search(problem: exciting_reference.ExcitationProblem, seed: int, starts: in
 
 
 def _unshown(config: ControllerConfig, remaining: np.ndarray) -> list[str]:
-    """Lines that name the parameters that the motion shows little of, the least shown first."""
+    """Return lines listing the parameters that the motion hardly shows, the least shown first."""
     order = [int(k) for k in np.argsort(-remaining) if remaining[k] > _UNSHOWN]
     if not order:
         return ['It shows all parameters.']
@@ -142,7 +142,7 @@ def _unshown(config: ControllerConfig, remaining: np.ndarray) -> list[str]:
     if config.model == 'urdf' and config.robot.learn == 'base':
         sums = parameters_of(config.robot, config.robot.chain(config.joints)).combinations
         names[: len(sums)] = sums
-    lines = ['It hardly shows the following; of the deviation of the prior a window leaves']
+    lines = ["It hardly shows the following; of the prior's deviation a window leaves"]
     for k in order:
         text = f'{100.0 * remaining[k]:4.0f} % of {names[k]}'
         lines += textwrap.wrap(text, _WIDTH, subsequent_indent=' ' * 10, initial_indent=' ')

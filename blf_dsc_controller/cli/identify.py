@@ -15,9 +15,9 @@ from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.identify import Identified, identify_bag
 from blf_dsc_controller.identification.prior import JOINT_TERMS, columns_of
 
-_TWO_SIDED = 1.96  # deviations that hold 95 %
-_UNSEEN = 0.5  # of the prior's variance: less was shown by the bag
-_POOR = 0.2  # of the torque, error on the part held back
+_TWO_SIDED = 1.96  # standard deviations of a 95 % interval
+_UNSEEN = 0.5  # of the prior's variance; parameters that keep more are not shown
+_POOR = 0.2  # of the torque, largest accepted error on the part held back
 
 
 def identify(options: Namespace) -> None:
@@ -77,7 +77,7 @@ def _joints(found: Identified) -> Iterator[str]:
         )
         yield f'{name:{width}}' + ''.join(f'  {term:24}' for term in terms).rstrip()
     delay, s = found.values[-1], _TWO_SIDED * np.sqrt(found.covariance[-1, -1])
-    yield f'delay of the torques against the positions: {1e3 * delay:.2f} +- {1e3 * s:.2g} ms'
+    yield f'delay of the torques relative to the positions: {1e3 * delay:.2f} +- {1e3 * s:.2g} ms'
 
 
 def _base(found: Identified) -> Iterator[str]:
@@ -89,7 +89,7 @@ def _base(found: Identified) -> Iterator[str]:
         np.einsum('ia,ab,ib->i', K, C, K) for C in (found.prior_covariance, found.covariance)
     )
     yield ''
-    yield 'what torques can show (base parameters), in kg, kg m, kg m^2:'
+    yield 'base parameters (all that torques can show), in kg, kg m, kg m^2:'
     unseen = posterior > _UNSEEN * prior
     for k, name in enumerate(P.combinations):
         mark = '  NOT SHOWN by this bag: from the URDF' if unseen[k] else ''
@@ -100,7 +100,7 @@ def _base(found: Identified) -> Iterator[str]:
 def _errors(found: Identified) -> Iterator[str]:
     begin, end = found.held_back
     yield ''
-    yield f'torque error on {begin:.1f} to {end:.1f} s, which was held back [% of the rms torque]:'
+    yield f'torque error from {begin:.1f} to {end:.1f} s, which was held back [% of rms torque]:'
     share = 100.0 * found.errors / found.torque
     total = 100.0 * np.sqrt(np.sum(found.errors**2, axis=1) / np.sum(found.torque**2))
     width = max(len(joint.name) for joint in found.chain.joints)
@@ -113,6 +113,6 @@ def _errors(found: Identified) -> Iterator[str]:
     if total[2] > min(100.0 * _POOR, total[0]):
         yield (
             'DO NOT USE this URDF: it does not explain the torques held back. Are the efforts in '
-            'N m (not currents), with gravity in them, is the gravity that of the base, and was '
-            'the load the same throughout?'
+            'N m (not currents) and do they include gravity, is --gravity given in the base '
+            'frame, and was the load the same throughout?'
         )

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `blf_dsc`, the aliases of its sub-commands, and the executables of the nodes.
 
-A sub-command is imported when it runs, so `--help` is fast and needs neither ROS nor any extra.
+Sub-commands are imported when they run, so `--help` is fast and needs neither ROS nor extras.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ INTERRUPTED = 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a sub-command and return its exit code; an error is one message on stderr and 1."""
+    """Run a sub-command and return its exit code; errors print a message to stderr and return 1."""
     parser = make_parser()
     options = parser.parse_args(arguments)
     if options.command is None:
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, partial(_interrupt, options.command))
-    # Names in letters that the pictures' font does not have.
+    # Names may have letters that the font of the pictures lacks.
     warnings.filterwarnings('ignore', 'Glyph .* missing')
     try:
         code = copy_context().run(_handle, options)
@@ -41,7 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f'blf_dsc {options.command}: {_sentence(error, options)}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        remedy = '; the same command resumes the study' if options.command == 'monte-carlo' else ''
+        is_study = options.command == 'monte-carlo' and not (options.reproduce or options.report)
+        remedy = '; the same command resumes the study' if is_study else ''
         print(f'blf_dsc {options.command}: interrupted{remedy}', file=sys.stderr)
         return INTERRUPTED
     return code or 0
@@ -59,7 +60,7 @@ def _handle(options: argparse.Namespace) -> int | None:
 
 
 def _interrupt(command: str, _number: int, _frame: object) -> None:
-    """Raise KeyboardInterrupt; while kernels are compiled, which swallows it, end at once."""
+    """Raise KeyboardInterrupt, or exit at once during compilation, which would swallow it."""
     numba = sys.modules.get('numba.core.compiler_lock')
     if numba is not None and numba.global_compiler_lock.is_locked():
         os.write(2, f'blf_dsc {command}: interrupted\n'.encode())
@@ -68,7 +69,7 @@ def _interrupt(command: str, _number: int, _frame: object) -> None:
 
 
 def _sentence(error: BlfDscError | OSError, options: argparse.Namespace) -> str:
-    """What went wrong; of a file or folder below --out, that it cannot be written."""
+    """Return the message of an error; an OSError around --out is reported as unwritable."""
     out = getattr(options, 'out', None)
     if isinstance(error, BlfDscError) or not (out and error.errno):
         return str(error)
@@ -79,9 +80,9 @@ def _sentence(error: BlfDscError | OSError, options: argparse.Namespace) -> str:
 
 
 def unwritable(path: Path, error: OSError) -> BlfDscError:
-    """What to say where a file or folder of --out cannot be written."""
+    """Return the error for a file or folder of --out that cannot be written."""
     reason = os.strerror(error.errno) if error.errno else error
-    return BlfDscError(f'{path} cannot be written ({reason}): make room or choose another --out')
+    return BlfDscError(f'{path} cannot be written ({reason}): make space or choose another path')
 
 
 def require_ros() -> None:
@@ -90,7 +91,7 @@ def require_ros() -> None:
         importlib.import_module('rclpy')
     except ImportError as error:
         raise BlfDscError(
-            f'ROS 2 cannot be imported ({error}): source a ROS 2 Jazzy '
+            f'ROS 2 cannot be imported ({error}): source ROS 2 Jazzy '
             '(source /opt/ros/jazzy/setup.bash), or install it as wheels '
             "(pip install 'blf_dsc_controller[ros]')"
         ) from error
@@ -112,7 +113,7 @@ monte_carlo = partial(_alias, 'monte-carlo')
 
 
 def _node(module: str) -> int:
-    for number in (signal.SIGINT, signal.SIGTERM):  # while it imports; then it has its own way
+    for number in (signal.SIGINT, signal.SIGTERM):  # until the node installs its own handlers
         signal.signal(number, lambda *_: os._exit(0))
     try:
         require_ros()

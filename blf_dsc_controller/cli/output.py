@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that commands write: none is overwritten by accident."""
+"""Protection of existing files against being overwritten by accident."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from blf_dsc_controller.errors import BlfDscError
 
 
 def make_room(*paths: Path, force: bool) -> None:
-    """Let `paths` be written anew; a link is replaced, not followed to where it leads.
+    """Prepare `paths` for writing; a symbolic link is replaced instead of followed.
 
     Raises BlfDscError if one of them exists, unless `force` is set.
     """
@@ -18,7 +18,7 @@ def make_room(*paths: Path, force: bool) -> None:
     if existing and not force:
         names = ', '.join(str(path) for path in existing)
         exist = 'exists' if len(existing) == 1 else 'exist'
-        raise BlfDscError(f'{names} {exist} already: choose another --out, or overwrite by --force')
+        raise BlfDscError(f'{names} {exist} already: choose another path, or use --force')
     for path in existing:
         if path.is_symlink():
             path.unlink()

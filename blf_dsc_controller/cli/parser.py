@@ -14,7 +14,7 @@ _WIDTH = 88
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Parser whose options name the function of a sub-command as `handler`: (module, function)."""
+    """Return the parser; the option `handler` is the (module, function) of a sub-command."""
     parser = argparse.ArgumentParser(
         prog='blf_dsc',
         description='Output-constrained tracking control of robot arms: run it, look at its bags, '
@@ -43,14 +43,15 @@ def make_parser() -> argparse.ArgumentParser:
             'run the closed loop and plot the results',
             'Run the simulated arm, the controller and the recorder over ROS 2, and leave a '
             'bag, pictures and summary.json in a new folder. '
-            'Exit code: 0 done, 5 the controller stopped before the end, 1 an error.',
+            'Exit code: 0 done, 5 the controller stopped before the end, 130 interrupted, '
+            '1 an error.',
             '--config noisy --duration 30 --mode realtime --out first',
         )
     )
     precompile = command(
         'precompile',
         'precompile',
-        'compile what a configuration needs, ahead of its first start',
+        'compile the kernels of a configuration before its first start',
         'Compile the kernels of the controller and the simulated arm of a configuration into the '
         "user's cache (NUMBA_CACHE_DIR, or ~/.cache/blf_dsc_controller), so that their nodes start "
         'within seconds: after an installation, or when a container is built.',
@@ -66,8 +67,8 @@ def make_parser() -> argparse.ArgumentParser:
             'run a bag through the controller again and compare bit for bit',
             'Feed the joint states of a bag through the controller with the recorded '
             'configuration, and compare every output bit for bit. '
-            'Exit code: 0 all outputs are bit-equal, 3 some differ, 4 only a part could be '
-            'compared, and is bit-equal, 1 an error.',
+            'Exit code: 0 all outputs are bit-equal, 3 some differ, 4 some could not be compared '
+            'and the others are bit-equal, 1 an error.',
             'run1/bag --config my.yaml',
         )
     )
@@ -75,7 +76,7 @@ def make_parser() -> argparse.ArgumentParser:
         'report',
         'bags',
         'show one or several bags on one HTML page',
-        'Write one HTML page that shows a bag, or several over each other: plots to zoom into, '
+        'Write one HTML page that shows a bag, or several overlaid: zoomable plots, '
         'events, configuration and the moving arm. It needs no network.',
         'run1/bag run2/bag --out comparison.html',
     )
@@ -86,18 +87,18 @@ def make_parser() -> argparse.ArgumentParser:
         'view',
         'show a running system, or a bag, on a page in the browser',
         'Serve a page with the arm in 3D, its errors inside their bounds, torques and estimates: '
-        'of the system that runs in this ROS domain, with buttons and sliders, or of a bag, with '
-        'play and pause. Nobody else can open it, and it needs no network.',
+        'of the system running in this ROS domain, with buttons and sliders, or of a bag, with '
+        'play and pause. It needs no network, and by default only this computer can open it.',
         'run1/bag',
     )
     view.add_argument('bag', type=Path, nargs='?', help=f'{_BAG}; without it: the running system')
-    view.add_argument('--host', default='127.0.0.1', help='address to serve it at (127.0.0.1)')
-    view.add_argument('--port', type=int, default=8080, help='or the next one free (8080)')
+    view.add_argument('--host', default='127.0.0.1', help='address to serve at (127.0.0.1)')
+    view.add_argument('--port', type=int, default=8080, help='port, or the next free one (8080)')
     recover = command(
         'recover',
         'bags',
-        'make a clean bag of a damaged one',
-        'Make a clean bag of one that was cut off or damaged, and list what was lost. '
+        'make a clean bag from a damaged one',
+        'Make a clean bag from one that was cut off or damaged, and list what was lost. '
         'The damaged bag is not touched. Exit code: 1 if nothing could be recovered.',
         'run1/bag --out rescued',
     )
@@ -107,7 +108,7 @@ def make_parser() -> argparse.ArgumentParser:
         'export',
         'bags',
         'write a bag as a table, in CSV or Parquet',
-        'Write the series of a bag as one table, a row for each joint state.',
+        'Write the series of a bag as one table with a row for each joint state.',
         'run1/bag --out run1.csv',
     )
     export.add_argument('bag', type=Path, help=_BAG)
@@ -115,7 +116,7 @@ def make_parser() -> argparse.ArgumentParser:
     plot = command(
         'plot',
         'bags',
-        'draw a bag and summarise it',
+        'plot and summarise a bag',
         'Draw tracking.png and parameters.png of a bag and write summary.json.',
         'run1/bag --out pictures',
     )
@@ -133,10 +134,10 @@ def make_parser() -> argparse.ArgumentParser:
             'excite',
             'excite',
             'find a reference that excites the learning',
-            'Find the sum of sinusoids, of the period of the learning window, that excites the '
-            'learning most within the limits of joints and torque, and write it as a preset. The '
-            'links of an arm of a URDF also keep their distance from each other and the floor, and '
-            'the parameters that the motion does not show are named.',
+            'Find the sum of sinusoids with the period of the learning window that excites the '
+            'learning most within the joint and torque limits, and write it as a preset. The links '
+            'of a URDF arm also keep their distance from each other and from the floor, and the '
+            'parameters that the motion does not show are listed.',
             'exciting.yaml --config my.yaml',
         )
     )
@@ -144,11 +145,11 @@ def make_parser() -> argparse.ArgumentParser:
         command(
             'identify',
             'identify',
-            'correct the inertias and frictions of a URDF by a bag',
+            'correct the inertias and friction of a URDF from a bag',
             'Identify an arm from the positions and efforts of any bag: write its URDF with '
-            'physical inertias that reproduce the torques, nearest to those it had, and print '
-            'what changed, with 95 % intervals, and the torque error on the last fifth of the '
-            'bag, which was held back.',
+            'physical inertias that reproduce the torques and are closest to the original ones, '
+            'and print what changed, with 95 % intervals, and the torque error on the last fifth '
+            'of the bag, which was held back.',
             'run1/bag --urdf robot.urdf --out corrected.urdf',
         )
     )
@@ -168,13 +169,13 @@ def make_parser() -> argparse.ArgumentParser:
         'studies',
         'compare laws on arms whose URDF is wrong',
         'Tune each law on one arm with wrong masses, run it on others, and write a page of the '
-        'errors; offline, on all cores, some ten minutes on two.',
+        'errors; offline, on all cores, about ten minutes on two.',
         '--config panda --out arms',
     )
     option = arms.add_argument
     option('--config', nargs='+', default=['panda', 'ur5e'], help='presets or files (panda ur5e)')
     option('--truths', type=int, default=5, help='runs of each law after tuning (5)')
-    option('--generations', type=int, default=7, help='of the tuning, after the first (7)')
+    option('--generations', type=int, default=7, help='generations of tuning after the first (7)')
     option('--out', type=Path, default=Path('arms'), help='new folder for the page')
     _monte_carlo_options(
         command(
@@ -190,11 +191,11 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def _namespace(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--namespace', default='', help='of the robot, if a bag holds several')
+    parser.add_argument('--namespace', default='', help='robot to use, if a bag holds several')
 
 
 def _force(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--force', action='store_true', help='overwrite what exists already')
+    parser.add_argument('--force', action='store_true', help='overwrite existing files')
 
 
 def _max_unpacked(parser: argparse.ArgumentParser) -> None:
@@ -203,7 +204,7 @@ def _max_unpacked(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=1.0,
         metavar='GB',
-        help='that a compressed bag may unpack to, if more than 100 times its size (1)',
+        help='size that a bag may unpack to, or 100 times its size if that is more (1)',
     )
 
 
@@ -222,19 +223,19 @@ def _run_options(parser: argparse.ArgumentParser) -> None:
     option = parser.add_argument
     option('--config', default='recommended', help='parameter file, or a preset (recommended)')
     option('--duration', type=float, help='simulated time [s] (as configured, or else 60)')
-    option('--mode', choices=('realtime', 'lockstep'), help='of the plant (as configured)')
-    option('--seed', type=int, help='of the sensor noise (as configured)')
+    option('--mode', choices=('realtime', 'lockstep'), help='mode of the plant (as configured)')
+    option('--seed', type=int, help='seed of the sensor noise (as configured)')
     option('--offline', action='store_true', help='without ROS: no processes, no topics')
     option('--domain', type=int, help='ROS domain (a free one)')
     option('--out', type=Path, help='new folder (closed_loop, closed_loop-2, ...)')
-    option('--view', action='store_true', help='show it on a page in the browser meanwhile')
-    option('--view-host', default='127.0.0.1', help='address to serve it at (127.0.0.1)')
+    option('--view', action='store_true', help='show the run on a page in the browser')
+    option('--view-host', default='127.0.0.1', help='address of that page (127.0.0.1)')
 
 
 def _replay_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bag', type=Path, help=_BAG_OF_ANY_KIND)
     parser.add_argument(
-        '--config', help='parameter file or preset: what it would have commanded (open loop)'
+        '--config', help='parameter file or preset: show what it would have commanded (open loop)'
     )
     _map(parser)
     _namespace(parser)
@@ -251,10 +252,10 @@ def _replay_options(parser: argparse.ArgumentParser) -> None:
     option('--loop', action='store_true', help='start again at the end')
     option('--start-paused', action='store_true', help='wait for ~/resume')
     option('--delay', type=float, default=1.0, help='time for discovery [s] (1)')
-    option('--topics', nargs='+', default=[], metavar='TOPIC', help='to play (all)')
-    option('--start-offset', type=float, default=0.0, help='time in the bag to begin at [s] (0)')
-    option('--playback-duration', type=float, default=inf, help='time in the bag [s] (its rest)')
-    option('--remap', action='append', default=[], metavar='FROM:=TO', help='as ROS remaps')
+    option('--topics', nargs='+', default=[], metavar='TOPIC', help='topics to play (all)')
+    option('--start-offset', type=float, default=0.0, help='time in the bag to start at [s] (0)')
+    option('--playback-duration', type=float, default=inf, help='time to play [s] (to the end)')
+    option('--remap', action='append', default=[], metavar='FROM:=TO', help='remap, as in ROS')
 
 
 def _excite_options(parser: argparse.ArgumentParser) -> None:
@@ -266,8 +267,8 @@ def _excite_options(parser: argparse.ArgumentParser) -> None:
         '--guess',
         type=float,
         nargs='+',
-        help='parameters P for computing the torque (learning.initial_estimate; of a URDF with and '
-        'without its payload)',
+        help='parameters P for computing the torque (learning.initial_estimate; for a URDF, with '
+        'and without its payload)',
     )
     option(
         '--torque-fraction',
@@ -282,34 +283,34 @@ def _excite_options(parser: argparse.ArgumentParser) -> None:
         help='fraction of limits.velocity and limits.acceleration to use; the rest is for the '
         'approach (0.95)',
     )
-    option('--harmonics', type=int, default=3, help='of the window (3)')
+    option('--harmonics', type=int, default=3, help='number of harmonics of the window (3)')
     option('--starts', type=int, default=4, help='number of searches; the best result is kept (4)')
-    option('--seed', type=int, default=0, help='of the starts (0)')
-    option('--radius', type=float, default=0.07, help='of the links of a URDF [m] (0.07)')
-    option('--floor', type=float, default=0.0, help='height of the floor in the base [m] (0)')
+    option('--seed', type=int, default=0, help='seed of the searches (0)')
+    option('--radius', type=float, default=0.07, help='radius of the links of a URDF [m] (0.07)')
+    option('--floor', type=float, default=0.0, help='height of the floor in the base frame [m] (0)')
 
 
 def _identify_options(parser: argparse.ArgumentParser) -> None:
     option = parser.add_argument
     option('bag', type=Path, help=_BAG_OF_ANY_KIND)
-    option('--urdf', required=True, help='URDF: a file, package://name/path, or a file of config/')
+    option('--urdf', required=True, help='URDF: a file, package://name/path, or a file in config/')
     option('--out', type=Path, required=True, help='URDF to write')
     _force(parser)
-    option('--base', default='', help='link that stands still (the root)')
-    option('--tip', default='', help='last link (of the last joint in the bag)')
+    option('--base', default='', help='fixed link (the root)')
+    option('--tip', default='', help='last link (that of the last joint in the bag)')
     option(
         '--gravity',
         type=float,
         nargs=3,
         default=(0.0, 0.0, -9.81),
         metavar=('X', 'Y', 'Z'),
-        help='in the base [m/s^2] (0 0 -9.81)',
+        help='gravity in the base frame [m/s^2] (0 0 -9.81)',
     )
     option(
         '--payload',
         type=float,
         default=3.0,
-        help='mass that may hang on the last link beside what the URDF has [kg] (3)',
+        help='largest mass on the last link that is not in the URDF [kg] (3)',
     )
     _map(parser)
     _namespace(parser)
@@ -320,7 +321,7 @@ def _monte_carlo_options(parser: argparse.ArgumentParser) -> None:
     option = parser.add_argument
     option('--config', default='monte_carlo', help='study file, or a preset (monte_carlo)')
     option('--runs', type=int, help='number of runs (as configured)')
-    option('--seed', type=int, help='of the study (as configured)')
+    option('--seed', type=int, help='seed of the study (as configured)')
     option(
         '--engine',
         choices=('processes', 'threads', 'dask', 'mpi'),

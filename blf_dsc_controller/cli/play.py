@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc replay --play`: a bag over ROS, until its end or Ctrl-C."""
+"""`blf_dsc replay --play`: play a bag over ROS until its end or Ctrl-C."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _REMAP = re.compile(rf'(?:\w+:)?{_NAME}:=(?:{_NAME}|/)')
 
 
 def play(options: Namespace) -> None:
-    """Play a bag as PlayerNode does, after subscribers had `delay` [s] to be found.
+    """Play a bag with PlayerNode, after `delay` [s] for the discovery of subscribers.
 
     Raises:
-        BlfDscError: an option is out of range, or as PlayerNode.
+        BlfDscError: an option is out of range, or PlayerNode rejects the bag.
     """
     _check(options)
     words = [word for remap in options.remap for word in ('--remap', remap)]
@@ -77,7 +77,7 @@ def _check(options: Namespace) -> None:
 
 def _announce(node: PlayerNode, options: Namespace) -> None:
     rate = f'at rate {options.rate:g}' if options.rate else 'as fast as possible'
-    again = ', again and again' if options.loop else ''
+    again = ', in a loop' if options.loop else ''
     name, seconds = node.get_fully_qualified_name(), (node.end - node.begin) * 1e-9
     print(f'{name} plays {seconds:.3f} s of {options.bag} {rate}{again}:')
     for output in node.outputs:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc precompile`: the machine code of a configuration's kernels, before its nodes need it."""
+"""`blf_dsc precompile`: compile the kernels of a configuration before its nodes need them."""
 
 from __future__ import annotations
 
@@ -15,10 +15,7 @@ from sim_plant.plant import plant_of
 
 
 def precompile(options: argparse.Namespace) -> None:
-    """Compile what the controller and the simulated plant of a configuration call.
-
-    Both compile at the same time, each in its process.
-    """
+    """Compile the kernels of a configuration's controller and plant, in two parallel processes."""
     config = load_loop(options.config)
     with ProcessPoolExecutor(2, get_context('spawn')) as pool:
         jobs = [
@@ -27,7 +24,7 @@ def precompile(options: argparse.Namespace) -> None:
         ]
         for job in jobs:
             job.result()
-    print(f'{options.config}: the kernels are compiled, and nodes of this user start at once')
+    print(f'{options.config}: the kernels are compiled; the nodes of this user now start at once')
 
 
 def _compile_law(config: ControllerConfig) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress of a running loop, or of a bag that is played, in one line."""
+"""One-line progress of a running loop or of a bag being played."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from sim_plant.plant import parameter_order, parameters_of
 
 _FORMAT = '{desc} |{bar}| {n:.1f}/{total:g} s [{elapsed}<{remaining}]{postfix}'
-_LINE_PERIOD = 10.0  # s between two lines where there is no terminal to draw a bar on
+_LINE_PERIOD = 10.0  # s between two lines if stderr is not a terminal
 
 
 class Progress:
-    """Progress over time: a bar on a terminal; elsewhere, such as in a log, a line now and then."""
+    """Progress over time: a bar on a terminal, otherwise (as in a log) a line every few seconds."""
 
     def __init__(self, title: str, seconds: float) -> None:
-        """Begin at 0 of so many seconds; 0 if the end is open."""
+        """Begin at 0 of `seconds`, which is 0 if the end is open."""
         self._title, self._seconds = title, seconds
         self._line = ''
         self._due = time.monotonic() + _LINE_PERIOD
@@ -35,7 +35,7 @@ class Progress:
         )
 
     def show(self, elapsed: float, status: str = '') -> None:
-        """Show the time [s] that has been reached, and a few words."""
+        """Show the elapsed time [s] and a short status."""
         self._bar.set_postfix_str(status, refresh=False)
         self._bar.update(min(elapsed, self._seconds) - self._bar.n)
         self._line = f'{self._title} {elapsed:.1f}/{self._seconds:g} s' + (status and f', {status}')
@@ -43,12 +43,12 @@ class Progress:
             self._print_line()
 
     def write(self, text: str) -> None:
-        """Print a line beside the bar."""
+        """Print a line without disturbing the bar."""
         self._bar.write(text, file=sys.stderr)
         sys.stderr.flush()
 
     def close(self) -> None:
-        """Leave the bar, or a last line, as it is."""
+        """Close the bar, or print the last line."""
         self._bar.close()
         self._print_line()
 
@@ -73,6 +73,6 @@ class LoopProgress(Progress):
         P = parameters_of(self._config, elapsed)[self._order]
         error = np.linalg.norm(np.asarray(estimate) - P) / np.linalg.norm(P)
         status = f'max|xi1|/bound {ratio:.2f}'
-        if np.all(self._order >= 0) and not self._config.robot.urdf:  # else it has no unit
+        if np.all(self._order >= 0) and not self._config.robot.urdf:  # else P has mixed units
             status += f', parameter error {100 * error:.2f} %'
         self.show(elapsed, status)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc replay`: a bag through the controller again: verify, what-if, learn or play."""
+"""`blf_dsc replay`: run a bag through the controller again: verify, what-if, learn or play."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from blf_dsc_controller.replay.verify import Verification, verify
 from blf_dsc_controller.replay.what_if import WhatIf, what_if
 
 DIFFERENT = 3
-"""Exit code where the replay differs from the bag."""
+"""Exit code if the replay differs from the bag."""
 
 PARTIAL = 4
-"""Exit code where the replay is equal as far as it goes, but not all outputs could be compared."""
+"""Exit code if all compared outputs are equal, but some outputs could not be compared."""
 
 
 def replay(options: Namespace) -> int:
-    """Replay a bag in the mode that the options choose, and print the result."""
+    """Replay a bag in the mode selected by the options, and print the result."""
     if options.play and options.map:
-        raise BlfDscError('--map has no effect on --play: rename topics by --remap')
+        raise BlfDscError('--map has no effect on --play: rename topics with --remap')
     if options.play:
         require_ros()
         from blf_dsc_controller.cli.play import play
@@ -97,13 +97,13 @@ def _verification(result: Verification) -> Iterator[str]:
         yield f'{one.topic}: {one.values} values {verdict}{left_out}'
     types = [one.type for one in result.events]
     for type_, what in (
-        (EventType.PARAMETERS, 'changes of parameters'),
+        (EventType.PARAMETERS, 'parameter changes'),
         (EventType.TRAJECTORY, 'trajectories'),
     ):
         if type_ in types:
             yield f'{types.count(type_)} {what} replayed where they took effect'
     if len(result.turns) > 1:
-        yield f'replayed in turn: {", ".join(result.turns)}'
+        yield f'replayed in order: {", ".join(result.turns)}'
     if result.safe_torques:
         yield f'{result.safe_torques} of the commands are safe torques, or on the ramp to one'
     if result.passed_over:
@@ -129,7 +129,7 @@ def _open_loop(found: WhatIf, config: ControllerConfig) -> Iterator[str]:
     for i, joint in enumerate(config.joints):
         known = found.difference[np.isfinite(found.difference[:, i]), i]
         difference = (
-            f'differs from the recorded by rms {np.sqrt(np.mean(known**2)):.4g}, '
+            f'differs from the recorded one by rms {np.sqrt(np.mean(known**2)):.4g}, '
             f'max {np.abs(known).max():.4g} N m'
             if known.size
             else 'cannot be compared: no torque was recorded'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc run`: plant, controller and recorder in one command, with a bag and pictures of it."""
+"""`blf_dsc run`: run plant, controller and recorder, and leave a bag and pictures of the run."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ from blf_dsc_controller.supervision.supervisor import Reason
 from blf_dsc_controller.view.address import LOCAL, free_port, open_to_others, require_viser
 
 STOPPED = 5
-"""Exit code where the controller stopped before the end."""
+"""Exit code if the controller stopped before the end."""
 
 _FOLDER = 'closed_loop'
-_DURATION = 60.0  # s, where neither the file nor an option gives one
+_DURATION = 60.0  # s, if neither the file nor an option sets it
 _PARAMETERS_TIMEOUT = 60.0  # s; a bag without its configuration cannot be replayed
 
 
 def run(options: Namespace) -> int:
-    """Run the closed loop into a new folder."""
+    """Run the closed loop and write the results to a new folder."""
     config = _configuration(options)
     if not options.offline:
         require_ros()
@@ -69,9 +69,9 @@ def run(options: Namespace) -> int:
 
 
 def make_folder(chosen: Path | None) -> Path:
-    """Make the chosen folder, or else the first free one of closed_loop, closed_loop-2 ...
+    """Create the chosen folder, or the first free one of closed_loop, closed_loop-2, ...
 
-    Raises BlfDscError if the chosen one exists already, or if it cannot be made.
+    Raises BlfDscError if the chosen one exists already, or if it cannot be created.
     """
     for number in itertools.count(1):
         path = chosen or Path(_FOLDER if number == 1 else f'{_FOLDER}-{number}')
@@ -90,10 +90,10 @@ def make_folder(chosen: Path | None) -> Path:
 
 
 def _configuration(options: Namespace) -> LoopConfig:
-    """Configuration of the three nodes, from the file and the options that override it.
+    """Return the configuration of the three nodes, from the file and the overriding options.
 
-    Raises StartError or MotionError if the controller would reject the true start, and
-    prints warnings.
+    Prints configuration warnings, and raises StartError or MotionError if the controller would
+    reject the true start.
     """
     chosen = {'duration': options.duration, 'mode': options.mode, 'seed': options.seed}
     given = {name: value for name, value in chosen.items() if value is not None}
@@ -134,7 +134,7 @@ def _run_offline(config: LoopConfig, bag: Path) -> None:
 
 
 def _run_over_ros(config: LoopConfig, out: Path, options: Namespace) -> bool:
-    """Run the three nodes; False if a signal ended the run."""
+    """Run the three nodes; return False if a signal ended the run."""
     from blf_dsc_controller.cli.session import run_session
 
     return run_session(config, out, options.domain, options.view_host if options.view else '')
@@ -144,7 +144,7 @@ def _check_view(options: Namespace) -> None:
     """Raise BlfDscError if the page cannot be served; warn if others can open it."""
     if options.offline:
         raise BlfDscError(
-            '--view shows what runs over ROS: leave out --offline, or look at the bag afterwards '
+            '--view shows a run over ROS: leave out --offline, or look at the bag afterwards '
             '(blf_dsc view OUT/bag)'
         )
     require_viser()
@@ -154,7 +154,7 @@ def _check_view(options: Namespace) -> None:
 
 
 def print_notice(notice: str) -> None:
-    """Print what is not a part of the results."""
+    """Print a notice to stderr, since it is not part of the results."""
     print(notice, file=sys.stderr, flush=True)
 
 
@@ -168,5 +168,5 @@ def _report(out: Path) -> bool:
     for topic, text in read_context(out / 'bag').losses.items():
         print(f'warning: messages of {topic} are missing in the bag: {text}')
     print(f'wrote       {out}: bag, summary.json, {", ".join(path.name for path in pictures)}')
-    last = recorded.stamp[-1]  # after it the plant has ended, and the controller waits in vain
+    last = recorded.stamp[-1]  # the plant ends after it, so the controller times out
     return any(stop.stamp < last or stop.reason != Reason.STATE_TIMEOUT for stop in recorded.stops)

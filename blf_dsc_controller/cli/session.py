@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One run over ROS: plant, controller and recorder as processes, from their start to their end."""
+"""One run over ROS, with plant, controller and recorder as processes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from blf_dsc_controller.messages.topics import RATIO
 from blf_dsc_controller.nodes.endpoints import qos_profile
 from blf_dsc_controller.view.address import free_port, url_of
 
-# In the order in which they start. They end in reverse: the recorder last, to get every message.
+# Started in this order and stopped in reverse, so that the recorder gets every message.
 _MODULES = {
     RECORDER: 'blf_dsc_controller.nodes.recorder_node',
     CONTROLLER: 'blf_dsc_controller.nodes.controller_node',
@@ -40,24 +40,24 @@ _MODULES = {
     VIEW: 'blf_dsc_controller.view.node',  # only on request, once the loop runs
 }
 _MIDDLEWARE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
-_DOMAINS = range(1, 101)  # 0 is the default; above 101 are the ports that the system hands out
-_FIRST_SIGN = 5.0  # s, at most, until a running loop is seen to run, also on a busy machine
-_LAST = 1.0  # s without a message after which no more is expected, also on a busy machine
-_LINGER = 0.5  # s for the messages of a loop that is being interrupted and still runs
-_ENDING = 20.0  # s that a node may take to end before it is killed
+_DOMAINS = range(1, 101)  # 0 is the default; above 101, ports are ephemeral
+_FIRST_SIGN = 5.0  # s, at most, to the first message of a running loop, even on a busy machine
+_LAST = 1.0  # s without a message after which none is expected, even on a busy machine
+_LINGER = 0.5  # s to wait for messages of an interrupted loop that still runs
+_ENDING = 20.0  # s that a node may take to exit before it is killed
 _TAIL = 12  # lines of a failed node's log that are shown
-_ROOM = 1_000_000  # bytes that a log needs at least
+_ROOM = 1_000_000  # bytes; with less free space the disk counts as full
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)  # loaded before there are threads
-_VIEW_PORT = 8080  # or the next one that is free
+_VIEW_PORT = 8080  # or the next free one
 
 
 def run_session(config: LoopConfig, out: Path, domain: int | None, view_host: str = '') -> bool:
     """Run the three nodes on `out/config.yaml` until the plant has ended.
 
-    In a ROS domain of its own, unless one is given, and with a page at `view_host`, unless that is
-    empty. Returns False if SIGINT or SIGTERM ended the run; raises NodeFailedError if a node ended
-    with an error.
+    They run in a ROS domain of their own unless `domain` is given, and with a page at `view_host`
+    unless that is empty. Returns False if SIGINT or SIGTERM ended the run; raises NodeFailedError
+    if a node exited with an error.
     """
     logs = out / 'logs'
     logs.mkdir()
@@ -81,9 +81,9 @@ def run_session(config: LoopConfig, out: Path, domain: int | None, view_host: st
 
 @contextmanager
 def _environment(values: dict[str, str]) -> Iterator[None]:
-    """Change the environment of this process and its children for a while.
+    """Temporarily change the environment of this process and its children.
 
-    Whoever called this from Python must not be left in a domain that another run may take next.
+    A caller in Python must not stay in a domain that the next run may claim.
     """
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
@@ -98,13 +98,13 @@ def _environment(values: dict[str, str]) -> Iterator[None]:
 
 @contextmanager
 def own_domain() -> Iterator[int]:
-    """Hold a ROS domain that no other run on this machine holds; BlfDscError if none is free."""
+    """Claim a ROS domain that no other run on this machine holds; BlfDscError if none is free."""
     first = os.getpid() % len(_DOMAINS)
     with socket.socket(socket.AF_UNIX) as claim:
         for domain in (*_DOMAINS[first:], *_DOMAINS[:first]):
             try:
                 claim.bind(f'\0blf_dsc_controller domain {domain}')
-            except OSError:  # held by another process; the system releases it when that ends
+            except OSError:  # held by another process, and released when that exits
                 continue
             yield domain
             return
@@ -112,18 +112,18 @@ def own_domain() -> Iterator[int]:
 
 
 class NodeFailedError(BlfDscError):
-    """A node ended with an error of its own."""
+    """A node exited with an error."""
 
 
 class NodeProcess:
-    """One node in a process of its own, which does not outlive this one."""
+    """A node in its own process, which does not outlive this one."""
 
     def __init__(self, name: str, params_file: Path, logs: Path, *arguments: str) -> None:
         self.name = name
         self._log = logs / f'{name}.log'
         command = [sys.executable, '-m', _MODULES[name], '--ros-args', '--params-file']
         with self._log.open('wb') as output:
-            # A session of its own: Ctrl-C reaches the parent alone, which ends the nodes in order.
+            # In its own session: Ctrl-C reaches only the parent, which stops the nodes in order.
             self._process = subprocess.Popen(
                 [*command, str(params_file), *arguments],
                 stdin=subprocess.DEVNULL,
@@ -141,24 +141,24 @@ class NodeProcess:
 
     @property
     def is_compiling(self) -> bool:
-        """Whether the node has said that it compiles the kernels."""
+        """Whether the node has reported that it compiles the kernels."""
         return COMPILATION_NOTICE in self._log.read_text(encoding='utf-8', errors='replace')
 
     def check(self, remark: str = '') -> None:
-        """Raise NodeFailedError, with the end of the log, if the node ended with an error."""
+        """Raise NodeFailedError, with the end of the log, if the node exited with an error."""
         code = self._process.poll()
         if not code:
             return
         names = {int(number): number.name for number in signal.Signals}
-        end = f'ended with exit code {code}'
+        end = f'exited with code {code}'
         if code < 0:
-            end = f'was ended by {names.get(-code, f"signal {-code}")}'
+            end = f'was terminated by {names.get(-code, f"signal {-code}")}'
         lines = self._log.read_text(encoding='utf-8', errors='replace').splitlines()[-_TAIL:]
         tail = ''.join(f'\n  {line}' for line in lines)
-        raise NodeFailedError(f'{self.name} {end}{remark}:{tail}\n(its whole log: {self._log})')
+        raise NodeFailedError(f'{self.name} {end}{remark}:{tail}\n(full log: {self._log})')
 
     def stop(self) -> None:
-        """Interrupt the node and wait for its end; kill it if it takes too long."""
+        """Interrupt the node and wait until it exits; kill it if it takes too long."""
         if self.is_running:
             self._process.send_signal(signal.SIGINT)
         try:
@@ -169,7 +169,7 @@ class NodeProcess:
 
 
 class Monitor:
-    """Shows the progress of the loop that runs in this process's ROS domain."""
+    """Progress display of the loop that runs in this process's ROS domain."""
 
     def __init__(self, config: LoopConfig, interrupts: Sequence[int]) -> None:
         plant = config.plant
@@ -190,11 +190,11 @@ class Monitor:
 
     @property
     def has_begun(self) -> bool:
-        """Whether the loop has been seen to run."""
+        """Whether a message of the loop has been received."""
         return self._start >= 0.0
 
     def wait(self, seconds: float) -> bool:
-        """Wait for a message and show it; False if none came."""
+        """Wait for a message and show it; return False if none arrived."""
         self._executor.spin_once(timeout_sec=seconds)
         message, self._latest = self._latest, None
         if message is None:
@@ -220,9 +220,9 @@ class Monitor:
         rclpy.try_shutdown(context=self._context)
 
     def _receive_last(self) -> None:
-        """Show what is still on its way, up to the message of the last sample.
+        """Show the messages still in transit, up to that of the last sample.
 
-        A short run in lock-step may be over before its controller has been found.
+        A short run in lock-step may be over before its controller has been discovered.
         """
         wait = _LAST if self.has_begun else _FIRST_SIGN
         wait = _LINGER if self._interrupts else wait
@@ -275,11 +275,11 @@ def _monitor(
     interrupts: list[int],
     show: Callable[[], str] | None,
 ) -> str:
-    """Show the progress until the plant ends or a signal comes; return a remark on the recorder.
+    """Show the progress until the plant exits or a signal arrives; return a note on the recorder.
 
-    A loop that has begun continues without its recorder; its first message may come a little later.
-    Only then `show` starts the page and returns its address: the nodes wait for a subscriber, which
-    is to be the recorder.
+    A loop that has begun continues without its recorder; its first message may arrive a bit later.
+    `show` starts the page and returns its address; it is called only after that message, since the
+    nodes wait for a subscriber, which must be the recorder.
     """
     recorder, *loop = nodes
     ended, warned, announced = inf, False, False

@@ -28,7 +28,7 @@ from blf_dsc_controller.monte_carlo.store import Span, Store, require_pyarrow
 from blf_dsc_controller.monte_carlo.study import load_study
 from blf_dsc_controller.paper.report import compare
 
-_PAUSE_IN_A_LOG = 10.0  # s between two states of the bar
+_PAUSE_IN_A_LOG = 10.0  # s between two updates of the bar
 
 
 def paper(options: Namespace) -> None:
@@ -39,7 +39,7 @@ def paper(options: Namespace) -> None:
 
 
 def arms(options: Namespace) -> None:
-    """Tune and run every law on arms of URDFs, write the page and print who is best at what."""
+    """Tune and run every law on URDF arms, write the page and print the best law of each figure."""
     folder = make_folder(options.out)
     with announced_compilation(print_notice):
         rows = compare_arms(folder, options.config, options.truths, options.generations)
@@ -49,7 +49,7 @@ def arms(options: Namespace) -> None:
 
 
 def monte_carlo(options: Namespace) -> None:
-    """Reproduce one run, report a study, or compute what is missing of it and report it."""
+    """Reproduce one run, report a study, or compute its missing runs and report it."""
     if options.reproduce:
         _reproduce(Path(options.reproduce[0]), options.reproduce[1], options.out)
     elif options.report:
@@ -108,7 +108,7 @@ def _report(store: Store) -> None:
 def _reproduce(folder: Path, index: str, out: Path | None) -> None:
     store = Store(folder)
     if not index.isdecimal():
-        raise BlfDscError(f'--reproduce: got run {index!r}, but its number is expected')
+        raise BlfDscError(f'--reproduce: expected the number of a run, got {index!r}')
     chosen = make_folder(out or Path(f'{folder.name}-run-{index}'))
     print(format_table(reproduce(store, int(index), chosen)))
     print(f'the same figures as in {folder}, bit for bit')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc view`: the page of a running system, or of a bag."""
+"""`blf_dsc view`: serve the page of a running system or of a bag."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def view(options: Namespace) -> int:
     page = Page(options.host, options.port)
     try:
         player = BagPlayer(page, options.bag, options.namespace, NameMap.parse(options.map))
-        print(f'{options.bag} is on {page.url}  (Ctrl-C ends it)', flush=True)
+        print(f'{options.bag} is shown at {page.url}  (Ctrl-C to quit)', flush=True)
         if options.host not in LOCAL:
             print(f'warning: {open_to_others(options.host)}', file=sys.stderr)
         player.play()

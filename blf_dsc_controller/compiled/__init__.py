@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compilation of the numerical kernels: jit with its cache, views on flat vectors."""
+"""Compilation of the numerical kernels: jit with its cache, views of flat vectors."""

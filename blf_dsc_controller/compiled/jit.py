@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compilation of the numerical kernels, with a cache that knows what each depends on.
+"""Compilation of the numerical kernels, with a cache that tracks their dependencies.
 
 Numba keys a cached function by the contents of its own file, not by those of the functions it
 calls in other files, so an edit there would leave stale machine code behind.  Here the cache folder
 of a kernel is named after a digest of every source file it is compiled from and of the constants it
-uses: an edit compiles afresh what depends on it, and a reinstall finds the old cache again.
+uses: an edit recompiles what depends on it, and a reinstall finds the existing cache.
 
-Where nothing can be written below the home folder, the cache is in the folder for temporary files.
+If the user's cache folder is not writable, the cache is in the folder for temporary files.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ INLINED = {
     'no_cfunc_wrapper': True,
     'pipeline_class': LinkedCompiler,
 }
-"""Compiler options of functions that are compiled into kernels."""
+"""Compiler options for functions that are compiled into kernels."""
 
 _PACKAGES = ('blf_dsc_controller.', 'sim_plant.')
 _ROOM = Path(__file__).resolve().parents[1]
@@ -47,7 +47,7 @@ _METHODS: dict[str, list[Callable[..., object]]] = {}  # by name, see `compile_m
 
 
 def dependencies(function: Callable[..., object]) -> tuple[set[Path], set[str]]:
-    """Source files that a kernel is compiled from, and the constants in it as `name=value`."""
+    """Return the source files of a kernel, and the constants in it as `name=value`."""
     files, constants = set(_IN_EVERY_KERNEL), set()
     pending: list[tuple[str, Any]] = [('', function)]
     seen: list[object] = []
@@ -67,7 +67,7 @@ def dependencies(function: Callable[..., object]) -> tuple[set[Path], set[str]]:
 
 
 def _globals_of(function: FunctionType) -> Iterator[tuple[str, object]]:
-    """What a function names, with what it names of the modules it names."""
+    """Yield the globals that a function uses, and what it uses of the package's modules."""
     names = function.__code__.co_names
     for name in names:
         value = function.__globals__.get(name)
@@ -79,7 +79,7 @@ def _globals_of(function: FunctionType) -> Iterator[tuple[str, object]]:
 
 
 def cache_folder(function: Callable[..., object]) -> Path:
-    """Folder of a kernel's machine code, below NUMBA_CACHE_DIR or else the user's cache."""
+    """Return the folder of a kernel's machine code, in NUMBA_CACHE_DIR or else the user's cache."""
     files, constants = dependencies(function)
     digest = hashlib.sha256(' '.join([numba.__version__, *sorted(constants)]).encode())
     for source in sorted(files):
@@ -102,7 +102,7 @@ def _base() -> Path:
         pass
     try:
         return _writable(Path(tempfile.gettempdir(), f'blf_dsc_controller-{os.getuid()}'))
-    except OSError:  # another user's
+    except OSError:  # owned by another user
         return Path(tempfile.mkdtemp(prefix='blf_dsc_controller-'))
 
 
@@ -115,21 +115,21 @@ def _writable(folder: Path) -> Path:
 
 
 def inner(function: F) -> F:
-    """Let kernels call `function`, which is compiled into them; in Python it stays what it is."""
+    """Let kernels call `function`, which is compiled into them; in Python it is unchanged."""
     register_jitable(**INLINED)(function)
     return function
 
 
 def called(function: F) -> F:
-    """Let kernels call `function` without inlining it: for large ones, which compile faster so."""
+    """Let kernels call `function` without inlining it: large functions compile faster this way."""
     register_jitable(**INLINED | {'forceinline': False})(function)
     return function
 
 
 def compile_methods(interface: type, names: Sequence[str], *types: type) -> None:
-    """Let kernels call these methods of named tuples: of the type at hand, and of no other.
+    """Let kernels call these methods of named tuples; only those of the actual type are compiled.
 
-    `interface` declares them, `types` implement them: a kernel depends on the files of all.
+    `interface` declares them, `types` implement them; a kernel depends on the files of all types.
     """
     for name in names:
         _METHODS.setdefault(name, []).extend(getattr(one, name) for one in types)
@@ -145,7 +145,7 @@ def _compile_method(name: str, signature: inspect.Signature) -> None:
 
 
 def kernel(function: F) -> F:
-    """Compile `function`, which Python calls: IEEE arithmetic (no fast-math), cached."""
+    """Compile `function` for calls from Python: IEEE arithmetic (no fast-math), cached."""
     before = config.CACHE_DIR
     config.CACHE_DIR = str(cache_folder(function))
     try:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flat vectors with named parts, each described once: by the annotated fields of a `NamedTuple`.
+"""Flat vectors with named parts, each described once, by the annotated fields of a `NamedTuple`.
 
-Kernels take one float64 vector for all settings, one for the whole state, and so on: handing over
+Kernels take one float64 vector for all settings, one for the whole state, and so on: passing
 many arrays would cost more than a step.  A `NamedTuple` names the parts of such a vector, in order:
 
     class State(NamedTuple):
@@ -15,11 +15,11 @@ many arrays would cost more than a step.  A `NamedTuple` names the parts of such
     state = state_of(vector, settings)  # in Python and in kernels alike; nothing is copied
 
 Lengths are expressions in the attributes of the second argument, here `settings.n`, `settings.m`
-and `settings.N`; `'actuator.delay'` works as well, and any named tuple or object serves (a named
+and `settings.N`; `'actuator.delay'` works as well, and any named tuple or object will do (a named
 tuple in kernels).  Fields of type `int` and `float` are numbers, read when the view is made.  An
-`int` field of the layout itself serves as a length, too; with all of them in the vector the view
-takes the vector alone, and `pack` of the tuple makes it.  A field may be a `NamedTuple` with a
-layout itself.  A field of any other type is in no vector: the view takes it as a further argument.
+`int` field of the layout itself can also be a length; if the vector holds all lengths, the view
+takes the vector alone, and `pack` makes it from the tuple.  A field may itself be such a
+`NamedTuple`.  A field of any other type is not in the vector: the view takes it as an argument.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from blf_dsc_controller.compiled.views import part
 
 Array = np.ndarray
 Cell = Annotated[Array, '1']
-"""One number of a vector that kernels write."""
+"""One number of a vector, which kernels can write."""
 
 T = TypeVar('T')
 
@@ -46,7 +46,7 @@ _hints: Callable[[Any], dict[str, Any]] = functools.cache(
 
 
 def pack(layout: Any) -> np.ndarray:
-    """Vector of a layout's numbers and arrays (or sequences), in the order of its fields."""
+    """Return the vector of a layout's numbers and arrays (or sequences), in field order."""
     parts = [
         pack(getattr(layout, name))
         if hasattr(hint, '_fields')
@@ -58,13 +58,13 @@ def pack(layout: Any) -> np.ndarray:
 
 
 def size_of(layout: type) -> Callable[..., int]:
-    """Function of the lengths (see above) that returns the size of a layout's vector."""
+    """Return a function of the lengths (see above) that computes the size of a layout's vector."""
     size: Callable[..., int] = _defined('_sizes', f'return {" + ".join(_sizes(layout))}', {})
     return size
 
 
 def view_of(layout: type[T]) -> Callable[..., T]:
-    """Function of a vector, and of the lengths where they are not in it, that returns the layout.
+    """Return a function of a vector, and of lengths not in it, that returns the layout.
 
     Kernels may call it; its arrays are views that must not outlive the vector (`views.part`).
     """
@@ -85,7 +85,7 @@ def view_of(layout: type[T]) -> Callable[..., T]:
 def _view(
     layout: type, own: tuple[str, ...], lines: list[str], names: dict[str, Any], prefix: str
 ) -> str:
-    """Append the reading of each field to `lines` and return the call that builds the tuple."""
+    """Append code that reads each field to `lines` and return the call that builds the tuple."""
     names[f'{prefix}{layout.__name__}'] = layout
     values = []
     for name, hint in _hints(layout).items():
@@ -117,7 +117,7 @@ def _is_part(hint: Any) -> bool:
 
 
 def _length(expression: object, own: tuple[str, ...]) -> str:
-    """Length with each name read from `_sizes`, unless it is one of the layout's own."""
+    """Return the length with names read from `_sizes`, except for the layout's own."""
 
     class FromSizes(ast.NodeTransformer):
         def visit_Name(self, node: ast.Name) -> ast.expr:
@@ -133,7 +133,7 @@ def _product(lengths: list[str]) -> str:
 
 
 def _defined(arguments: str, body: str, names: dict[str, Any]) -> Any:
-    """Python function of generated source."""
+    """Return the Python function of a generated source."""
     source = f'def generated({arguments}):\n    {body}\n'
-    exec(source, names)  # noqa: S102 - generated above, of the package's own annotations
+    exec(source, names)  # noqa: S102 - generated above, from the package's own annotations
     return names['generated']

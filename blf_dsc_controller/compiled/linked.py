@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Functions that are compiled into kernels, and not by themselves.
+"""Compilation of functions into kernels only, not on their own.
 
-Numba optimises every function that a kernel calls and makes machine code of it, before it links it
-into its caller, which it optimises anew: what is called five calls deep is compiled six times.
-Here such a function is translated only, and the kernel optimised as a whole: in 0.6 of the time.
+Numba optimises every function that a kernel calls and generates machine code for it before linking
+it into its caller, which it optimises again: a function five calls deep is compiled six times.
+Here such a function is only translated, and the kernel optimised as a whole, in 0.6 of the time.
 
-It also counts the references to every array of every tuple that a function is called with, which is
-more than half of the code that LLVM then has to remove. Here nothing is counted: in half the time.
+Numba also counts the references to every array in every tuple argument, which makes up more than
+half of the code, for LLVM to remove again. Here nothing is counted, which halves the time.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from numba.core.types import NumPyRandomGeneratorType
 
 _ENVIRONMENT = '_ZN08NumbaEnv'
 _ALLOCATORS = ('NRT_Allocate', 'NRT_MemInfo_alloc')
-_INTERNAL: dict[object, object] = {}  # numba's own functions, compiled so
+_INTERNAL: dict[object, object] = {}  # numba's own functions, compiled this way
 
 
 class _Linked(JITCodeLibrary):  # type: ignore[misc]
     """LLVM code of a function for its callers; it has no machine code and no address."""
 
     def _optimize_final_module(self) -> None:
-        """Leave it to the kernel."""
+        """Do nothing: this is left to the kernel."""
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
@@ -46,13 +46,13 @@ class _Linked(JITCodeLibrary):  # type: ignore[misc]
         return self
 
     def set_env(self, _name: str, _environment: object) -> None:
-        """Leave it to the kernel."""
+        """Do nothing: this is left to the kernel."""
 
 
 def _without_reference_counts(state: Any) -> None:
     """Compile without counting the references to arrays.
 
-    Whoever calls a kernel keeps its arrays; a kernel allocates none, as nothing would free it.
+    The caller of a kernel keeps its arrays alive; a kernel allocates none: nothing would free it.
     """
     state.targetctx = state.targetctx.subtarget(enable_nrt=False)
     state.targetctx.cached_internal_func = _INTERNAL
@@ -73,11 +73,11 @@ class _LowerKernel(NativeLowering):  # type: ignore[misc]
     _name = 'lower_kernel'
 
     def run_pass(self, state: Any) -> bool:
-        """Let the functions in a kernel find their environments, too."""
+        """Lower a kernel, and set the environments of the functions in it."""
         counting = state.targetctx
         _without_reference_counts(state)
         if any(isinstance(one, NumPyRandomGeneratorType) for one in state.args):
-            # It is allocated for the call, and freed by what counts references.
+            # It is allocated for the call, and freed by the wrapper that counts references.
             state.targetctx.create_cpython_wrapper = counting.create_cpython_wrapper
         changed = bool(super().run_pass(state))
         library = state.library
@@ -103,18 +103,18 @@ class _Compiler(CompilerBase):  # type: ignore[misc]
 
 
 class LinkedCompiler(_Compiler):
-    """Of a function that only kernels call."""
+    """Compiler of a function that only kernels call."""
 
     lowering = _LowerLinked
 
 
 class KernelCompiler(_Compiler):
-    """Of a kernel."""
+    """Compiler of a kernel."""
 
     lowering = _LowerKernel
 
     def compile_extra(self, function: Any) -> Any:
-        """Compile without looking for garbage meanwhile: a tenth of the time."""
+        """Compile without garbage collection, which would take a tenth of the time."""
         enabled = gc.isenabled()
         gc.disable()
         try:

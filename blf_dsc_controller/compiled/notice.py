@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A notice when kernels are compiled: a wait that would look like a hang."""
+"""Notice that kernels are being compiled, since the wait would look like a hang."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class _Listener(event.Listener):  # type: ignore[misc]
 
 
 def announced_compilation(say: Callable[[str], object]) -> AbstractContextManager[object]:
-    """Say a notice, once, if anything is compiled in this context that is not in the cache.
+    """Call `say` once with a notice if anything not in the cache is compiled in this context.
 
-    Only numba knows: kernels have a version for each type of arguments, and another install of the
-    same sources has entries of its own in the same cache.
+    Only numba knows this: a kernel has a version for each type of arguments, and another install of
+    the same sources has its own entries in the same cache.
     """
     listener: AbstractContextManager[object] = event.install_listener(
         'numba:compile', _Listener(say)

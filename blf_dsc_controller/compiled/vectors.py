@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Vectors of three as tuples, which kernels keep in registers."""
+"""Vectors of three entries as tuples, which kernels keep in registers."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ Vector = tuple[float, float, float]
 
 @inner
 def vector(a: np.ndarray) -> Vector:
-    """Vector of an array (3,)."""
+    """Return an array (3,) as a vector."""
     return a[0], a[1], a[2]
 
 
@@ -22,29 +22,29 @@ def put(a: Vector, out: np.ndarray) -> None:
 
 @inner
 def plus(a: Vector, b: Vector) -> Vector:
-    """Sum."""
+    """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @inner
 def times(k: float, a: Vector) -> Vector:
-    """Product with a number."""
+    """Return k a."""
     return k * a[0], k * a[1], k * a[2]
 
 
 @inner
 def cross(a: Vector, b: Vector) -> Vector:
-    """Cross product."""
+    """Return the cross product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @inner
 def dot(a: Vector, b: Vector) -> float:
-    """Scalar product."""
+    """Return the scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @inner
 def product(A: np.ndarray, b: Vector) -> Vector:
-    """Product of a matrix (3, 3) and a vector."""
+    """Return the product of a matrix (3, 3) and a vector."""
     return dot(vector(A[0]), b), dot(vector(A[1]), b), dot(vector(A[2]), b)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Views on parts of vectors without reference counting in compiled code.
+"""Views of parts of vectors, without reference counting in compiled code.
 
 Numba counts the references to every slice of an array with an atomic operation, and checks every
 slice and reshape, which in a step of a few hundred floating point operations costs more than the
-arithmetic. The vectors of a kernel belong to its caller, who keeps them alive during the call, and
-their layout is fixed, so nothing needs counting or checking.
+arithmetic. The vectors of a kernel belong to its caller, which keeps them alive during the call,
+and their layout is fixed, so nothing needs counting or checking.
 """
 
 from math import prod

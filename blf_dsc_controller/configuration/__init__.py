@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Configuration: frozen dataclasses that say what can be set, and parameter files that set it."""
+"""Configuration: frozen dataclasses of parameters, and the parameter files that set them."""

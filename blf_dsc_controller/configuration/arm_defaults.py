@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gains and limits of the controller for the arm of a URDF: what is not given follows from it.
+"""Default gains and limits of the controller, derived from the URDF of the arm.
 
-From the delay of the loop, 1.5 T + robot.lag, comes one rate, omega_v = 0.5 / delay, at which it
-loses half a radian of phase; every gain is a fraction of it and of the inertia m_i = 1 / (M^-1)_ii
-of a joint with the others free, the least over several postures (doc/arms.md has the margins).
+The delay of the loop, 1.5 T + robot.lag, gives the rate omega_v = 0.5 / delay, at which the loop
+loses half a radian of phase. Gains are multiples of this rate and of the inertia of each joint with
+the others free, m_i = 1 / (M^-1)_ii, minimised over several postures (doc/arms.md: margins).
 
-What gravity may be off by, the rated payload among it, makes a joint sag at the start before the
-disturbance estimate follows: where that is more than the bound, it is a funnel.
+Errors of the modelled gravity, including the rated payload, make a joint sag at the start until the
+disturbance estimate compensates them. If it sags by more than the bound, the bound is a funnel.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ if TYPE_CHECKING:
 
 UNKNOWN_EFFORT = 100.0
 """Torque limit [N m] of a joint without one in the URDF."""
-_SAG = 1.5  # standard deviations of gravity over m omega_v^2; measured: at most 1
-_PHASE = 0.5  # rad that is lost to the delay at omega_v
+_SAG = 1.5  # sag over (standard deviation of gravity / m omega_v^2); measured: at most 1
+_PHASE = 0.5  # rad, phase lost to the delay at omega_v
 _BOUND = 0.002  # rad
-_UNMODELLED = 0.01  # of the rated torque, rms: ripple, noise, Stribeck
+_UNMODELLED = 0.01  # rms, fraction of the rated torque: ripple, noise, Stribeck
 _WINDOW = {'base': 5.0, 'payload': 2.0, 'scale': 5.0}  # s
-# One over the independent rows in a window; more where few unknowns cannot explain them all.
+# 1 / (independent rows in a window); more where few parameters cannot explain all rows.
 _PRIOR = {'base': 0.01, 'payload': 0.1, 'scale': 0.1}
-_REGULARISATION = {'base': 1e-5, 'payload': 1e-9, 'scale': 1e-9}  # to 0, where P is about 1
-_ANCHOR = 5.0  # of the mean square of the unmodelled torque
+_REGULARISATION = {'base': 1e-5, 'payload': 1e-9, 'scale': 1e-9}  # pulls P (about 1) to 0
+_ANCHOR = 5.0  # times the mean square of the unmodelled torque
 _POSTURES = 20
-_FREE = 2.0 * math.pi  # rad, limit of a joint without one
-_SLOW = 0.5  # of the rated velocity
+_FREE = 2.0 * math.pi  # rad, position limit of a joint without one
+_SLOW = 0.5  # fraction of the rated velocity
 
 
 def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
-    """Defaults by dotted name for the parameters of the model `urdf` that are given.
+    """Return the defaults by dotted name that follow from the given parameters and their URDF.
 
-    Raises ConfigurationError where the URDF has no such arm.
+    Raises ConfigurationError if the URDF has no such arm.
     """
     robot, chain = given_robot(given, given.get('joints', ()))
     n = len(chain.joints)
@@ -124,11 +124,11 @@ def over_postures(
     lower: tuple[float, ...],
     upper: tuple[float, ...],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Least 1 / (M^-1)_ii (n,), and largest standard deviation of gravity (n,) [N m].
+    """Return least 1 / (M^-1)_ii (n,) and largest standard deviation of gravity (n,) [N m].
 
-    Over random postures within the limits; for a rated payload [kg].
+    Both are taken over random postures within the limits, with the rated payload [kg].
     """
-    from blf_dsc_controller.arms.prior import prior_factor  # compiles
+    from blf_dsc_controller.arms.prior import prior_factor  # slow: compiles
 
     model = parameters.model
     n = model.n
@@ -148,7 +148,7 @@ def over_postures(
 
 
 def _bound_of(given: Mapping[str, Any], n: int) -> np.ndarray:
-    """Bound [rad] that is given, or the default; validation comes later."""
+    """Return the given bound [rad], which is validated later, or the default."""
     try:
         return np.broadcast_to(np.array(given['barrier.bound'], dtype=float), (n,))
     except (KeyError, TypeError, ValueError):
@@ -160,5 +160,5 @@ def _finite(values: list[float], instead: float) -> np.ndarray:
 
 
 def _listed(values: np.ndarray) -> tuple[float, ...]:
-    """Entries of four digits: gains are no measurements."""
+    """Round to four digits, since gains need no more."""
     return tuple(float(f'{value:.4g}') for value in values)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""YAML of somebody else: not too large, not nested too deep, without references to itself.
+"""Untrusted YAML: limited in size and nesting, and without aliases.
 
-A few lines that refer to each other can stand for a billion, and a row of brackets is deeper than
-the interpreter can go.
+A few lines of aliases can expand to a billion entries, and deeply nested brackets exceed the
+recursion limit of the interpreter.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import yaml
 _MOST_NODES = 50_000
 _DEEPEST = 50
 
-_Parser: Any = getattr(yaml, 'CLoader', yaml.Loader)  # ten times as fast, where it is installed
+_Parser: Any = getattr(yaml, 'CLoader', yaml.Loader)  # ten times as fast, if available
 _Loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
@@ -32,9 +32,9 @@ def check_yaml(text: str) -> None:
         nodes += isinstance(event, yaml.NodeEvent)
         problem = ''
         if isinstance(event, yaml.AliasEvent):
-            problem = f'ROS does not support the reference *{event.anchor}'
+            problem = f'ROS does not support the alias *{event.anchor}'
         elif depth > _DEEPEST:
-            problem = f'nested more than {_DEEPEST} deep'
+            problem = f'nested more than {_DEEPEST} levels deep'
         elif nodes > _MOST_NODES:
             problem = f'more than {_MOST_NODES} entries'
         if problem:
@@ -42,6 +42,6 @@ def check_yaml(text: str) -> None:
 
 
 def load_yaml(text: str) -> Any:
-    """Plain data of YAML; raises as `check_yaml`."""
+    """Return the plain data of a YAML text; raises the errors of `check_yaml`."""
     check_yaml(text)
-    return yaml.load(text, Loader=_Loader)  # noqa: S506 - it is a safe one
+    return yaml.load(text, Loader=_Loader)  # noqa: S506 - a safe loader

@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeAlias
 from blf_dsc_controller.configuration.schema import counted, parameter
 
 PerJoint: TypeAlias = Annotated[tuple[float, ...], 'joints']
-"""An array with an entry for each joint."""
+"""Array with one entry per joint."""
 
 _ROUNDING = 1e-12  # relative; the product of a decimal fraction and 1e9 is off by a few 1e-16
 
@@ -47,7 +47,7 @@ class Sampled:
         return round(self.sample_time * 1e9)
 
     def sample_time_problems(self) -> list[str]:
-        """Require whole nanoseconds: otherwise stamps drift from the time in the law."""
+        """Require whole nanoseconds, or stamps would drift from the time in the law."""
         if abs(self.sample_time * 1e9 - self.sample_time_ns) <= _ROUNDING * self.sample_time_ns:
             return []
         got = f'got {self.sample_time!r} s, not a whole number of nanoseconds'

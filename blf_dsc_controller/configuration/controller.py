@@ -80,9 +80,7 @@ class Safety:
         1.0,
         'tracking error to stop at, as a multiple of the bound, for laws with a barrier; 0: never',
     )
-    saturation_time: float = positive(
-        0.5, 'longest uninterrupted time of a torque at its limit', 's'
-    )
+    saturation_time: float = positive(0.5, 'longest time that a torque may stay at its limit', 's')
     overrun_fraction: float = positive(
         0.4, 'largest fraction of missed states, averaged over overrun_window', at_most=1.0
     )
@@ -96,7 +94,7 @@ class Safety:
     )
     deactivation_ramp: float = non_negative(0.5, 'the same ramp when the node is deactivated', 's')
     fade_time: float = positive(
-        0.5, 'time over which the safe torque fades to zero while no usable joint state comes', 's'
+        0.5, 'time over which the safe torque fades to zero without usable joint states', 's'
     )
     keep_estimates: bool = parameter(
         True, 'keep the estimates when the node is activated again; a reset clears them'
@@ -105,14 +103,14 @@ class Safety:
 
 @dataclass(frozen=True)
 class Telemetry:
-    """What the controller publishes beside its commands."""
+    """What the controller publishes besides its commands."""
 
     enabled: bool = parameter(
         True, 'publish reference, errors, estimates and monitors', read_only=_TOPICS
     )
     decimation: int = parameter(
         1,
-        'samples from one message of reference and estimates to the next; errors come with each',
+        'samples per message of reference and estimates; errors are published at every sample',
         at_least=1,
         read_only=_TOPICS,
     )
@@ -122,8 +120,8 @@ class Telemetry:
 class ControllerConfig(Sampled):
     """Parameters of the node `blf_dsc_controller`; the defaults are the recommended set.
 
-    Make one with `load` from a parameter file, or with `build` and `change` from values by dotted
-    name: these validate. The constructor does not.
+    Create it with `load` from a parameter file, or with `build` and `change` from values by dotted
+    name; these validate it, the constructor does not.
     """
 
     joints: tuple[str, ...] = _size(('joint1', 'joint2'), 'names of the joints, from the base')
@@ -139,7 +137,7 @@ class ControllerConfig(Sampled):
     model: str = _size('two_link', 'model of the arm', choices=tuple(MODELS))
     wait_for_subscribers: int = non_negative(
         0,
-        'subscribers per topic, beside the plant, required before the first state is used',
+        'subscribers per topic, besides the plant, required before the first state is used',
         read_only=_TOPICS,
     )
     autostart: bool = autostart()
@@ -162,13 +160,13 @@ class ControllerConfig(Sampled):
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> Mapping[str, Value]:
-        """Return gains and limits for the arm of a URDF; those of the two-link arm are declared."""
+        """Return gains and limits for the arm of a URDF; the defaults suit the two-link arm."""
         if given.get('model', 'urdf' if given.get('robot.urdf') else '') != 'urdf':
             return {}
         return {'model': 'urdf', **controller_defaults(given)}
 
     def problems(self) -> list[str]:
-        """Check parameters against each other, and joints and estimates against the model."""
+        """Check the parameters against each other, joints and estimates against the model."""
         needed = MODELS[self.model]
         count = parameter_count(needed or len(self.joints))
         if self.model == 'urdf':

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The generated page of all parameters.
+"""Generation of the page of all parameters.
 
-`python -m blf_dsc_controller.configuration.documentation doc/parameters.md` writes it.
+Run `python -m blf_dsc_controller.configuration.documentation doc/parameters.md` to write it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from blf_dsc_controller.configuration.schema import Parameter, parameters
 _PREFACE = """\
 # Parameters
 
-Every parameter of every node, with its default: the recommended set. One parameter file serves all
+All parameters of all nodes; the defaults are the recommended set. One parameter file serves all
 nodes ([config/recommended.yaml](../config/recommended.yaml) has all of them); a file needs only the
 parameters it changes. Values of type double need a decimal point: `1.0`, not `1`. Arrays have one
 entry per joint unless the range says otherwise.
@@ -48,7 +48,8 @@ def _row(one: Parameter) -> str:
     if 'joints' in one.length and lengths:
         lengths.insert(0, 'joint')
     each = f'{number or "one entry"} per {" and ".join(lengths)}' if lengths else number
-    each += ', or none' if one.omittable else ''
+    if one.omittable:
+        each = f'{each}, or none' if each else 'may be empty'
     cells = (
         f'`{one.name}`',
         one.symbol,

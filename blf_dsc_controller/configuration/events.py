@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an arm goes through: payloads, pushes, changed friction, encoder offsets, a wall.
+"""Loads and events of the simulated arm: payloads, pushes, friction, encoder offsets, a wall.
 
-`load` acts as long as it is set, `events` at their time. Vectors at the tip are in the frame of the
-base: x to the right, z upwards.
+A load acts as long as it is set, an event from its time on. Vectors at the tip are in the base
+frame: x to the right, z upwards.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ _of_events = partial(parameter, (), omittable=True)
 
 @dataclass(frozen=True)
 class Load:
-    """What acts on the arm beside its motors."""
+    """Loads that act on the arm besides its motors."""
 
     payload: float = non_negative(0.0, 'point mass at the tip', 'kg')
-    torque: PerJoint = parameter((0.0, 0.0), 'torque that pushes each joint', 'N m')
-    force: Vector = parameter((0.0, 0.0, 0.0), 'force that pushes the tip', 'N')
+    torque: PerJoint = parameter((0.0, 0.0), 'external torque on each joint', 'N m')
+    force: Vector = parameter((0.0, 0.0, 0.0), 'external force on the tip', 'N')
 
 
 @dataclass(frozen=True)
 class Wall:
-    """A plane that pushes the tip back, as a spring and a damper that never pull."""
+    """Plane that pushes the tip back like a spring and a damper, but never pulls it."""
 
-    point: Vector = parameter((0.0, 0.0, 0.0), 'a point of the plane', 'm')
-    normal: Vector = parameter((0.0, 0.0, 1.0), 'direction in which it pushes')
-    stiffness: float = non_negative(0.0, 'force per depth; 0: no wall', 'N/m')
+    point: Vector = parameter((0.0, 0.0, 0.0), 'a point on the plane', 'm')
+    normal: Vector = parameter((0.0, 0.0, 1.0), 'direction in which the wall pushes')
+    stiffness: float = non_negative(0.0, 'force per penetration depth; 0: no wall', 'N/m')
     damping: float = non_negative(0.0, 'force per velocity into the wall', 'N s/m')
 
     def problems(self) -> list[str]:
-        """Require a direction."""
+        """Require a non-zero normal."""
         if any(self.normal):
             return []
         return ['wall.normal: got [0.0, 0.0, 0.0], but a direction is needed']
@@ -48,21 +48,21 @@ class Wall:
 
 @dataclass(frozen=True)
 class Events:
-    """Each event adds to the load, to the friction and to the encoders' offsets for a while.
+    """Events, each of which adds to the load, the friction and the encoder offsets for a while.
 
-    An event comes and goes at whole samples; during a ramp it acts by the fraction that has passed.
+    Events begin and end at whole samples; a ramp scales an event by the elapsed fraction.
     """
 
     begin: tuple[float, ...] = parameter(
-        (), 'time of each event from the start', 's', at_least=0.0, may_be_empty=True
+        (), 'time at which each event begins, from the start', 's', at_least=0.0, may_be_empty=True
     )
-    duration: PerEvent = _of_events('time after which it ends; 0: it stays', unit='s', at_least=0.0)
-    ramp: PerEvent = _of_events('time in which it comes, and goes', unit='s', at_least=0.0)
+    duration: PerEvent = _of_events('duration of each event; 0: permanent', unit='s', at_least=0.0)
+    ramp: PerEvent = _of_events('time to fade in, and to fade out', unit='s', at_least=0.0)
     payload: PerEvent = _of_events('point mass at the tip', unit='kg', at_least=0.0)
     force: Annotated[tuple[float, ...], 'events.begin', '3'] = _of_events(
-        'force that pushes the tip', unit='N'
+        'external force on the tip', unit='N'
     )
-    torque: PerEventAndJoint = _of_events('torque that pushes each joint', unit='N m')
-    viscous: PerEventAndJoint = _of_events('change of the viscous friction', unit='N m s/rad')
-    coulomb: PerEventAndJoint = _of_events('change of the Coulomb friction', unit='N m')
-    offset: PerEventAndJoint = _of_events('change of the offset of the encoder', unit='rad')
+    torque: PerEventAndJoint = _of_events('external torque on each joint', unit='N m')
+    viscous: PerEventAndJoint = _of_events('change in viscous friction', unit='N m s/rad')
+    coulomb: PerEventAndJoint = _of_events('change in Coulomb friction', unit='N m')
+    offset: PerEventAndJoint = _of_events('change in encoder offset', unit='rad')

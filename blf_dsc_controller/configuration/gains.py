@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gains of the control laws: (28), which can change while the controller runs, and (35)."""
+"""Gains of the control laws (28) and (35), which can change while the controller runs."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Surface:
         (150.0, 150.0), 'gain of the virtual control on the tracking error', '1/s', 'K'
     )
     mu: PerJoint = non_negative(
-        (20.0, 20.0), 'part of that gain that remains at the bound', '1/s', 'mu'
+        (20.0, 20.0), 'part of surface.gain that remains at the bound', '1/s', 'mu'
     )
     time_constant: float = positive(0.002, 'time constant of the surface filter', 's', 'lambda')
 
@@ -77,7 +77,7 @@ class Feedback:
 
     gain: PerJoint = non_negative((60.0, 20.0), 'gain on the velocity error', 'N m s/rad', 'K_p')
     damping_rate: float = non_negative(
-        0.0, 'rate of damping by the inertia of learning.initial_estimate', '1/s', 'omega_v'
+        0.0, 'rate of damping, scaled by the inertia of learning.initial_estimate', '1/s', 'omega_v'
     )
     damping: PerJoint = non_negative(
         (0.0, 0.0), 'gain of the robust term d2 |xi1| sat(xi2/b)', 'N m/rad', 'd2'
@@ -114,7 +114,7 @@ class Torque:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Gains of the laws `backstepping` (35) and `slotine_li`, beside feedback and learning."""
+    """Gains of the laws `backstepping` (35) and `slotine_li`, besides feedback and learning."""
 
     surface_gain: PerJoint = positive(
         (70.0, 70.0), 'gain of the linear surface alpha2 = dqr - lambda_s z1', '1/s', 'lambda_s'
@@ -127,7 +127,7 @@ class Comparison:
     )
     integral_gain: PerJoint = non_negative(
         (),
-        'integrator on the surface error, only of slotine_li; empty: none',
+        'integral gain on the surface error, slotine_li only; empty: none',
         'N m/rad',
         omittable=True,
     )
@@ -146,25 +146,25 @@ class KnownArm:
     parameters: tuple[float, ...] = _known(
         (), 'true parameters; empty: unknown', 'kg m^2', 'P', may_be_empty=True
     )
-    constant: PerJoint = _known((0.0, 0.0), 'constant part of the disturbance', 'N m')
-    amplitude: PerJoint = _known((0.0, 0.0), 'amplitude of its sinusoid', 'N m')
+    constant: PerJoint = _known((0.0, 0.0), 'constant part of the known disturbance', 'N m')
+    amplitude: PerJoint = _known((0.0, 0.0), 'amplitude of the sinusoidal part', 'N m')
     frequency: PerJoint = _known(
-        (1.0, 1.0), 'angular frequency of its sinusoid', 'rad/s', at_least=0.0
+        (1.0, 1.0), 'angular frequency of the sinusoidal part', 'rad/s', at_least=0.0
     )
-    phase: PerJoint = _known((0.0, 0.0), 'phase of its sinusoid', 'rad')
+    phase: PerJoint = _known((0.0, 0.0), 'phase of the sinusoidal part', 'rad')
     feed_forward: bool = _known(False, 'compensate the known disturbance; model_based always does')
 
     def problems(self, law: str, model: str, count: int, radius: float) -> list[str]:
-        """Check that the parameters fit the model and the ball, and are given if needed."""
+        """Check that the parameters fit the model and the ball, and are given if required."""
         given = len(self.parameters)
         if law == 'model_based' and given == 0:
             return ['truth.parameters: got none, but the law model_based needs them']
         norm = math.hypot(*self.parameters)
         if law == 'model_based' and norm >= radius:
             reason = (
-                f'learning.radius: got {radius:g} kg m^2, but truth.parameters lie at {norm:.6g} '
-                'kg m^2, and the law model_based would shrink them to the ball: the radius must be '
-                'larger'
+                f'learning.radius: got {radius:g} kg m^2, but truth.parameters have a norm of '
+                f'{norm:.6g} kg m^2, and the law model_based would shrink them to the ball: the '
+                'radius must be larger'
             )
             return [reason]
         if given in (0, count):

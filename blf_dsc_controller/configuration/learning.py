@@ -15,7 +15,7 @@ _size = partial(parameter, read_only='it sets the memory size of the learning')
 _in_window = partial(parameter, read_only='the data in the excitation window depend on it')
 _at_start = partial(parameter, read_only='it has no effect later')
 
-_SAMPLES = (10, 1_000_000)  # of a window: fewer do not determine P, more take over 100 MB
+_SAMPLES = (10, 1_000_000)  # per window: fewer do not determine P, more need over 100 MB
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Learning:
         'newton', 'step along the prediction error: regularised Newton, or the gradient (paper)'
     )
     prediction: Literal['filtered', 'acceleration', 'lambda'] = _in_window(
-        'filtered', 'prediction error: filtered regressor, estimated acceleration, Lambda of (24)'
+        'filtered', 'prediction error by filtered regressor, estimated acceleration or Lambda (24)'
     )
     latch: Literal['last', 'max'] = parameter(
         'last', 'excited window that is latched: the last one (paper), or the best one'
@@ -48,7 +48,7 @@ class Learning:
     )
     window: float = _size(
         2.0 * math.pi,
-        'length of the excitation window; whole periods of the reference average disturbances out',
+        'length of the excitation window; whole reference periods average out disturbances',
         's',
         'tau_d',
         above=0.0,
@@ -79,24 +79,24 @@ class Learning:
         3.0, 'radius of the projection ball of the estimate', 'kg m^2', 'omega_a'
     )
     bumpless: bool = parameter(
-        True, 'let the disturbance estimate yield what the prediction error adds to the torque'
+        True, 'let the disturbance estimate offset the torque that the prediction error adds'
     )
     change_detection: bool = _size(
         True, 'discard the window when torques contradict it: payload, contact, a changed arm'
     )
     residual_floor: PerJoint = positive(
         (0.07, 0.07),
-        'unmodelled torque (rms) of a joint that is not taken for a change of the arm',
+        'rms unmodelled torque of a joint that is not treated as a change of the arm',
         'N m',
     )
     anchor_weight: float = non_negative(
-        0.1, 'pull to the estimate before a change, until the new window is full'
+        0.1, 'pull towards the estimate before a change, until the new window is full'
     )
     prior_weight: float = non_negative(
-        0.0, 'pull to the initial estimate, for arms whose parameters are not all excited'
+        0.0, 'pull towards the initial estimate, for arms whose parameters are not all excited'
     )
     motion_scale: float = non_negative(
-        0.0, 'velocity of the reference below which a joint counts less; 0: none', 'rad/s'
+        0.0, 'reference velocity below which the rows of a joint count less; 0: none', 'rad/s'
     )
     row_interval: int = _size(
         1, 'samples between two rows of the excitation window', 'samples', at_least=1
@@ -127,7 +127,7 @@ class Learning:
         norm = math.hypot(*self.initial_estimate)
         if norm >= self.radius:
             problems.append(
-                f'learning.radius: got {self.radius:g} kg m^2, but learning.initial_estimate lies '
-                f'at {norm:.6g} kg m^2: the radius must be larger'
+                f'learning.radius: got {self.radius:g} kg m^2, but learning.initial_estimate has '
+                f'a norm of {norm:.6g} kg m^2: the radius must be larger'
             )
         return problems

@@ -36,7 +36,7 @@ class RecorderConfig:
     compression: Literal['none', 'zstd'] = _of_bag('none', 'compression of the chunks of the bag')
     queue_depth: int = _of_bag(
         100_000,
-        'messages of a topic that are buffered while the disk is busy',
+        'messages buffered per topic while the disk is busy',
         'messages',
         at_least=1,
     )
@@ -48,13 +48,13 @@ class RecorderConfig:
     )
     ring: float = _of_bag(
         0.0,
-        'keep only this much time in memory, and write it on ~/trigger; 0: write all',
+        'time span kept in memory, and written on ~/trigger; 0: write everything',
         's',
         at_least=0.0,
     )
     wait_for_parameters: float = _of_bag(
         0.0,
-        'longest time until the parameters of its publishers are read and a topic is recorded',
+        'longest wait for the parameters of the publishers before a topic is recorded',
         's',
         at_least=0.0,
     )
@@ -66,7 +66,7 @@ class RecorderConfig:
 
 @dataclass(frozen=True)
 class DrawnArm:
-    """Lengths of the arm in the picture."""
+    """Link lengths of the drawn arm."""
 
     l1: float = _of_markers(1.0, 'length of the first link', 'm', 'l1', above=0.0)
     l2: float = _of_markers(0.8, 'length of the second link', 'm', 'l2', above=0.0)
@@ -87,7 +87,7 @@ class MarkersConfig:
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Value]:
-        """Of the arm of a URDF: its joints, and its base as the frame."""
+        """Return the joints of a URDF, and its base as the frame."""
         if not given.get('robot.urdf'):
             return {}
         chain = given_robot(given, given.get('joints'))[1]
@@ -112,9 +112,9 @@ class MarkersConfig:
 class ViewConfig:
     """Parameters of the node `view`."""
 
-    host: str = _of_view('127.0.0.1', 'address of this computer that the page is served at')
+    host: str = _of_view('127.0.0.1', 'address of this computer on which the page is served')
     port: int = _of_view(
-        8080, 'of the page, or the next one that is free', at_least=1, at_most=65535
+        8080, 'port of the page; if taken, the next free one', at_least=1, at_most=65535
     )
 
 

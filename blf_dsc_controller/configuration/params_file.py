@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Presets and ROS 2 parameter files: found, loaded as configurations and written, without ROS."""
+"""Locating, loading and writing of presets and ROS 2 parameter files, without ROS."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ Config = TypeVar('Config')
 def locate(given: str | Path) -> Path:
     """Return the path of a preset by its name, or of a file by its path.
 
-    The name of a preset means the preset, whatever is in the current folder; `./name` is a file.
-    Raises ConfigurationError, which lists the presets, if there is neither.
+    A preset takes precedence over a file of the same name in the current folder; `./name` is the
+    file. Raises ConfigurationError, which lists the presets, if neither exists.
     """
     presets = {path.stem: path for path in sorted((share_folder() / 'config').glob('*.yaml'))}
     name, path = str(given), Path(given)
@@ -83,7 +83,7 @@ def load_loop(
     """Load the configurations of plant, controller and recorder from a preset or a file.
 
     `overrides`, by node and dotted name, take precedence over the file. Raises ConfigurationError
-    with the problems of all nodes, or where plant and controller disagree.
+    with the problems of all nodes, or if plant and controller disagree.
     """
     path = locate(given)
     sections = read(path)
@@ -106,7 +106,7 @@ def load_loop(
 
 
 def dump(path: Path, nodes: Mapping[str, object]) -> None:
-    """Write every parameter of the nodes into a parameter file that loads back equal."""
+    """Write all parameters of the nodes to a parameter file; loading it restores them exactly."""
     path.write_text(dumps(nodes), encoding='utf-8')
 
 
@@ -154,7 +154,7 @@ def _load(
         for problem in error.problems:
             name = problem.split(':', 1)[0]
             if name in overrides:
-                problems.append(f'{problem} (given beside the file)')
+                problems.append(f'{problem} (given as an override)')
             else:
                 line = f'line {entries[name].line}: ' if name in entries else ''
                 problems.append(f'{line}{problem}')
@@ -170,10 +170,10 @@ def _unknown_names(sections: list[Section]) -> Iterator[str]:
 
 
 def unmatched_sections(sections: list[Section], nodes: Iterable[str]) -> Iterator[str]:
-    """Yield a problem for each section that is meant for one of these nodes and would be ignored.
+    """Yield a problem for each section that is meant for one of these nodes but would be ignored.
 
-    Its name is misspelt, or it has another namespace than the node, whose full name is given (that
-    of a node in the root may lack the slash), and no section of that name has the right one.
+    Either its name is misspelt, or its namespace differs from the node's and no other section of
+    that name matches. `nodes` are full names; in the root namespace the slash may be omitted.
     """
     by_name = {section.pattern.rsplit('/', 1)[-1]: section for section in sections}
     absent = [node for node in NODES if node not in by_name]
@@ -188,6 +188,6 @@ def unmatched_sections(sections: list[Section], nodes: Iterable[str]) -> Iterato
         ):
             section = by_name[name]
             yield (
-                f'line {section.line}: {section.pattern} is not {full}: write /**/{name} for the '
-                'node in any namespace'
+                f'line {section.line}: {section.pattern} does not match {full}: write /**/{name} '
+                'for the node in any namespace'
             )

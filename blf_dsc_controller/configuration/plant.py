@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the simulated plant: arm, disturbance, sensors, actuators, events, its clock."""
+"""Parameters of the simulated plant: arm, disturbance, sensors, actuators, events, clock."""
 
 from __future__ import annotations
 
@@ -68,14 +68,14 @@ class PlantDisturbance:
         0.01, 'velocity scale of the sign change of Coulomb friction', 'rad/s'
     )
     stribeck: float = non_negative(
-        0.0, 'friction of a joint that breaks away, above the Coulomb friction as a fraction of it'
+        0.0, 'breakaway friction in excess of the Coulomb friction, as a fraction of it'
     )
-    stribeck_velocity: float = positive(0.1, 'velocity scale at which this has faded', 'rad/s')
+    stribeck_velocity: float = positive(0.1, 'velocity scale at which this excess fades', 'rad/s')
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """How the true state is measured."""
+    """Measurement of the true state."""
 
     position_noise: float = _fixed(
         0.0, 'standard deviation of the white noise on measured positions', 'rad', at_least=0.0
@@ -90,31 +90,31 @@ class Sensor:
     velocity_pole: float = _fixed(
         0.0, 'pole of the low-pass filter on the velocity; 0: none', 'rad/s', at_least=0.0
     )
-    offset: PerJoint = parameter((0.0, 0.0), 'measured position less the true one', 'rad')
+    offset: PerJoint = parameter((0.0, 0.0), 'measured minus true position', 'rad')
 
 
 @dataclass(frozen=True)
 class Actuator:
-    """What happens to a commanded torque."""
+    """Effects between the commanded and the applied torque."""
 
     torque_limit: PerJoint = _fixed(
         (0.0, 0.0), 'rated joint torque; 0: no limit', 'N m', at_least=0.0
     )
     delay: int = _fixed(0, 'delay of the torque', 'samples', at_least=0, at_most=1000)
     time_constant: float = _fixed(
-        0.0, 'lag of first order between the limited torque and the joint', 's', at_least=0.0
+        0.0, 'first-order lag between the limited torque and the joint', 's', at_least=0.0
     )
     torque_noise: float = _fixed(
-        0.0, 'standard deviation of the torque, as a fraction of it', at_least=0.0
+        0.0, 'standard deviation of the torque noise, as a fraction of the torque', at_least=0.0
     )
     ripple: float = _fixed(
         0.0, 'amplitude of the torque ripple, as a fraction of the rated torque', at_least=0.0
     )
     ripple_cycles: float = _fixed(
-        20.0, 'periods of the ripple in a turn of the joint, or in a metre', above=0.0
+        20.0, 'periods of the ripple per turn of the joint, or per metre', above=0.0
     )
     command_timeout: float = positive(
-        0.05, 'age above which a torque is not applied, in real time only', 's'
+        0.05, 'age above which a commanded torque is not applied, in real time only', 's'
     )
     without_command: Literal['zero', 'brake'] = parameter(
         'zero', 'without a command: zero torque, or the brakes hold the joints'
@@ -125,8 +125,8 @@ class Actuator:
 class PlantConfig(Sampled):
     """Parameters of the node `sim_plant`.
 
-    Make one with `load` from a parameter file, or with `build` and `change` from values by dotted
-    name: these validate. The constructor does not.
+    Create it with `load` from a parameter file, or with `build` and `change` from values by dotted
+    name; these validate it, the constructor does not.
     """
 
     joints: tuple[str, ...] = _fixed(('joint1', 'joint2'), 'names of the joints, from the base')
@@ -139,7 +139,7 @@ class PlantConfig(Sampled):
         at_most=1.0,
     )
     mode: Literal['realtime', 'lockstep'] = _fixed(
-        'realtime', 'a step each sample time of the wall clock, or a step for each torque received'
+        'realtime', 'one step per sample time of the wall clock, or one per received torque'
     )
     duration: float = _fixed(
         0.0, 'simulated time after which the plant stops; 0: no limit', 's', at_least=0.0
@@ -148,7 +148,7 @@ class PlantConfig(Sampled):
     publish_clock: bool = _fixed(False, 'publish the simulated time on /clock')
     wait_for_subscribers: int = _fixed(
         0,
-        'subscribers per topic, beside the controller, required before the first state',
+        'subscribers per topic, besides the controller, required before the first state',
         at_least=0,
     )
     autostart: bool = autostart()
@@ -169,7 +169,7 @@ class PlantConfig(Sampled):
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Value]:
-        """Of the arm of a URDF: its joints, limits and friction, at rest in mid-range."""
+        """Return joints, limits and friction from a URDF, and a start at rest in mid-range."""
         if not given.get('robot.urdf'):
             return {}
         joints = given_robot(given, given.get('joints'))[1].joints
@@ -188,12 +188,12 @@ class PlantConfig(Sampled):
         }
 
     def problems(self) -> list[str]:
-        """Check the joints, the sample time, and the duration against it."""
+        """Check the joints, the sample time and the duration."""
         needed = None if self.robot.urdf else 2
         problems = joint_problems(self.joints, 'the simulated arm', needed)
         problems += self.sample_time_problems() + self.wall.problems()
         if self.truth != Truth() and not self.robot.urdf:
-            problems.append('truth: it changes the arm of a URDF: give robot.urdf, or change arm')
+            problems.append('truth: it applies only to a URDF: give robot.urdf, or change arm')
         if self.actuator.ripple > 0.0 and not all(self.actuator.torque_limit):
             problems.append(
                 'actuator.ripple: it is a fraction of the rated torque: give actuator.torque_limit'

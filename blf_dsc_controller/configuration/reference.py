@@ -25,7 +25,7 @@ class Reference:
     waypoints  minimum jerk through `points` at `times`, at rest at both ends
     hold       the initial position
 
-    `amplitude` and `points` hold one row per joint, row after row.
+    `amplitude` and `points` hold one row per joint, row by row.
     """
 
     type: Literal['sinusoids', 'waypoints', 'hold'] = _fixed(
@@ -34,7 +34,7 @@ class Reference:
     )
     offset: PerJoint = _fixed((1.9935, 1.3961), 'centre of the motion', 'rad')
     amplitude: Annotated[tuple[float, ...], 'joints', 'reference.frequency'] = _fixed(
-        (0.3, 0.3), 'amplitude of each tone: one row per joint, row after row', 'rad'
+        (0.3, 0.3), 'amplitude of each tone: one row per joint, row by row', 'rad'
     )
     frequency: tuple[float, ...] = _fixed(
         (1.0,), 'angular frequency of each tone', 'rad/s', at_least=0.0
@@ -46,7 +46,7 @@ class Reference:
         (), 'time of each waypoint from the start', 's', at_least=0.0, may_be_empty=True
     )
     points: Annotated[tuple[float, ...], 'joints', 'reference.times'] = _fixed(
-        (), 'position at each waypoint: one row per joint, row after row', 'rad', may_be_empty=True
+        (), 'position at each waypoint: one row per joint, row by row', 'rad', may_be_empty=True
     )
 
     def problems(self) -> list[str]:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS 2 parameter files, read as rcl_yaml_param_parser reads them, but without ROS.
 
-Node names nest or are joined by `/`; `*` matches one part of a name, `**` any number of parts. Of
-all sections that match a node the last one wins, whichever is more specific. The types of unquoted
-words differ from those of YAML libraries: `1e-5` is a number and `1_000` a string for ROS, the
-other way round for PyYAML; `yes` is a bool, `010` is eight, `null` a string.
+Node names nest or are joined by `/`; `*` matches one part of a name, `**` any number of parts. If
+several sections match a node, the last one wins, even if another is more specific. The types of
+unquoted words differ from those of YAML libraries: `1e-5` is a number and `1_000` a string for ROS,
+the other way round for PyYAML; `yes` is a bool, `010` is eight, `null` a string.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ class Section(NamedTuple):
 
     @property
     def is_wildcard(self) -> bool:
-        """Whether the section can match nodes of several names."""
+        """Whether the section can match nodes with different names."""
         return '*' in self.pattern.rsplit('/', 1)[-1]
 
     def matches(self, node: str) -> bool:
-        """Whether the section applies to the node of this fully qualified name."""
+        """Whether the section applies to the node with this fully qualified name."""
         expression = self.pattern.replace('/**', r'(?:/\w+)#').replace('/*', r'/\w+')
         return re.fullmatch(expression.replace('#', '*'), node) is not None
 
@@ -100,9 +100,9 @@ def parse_scalar(word: str) -> bool | int | float | str:
 
 
 class _Composer(yaml.BaseLoader):
-    """Keeps each word as written."""
+    """YAML loader that keeps each word as written."""
 
-    DEFAULT_SCALAR_TAG = '?'  # type: ignore[misc] # not that of an explicit !!str
+    DEFAULT_SCALAR_TAG = '?'  # type: ignore[misc] # unlike an explicit !!str
 
 
 def _sections(node: yaml.Node, name: str) -> Iterator[Section]:
@@ -112,7 +112,7 @@ def _sections(node: yaml.Node, name: str) -> Iterator[Section]:
     keys = dict(_pairs(node))
     if _PARAMETERS in keys and len(keys) > 1:
         other = next(key for key in keys if key != _PARAMETERS)
-        raise _error(_line(keys[other]), f'{other} cannot stand beside {_PARAMETERS} of {name}')
+        raise _error(_line(keys[other]), f'{other} cannot be next to {_PARAMETERS} of {name}')
     for key, value in keys.items():
         if key == _PARAMETERS:
             yield _section(value, name)

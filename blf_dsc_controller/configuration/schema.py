@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Configurations: frozen dataclasses whose fields are validated, described ROS parameters.
+"""Configurations: frozen dataclasses of validated and described ROS parameters.
 
 Each field is declared with `parameter`, or is itself such a dataclass: a group, whose parameters
 have dotted names (`arm.l1`). The method `problems()` of a configuration, if it has one, checks
-parameters against each other; its class method `defaults(given)` replaces defaults by what follows
-from the parameters that are given.
+parameters against each other; its class method `defaults(given)` returns the defaults that follow
+from the given parameters.
 """
 
 from __future__ import annotations
@@ -62,11 +62,10 @@ class Parameter:
     """A parameter of a node: what it means and which values are valid.
 
     Ranges and choices apply to each entry of an array. `read_only` is the reason why the parameter
-    cannot change while the node runs; empty: it can. An array that is `omittable` may be empty
-    whatever its length is otherwise. A configuration holds what `kept` makes of a given text; it
-    raises BlfDscError where it cannot. The last three are known from the field of the dataclass:
-    `length` names the parameters whose lengths multiply to the length of this array; a number among
-    them is a length itself.
+    cannot change while the node runs; empty: it can. An `omittable` array may be empty regardless
+    of its required length. `kept` converts a given text to the value that a configuration holds, or
+    raises BlfDscError. The last three are derived from the field of the dataclass: `length` names
+    the parameters whose lengths multiply to the length of this array; a number is itself a length.
     """
 
     default: Value
@@ -162,7 +161,7 @@ def flatten(config: object) -> dict[str, Value]:
 
 
 def differences(before: object, after: object) -> dict[str, Value]:
-    """Return the values by dotted name that another configuration of the same type changes."""
+    """Return the values of `after`, by dotted name, that differ from those of `before`."""
     old = flatten(before)
     return {name: value for name, value in flatten(after).items() if value != old[name]}
 
@@ -170,8 +169,8 @@ def differences(before: object, after: object) -> dict[str, Value]:
 def build(cls: type[Config], given: Mapping[str, object], source: str = '') -> Config:
     """Make a configuration from values by dotted name; missing ones keep their defaults.
 
-    Raises ConfigurationError with all problems: unknown names, types, ranges and lengths, and, once
-    each value is valid by itself, those between parameters.
+    Raises ConfigurationError with all problems: unknown names, types, ranges and lengths, and, if
+    each value is valid by itself, conflicts between parameters.
     """
     known = {one.name: one for one in parameters(cls)}
     given = _kept(known, given, source)
@@ -200,7 +199,7 @@ def build(cls: type[Config], given: Mapping[str, object], source: str = '') -> C
 def _kept(
     known: Mapping[str, Parameter], given: Mapping[str, object], source: str
 ) -> Mapping[str, object]:
-    """Return the given values as the configuration holds them, such as a URDF for its file."""
+    """Return the given values as the configuration holds them, e.g. the URDF for its file."""
     values = dict(given)
     for name, value in given.items():
         if name in known and isinstance(value, str):
@@ -217,7 +216,7 @@ def change(config: Config, given: Mapping[str, object], source: str = '') -> Con
 
 
 def unknown(name: str, known: Iterable[str]) -> str:
-    """Return the problem of an unknown name, with the closest known one."""
+    """Return the problem for an unknown name, suggesting the closest known one."""
     close = difflib.get_close_matches(name, known, n=1)
     if not close:
         close = [other for other in known if other.rsplit('.', 1)[-1] == name.rsplit('.', 1)[-1]]
@@ -242,7 +241,7 @@ def _parameters(cls: Any) -> tuple[Parameter, ...]:
 
 @functools.cache
 def _fields(cls: Any) -> dict[str, Any]:
-    """Return the parameter or the class of the group that each field declares."""
+    """Return, for each field, the declared parameter or the class of the group."""
     types = typing.get_type_hints(cls)
     annotated = typing.get_type_hints(cls, include_extras=True)
     found: dict[str, Any] = {}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The data files of this package and of others, in a sourced ROS and without one."""
+"""Data files of this package and of others, with or without a sourced ROS."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _LARGEST = 1 << 24  # bytes of a parameter file, a URDF or a metadata.yaml
 
 
 def share_folder() -> Path:
-    """Return the folder that holds `config/` and `launch/`, whatever the current folder is.
+    """Return the folder that holds `config/` and `launch/`, regardless of the current folder.
 
-    The source tree comes first if the code runs from one: an editable install leaves the files
-    there. Then the ament index (colcon), then the data folders of this Python (pip).
+    If the code runs from a source tree, as in an editable install, that comes first; then the ament
+    index (colcon), then the data folders of this Python (pip).
 
-    Raises BlfDscError with the places searched if it is in none of them.
+    Raises BlfDscError, listing the places searched, if the folder is not found.
     """
     searched = []
     for folder in _candidates():
@@ -41,8 +41,8 @@ def share_folder() -> Path:
 def resolve(url: str) -> Path:
     """Return the path of a file, or of a resource as `package://name/path`.
 
-    A path that is not there is looked up in `config/` of this package. Raises BlfDscError where
-    there is none, or no package of that name.
+    A path that does not exist is looked up in `config/` of this package. Raises BlfDscError if
+    there is no such folder or package.
     """
     if url.startswith('package://'):
         name, _, rest = url.removeprefix('package://').partition('/')
@@ -55,7 +55,7 @@ def resolve(url: str) -> Path:
 
 
 def read_text(path: Path) -> str:
-    """Text of a file; OSError if it is not a regular one or too large, or UnicodeDecodeError."""
+    """Return the text of a file; OSError if not regular or too large, or UnicodeDecodeError."""
     state = path.stat()
     if not stat.S_ISREG(state.st_mode):
         raise OSError(f'{path} is not a regular file: give a file')
@@ -80,7 +80,7 @@ def _share_of(package: str) -> Path:
 def _candidates() -> Iterator[Path]:
     if (_CHECKOUT / 'setup.py').is_file():
         yield _CHECKOUT
-    with suppress(ImportError, LookupError, OSError):  # no ROS, index, or package in it
+    with suppress(ImportError, LookupError, OSError):  # no ROS, no index, or package not in it
         from ament_index_python.packages import get_package_share_directory
 
         yield Path(get_package_share_directory(_PACKAGE))

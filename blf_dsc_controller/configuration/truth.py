@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the simulated arm differs from its URDF: what the controller must not take for granted."""
+"""Deviations of the simulated arm from its URDF, unknown to the controller."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _fixed = partial(parameter, read_only='the plant is built once, when the node st
 
 @dataclass(frozen=True)
 class Truth:
-    """Masses as they are, of an arm whose URDF says otherwise.
+    """Deviations of the true masses from those of the URDF.
 
-    A changed body is always possible: its mass distribution is scaled and shifted as it is.
+    A changed body stays physically consistent: its mass distribution is only scaled and shifted.
     """
 
     mass_factor: float = _fixed(1.0, 'factor on all masses and inertias', above=0.0)
@@ -31,7 +31,7 @@ class Truth:
     seed: int = _fixed(0, 'seed of the random deviations', at_least=0)
 
     def changes(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Of each body: the factor on its mass (n,), and the shift of its masses (n, 3) [m]."""
+        """Return the factor on the mass (n,) and the shift of mass (n, 3) [m] of each body."""
         random = np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed)))
         drawn = random.uniform(-1.0, 1.0, (n, 4))
         factors = self.mass_factor * (1.0 + self.mass_deviation * drawn[:, 0])

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arm of a URDF identified from any bag, and the URDF corrected."""
+"""Identification of the arm of a URDF from any bag, and correction of the URDF."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A URDF with other inertias and frictions; every other byte of it stays.
+"""A URDF with corrected inertias and friction; every other byte is unchanged.
 
-The inertia of a body is written into the link that its joint moves, and the links fixed to that
-lose theirs.  Links that joints of their own move, as a gripper's fingers, keep theirs.
+The inertia of a body is written to the link that its joint moves, and the links fixed to that link
+lose theirs.  Links with joints of their own, such as a gripper's fingers, keep theirs.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from blf_dsc_controller.run import Floats
 def corrected_urdf(
     text: str, chain: Chain, inertias: Floats, viscous: Floats, coulomb: Floats, note: str
 ) -> str:
-    """Text of the URDF with inertias (n, 10) of the bodies and friction (n,) of the joints.
+    """Return the URDF with inertias (n, 10) of the bodies and friction (n,) of the joints.
 
-    `note` is a comment at its end.
+    `note` is added as a comment at the end.
     """
     joints = [joint.name for joint in chain.joints]
     parts: dict[tuple[str, str], str] = {}  # of links and joints by name
@@ -43,7 +43,7 @@ def corrected_urdf(
 
 
 def _inertial(J: Floats) -> str:
-    """`<inertial>` of a pseudo-inertia (4, 4), along the link's axes about its centre of mass."""
+    """Return the `<inertial>` of a pseudo-inertia (4, 4), about the centre of mass in link axes."""
     mass = J[3, 3]
     centre = J[:3, 3] / mass
     T = np.eye(4)
@@ -63,7 +63,7 @@ _PART = {'link': 'inertial', 'joint': 'dynamics'}
 
 
 class _Element(NamedTuple):
-    """Where an element is: bytes of its first tag and of its last, the same if it has only one."""
+    """Byte ranges of the opening and closing tag of an element; equal if it has only one."""
 
     opening: tuple[int, int]
     closing: tuple[int, int]
@@ -72,7 +72,7 @@ class _Element(NamedTuple):
 def _edits(
     raw: bytes, parts: Mapping[tuple[str, str], str], note: str
 ) -> Iterator[tuple[int, int, str]]:
-    """Bytes from and to, and what takes their place."""
+    """Yield begin and end byte of each edit, and the replacement."""
     elements = _elements(raw)
     for (kind, name), part in parts.items():
         owner = elements[kind, name, '']
@@ -88,7 +88,7 @@ def _edits(
 
 
 def _elements(raw: bytes) -> dict[tuple[str, str, str], _Element]:
-    """Elements of a URDF by tag and name of a link or joint, and the tag of a part of it."""
+    """Return the elements of a URDF by tag and name of a link or joint, and tag of its child."""
     found: dict[tuple[str, str, str], _Element] = {}
     stack: list[tuple[str, str, tuple[int, int]]] = []
     parser = expat.ParserCreate('utf-8')
@@ -112,5 +112,5 @@ def _elements(raw: bytes) -> dict[tuple[str, str, str], _Element]:
         stack.pop()
 
     parser.StartElementHandler, parser.EndElementHandler = begin, end
-    parser.Parse(raw, True)  # noqa: FBT003 - it has no name there
+    parser.Parse(raw, True)  # noqa: FBT003 - positional only
     return found

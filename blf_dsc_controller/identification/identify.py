@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inertias, rotors and friction that a recording shows, nearest to those of the URDF.
+"""Inertias, rotors and friction identified from a recording, with the URDF as the prior.
 
-The maximum a posteriori of all unknowns, over physical bodies: the first four fifths of the rows,
-each joint weighed by the variance of its residual times its correlation length, and the prior of
-`prior_of`.  The covariance is that of the posterior without the bounds, which make it smaller only.
+The maximum a posteriori estimate of all unknowns over physical bodies, from the prior of `prior_of`
+and the first four fifths of the rows, each joint weighted by the inverse of its residual variance
+times correlation length.  The covariance ignores the bounds, which can only reduce it.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from blf_dsc_controller.replay.learn import correlation_length
 from blf_dsc_controller.run import Floats
 
 _SHORTEST = 5.0  # s
-_HELD_BACK = 0.2  # of the rows, at the end
+_HELD_BACK = 0.2  # fraction of the rows, at the end
 _STILL = 0.02  # rad/s or m/s
 _PASSES = 6
 
 
 class Identified(NamedTuple):
-    """An arm of n bodies identified; values are ordered as in `Prior`."""
+    """An identified arm of n bodies; values are ordered as in `Prior`."""
 
     source: str  # topic of the torques
     duration: float  # s
@@ -42,14 +42,14 @@ class Identified(NamedTuple):
     values: Floats  # (14 n + 1,)
     prior_covariance: Floats  # (14 n + 1, 14 n + 1)
     covariance: Floats  # likewise, given the recording
-    errors: Floats  # (3, n) rms torque error of the URDF, of the corrected one, of all values
+    errors: Floats  # (3, n) rms torque error of the URDF, the corrected URDF, all values
     torque: Floats  # (n,) root mean square of the torque held back, N m or N
     still: tuple[str, ...]  # joints that did not move
     held_back: tuple[float, float]  # s, from, to
 
     @property
     def inertias(self) -> Floats:
-        """Ten of each body (n, 10)."""
+        """Inertial parameters of the bodies (n, 10)."""
         n = len(self.chain.joints)
         return self.values[: 10 * n].reshape(n, 10)
 
@@ -66,7 +66,7 @@ def identify_bag(
 
     Raises:
         BlfDscError: the bag or the URDF cannot be read, or the bag has no torques of the arm, is
-            too short, or nothing moves in it.
+            too short, or contains no motion.
     """
     joints = robot.chain(()).joints if robot.tip else ()
     given = [joint.name for joint in joints]
@@ -74,7 +74,7 @@ def identify_bag(
 
 
 def identify_arm(recording: Recording, robot: Robot) -> Identified:
-    """Identify the arm of a recording; BlfDscError if that is too short, or nothing moves in it."""
+    """Identify the arm of a recording; raises BlfDscError if it is too short or has no motion."""
     chain = robot.chain(recording.joints)
     n = len(chain.joints)
     x, y, z = robot.gravity
@@ -84,9 +84,9 @@ def identify_arm(recording: Recording, robot: Robot) -> Identified:
         raise BlfDscError(f'the bag holds {duration:.3g} s; record at least {_SHORTEST:g} s')
     rows = rows_of(recording, parameters.model)
     if rows.time.size < 10 * n:
-        raise BlfDscError(f'gaps leave {rows.time.size} windows of the bag: record without losses')
+        raise BlfDscError(f'only {rows.time.size} windows have no gaps: record without losses')
     if rows.speed.max() < _STILL:
-        fastest = f'{rows.speed.max():.2g} rad/s'
+        fastest = f'{rows.speed.max():.2g} rad/s (or m/s)'
         raise BlfDscError(f'no joint moves faster than {fastest}: record a motion of all joints')
     held = [attached(robot.text, joint.link, recording.joints)[1] for joint in chain.joints]
     largest = np.maximum(np.abs(recording.torque).max(axis=0), 1e-6)
@@ -121,9 +121,9 @@ def identify_arm(recording: Recording, robot: Robot) -> Identified:
 
 
 def _whitened(rows: Rows, fit: Floats, B: Floats, theta0: Floats) -> tuple[Floats, Floats]:
-    """A, b such that |A z - b|^2 are the squared residuals of theta = theta0 + B z in deviations.
+    """Return A, b so that |A z - b|^2 sums the normalised squared residuals of theta0 + B z.
 
-    The delay enters linearly about its last estimate; variances are those of the residuals.
+    The delay is linearised about its last estimate; variances are those of the residuals.
     """
     X, weight = rows.X[fit], rows.weight[fit][:, :, None]
     count, n, m = (int(size) for size in X.shape)

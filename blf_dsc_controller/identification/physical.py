@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Least squares over physical bodies only: a convex problem, by the barrier method.
+"""Least squares over physical bodies only: a convex problem, solved by the barrier method.
 
     minimise  |A z - b|^2 / 2 + |z|^2 / 2  - mu sum_i log det J_i(z) - mu sum_k log s_k(z)
 
-with the pseudo-inertias J_i > 0 and scalars s_k > 0 affine in z, by Newton steps for a falling mu
+with the pseudo-inertias J_i > 0 and scalars s_k > 0 affine in z, by Newton steps with decreasing mu
 (Boyd and Vandenberghe, Convex Optimization, 2004, chapter 11).  At the end the sum of squares is at
 most mu times the number of rows of all J_i and s_k above its minimum.
 """
@@ -17,7 +17,7 @@ import numpy as np
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Floats
 
-_LAST = 1e-3  # mu, a thousandth of what one standard deviation adds to the objective
+_LAST = 1e-3  # mu; one standard deviation adds 0.5 to the objective
 _STEPS = 100
 
 
@@ -29,13 +29,13 @@ class Cone(NamedTuple):
     E: Floats  # (k, d, d)
 
     def of(self, z: Floats) -> Floats:
-        """The matrix at z."""
+        """Return the matrix at z."""
         part = z[self.at : self.at + self.E.shape[0]]
         return np.asarray(self.J0 + np.tensordot(part, self.E, 1))
 
 
 def solve(A: Floats, b: Floats, cones: list[Cone], z: Floats) -> Floats:
-    """Minimum from a z inside all cones; BlfDscError if it is not found."""
+    """Return the minimum, starting from z inside all cones; raises BlfDscError if not found."""
     mu = max(1.0, float(np.sum((A @ z - b) ** 2)))
     while mu > _LAST:
         mu = max(_LAST, 0.1 * mu)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is identified, as one vector of standard deviations from the URDF.
+"""Prior of the identified values, in standard deviations from the URDF.
 
-The values of n bodies and joints (14 n + 1,) are of each body its ten inertial parameters, then the
-four JOINT_TERMS, of every joint each, and last the delay of the torques.
+The values (14 n + 1,) of n bodies and joints are the ten inertial parameters of each body, then
+each of the four JOINT_TERMS for all joints, and last the delay of the torques.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from blf_dsc_controller.identification.physical import Cone
 from blf_dsc_controller.run import Floats
 
 JOINT_TERMS = ('rotor inertia', 'viscous friction', 'Coulomb friction', 'offset')
-_POSITIVE = 3  # so many of them, the first, cannot be negative
+_POSITIVE = 3  # the first three of them cannot be negative
 
 _DELAY = 0.005  # s
-_FRICTION = 0.3  # of the largest torque of a joint, also at its largest speed
+_FRICTION = 0.3  # of a joint's largest torque; viscous friction: at its largest speed
 _OFFSET = 0.05  # of the largest torque
-_ROTOR = 100.0  # rad/s^2 or m/s^2, that the largest torque would give to the rotor alone
-_NEAREST = 0.01  # of a body's mass and extent: where the search begins if the URDF's has less
+_ROTOR = 100.0  # rad/s^2 or m/s^2, acceleration of the rotor alone by the largest torque
+_NEAREST = 0.01  # of a body's mass and extent: least value at which the search begins
 
 
 class Prior(NamedTuple):
-    """Values  mean + D z  with z of mean zero and covariance one, physical where all cones are."""
+    """Values  mean + D z  with z of zero mean and unit covariance; physical inside all cones."""
 
     mean: Floats  # (14 n + 1,)
     D: Floats  # (14 n + 1, 14 n + 1)
@@ -43,9 +43,9 @@ class Prior(NamedTuple):
 def prior_of(
     robot: Robot, chain: Chain, held: Sequence[Floats], torque: Floats, speed: Floats
 ) -> Prior:
-    """Prior of a chain: its inertias as the learning trusts them, its joints by what they did.
+    """Return the prior of a chain: inertias as for learning, joint terms scaled by the recording.
 
-    `held` are pseudo-inertias (4, 4) that the bodies contain at least; `torque` and `speed` (n,)
+    `held` are lower bounds (4, 4) of the pseudo-inertias of the bodies; `torque` and `speed` (n,)
     are the largest of each joint.
     """
     from scipy.linalg import block_diag
@@ -87,7 +87,7 @@ def prior_of(
 
 
 def _inside(J: Floats, mass: float) -> Floats:
-    """Pseudo-inertia near J (4, 4) of a body with some mass and extent [kg]."""
+    """Return a physical pseudo-inertia near J (4, 4); `mass` [kg] sets the scale."""
     scale = np.sqrt(mass) * np.array([CENTRE, CENTRE, CENTRE, 1.0])
     values, axes = np.linalg.eigh(J / np.outer(scale, scale))
     L = scale[:, None] * axes * np.sqrt(np.maximum(values, _NEAREST))
@@ -95,7 +95,7 @@ def _inside(J: Floats, mass: float) -> Floats:
 
 
 def columns_of(parameters: BaseParameters, n: int) -> Floats:
-    """Matrix (p + 3 n + 1, 14 n + 1) from the values to [P; viscous; Coulomb; offset; delay]."""
+    """Return the matrix (p + 3 n + 1, 14 n + 1) to [P; viscous; Coulomb; offset; delay]."""
     K = parameters.K.reshape(-1, n, ROTOR + 1)
     p = K.shape[0]
     G = np.zeros((p + 3 * n + 1, 14 * n + 1))

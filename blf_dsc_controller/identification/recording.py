@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What identification takes from a bag: positions and torques of an arm's joints, evenly sampled.
+"""Input of the identification: positions and torques of an arm's joints, evenly sampled.
 
-Velocities are not read: those of a driver lag behind its positions, by how much is rarely known.
+Velocities are not read: those of a driver lag behind its positions, usually by an unknown time.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Recording(NamedTuple):
     period: float  # s
     q: Floats  # (N, n) rad, or m
     torque: Floats  # (N, n) N m, or N
-    gap: NDArray[np.bool_]  # (N,) nothing was recorded here
+    gap: NDArray[np.bool_]  # (N,) whether nothing was recorded here
     source: str  # topic of the torques
 
 
@@ -50,8 +50,8 @@ def read_recording(
     up to where the arm branches; `namespace` and `names` are as for `what_if`.
 
     Raises:
-        BlfDscError: the bag cannot be read, has no torques or too few states, or names no arm's
-            joints.
+        BlfDscError: the bag cannot be read, has no torques or too few states, or has the joints
+            of no arm.
     """
     content = read_content(path, namespace, names)
     named = [joint_state_layout(raw).names for raw in content.topics[JOINT_STATES].raw]
@@ -69,7 +69,7 @@ def read_recording(
 
 
 def _arm_joints(text: str, in_bag: set[str], names: NameMap) -> tuple[str, ...]:
-    """Joints of the arm: from the root of the URDF as long as the bag has them.
+    """Return the joints of the arm: from the root of the URDF as far as the bag has them.
 
     Where it branches, as into fingers, the arm is the only branch with several joints in the bag.
     """
@@ -91,7 +91,7 @@ def _arm_joints(text: str, in_bag: set[str], names: NameMap) -> tuple[str, ...]:
     if not arm:
         found = f'joints of {len(followed)} arms' if followed else 'no joint of the URDF'
         raise BagError(
-            f'the bag has {found}; it names {", ".join(sorted(in_bag))}: choose an arm by --tip, '
+            f'the bag has {found}; it names {", ".join(sorted(in_bag))}: choose an arm with --tip, '
             "or give the bag's names, as in --map joint1=shoulder"
         )
     return arm
@@ -100,21 +100,21 @@ def _arm_joints(text: str, in_bag: set[str], names: NameMap) -> tuple[str, ...]:
 def _resampled(
     joints: tuple[str, ...], stamp: Stamps, q: Floats, torque: Floats, source: str
 ) -> Recording:
-    """Interpolate over uneven stamps and over single lost states."""
+    """Resample evenly, interpolating over uneven stamps and up to two lost states."""
     known = np.isfinite(np.column_stack((q, torque))).all(axis=1)
     stamp, order = np.unique(stamp[known], return_index=True)
     q, torque = q[known][order], torque[known][order]
     if stamp.size < 2:
         raise BagError(
-            f'the bag has {stamp.size} joint state(s) with a position, a torque and a stamp of '
-            'its own; hundreds are needed'
+            f'the bag has {stamp.size} joint state(s) with a position, a torque and a unique '
+            'stamp; hundreds are needed'
         )
     time = (stamp - stamp[0]) * 1e-9
     intervals = np.diff(time)
     period = float(np.median(intervals))
     if period > _SLOWEST:
         raise BagError(
-            f'the joint states come every {period:.3g} s; at least one in {_SLOWEST:g} s is needed'
+            f'the joint states are {period:.3g} s apart; at least one in {_SLOWEST:g} s is needed'
         )
     grid = np.arange(0.0, time[-1], period)
     gap = (intervals > _GAP * period)[np.searchsorted(time, grid, side='right') - 1]

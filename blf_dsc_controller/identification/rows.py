@@ -5,8 +5,8 @@ With a smooth g that vanishes at both ends of a window, d/dt(Yp P) + Yr P + fric
 
     int (g Yr - g' Yp) dt P + int g friction dt = int g torque dt
 
-by parts, exactly (modulating functions: Shinbrot, On the analysis of linear and nonlinear systems,
-1957).  Both sides pass the same low-pass, and a window with a gap in it is left out.
+exactly, by parts (modulating functions: Shinbrot, On the analysis of linear and nonlinear systems,
+1957).  Both sides pass the same low-pass filter; windows with gaps are left out.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ WINDOW = 0.2
 """Length of a window [s]."""
 
 HOP = WINDOW / 4
-"""From one window to the next [s]."""
+"""Time from one window to the next [s]."""
 
 _SMOOTHING = 0.03  # s, over which positions are smoothed
-_COULOMB = 0.01  # rad/s or m/s, of the tanh in place of the sign
-_REST = 0.05  # rad/s or m/s, below which a joint may stick: its rows count less
+_COULOMB = 0.01  # rad/s or m/s, scale of the tanh that replaces the sign
+_REST = 0.05  # rad/s or m/s, below which a joint may stick and its rows count less
 
 
 class Rows(NamedTuple):
@@ -38,19 +38,19 @@ class Rows(NamedTuple):
     time: Floats  # (R,) of their centres, s
     X: Floats  # (R, n, m)
     weight: Floats  # (R, n) of each row, at most 1
-    speed: Floats  # (n,) of each joint, exceeded in a twentieth of the time, rad/s or m/s
+    speed: Floats  # (n,) 95th percentile of each joint's speed, rad/s or m/s
     torque: Floats  # (N, n) at all samples
     g: Floats  # (L,) with sum 1
-    slope: Floats  # (L,) g' in 1/s, likewise
+    slope: Floats  # (L,) g' in 1/s, scaled likewise
     starts: np.ndarray  # (R,) first sample of each window
     period: float  # s
 
     def u(self, delay: float) -> Floats:
-        """Right-hand side (R, n) of torques recorded `delay` [s] late."""
+        """Return the right-hand side (R, n) of torques recorded `delay` [s] late."""
         return self.over_windows(self._shifted(delay), self.g)
 
     def rate(self, delay: float) -> Floats:
-        """Its derivative with respect to time (R, n)."""
+        """Return the time derivative (R, n) of `u`."""
         return -self.over_windows(self._shifted(delay), self.slope)
 
     def _shifted(self, delay: float) -> Floats:
@@ -59,13 +59,13 @@ class Rows(NamedTuple):
         return np.transpose([np.interp(at, samples, column) for column in self.torque.T])
 
     def over_windows(self, values: Floats, factors: Floats) -> Floats:
-        """Sums (R, n) of the values (N, n) in each window times factors (L,)."""
+        """Return the sums (R, n) of the values (N, n) in each window times factors (L,)."""
         windows = sliding_window_view(values, factors.size, axis=0)[self.starts]
         return np.asarray(windows @ factors)
 
 
 def rows_of(recording: Recording, model: SerialChain) -> Rows:
-    """Rows of all whole windows of a recording."""
+    """Return the rows of all windows of a recording without gaps."""
     from scipy.signal import savgol_filter
 
     h, n = recording.period, len(recording.joints)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The control law and its learning: compiled kernels without ROS, files or a clock."""
+"""Control laws and their learning: compiled kernels, independent of ROS, files and clocks."""

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Composite learning: the update law (20) with the latched prediction error (26).
 
-    eps = b_e - Phi_e theta^                                theta^ = [P^; d^], the current one
-    theta^' = Proj( -Gamma (H^T xi2 - kappa W eps) )        W = I, or (Phi_e + rho I)^-1 (newton)
+    eps = b_e - Phi_e theta^                                theta^ = [P^; d^], the current estimate
+    theta^' = Proj( -Gamma (H^T xi2 - kappa W eps) )        W = I, or (Phi_e + rho R)^-1 (newton)
 
     d^3' = -gamma (xi2 + eta d^3) - H (theta^' + Gamma H^T xi2)
 
-(20) prints + kappa eps, which drives P^ to the projection ball as soon as learning starts.
-H^T xi2, with the leakage W_c P^ of the comparison law (35), acts on P^ alone.  With Newton's W
-every excited direction converges at the rate Gamma kappa; the gradient's rates are spread as the
-eigenvalues of Phi_e.
+As printed, (20) has + kappa eps, which drives P^ to the projection ball as soon as learning starts.
+H^T xi2 and the leakage W_c P^ of the comparison law (35) act on P^ alone.  With the Newton W every
+excited direction converges at the rate Gamma kappa; with the gradient update the rates vary with
+the eigenvalues of Phi_e.
 
-(30) lacks the last term.  As long as the estimate is wrong, d^3 makes up for it; the prediction
-error then corrects the estimate within milliseconds but d^3 follows within seconds, and their sum
+(30) lacks the last term.  While the estimate is wrong, d^3 compensates for it; the prediction error
+then corrects the estimate within milliseconds, but d^3 follows only within seconds, and their sum
 is wrong in between.  With the term (`bumpless`) learning does not change the torque H P^ + d^3,
-and d^3 is left with the disturbance.
+and d^3 is left to estimate the disturbance alone.
 """
 
 from blf_dsc_controller.compiled.jit import inner
@@ -26,7 +26,7 @@ from blf_dsc_controller.law.state import Signals, State
 
 @inner
 def prediction_error(settings: Settings, state: State, signals: Signals) -> None:
-    """Compute W eps (m,) in `signals.rate`; zero before the first latch."""
+    """Write W eps (m,) to `signals.rate`; zero while no window is latched."""
     for i in range(settings.m):
         signals.rate[i] = 0.0
     if state.latched[0] == 0.0:
@@ -41,7 +41,7 @@ def prediction_error(settings: Settings, state: State, signals: Signals) -> None
 
 @inner
 def hand_over(settings: Settings, state: State, signals: Signals) -> None:
-    """Take off d^3 what the estimate differs from `signals.work`, that by the tracking error."""
+    """Subtract H (theta^ - `work`) from d^3; `work` is theta^ after the tracking error alone."""
     for j in range(settings.m):
         for i in range(settings.n):
             state.disturbance[i] -= signals.H[i, j] * (state.estimate[j] - signals.work[j])
@@ -49,11 +49,11 @@ def hand_over(settings: Settings, state: State, signals: Signals) -> None:
 
 @inner
 def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturated: bool) -> None:
-    """Step theta^ and d^3 by `dt` [s]: (20), (30).
+    """Advance theta^ and d^3 by `dt` [s]: (20), (30).
 
-    While a torque is saturated the tracking error reflects the limit, not the parameters: then only
-    the prediction error, which uses the applied torque, adapts.  Where a full window is not
-    excited, as in standing still, H^T xi2 is correlated noise and P^ is held (`change_detection`).
+    While a torque is saturated, the tracking error reflects the limit, not the parameters, so only
+    the prediction error, which uses the applied torque, adapts the estimate.  While a full window
+    is not excited, as at standstill, H^T xi2 is correlated noise and ignored (`change_detection`).
     """
     prediction_error(settings, state, signals)
     unexcited = (

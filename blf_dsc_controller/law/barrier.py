@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tan-type barrier (3), weighted, and continued past a stiffness that a sampled loop can hold.
+"""Weighted tan-type barrier (3), continued linearly past the stiffness a sampled loop can hold.
 
     V(xi) = w (k_c^2 / pi) tan s,      s = pi xi^2 / (2 k_c^2)                        [J]
     dV/dxi = w xi / cos^2 s                                                            [N m]
 
-The paper's w = 1 N m/rad makes V1 (11) add rad^2 to J; the weight repairs the unit and lets the
+The paper's w = 1 makes V1 (11) add rad^2 to J; the weight [N m/rad] corrects the unit and lets the
 barrier act before the last microradian.  dV/dxi has slope w (1 + 4 s tan s) / cos^2 s, unbounded at
-the bound, while a torque that is held for a sample can only stabilise a finite stiffness.  Past the
-error where the slope reaches `slope_limit` (the knee) the torque continues as a straight line of
-that slope: continuous with its derivative, strong enough to return the arm, and defined everywhere.
+the bound, but a torque held for one sample can only stabilise a finite stiffness.  Past the error
+at which the slope reaches `slope_limit` (the knee), the torque continues as a straight line of that
+slope: continuous with its derivative, strong enough to return the arm, and defined everywhere.
 
 The bound is constant, or a funnel that narrows to k_c:
 
     k(t) = k_c + (k_0 - k_c) exp(-a t)                                                 [rad]
 
-The potential depends on xi and k as k^2 v(xi / k), its continuation past the knee included, so that
+The potential has the form k^2 v(xi / k), including its continuation past the knee, so that
 V' = dV/dxi (xi1' - xi1 k'/k) + 2 (k'/k) V.  With xi1 k'/k added to the virtual control, V' is that
 of a constant bound plus 2 (k'/k) V, which is not positive while the bound narrows
 (doc/theory-funnel.md).
@@ -31,7 +31,7 @@ _BISECTIONS = 60
 
 @inner
 def slope(xi: float, bound: float, weight: float) -> float:
-    """Stiffness w (1 + 4 s tan s) / cos^2 s   [N m/rad] of the barrier at |xi| < bound [rad]."""
+    """Return the stiffness w (1 + 4 s tan s) / cos^2 s [N m/rad] at |xi| < bound [rad]."""
     s = 0.5 * pi * (xi / bound) ** 2
     c = cos(s)
     return weight * (1.0 + 4.0 * s * tan(s)) / (c * c)
@@ -39,7 +39,7 @@ def slope(xi: float, bound: float, weight: float) -> float:
 
 @inner
 def knee(bound: float, weight: float, slope_limit: float) -> float:
-    """Error [rad] at which the stiffness reaches `slope_limit` [N m/rad] (>= weight)."""
+    """Return the error [rad] at which the stiffness reaches `slope_limit` [N m/rad] (>= weight)."""
     low = 0.0
     high = bound
     for _ in range(_BISECTIONS):
@@ -53,7 +53,7 @@ def knee(bound: float, weight: float, slope_limit: float) -> float:
 
 @inner
 def gradient(xi: float, bound: float, weight: float, slope_limit: float, knee: float) -> float:
-    """dV/dxi [N m]; the barrier torque tau_c of (16), (28) is its negative."""
+    """Return dV/dxi [N m]; its negative is the barrier torque tau_c of (16), (28)."""
     edge = min(abs(xi), knee)
     c = cos(0.5 * pi * (edge / bound) ** 2)
     torque = weight * edge / (c * c) + slope_limit * (abs(xi) - edge)
@@ -62,7 +62,7 @@ def gradient(xi: float, bound: float, weight: float, slope_limit: float, knee: f
 
 @inner
 def potential(xi: float, bound: float, weight: float, slope_limit: float, knee: float) -> float:
-    """V [J]: (3) up to the knee, a parabola past it."""
+    """Return V [J]: (3) up to the knee, a parabola past it."""
     edge = min(abs(xi), knee)
     past = abs(xi) - edge
     inside = weight * bound * bound / pi * tan(0.5 * pi * (edge / bound) ** 2)
@@ -73,7 +73,7 @@ def potential(xi: float, bound: float, weight: float, slope_limit: float, knee: 
 
 @inner
 def update_bound(settings: Settings, signals: Signals, t: float) -> None:
-    """Compute k(t), the knee of its barrier, and k'/k [1/s] of time t [s]."""
+    """Compute k(t), the knee of its barrier and k'/k [1/s] at time t [s]."""
     for i in range(settings.n):
         final = settings.bound[i]
         above = (settings.initial_bound[i] - final) * exp(-settings.funnel_rate * t)

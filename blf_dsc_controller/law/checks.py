@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled checks of every joint state and every sample: flags only.
+"""Compiled checks of every joint state and every sample, which only set flags.
 
-The supervisor derives the reason of each flag.
+The supervisor derives the reason for each flag.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from blf_dsc_controller.law.settings import EFFORT, LINEAR, Settings
 from blf_dsc_controller.law.state import Sample, Signals, State
 
 SUSPECT = 1
-"""A value that is not finite, a torque at its limit, or an error too large."""
+"""A value that is not finite, a torque demand past its limit, or too large an error."""
 
 OUTSIDE = 2
-"""An error past its bound."""
+"""An error outside its bound."""
 
 INVALID = 4
-"""A joint state that is not finite or too fast; the law has not used it."""
+"""A joint state that is not finite or too fast; the law did not use it."""
 
 
 class Checks(NamedTuple):
-    """Limits of the checks, and what they keep of the samples so far."""
+    """Limits of the checks, and the values that they keep from past samples."""
 
-    velocity_limit: Cell  # rad/s, of each joint; 0 switches all checks off
-    error_ratio: Cell  # |xi1| / k_c from which on an error is suspect; 0: never
-    ratio: Annotated[Array, 'n']  # largest |xi1| / k_c so far
+    velocity_limit: Cell  # rad/s, of each joint; 0 disables all checks
+    error_ratio: Cell  # |xi1| / k from which an error is suspect; 0: never
+    ratio: Annotated[Array, 'n']  # largest |xi1| / k so far
     kept: Annotated[Array, 'm + n']  # estimates and d^3 of the last sample that was not suspect
 
 
@@ -40,7 +40,7 @@ checks_of, checks_size = view_of(Checks), size_of(Checks)
 
 @inner
 def is_valid_state(settings: Settings, checks: Checks, measurement: np.ndarray) -> bool:
-    """Whether [q, dq, applied torque] (3 n,) is finite, as far as used, and no joint too fast."""
+    """Check that the used values of [q, dq, applied torque] (3 n,) are finite and not too fast."""
     n = settings.n
     for i in range(n):
         if not (isfinite(measurement[i]) and abs(measurement[n + i]) <= checks.velocity_limit[0]):
@@ -52,7 +52,7 @@ def is_valid_state(settings: Settings, checks: Checks, measurement: np.ndarray) 
 
 @inner
 def check_error(settings: Settings, checks: Checks, xi1: np.ndarray, bound: np.ndarray) -> int:
-    """Return the flags of the errors (n,) [rad]; update the largest ratio."""
+    """Return the flags for the errors (n,) [rad]; update the largest ratio."""
     flags = 0
     error_ratio = checks.error_ratio[0] if settings.surface != LINEAR else 0.0
     for i in range(settings.n):
@@ -70,9 +70,9 @@ def check_error(settings: Settings, checks: Checks, xi1: np.ndarray, bound: np.n
 def check_sample(
     settings: Settings, checks: Checks, state: State, signals: Signals, sample: Sample
 ) -> int:
-    """Return the flags of what the law computed in a sample; update what is kept.
+    """Return the flags for what the law computed in a sample; update the kept values.
 
-    The estimate of a rejected column is finite in the state, and NaN in the sample.
+    The estimate of a rejected column is finite in the state but NaN in the sample.
     """
     flags = check_error(settings, checks, sample.xi1, sample.bound)
     for i in range(settings.n):

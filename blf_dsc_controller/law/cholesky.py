@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cholesky factor and solve in place; numpy's own allocate memory."""
+"""In-place Cholesky factorisation and solve; numpy's versions allocate memory."""
 
 from math import sqrt
 
@@ -7,16 +7,16 @@ import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
 
-_ROUNDING = 1e-14  # of a diagonal entry
+_ROUNDING = 1e-14  # relative to the diagonal entry
 _TINY = 1e-300
 
 
 @inner
 def factor(L: np.ndarray) -> bool:
-    """Replace the lower triangle of a matrix A (m, m) by its factor, for `solve`: whether A > 0.
+    """Replace the lower triangle of A (m, m) by its factor, for `solve`; return whether A > 0.
 
-    The diagonal is kept inverted.  A pivot lost to rounding is replaced by the level of rounding,
-    so that every excitation matrix with its regularization has a factor.
+    The diagonal is stored inverted.  A pivot lost to rounding is replaced by the rounding level,
+    so that every regularized excitation matrix has a factor.
     """
     is_positive = True
     for j in range(L.shape[0]):
@@ -36,7 +36,7 @@ def factor(L: np.ndarray) -> bool:
 
 @inner
 def solve(L: np.ndarray, x: np.ndarray) -> None:
-    """Solve A y = x with the L of `factor`, leaving y in x (m,)."""
+    """Solve A y = x with the L of `factor`; y overwrites x (m,)."""
     m = x.size
     for i in range(m):
         value = x[i]

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Consistency of the window: learn only from rows of one and the same arm.
 
-A window that spans a change of the arm (a payload, a touch) contradicts itself, yet it is excited;
-its least-squares solution is a mixture, and the Newton step would solve it exactly.  With the mean
-of u^T u beside Phi and b the residual of the solution is known,
+A window that spans a change of the arm (a payload, a contact) contradicts itself although it is
+excited; its least-squares solution is a mixture, and the Newton step would solve it exactly.  The
+mean of u^T u, kept with Phi and b, gives the residual of the solution,
 
     r^2 = mean(u^T u) - b^T theta_LS   [(N m)^2],
 
-and a window is latched only if r^2 is at most four times the least of any full window, and if its
-solution gives the arm a positive inertia, which the residual does not show.  Rows that contradict
-the latched solution (their mean square over 0.1 s is more than eight times r^2) mean that the arm
-has changed: window, filters and latch are dropped, and learning starts anew.  Until the new window
-is full it averages no disturbance out, so its solution is pulled to the estimate
-before the change, weakly excited directions most; likewise a full window whose residual is unusual,
-to the solution a window ago.
+and a window is latched only if r^2 is at most four times the smallest of any full window, and if
+its solution gives the arm a positive inertia, which the residual does not show.  Rows that
+contradict the latched solution (their mean square error over 0.1 s exceeds eight times r^2) mean
+that the arm has changed: window, filters and latch are cleared, and learning restarts.  Until the
+new window is full, it does not average out disturbances, so its solution is pulled to the estimate
+before the change, most strongly in weakly excited directions; likewise, a full window with an
+unusually large residual is pulled to the solution of one window ago.
 """
 
 import numpy as np
@@ -23,17 +23,17 @@ from blf_dsc_controller.law import cholesky, window
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Signals, State
 
-_GATE = 4.0  # of mean squares: twice the torque
-_ALARM = 8.0  # likewise, more, for a solution extrapolates
-_USUAL = 1.25  # times the least residual, which varies with the motion
-_DOUBT = 3.0  # pull of the anchor for each (N m)^2 above, 1/(kg m^2)^2
-_LEAST_INERTIA = 0.1  # of the initial estimate's
-_MEMORY = 0.1  # s, over which the last rows are averaged
+_GATE = 4.0  # ratio of mean squares: twice the torque
+_ALARM = 8.0  # likewise; larger, since a solution extrapolates
+_USUAL = 1.25  # times the smallest residual, which varies with the motion
+_DOUBT = 3.0  # pull to the anchor per (N m)^2 above that, 1/(kg m^2)^2
+_LEAST_INERTIA = 0.1  # fraction of the initial estimate's
+_MEMORY = 0.1  # s, averaging time of the last rows
 
 
 @inner
 def explained(settings: Settings, residual: float) -> float:
-    """Mean square residual that noise and unmodelled torque explain, at least `residual`."""
+    """Return the mean square residual that noise and unmodelled torque explain (>= `residual`)."""
     return max(residual, settings.residual_floor)
 
 
@@ -58,7 +58,7 @@ def detect_change(settings: Settings, state: State, signals: Signals, t: float, 
 
 @inner
 def forget_window(settings: Settings, state: State) -> None:
-    """Empty the window, its filters and the latch; the estimate stays and becomes the anchor."""
+    """Clear the window, its filters and the latch; the estimate stays and becomes the anchor."""
     state.latched[0] = 0.0
     state.latched_lambda[0] = 0.0
     state.best_lambda[0] = 0.0
@@ -84,7 +84,7 @@ def clear(matrix: np.ndarray) -> None:
 
 @inner
 def window_residual(running: np.ndarray, theta: np.ndarray) -> float:
-    """Sum of |u - X theta|^2 over the window, from its sums of [X | u]^T [X | u]."""
+    """Return the sum of |u - X theta|^2 over the window, from its sums of [X | u]^T [X | u]."""
     m = theta.size
     total = running[m, m]
     for i in range(m):
@@ -97,7 +97,7 @@ def window_residual(running: np.ndarray, theta: np.ndarray) -> float:
 
 @inner
 def is_physical(settings: Settings, signals: Signals, q: np.ndarray, theta: np.ndarray) -> bool:
-    """Whether M(q) of theta (m,) is positive definite, with a tenth of that of P^(0) to spare.
+    """Check that M(q) of theta (m,), minus a tenth of that of P^(0), is positive definite.
 
     Overwrites Yp and Yr of `signals`.
     """
@@ -115,10 +115,10 @@ def is_physical(settings: Settings, signals: Signals, q: np.ndarray, theta: np.n
 
 @inner
 def accept_window(settings: Settings, state: State, signals: Signals, q: np.ndarray) -> bool:
-    """Whether the window is consistent and its solution physical; if so it is kept.
+    """Check that the window is consistent and its solution physical; if so, keep the solution.
 
-    A window that is not full, or whose residual is more than usual, is pulled to the anchor:
-    Phi + a I, b + a theta_anchor, in `signals`.
+    A window that is not full, or has an unusually large residual, is pulled to the anchor:
+    Phi + a R, b + a R theta_anchor, in `signals`.
     """
     m = settings.m
     solution = signals.work

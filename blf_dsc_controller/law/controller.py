@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller: a law with explicit state, `reset`, and `update` once a sample."""
+"""Controller: a law with explicit state, `reset`, and `update` once per sample."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ def update(
     sample_vector: np.ndarray,
     checks_vector: np.ndarray,
 ) -> int:
-    """One sample of the law with its whole telemetry, on packed vectors: see `step`.
+    """Run one sample of the law with all its telemetry, on packed vectors: see `step`.
 
-    Returns the flags of its checks (see `checks`), 0 without them.
+    Returns the flags of its checks (see `checks`), or 0 while they are off.
     """
     settings = settings_of(settings_vector, model)
     state = state_of(state_vector, settings)
@@ -66,16 +66,16 @@ class Controller:
     """A law with its settings, its reference and its state.
 
     Attributes:
-        settings: of the law; views on `settings_vector`.
-        state: views on `state_vector`, the whole state of the controller.
-        signals: views on what the last update computed.
+        settings: settings of the law; views of `settings_vector`.
+        state: views of `state_vector`, the whole state of the controller.
+        signals: views of the values that the last update computed.
         sample: telemetry of the last update.
-        checks: views on `checks_vector`: limits of the checks, which are off at first.
-        flags: of the checks of the last update.
+        checks: views of `checks_vector`: limits of the checks, which are initially off.
+        flags: flags set by the checks in the last update.
     """
 
     def __init__(self, settings: Settings, reference_vector: np.ndarray) -> None:
-        """Allocate for settings and a packed reference; compile the kernels."""
+        """Allocate the vectors for settings and a packed reference; compile the kernels."""
         self.settings_vector = pack(settings)
         self.reference_vector = reference_vector
         self.settings = settings_of(self.settings_vector, settings.model)
@@ -94,22 +94,22 @@ class Controller:
         self.reset()
 
     def bound_at(self, t: float) -> np.ndarray:
-        """Bound k(t) (n,) [rad] at a time [s] since the start."""
+        """Return the bound k(t) (n,) [rad] at time t [s] since the start."""
         barrier.update_bound(self.settings, self.signals, t)
         return np.array(self.signals.bound)
 
     def reference_at(self, t: float) -> np.ndarray:
-        """Reference at a time [s] since the start: qr, dqr, ddqr (3, n)."""
+        """Return the reference qr, dqr, ddqr (3, n) at time t [s] since the start."""
         (now,) = reference.sampled(self.reference_vector, np.array([t]))
         return np.asarray(now)
 
     @property
     def samples(self) -> int:
-        """Samples since the start."""
+        """Number of samples since the start."""
         return int(self.state.samples[0])
 
     def reset(self) -> None:
-        """Return to the initial state: estimates P^(0), filters and window empty."""
+        """Return to the initial state: initial estimate, empty filters and window."""
         self.state_vector.fill(0.0)
         self.state.estimate[:] = self.settings.initial_estimate
         self.state.anchor[:] = self.settings.initial_estimate
@@ -121,11 +121,11 @@ class Controller:
         check_start(joints, q, self.bound_at(t), self.reference_vector, t)
 
     def update(self, t: float, dt: float, measurement: np.ndarray) -> np.ndarray:
-        """Torque (n,) [N m] for a measurement; a view that the next update overwrites.
+        """Return the torque (n,) [N m] for a measurement: a view that the next update overwrites.
 
         The measurement is [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,)
-        N m], t [s] the time since the start and dt [s] since the last sample. With INVALID among
-        the `flags` nothing has changed, the torque neither.
+        N m], t [s] the time since the start and dt [s] since the last sample. If INVALID is among
+        the `flags`, nothing has changed, including the torque.
         """
         self.flags = update(
             self.settings.model,
@@ -142,7 +142,7 @@ class Controller:
         return self.sample.torque
 
     def save(self) -> np.ndarray:
-        """Copy of the whole state."""
+        """Return a copy of the whole state."""
         return np.array(self.state_vector)
 
     def restore(self, saved: np.ndarray) -> None:

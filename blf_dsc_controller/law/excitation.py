@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Excitation: the latch (27), and which disturbance columns a window can tell apart.
+"""Excitation: the latch (27) and the rejection of disturbance columns.
 
-Disturbance columns that the window cannot tell from the parameters are rejected: theta_j = 0.
+Columns that the window cannot distinguish from the parameters are rejected: theta_j = 0.
 """
 
 import numpy as np
@@ -12,26 +12,25 @@ from blf_dsc_controller.law.settings import BEST, Settings
 from blf_dsc_controller.law.state import Signals, State
 
 _WARM = 4  # inverse iterations from the previous direction
-_COLD = 60  # from any direction
-_COMPARABLE = 0.95  # of the best lambda_min
-_FORGETTING = 0.1  # of the best lambda_min in the time of a window
+_COLD = 60  # from an arbitrary direction
+_COMPARABLE = 0.95  # fraction of the best lambda_min
+_FORGETTING = 0.1  # fraction of the best lambda_min lost per window
 
 
 @inner
 def reset_direction(settings: Settings, state: State) -> None:
-    """Start the inverse iteration afresh, for a matrix that has changed."""
+    """Restart the inverse iteration, for a matrix that has changed."""
     for i in range(settings.m):
         state.min_eigenvector[i] = settings.m**-0.5
 
 
 @inner
 def reject_columns(settings: Settings, state: State, signals: Signals) -> None:
-    """Reject the disturbance columns that this window cannot tell from the parameters.
+    """Reject the disturbance columns that this window cannot distinguish from the parameters.
 
-    Only if the window excites the parameters without any column; then the column with the largest
-    entry in the minimum eigenvector is rejected, until the rest is excited.  This happens once, at
-    the first full window that is excited enough: a column that came and went would move the
-    estimates.
+    The window must excite the parameters without any column; then the column with the largest entry
+    in the minimum eigenvector is rejected, repeatedly, until the rest is excited.  This happens at
+    the first full window that is excited enough, and once per window while a column is rejected.
     """
     for j in range(settings.p, settings.m):
         state.active[j] = 0.0
@@ -40,7 +39,7 @@ def reject_columns(settings: Settings, state: State, signals: Signals) -> None:
     for j in range(settings.p, settings.m):
         state.active[j] = 1.0
     if not parameters_excited:
-        state.columns_checked[0] = 0.0  # all are back, until a window is excited
+        state.columns_checked[0] = 0.0  # readmit all, until a window is excited
         reset_direction(settings, state)
         return
     state.columns_checked[0] = 1.0
@@ -58,7 +57,7 @@ def reject_columns(settings: Settings, state: State, signals: Signals) -> None:
 
 @inner
 def readmit_columns(settings: Settings, state: State, signals: Signals) -> None:
-    """Check rejected columns again, once a window: a later one may tell them apart."""
+    """Check rejected columns again, once per window: a later one may distinguish them."""
     rejected = 0.0
     for j in range(settings.p, settings.m):
         rejected += 1.0 - state.active[j]
@@ -69,9 +68,9 @@ def readmit_columns(settings: Settings, state: State, signals: Signals) -> None:
 
 @inner
 def is_preferred(settings: Settings, state: State, value: float) -> bool:
-    """Whether a window of this lambda_min may replace the latched one.
+    """Return whether a window with lambda_min `value` may replace the latched one.
 
-    When the reference stops, `last` (27) would end on the weakest window above the threshold.  A
+    When the reference stops, `last` (27) would end with the weakest window above the threshold.  A
     weaker window only has less information, unless the latched one is old or contradicted.
     """
     if settings.latch == BEST:
@@ -83,9 +82,9 @@ def is_preferred(settings: Settings, state: State, value: float) -> bool:
 def update_excitation(
     settings: Settings, state: State, signals: Signals, t: float, dt: float, q: np.ndarray
 ) -> None:
-    """Compute lambda_min of the window; latch it from tau_d + T_a on if it suffices (27).
+    """Compute lambda_min of the window; from tau_d + T_a on, latch the window if it suffices (27).
 
-    After a change of the arm a window need not be full, but must have lasted T_a.
+    After a change of the arm the window need not be full, but must span at least T_a.
     """
     if state.rows[0] == 0.0:
         return

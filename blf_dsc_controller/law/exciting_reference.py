@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Search for the sum of sinusoids that excites the learning most.
 
-For a reference whose period is the window the excitation matrix is, in the steady state,
+For a reference whose period is the window, the excitation matrix in the steady state is
 
-    Phi = 1/tau_d int X_f^T X_f dt,      X_f = [H(q, dq, dq, ddq) | D] behind the learning's filter
+    Phi = 1/tau_d int X_f^T X_f dt,      X_f = [H(q, dq, dq, ddq) | D] after the learning's filter
 
-with the rows' weights of the learning.  Its eigenvalues mu_i relative to the information R of the
-prior, a multiple a of which the learning adds to Phi (`learning.prior_weight`), say how well a
-window determines theta.  What is maximised, over offset, cosines and sines of each joint, is
+with the row weights of the learning.  Its eigenvalues mu_i relative to the information R of the
+prior, of which the learning adds a multiple a to Phi (`learning.prior_weight`), measure how well a
+window determines theta.  The search maximises, over offset, cosines and sines of each joint,
 
-    a = 0:  log min mu_i                    the worst determined combination
+    a = 0:  log min mu_i                    the worst-determined combination
     a > 0:  sum log (1 + mu_i / a)          the log-determinant of (a R)^-1 (Phi + a R)
 
-The second says how much a window shrinks the volume that the prior leaves.  With a prior the worst
-determined combination is one that no motion shows, and the prior stands for it: the least
-eigenvalue would spend the motion on that.
+The second measures how much a window shrinks the uncertainty volume of the prior.  With a prior,
+the worst-determined combination is one that no motion reveals and that is left to the prior:
+maximising the smallest eigenvalue would spend the motion on it.
 """
 
 from __future__ import annotations
@@ -33,38 +33,38 @@ from blf_dsc_controller.reference.limits import MotionError
 from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
 
 ITERATIONS = 150
-"""Most iterations of a search."""
+"""Maximum number of iterations of a search."""
 
 _SAMPLES_PER_HARMONIC = 64
-_COARSE = 4  # samples to one of the rows behind the filter
-_MARGIN = 1e-3  # of each limit, for peaks between two samples
-_PENALTY = 1e4  # of the mean square excess: limits are exceeded by some percent
-_SHRINKS = 30  # of the amplitudes, by a hundredth each, to keep them
-_SPREAD = 0.2  # of the amplitudes that a search starts from
+_COARSE = 4  # samples per filtered row
+_MARGIN = 1e-3  # fraction of each limit, for peaks between samples
+_PENALTY = 1e4  # on the mean square excess: limits are exceeded by a few percent
+_SHRINKS = 30  # most reductions of the amplitudes, by 1 % each, to keep the limits
+_SPREAD = 0.2  # standard deviation of a search's initial amplitudes
 
 
 class Excitation(NamedTuple):
-    """Excitation by a periodic reference in the steady state, and how it uses the limits."""
+    """Excitation by a periodic reference in the steady state, and its use of the limits."""
 
     lambda_min: float  # minimum eigenvalue of Phi, relative to R
-    gain: float  # what is maximised
-    ratios: np.ndarray  # (4, n) largest position, velocity, acceleration, torque over its limit
-    room: np.ndarray  # (k,) least room of each pair of links and to the floor; negative: too near
-    excess: float  # mean square by which the limits are violated, in their units
+    gain: float  # objective of the search
+    ratios: np.ndarray  # (4, n) largest position, velocity, acceleration, torque, over the limit
+    room: np.ndarray  # (k,) least room between pairs of links and to the floor; negative: too close
+    excess: float  # mean square violation of the limits, relative to them
 
     @property
     def is_allowed(self) -> bool:
-        """Whether it keeps all limits."""
+        """Whether the reference keeps all limits."""
         return bool(self.ratios.max() <= 1.0 and self.room.min(initial=0.0) >= 0.0)
 
 
 class ExcitationProblem:
     """Excitation of a controller as a function of its periodic reference.
 
-    The torque is computed with each of the parameters `guess` (p,) or (k, p), and the friction that
-    the controller starts from, and limited to `torque_fraction` of the configured limit, as are
-    velocity and acceleration to `speed_fraction`; `harmonics` is the highest harmonic of the window
-    in the reference.
+    The torque is computed for each parameter vector in `guess` (p,) or (k, p), with the initial
+    friction of the controller, and limited to `torque_fraction` of the configured limit; velocity
+    and acceleration are limited to `speed_fraction`.  `harmonics` is the highest harmonic of the
+    window in the reference.
     """
 
     def __init__(
@@ -103,15 +103,15 @@ class ExcitationProblem:
         self._filter = 1.0 / (1.0 + 1j * omega / settings.pole) ** 2  # two poles in series
 
     def start(self, random: np.random.Generator) -> np.ndarray:
-        """A random x in the middle of the range of each joint, see `parameters`."""
+        """Return a random x around the middle of each joint's range; see `parameters`."""
         n, h = self.n, self.harmonics
         return np.append(random.uniform(-0.5, 0.5, n), random.normal(0.0, _SPREAD, 2 * n * h))
 
     def parameters(self, x: np.ndarray) -> dict[str, tuple[float, ...]]:
-        """Parameters of `reference` for x: offsets (n,), cosines (n, h) and sines (n, h).
+        """Return the parameters of `reference` for x: offsets (n,), cosines and sines (n, h).
 
-        Offsets are in units of half the range, amplitudes of what alone would reach a limit of
-        position, velocity or acceleration. Sines are cosines of phase -pi/2.
+        Offsets are in units of half the range, amplitudes in units of the one that alone would
+        reach a limit of position, velocity or acceleration. Sines are cosines of phase -pi/2.
         """
         n, h = self.n, self.harmonics
         unit = self._units
@@ -124,7 +124,7 @@ class ExcitationProblem:
         }
 
     def evaluate(self, parameters: dict[str, tuple[float, ...]]) -> Excitation:
-        """Excitation by the reference with parameters offset, amplitude, frequency and phase."""
+        """Return the excitation by the reference with offset, amplitude, frequency and phase."""
         motion, rows = self._rows(parameters)
         q, dq, ddq = motion.transpose(1, 0, 2)
         torque = np.abs(rows @ self._guess.T).max(axis=2)
@@ -144,7 +144,7 @@ class ExcitationProblem:
         )
 
     def remaining(self, parameters: dict[str, tuple[float, ...]]) -> np.ndarray:
-        """Deviation (m,) of each entry of theta after a window, over that of its prior."""
+        """Return each entry's deviation (m,) in theta after a window, relative to its prior."""
         motion, rows = self._rows(parameters)
         mu, V = np.linalg.eigh(self._relative_excitation(motion[:, 1], rows))
         a, L = self._settings.prior_weight, self._scale
@@ -152,12 +152,12 @@ class ExcitationProblem:
         return np.asarray(np.sqrt(after / (L**2).sum(axis=1)))
 
     def _rows(self, parameters: dict[str, tuple[float, ...]]) -> tuple[np.ndarray, np.ndarray]:
-        """Motion (k, 3, n) and [H | D] (k, n, m) over a period."""
+        """Return the motion (k, 3, n) and [H | D] (k, n, m) over a period."""
         motion = sampled(pack(self.n, [sinusoids_term(**parameters)]), self._times)
         return motion, rows_along(self._settings, self._vector, self._times, motion)
 
     def _relative_excitation(self, dq: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """L^T Phi L (m, m) where R^-1 = L L^T: its eigenvalues are those of Phi relative to R."""
+        """Return L^T Phi L (m, m), R^-1 = L L^T; its eigenvalues are those of Phi relative to R."""
         settings = self._settings
         coarse = dq[::_COARSE]
         spectrum = np.fft.rfft(rows, axis=0)[: len(coarse) // 2 + 1] / _COARSE
@@ -175,13 +175,13 @@ def search(
     starts: int,
     progress: Callable[[int, float], None] = lambda _done, _best: None,
 ) -> np.ndarray:
-    """Best x (see `ExcitationProblem.parameters`) of searches from random starting points.
+    """Return the best x (see `ExcitationProblem.parameters`) found from random starting points.
 
-    `progress` is told after each iteration how many of `starts` * ITERATIONS are done, and the best
-    gain of the searches that are finished.
+    `progress` is called after each iteration with the number of iterations done, of `starts` *
+    ITERATIONS, and the best gain of the finished searches.
 
     Raises:
-        MotionError: none of the searches found a reference that keeps the limits.
+        MotionError: no search found a reference that keeps the limits.
     """
     from scipy.optimize import approx_fprime, minimize
 
@@ -219,9 +219,9 @@ def search(
     progress(starts * ITERATIONS, most)
     if best is None:
         raise MotionError(
-            f'no reference was found, in {starts} searches, that keeps positions, velocities, '
-            'accelerations and torques within their limits and the links apart from each other '
-            'and from the floor: allow a larger fraction of the torque, widen limits, take a '
+            f'no reference found in {starts} searches keeps positions, velocities, '
+            'accelerations and torques within their limits and the links clear of each other '
+            'and of the floor: allow a larger fraction of the torque, widen the limits, use a '
             'smaller radius or a lower floor, or search from more starts'
         )
     return best

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a configuration to its model, settings and controller.
+"""Construction of the model, settings and controller of a configuration.
 
 All laws share one kernel; they differ in the surface and in which gains are zero:
 
     blf_dsc       (28): filtered surface, barrier, composite learning, d^3
     model_based   (16): the same with P^ = P and the disturbance known, nothing adapted
     backstepping  (35): linear surface, position gain, leaky adaptation by the tracking error
-    slotine_li    tau = H P^ - K_p s, P^' = -Gamma H^T s: (35) without its extra terms; may
-                  integrate s, by (30)
+    slotine_li    tau = H P^ - K_p s, P^' = -Gamma H^T s: (35) without its extra terms,
+                  optionally with the integral of s, by (30)
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from blf_dsc_controller.law.settings import (
 )
 from blf_dsc_controller.reference.approach import plan_start, reference_of
 
-_FRICTION = 0.05  # deviation of friction, of the rated torque
+_FRICTION = 0.05  # standard deviation of friction, over the rated torque
 
 
 def model_of(config: ControllerConfig) -> ArmModel:
-    """Model named by `model`, with the geometry known to the controller."""
+    """Return the model named by `model`, with the geometry known to the controller."""
     if config.model == 'urdf':
         robot = config.robot
-        return deepcopy(learned_of(robot, robot.chain(config.joints)).model)  # working memory
+        return deepcopy(learned_of(robot, robot.chain(config.joints)).model)  # has working memory
     return arm_model(config.model, len(config.joints), config.arm.l1, config.arm.gravity)
 
 
 def column_names(config: ControllerConfig) -> tuple[str, ...]:
-    """Name of each disturbance column, in the order of `prediction.fill_columns`."""
+    """Return the name of each disturbance column, in the order of `prediction.fill_columns`."""
     learning = config.learning
     switched = {'bias': learning.bias, 'viscous': learning.viscous, 'coulomb': learning.coulomb}
     blocks = [name for name, is_on in switched.items() if is_on]
@@ -53,12 +53,12 @@ def column_names(config: ControllerConfig) -> tuple[str, ...]:
 
 
 def estimate_names(config: ControllerConfig) -> tuple[str, ...]:
-    """Name of each entry of theta^: the model's parameters, then the disturbance columns."""
+    """Return the name of each entry of theta^: model parameters, then disturbance columns."""
     return model_of(config).parameter_names + column_names(config)
 
 
 def initial_columns(config: ControllerConfig) -> tuple[float, ...]:
-    """Initial estimate of each disturbance column: the friction of a URDF, else zero."""
+    """Return the initial estimate of each disturbance column: friction of a URDF, else zero."""
     known: dict[str, tuple[float, ...]] = {}
     if config.model == 'urdf':
         known = config.robot.friction(config.robot.chain(config.joints))
@@ -68,9 +68,9 @@ def initial_columns(config: ControllerConfig) -> tuple[float, ...]:
 
 
 def prior_covariance(config: ControllerConfig) -> np.ndarray:
-    """Covariance (m, m) of the prior of theta: one for the planar arms, of a URDF its deviations.
+    """Return the prior covariance (m, m) of theta: identity for planar arms, else of the URDF.
 
-    Drives may be off by half, friction columns by a twentieth of the rated torque.
+    Standard deviations: half its value for a drive, 5 % of the rated torque for friction columns.
     """
     columns = column_names(config)
     if config.model != 'urdf':
@@ -87,14 +87,14 @@ def prior_covariance(config: ControllerConfig) -> np.ndarray:
 
 
 def required_fields(config: ControllerConfig) -> tuple[str, ...]:
-    """Fields of a joint state that the controller needs."""
+    """Return the fields of a joint state that the controller needs."""
     velocity = ('velocity',) if config.safety.velocity == 'measured' else ()
     effort = ('effort',) if config.learning.torque_source == 'effort' else ()
     return ('position', *velocity, *effort)
 
 
 def settings_of_config(config: ControllerConfig) -> Settings:
-    """Settings of a configuration, in the paper's symbols."""
+    """Return the settings of a configuration, in the paper's symbols."""
     model = model_of(config)
     learning = config.learning
     p, columns = len(model.parameter_names), len(column_names(config))
@@ -206,7 +206,7 @@ def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
 
 
 def controller_of(config: ControllerConfig) -> Controller:
-    """Controller of a configuration, compiled and at rest."""
+    """Return the controller of a configuration, compiled and in its initial state."""
     return Controller(settings_of_config(config), reference_of(config))
 
 
@@ -217,9 +217,9 @@ def begin(
     dq: np.ndarray,
     t: float = 0.0,
 ) -> float:
-    """Give the controller the planned reference; returns when [s] the approach is over, or `t`.
+    """Set the planned reference of the controller; return when [s] the approach ends, or `t`.
 
-    Arguments and errors as in `plan_start`.
+    Arguments and errors are those of `plan_start`.
     """
     motion = plan_start(config, controller.bound_at(t), q, dq, t)
     controller.reference_vector = motion.vector

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Lyapunov function (29) term by term, and the bound (32) on it, where the truth is known."""
+"""Lyapunov function (29), term by term, and the bound (32) on it, where the truth is known."""
 
 from math import exp, nan
 
@@ -15,7 +15,7 @@ _POSTURES = 181
 
 @inner
 def error_term(settings: Settings, signals: Signals) -> float:
-    """Barrier potential (3) of xi1, weighted; w z1^2 / 2 for the laws without a barrier   [J]."""
+    """Return the weighted barrier potential (3) of xi1 [J]; w z1^2 / 2 without a barrier."""
     total = 0.0
     for i in range(settings.n):
         if settings.surface == LINEAR:
@@ -33,7 +33,7 @@ def error_term(settings: Settings, signals: Signals) -> float:
 
 @inner
 def kinetic_term(settings: Settings, signals: Signals, q: np.ndarray) -> float:
-    """xi2^T M xi2 / 2 [J], by M xi2 = Yp(q, xi2) P; overwrites Yp and Yr in `signals`."""
+    """Return xi2^T M xi2 / 2 [J], M xi2 = Yp(q, xi2) P; overwrites Yp and Yr in `signals`."""
     settings.model.momentum_regressor(q, signals.xi2, signals.momentum, signals.rest)
     total = 0.0
     for i in range(settings.n):
@@ -44,7 +44,7 @@ def kinetic_term(settings: Settings, signals: Signals, q: np.ndarray) -> float:
 
 @inner
 def parameter_term(settings: Settings, state: State) -> float:
-    """P~^T Gamma^-1 P~ / 2; parameters that are not adapted (Gamma_j = 0) do not count."""
+    """Return P~^T Gamma^-1 P~ / 2 of the parameters that are adapted (Gamma_j > 0)."""
     total = 0.0
     for j in range(settings.p):
         if settings.Gamma[j] > 0.0:
@@ -55,7 +55,7 @@ def parameter_term(settings: Settings, state: State) -> float:
 
 @inner
 def disturbance_term(settings: Settings, state: State, signals: Signals) -> float:
-    """(tau_dist - d^3)^2 / (2 gamma); joints whose d^3 is not adapted do not count."""
+    """Return (tau_dist - d^3)^2 / (2 gamma) of the joints whose d^3 is adapted (gamma > 0)."""
     total = 0.0
     for i in range(settings.n):
         if settings.gamma[i] > 0.0:
@@ -68,7 +68,7 @@ def disturbance_term(settings: Settings, state: State, signals: Signals) -> floa
 def fill_energies(
     settings: Settings, state: State, signals: Signals, q: np.ndarray, sample: Sample
 ) -> None:
-    """Compute the terms of (29) for the telemetry sample; NaN where the truth is not known."""
+    """Compute the terms of (29) for the telemetry sample; NaN where the truth is unknown."""
     sample.lyapunov[0] = error_term(settings, signals)
     if settings.truth_known == 1:
         sample.lyapunov[1] = kinetic_term(settings, signals, q)
@@ -80,7 +80,7 @@ def fill_energies(
 
 
 def largest_inertia(settings: Settings) -> float:
-    """Largest eigenvalue of M(q) [kg m^2] over all postures, by the true parameters."""
+    """Return the largest eigenvalue of M(q) [kg m^2] over all postures, for the true parameters."""
     n, p = settings.n, settings.p
     Yp, Yr = np.zeros((2, n, p))
     largest = 0.0
@@ -94,9 +94,9 @@ def largest_inertia(settings: Settings) -> float:
 
 
 def decay_rate(settings: Settings) -> float:
-    """kappa_e of (32) [1/s]; 0, so that (32) says nothing, where eta, gamma or kappa is zero.
+    """Return kappa_e of (32) [1/s]; 0 if eta, gamma or kappa is zero, when (32) is void.
 
-    A Newton step replaces sigma, the least eigenvalue of Phi_e, by sigma / (sigma + rho).
+    A Newton step replaces sigma, the smallest eigenvalue of Phi_e, by sigma / (sigma + rho).
     """
     if settings.surface == LINEAR or settings.truth_known == 0:
         return 0.0
@@ -112,16 +112,16 @@ def decay_rate(settings: Settings) -> float:
 
 
 class ExponentialBound:
-    """(32) from the latch T_e on, at its tightest: without the mismatch eps_d.
+    """Bound (32) from the latch T_e on, at its tightest: without the mismatch eps_d.
 
         V(t) <= V(T_e) exp(-kappa_e (t - T_e)) + theta / kappa_e (1 - exp(-kappa_e (t - T_e)))
         theta = eta d3^T d3 / 2
 
-    The printed theta is divided by kappa_e once too often.  d3 is the largest disturbance known.
+    The printed theta is divided by kappa_e once too often.  d3 is the largest known disturbance.
 
     Attributes:
-        rate: kappa_e [1/s]; at 0 there is no bound.
-        floor: theta / kappa_e [J], which V may stay below for ever.
+        rate: kappa_e [1/s]; if 0, there is no bound.
+        floor: theta / kappa_e [J], the limit of the bound for large t.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -132,7 +132,7 @@ class ExponentialBound:
         self._begin: tuple[float, float] | None = None
 
     def at(self, t: float, V: float, latched: bool) -> float:
-        """Bound at the time t [s], where V [J] is; NaN before the latch and without a rate."""
+        """Return the bound at time t [s], given V(t) [J]; NaN before the latch or at rate 0."""
         if self.rate == 0.0 or not latched:
             return nan
         if self._begin is None:

@@ -1,25 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows [X | u] of the prediction error: X theta = u holds for the true theta = [P; d].
 
-`filtered` (default).  d/dt(Yp P) + Yr P + D d = tau, integrated over a sample of held torque, is
+`filtered` (default).  d/dt(Yp P) + Yr P + D d = tau, integrated over a sample of held torque, gives
 
     X_k = (Yp_k - Yp_{k-1}) / T + (Yr_k + Yr_{k-1}) / 2,      X_k P + D_k d = tau on [k-1, k]
 
-up to O(T^2).  Both sides pass the same two cascaded poles, which leaves the identity untouched and
-takes the noise off the difference quotient.  No acceleration is needed.
+up to O(T^2).  Both sides pass through the same two cascaded poles, which preserves the identity and
+filters the noise of the difference quotient.  No acceleration is needed.
 
 `acceleration`.  ddq^ = alpha2' + xi2'^ with xi2'^ from the filter (8): X = H(q, dq, dq, ddq^).
 
 `lambda`.  The paper's (24): X = H(q, dq, alpha2, alpha2'), u = Lambda tau with the scalar
 Lambda = x^T y / x^T x,  x = [xi2'^ + alpha2'; xi2 + alpha2; 1],  y = [alpha2'; alpha2; 1].  Since
 tau = [M C G] x and H P = [M C G] y, this is exact only where y is parallel to x: its error is of
-first order in xi2 and xi2', and changes with the units.
+first order in xi2 and xi2', and depends on the units.
 
-Beside P the learning estimates the coefficients d of the disturbance columns
+Besides P, the learning estimates the coefficients d of the disturbance columns
 
     tau_dist = D d,    D = [ I | diag(dq) | diag(tanh(dq / v_c)) | I sin(w t) | I cos(w t) | ... ]
 
-as far as each block is configured.  (22)-(24) instead subtract the estimate d^3 from the torque,
+for each block that is configured.  (22)-(24) instead subtract the estimate d^3 from the torque,
 which hides the parameter error.
 """
 
@@ -36,7 +36,7 @@ from blf_dsc_controller.law.state import Signals, State
 
 @inner
 def set_block(rest: np.ndarray, at: int, i: int, value: float) -> None:
-    """Entry (i, i) of the block that starts at column `at`; the others of its row are zero."""
+    """Set entry (i, i) of the block that starts at column `at`; zero the rest of its row."""
     for k in range(rest.shape[0]):
         rest[i, at + k] = 0.0
     rest[i, at + i] = value
@@ -65,9 +65,9 @@ def fill_columns(settings: Settings, t: float, dq: np.ndarray, rest: np.ndarray)
 
 @inner
 def fill_compensation(settings: Settings, signals: Signals) -> None:
-    """Fill columns p.. of `signals.H` with friction at the velocity of the reference.
+    """Fill columns p.. of `signals.H` with friction at the reference velocity.
 
-    The measured velocity would feed its noise and the chatter at rest into the torque.
+    The measured velocity would feed its noise, and chatter at rest, into the torque.
     """
     n = settings.n
     at = settings.p + n * settings.bias
@@ -83,9 +83,9 @@ def fill_compensation(settings: Settings, signals: Signals) -> None:
 def filter_row(
     settings: Settings, state: State, signals: Signals, dt: float, torque: np.ndarray
 ) -> None:
-    """Pass [X | u] of the last interval through both poles, leaving it in `signals.row`.
+    """Pass [X | u] of the last interval through both poles; write the result to `signals.row`.
 
-    Rows of a joint that hardly moves count less: its stiction would be taken for gravity.
+    Rows of a joint that hardly moves count less: its stiction would be mistaken for gravity.
     """
     gain = surface.filter_gain(1.0 / settings.pole, dt)
     p = settings.p
@@ -118,7 +118,7 @@ def remember(settings: Settings, state: State, signals: Signals) -> None:
 
 @inner
 def differentiate(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Filter (8) with damping 1, exact for xi2 held over the interval; leaves ddq^ in `signals`."""
+    """Step the filter (8) with damping 1, exactly for held xi2; write ddq^ to `signals`."""
     decay = exp(-settings.omega * dt)
     for i in range(settings.n):
         if state.samples[0] == 0.0:
@@ -134,7 +134,7 @@ def differentiate(settings: Settings, state: State, signals: Signals, dt: float)
 
 @inner
 def heuristic_factor(settings: Settings, state: State, signals: Signals, dq: np.ndarray) -> float:
-    """Lambda of (24), dimensionless only by neglect of the units."""
+    """Return Lambda of (24), which is dimensionless only if units are ignored."""
     products = 1.0
     squares = 1.0
     for i in range(settings.n):
@@ -152,7 +152,7 @@ def accelerated_row(
     dq: np.ndarray,
     torque: np.ndarray,
 ) -> None:
-    """Rows `acceleration` and `lambda`, from ddq^ of `differentiate`, into `signals.row`."""
+    """Write the row `acceleration` or `lambda` to `signals.row`, from ddq^ of `differentiate`."""
     scale = 1.0
     X = signals.H
     if settings.prediction == LAMBDA:
@@ -176,7 +176,7 @@ def form_row(
     dq: np.ndarray,
     torque: np.ndarray,
 ) -> None:
-    """Leave the configured row of the last interval in `signals.row` (n, m + 1)."""
+    """Write the configured row of the last interval to `signals.row` (n, m + 1)."""
     if settings.prediction != FILTERED:
         differentiate(settings, state, signals, dt)
         accelerated_row(settings, state, signals, q, dq, torque)
@@ -189,9 +189,9 @@ def form_row(
 def rows_along(
     settings: Settings, settings_vector: np.ndarray, times: np.ndarray, motion: np.ndarray
 ) -> np.ndarray:
-    """Rows [H(q, dq, dq, ddq) | D] (k, n, m) of packed settings.
+    """Return the rows [H(q, dq, dq, ddq) | D] (k, n, m) along a motion, for packed settings.
 
-    `times` (k,) [s], `motion` (k, 3, n) q, dq, ddq at each time.
+    `times` (k,) [s]; `motion` (k, 3, n): q, dq, ddq at each time.
     """
     H = np.zeros((settings.n, settings.p))
     rows = np.zeros((times.size, settings.n, settings.m))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Projection (4) of the parameter update onto a ball, in the metric of the adaptation gain.
 
-(4) as printed acts where |P^| equals the radius, which a sampled update never does: it steps over
+As printed, (4) acts where |P^| equals the radius, which a sampled update never hits: it steps over
 and never returns.  Here the outward part is removed on and beyond the sphere, in the metric that
-the Lyapunov function (29) measures P~ with, and a step that leaves the ball ends at its nearest
-point in that metric, which is never farther from a true P inside.
+the Lyapunov function (29) uses for P~, and a step that leaves the ball ends at the nearest point of
+the ball in that metric, which is never farther from a true P inside.
 """
 
 from math import isfinite, sqrt
@@ -13,16 +13,16 @@ import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
 
-_ON_SPHERE = 1.0 - 1e-12  # of radius^2: `retract` ends a rounding inside or outside
+_ON_SPHERE = 1.0 - 1e-12  # of radius^2: `retract` ends within rounding of the sphere
 _ROUNDED = 1.0 + 1e-14
-_MOST_STEPS = 20  # of Newton's method; 12 for a Gamma of eight decades, ten radii outside
+_MOST_STEPS = 20  # of Newton's method; 12 for Gamma spanning eight decades, ten radii outside
 
 
 @inner
 def project(estimate: np.ndarray, rate: np.ndarray, gain: np.ndarray, radius: float) -> None:
-    """Remove from `rate` (p,) what leads out of the ball:  v - Gamma w w^T v / (w^T Gamma w).
+    """Remove the outward part from `rate` v (p,):  v - Gamma w w^T v / (w^T Gamma w).
 
-    `estimate` P^ (p,) is the direction w, `rate` (p,) changes in place, `gain` (p,) is the diagonal
+    `estimate` P^ (p,) is the direction w, `rate` is modified in place, `gain` (p,) is the diagonal
     of Gamma and `radius` omega_a.
     """
     square = 0.0
@@ -39,10 +39,10 @@ def project(estimate: np.ndarray, rate: np.ndarray, gain: np.ndarray, radius: fl
 
 @inner
 def retract(estimate: np.ndarray, gain: np.ndarray, radius: float) -> None:
-    """Replace a P^ (p,) outside the ball by the nearest in it, in the metric of Gamma.
+    """Replace a P^ (p,) outside the ball by the nearest point in it, in the metric of Gamma.
 
     That is P^_j / (1 + nu Gamma_j) with the nu > 0 that gives it the length omega_a, found by
-    Newton's method on 1 / length: exact after one step if Gamma is even, monotone if it is not.
+    Newton's method on 1 / length: exact after one step for equal gains, monotone otherwise.
     """
     square = 0.0
     for j in range(gain.size):
@@ -63,7 +63,7 @@ def retract(estimate: np.ndarray, gain: np.ndarray, radius: float) -> None:
 
 @inner
 def _shrunk(estimate: np.ndarray, gain: np.ndarray, nu: float) -> tuple[float, float]:
-    """Length of P^_j / (1 + nu Gamma_j), and minus half the slope of its square in nu."""
+    """Return the length of P^_j / (1 + nu Gamma_j) and minus half the slope of its square."""
     square = 0.0
     slope = 0.0
     for j in range(gain.size):

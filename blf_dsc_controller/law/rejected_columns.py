@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which disturbance columns are rejected (`excitation.reject_columns`), and what they resemble."""
+"""Rejected disturbance columns (`excitation.reject_columns`), and what they resemble."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from blf_dsc_controller.law.controller import Controller
 
-_NOTABLE = 0.1  # of the largest component
+_NOTABLE = 0.1  # relative to the largest component
 
 
 class RejectedColumn(NamedTuple):
@@ -18,21 +18,21 @@ class RejectedColumn(NamedTuple):
 
     column: str  # its name
     alike: tuple[str, ...]  # names of the columns whose combination resembles it, largest first
-    fraction: float  # of the column that they explain, in [0, 1]
+    fraction: float  # of the column that these explain, in [0, 1]
 
     def __str__(self) -> str:
         return (
-            f'{self.column} is not estimated: on this window it cannot be told from '
+            f'{self.column} is not estimated: this window cannot distinguish it from '
             f'{" + ".join(self.alike)} ({100 * self.fraction:.4g} % of it is explained by them). '
-            'A reference with more tones can separate them; learning.excitation_threshold says '
+            'A reference with more tones can separate them; learning.excitation_threshold sets '
             'how clearly'
         )
 
 
 def rejected_columns(controller: Controller, names: Sequence[str]) -> tuple[RejectedColumn, ...]:
-    """Rejected columns of a controller that learns, with the reason from its present window.
+    """Return the rejected columns of a controller that learns, explained by its current window.
 
-    `names` are those of the m entries of theta^, as `factory.estimate_names` returns them.
+    `names` are those of the m entries of theta^, as returned by `factory.estimate_names`.
     """
     state = controller.state
     rejected = np.flatnonzero(state.active == 0.0)
@@ -47,7 +47,7 @@ def rejected_columns(controller: Controller, names: Sequence[str]) -> tuple[Reje
 def _explained(
     Phi: np.ndarray, column: int, kept: np.ndarray, names: Sequence[str]
 ) -> RejectedColumn:
-    """Regress the column on those that are kept, by their inner products over the window."""
+    """Regress the column on the kept ones, from their inner products over the window."""
     products = Phi[kept, column]
     parts = np.linalg.lstsq(Phi[np.ix_(kept, kept)], products, rcond=None)[0]
     strength = np.abs(parts) * np.sqrt(np.diag(Phi)[kept])

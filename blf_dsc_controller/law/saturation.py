@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Saturation of the torque, in level and rate.
 
-The rate counts from the last commanded torque, not at the first sample after a reset.  The level
-limit takes precedence, as when it is lowered below the last torque.
+The rate is relative to the last commanded torque, and not limited at the first sample after a
+reset.  The level limit takes precedence, for example if it is lowered below the last torque.
 """
 
 from blf_dsc_controller.compiled.jit import inner
@@ -25,7 +25,7 @@ def clip(x: float, low: float, high: float) -> float:
 
 @inner
 def saturate(settings: Settings, state: State, signals: Signals, dt: float) -> bool:
-    """Limit `signals.demand` to `signals.torque` [N m]; True if any joint is saturated.
+    """Limit `signals.demand`, giving `signals.torque` [N m]; return whether any joint is saturated.
 
     `dt` [s] is the time since the last torque.
     """

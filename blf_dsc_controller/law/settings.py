@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.layout import Array, view_of
 
-# The vector holds the index of the choice.
+# The vector holds the index of each choice.
 SURFACES = ('filtered', 'linear')
 PREDICTIONS = ('filtered', 'acceleration', 'lambda')
 LATCHES = ('last', 'max')
@@ -26,7 +26,7 @@ EFFORT = TORQUE_SOURCES.index('effort')
 class Settings(NamedTuple):
     """Gains and choices of a law for n joints, p parameters and m - p disturbance columns.
 
-    The model is passed to kernels as it is, everything else in one vector.
+    The model is passed to kernels as is, everything else in one vector.
     """
 
     model: ArmModel
@@ -44,10 +44,10 @@ class Settings(NamedTuple):
     bias: int  # 1: a constant column per joint
     viscous: int  # 1: a column dq_i per joint
     coulomb: int  # 1: a column tanh(dq_i / coulomb_velocity) per joint
-    tones: int  # sine and cosine columns per joint, for as many frequencies
-    truth_known: int  # 1: true_parameters and true_disturbance hold
+    tones: int  # number of frequencies, each with a sine and a cosine column per joint
+    truth_known: int  # 1: true_parameters and true_disturbance are valid
     feed_forward: int  # 1: the true disturbance is compensated
-    bumpless: int  # 1: d^3 yields what the prediction error adds to the torque
+    bumpless: int  # 1: d^3 gives up what the prediction error adds to the torque
     change_detection: int  # 1: windows must be consistent (see `consistency`)
     time_constant: float  # lambda of (13), s
     boundary_layer: float  # b, rad/s
@@ -59,31 +59,31 @@ class Settings(NamedTuple):
     residual_floor: float  # mean square residual that noise and unmodelled torque explain, (N m)^2
     anchor_weight: float  # pull to `anchor` while the window is empty
     prior_weight: float  # pull to `initial_estimate`, always
-    motion_scale: float  # reference velocity below which rows count less, rad/s; 0: none
+    motion_scale: float  # reference velocity below which rows count less, rad/s; 0: off
     damping_rate: float  # omega_v, of the damping by the initial estimate's inertia, 1/s
     pole: float  # of the regressor filter, rad/s
     omega: float  # of the differentiating filter (8), rad/s
     coulomb_velocity: float  # rad/s
     radius: float  # omega_a of (4)
     Wc: float  # leakage of P^ in (35)
-    funnel_rate: float  # a, at which the bound narrows, 1/s
+    funnel_rate: float  # a, rate at which the bound narrows, 1/s
     bound: Annotated[Array, 'n']  # k_c, rad
     initial_bound: Annotated[Array, 'n']  # k_0, rad; k_c: constant bound
     weight: Annotated[Array, 'n']  # w, N m/rad; of z1 in (35)
     slope_limit: Annotated[Array, 'n']  # S_lim, N m/rad
-    knee: Annotated[Array, 'n']  # where the slope reaches S_lim if the bound is k_c, rad
+    knee: Annotated[Array, 'n']  # error at which the slope reaches S_lim if the bound is k_c, rad
     K: Annotated[Array, 'n']  # 1/s; lambda_s of (35)
     mu: Annotated[Array, 'n']  # 1/s
     Kp: Annotated[Array, 'n']  # N m s/rad
     d2: Annotated[Array, 'n']  # N m/rad
     mu_bar: Annotated[Array, 'n']  # N m
     gamma: Annotated[Array, 'n']  # gain of (30)
-    row_weight: Annotated[Array, 'n']  # of the rows of a joint: the less, the more is unmodelled
+    row_weight: Annotated[Array, 'n']  # of a joint's rows: smaller where more torque is unmodelled
     torque_limit: Annotated[Array, 'n']  # N m
     rate_limit: Annotated[Array, 'n']  # N m/s; 0: none
     true_disturbance: Annotated[Array, 4, 'n']  # constant, then amplitude, frequency, phase
     Gamma: Annotated[Array, 'm']  # diagonal of the adaptation gain
-    initial_estimate: Annotated[Array, 'm']  # P^(0), zeros for the columns
+    initial_estimate: Annotated[Array, 'm']  # P^(0), then that of the columns
     information: Annotated[Array, 'm', 'm']  # R, inverse covariance of the prior of theta
     variance: Annotated[Array, 'm']  # diagonal of R^-1
     true_parameters: Annotated[Array, 'p']

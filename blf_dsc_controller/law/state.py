@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """State of a law between two samples, signals within one, and the telemetry sample: flat vectors.
 
-Saving, restoring and comparing a controller is copying and comparing its state vector: the package
+A controller is saved, restored and compared by copying and comparing its state vector: the package
 keeps no other state of the loop.
 """
 
@@ -13,30 +13,30 @@ from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
 
 
 class State(NamedTuple):
-    """What a law keeps from one sample to the next."""
+    """Values that a law keeps from one sample to the next."""
 
-    samples: Cell  # samples so far
-    cursor: Cell  # oldest row of the window
-    rows: Cell  # rows in the window
-    latched: Cell  # 1 once (Phi_e, b_e) is kept
+    samples: Cell  # number of samples so far
+    cursor: Cell  # index of the oldest row of the window
+    rows: Cell  # number of rows in the window
+    latched: Cell  # 1 while a window (Phi_e, b_e) is latched
     latch_time: Cell  # T_e, s
     lambda_min: Cell  # of Phi at the last check
     latched_lambda: Cell  # lambda_min of the latched window
-    best_lambda: Cell  # the largest of a full window since the last change
+    best_lambda: Cell  # largest of a full window since the last change
     columns_checked: Cell  # 1 once the disturbance columns are accepted or rejected
     residual: Cell  # mean square torque residual of the latched window, (N m)^2
-    least_residual: Cell  # the lowest of any full window, (N m)^2
-    recent_residual: Cell  # of the last rows to `solution`, (N m)^2
-    changes: Cell  # times that the arm was found to have changed
-    change_time: Cell  # of the last, s
+    least_residual: Cell  # smallest residual of any full window, (N m)^2
+    recent_residual: Cell  # of the last rows against `solution`, (N m)^2
+    changes: Cell  # number of times that the arm was found to have changed
+    change_time: Cell  # time of the last change, s
     contradiction: Cell  # `recent_residual` at the last change, (N m)^2
     alpha2: Annotated[Array, 'n']  # rad/s
-    torque: Annotated[Array, 'n']  # torque commanded last, N m
+    torque: Annotated[Array, 'n']  # last commanded torque, N m
     disturbance: Annotated[Array, 'n']  # d^3, N m
-    observed: Annotated[Array, 'n']  # xi2 through the filter (8), rad/s
+    observed: Annotated[Array, 'n']  # xi2 filtered by (8), rad/s
     observed_rate: Annotated[Array, 'n']  # its derivative, rad/s^2
-    level_cuts: Annotated[Array, 'n']  # samples in which the torque was cut at its limit
-    rate_cuts: Annotated[Array, 'n']  # samples in which it was cut at the limit of its rate
+    level_cuts: Annotated[Array, 'n']  # number of samples in which the torque was cut at its limit
+    rate_cuts: Annotated[Array, 'n']  # number of samples in which it was cut at its rate limit
     estimate: Annotated[Array, 'm']  # theta^ = [P^; columns]
     momentum: Annotated[Array, 'n', 'p']  # Yp of the last sample
     rest: Annotated[Array, 'n', 'm']  # [Yr | columns] of the last sample
@@ -46,16 +46,16 @@ class State(NamedTuple):
     fresh: Annotated[Array, 'm + 1', 'm + 1']  # F of the window
     Phi: Annotated[Array, 'm', 'm']  # latched Phi_e
     b: Annotated[Array, 'm']  # latched b_e
-    factor: Annotated[Array, 'm', 'm']  # Cholesky factor of Phi_e + rho I
-    solution: Annotated[Array, 'm']  # of the latched window, (Phi_e + rho I)^-1 b_e
-    anchor: Annotated[Array, 'm']  # theta^ that windows of little information are pulled to
+    factor: Annotated[Array, 'm', 'm']  # Cholesky factor of Phi_e + rho R
+    solution: Annotated[Array, 'm']  # of the latched window, (Phi_e + rho R)^-1 b_e
+    anchor: Annotated[Array, 'm']  # theta^ to which windows with little information are pulled
     min_eigenvector: Annotated[Array, 'm']  # of Phi, a unit vector
     active: Annotated[Array, 'm']  # 0 where a disturbance column has been rejected
     ring: Annotated[Array, 'window', 'n', 'm + 1']  # the window's rows
 
 
 class Signals(NamedTuple):
-    """What a law computes in one sample."""
+    """Values that a law computes in one sample."""
 
     qr: Annotated[Array, 'n']  # rad
     dqr: Annotated[Array, 'n']  # rad/s
@@ -66,20 +66,20 @@ class Signals(NamedTuple):
     xi2: Annotated[Array, 'n']  # rad/s
     known: Annotated[Array, 'n']  # disturbance known to the law, N m
     acceleration: Annotated[Array, 'n']  # estimated ddq, rad/s^2
-    demand: Annotated[Array, 'n']  # torque (28) before the limit, N m
-    torque: Annotated[Array, 'n']  # torque commanded, N m
+    demand: Annotated[Array, 'n']  # torque (28) before saturation, N m
+    torque: Annotated[Array, 'n']  # commanded torque, N m
     cuts: Annotated[Array, 'n']  # how the torque was cut: 0, LEVEL_CUT, RATE_CUT, or their sum
     bound: Annotated[Array, 'n']  # k(t), rad
-    knee: Annotated[Array, 'n']  # knee of the barrier of that bound, rad
+    knee: Annotated[Array, 'n']  # knee of the barrier for that bound, rad
     narrowing: Annotated[Array, 'n']  # k'/k, 1/s
-    H: Annotated[Array, 'n', 'm']  # [H | columns that are compensated]
+    H: Annotated[Array, 'n', 'm']  # [H | compensated columns]
     momentum: Annotated[Array, 'n', 'p']  # Yp
     rest: Annotated[Array, 'n', 'm']  # [Yr | columns]
     row: Annotated[Array, 'n', 'm + 1']  # filtered [X | u]
-    Phi: Annotated[Array, 'm', 'm']  # of the present window
+    Phi: Annotated[Array, 'm', 'm']  # of the current window
     b: Annotated[Array, 'm']
     factor: Annotated[Array, 'm', 'm']
-    inertia: Annotated[Array, 'n', 'n']  # M^(q) less its least admissible, or its factor
+    inertia: Annotated[Array, 'n', 'n']  # M^(q) minus its least admissible value, or its factor
     unit: Annotated[Array, 'n']  # scratch
     rate: Annotated[Array, 'm']  # theta^' [1/s]
     work: Annotated[Array, 'm']  # scratch
@@ -92,15 +92,15 @@ class Sample(NamedTuple):
     dqr: Annotated[Array, 'n']  # rad/s
     xi1: Annotated[Array, 'n']  # rad
     xi2: Annotated[Array, 'n']  # rad/s
-    torque: Annotated[Array, 'n']  # commanded, after the limit, N m
-    disturbance: Annotated[Array, 'n']  # d^3 and the learned friction, N m
+    torque: Annotated[Array, 'n']  # commanded, after saturation, N m
+    disturbance: Annotated[Array, 'n']  # d^3 plus the learned friction, N m
     bound: Annotated[Array, 'n']  # k(t), rad
-    cuts: Annotated[Array, 'n']  # 0, or LEVEL_CUT + RATE_CUT as the torque was cut in this sample
+    cuts: Annotated[Array, 'n']  # how the torque was cut: 0, LEVEL_CUT, RATE_CUT, or their sum
     estimate: Annotated[Array, 'm']  # theta^; NaN for a disturbance column that has been rejected
     lyapunov: Annotated[Array, 4]  # terms of (29): error, kinetic, parameters, disturbance; or NaN
-    lambda_min: Cell  # of the present window's Phi
+    lambda_min: Cell  # of the current window's Phi
     latched: Cell  # 0 or 1
-    changes: Cell  # times that the arm was found to have changed
+    changes: Cell  # number of times that the arm was found to have changed
 
 
 state_of, state_size = view_of(State), size_of(State)

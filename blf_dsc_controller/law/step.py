@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """One sample of a law: reference, errors, regressors, learning, torque, adaptation.
 
-The proposed law (28) has the filtered surface (13), (15), (18) and the barrier torque, the
-comparison law (35) the linear surface and a position gain.  All other differences between the laws
-are gains that are zero (see `factory`).
+The proposed law (28) has the filtered surface (13), (15), (18) and the barrier torque; the
+comparison law (35) has the linear surface and a position gain.  All other differences between the
+laws are gains that are zero (see `factory`).
 """
 
 from math import nan
@@ -32,7 +32,7 @@ from blf_dsc_controller.reference import terms as reference
 def compute_regressors(
     settings: Settings, state: State, signals: Signals, q: np.ndarray, dq: np.ndarray
 ) -> None:
-    """H(q, dq, alpha2, alpha2') and, for the filtered prediction, Yp and Yr."""
+    """Compute H(q, dq, alpha2, alpha2') and, for the filtered prediction, Yp and Yr."""
     model, H = settings.model, signals.H
     if settings.prediction != FILTERED:
         model.regressor(q, dq, state.alpha2, signals.dalpha2, H)
@@ -52,7 +52,7 @@ def update_window(
     dq: np.ndarray,
     applied: np.ndarray,
 ) -> None:
-    """Add the row of the last interval to the window; check the excitation when it is due."""
+    """Add the row of the last interval to the window; check the excitation when due."""
     prediction.fill_columns(settings, t, dq, signals.rest)
     prediction.form_row(settings, state, signals, dt, q, dq, applied)
     if state.samples[0] == 0.0:
@@ -102,7 +102,7 @@ def step(
     measurement: np.ndarray,
     sample: Sample,
 ) -> None:
-    """One sample, from the measurement to the torque; `lyapunov.fill_energies` is separate.
+    """Run one sample, from the measurement to the torque; `lyapunov.fill_energies` is separate.
 
     The measurement is [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m],
     t [s] the time since the start, dt [s] since the last sample (at the first: until the next).

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors and surfaces: virtual control (15), (18) with its filter (13), and the linear one of (35).
+"""Errors and surfaces: virtual control (15), (18) with its filter (13); the linear surface of (35).
 
 xi1 = q - qr,   xi2 = dq - alpha2,   lambda alpha2' = beta2 - alpha2,   alpha2(0) = beta2(0)
 """
@@ -15,7 +15,7 @@ from blf_dsc_controller.law.state import Signals, State
 
 @inner
 def sinc(x: float) -> float:
-    """sin(x) / x, by its series where the quotient would lose its digits."""
+    """Return sin(x) / x, by its series where the quotient would lose precision."""
     if abs(x) < 1e-4:
         return 1.0 - x * x / 6.0
     return sin(x) / x
@@ -25,11 +25,11 @@ def sinc(x: float) -> float:
 def virtual_control(
     xi1: float, bound: float, barrier_gain: float, linear_gain: float, reference_velocity: float
 ) -> float:
-    """beta2 = -(K/2) xi1 sinc(pi xi1^2 / k_c^2) - mu xi1 + dqr   [rad/s], (15) and (18).
+    """Return beta2 = -(K/2) xi1 sinc(pi xi1^2 / k_c^2) - mu xi1 + dqr   [rad/s], (15) and (18).
 
     (15) is printed as a quotient that is 0/0 at xi1 = 0; sin s cos s = sin(2 s)/2 turns it into a
-    sinc.  Its barrier part falls to zero at the bound, where only mu acts, and would change sign
-    beyond: it is zero there.
+    sinc.  Its barrier part falls to zero at the bound, where only mu acts; beyond, it would change
+    sign and is set to zero.
     """
     ratio = xi1 / bound
     barrier_part = 0.0
@@ -40,13 +40,13 @@ def virtual_control(
 
 @inner
 def filter_gain(time_constant: float, dt: float) -> float:
-    """Exact gain 1 - exp(-dt / time_constant) of a first-order lag with a held input."""
+    """Return the exact gain 1 - exp(-dt / time_constant) of a first-order lag with held input."""
     return 1.0 - exp(-dt / time_constant)
 
 
 @inner
 def filtered_surface(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """beta2 of (18) and alpha2' of the filter (13); `filter_step` moves alpha2 itself.
+    """Compute beta2 of (18) and alpha2' of the filter (13); `filter_step` advances alpha2.
 
     beta2 is held for the sample, in which alpha2' decays from (beta2 - alpha2) / lambda by the
     factor exp(-dt / lambda).  The torque is held too, so it uses the mean of alpha2': with
@@ -68,7 +68,7 @@ def filtered_surface(settings: Settings, state: State, signals: Signals, dt: flo
 
 @inner
 def linear_surface(settings: Settings, state: State, signals: Signals, dq: np.ndarray) -> None:
-    """alpha2 = dqr - lambda_s z1 of (35), and its derivative, which needs ddqr."""
+    """Compute alpha2 = dqr - lambda_s z1 of (35), and its derivative, which needs ddqr."""
     for i in range(settings.n):
         state.alpha2[i] = signals.dqr[i] - settings.K[i] * signals.xi1[i]
         signals.beta2[i] = state.alpha2[i]
@@ -84,7 +84,7 @@ def compute_errors(
     q: np.ndarray,
     dq: np.ndarray,
 ) -> None:
-    """Errors xi1 and xi2, and the surface between them."""
+    """Compute the errors xi1 and xi2, and the surface between them."""
     for i in range(settings.n):
         signals.xi1[i] = q[i] - signals.qr[i]
     if settings.surface == LINEAR:
@@ -97,7 +97,7 @@ def compute_errors(
 
 @inner
 def filter_step(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Move alpha2 of the filter (13) by `dt` [s], exactly for the held beta2."""
+    """Advance alpha2 of the filter (13) by `dt` [s], exactly for the held beta2."""
     gain = filter_gain(settings.time_constant, dt)
     for i in range(settings.n):
         state.alpha2[i] += gain * (signals.beta2[i] - state.alpha2[i])

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commanded torque before saturation: (28) of the proposed law and (35) of the comparison.
+"""Torque demand before saturation: (28) of the proposed law and (35) of the comparison law.
 
     tau = -dV/dxi1 - d2 |xi1| sat(xi2/b) - K_p xi2 + H(q, dq, alpha2, alpha2') P^ + d^3        (28)
     tau = -w z1 - mu_bar sat(z2/b) - K_p z2 + H P^                                             (35)
 
-(28) prints the robust term with sgn; sat is its smooth stand-in.  Where the joints' inertias are
-known roughly, the damping may follow them: - omega_v M(q, P^(0)) xi2 beside - K_p xi2 dampens every
+(28) prints the robust term with sgn; sat is its smooth replacement.  Where the inertias are roughly
+known, the damping can scale with them: - omega_v M(q, P^(0)) xi2, added to - K_p xi2, damps every
 direction at the same rate.
 """
 
@@ -21,7 +21,7 @@ from blf_dsc_controller.law.state import Signals, State
 
 @inner
 def smooth_sign(x: float) -> float:
-    """sat(x): x, limited to [-1, 1]."""
+    """Return sat(x): x limited to [-1, 1]."""
     return min(1.0, max(-1.0, x))
 
 
@@ -37,7 +37,7 @@ def known_disturbance(settings: Settings, signals: Signals, t: float) -> None:
 
 @inner
 def feedback(settings: Settings, signals: Signals, i: int) -> float:
-    """Feedback of joint i [N m]: barrier (16), robust term and damping of (28) and (35)."""
+    """Return the feedback of joint i [N m]: barrier (16), robust term and damping of (28), (35)."""
     robust = settings.d2[i] * abs(signals.xi1[i]) + settings.mu_bar[i]
     torque = settings.Kp[i] * signals.xi2[i]
     torque += robust * smooth_sign(signals.xi2[i] / settings.boundary_layer)
@@ -56,7 +56,7 @@ def feedback(settings: Settings, signals: Signals, i: int) -> float:
 def compute_demand(settings: Settings, state: State, signals: Signals, q: np.ndarray) -> None:
     """Compute the torque (28) or (35) before saturation, `signals.demand` (n,) [N m].
 
-    Overwrites Yp and Yr of `signals` where the damping is that of the initial estimate.
+    Overwrites Yp and Yr of `signals` if it damps by the initial estimate's inertia.
     """
     damped = settings.damping_rate > 0.0
     if damped:

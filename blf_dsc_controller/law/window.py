@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sliding window (21), (22): its sums, and lambda_min of its Phi.
+"""Sliding window (21), (22): its sums, and lambda_min of its Phi.
 
 The window's sums of X^T [X | u] take constant time and do not drift.  A running sum that adds the
-new and subtracts the old term accumulates one rounding error a sample.  Beside the running sum S
-the window keeps F, the sum of what was written since the ring last wrapped; at the wrap F is the
-exact content of the ring and replaces S.
+new and subtracts the old term accumulates a rounding error in every sample.  The window therefore
+also keeps, beside the running sum S, the sum F of the rows written since the ring last wrapped; at
+the next wrap F is the exact sum over the ring and replaces S.
 
-Eigenvalues are relative to the information R of the prior, by which parameters of different units
-compare: Phi x = lambda R x.
+Eigenvalues are relative to the information R of the prior, which makes parameters of different
+units comparable: Phi x = lambda R x.
 """
 
 from math import sqrt
@@ -32,8 +32,8 @@ def push_row(
     """Replace the oldest row of the window by `row` and return the next cursor.
 
     `ring` (N, n, m + 1) has the oldest row at `cursor`, which counts once the window is full;
-    `running` S and `fresh` F (m + 1, m + 1), the sums of [X | u]^T [X | u], are filled in the upper
-    triangle; `row` is [X | u] (n, m + 1).
+    `running` S and `fresh` F (m + 1, m + 1), the sums of [X | u]^T [X | u], have only their upper
+    triangle filled; `row` is [X | u] (n, m + 1).
     """
     old = ring[cursor]
     n = row.shape[0]
@@ -76,7 +76,7 @@ def average_window(running: np.ndarray, samples: int, Phi: np.ndarray, b: np.nda
 def pull_to(
     target: np.ndarray, weight: float, information: np.ndarray, Phi: np.ndarray, b: np.ndarray
 ) -> None:
-    """Add `weight` times the information R on theta = target (m,):  Phi + a R,  b + a R target."""
+    """Pull theta to `target` (m,) by `weight` a times R:  Phi + a R,  b + a R target."""
     for i in range(b.size):
         pull = weight * target[i]
         for j in range(b.size):
@@ -97,10 +97,10 @@ def regularized_factor(
 
 @inner
 def weigh(information: np.ndarray, x: np.ndarray, out: np.ndarray) -> float:
-    """Write R x (m,); returns x^T R x."""
+    """Write R x (m,) to `out`; return x^T R x."""
     for i in range(x.size):
         out[i] = 0.0
-    for j in range(x.size):  # R is symmetric: by rows, which are contiguous
+    for j in range(x.size):  # R is symmetric: traversed by rows, which are contiguous
         for i in range(x.size):
             out[i] += information[j, i] * x[j]
     square = 0.0
@@ -118,12 +118,12 @@ def min_eigenvector(
     work: np.ndarray,
     iterations: int,
 ) -> float:
-    """lambda_min(Phi) relative to R by inverse iteration, which improves `direction`.
+    """Return lambda_min(Phi) relative to R by inverse iteration, which refines `direction`.
 
     The direction x is the eigenvector of Phi x = lambda R x with x^T R x = 1.
 
     From a warm start a few iterations suffice (the error of the Rayleigh quotient is the square of
-    the direction's), at a fixed cost and without the m^3 of an eigenvalue decomposition.
+    the direction's), at a fixed cost and without the O(m^3) of an eigenvalue decomposition.
 
     `factor` is the Cholesky factor of Phi + rho R, `work` (m,) scratch.
     """
@@ -142,7 +142,7 @@ def min_eigenvector(
 
 @inner
 def remove_rejected(active: np.ndarray, Phi: np.ndarray, b: np.ndarray) -> None:
-    """Remove the rejected columns from Phi theta = b: theta_j = 0 instead."""
+    """Remove the rejected columns from Phi theta = b, setting theta_j = 0."""
     for i in range(active.size):
         if active[i] == 0.0:
             for j in range(active.size):
@@ -168,7 +168,7 @@ def min_eigenvalue(
     work: np.ndarray,
     iterations: int,
 ) -> float:
-    """lambda_min of the present window's Phi, which is computed with b and its factor."""
+    """Return lambda_min of the current window's Phi; fill Phi, b and its factor."""
     average_window(running, samples, Phi, b)
     if prior_weight > 0.0:
         pull_to(prior, prior_weight, information, Phi, b)
@@ -179,7 +179,7 @@ def min_eigenvalue(
 
 @inner
 def excitation(settings: Settings, state: State, signals: Signals, iterations: int) -> float:
-    """lambda_min of the present window's Phi, which is left in `signals` with b and its factor."""
+    """Return lambda_min of the current window's Phi; leave Phi, b and its factor in `signals`."""
     return min_eigenvalue(
         state.running,
         int(state.rows[0]),
@@ -199,5 +199,5 @@ def excitation(settings: Settings, state: State, signals: Signals, iterations: i
 
 @inner
 def is_at_start(settings: Settings, state: State) -> bool:
-    """Whether the ring has wrapped since the last check: true once a window."""
+    """Return whether the ring has wrapped since the last check: true once per window."""
     return bool(state.cursor[0] * settings.row_interval < settings.interval)

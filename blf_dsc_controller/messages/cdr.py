@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the values are in a serialised message.
+"""Positions of the values in a serialised message.
 
 Plain CDR, version 1, as ROS 2 sends it: two bytes for the byte order, two unused, then the fields,
-each number aligned to its own size counted from the fifth byte. Padding bytes, and bytes after the
+each number aligned to its own size, from the fifth byte on. Padding bytes, and bytes after the
 last field, may hold anything.
 """
 
@@ -15,7 +15,7 @@ from typing import NamedTuple
 from blf_dsc_controller.errors import BlfDscError
 
 NANOSECONDS = 1_000_000_000
-"""Of one second."""
+"""Per second."""
 
 ORIGIN = 4  # alignment is counted from here
 STAMP_OFFSET = 4  # of a message that starts with a std_msgs/Header
@@ -40,7 +40,7 @@ class MissingJointError(MessageError):
         )
 
     def is_foreign(self, joints: Collection[str]) -> bool:
-        """Whether the message is for other joints alone: drivers may share a topic."""
+        """Return whether the message is for other joints only: drivers may share a topic."""
         return bool(self.names) and not set(joints) & set(self.names)
 
 
@@ -61,12 +61,12 @@ class Doubles(NamedTuple):
 
     @property
     def place(self) -> int:
-        """Of the first value among the doubles that could follow ORIGIN."""
+        """Index of the first value in a grid of doubles that starts at ORIGIN."""
         return (self.offset - ORIGIN) // 8
 
 
 class Layout(NamedTuple):
-    """Byte order of a message, names in it, and the places of its arrays."""
+    """Byte order of a message, names in it, and positions of its arrays."""
 
     byte_order: str
     begin: int  # offset of what follows the stamp
@@ -80,11 +80,11 @@ class Layout(NamedTuple):
         return slice(2), slice(self.begin, first + 4), *(slice(at, at + 4) for at in others)
 
     def columns_of(self, joints: Sequence[str]) -> list[int]:
-        """Place of each joint among the names.
+        """Return the index of each joint among the names.
 
         Raises:
             MissingJointError: a joint is not among them.
-            DuplicatedJointError: a joint is there twice.
+            DuplicatedJointError: a joint appears more than once.
         """
         for joint in joints:
             count = self.names.count(joint)
@@ -102,7 +102,7 @@ def joint_state_layout(raw: bytes | bytearray) -> Layout:
     """Find position, velocity and effort of a sensor_msgs/JointState.
 
     Raises:
-        MessageError: not plain CDR, or `raw` ends too early.
+        MessageError: `raw` is not plain CDR, or is cut off.
     """
     cursor = _Cursor(raw)
     cursor.unsigned()
@@ -115,7 +115,7 @@ def joint_state_layout(raw: bytes | bytearray) -> Layout:
 
 
 def array_layout(raw: bytes | bytearray) -> Layout:
-    """Find the values of a std_msgs/Float64MultiArray behind its dimensions; MessageError too."""
+    """Find the values of a std_msgs/Float64MultiArray after its dimensions; errors as above."""
     cursor = _Cursor(raw)
     for _ in range(cursor.unsigned()):
         cursor.text()
@@ -136,7 +136,7 @@ class TrajectoryContent(NamedTuple):
 def joint_trajectory(raw: bytes) -> TrajectoryContent:
     """Read a trajectory_msgs/JointTrajectory; MessageError as above.
 
-    rclpy would keep all other threads waiting, for 10 ms with a thousand points.
+    Decoding by rclpy would block all other threads, for 10 ms with a thousand points.
     """
     cursor = _Cursor(raw)
     stamp = cursor.time()
@@ -150,7 +150,7 @@ def joint_trajectory(raw: bytes) -> TrajectoryContent:
 
 
 class _Cursor:
-    """Steps over the fields of one serialised message."""
+    """Cursor over the fields of one serialised message."""
 
     def __init__(self, raw: bytes | bytearray) -> None:
         self._raw = raw

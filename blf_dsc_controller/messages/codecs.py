@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays to serialised messages and back, in about a microsecond.
+"""Conversion between arrays and serialised messages, in about a microsecond.
 
 An encoder serialises a template once and then only overwrites its numbers; nodes publish these
-bytes and bags store them as they are. A decoder finds the places of the values once and keeps them
+bytes and bags store them as they are. A decoder locates the values once and keeps their positions
 for as long as the messages have the same names and lengths.
 """
 
@@ -36,9 +36,9 @@ _STAMP = _STAMPS['<']
 
 
 class JointStateEncoder:
-    """Encodes sensor_msgs/JointState with fixed names.
+    """Encoder of sensor_msgs/JointState with fixed names.
 
-    `fields` of position, velocity, effort hold a value for each name; the others stay empty.
+    Those of position, velocity, effort in `fields` hold a value for each name; others are empty.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class JointStateEncoder:
         """Return the serialised message of a header stamp [ns] and n values for each of `fields`.
 
         Raises:
-            ValueError: an array of another length.
+            ValueError: an array has another length.
         """
         _STAMP.pack_into(self._buffer, STAMP_OFFSET, *divmod(stamp_ns, NANOSECONDS))
         self._position[:] = position
@@ -77,7 +77,7 @@ class JointStateEncoder:
 
 
 class Float64MultiArrayEncoder:
-    """Encodes std_msgs/Float64MultiArray of a fixed size, without dimensions."""
+    """Encoder of std_msgs/Float64MultiArray of a fixed size, without dimensions."""
 
     def __init__(self, size: int) -> None:
         types = typestore().types
@@ -102,7 +102,7 @@ def _view(buffer: bytearray, doubles: Doubles) -> Floats:
 
 
 class Decoder(ABC):
-    """Takes `values` (s,) off the places where they are in all messages of one layout."""
+    """Decoder of `values` (s,) at positions that are the same in all messages of one layout."""
 
     def __init__(self, size: int) -> None:
         self.values = np.full(size, np.nan)
@@ -113,12 +113,12 @@ class Decoder(ABC):
         """Fill `values` and return the stamp or the size of a message."""
 
     def decode_all(self, raw: Sequence[bytes]) -> tuple[NDArray[np.int64], Floats] | None:
-        """What `decode` returns of N messages (N,), and their values (N, s).
+        """Return the results of `decode` for N messages (N,), and their values (N, s).
 
-        None unless all have the layout of the first.
+        Returns None unless all have the layout of the first.
 
         Raises:
-            MessageError: as `decode` of the first.
+            MessageError: as in `decode`, for the first message.
         """
         self.decode(raw[0])
         count, size = len(raw), self._length
@@ -135,15 +135,15 @@ class Decoder(ABC):
 
     @abstractmethod
     def _decoded(self, joined: bytes) -> NDArray[np.int64]:
-        """What `decode` returns of messages one after the other."""
+        """Return the results of `decode` for concatenated messages."""
 
     def _is_known(self, raw: bytes) -> bool:
         return len(raw) == self._length and self._fixed_of(raw) == self._fixed
 
     def _learn(self, raw: bytes, layout: Layout, places: NDArray[np.intp]) -> None:
-        """Know a layout from here on.
+        """Store a layout.
 
-        Doubles lie on a grid from ORIGIN on: there are the `places` (s,) of the values, -1 for NaN.
+        `places` (s,) are the values' indices in a grid of doubles from ORIGIN on, -1 for NaN.
         """
         self._length = len(raw)
         self._fixed_parts = layout.fixed_parts
@@ -167,14 +167,14 @@ _WITHOUT = {
 
 
 class JointStateDecoder(Decoder):
-    """Decodes sensor_msgs/JointState into arrays in the order of the n `joints`, by name.
+    """Decoder of sensor_msgs/JointState into arrays in the order of the n `joints`, by name.
 
     Other joints in the message are ignored. A field that is not `required` and is empty in the
     message reads as NaN. Values are not checked: NaN passes through.
 
     Attributes:
         position, velocity, effort: (n,) of the last message.
-        values: (3 n,) all of these in turn.
+        values: (3 n,) all of these, concatenated.
     """
 
     def __init__(
@@ -192,7 +192,7 @@ class JointStateDecoder(Decoder):
             MessageError: not plain CDR, or `raw` ends too early.
             MissingJointError: one of `joints` is not named.
             DuplicatedJointError: one of `joints` is named twice.
-            ShortArrayError: an array is not as long as the names.
+            ShortArrayError: an array differs in length from the names.
         """
         if not self._is_known(raw):
             layout = joint_state_layout(raw)
@@ -224,7 +224,7 @@ class JointStateDecoder(Decoder):
 
 
 class Float64MultiArrayDecoder(Decoder):
-    """Decodes std_msgs/Float64MultiArray of an expected size; dimensions are skipped.
+    """Decoder of std_msgs/Float64MultiArray of an expected size; dimensions are skipped.
 
     Attributes:
         values: (size,) of the last message of that size.

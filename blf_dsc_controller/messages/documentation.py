@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The generated page of all topics.
+"""Generator of the page on all topics.
 
 `python -m blf_dsc_controller.messages.documentation doc/topics.md` writes it.
 """
@@ -15,12 +15,12 @@ from blf_dsc_controller.messages.topics import Quality, Topic
 _PREFACE = """\
 # Topics
 
-Names are the defaults, those with the name of a node are private to it. Joints are matched by name,
-stamps are the plant's time. The values of a JointState that has no joints are in `position`, by the
-names in `name`. *Kept* is how many messages a publisher keeps (of `joint_trajectory`: the
-subscriber), and *latched* that late subscribers get them; all are reliable. `reference`,
-`tracking_error` and `learning` are sent while any of the three has a subscriber (looked for every
-10th sample).
+Names are the defaults; those with the name of a node are private to it. Joints are matched by name;
+stamps are the plant's time. A JointState without joints holds named values: `position` has the
+values, `name` their names. *Kept* is the number of messages that a publisher keeps (for
+`joint_trajectory`: the subscriber); *latched* topics send them to late subscribers, too. All topics
+are reliable. `reference`, `tracking_error` and `learning` are published while any of the three has
+a subscriber (checked every 10th sample).
 
 This page is generated: `python -m blf_dsc_controller.messages.documentation doc/topics.md`.
 
@@ -33,34 +33,34 @@ _OFTEN = 'every `telemetry.decimation`-th sample'
 _ABOUT = {
     topics.JOINT_STATES: (
         'each sample',
-        'position and velocity as measured; effort: torque applied over the last sample',
+        'position and velocity as measured; effort: torque applied since the previous sample',
     ),
     topics.COMMANDS: ('each sample', 'torque [N m], in the order of `joints`'),
     topics.REFERENCE: (_OFTEN, 'position and velocity of the reference'),
     topics.TRACKING_ERROR: (
         'each sample',
-        r'position: $\xi_1$ [rad], velocity: $\xi_2$ [rad/s], effort: torque after its limit',
+        r'position: $\xi_1$ [rad], velocity: $\xi_2$ [rad/s], effort: torque after saturation',
     ),
     topics.LEARNING: (
         _OFTEN,
         (
             f'{_NAMED}each estimate, `{topics.DISTURBANCE}<joint>` (with the learned friction), '
-            f'`{topics.LAMBDA_MIN}`, `{topics.LATCHED}`, `{topics.MODEL_CHANGES}` (times that the '
-            f'arm was found to have changed), `{topics.COMPUTE_TIME}` [s]'
+            f'`{topics.LAMBDA_MIN}`, `{topics.LATCHED}`, `{topics.MODEL_CHANGES}` (number of '
+            f'detected changes of the arm), `{topics.COMPUTE_TIME}` [s]'
         ),
     ),
-    topics.JOINT_TRAJECTORY: ('subscribed', 'another reference: [references.md](references.md)'),
+    topics.JOINT_TRAJECTORY: ('subscribed', 'new reference: [references.md](references.md)'),
     topics.JOURNAL: (
         'each event',
         (
-            'JSON: activations, trajectories, changed parameters, stops, and after which joint '
-            'state; see [operation.md](operation.md#the-journal)'
+            'JSON: activations, trajectories, changed parameters, stops, each with the joint state '
+            'that it follows; see [operation.md](operation.md#the-journal)'
         ),
     ),
     topics.BOUND: ('at the start, on change', 'position: $k_c$ [rad], effort: torque limit'),
     topics.STATE: ('on change', 'starting, approaching, tracking, or stopped and why'),
     topics.MONITOR: (
-        'each 10th sample',
+        'every 10th sample',
         (
             f'{_NAMED}`{topics.RATIO}<joint>`, `{topics.DISTANCE}<joint>` [rad], estimates (NaN: a '
             f'rejected disturbance column), `{topics.LAMBDA_MIN}`, `{topics.LATCHED}`; where '
@@ -68,12 +68,12 @@ _ABOUT = {
             'and its bound'
         ),
     ),
-    topics.TRUTH: ('each 10th sample', f'{_NAMED}the true values, named as the estimates'),
+    topics.TRUTH: ('every 10th sample', f'{_NAMED}the true values, named as the estimates'),
     topics.CHANGES: (
         'on change',
         (
-            'JSON: `parameters` of the plant that changed while it runs, and the `stamp` [ns] of '
-            'the first sample with them'
+            'JSON: `parameters` of the plant changed while it runs, and the `stamp` [ns] of the '
+            'first sample with them'
         ),
     ),
     topics.TIMING: (
@@ -82,11 +82,11 @@ _ABOUT = {
     ),
     topics.ROBOT_DESCRIPTION: ('at the start', 'URDF of the simulated arm'),
     topics.MARKERS: (
-        'each `period`',
+        'every `period`',
         'reference as a ghost, bound around its tip, torques: for RViz and Foxglove',
     ),
     topics.CLOCK: ('each sample, if `publish_clock`', "the plant's time"),
-    topics.DIAGNOSTICS: ('each second, on change', 'health of controller and plant'),
+    topics.DIAGNOSTICS: ('every second, on change', 'health of controller and plant'),
 }
 
 
@@ -96,7 +96,7 @@ def topic_page() -> str:
 
 
 def _all() -> list[Topic]:
-    """Every topic of the package, those of the control loop first."""
+    """Return every topic of the package, those of the control loop first."""
     return [one for one in vars(topics).values() if isinstance(one, Topic)]
 
 

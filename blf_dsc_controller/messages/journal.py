@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`~/journal`: every event of the controller as JSON in a std_msgs/String, one message each.
 
-With the journal and the joint states, a replay repeats a run exactly: an event takes effect after
-so many joint-state messages, the last of which has a known stamp.
+With the journal and the joint states, a replay repeats a run exactly: each event states the number
+of joint-state messages it follows, and the stamp of the last of them.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from blf_dsc_controller.messages.topics import JOURNAL
 from blf_dsc_controller.messages.types import typestore
 
 OUTSIDE_BOUND = 'error past the bound'
-"""Reason of a stop after which the bound was not held."""
+"""Reason for a stop: the error left its bound."""
 
 
 class EventType(str, Enum):
-    """What happened, with the content of its event."""
+    """Type of an event, with the event's content."""
 
     __str__ = str.__str__
 
     CONFIGURE = 'configure'  # parameters: all of them by name
     ACTIVATE = 'activate'
-    START = 'start'  # the law takes the first joint state; resumed: along the running reference
-    TRAJECTORY = 'trajectory'  # joints, points, begin: as it was sent; at: followed from then on
+    START = 'start'  # the law receives its first state; resumed: on the running reference
+    TRAJECTORY = 'trajectory'  # joints, points, begin: as sent; at: followed from then on
     PARAMETERS = 'parameters'  # parameters: the changed ones by name
     STOP = 'stop'  # reason, text
     SILENCE = 'silence'  # torques: commanded by the watchdog before the next message
@@ -38,7 +38,7 @@ class EventType(str, Enum):
 
 
 class Event(NamedTuple):
-    """One event."""
+    """One event of the controller."""
 
     number: int  # since the controller was configured
     type: EventType
@@ -55,7 +55,7 @@ class Event(NamedTuple):
 
 
 def decode(raw: bytes) -> Event:
-    """Return the event of a serialised message.
+    """Decode the event of a serialised message.
 
     Raises:
         BlfDscError: it holds no event.
@@ -70,7 +70,7 @@ def decode(raw: bytes) -> Event:
 
 
 class Journal:
-    """Notes the events of a controller until they are published.
+    """Queue of a controller's events until they are published.
 
     Attributes:
         stamp, messages, commands: as in `Event`, up to now.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The samples of a law, a packed row each, by name: as columns, and as a `Run`."""
+"""Conversion of a law's packed samples to columns by name, and to a `Run`."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from blf_dsc_controller.run import Floats, LearnedArm, Run, Series, Stamps
 
 
 def columns_of(rows: Floats, settings: Settings) -> Sample:
-    """Columns by name of packed samples (N, s): their places are found on a row of indices."""
+    """Split packed samples (N, s) into columns by name, located by unpacking a row of indices."""
     places = sample_of(np.arange(rows.shape[1], dtype=np.float64), settings)
     return Sample(*(rows[:, part.astype(np.intp)] for part in places))
 
 
 def learning_of(config: ControllerConfig, stamps: Stamps, samples: Sample) -> Series:
-    """What the law learned, under the names of `~/learning`."""
+    """Return what the law learned, under the names of `~/learning`."""
     names = learning_names(estimate_names(config), config.joints)
     figures = samples.lambda_min, samples.latched, samples.changes
     return Series(names, stamps, np.hstack((samples.estimate, samples.disturbance, *figures)))
 
 
 def learned_arm(config: ControllerConfig) -> LearnedArm | None:
-    """Units, prior and regressor of what is learned of a URDF; None of another model."""
+    """Return units, prior and regressor of what is learned of a URDF; None for other models."""
     if config.model != 'urdf':
         return None
     model, names = model_of(config), estimate_names(config)
@@ -57,9 +57,9 @@ def run_of(
     measurements: Floats,
     rows: Floats,
 ) -> Run:
-    """Run of a controller, from its stamps (N,) [ns], measurements (N, 3 n) and samples (N, s).
+    """Build a run from stamps (N,) [ns], measurements (N, 3 n) and samples (N, s).
 
-    Rows of states that the law did not use are NaN but for bound and torque.
+    Rows of states that the law did not use are NaN except for bound and torque.
     """
     samples = columns_of(rows, controller.settings)
     used = ~np.isnan(samples.qr[:, 0])

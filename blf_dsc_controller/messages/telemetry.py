@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The messages that controller and plant publish in each sample, as (topic, bytes).
+"""Messages that controller and plant publish in each sample, as (topic, bytes).
 
 The nodes publish them and the offline loop writes them into a bag. Vectors of named values are sent
 as JointState with the values in `position`.
@@ -28,24 +28,24 @@ from blf_dsc_controller.messages.types import typestore
 Message: TypeAlias = tuple[topics.Topic, bytes]
 
 DECIMATION = 10
-"""Samples from one slow message (monitor, truth) to the next."""
+"""Number of samples from one slow message (monitor, truth) to the next."""
 
 
 def learning_names(estimates: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
-    """Names of what is learned of n `joints`; `estimates` are those of theta^."""
+    """Return the names of what is learned of n `joints`; `estimates` are those of theta^."""
     figures = topics.LAMBDA_MIN, topics.LATCHED, topics.MODEL_CHANGES
     return (*estimates, *disturbance_names(joints), *figures)
 
 
 def disturbance_names(joints: Sequence[str]) -> tuple[str, ...]:
-    """Names of the disturbance torques, estimated or true."""
+    """Return the names of the disturbance torques, estimated or true."""
     return tuple(topics.DISTURBANCE + joint for joint in joints)
 
 
 class ControllerTelemetry:
     """Messages of the controller of n joints and `estimates`, the m entries of theta^.
 
-    Reference and estimates come with every `decimation`-th sample.
+    Reference and estimates are sent with every `decimation`-th sample.
     """
 
     def __init__(self, joints: Sequence[str], estimates: Sequence[str], decimation: int) -> None:
@@ -59,18 +59,18 @@ class ControllerTelemetry:
         self._decimation, self._samples = decimation, 0
 
     def command(self, torque: np.ndarray) -> Message:
-        """Commanded torque (n,) [N m]."""
+        """Encode the commanded torque (n,) [N m]."""
         return topics.COMMANDS, self._command.encode(torque)
 
     def bound(self, stamp: int, bound: np.ndarray, torque_limit: np.ndarray) -> Message:
-        """Bound k_c (n,) [rad] on the tracking error, and the torque limit (n,) [N m]."""
+        """Encode the bound k_c (n,) [rad] on the tracking error and the torque limit (n,) [N m]."""
         message = self._bound.encode(stamp, position=bound, effort=torque_limit)
         return topics.BOUND, message
 
     def sample(self, stamp: int, sample: Sample, compute_time: float) -> Iterator[Message]:
-        """Messages of the sample of a joint state: its stamp [ns], telemetry, update time [s].
+        """Yield the messages for a joint state: its stamp [ns], telemetry sample, update time [s].
 
-        The tracking error comes with each: by it a replay knows which states the law has used.
+        The tracking error is sent every time: it tells a replay which states the law has used.
         """
         error = self._error.encode(stamp, sample.xi1, sample.xi2, sample.torque)
         yield topics.TRACKING_ERROR, error
@@ -100,27 +100,27 @@ class PlantTelemetry:
         )
 
     def joint_states(self, stamp: int, measurement: np.ndarray) -> Message:
-        """Measured [q, dq, applied torque of the last interval] (3 n,)."""
+        """Encode measured [q, dq, applied torque of the last interval] (3 n,)."""
         fields = measurement.reshape(3, self._joints)
         return topics.JOINT_STATES, self._joint_states.encode(stamp, *fields)
 
     def truth(self, stamp: int, truth: np.ndarray) -> Message:
-        """True [P, tau_dist, q, dq] (p + 3 n,)."""
+        """Encode the true [P, tau_dist, q, dq] (p + 3 n,)."""
         return topics.TRUTH, self._truth.encode(stamp, truth)
 
     def timing(self, stamp: int, latency: float, lateness: float, late_steps: int) -> Message:
-        """Real-time performance of the step up to this sample [s, s, count]."""
+        """Encode the real-time performance of the step up to this sample [s, s, count]."""
         return topics.TIMING, self._timing.encode(stamp, (latency, lateness, late_steps))
 
     def clock(self, stamp: int) -> Message:
-        """Plant time [ns] on /clock."""
+        """Encode the plant's time [ns] for /clock."""
         return topics.CLOCK, encode_clock(stamp)
 
 
 class Monitor:
-    """Messages of the slow topic `~/monitor`: how far the guarantees of the law hold.
+    """Messages of the slow topic `~/monitor`: how well the guarantees of the law hold.
 
-    Where the truth is known: the Lyapunov function (29) term by term, and the bound (32) on it.
+    If the truth is known, they include the Lyapunov function (29) term by term and its bound (32).
 
     Attributes:
         names: of the values.
@@ -140,9 +140,9 @@ class Monitor:
     def values(
         self, stamp: int, sample: Sample, ratio: np.ndarray, bound: np.ndarray
     ) -> list[float]:
-        """Values of `names`, of a telemetry sample at a stamp [ns].
+        """Return the values of `names` for a telemetry sample at a stamp [ns].
 
-        `ratio` is the largest |xi1| / k_c so far (n,), `bound` the present k_c (n,) [rad].
+        `ratio` is the largest |xi1| / k_c so far (n,), `bound` the current k_c (n,) [rad].
         """
         distance = bound - np.abs(sample.xi1)
         values = [*ratio, *distance, *sample.estimate, sample.lambda_min[0], sample.latched[0]]
@@ -154,7 +154,7 @@ class Monitor:
         return values
 
     def message(self, stamp: int, sample: Sample, ratio: np.ndarray, bound: np.ndarray) -> Message:
-        """Message of these values."""
+        """Encode these values."""
         values = self.values(stamp, sample, ratio, bound)
         return topics.MONITOR, self._encoder.encode(stamp, values)
 

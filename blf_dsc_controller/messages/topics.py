@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics of the package: name, message type, quality of service, names of their values.
+"""Topics of the package: name, message type, quality of service, names of their values.
 
 Nodes, offline writer and reader share this table, so that a bag made without ROS holds the same
 topics as a recording of the running nodes.
@@ -64,9 +64,9 @@ JOINT_STATE = 'sensor_msgs/msg/JointState'
 FLOAT64_MULTI_ARRAY = 'std_msgs/msg/Float64MultiArray'
 
 # The subscribers of the control loop keep one message: a late state or torque is useless once the
-# next one has come. Publishers keep more, so that a recorder misses none. Most are volatile: an arm
-# must never receive an old torque. A recorder that starts late reports it, and closed_loop waits
-# until the recorder has subscribed.
+# next one has arrived. Publishers keep more, so that a recorder misses none. Most are volatile: an
+# arm must never receive an old torque. A recorder that starts late reports it, and closed_loop
+# waits until the recorder has subscribed.
 LATEST = Quality(depth=1)
 STREAM = Quality(depth=5000)
 HISTORY = Quality(depth=5000, durability='transient_local')
@@ -127,7 +127,7 @@ TOPICS = (
 
 # In the vectors learning, truth, timing, monitor.
 DISTURBANCE = 'disturbance '  # followed by the joint
-COLUMNS = ('bias ', 'viscous ', 'coulomb ', 'sin ', 'cos ')  # beginnings of learned disturbances
+COLUMNS = ('bias ', 'viscous ', 'coulomb ', 'sin ', 'cos ')  # prefixes of disturbance columns
 POSITION = 'position '  # followed by the joint
 VELOCITY = 'velocity '  # followed by the joint
 RATIO = 'max_error_ratio '  # followed by the joint: the largest |xi1| / k_c so far

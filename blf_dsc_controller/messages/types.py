@@ -17,7 +17,7 @@ class UnknownTypeError(BlfDscError):
 
     def __init__(self, type_name: str) -> None:
         super().__init__(
-            f'message type {type_name!r} is not known here: its definition is needed to record it'
+            f'unknown message type {type_name!r}: its definition is needed to record it'
         )
 
 
@@ -31,12 +31,12 @@ class Definition(NamedTuple):
 
 @functools.cache
 def typestore() -> Typestore:
-    """Types of Jazzy's common interfaces, to which further types can be registered."""
+    """Return the types of Jazzy's common interfaces; further types can be registered there."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 def definition(type_name: str) -> Definition:
-    """Definition of a message type; UnknownTypeError if it is not in the store."""
+    """Return the definition of a message type; UnknownTypeError if it is not in the store."""
     if type_name not in typestore().fielddefs:
         raise UnknownTypeError(type_name)
     text, _md5 = typestore().generate_msgdef(type_name, ros_version=2)

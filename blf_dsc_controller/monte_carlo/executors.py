@@ -2,12 +2,12 @@
 """The runs of a study, computed by any `concurrent.futures.Executor`.
 
     processes   processes of this machine (default)
-    threads     threads of this process: the kernels release the interpreter's lock
+    threads     threads of this process: the kernels release the GIL
     dask        a dask.distributed cluster: a running one, by its address, or a local one
     mpi         the ranks of an MPI job (mpi4py.futures)
 
-The results are the same with each of them.  Chunks of runs are handed out one after the other, a
-few ahead of the workers, so the memory needed does not grow with the number of runs.
+All of them give the same results.  Chunks of runs are submitted one after the other, a few ahead of
+the workers, so the memory needed does not grow with the number of runs.
 """
 
 from __future__ import annotations
@@ -37,39 +37,39 @@ from blf_dsc_controller.monte_carlo.store import Span
 from blf_dsc_controller.monte_carlo.study import Study
 
 RETRIES = 3
-"""Times in a row that all workers may be lost before any has finished a chunk."""
+"""Consecutive losses of all workers that are tolerated before any has finished a chunk."""
 
-_AHEAD = 3  # chunks handed out for each worker
+_AHEAD = 3  # chunks submitted for each worker
 
 
 class Engine(NamedTuple):
-    """Workers: `open` starts them, each time as a new executor; BrokenExecutor: they were lost."""
+    """Workers: `open` starts a new executor, which raises BrokenExecutor if they are lost."""
 
     open: Callable[[], AbstractContextManager[Executor]]
     workers: int
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
 
 
 def processes(workers: int) -> Engine:
-    """Processes of this machine, each of which ends with this one."""
+    """Use processes of this machine, each of which ends with this one."""
     context = multiprocessing.get_context('forkserver')
     context.set_forkserver_preload([run_chunk.__module__])  # imported once, for all workers
     return Engine(lambda: ProcessPoolExecutor(workers, context, _end_with_parent), workers)
 
 
 def threads(workers: int) -> Engine:
-    """Threads of this process."""
+    """Use threads of this process."""
     return Engine(lambda: ThreadPoolExecutor(workers), workers)
 
 
 def dask(workers: int, address: str = '') -> Engine:
-    """Make a dask.distributed cluster of this machine, or use the one of this scheduler.
+    """Start a dask.distributed cluster on this machine, or use the one at a scheduler's address.
 
-    Dask itself repeats what a lost worker was doing, unless that fails again and again.
+    Dask itself repeats the work of a lost worker, unless it fails repeatedly.
     """
     try:
         import distributed
@@ -96,9 +96,9 @@ def dask(workers: int, address: str = '') -> Engine:
 
 
 def mpi(workers: int) -> Engine:
-    """Use the ranks of an MPI job, `mpiexec -n 9 python -m mpi4py.futures -m ...`: all but one.
+    """Use all ranks but one of an MPI job, `mpiexec -n 9 python -m mpi4py.futures -m ...`.
 
-    Started as a single rank, it requests as many more as there are to be workers.
+    Started as a single rank, it requests `workers` more.
     """
     try:
         from mpi4py import MPI
@@ -110,7 +110,7 @@ def mpi(workers: int) -> Engine:
 
 
 def chunk_size(runs: int, workers: int) -> int:
-    """Runs in a chunk: few files, yet enough chunks for the workers to end together."""
+    """Return the runs per chunk: few files, yet enough chunks for workers to finish together."""
     largest = min(1000, max(100, runs // 1000))
     return max(1, min(largest, runs // (20 * workers)))
 
@@ -122,10 +122,10 @@ def compute(
     keep: Callable[[Span, Columns], None],
     warn: Callable[[str], None],
 ) -> None:
-    """Compute all `spans` and give each with its results to `keep`, as they are done.
+    """Compute all `spans` and pass each with its results to `keep` as soon as it is done.
 
-    The chunk of a lost worker is repeated, after a warning; BlfDscError if workers are lost again
-    and again.
+    The chunk of a lost worker is repeated, after a warning; raises BlfDscError if workers are lost
+    repeatedly.
     """
     waiting = deque(spans)
     in_a_row = 0
@@ -142,7 +142,7 @@ def compute(
                     f'({error}); {len(waiting)} chunks are left. Is there enough memory? Start the '
                     'same command again to resume: finished runs are kept'
                 ) from error
-            warn(f'a worker was lost: {len(waiting)} chunks are left, and go to new workers')
+            warn(f'a worker was lost: the {len(waiting)} chunks left go to new workers')
 
 
 def _hand_out(
@@ -152,7 +152,7 @@ def _hand_out(
     most: int,
     keep: Callable[[Span, Columns], None],
 ) -> None:
-    """Empty `waiting`; what was not kept is put back if anything goes wrong."""
+    """Submit all of `waiting`; on an error, put back the spans that were not kept."""
     handed: dict[Future[Columns], Span] = {}
     try:
         while waiting or handed:
@@ -170,7 +170,7 @@ def _hand_out(
 
 
 def _end_with_parent() -> None:
-    """Leave an interrupt to the parent, and do not outlive it, even if it is killed."""
+    """Leave interrupts to the parent, and exit with it, even if it is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is None:

@@ -21,8 +21,8 @@ _PANELS_OF_INFLUENCE = 6
 _MOST_DOTS = 20_000
 _FEW_DOTS = 1000
 _LEAST_ERROR = 1e-6
-_FAR = 1.25  # |xi1| / k_c of the last bar, which holds all above
-_FARTHEST = 2.0  # |xi1| / k_c that is drawn; what is beyond is put there
+_FAR = 1.25  # |xi1| / k_c of the last bar, which includes all larger ones
+_FARTHEST = 2.0  # largest |xi1| / k_c drawn; larger ones are clipped
 _FEW_DECADES = 50.0
 _RATIO = r'max $|\xi_1| \; / \; k_c$'
 _PERCENT = FuncFormatter(lambda value, _: f'{100 * value:g} %')
@@ -60,7 +60,7 @@ def _draw_distributions(study: Study, results: Columns, path: Path) -> None:
     tail.set_ylabel('fraction of runs above')
     tail.yaxis.set_major_formatter(_PERCENT)
     _plain(tail)
-    tail.set_xlabel(f'{_RATIO}, the worse joint')
+    tail.set_xlabel(f'{_RATIO}, worst joint')
     head(tail, 'tail of the largest error')
 
     _histogram(
@@ -93,7 +93,7 @@ def _plain(axes: Axes) -> None:
 
 
 def _histogram(axes: Axes, columns: dict[str, Floats], *, logarithmic: bool = False) -> None:
-    """Outlines of several distributions over common bins."""
+    """Draw the outlines of several distributions over common bins."""
     known = {label: values[np.isfinite(values)] for label, values in columns.items()}
     everything = np.concatenate(list(known.values()))
     if everything.size == 0:

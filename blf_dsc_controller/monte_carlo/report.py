@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report of a study in its own folder, and one of its runs again with every sample recorded."""
+"""Report of a study in its folder, and reproduction of one run with every sample recorded."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _QUANTILES = ('min', 'median', 'p95', 'p99', 'max')
 
 
 def write_report(store: Store) -> tuple[Summary, list[Path]]:
-    """Write report.html with its figures, and summary.json, of the runs that are done.
+    """Write report.html with its figures, and summary.json, of the finished runs.
 
-    Returns the summary and the paths; raises BlfDscError where there are no results yet.
+    Returns the summary and the paths; raises BlfDscError if there are no results yet.
     """
     results = store.results()
     summary = summarize(store.study, results)
@@ -44,7 +44,7 @@ def write_report(store: Store) -> tuple[Summary, list[Path]]:
 
 
 def headline(summary: Summary) -> str:
-    """Result in one sentence."""
+    """Return the result in one sentence."""
     kept = summary['kept']
     return (
         f'{_percent(kept["fraction"])} of the runs kept the bound '
@@ -54,18 +54,18 @@ def headline(summary: Summary) -> str:
 
 
 def reproduce_command(folder: Path, run: int) -> str:
-    """Command that computes a run again and records it."""
+    """Return the command that repeats a run and records it."""
     out = shlex.quote(f'{folder.name}-run-{run}')
     return f'blf_dsc monte-carlo --reproduce {shlex.quote(str(folder))} {run} --out {out}'
 
 
 def plant_of_run(study: Study, run: int) -> PlantConfig:
-    """Configuration of the plant of a run."""
+    """Return the plant configuration of a run."""
     return plant_of_draw(study, draw(study, run), origin_of(controller_of(study.controller)))
 
 
 def reproduce(store: Store, run: int, out: Path) -> Summary:
-    """Compute a run of the study again into the folder `out`: config.yaml, bag, figures, summary.
+    """Repeat a run of the study and write config.yaml, bag, figures and summary to `out`.
 
     Raises BlfDscError if the run has no results, or if they are not reproduced bit for bit;
     StartError if the controller rejects its start.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs of a study, and what is measured of each, as columns of the results."""
+"""Runs of a study and their metrics, as columns of the results."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ OUTCOMES = {
     DIVERGED: 'a number became infinite or NaN',
     REJECTED: 'measured outside the bound at the start, where the controller refuses to start',
 }
-"""What can become of a run."""
+"""Possible outcomes of a run."""
 
 Row = dict[str, float | int | str]
 Columns = dict[str, np.ndarray]
-"""Results by the names of their columns, an entry for each run."""
+"""Results by column name, one entry per run."""
 
 
 def run_chunk(study: Study, first: int, count: int) -> Columns:
     """Compute runs `first` to `first + count - 1`.
 
-    The memory of one controller, which is nearly all there is, serves one run after the other. The
-    result depends on the arguments alone, and no file is written.
+    All runs share one controller, which takes nearly all of the memory. The result depends on the
+    arguments alone, and no file is written.
     """
     controller = controller_of(study.controller)
     origin = origin_of(controller)
@@ -61,7 +61,7 @@ def warm_up(study: Study) -> None:
 
 
 def metrics_settings(study: Study, plant: PlantConfig) -> MetricsSettings:
-    """Settings of the metrics of a run with this plant."""
+    """Return the settings of the metrics of a run with this plant."""
     order = parameter_order(model_of(study.controller).parameter_names, plant)
     limits = zip(study.controller.torque.limit, plant.actuator.torque_limit, strict=True)
     times = (study.settings.settled_after, *study.settings.moments)
@@ -79,7 +79,7 @@ def metrics_settings(study: Study, plant: PlantConfig) -> MetricsSettings:
 
 
 def metrics_row(study: Study, metrics: LoopMetrics) -> Row:
-    """Columns of a run from its metrics; NaN is what has not happened."""
+    """Return the columns of a run from its metrics; NaN for events that did not happen."""
     settled = metrics.settled[0]
     outcome = KEPT if np.isnan(metrics.violation[0]) else VIOLATED
     row: Row = {
@@ -99,7 +99,7 @@ def metrics_row(study: Study, metrics: LoopMetrics) -> Row:
 
 
 def error_columns(study: Study) -> Iterator[str]:
-    """Names of the parameter errors, the one at the end last."""
+    """Yield the column names of the parameter errors, the final one last."""
     for moment in study.settings.moments:
         yield f'parameter_error.{moment:g}_s'
     yield 'parameter_error.end'
@@ -123,7 +123,7 @@ def _run(study: Study, index: int, controller: Controller, origin: Origin) -> Ro
 
 
 def _rejected_row(study: Study, ratios: np.ndarray) -> Row:
-    """Columns of a run that does not begin, with |xi1(0)| / k_c (n,)."""
+    """Return the columns of a run that does not begin, with |xi1(0)| / k_c (n,)."""
     settings = metrics_settings(study, study.plant)
     metrics = metrics_of(np.full_like(new_metrics(settings), np.nan), settings)
     metrics.violation[0] = 0.0

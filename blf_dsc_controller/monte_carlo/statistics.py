@@ -23,10 +23,10 @@ _DRAWN = 'plant.'
 
 
 def summarize(study: Study, results: Columns) -> Summary:
-    """Summary of the results as plain data for JSON; None is what is not known.
+    """Return a summary of the results as plain data for JSON; unknown values are None.
 
-    The interval of Wilson, unlike p +- z sqrt(p (1 - p) / n), does not shrink to a point where all
-    runs kept the bound, and never leaves [0, 1].
+    The Wilson interval, unlike p +- z sqrt(p (1 - p) / n), does not shrink to a point if all runs
+    kept the bound, and never leaves [0, 1].
     """
     outcomes = results['outcome']
     runs = outcomes.size
@@ -54,22 +54,22 @@ def summarize(study: Study, results: Columns) -> Summary:
 
 
 def worst_ratio(study: Study, results: Columns) -> Floats:
-    """Largest |xi1| / k_c of any joint in each run; infinite where the run diverged."""
+    """Return the largest |xi1| / k_c of any joint in each run; infinite if the run diverged."""
     each = [results[f'max_error_ratio.{joint}'] for joint in study.plant.joints]
     return np.where(results['outcome'] == DIVERGED, np.inf, np.max(each, axis=0))
 
 
 def worst_first(study: Study, results: Columns) -> np.ndarray:
-    """Rows of the results, the largest |xi1| / k_c first; equal ones in the order of the runs."""
+    """Return the rows of the results, largest |xi1| / k_c first; ties in the order of the runs."""
     return np.argsort(-worst_ratio(study, results), kind='stable')
 
 
 def influence(study: Study, results: Columns) -> dict[str, float]:
-    """Fraction of the variance of the largest |xi1| / k_c that each drawn number explains.
+    """Return the fraction of the variance of the largest |xi1| / k_c due to each drawn number.
 
-    The correlation ratio of the ranks over groups of equal size, less what chance explains: unlike
-    a correlation it also shows that both ends of a range are bad. Strongest first; what is the
-    same in all runs is left out.
+    This is the correlation ratio of the ranks over groups of equal size, corrected for chance:
+    unlike a correlation, it also shows if both ends of a range are bad. Strongest first; numbers
+    that are the same in all runs are left out.
     """
     ranks = rankdata(worst_ratio(study, results))
     found = {

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a study: what it is, and a file of results for each chunk of runs that is done.
+"""The folder of a study: its configuration, and a file of results for each finished chunk of runs.
 
-    study.yaml       the whole configuration, a file that `blf_dsc monte-carlo --config` takes
-    versions.json    what computed it
+    study.yaml       the whole configuration, a file that `blf_dsc monte-carlo --config` accepts
+    versions.json    the versions that computed the results
     runs/            Parquet files, named after the first and the last run in them
 
-A file of results appears whole or not at all, so a study that was killed resumes with the runs
-that have none.
+Files of results are written atomically, so a study that was killed resumes with the runs that have
+none.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Span(NamedTuple):
 
 
 def require_pyarrow() -> Any:
-    """Return pyarrow with its Parquet files; MissingExtraError where it is not installed."""
+    """Return pyarrow with its Parquet module; raises MissingExtraError if it is not installed."""
     try:
         import pyarrow as pa
         import pyarrow.parquet
@@ -55,7 +55,7 @@ def require_pyarrow() -> Any:
 
 
 def versions() -> dict[str, str]:
-    """What the numbers depend on beside the configuration."""
+    """Return the versions on which the numbers depend besides the configuration."""
     return {
         'blf_dsc_controller': blf_dsc_controller.__version__,
         'kernels': cache_folder(run_loop).name,
@@ -64,20 +64,20 @@ def versions() -> dict[str, str]:
 
 
 def differences(there: Mapping[str, object], here: Mapping[str, object]) -> str:
-    """Lines for a message, one for each value that differs; empty if none does."""
+    """Return lines for a message, one for each value that differs; empty if none does."""
     names = [*there, *(name for name in here if name not in there)]
     pairs = ((name, there.get(name, 'nothing'), here.get(name, 'nothing')) for name in names)
     return ''.join(
         f'\n  - {name}: there {old}, here {new}'
         for name, old, new in pairs
-        if old != new and (old == old or new == new)  # noqa: PLR0124 - NaN is as good as NaN
+        if old != new and (old == old or new == new)  # noqa: PLR0124 - NaN equals NaN here
     )
 
 
 class Store:
     """The folder of a study, with the `study` that its results belong to.
 
-    Raises BlfDscError where there is none.
+    Raises BlfDscError if the folder holds no study.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -96,9 +96,9 @@ class Store:
 
     @classmethod
     def create_or_open(cls, folder: Path, study: Study) -> Store:
-        """Make the folder of a study, or open it to resume.
+        """Create the folder of a study, or open it to resume.
 
-        Raises BlfDscError if it holds another study, the same by another version, or none.
+        Raises BlfDscError if it holds no study, another one, or the same by another version.
         """
         if not os.path.lexists(folder):
             _create(folder, study)
@@ -114,9 +114,9 @@ class Store:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes from writing into the folder; a lock ends with its process.
+        """Keep other processes from writing to the folder; the lock ends with its process.
 
-        Removes what an earlier process left unfinished. Raises BlfDscError if another holds it.
+        Removes unfinished files of an earlier process. Raises BlfDscError if it is locked already.
         """
         with (self.folder / _STUDY).open(encoding='utf-8') as file:
             try:
@@ -130,7 +130,7 @@ class Store:
             yield
 
     def keep(self, span: Span, columns: Columns) -> None:
-        """Write the results of some runs: the whole file or none, even if the process is killed."""
+        """Write the results of a span of runs atomically, even if the process is killed."""
         pa = require_pyarrow()
         last = span.first + span.runs - 1
         path = self.folder / _RUNS / f'runs-{span.first:09d}-{last:09d}.parquet'
@@ -142,13 +142,13 @@ class Store:
         unfinished.replace(path)
 
     def done(self) -> list[Span]:
-        """Runs that have results, in their order."""
+        """Return the runs that have results, in order."""
         found = (_PART.fullmatch(path.name) for path in (self.folder / _RUNS).iterdir())
         bounds = sorted((int(one[1]), int(one[2])) for one in found if one)
         return [Span(first, last - first + 1) for first, last in bounds]
 
     def missing(self, size: int) -> list[Span]:
-        """Runs that have none, in chunks of at most `size`."""
+        """Return the runs without results, in chunks of at most `size`."""
         edges = [Span(0, 0), *self.done(), Span(self.study.settings.runs, 0)]
         return [
             Span(first, min(size, after.first - first))
@@ -157,9 +157,9 @@ class Store:
         ]
 
     def results(self) -> Columns:
-        """Read all results, a row for each run, in their order.
+        """Read all results, one row per run, in order.
 
-        Raises BlfDscError if there are none yet, and for a damaged file.
+        Raises BlfDscError if there are none yet, or if a file is damaged.
         """
         pa = require_pyarrow()
         paths = sorted(
@@ -178,15 +178,15 @@ class Store:
                 problem = str(error)
             if problem:
                 raise BlfDscError(
-                    f'{path} cannot be read ({problem}): remove it and start the study again, '
-                    'which computes these runs again'
+                    f'{path} cannot be read ({problem}): remove it and start the study again '
+                    'to recompute these runs'
                 )
         whole = pa.concat_tables(tables).sort_by('run')
         return {name: np.asarray(whole[name].to_numpy()) for name in whole.column_names}
 
 
 def _create(folder: Path, study: Study) -> None:
-    """Make the folder as a whole or not at all."""
+    """Create the folder atomically."""
     unfinished = folder.with_name(f'.{folder.name}.{os.getpid()}')
     shutil.rmtree(unfinished, ignore_errors=True)
     (unfinished / _RUNS).mkdir(parents=True)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A study: a closed loop, what of it varies, and the run that each index stands for.
+"""A study: a closed loop, the parameters that vary, and the run of each index.
 
-Its file is a parameter file of the loop with one section more:
+Its file is a parameter file of the loop with one additional section:
 
     monte_carlo:
       ros__parameters:
@@ -31,12 +31,12 @@ from blf_dsc_controller.monte_carlo.variations import Value, Variation, read_var
 
 _NODE = 'monte_carlo'
 _VARY = 'vary.'
-_ONE_STUDY = 'a study is one configuration from its first run to its last'
+_ONE_STUDY = 'a study has one configuration from its first run to its last'
 
 
 @dataclass(frozen=True)
 class MonteCarloConfig:
-    """Section `monte_carlo` of a study file: how many runs, and what is measured of each."""
+    """Section `monte_carlo` of a study file: number of runs, and what is measured in each."""
 
     runs: int = parameter(
         1000, 'closed loops to run', at_least=1, at_most=100_000_000, read_only=_ONE_STUDY
@@ -46,14 +46,14 @@ class MonteCarloConfig:
     )
     settled_after: float = parameter(
         0.0,
-        'time from which on the rms error is taken: leave the learning its window',
+        'time from which the rms error is computed; allow for the learning window',
         unit='s',
         at_least=0.0,
         read_only=_ONE_STUDY,
     )
     moments: tuple[float, ...] = parameter(
         (),
-        'times at which the parameter error is kept, beside the end',
+        'times at which the parameter error is stored, besides the end',
         unit='s',
         at_least=0.0,
         may_be_empty=True,
@@ -61,7 +61,7 @@ class MonteCarloConfig:
     )
 
     def duration_problems(self, duration: float) -> list[str]:
-        """Problems with what is measured after the end of a run of this duration [s]."""
+        """Return the problems with times after the end of a run of this duration [s]."""
         if duration == 0.0:
             return ['sim_plant.duration: got 0 s, but every run must end: give its duration']
         problems = [
@@ -79,7 +79,7 @@ class MonteCarloConfig:
 
 @dataclass(frozen=True)
 class Study:
-    """All that determines the results."""
+    """Everything that determines the results."""
 
     controller: ControllerConfig
     plant: PlantConfig
@@ -87,11 +87,11 @@ class Study:
     variations: tuple[Variation, ...]
 
     def by_node(self) -> dict[str, Any]:
-        """Configurations by the names of their nodes."""
+        """Return the configurations by node name."""
         return {PLANT: self.plant, CONTROLLER: self.controller, _NODE: self.settings}
 
     def flat(self) -> dict[str, object]:
-        """Every value by its node and name, with the distributions as they are written."""
+        """Return every value by node and name, with the distributions as written."""
         values: dict[str, object] = {
             f'{node}.{name}': value
             for node, config in self.by_node().items()
@@ -100,7 +100,7 @@ class Study:
         return values | {f'{_NODE}.{_VARY}{name}': text for name, text in self.varied().items()}
 
     def varied(self) -> dict[str, str | tuple[str, ...]]:
-        """Distributions as they are written: a list for a parameter that is one."""
+        """Return the distributions as written, in a list for each list parameter."""
         texts: dict[str, str | tuple[str, ...]] = {}
         for one in self.variations:
             text = str(one.distribution)
@@ -128,7 +128,7 @@ def load_study(path: str | Path, overrides: Mapping[str, object] | None = None) 
         settings = build(MonteCarloConfig, {**others, **(overrides or {})})
     except ConfigurationError as error:
         own += error.problems
-    if loop is None:  # how many events there are is unknown
+    if loop is None:  # the number of events is unknown
         varied = {name: one for name, one in varied.items() if not name.startswith('events.')}
     variations, found = read_variations(varied, loop.plant if loop else PlantConfig())
     own += [f'{_VARY}{problem}' for problem in found]
@@ -146,7 +146,7 @@ def load_study(path: str | Path, overrides: Mapping[str, object] | None = None) 
 
 
 def write_study(study: Study, path: Path) -> None:
-    """Write a study so that `load_study` gives the same one."""
+    """Write a study so that `load_study` returns the same one."""
     dump(path, study.by_node())
     with path.open('a', encoding='utf-8') as file:
         file.writelines(
@@ -155,7 +155,7 @@ def write_study(study: Study, path: Path) -> None:
 
 
 def _read_section(path: str | Path) -> tuple[dict[str, Any], dict[str, int]]:
-    """Values and lines of the section `monte_carlo`, by name."""
+    """Return values and lines of the section `monte_carlo`, by name."""
     entries = {
         name: entry
         for section in read(path)
@@ -164,7 +164,7 @@ def _read_section(path: str | Path) -> tuple[dict[str, Any], dict[str, int]]:
     }
     if not entries:
         problem = (
-            f'there is no section {_NODE}, which says how many runs there are and what varies: '
+            f'there is no section {_NODE}, which sets the number of runs and what varies: '
             'see the preset monte_carlo'
         )
         raise ConfigurationError([problem], str(path))
@@ -189,10 +189,10 @@ class Draw(NamedTuple):
 
 
 def draw(study: Study, index: int) -> Draw:
-    """Draw run `index`, from nothing but the seed of the study and the index.
+    """Draw run `index` from the seed of the study and the index alone.
 
-    Each variation has a random number of its own, which it keeps whatever else varies: two studies
-    of one seed that differ in one distribution have the same arms.
+    Each variation has its own random number, regardless of what else varies: two studies with the
+    same seed that differ in one distribution have otherwise the same arms.
     """
     sequence = np.random.SeedSequence(study.settings.seed, spawn_key=(index,))
     rng = np.random.Generator(np.random.PCG64(sequence))
@@ -203,13 +203,13 @@ def draw(study: Study, index: int) -> Draw:
 
 
 def origin_of(controller: Controller) -> Origin:
-    """Origin of a controller that has not begun."""
+    """Return the origin of a controller that has not begun."""
     qr, dqr, _ = controller.reference_at(0.0)
     return Origin(qr, dqr, controller.bound_at(0.0))
 
 
 def plant_of_draw(study: Study, drawn: Draw, origin: Origin) -> PlantConfig:
-    """Configuration of the plant of a run; `origin` is that of the study's controller."""
+    """Return the plant configuration of a run; `origin` is that of the study's controller."""
     changes: dict[str, dict[str, Any]] = {}
     for one, value in zip(study.variations, drawn.values, strict=True):
         group, _, field = one.name.partition('.')

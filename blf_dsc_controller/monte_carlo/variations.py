@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What varies from run to run: parameters of the plant with distributions like `uniform(0.4, 0.6)`.
+"""Plant parameters that vary from run to run, with distributions like `uniform(0.4, 0.6)`.
 
 A value is the inverse of the distribution function at a number u in [0, 1), so each draw takes one
 random number. The inverses are written out because `ppf` of scipy.stats takes 0.1 ms a call.
@@ -42,16 +42,16 @@ FORMS = {
     Kind.INTEGER: ('integers(low, high)', 'choice(a, b, ...)'),
     Kind.STRING: ('choice(a, b, ...)',),
 }
-"""Distributions of a parameter of each kind."""
+"""Distributions for each kind of parameter."""
 
 TAIL = 4.0
-"""Deviations from the mean at which a normal distribution is cut off."""
+"""Standard deviations from the mean at which a normal distribution is cut off."""
 
 _CALL = re.compile(r'\s*(\w+)\s*\((.*)\)\s*')
 _NAMES = {Kind.DOUBLE: 'a number', Kind.INTEGER: 'an integer', Kind.STRING: 'a word'}
 _NORMAL = NormalDist()
 _GROUPS = ('arm.', 'disturbance.', 'sensor.', 'actuator.')
-# In the order in which they came to be, so that the draws of the others stay as they were.
+# Added later, in this order, so that the draws of the others do not change.
 _LATER = (
     ('sensor.offset', 'load.', 'wall.', 'events.'),
     (
@@ -68,13 +68,13 @@ _REALTIME = ('actuator.command_timeout', 'actuator.without_command')
 
 @dataclass(frozen=True)
 class Distribution:
-    """One distribution of values of one kind."""
+    """A distribution of values of one kind."""
 
     name: str
     arguments: tuple[Value, ...]
 
     def at(self, u: float) -> Value:
-        """Value below which the fraction `u`, in [0, 1), of all draws lies."""
+        """Return the value below which the fraction `u`, in [0, 1), of all draws lies."""
         if self.name == 'choice':
             return self.arguments[int(u * len(self.arguments))]
         low, high = cast('tuple[float, float]', self.arguments)
@@ -89,7 +89,7 @@ class Distribution:
 
     @property
     def extremes(self) -> tuple[Value, ...]:
-        """The lowest and the highest value, or all of a choice."""
+        """Lowest and highest value, or all values of a choice."""
         if self.name != 'normal':
             return self.arguments
         mean, deviation = cast('tuple[float, float]', self.arguments)
@@ -100,7 +100,7 @@ class Distribution:
 
 
 def parse(text: object, kind: Kind) -> Distribution:
-    """Read a distribution of values of a scalar kind; ValueError says what is expected."""
+    """Parse a distribution of a scalar kind; raises ValueError naming what is expected."""
     call = _CALL.fullmatch(text) if isinstance(text, str) else None
     forms = FORMS[kind]
     if call is None or call[1] not in (form.partition('(')[0] for form in forms):
@@ -148,10 +148,10 @@ class RelativeStart:
 
 @dataclass(frozen=True)
 class Variation:
-    """One number that is drawn for each run."""
+    """One number drawn for each run."""
 
     name: str  # of the parameter
-    entry: int  # index in the list; -1: the parameter is no list
+    entry: int  # index in the list; -1: not a list
     column: str  # name in the results
     slot: int  # index of its random number among those of a run
     distribution: Distribution
@@ -159,7 +159,7 @@ class Variation:
 
 @functools.cache
 def variable_parameters() -> Mapping[str, Parameter]:
-    """Every parameter that may vary, by name."""
+    """Return every parameter that may vary, by name."""
     start = parameters(RelativeStart)
     plant = parameters(PlantConfig)
     later = [one for names in _LATER for one in plant if one.name.startswith(names)]
@@ -172,7 +172,7 @@ def variable_parameters() -> Mapping[str, Parameter]:
 
 
 def entries(one: Parameter, plant: PlantConfig) -> tuple[str, ...]:
-    """Name of each entry of a parameter that is a list, by joint or number; else none."""
+    """Return the names of the entries of a list parameter, by joint or number; else ()."""
     if not one.kind.is_array:
         return ()
     if not one.length:
@@ -192,7 +192,7 @@ def _numbers(count: int) -> tuple[str, ...]:
 
 
 def slots(plant: PlantConfig) -> int:
-    """Random numbers that a run draws: one for each that may vary, whether it does or not."""
+    """Return how many random numbers a run draws: one per entry that may vary, varied or not."""
     return sum(_slots(one, plant) for one in variable_parameters().values())
 
 
@@ -203,9 +203,9 @@ def _slots(one: Parameter, plant: PlantConfig) -> int:
 def read_variations(
     given: Mapping[str, object], plant: PlantConfig
 ) -> tuple[tuple[Variation, ...], list[str]]:
-    """Variations in the order of the plant's parameters, and the problems with them.
+    """Return the variations in the order of the plant's parameters, and their problems.
 
-    Each name has a distribution; a parameter that is a list takes a list of them as well.
+    Each name has a distribution; a list parameter also takes a list of them.
     """
     known = variable_parameters()
     problems = [unknown(name, known) for name in given if name not in known]
@@ -241,7 +241,7 @@ def _variations_of(
 
 
 def _distribution(one: Parameter, text: object) -> Distribution:
-    """Read a distribution all of whose values the parameter allows."""
+    """Parse a distribution and check that the parameter allows all of its values."""
     scalar = dataclasses.replace(one, kind=one.kind.element)
     distribution = parse(text, scalar.kind)
     for value in distribution.extremes:

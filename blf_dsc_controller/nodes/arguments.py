@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arguments of a node's process: checked where ROS ignores a mistake, and `-p` before files.
+"""Arguments of a node's process: checks for mistakes that ROS ignores, and `-p` before files.
 
-Of all sections that match a node ROS takes the last, in the order in which their names first
-appear: a section `/**/sim_plant` of a file would win over `-p`, which stands under `/**`.
+Of all sections that match a node, ROS uses the last in the order in which their names first
+appear: a section `/**/sim_plant` of a file would override `-p`, which belongs to `/**`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 
 
 def refuse_unknown(argv: Sequence[str]) -> None:
-    """Raise BlfDscError if there are arguments that ROS would leave to the node."""
+    """Raise BlfDscError if there are arguments that ROS does not handle itself."""
     foreign = remove_ros_args(args=list(argv))[1:]
     if foreign:
         remedy = 'ROS reads only those after --ros-args'
@@ -25,7 +25,7 @@ def refuse_unknown(argv: Sequence[str]) -> None:
 
 
 def check_sections(argv: Sequence[str], node: str) -> None:
-    """Raise ConfigurationError if a parameter file means this node, of full name, and misses it."""
+    """Raise ConfigurationError if a section meant for `node` (a full name) does not match it."""
     for option, path in _ros_options(argv):
         if option == '--params-file':
             problems = list(unmatched_sections(read(path), [node]))
@@ -34,7 +34,7 @@ def check_sections(argv: Sequence[str], node: str) -> None:
 
 
 def assigned(argv: Sequence[str]) -> dict[str, object]:
-    """Return the values of `-p name:=value`; those with the name of a node are left to ROS."""
+    """Return the values of `-p name:=value`; those prefixed with a node name are left to ROS."""
     given: dict[str, object] = {}
     for option, rule in _ros_options(argv):
         name, _, value = rule.partition(':=')
@@ -45,7 +45,7 @@ def assigned(argv: Sequence[str]) -> dict[str, object]:
 
 
 def _ros_options(argv: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Yield each option for parameters, and its value."""
+    """Yield each parameter option with its value."""
     for_ros = False
     words = iter(argv)
     for word in words:

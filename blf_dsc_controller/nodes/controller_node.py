@@ -37,16 +37,16 @@ OUTPUTS = (
     topics.MONITOR,
 )
 STREAMS = topics.REFERENCE, topics.TRACKING_ERROR, topics.LEARNING
-"""Telemetry of each sample; nobody gets messages of these from before the subscription."""
+"""Telemetry of each sample; late subscribers receive none of the earlier messages."""
 
-_RATE_SAMPLES = 1001  # when the rate is checked
-_FAST = 0.9  # of the sample time
+_RATE_SAMPLES = 1001  # samples before the rate is checked
+_FAST = 0.9  # fraction of the sample time
 
 
 class ControllerNode(LoopNode[ControllerConfig]):
     """Commands a torque on `~/commands` for each joint state, and publishes telemetry.
 
-    `guard` is the law behind its supervisor, None until the node is configured.
+    `guard` runs the guarded law; None until the node is configured.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -60,14 +60,14 @@ class ControllerNode(LoopNode[ControllerConfig]):
         )
         self._monitor: Monitor | None = None
         self._learning_events = (0.0, 0.0, 0.0)  # columns checked, columns in use, model changes
-        self._published_bound = b''  # the bytes of the array, which each sample is compared with
+        self._published_bound = b''  # bytes of the array, to detect changes
         self._decoder = JointStateDecoder(joints, assembly.required_fields(self.config))
         self._pending: bytes | None = None
-        self._warned_at = -1  # stamp of the start that was warned of
-        self._listeners: list[Callable[[], int]] = []  # counts subscribers of the STREAMS
-        self._heard = False  # when they were counted last
+        self._warned_at = -1  # stamp of the start that the last warning was about
+        self._listeners: list[Callable[[], int]] = []  # count the subscribers of STREAMS
+        self._heard = False  # whether there were any at the last count
         self._observed = self._started = False
-        self._phase = Phase.INACTIVE  # that was logged last
+        self._phase = Phase.INACTIVE  # the last one logged
         self._status = ControllerStatus(self, joints)
         parameters.on_change(self, ControllerConfig, self._retune, self._problems)
         self.start()
@@ -75,7 +75,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
     # Life cycle.
 
     def configure(self) -> None:
-        """Compile the law; create the topics of the loop the first time."""
+        """Compile the law; create the topics of the loop on the first call."""
         self.guard = Guard(self.config, self._steady, self._wall)
         self._load = reference_load(self.config, self.guard.controller.settings)
         for warning in config_warnings(self.config, load=self._load):
@@ -97,7 +97,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._report()
 
     def deactivate(self) -> None:
-        """Go to the safe torque on its ramp, and command it for the joint states from then on."""
+        """Ramp to the safe torque, which is commanded for all joint states from then on."""
         if self.guard is not None:
             self.guard.deactivate()
         self.get_logger().info(f'deactivated: {self.config.safety.torque} torque')
@@ -110,12 +110,12 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._report()
 
     def close(self) -> None:
-        """Command zero torque and wait until every subscriber has the last messages."""
+        """Command zero torque and wait until all subscribers have received the last messages."""
         self._command_zero()
         process.drain([*self._outputs.values(), self._status.journal])
 
     def _command_zero(self) -> None:
-        """Command zero torque, as drivers hold the last command, and release the guard."""
+        """Command zero torque, since drivers hold the last command, and release the guard."""
         guard, states = self.guard, self.resolve_topic_name(topics.JOINT_STATES.relative)
         if guard is not None:
             if guard.commanding and self.count_publishers(states):
@@ -124,7 +124,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self._status.publish_events(guard)
 
     def reset(self) -> str:
-        """Start again with the next joint state, with the initial estimates."""
+        """Restart with the next joint state and the initial estimates."""
         if self.guard is not None:
             self.guard.reset()
         self.failure = None
@@ -146,7 +146,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self._status.trajectories.poll(guard)
         try:
             torque = self._torque_for(guard, raw)
-        except Exception as error:  # noqa: BLE001 - whatever it is, the arm needs a torque
+        except Exception as error:  # noqa: BLE001 - the arm needs a torque after any error
             self.survive(error)
             return
         self._command(torque)
@@ -194,7 +194,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self._publish(self._monitor.message(stamp, sample, guard.samples.ratio, sample.bound))
 
     def _follow_progress(self, guard: Guard) -> None:
-        """Look at what changes seldom: subscribers, the learning, the rate of the states."""
+        """Check what rarely changes: subscribers, learning and the rate of the joint states."""
         self._heard = any(count() for count in self._listeners)
         state, samples = guard.controller.state, guard.controller.samples
         events = (state.columns_checked[0], state.active.sum(), state.changes[0])
@@ -203,8 +203,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         period, expected = guard.time / max(samples - 1, 1), self.config.sample_time
         if samples == _RATE_SAMPLES and period < _FAST * expected:
             self.get_logger().warning(
-                f'a joint state comes every {period:.3g} s, but sample_time is {expected:g} s: set '
-                'it to that of the arm, which gains and windows depend on'
+                f'joint states arrive every {period:.3g} s, but sample_time is {expected:g} s: set '
+                'it to that of the arm, since gains and windows depend on it'
             )
 
     def _report_learning(self, guard: Guard, events: tuple[float, float, float]) -> None:
@@ -232,7 +232,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._publish(self._telemetry.bound(stamp, bound, limit))
 
     def _on_poll(self) -> None:
-        """Check for missing states, and set the timer to the next check: waking up is costly."""
+        """Check for missing states, and set the timer to the next check, as waking up is costly."""
         wait, guard = POLL_PERIOD, self.guard
         if guard is not None:
             if self._pending is not None and self._is_observed():
@@ -250,7 +250,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def _problems(self, config: ControllerConfig) -> list[str]:
         if self.guard is None or self._load is None:
             return []
-        remedy = '; to have it all the same, start with it'
+        remedy = '; to use it anyway, start the node with it'
         doubts = [text + remedy for text in worsened(self.config, config, self._load)]
         return self.guard.problems(config) + doubts
 
@@ -289,11 +289,11 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.get_logger().info('tracking the reference')
 
     def _way_back(self) -> str:
-        """How to start again after a stop."""
+        """Return how to start again after a stop."""
         plant = f'{self.get_namespace().rstrip("/")}/{topics.PLANT}/reset'
         if plant in dict(self.get_service_names_and_types()):
-            return f'{plant} takes the arm to its start and begins anew'
-        return f'{self.get_fully_qualified_name()}/reset begins anew from where the arm is then'
+            return f'{plant} returns the arm to its start and starts again'
+        return f'{self.get_fully_qualified_name()}/reset starts again from where the arm is'
 
     def _report(self) -> None:
         self._status.report(self.state_label, self.guard, self.rivals)

@@ -112,13 +112,13 @@ class ControllerStatus:
         elif samples.saturated_time > 0.0:
             message = message.format('')
         elif guard.has_sample and guard.controller.sample.cuts.any():
-            message = message.format(' changes')
+            message = message.format(' rate')
         else:
             level, message = OK, _PHASES[guard.supervisor.phase][1]
         return self._diagnostics.status('loop', level, message, values)
 
     def _cuts(self, guard: Guard) -> dict[str, int]:
-        """Samples in which the law's torque was cut, joint by joint."""
+        """Return in how many samples the law's torque was cut, by joint and cause."""
         state = guard.controller.state
         causes = {'torque limit': state.level_cuts, 'torque rate limit': state.rate_cuts}
         return {

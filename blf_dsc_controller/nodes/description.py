@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The URDF that is published on a latched topic, such as by robot_state_publisher."""
+"""The URDF from a latched topic, such as the one published by robot_state_publisher."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 TIMEOUT = 60.0  # s
 _POLL = 0.05  # s
-_SILENCE = 5.0  # s between two lines in the log
+_SILENCE = 5.0  # s between two log lines
 
 
 def wait_for_description(node: Node, name: str) -> str:
-    """Return the text on a topic, named as the node would; at a signal the process ends.
+    """Return the URDF from a topic, resolving its name for the node; a signal ends the process.
 
-    Raises ConfigurationError if none comes within a minute.
+    Raises ConfigurationError if none is received within a minute.
     """
     topic = node.resolve_topic_name(name)
     hidden = RawSubscriptions(node, depth=1)
@@ -52,6 +52,6 @@ def _nothing(topic: str, publishers: int) -> str:
     if publishers:
         found = f'its {publishers} publisher(s) may not be latched (transient local)'
     return (
-        f'robot.urdf: no URDF came on {topic} within {TIMEOUT:g} s, and {found}: start '
+        f'robot.urdf: no URDF was received on {topic} within {TIMEOUT:g} s, and {found}: start '
         'robot_state_publisher, correct the name, or give a file'
     )

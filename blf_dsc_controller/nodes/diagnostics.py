@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The diagnostics of a node: `/diagnostics`, once a second and at once on a change.
+"""The diagnostics of a node on `/diagnostics`: once a second and immediately after a change.
 
 Names are paths (`left/blf_dsc_controller/loop`), which rqt_robot_monitor shows as a tree; the
 hardware is named by its joints.
@@ -23,7 +23,7 @@ STALE = DiagnosticStatus.STALE
 
 
 class DiagnosticsPublisher:
-    """Publishes the statuses of a node and, if there is a topic for it, its latched state."""
+    """Publishes the statuses of a node and, given a topic for it, its latched state."""
 
     def __init__(
         self, node: Node, joints: Sequence[str], state: topics.Topic | None = None
@@ -39,7 +39,7 @@ class DiagnosticsPublisher:
     def status(
         self, part: str, level: bytes, message: str, values: Mapping[str, Any]
     ) -> DiagnosticStatus:
-        """Status of a part of the node."""
+        """Return the status of a part of the node."""
         return DiagnosticStatus(
             level=level,
             name=f'{self._name}/{part}',
@@ -55,6 +55,6 @@ class DiagnosticsPublisher:
         self._diagnostics.publish(array)
 
     def publish_state(self, status: DiagnosticStatus) -> None:
-        """Publish the latched state, which late subscribers receive, too."""
+        """Publish the latched state, which late subscribers also receive."""
         if self._state is not None:
             self._state.publish(status)

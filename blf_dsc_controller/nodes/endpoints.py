@@ -28,11 +28,11 @@ _MESSAGE = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)')
 
 
 def message_class(type_name: str) -> Any:
-    """Class of a message type such as `sensor_msgs/msg/JointState`.
+    """Return the class of a message type such as `sensor_msgs/msg/JointState`.
 
-    Only packages of ROS are imported: the name may come from a bag, or from any DDS participant.
+    Only ROS packages are imported, since the name may come from a bag or any DDS participant.
 
-    Raises ImportError if there is no such package, AttributeError if that has no such type.
+    Raises ImportError if there is no such package, AttributeError if it has no such type.
     """
     match = _MESSAGE.fullmatch(type_name)
     if match is None or not (_share(match[1]) / 'package.xml').is_file():
@@ -41,7 +41,7 @@ def message_class(type_name: str) -> Any:
 
 
 def _share(package: str) -> Path:
-    """Folder of a package's data files, if there is one."""
+    """Return the folder of a package's data files, which need not exist."""
     try:
         return Path(get_package_share_directory(package))
     except (LookupError, OSError):  # a pip install sets no AMENT_PREFIX_PATH
@@ -77,7 +77,7 @@ def _nested(fields: Iterable[tuple[str, Any]]) -> Iterator[str]:
 
 
 def qos_profile(quality: Quality) -> QoSProfile:
-    """Quality of service as rclpy takes it."""
+    """Return a quality of service as an rclpy profile."""
     return QoSProfile(
         depth=quality.depth,
         reliability=ReliabilityPolicy[quality.reliability.upper()],
@@ -88,12 +88,12 @@ def qos_profile(quality: Quality) -> QoSProfile:
     )
 
 
-# Declares `qos_overrides.TOPIC.publisher.depth` and so on: history, depth, reliability.
+# Declares `qos_overrides.TOPIC.publisher.depth`, and likewise for history and reliability.
 _overridable = QoSOverridingOptions.with_default_policies
 
 
 def create_publisher(node: Node, topic: Topic) -> Publisher:
-    """Publisher of one of the node's own topics, for serialised messages."""
+    """Create a publisher of one of the node's own topics, for serialised messages."""
     return node.create_publisher(
         message_class(topic.type),
         topic.name,
@@ -103,7 +103,7 @@ def create_publisher(node: Node, topic: Topic) -> Publisher:
 
 
 def create_subscription(node: Node, topic: Topic, callback: Callable[[bytes], None]) -> None:
-    """Subscribe to a topic of another node; the callback gets serialised messages."""
+    """Subscribe to a topic of another node; the callback receives serialised messages."""
     node.create_subscription(
         message_class(topic.type),
         topic.relative,
@@ -115,5 +115,5 @@ def create_subscription(node: Node, topic: Topic, callback: Callable[[bytes], No
 
 
 def create_steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
-    """Timer [s] on the steady clock, which also runs while simulated time stands still."""
+    """Create a timer [s] on the steady clock, which also runs while simulated time is paused."""
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))

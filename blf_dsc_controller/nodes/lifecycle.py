@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Managed (lifecycle) nodes: any of them, and the two of the control loop."""
+"""Managed (lifecycle) nodes: a general base class, and that of the control loop's two nodes."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ _DIAGNOSTICS_PERIOD = 1.0  # s
 
 
 class ManagedNode(LifecycleNode, process.PlainNode):
-    """A lifecycle node that starts by itself, and that no request can bring down.
+    """A lifecycle node that can start by itself and survives invalid requests.
 
     Override `configure`, `activate`, `deactivate` and `release`. Topics, services and parameters
-    exist for the life of the node; what it computes with is made when it is configured and released
-    when it is cleaned up.
+    exist for the life of the node; everything it computes with is created when it is configured and
+    released when it is cleaned up.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
@@ -53,7 +53,7 @@ class ManagedNode(LifecycleNode, process.PlainNode):
         wrap_change_state(self, self._rejecting)
 
     def configure(self) -> None:
-        """Make what the node computes with."""
+        """Create everything the node computes with."""
 
     def activate(self) -> None:
         """Start working."""
@@ -62,7 +62,7 @@ class ManagedNode(LifecycleNode, process.PlainNode):
         """Stop working."""
 
     def release(self) -> None:
-        """Release what `configure` made; also called after an error, when nothing was made."""
+        """Release what `configure` created, if anything; also called after an error."""
 
     @property
     def state_label(self) -> str:
@@ -70,7 +70,7 @@ class ManagedNode(LifecycleNode, process.PlainNode):
         return lifecycle_state(self)
 
     def autostart(self) -> None:
-        """Configure and activate the node, as a manager would; BlfDscError if a step fails."""
+        """Configure and activate the node as a manager would; raise BlfDscError if a step fails."""
         for name in ('configure', 'activate'):
             if getattr(self, f'trigger_{name}')() != TransitionCallbackReturn.SUCCESS:
                 error = self._transition_error
@@ -133,14 +133,14 @@ class ManagedNode(LifecycleNode, process.PlainNode):
 
 
 class LoopNode(ManagedNode, Generic[Config]):
-    """One of the two nodes of the control loop: configuration, topics, diagnostics, `~/reset`.
+    """Base of the control loop's two nodes: configuration, topics, diagnostics, `~/reset`.
 
-    `steady` [ns] is the clock of timeouts and of real time, `wall` [ns] that of live stamps.
-    Raises ConfigurationError if a parameter is wrong.
+    `steady` [ns] is the clock for timeouts and real time, `wall` [ns] the one for live stamps.
+    Raises ConfigurationError if a parameter is invalid.
 
     Attributes:
-        config: in force.
-        rivals: other publishers of the output to the other node of the loop.
+        config: configuration in force.
+        rivals: number of other publishers of the output to the other node of the loop.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class LoopNode(ManagedNode, Generic[Config]):
         self.rivals = 0
 
     def start(self) -> None:
-        """Start timers and services, and the node itself if it is configured to."""
+        """Start timers and services, and the node itself if `autostart` is set."""
         self._poll_timer = create_steady_timer(self, POLL_PERIOD, self._on_poll)
         create_steady_timer(self, _DIAGNOSTICS_PERIOD, self._on_second)
         self.create_service(Trigger, '~/reset', self._on_reset)
@@ -170,7 +170,7 @@ class LoopNode(ManagedNode, Generic[Config]):
     def connect(
         self, outputs: Sequence[Topic], source: Topic, callback: Callable[[bytes], None]
     ) -> bool:
-        """Create the topics of the loop, `outputs[0]` to the other node, unless they exist."""
+        """Create the loop's topics, `outputs[0]` to the other node; return False if they exist."""
         if self._outputs:
             return False
         self._outputs = {topic: create_publisher(self, topic) for topic in outputs}
@@ -181,7 +181,7 @@ class LoopNode(ManagedNode, Generic[Config]):
 
     @abstractmethod
     def reset(self) -> str:
-        """Start again, while active; return the message of the response."""
+        """Restart the active node; return the message of the response."""
 
     @abstractmethod
     def _on_poll(self) -> None: ...
@@ -195,15 +195,15 @@ class LoopNode(ManagedNode, Generic[Config]):
         self._report()
 
     def _look_for_rivals(self) -> None:
-        """Warn of others that publish what only this node should publish for the other one."""
+        """Warn of other publishers of the output that only this node should publish."""
         if not self._outputs:
             return
         publisher = next(iter(self._outputs.values()))
         before, self.rivals = self.rivals, self.count_publishers(publisher.topic_name) - 1
         if self.rivals > before:
             self.get_logger().warning(
-                f'another node publishes on {publisher.topic_name}, too: end one of the two '
-                '(one that was killed is seen for 20 s)'
+                f'another node publishes on {publisher.topic_name}, too: stop one of the two '
+                '(a killed node stays visible for 20 s)'
             )
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -217,7 +217,7 @@ class LoopNode(ManagedNode, Generic[Config]):
         self._senders[topic](raw)
 
     def _is_observed(self) -> bool:
-        """Whether each output has its subscribers, the first the other node's beside them."""
+        """Whether each output has its subscribers, and the first one also the other node."""
         observers = self.config.wait_for_subscribers
         return all(
             publisher.get_subscription_count() >= observers + (number == 0)

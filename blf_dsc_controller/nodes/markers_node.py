@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `arm_markers`: the reference as a ghost, the bound at its tip, torques as arrows.
 
-It takes the newest messages a few times a second instead of a callback for each of them.
+It polls for the newest messages a few times a second instead of handling each in a callback.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from blf_dsc_controller.nodes.parameters import declare
 from blf_dsc_controller.nodes.process import PlainNode, run
 from blf_dsc_controller.nodes.raw_subscriptions import RawSubscriptions
 
-_DEPTH = 1  # only the newest counts
+_DEPTH = 1  # only the newest message matters
 _GHOST = ColorRGBA(r=0.2, g=0.8, b=0.3, a=0.5)
 _BOUND = ColorRGBA(r=0.9, g=0.7, b=0.1, a=0.5)
 _TORQUE = ColorRGBA(r=0.9, g=0.2, b=0.2, a=0.9)
@@ -33,7 +33,7 @@ _WIDTH = 0.01  # m
 
 
 class MarkersNode(PlainNode):
-    """Publishes `~/markers`; ConfigurationError if a parameter is wrong."""
+    """Publishes `~/markers`; raises ConfigurationError if a parameter is invalid."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(topics.MARKERS_NODE, **options)
@@ -69,7 +69,7 @@ class MarkersNode(PlainNode):
             self._markers.publish(MarkerArray(markers=markers))
 
     def _torques(self, q: np.ndarray, torque: np.ndarray) -> list[Marker]:
-        """Arrows along the axes."""
+        """Return the torques as arrows along the joint axes."""
         if not (np.isfinite(q).all() and np.isfinite(torque).all()):
             return []
         arrows = []
@@ -83,7 +83,7 @@ class MarkersNode(PlainNode):
         return arrows
 
     def _ghost(self, q: np.ndarray, bound: np.ndarray) -> list[Marker]:
-        """The arm where it should be, and a ball that its tip stays in."""
+        """Return the arm at its reference, and the ball that its tip must stay in."""
         if not np.isfinite(q).all():
             return []
         corners = skeleton(self._chain, q)[0]

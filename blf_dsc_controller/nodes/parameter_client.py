@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads the parameters of other nodes: the configuration that is really in force.
+"""Client that reads the parameters of other nodes: the configuration actually in force.
 
-The clients belong to a node that no executor spins, and the owner polls for the responses: the
-EventsExecutor of these releases crashes when clients come and go.
+The service clients belong to a node that no executor spins, and the owner polls for responses: the
+EventsExecutor of these releases crashes when clients are created and destroyed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _WITHOUT_YAML = (ParameterType.PARAMETER_NOT_SET, ParameterType.PARAMETER_BYTE_A
 
 
 class ParameterClient:
-    """Reads the parameters of each requested node once, when its services are there.
+    """Reads the parameters of each requested node once, as soon as its services are available.
 
     `callback` is called with the full name of the node and the values of its parameters.
     """
@@ -40,13 +40,13 @@ class ParameterClient:
         return tuple(self._requests)
 
     def request(self, node: Node, name: str) -> None:
-        """Read the parameters of the node of this full name by `node`, which must not be spun."""
+        """Request the parameters of node `name` (full name) via `node`, which must not be spun."""
         if name not in self._known:
             self._known.add(name)
             self._requests[name] = _values_of(node, name)
 
     def poll(self) -> None:
-        """Send the requests that are possible now, and call back for complete responses."""
+        """Send the requests that are possible now, and call `callback` for complete responses."""
         for name in self.pending:
             values = next(self._requests[name])
             if values is not None:
@@ -55,10 +55,10 @@ class ParameterClient:
 
 
 def _values_of(node: Node, name: str) -> Iterator[Values | None]:
-    """Yield None until the values have come: first the names are listed, then their values.
+    """List the names, then get their values; yield None until the values have arrived.
 
-    Where one of them is declared but not set, rclpy's response is empty: the names are then
-    requested in halves, down to the one that is not set.
+    If a parameter is declared but not set, rclpy's response is empty: the names are then requested
+    in halves, down to the unset one.
     """
     listing = node.create_client(ListParameters, f'{name}/list_parameters')
     getting = node.create_client(GetParameters, f'{name}/get_parameters')
@@ -88,6 +88,6 @@ def _call(client: Client, request: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Value as the configurations hold it: sequences as tuples."""
+    """Return the value as configurations hold it, with sequences as tuples."""
     content = parameter_value_to_python(value)
     return content if isinstance(content, (bool, int, float, str)) else tuple(content)

@@ -40,10 +40,10 @@ _RANGES: dict[Kind, tuple[str, type[Any], type[Any], Any]] = {
 
 
 def declare(node: Node, cls: type[Config]) -> Config:
-    """Declare every parameter of a configuration, and return the one the node was started with.
+    """Declare all parameters of a configuration, and return the one the node was started with.
 
-    A URDF on a topic is waited for. Raises ConfigurationError with all problems of the files and
-    arguments the node was started with; then no parameter is declared.
+    Waits for a URDF that comes from a topic. Raises ConfigurationError with all problems of the
+    files and arguments the node was started with; no parameter is declared in that case.
     """
     given = _overrides(node, cls)
     if str(given.get('robot.urdf', '')).startswith(TOPIC):
@@ -61,9 +61,9 @@ def declare(node: Node, cls: type[Config]) -> Config:
 
 
 def _declare_empty(node: Node, one: Parameter) -> None:
-    """Declare an empty list, which rclpy would take for one of bytes, by its type.
+    """Declare an empty list by its type, since rclpy would infer a list of bytes.
 
-    Declared by the type alone it is unset, and then no request for several parameters is answered.
+    It is set as well: if any of several requested parameters is unset, rclpy's response is empty.
     """
     kind, described = RosParameter.Type[one.kind.name], descriptor(one)
     node.declare_parameter(one.name, kind, ignore_override=True)
@@ -84,11 +84,11 @@ def on_change(
     apply: Callable[[Config], None],
     problems: Callable[[Config], list[str]] | None = None,
 ) -> None:
-    """Accept parameter changes while the node runs: all of a request, or none.
+    """Accept parameter changes while the node runs: all changes of a request or none.
 
-    Call it after `declare`. A request is validated as the whole configuration it leads to, and
-    rejected with the reasons if that is invalid, or if `problems` finds that the node cannot accept
-    it now. `apply` receives the new configuration once it is in effect, and must not fail.
+    Call it after `declare`. A request is validated as the complete resulting configuration,
+    and rejected with the reasons if that is invalid, or if `problems` finds that the node cannot
+    accept it now. `apply` receives the new configuration once it is in effect, and must not fail.
     """
     names = {one.name for one in parameters(cls)}
 
@@ -112,9 +112,9 @@ def on_change(
 
 
 def descriptor(one: Parameter) -> ParameterDescriptor:
-    """Return what `ros2 param describe` shows of a parameter.
+    """Return what `ros2 param describe` shows for a parameter.
 
-    ROS has inclusive ranges only, so `build` alone rejects an excluded limit.
+    ROS only has inclusive ranges, so an excluded limit is rejected by `build` alone.
     """
     symbol = f'{one.symbol}: ' if one.symbol else ''
     unit = f' [{one.unit}]' if one.unit else ''
@@ -139,10 +139,10 @@ def descriptor(one: Parameter) -> ParameterDescriptor:
 
 
 def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
-    """Return what the node was started with, without parameters of other nodes.
+    """Return the values the node was started with, without parameters of other nodes.
 
-    rclpy does not show which section they come from, so a name that any node of the package has is
-    accepted, as in a section for several nodes.
+    rclpy does not show which section a value comes from, so parameters of any node of the package
+    are accepted, as in a section for several nodes.
     """
     own = {one.name: one.kind for one in parameters(cls)}
     others = known_names() - own.keys()

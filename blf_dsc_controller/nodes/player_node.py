@@ -30,15 +30,15 @@ _CLOCK_PERIOD = 10_000_000  # ns
 
 
 class PlayerNode(Node):
-    """Publishes the messages of a bag in its time, and that time on /clock if `clock` is set.
+    """Publishes the messages of a bag in bag time, and that time on /clock if `clock` is set.
 
-    Messages are read as they are played, so that a bag may be larger than memory. A publisher has
-    the recorded quality of service of its topic. `rate` is bag time per time, 0 as fast as
-    possible; a `loop` begins again at the end. `topics` are all, if there are none; played is from
-    `offset` [s] on, for `duration` [s]. It waits for `resume`.
+    Messages are read as they are played, so a bag may be larger than memory. Publishers use the
+    recorded quality of service of their topics. `rate` is bag time per real time, or 0 to play as
+    fast as possible; with `loop`, playback restarts at the end. Empty `topics` selects all topics;
+    `offset` [s] and `duration` [s] select the time range. The player is paused until `resume`.
 
     Raises:
-        BagError: there is no bag, it is damaged, or it holds nothing of these topics and times.
+        BagError: the bag is missing or damaged, or has no messages for these topics and times.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class PlayerNode(Node):
         self._messages = self._read()
         self._next = next(self._messages, None)
         if self._next is None:
-            raise BagError(f'{path} holds no message of these topics and times that can be played')
+            raise BagError(f'{path} holds no playable message for these topics and times')
         self._clock_output = (
             self.create_publisher(message_class(CLOCK.type), CLOCK.name, 10) if clock else None
         )
@@ -107,12 +107,12 @@ class PlayerNode(Node):
 
     @property
     def elapsed(self) -> float:
-        """Time in the bag [s] since where it begins to play."""
+        """Bag time [s] since the beginning of the selected range."""
         at = min(self.timeline.position(time.monotonic_ns()), self.end)
         return (at - self.begin) * 1e-9
 
     def play(self) -> float:
-        """Publish what is due; return the time until the next message is [s]."""
+        """Publish the messages that are due; return the time [s] until the next one."""
         now = time.monotonic_ns()
         for _ in range(_MOST_AT_ONCE):
             if self._next is None or self.timeline.wait(self._next[1], now) > 0.0:
@@ -133,7 +133,7 @@ class PlayerNode(Node):
             self.get_logger().warning(f'{name} is not played: it is not the name of a topic')
 
     def _read(self) -> Iterator[tuple[str, int, bytes]]:
-        """Messages to play; first the last one of each latched topic from before."""
+        """Yield the messages to play, after each latched topic's last one before the range."""
         with open_bag(self._path) as bag:
             if self.begin > bag.times[0]:
                 latched = self._latched & {*self._outputs}
@@ -158,13 +158,13 @@ class PlayerNode(Node):
         return True, 'paused'
 
     def resume(self) -> tuple[bool, str]:
-        """Begin, or continue after a pause."""
+        """Start, or continue after a pause."""
         self.timeline.resume(time.monotonic_ns())
         return True, 'playing'
 
     def _play_next(self) -> tuple[bool, str]:
         if not self.timeline.paused or self._next is None:
-            return False, 'this is the end' if self._next is None else 'pause first'
+            return False, 'end of the bag' if self._next is None else 'pause first'
         self._publish(self._next, time.monotonic_ns())
         return True, f'at {self.elapsed:.3f} s'
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Running one node as a process: scheduling, spinning, and an end with the right exit code."""
+"""Running one node as a process: scheduling, spinning, and shutdown with the right exit code."""
 
 from __future__ import annotations
 
@@ -35,36 +35,36 @@ _MCL_CURRENT = 1
 _MCL_FUTURE = 2
 
 
-_signals: list[int] = []  # received; a flag, so that no callback is cut off in the middle
+_signals: list[int] = []  # received; only recorded, so that no callback is interrupted
 
 
 def interrupted() -> bool:
-    """Whether SIGINT or SIGTERM has come to the process of `run`."""
+    """Whether the process of `run` has received SIGINT or SIGTERM."""
     return bool(_signals)
 
 
 class PlainNode(Node):
     """A node for `run`.
 
-    It sets `finished` once it has nothing more to do, with `failure` if it cannot go on.
+    It sets `finished` once it has nothing more to do, with `failure` if it cannot continue.
     """
 
     finished = False
     failure: BlfDscError | None = None
 
     def close(self) -> None:
-        """Save and release what must not be lost, while ROS is still up."""
+        """Save data and release resources while ROS is still up."""
 
     def survive(self, error: Exception) -> bool:  # noqa: ARG002
-        """Whether the node goes on after an error that has escaped from one of its callbacks."""
+        """Return whether the node continues after an error that escaped from a callback."""
         return False
 
 
 def run(make_node: Callable[[], PlainNode]) -> int:
-    """Run a node until it has finished, a signal comes, or it fails.
+    """Run a node until it finishes, receives a signal, or fails.
 
-    Returns the exit code: 0 at the end or on SIGINT and SIGTERM, 1 after an error, printed on
-    stderr.
+    Returns the exit code: 0 at the end or on SIGINT and SIGTERM, 1 after an error, which is printed
+    to stderr.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: _signals.append(number))
@@ -76,7 +76,7 @@ def run(make_node: Callable[[], PlainNode]) -> int:
         executor = EventsExecutor()
         node = make_node()
         executor.add_node(node)
-        # What is loaded now stays: looking through it again would hold up the loop for 0.1 s.
+        # What is loaded by now stays: scanning it again would stall the loop for 0.1 s.
         gc.collect()
         gc.freeze()
         while not (interrupted() or node.finished):
@@ -94,17 +94,17 @@ def run(make_node: Callable[[], PlainNode]) -> int:
                 _close(node)
         finally:
             rclpy.try_shutdown()
-            # A launch passes on the signal that the terminal has sent: the second one comes now.
+            # ros2 launch forwards the terminal's signal: the second copy arrives now.
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, signal.SIG_IGN)
-    if problem:  # last, so that it stands at the end of the output
+    if problem:  # last, so that it ends the output
         print(problem, file=sys.stderr)  # noqa: T201
         return 1
     return 0
 
 
 def spin_once(executor: Any, node: PlainNode) -> None:
-    """Wait for work and do it; an error that escapes is raised unless the node survives it."""
+    """Wait for work and execute it; an error is raised unless the node survives it."""
     try:
         executor.spin_once(timeout_sec=_POLL)
     except RCLError:
@@ -159,10 +159,10 @@ def request_realtime(realtime: Realtime, logger: RcutilsLogger) -> None:
 
 
 def _schedule(priority: int) -> None:
-    """Schedule all threads alike: states and torques pass through the middleware's threads, too.
+    """Schedule all threads alike: states and torques also pass through the middleware's threads.
 
-    One left behind, even at the next lower priority, makes the others wait for it [measured].
+    A single thread left behind, even at the next lower priority, delays the others [measured].
     """
     for thread in _THREADS.iterdir():
-        with suppress(ProcessLookupError):  # it has ended meanwhile
+        with suppress(ProcessLookupError):  # it has ended in the meantime
             os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Subscriptions whose messages are taken many at a time, serialised.
+"""Subscriptions whose messages are taken in batches, serialised.
 
-An executor would call back once for each message. Here the messages of all topics are taken from
-the middleware's queues at the owner's pace, which costs a third less, and each comes with what the
-middleware knows of it: when it was sent, when it arrived, and its number, which reveals losses.
-The subscriptions therefore belong to a node of their own that no executor spins.
+An executor would run a callback for each message. Here the messages of all topics are taken from
+the middleware's queues at the owner's pace, which costs a third less, and each carries the
+middleware's metadata: when it was sent and received, and its sequence number, which reveals losses.
+The subscriptions therefore belong to a separate node that no executor spins.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from blf_dsc_controller.messages.topics import Quality
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.nodes.rclpy_internals import take_messages
 
-_BATCH = 1000  # messages taken of one topic before the next has its turn
+_BATCH = 1000  # messages taken from one topic before the next one's turn
 
 
 class RawMessage(NamedTuple):
-    """A serialised message with what the middleware knows of it."""
+    """A serialised message with the middleware's metadata."""
 
     handle: int
     raw: bytes
     received: int  # ns, system time
     published: int  # ns, system time of the publisher
-    sequence: int  # number given by the publisher, 0 if not known
+    sequence: int  # assigned by the publisher, 0 if unknown
 
 
 class RawSubscriptions:
     """Subscriptions to any number of topics, each with a queue of `depth`.
 
-    They are those of a hidden `node` beside their owner.
+    They belong to `node`, a hidden node separate from their owner.
     """
 
     def __init__(self, owner: Node, depth: int) -> None:
@@ -55,11 +55,11 @@ class RawSubscriptions:
     def subscribe(
         self, topic: str, type_name: str, offered: Sequence[Quality], handle: int
     ) -> None:
-        """Subscribe to a topic; its messages carry `handle`. Raises as `message_class`."""
+        """Subscribe to a topic; its messages carry `handle`. Raises what `message_class` raises."""
         subscription = self.node.create_subscription(
             message_class(type_name),
             topic,
-            lambda _: None,  # rclpy wants a callback; the messages are taken, not delivered
+            lambda _: None,  # rclpy requires a callback; the messages are taken, not delivered
             compatible_profile(offered, self._depth),
             raw=True,
         )
@@ -84,7 +84,7 @@ class RawSubscriptions:
 
 
 def compatible_profile(offered: Sequence[Quality], depth: int) -> QoSProfile:
-    """Strictest quality of service that is compatible with every one of the publishers."""
+    """Return the strictest quality of service that is compatible with all publishers."""
     reliable = all(quality.reliability == 'reliable' for quality in offered)
     latched = all(quality.durability == 'transient_local' for quality in offered)
     reliability = 'reliable' if reliable else 'best_effort'
@@ -93,7 +93,7 @@ def compatible_profile(offered: Sequence[Quality], depth: int) -> QoSProfile:
 
 
 def quality_of(profile: QoSProfile) -> Quality:
-    """Quality of a publisher as plain data; the ROS graph leaves out history and depth."""
+    """Return a publisher's quality of service; the ROS graph omits history and depth."""
     return Quality(
         depth=profile.depth,
         reliability=profile.reliability.name.lower(),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Everything that the nodes use of rclpy 7 that is private or undocumented."""
+"""All private and undocumented parts of rclpy 7 that the nodes use."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
-__all__ = ['RCLError', 'UnknownROSArgsError']  # exported again
+__all__ = ['RCLError', 'UnknownROSArgsError']  # re-exported
 
 
 def parameter_overrides(node: Node) -> Mapping[str, Parameter]:
-    """Parameters from the files and arguments a node was started with, declared or not."""
+    """Return the parameters in a node's start files and arguments, declared or not."""
     return node._parameter_overrides  # noqa: SLF001
 
 
 def raw_publish(publisher: Publisher) -> Callable[[bytes], None]:
-    """Function that publishes serialised messages in half the time, until the node is destroyed."""
+    """Return a function that publishes raw messages in half the time while the node exists."""
     publish: Callable[[bytes], None] = publisher.handle.publish_raw
     return publish
 
 
 def subscription_count(publisher: Publisher) -> Callable[[], int]:
-    """Function that counts subscribers in a fifth of the time, until the node is destroyed."""
+    """Return a function that counts subscribers in a fifth of the time while the node exists."""
     count: Callable[[], int] = publisher.handle.get_subscription_count
     return count
 
@@ -37,10 +37,10 @@ def subscription_count(publisher: Publisher) -> Callable[[], int]:
 def take_messages(
     subscription: Subscription, limit: int
 ) -> Iterator[tuple[bytes, Mapping[str, int | None]]]:
-    """Take up to `limit` waiting messages of a subscription that no executor spins.
+    """Take up to `limit` waiting messages from a subscription that no executor spins.
 
-    Each comes serialised, with `source_timestamp` [ns], `received_timestamp` [ns] and
-    `publication_sequence_number`, each None where the middleware does not know it.
+    Each is serialised and comes with `source_timestamp` [ns], `received_timestamp` [ns] and
+    `publication_sequence_number`, which are None where the middleware does not know them.
     """
     take, type_ = subscription.handle.take_message, subscription.msg_type
     for _ in range(limit):
@@ -51,20 +51,20 @@ def take_messages(
 
 
 def take_response(client: Client) -> Any:
-    """Take a response from a client that no executor spins; None if none has come."""
+    """Take a response from a client that no executor spins; None if there is none yet."""
     type_: Any = client.srv_type
     _, response = client.handle.take_response(type_.Response)
     return response
 
 
 def lifecycle_state(node: LifecycleNode) -> str:
-    """State of a lifecycle node: unconfigured, inactive, active or finalized."""
+    """Return the state of a lifecycle node: unconfigured, inactive, active or finalized."""
     return str(node._state_machine.current_state[1])  # noqa: SLF001
 
 
 def wrap_change_state(
     node: LifecycleNode, wrap: Callable[[Callable[[Any, Any], Any]], Callable[[Any, Any], Any]]
 ) -> None:
-    """Replace the callback of the service `~/change_state` by `wrap(callback)`."""
+    """Replace the callback of the service `~/change_state` with `wrap(callback)`."""
     service = node._service_change_state  # noqa: SLF001
     service.callback = wrap(service.callback)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `bag_recorder`: every message of the chosen topics into a bag, without decoding."""
+"""The node `bag_recorder`: records every message of the chosen topics without decoding it."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ from blf_dsc_controller.nodes.raw_subscriptions import RawSubscriptions, quality
 
 _DISCOVERY_PERIOD = 0.1  # s
 _TAKE_PERIOD = 0.01  # s
-_FLUSH_INTERVAL = 0.05  # s; with that of taking less than 0.1 s, unless the computer is overloaded
-_REPEAT = 60.0  # s between the same warning
+_FLUSH_INTERVAL = 0.05  # s; below 0.1 s including _TAKE_PERIOD, unless overloaded
+_REPEAT = 60.0  # s between repeats of a warning
 _MEGABYTE = 1_000_000
 _UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'  # of rmw
 _OF_EVERY_NODE = ('/parameter_events', '/rosout')
 
 
 class BagRecorderNode(PlainNode):
-    """Subscribes to topics as they appear and records their messages, or keeps the last seconds.
+    """Subscribes to topics as they appear and records their messages, or buffers the last seconds.
 
-    Raises ConfigurationError if a parameter is wrong, BagError if the bag's folder exists already.
+    Raises ConfigurationError if a parameter is invalid, BagError if the bag's folder exists.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -61,7 +61,7 @@ class BagRecorderNode(PlainNode):
         self.parameters_of: dict[str, Values] = {}
         create_steady_timer(self, _DISCOVERY_PERIOD, self._discover)
         create_steady_timer(self, _TAKE_PERIOD, self._record)
-        # The folder comes last: whatever ends the node from here on also completes the bag.
+        # The folder is created last: from here on, any end of the node also completes the bag.
         self._sink = self._open_sink()
 
     def _open_sink(self) -> BagWriter | Ring:
@@ -100,7 +100,7 @@ class BagRecorderNode(PlainNode):
         return response
 
     def close(self) -> None:
-        """Write what still waits, complete the bag and log a summary."""
+        """Write the waiting messages, complete the bag and log a summary."""
         if self.failure is None:
             self._record()
         self._raw_subscriptions.close()
@@ -113,7 +113,7 @@ class BagRecorderNode(PlainNode):
     def _discover(self) -> None:
         try:
             found = self.get_topic_names_and_types()
-        except UnicodeDecodeError:  # of one participant, but rclpy then tells of none
+        except UnicodeDecodeError:  # caused by one participant, but rclpy then returns no topics
             self.get_logger().warning(
                 'new topics cannot be found: the name of a topic or type is not UTF-8',
                 throttle_duration_sec=_REPEAT,
@@ -128,7 +128,7 @@ class BagRecorderNode(PlainNode):
                 self._consider(topic, types)
 
     def _request_parameters(self, topic: str) -> bool:
-        """Request those of the publishers; return whether all of them have been read.
+        """Request the parameters of a topic's publishers; return whether all have been read.
 
         A node's name may be discovered after its publishers.
         """
@@ -144,7 +144,7 @@ class BagRecorderNode(PlainNode):
         return known == names and not {*known}.intersection(self._parameter_client.pending)
 
     def _waits(self, topic: str) -> bool:
-        """Whether it is recorded later, as a short run may end before its parameters are read."""
+        """Whether to record a topic later: a short run may end before its parameters are read."""
         limit = self._config.wait_for_parameters
         if not limit or topic in _OF_EVERY_NODE:
             return False
@@ -168,7 +168,7 @@ class BagRecorderNode(PlainNode):
         if len(types) > 1:
             self._skip(topic, f'it has several types, {" and ".join(types)}')
             return
-        self._record(flush=True)  # importing a type, and its first subscription, may take 0.1 s
+        self._record(flush=True)  # importing a type and first subscribing to it may take 0.1 s
         try:
             message_class(types[0])
             register_definition(types[0])
@@ -194,7 +194,7 @@ class BagRecorderNode(PlainNode):
         self.get_logger().warning(f'{topic} is not recorded: {reason}')
 
     def _record(self, *, flush: bool = False) -> None:
-        """Write the waiting messages; `flush` all of them to the disk, or what is due."""
+        """Write the waiting messages, and flush them to disk: all with `flush`, else those due."""
         if self.failure is not None:
             return
         try:
@@ -208,8 +208,8 @@ class BagRecorderNode(PlainNode):
         except OSError as error:
             self.finished = True
             self.failure = BagError(
-                f'the bag cannot be written any further: {error}; what was written before is '
-                'saved by bag_recover'
+                f'the bag cannot be written any further: {error}; bag_recover saves what '
+                'was written before'
             )
 
     def _summary(self) -> Iterator[str]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`~/joint_trajectory`: another reference while the controller runs, or the reason why not."""
+"""`~/joint_trajectory`: new references while the controller runs, with reasons for rejections."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from blf_dsc_controller.reference.trajectory import (
 from blf_dsc_controller.supervision.guard import Guard, LatePlanError, Plan
 
 _NANO = 1e-9
-_POINT_SIZE = 32  # bytes per joint of a point with all its fields, which begin with 8 bytes each
-_LEAD = 0.02  # s from now on in which a trajectory is planned, at first
+_POINT_SIZE = 32  # bytes per joint of a point with all its fields, each with a header of 8 bytes
+_LEAD = 0.02  # s from now to the time for which a trajectory is planned, at first
 _LONGEST_LEAD = 2.0
-_SWITCH_INTERVAL = 1e-4  # s after which the thread that plans makes way for the loop
+_SWITCH_INTERVAL = 1e-4  # s after which the planning thread yields to the loop
 
 
 class _Job(NamedTuple):
@@ -38,19 +38,19 @@ class _Job(NamedTuple):
 
 
 class TrajectoryInput:
-    """Hands trajectories to the guard, between two samples.
+    """Passes trajectories to the guard, between two samples.
 
-    In lock-step the plant waits while one is planned.  Otherwise it is planned in a thread, for a
-    moment that is a little ahead, and further ahead if planning takes longer.
+    In lock-step the plant waits while a trajectory is planned. Otherwise it is planned in a thread,
+    for a time slightly ahead, and further ahead if planning takes longer.
 
     Attributes:
         accepted: number of trajectories that are or were followed.
-        rejected: number of those that are not.
-        reason: of the last rejection.
+        rejected: number of trajectories that are not.
+        reason: why the last one was rejected.
     """
 
     def __init__(self, node: Node, joints: int, guard: Callable[[], Guard | None]) -> None:
-        """Subscribe for so many joints; `guard` returns None while the node is not configured."""
+        """Subscribe for `joints` joints; `guard` returns None while the node is not configured."""
         self.accepted = 0
         self.rejected = 0
         self.reason = ''
@@ -85,13 +85,13 @@ class TrajectoryInput:
                 self._reject(error)
             else:
                 self._submit(guard, job.raw, 2.0 * job.lead)
-        except Exception as error:  # noqa: BLE001 - the present reference goes on
+        except Exception as error:  # noqa: BLE001 - the current reference continues
             self._reject(error)
 
     def _on_trajectory(self, raw: bytes) -> None:
         try:
             self._take(raw)
-        except Exception as error:  # noqa: BLE001 - the present reference goes on
+        except Exception as error:  # noqa: BLE001 - the current reference continues
             self._reject(error)
 
     def _take(self, raw: bytes) -> None:
@@ -130,7 +130,7 @@ class TrajectoryInput:
 
 
 def _trajectory(raw: bytes, start_stamp: int) -> Trajectory:
-    """Trajectory of a message, in times since the controller's start; stamp 0 begins at once."""
+    """Return a message's trajectory in times since the controller's start; stamp 0 means now."""
     stamp, names, points = joint_trajectory(raw)
     begin = (stamp - start_stamp) * _NANO if stamp else None
     own = (TrajectoryPoint(time * _NANO, *arrays) for time, arrays in points)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Section IV of the paper: every law side by side, and its claims evaluated."""
+"""Section IV of the paper: comparison of all laws, and evaluation of its claims."""

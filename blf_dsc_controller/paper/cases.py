@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cases: laws side by side, variations for single claims, and sweeps of one condition each."""
+"""Cases: laws side by side, variations for single claims, and sweeps of one condition each."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Case:
     keep_run: bool = True
 
     def loop(self) -> LoopConfig:
-        """Configuration of the case."""
+        """Return the configuration of the case."""
         loop = load_loop(self.preset, {PLANT: {'duration': self.duration}, CONTROLLER: {}})
         return loop._replace(
             controller=change(loop.controller, self.law), plant=change(loop.plant, self.plant)
@@ -99,7 +99,7 @@ Changes = tuple[Mapping[str, object], Mapping[str, object]]
 
 @dataclass(frozen=True)
 class Sweep:
-    """A condition, the values it takes, and what each changes of law and plant."""
+    """A condition, its values, and the changes of law and plant for each value."""
 
     name: str
     label: str
@@ -109,7 +109,7 @@ class Sweep:
     laws: tuple[str, ...] = tuple(LAWS)
 
     def cases(self) -> Iterator[Case]:
-        """A case for every law and value, named by both."""
+        """Yield a case for every law and value, named after both."""
         for law in self.laws:
             for value in self.values:
                 name = case_name(self.name, law, value)
@@ -117,7 +117,7 @@ class Sweep:
 
 
 def case_name(sweep: str, law: str, value: float) -> str:
-    """Name of one run of a sweep."""
+    """Return the name of one run of a sweep."""
     return f'{sweep} {law} {value:g}'
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The claims of the paper: what is said, what was measured, and the verdict.
+"""The claims of the paper: what it says, what was measured, and the verdict.
 
-Every verdict is computed from the runs. `holds only if` is given where a claim holds in some of the
-runs that it speaks of and fails in others; `condition` then says where.
+Every verdict is computed from the runs. It is `holds only if` for a claim that holds in some of
+the runs that it is about and fails in others; `condition` then says when it holds.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ ONLY_IF = 'holds only if'
 FAILS = 'does not hold'
 
 _CASES = {case.name: case for case in CASES}
-_FITTED = 0.95  # of the variance of log |P~| that an exponential must explain
+_FITTED = 0.95  # share of the variance of log |P~| that an exponential must explain
 
 
 class Claim(NamedTuple):
-    """A row of the table; `condition` continues the verdict `holds only if`."""
+    """A row of the table; `condition` completes the verdict `holds only if`."""
 
     where: str
     says: str
@@ -46,12 +46,12 @@ class Claim(NamedTuple):
 
 
 def verdict(*runs: bool | None) -> str:
-    """`holds` where all of the runs agree, `does not hold` where none does."""
+    """Return `holds` if all of the runs agree, `does not hold` if none does."""
     return HOLDS if all(runs) else ONLY_IF if any(runs) else FAILS
 
 
 def claims(results: Results) -> list[Claim]:
-    """Every claim of abstract, sections and conclusion that a run can be held against."""
+    """Return every claim of abstract, sections and conclusion that runs can check."""
     return [
         *_of_abstract(results),
         *_of_section_3(results),
@@ -67,9 +67,9 @@ def _of_abstract(results: Results) -> Iterator[Claim]:
         'Abstract',
         'The scheme guarantees a small bounded tracking error.',
         f"largest |xi1| / k_c {paper.max_error_ratio:.2f} with the paper's choices; with the tuned "
-        f'gains kept for a delay up to {max(held["delay"], default=0):g} samples, a sample time '
-        f'up to {max(held["sample time"], default=0):g} ms and torque limits from '
-        f'{min(held["torque limit"], default=np.nan):g} N m on',
+        f'gains the bound is kept up to a delay of {max(held["delay"], default=0):g} samples, up '
+        f'to a sample time of {max(held["sample time"], default=0):g} ms and down to a torque '
+        f'limit of {min(held["torque limit"], default=np.nan):g} N m',
         verdict(paper.held, all(len(held[sweep.name]) == len(sweep.values) for sweep in SWEEPS)),
         'torque, sample time, delay and sensors allow it',
     )
@@ -86,7 +86,7 @@ def _of_abstract(results: Results) -> Iterator[Claim]:
     lag = _lag(results) / BOUND
     yield Claim(
         'Abstract, I',
-        'Dynamic surface control spares the derivatives of the virtual control.',
+        'Dynamic surface control avoids the derivatives of the virtual control.',
         f'(28) takes qr and its first derivative, (35) takes the second too; with all else known '
         f'the lag of the filter costs {_percent(lag)} of the bound',
         verdict(lag < 0.01),
@@ -100,7 +100,7 @@ def _final_errors(results: Results, *names: str) -> list[float]:
 
 
 def _lag(results: Results) -> float:
-    """Largest error [rad] of the law that knows everything, once it has settled."""
+    """Return the largest error [rad] of the law that knows everything, once settled."""
     run = results.runs['model_based']
     return float(np.abs(_error(run)[run.time >= 1.0]).max())
 
@@ -115,8 +115,8 @@ def _superiority(results: Results, where: str, says: str) -> Claim:
     return Claim(
         where,
         says,
-        f'rms |xi1| {1e6 * proposed:.0f} µrad, against {1e6 * tuned:.0f} of a comparison tuned as '
-        f'well and {1e6 * detuned:.0f} of one with low gains; parameter error at 60 s '
+        f'rms |xi1| {1e6 * proposed:.0f} µrad, against {1e6 * tuned:.0f} for an equally tuned '
+        f'comparison and {1e6 * detuned:.0f} for one with low gains; parameter error at 60 s '
         f'{_percent(learned)} against {_percent(learned_tuned)} and {_percent(learned_detuned)}'
         + (only_detuned if proposed >= tuned else ''),
         verdict(
@@ -221,7 +221,7 @@ def _of_section_4(results: Results) -> Iterator[Claim]:
 
 
 def _swift_torque(results: Results) -> Claim:
-    """The barrier's part of the torque when the error is largest, and when the arm is pushed."""
+    """Evaluate the barrier's torque at the largest error, and the error of a pushed arm."""
     run, barrier = results.runs['paper'], _CASES['paper'].loop().controller.barrier
     error = np.abs(_error(run))
     ratio = error / np.array(barrier.bound)
@@ -248,7 +248,7 @@ def _of_conclusion(results: Results) -> Iterator[Claim]:
     )
     yield Claim(
         'V',
-        'Tracking and parameter errors converge like an exponential.',
+        'Tracking and parameter errors converge exponentially.',
         f'an exponential explains {_percent(explained[0])} of log |P~| from the latch to twice its '
         f'residue without the disturbance (residue {_percent(residue[0])}), '
         f'{_percent(explained[1])} with it (residue {_percent(residue[1])})',
@@ -259,7 +259,7 @@ def _of_conclusion(results: Results) -> Iterator[Claim]:
 
 
 def _exponential_fit(run: Run) -> float:
-    """Fraction of the variance of log |P~| that a straight line explains."""
+    """Return the fraction of the variance of log |P~| that a straight line explains."""
     estimates = estimates_of(run)
     error = None if estimates is None else estimates.relative_error
     assert error is not None  # noqa: S101
@@ -284,7 +284,7 @@ def _learned(run: Run, name: str) -> Floats:
 
 
 def _energy(run: Run) -> Floats:
-    """V of (29), (N,) [J]."""
+    """Return V of (29), (N,) [J]."""
     assert run.monitor is not None  # noqa: S101
     return np.asarray(run.monitor.select(LYAPUNOV_TERMS).sum(axis=1))
 

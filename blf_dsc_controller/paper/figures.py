@@ -39,8 +39,8 @@ _TRACKING = (6.4, 2.5)  # inches
 _ESTIMATES = (8.6, 2.4)
 _PANEL = (4.6, 2.9)
 _COLUMNS = 3
-_UNTIL = 10.0  # s, of Fig. 2
-_BROKEN = 10.0  # of the bound: larger ratios are drawn there
+_UNTIL = 10.0  # s, end of Fig. 2
+_BROKEN = 10.0  # multiple of the bound at which all larger ratios are drawn
 _MARKS = 'os^D'
 
 
@@ -68,7 +68,7 @@ def draw_pairs(results: Results, folder: Path) -> Iterator[tuple[Path, str]]:
 def draw_robustness(results: Results, folder: Path) -> list[Path]:
     """Draw the largest error and the parameter error of every sweep; return both paths."""
     tracking, learning = folder / 'robustness_tracking.png', folder / 'robustness_learning.png'
-    title = 'Largest error, in units of the bound: above the red line the bound was left'
+    title = 'Largest error, in units of the bound: above the red line it is violated'
     _draw_sweeps(title, results, lambda one: min(one.max_error_ratio, _BROKEN), _ratio, tracking)
     title = 'Parameter error over the last ten of 30 s'
     _draw_sweeps(title, results, lambda one: one.tail_parameter_error, _learning, learning)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The comparison of the paper as a folder: runs, figures, claims, tables, and a page of all."""
+"""The comparison of the paper as a folder of runs, figures, claims and tables, with a page."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def compare(folder: Path) -> list[Claim]:
 
 
 def side_by_side(results: Results) -> Iterator[list[str]]:
-    """A header, and a row for each law; two joints are written as one / other."""
-    columns = {  # title: entry of the metrics, units to 1, decimals
+    """Yield a header and a row for each law; values of the joints are separated by `/`."""
+    columns = {  # title: field of the metrics, factor, decimals
         'max |xi1| [mrad]': ('max_error', 1e3, 3),
         'rms xi1 [mrad]': ('rms_error', 1e3, 4),
         'peak torque [N m]': ('peak_torque', 1.0, 2),
@@ -90,7 +90,7 @@ def side_by_side(results: Results) -> Iterator[list[str]]:
 
 
 def kept_bounds(results: Results) -> list[list[str]]:
-    """A header, and at which values of each condition each law has kept its bound."""
+    """Return a header and, by condition, the values at which each law kept its bound."""
     rows = [[sweep.label, *(_kept(results, sweep, law) for law in LAWS)] for sweep in SWEEPS]
     return [['bound kept at', *LAWS.values()], *rows]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The runs of the cases on all cores, and their metrics."""
+"""Simulation of the cases on all cores, and the metrics of their runs."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from blf_dsc_controller.simulation.loop import simulate_law
 
 
 class Results(NamedTuple):
-    """Results by the names of the cases; the runs of sweeps are not kept."""
+    """Results by name of the case; the runs of sweeps are not kept."""
 
     metrics: dict[str, Metrics]
     runs: dict[str, Run]
 
     def held(self, sweep: str, law: str) -> list[float]:
-        """Values of a sweep at which the law keeps its bound."""
+        """Return the values of a sweep at which the law keeps its bound."""
         (values,) = (one.values for one in SWEEPS if one.name == sweep)
         return [value for value in values if self.metrics[case_name(sweep, law, value)].held]
 
 
 def run_case(case: Case) -> tuple[Metrics, Run | None]:
-    """Simulate a case; the run is returned where it is kept."""
+    """Simulate a case; return its metrics and, if the case keeps it, the run."""
     loop = case.loop()
     with np.errstate(all='ignore'):  # a run that diverges has metrics too
         run = simulate_law(loop.controller, loop.plant).run()

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gains for the laws that are compared, all found by one procedure, objective and budget.
+"""Tuning of the compared laws, all by the same procedure, objective and budget.
 
     python -m blf_dsc_controller.paper.tune proposed      config/paper_tuned.yaml
     python -m blf_dsc_controller.paper.tune comparison    config/comparison.yaml
     python -m blf_dsc_controller.paper.tune slotine_li    config/slotine_li.yaml
 
-Equal for all: the arm, its disturbance, reference, start, P^(0), sample time and torque limit; two
-runs of 30 s, on exact sensors and on real ones (preset noisy); the objective; the number of gains
-(slotine_li has fewer) and the ranges of those that they share; the optimiser, its seed and budget.
+Common to all: the arm, its disturbance, reference, start, P^(0), sample time and torque limit; two
+runs of 30 s, with ideal and with realistic sensors (preset noisy); the objective; the number of
+gains (slotine_li has fewer) and the ranges of shared ones; the optimiser, its seed and budget.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ POPULATION = 96
 GENERATIONS = 12
 EVALUATIONS = POPULATION * (GENERATIONS + 1)
 DURATION = 30.0  # s
-ROUGHEST = 2.0  # N m, rms change of a torque from sample to sample that a motor is to be spared
+ROUGHEST = 2.0  # N m, largest acceptable rms change of a torque from sample to sample
 HOPELESS = 30.0
 
 PLANTS = ('recommended', 'noisy')
@@ -45,7 +45,7 @@ PLANTS = ('recommended', 'noisy')
 
 
 class Gain(NamedTuple):
-    """One tuned number: the parameter it sets, its range, and for which of two joints."""
+    """One tuned number: the parameter it sets, its range, and its joint."""
 
     name: str
     least: float
@@ -55,7 +55,7 @@ class Gain(NamedTuple):
 
 
 class Task(NamedTuple):
-    """A law to tune: the preset and choices it starts from, and its gains."""
+    """A law to tune: its preset, fixed parameters and tuned gains."""
 
     title: str
     preset: str
@@ -106,7 +106,7 @@ TASKS = {
 
 
 def settings_of(task: Task, exponents: Floats) -> dict[str, object]:
-    """Parameters of a point, of which each coordinate is a gain's decimal logarithm."""
+    """Return the parameters of a point, whose coordinates are log10 of the gains."""
     chosen: dict[str, object] = dict(task.fixed)
     per_joint: dict[str, list[float]] = {}
     for gain, exponent in zip(task.gains, exponents, strict=True):
@@ -119,9 +119,9 @@ def settings_of(task: Task, exponents: Floats) -> dict[str, object]:
 
 
 def cost_of(metrics: Metrics, sample_time: float) -> float:
-    """Objective of one run, in decades: largest error, rms error and parameter error; less is more.
+    """Return the cost of one run in decades of largest, rms and parameter error.
 
-    Leaving the bound costs ten decades a decade, and so does a torque rougher than `ROUGHEST`.
+    Each decade beyond the bound, and each of torque rougher than `ROUGHEST`, costs ten more.
     """
     largest = np.log10(metrics.max_error_ratio)
     typical = np.log10(np.linalg.norm(metrics.rms_error))
@@ -132,7 +132,7 @@ def cost_of(metrics: Metrics, sample_time: float) -> float:
 
 
 def objective(exponents: Floats, task: Task, loops: Sequence[LoopConfig]) -> float:
-    """Mean of `cost_of` over the plants."""
+    """Return the mean of `cost_of` over the plants."""
     values = []
     for loop in loops:
         config = change(loop.controller, settings_of(task, exponents))
@@ -143,7 +143,7 @@ def objective(exponents: Floats, task: Task, loops: Sequence[LoopConfig]) -> flo
 
 
 def loops_of(task: Task) -> list[LoopConfig]:
-    """The task's controller against each plant, for the duration of the tuning."""
+    """Return the loops of the task's controller with each plant, for the tuning's duration."""
     law = load_loop(task.preset).controller
     loops = (load_loop(name, {PLANT: {'duration': DURATION}}) for name in PLANTS)
     return [loop._replace(controller=law) for loop in loops]
@@ -156,10 +156,10 @@ def search(
     generations: int,
     **options: Any,
 ) -> tuple[Floats, float, int]:
-    """Best point within the ranges (k, 2), its cost, and how many costs were evaluated.
+    """Return the best point within the ranges (k, 2), its cost, and the number of evaluations.
 
-    Differential evolution of one seed from points evenly spread, as many for every law; `options`
-    are scipy's.
+    Differential evolution with a fixed seed from a Latin hypercube, of the same size for every
+    law; `options` are passed to scipy.
     """
     points = qmc.LatinHypercube(len(ranges), seed=np.random.default_rng(SEED)).random(population)
     found = differential_evolution(
@@ -176,7 +176,7 @@ def search(
 
 
 def tune(task: Task) -> tuple[Floats, float, int]:
-    """Best exponents, their objective, and how many times it was evaluated."""
+    """Return the best exponents, their objective, and the number of evaluations."""
     loops = loops_of(task)
     ranges = np.log10([(gain.least, gain.most) for gain in task.gains])
     with tqdm(total=EVALUATIONS, desc='tuning', unit='run') as bar:
@@ -189,9 +189,9 @@ def tune(task: Task) -> tuple[Floats, float, int]:
 
 
 def preset(name: str, exponents: Floats, value: float, evaluations: int) -> str:
-    """Text of the parameter file that holds the result: its changes of the defaults.
+    """Return the text of the parameter file with the result, as changes to the defaults.
 
-    The truth is that of the preset paper, for the monitors.
+    The truth, which the monitors use, is that of the preset paper.
     """
     task, defaults = TASKS[name], flatten(ControllerConfig())
     base = flatten(load_loop(task.preset).controller)

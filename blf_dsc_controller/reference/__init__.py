@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reference trajectories: their kernels, their planning and their limits."""
+"""Reference trajectories: kernels, planning and limits."""

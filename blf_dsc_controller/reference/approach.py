@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The configured reference, and the approach to it from where the arm is.
+"""The configured reference, and the approach to it from the present position of the arm.
 
 The reference is blended into the present motion (see `terms`), starting at t0, in the shortest time
-that keeps the limits, found in 10 % steps and refined by bisection.  A blend is never faster than
-its parts but for their distance over its duration, so there is one wherever both parts keep
+that keeps the limits, found in 10 % steps and refined by bisection.  A blend exceeds the speed of
+its parts only by a multiple of their distance over its duration, so one exists if both parts stay
 strictly within the limits and their distance is finite.
 """
 
@@ -30,25 +30,25 @@ from blf_dsc_controller.reference.terms import (
 _SHORTEST = 0.02  # s
 _STEP = 1.1
 _BISECTIONS = 5
-_PAST = 0.1  # rad
+_PAST = 0.1  # rad, tolerance of the position limits
 _BRAKE = 3.0
-"""Braking from v in the time h takes up to 1.5 v / h: twice the time needs half the limit."""
+"""Braking from v in the time h takes up to 1.5 v / h, so that h = 3 v / limit takes half of it."""
 
 
 class Motion(NamedTuple):
-    """A packed reference, and the time [s] at which its last blend is over."""
+    """A packed reference, and the time [s] at which its last blend ends."""
 
     vector: np.ndarray
     settled: float
 
 
 def hold(position: np.ndarray) -> Term:
-    """Stay at `position` (n,) [rad]."""
+    """Return the term that stays at `position` (n,) [rad]."""
     return spline_term(np.zeros(1), at_rest(position))
 
 
 def stop(t0: float, q: np.ndarray, dq: np.ndarray, config: ControllerConfig) -> Term:
-    """Come to rest from q (n,) [rad] and dq (n,) [rad/s] at t0 [s]."""
+    """Return the term that comes to rest from q (n,) [rad] and dq (n,) [rad/s] at t0 [s]."""
     h = max(_SHORTEST, float(np.max(_BRAKE * np.abs(dq) / config.limits.acceleration)))
     points = np.zeros((3, 2, q.size))
     points[0] = q, q + 0.5 * h * dq
@@ -57,16 +57,16 @@ def stop(t0: float, q: np.ndarray, dq: np.ndarray, config: ControllerConfig) -> 
 
 
 def blend(before: Sequence[Term], target: Term, t0: float, config: ControllerConfig) -> Motion:
-    """Go over from `before` to `target`, starting at t0 [s], as fast as the limits allow.
+    """Blend from `before` to `target`, starting at t0 [s], as fast as the limits allow.
 
     Raises:
-        MotionError: `target` itself violates a limit, or every blend that is short enough does.
+        MotionError: `target` or every blend within approach.longest violates a limit.
     """
     n, longest = len(config.joints), config.approach.longest
     found = worst_violation(pack(n, [target]), check_times(t0, t0 + longest), config)
     if found is not None:
         raise MotionError(
-            f'the reference exceeds the limits of the arm: {found}; ask for less, or raise '
+            f'the reference exceeds the limits of the arm: {found}; reduce the motion, or relax '
             f'{found.parameters}',
             found,
         )
@@ -84,9 +84,9 @@ def blend(before: Sequence[Term], target: Term, t0: float, config: ControllerCon
             closest = found
         if duration >= longest:
             raise MotionError(
-                f'no motion of at most {longest:g} s from here to the reference keeps '
-                f'within the limits of the arm: in the one that comes closest {closest}; start '
-                f'closer and at rest, or raise {closest.parameters} or approach.longest',
+                f'no motion of at most {longest:g} s from here to the reference stays '
+                f'within the limits of the arm: in the closest one, {closest}; start closer and '
+                f'at rest, or relax {closest.parameters} or approach.longest',
                 closest,
             )
         too_short, duration = duration, min(duration * _STEP, longest)
@@ -124,7 +124,7 @@ def check_start(
     """Check that positions q (n,) [rad] at time t [s] are inside the bound k(t) (n,) [rad].
 
     Raises:
-        OutsideBarrierError: some |xi1_i| >= k_i(t), where the law is not defined.
+        OutsideBarrierError: some |xi1_i| >= k_i(t), where the law is undefined.
     """
     qr, dqr, ddqr = np.zeros((3, len(joints)))
     evaluate(reference_vector, t, qr, dqr, ddqr)
@@ -143,12 +143,12 @@ def check_takeover(
 ) -> None:
     """Check that the law can take over an arm at q (n,) [rad] with dq (n,) [rad/s] at time t [s].
 
-    A difference v in velocity carries the error |xi1| on by v^2 / (2 a) until it is made up at the
-    acceleration a of `limits`: that has to stay inside the bound k(t) (n,) [rad].
+    A velocity difference v increases the error |xi1| by v^2 / (2 a) until it is removed at the
+    acceleration a of `limits`: the error must stay inside the bound k(t) (n,) [rad].
 
     Raises:
-        OutsideBarrierError: an error is outside already.
-        VelocityMismatchError: an error would get there.
+        OutsideBarrierError: an error is already outside its bound.
+        VelocityMismatchError: an error would leave its bound.
     """
     check_start(config.joints, q, bound, reference_vector, t)
     qr, dqr, ddqr = np.zeros((3, q.size))
@@ -162,7 +162,7 @@ def check_takeover(
 def _by_way_of_the_middle(
     begin: Sequence[Term], target: Term, t: float, config: ControllerConfig
 ) -> Motion | None:
-    """Approach to sinusoids that leave little speed for it, by a rest in their middle; or None."""
+    """Plan an approach to fast sinusoids that rests at their centre first; None if impossible."""
     if config.reference.type != 'sinusoids':
         return None
     try:
@@ -174,7 +174,7 @@ def _by_way_of_the_middle(
 
 
 def _check_limits(config: ControllerConfig, q: np.ndarray) -> None:
-    """Check that the arm is to be held at q (n,) [rad]: it may rest a little past its limits."""
+    """Check that the arm can be held at q (n,) [rad], at most `_PAST` past its limits."""
     limits = zip(config.limits.position_lower, config.limits.position_upper, strict=True)
     for joint, at, (lower, upper) in zip(config.joints, q, limits, strict=True):
         if not lower - _PAST <= at <= upper + _PAST:
@@ -188,14 +188,14 @@ def _check_limits(config: ControllerConfig, q: np.ndarray) -> None:
 def plan_start(
     config: ControllerConfig, bound: np.ndarray, q: np.ndarray, dq: np.ndarray, t: float = 0.0
 ) -> Motion:
-    """Configured reference, with an approach to it unless the law can take over at once.
+    """Plan the configured reference, with an approach unless the law can take over at once.
 
-    The arm is at q (n,) [rad] with dq (n,) [rad/s] at time t [s], when the bound is `bound` (n,)
+    At time t [s], the arm is at q (n,) [rad] with dq (n,) [rad/s], and the bound is `bound` (n,)
     [rad].
 
     Raises:
         StartError: the law cannot take over (`check_takeover`), and approach.enabled is false;
-            or the arm is to be held far past its limits.
+            or the arm would be held far past its limits.
         MotionError: no approach keeps the limits.
     """
     vector = reference_of(config)

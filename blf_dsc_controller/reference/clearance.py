@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far the links of an arm are from each other and from the floor.
+"""Clearance of the links of an arm from each other and from the floor.
 
-Meshes are not read.  A link is taken for all points within `radius` of the straight line from its
-joint to the next, or to the tip; by way of its centre of mass, if that is farther from the line
-than the radius.  Every two links are checked, but for those between which the arm, from joint to
-joint, is shorter than two radii: they touch in every posture, and only the limits of the joints can
-keep them apart.
+Meshes are not read.  A link is modelled as all points within `radius` of the straight line from its
+joint to the next, or to the tip; via its centre of mass, if that is farther from the line than the
+radius.  All pairs of links are checked except those separated by less than two radii of arm, from
+joint to joint: they touch in every posture, and only the joint limits can keep them apart.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ import numpy as np
 from blf_dsc_controller.arms.chain_geometry import frames
 from blf_dsc_controller.arms.urdf import Chain
 
-_LEAST = 1e-6  # m, of a line; shorter ones are points of the next
-_CARRIED = 2  # joints, up to which the arm may be near the floor
+_LEAST = 1e-6  # m, length of a line; shorter ones are points of the next line
+_CARRIED = 2  # joints, counted from the base, that may be near the floor
 
 
 class Clearance:
-    """Room between the links of a chain, and between them and the floor.
+    """Clearance between the links of a chain, and between them and the floor.
 
     The floor is the plane z = `floor` [m] in the base; the first two joints may be near it.
     """
@@ -50,7 +49,7 @@ class Clearance:
         self._first, self._second = np.array(pairs, dtype=int).reshape(-1, 2).T
 
     def corners(self, q: np.ndarray) -> np.ndarray:
-        """Base, joints, centres of mass that are aside, and tip (..., k, 3) [m], at q (..., n)."""
+        """Return base, joints, centres of mass aside, and tip (..., k, 3) [m], at q (..., n)."""
         placements = frames(self._chain, q)
         corners = [placements[0][..., :3, 3]]
         for placement, centre, aside in zip(
@@ -62,9 +61,9 @@ class Clearance:
         return np.stack([*corners, placements[-1][..., :3, 3]], axis=-2)
 
     def room(self, q: np.ndarray) -> np.ndarray:
-        """Room (..., k) of each pair of links, then of the corners above the floor, at q (..., n).
+        """Return the room (..., k) of the pairs of links, then of the corners above the floor.
 
-        In units of what there should be: two radii, or one above the floor; negative: too near.
+        At q (..., n), as (distance / required) - 1: two radii are required, or one above the floor.
         """
         corners = self.corners(q)
         begin, end = corners[..., :-1, :], corners[..., 1:, :]
@@ -76,9 +75,9 @@ class Clearance:
 
 
 def distance(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Distance (...) [m] of the straight lines from a to b and from c to d (..., 3).
+    """Return the distance (...) [m] of the line segments from a to b and from c to d (..., 3).
 
-    Ericson, Real-Time Collision Detection, 2005, 5.1.9; a line may be a point.
+    Ericson, Real-Time Collision Detection, 2005, 5.1.9; a segment may be a point.
     """
     u, v, w = b - a, d - c, a - c
     uu, uv, vv = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The limits of a motion, and where it violates them."""
+"""The limits of a motion, and their violations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.reference.terms import sampled
 
-_PERIOD = 0.005  # s, between two samples that are checked
+_PERIOD = 0.005  # s, between two checked samples
 _LEAST = 200  # samples, for short motions
 _MOST = 1_000_000  # samples, for very long ones
 _ROUNDING = 1e-9  # relative, for motions that just reach a limit
@@ -25,10 +25,10 @@ class Violation(NamedTuple):
     value: float
     limit: float
     time: float  # s
-    ratio: float  # of value to limit; positions count from the middle of their range
+    ratio: float  # value over limit; positions are relative to the middle of their range
 
     def __str__(self) -> str:
-        """Joint, quantity, value and limit with their unit."""
+        """Describe the violation: joint, quantity, value and limit with their unit."""
         unit = {'position': 'rad', 'velocity': 'rad/s', 'acceleration': 'rad/s^2'}[self.quantity]
         return (
             f'the {self.quantity} of joint {self.joint!r} would be {self.value:.6g} {unit} at '
@@ -44,7 +44,7 @@ class Violation(NamedTuple):
 
 
 class MotionError(BlfDscError):
-    """No motion that keeps the limits; `violation` is where the best one breaks them."""
+    """No motion keeps the limits; `violation` is that of the best motion found."""
 
     def __init__(self, message: str, violation: Violation | None = None) -> None:
         self.violation = violation
@@ -52,7 +52,7 @@ class MotionError(BlfDscError):
 
 
 def check_times(begin: float, end: float) -> np.ndarray:
-    """Times from `begin` to `end` [s], close enough to catch the largest velocity of a motion."""
+    """Return times from `begin` to `end` [s], dense enough to catch the largest velocity."""
     count = 1 + (end - begin) / _PERIOD
     return np.linspace(begin, end, int(min(max(_LEAST, count), _MOST)))
 
@@ -60,7 +60,7 @@ def check_times(begin: float, end: float) -> np.ndarray:
 def worst_violation(
     vector: np.ndarray, times: np.ndarray, config: ControllerConfig
 ) -> Violation | None:
-    """Largest violation of a packed reference at times (k,) [s]; None if it keeps the limits."""
+    """Return the largest violation by a packed reference at times (k,) [s], or None."""
     qr, dqr, ddqr = sampled(vector, times).transpose(1, 0, 2)
     limits = config.limits
     lower, upper = np.array((limits.position_lower, limits.position_upper))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splines through given points: by their derivatives there, or of minimum jerk.
+"""Splines through given points, with given derivatives there or of minimum jerk.
 
-The quintic with given position, velocity and acceleration at both ends is the one of least
-integrated squared jerk between them (Flash and Hogan, 1985).  Through several points the optimum is
-the spline of such pieces whose jerk and snap are continuous too.
+The quintic with given position, velocity and acceleration at both ends minimises the integrated
+squared jerk between them (Flash and Hogan, 1985).  Through several points, the optimum is the
+spline of such pieces whose jerk and snap are also continuous.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from blf_dsc_controller.reference.terms import Term, spline_term
 
 
 def quintics(h: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Coefficients (pieces, n, 6) of quintics of durations h (pieces,) [s].
+    """Return coefficients (pieces, n, 6) of quintics of durations h (pieces,) [s].
 
     `begin` and `end` are the positions, velocities and accelerations (3, pieces, n) at the ends.
     """
@@ -30,7 +30,7 @@ def quintics(h: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def cubics(h: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Coefficients (pieces, n, 6) of cubics of durations h (pieces,) [s].
+    """Return coefficients (pieces, n, 6) of cubics of durations h (pieces,) [s].
 
     `begin` and `end` are the positions and velocities (2, pieces, n) at the ends.
     """
@@ -43,27 +43,27 @@ def cubics(h: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def at_rest(position: np.ndarray) -> np.ndarray:
-    """Coefficients (1, n, 6) of the piece that stays at `position` (n,) [rad]."""
+    """Return coefficients (1, n, 6) of the piece that stays at `position` (n,) [rad]."""
     coefficients = np.zeros((1, len(position), 6))
     coefficients[0, :, 0] = position
     return coefficients
 
 
 def ending_at_rest(knots: np.ndarray, coefficients: np.ndarray, position: np.ndarray) -> Term:
-    """Spline of the pieces between the knots (k,) [s] that stays at `position` (n,) afterwards."""
+    """Return the spline of pieces between knots (k,) [s] that then stays at `position` (n,)."""
     return spline_term(knots, np.concatenate((coefficients, at_rest(position))))
 
 
 def hermite(times: np.ndarray, points: np.ndarray) -> Term:
-    """Quintics through positions, velocities and accelerations (3, k, n) at times (k,) [s]."""
+    """Return quintics through positions, velocities, accelerations (3, k, n) at times (k,) [s]."""
     pieces = quintics(np.diff(times), points[:, :-1], points[:, 1:])
     return ending_at_rest(times, pieces, points[0, -1])
 
 
 def minimum_jerk(times: np.ndarray, positions: np.ndarray, begin: np.ndarray | None = None) -> Term:
-    """Minimum jerk through positions (k, n) [rad] at increasing times (k,) [s], ending at rest.
+    """Return the minimum jerk through positions (k, n) [rad] at times (k,) [s], ending at rest.
 
-    `begin` is the velocity and acceleration (2, n) at the first point, by default zero.
+    Times increase. `begin` is velocity and acceleration (2, n) at the first point, zero by default.
     """
     k, n = positions.shape
     points = np.zeros((3, k, n))
@@ -78,7 +78,7 @@ def minimum_jerk(times: np.ndarray, positions: np.ndarray, begin: np.ndarray | N
 def _solve_inner_points(h: np.ndarray, points: np.ndarray) -> None:
     """Fill in the velocities and accelerations that make jerk and snap continuous.
 
-    A block tridiagonal system, two equations for each inner point, solved by elimination.
+    This is a block tridiagonal system with two equations per inner point, solved by elimination.
     """
     rise = np.diff(points[0], axis=0)
     inner = range(1, len(h))

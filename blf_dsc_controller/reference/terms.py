@@ -4,14 +4,14 @@
     sinusoids   qr_i = offset_i + sum_k amplitude_ik cos(frequency_k t + phase_k)
     spline      qr_i = sum_j c_kij (t - knot_k)^j, j = 0 .. 5, from knot k to knot k + 1
 
-The last piece of a spline holds for ever; before the first knot the spline is at rest where it
-begins.  From its `begin` on, during the time `fade`, a term is blended into the one before:
+The last piece of a spline extends without end; before the first knot, the spline rests at its
+initial position.  From its `begin` on, over the time `fade`, a term is blended into the one before:
 
     qr(t) = (1 - s) before(t) + s term(t),    s = 10 x^3 - 15 x^4 + 6 x^5,   x = (t - begin) / fade
 
-s is the minimum-jerk step, so the blend starts and ends with continuous acceleration, and is never
-faster than its parts but for s' times their distance.  From begin + fade on the reference equals
-the term bit for bit.
+s is the minimum-jerk step, so the acceleration is continuous at both ends of the blend, and the
+blend exceeds the speed of its parts by at most s' times their distance.  From begin + fade on, the
+reference equals the term bit for bit.
 
     vector = [n, number of terms, term, term, ...],   term = [code, size, begin, fade, content]
 """
@@ -35,7 +35,7 @@ _HEAD = 4
 
 
 class Term(NamedTuple):
-    """One term of a reference: its kind and content, when it takes over [s], and how fast [s]."""
+    """One term of a reference: kind, content, and the start and duration [s] of its blend."""
 
     code: int
     content: np.ndarray
@@ -44,7 +44,7 @@ class Term(NamedTuple):
 
     @property
     def settled(self) -> float:
-        """Time [s] from which on it is the reference."""
+        """Time [s] from which on the term is the reference."""
         return self.begin + self.fade
 
 
@@ -54,7 +54,7 @@ def sinusoids_term(
     frequency: Sequence[float],
     phase: Sequence[float],
 ) -> Term:
-    """Sum of cosines.
+    """Return a sum of cosines.
 
     `offset` (n,) and `amplitude` (n * tones,) in rad, all tones of the first joint first;
     `frequency` (tones,) in rad/s, `phase` (tones,) in rad.
@@ -64,13 +64,13 @@ def sinusoids_term(
 
 
 def spline_term(knots: np.ndarray, coefficients: np.ndarray) -> Term:
-    """Piecewise quintic of increasing knots (pieces,) [s] and c_kij (pieces, n, 6) [rad/s^j]."""
+    """Return the spline of increasing knots (pieces,) [s] and c_kij (pieces, n, 6) [rad/s^j]."""
     content = ([float(len(knots))], knots, np.ravel(coefficients))
     return Term(SPLINE, np.concatenate(content))
 
 
 def pack(n: int, terms: Sequence[Term]) -> np.ndarray:
-    """Vector of a reference for n joints; `unpack` is the inverse."""
+    """Return the vector of a reference for n joints; `unpack` is the inverse."""
     packed = [
         np.concatenate(
             ((term.code, _HEAD + term.content.size, term.begin, term.fade), term.content)
@@ -81,7 +81,7 @@ def pack(n: int, terms: Sequence[Term]) -> np.ndarray:
 
 
 def unpack(vector: np.ndarray) -> list[Term]:
-    """Terms of a packed reference."""
+    """Return the terms of a packed reference."""
     terms = []
     at = _VECTOR_HEAD
     for _ in range(int(vector[1])):
@@ -94,7 +94,7 @@ def unpack(vector: np.ndarray) -> list[Term]:
 
 @inner
 def sinusoids(vector: np.ndarray, at: int, n: int, i: int, t: float) -> tuple[float, float, float]:
-    """Joint i of n of the sinusoids whose content starts at entry `at`: q, q', q'' at t [s]."""
+    """Return q, q', q'' at t [s] of joint i of n, of sinusoids with content from entry `at` on."""
     tones = int(vector[at])
     offset = part(vector, at + 1, (n,))
     frequency = part(vector, at + 1 + n, (tones,))
@@ -114,7 +114,7 @@ def sinusoids(vector: np.ndarray, at: int, n: int, i: int, t: float) -> tuple[fl
 
 @inner
 def piece_at(knots: np.ndarray, t: float) -> int:
-    """Last piece that has begun at time t; the first before the first knot."""
+    """Return the last piece that has begun at time t; the first one before the first knot."""
     low = 0
     high = knots.size
     while high - low > 1:
@@ -128,7 +128,7 @@ def piece_at(knots: np.ndarray, t: float) -> int:
 
 @inner
 def spline(vector: np.ndarray, at: int, n: int, i: int, t: float) -> tuple[float, float, float]:
-    """Joint i of n of the spline whose content starts at entry `at`: q, q', q'' at t [s]."""
+    """Return q, q', q'' at t [s] of joint i of n, of a spline with content from entry `at` on."""
     pieces = int(vector[at])
     knots = part(vector, at + 1, (pieces,))
     if t < knots[0]:
@@ -148,7 +148,7 @@ def spline(vector: np.ndarray, at: int, n: int, i: int, t: float) -> tuple[float
 
 @inner
 def term_in_force(vector: np.ndarray, t: float) -> tuple[int, int]:
-    """Entry at which the last term starts that has taken over completely, and its number."""
+    """Return the first entry and the number of the last term that has taken over completely."""
     found = _VECTOR_HEAD
     number = 0
     at = _VECTOR_HEAD
@@ -162,7 +162,7 @@ def term_in_force(vector: np.ndarray, t: float) -> tuple[int, int]:
 
 @inner
 def term_at(vector: np.ndarray, at: int, n: int, i: int, t: float) -> tuple[float, float, float]:
-    """Joint i of n of the term that starts at entry `at`: q, q', q'' at time t [s]."""
+    """Return q, q', q'' at time t [s] of joint i of n, of the term that starts at entry `at`."""
     if vector[at] == SPLINE:
         return spline(vector, at + _HEAD, n, i, t)
     return sinusoids(vector, at + _HEAD, n, i, t)
@@ -172,7 +172,7 @@ def term_at(vector: np.ndarray, at: int, n: int, i: int, t: float) -> tuple[floa
 def evaluate(
     vector: np.ndarray, t: float, qr: np.ndarray, dqr: np.ndarray, ddqr: np.ndarray
 ) -> None:
-    """Write qr [rad], dqr [rad/s] and ddqr [rad/s^2] (n,) of time t [s]."""
+    """Write qr [rad], dqr [rad/s] and ddqr [rad/s^2] (n,) at time t [s]."""
     n = qr.size
     at, first = term_in_force(vector, t)
     for i in range(n):
@@ -204,7 +204,7 @@ def _sample(vector: np.ndarray, times: np.ndarray, out: np.ndarray) -> None:
 
 
 def sampled(vector: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """qr, dqr and ddqr (k, 3, n) of a packed reference at times (k,) [s]."""
+    """Return qr, dqr and ddqr (k, 3, n) of a packed reference at times (k,) [s]."""
     out = np.zeros((len(times), 3, int(vector[0])))
     _sample(vector, np.asarray(times, dtype=np.float64), out)
     return out

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """A trajectory that is sent while the controller runs and replaces the present reference.
 
-Interpolated as by joint_trajectory_controller, except where that would jump:
+It is interpolated as by joint_trajectory_controller, except where that would jump:
 
     positions, velocities, accelerations   quintic from point to point
     positions, velocities                  cubic from point to point
     positions only                         minimum jerk through all points, at rest at the last one
 
-(There, positions only are joined by straight lines, whose velocity jumps at each point.)  The first
-point is reached from the position, velocity and acceleration of the present reference when the
-trajectory begins.  If the first point is at the beginning itself, the trajectory is blended into
-the present reference as fast as the limits allow.  Points in the past are skipped.  The last point
-is held.  What is longer than `LONGEST`, or has more than `MOST_POINTS`, is rejected: planning takes
-less than a second.
+(That controller joins bare positions by straight lines, so the velocity jumps at each point.)  The
+motion to the first point starts from the position, velocity and acceleration of the reference when
+the trajectory begins; if the first point is at that very time, the trajectory is blended into the
+present reference as fast as the limits allow.  Points in the past are skipped.  The last point is
+held.  To keep planning below a second, a trajectory longer than `LONGEST` or with more than
+`MOST_POINTS` is rejected.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from blf_dsc_controller.reference.terms import Term, pack, sampled, unpack
 
 MOST_POINTS = 1000
 LONGEST = 3600.0
-"""Time [s] from its beginning to its last point, at most."""
+"""Longest time [s] from the beginning of a trajectory to its last point."""
 
 _FIELDS = ('positions', 'velocities', 'accelerations')
 
 
 class TrajectoryError(MotionError):
-    """A trajectory that is rejected, with all problems found."""
+    """A rejected trajectory, with all problems found."""
 
     def __init__(self, problems: list[str]) -> None:
         self.problems = problems
@@ -51,7 +51,7 @@ class TrajectoryError(MotionError):
 
 
 class TrajectoryPoint(NamedTuple):
-    """A point of a trajectory; fields that are not given are empty."""
+    """A point of a trajectory; unspecified fields are empty."""
 
     time: float  # s, since the trajectory's beginning
     positions: tuple[float, ...]  # rad
@@ -61,7 +61,7 @@ class TrajectoryPoint(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """A trajectory as it was sent; its values are in the order of its own joints."""
+    """A trajectory as received; its values are in the order of its own joints."""
 
     joints: tuple[str, ...]
     points: tuple[TrajectoryPoint, ...]
@@ -71,7 +71,7 @@ class Trajectory(NamedTuple):
 def plan_trajectory(
     trajectory: Trajectory, vector: np.ndarray, now: float, config: ControllerConfig
 ) -> Motion:
-    """Packed reference that continues `vector` at time now [s] and then follows the trajectory.
+    """Return a packed reference that continues `vector` at `now` [s], then follows the trajectory.
 
     Raises:
         TrajectoryError: it is not valid, too late, or violates a limit.
@@ -97,14 +97,14 @@ def plan_trajectory(
     end = max(float(times[-1]), motion.settled)
     found = worst_violation(motion.vector, check_times(t0, end), config)
     if found is not None:
-        raise TrajectoryError([f'{found}; ask for less, or raise {found.parameters}'])
+        raise TrajectoryError([f'{found}; reduce the motion, or relax {found.parameters}'])
     return motion
 
 
 def _remaining_points(
     trajectory: Trajectory, joints: tuple[str, ...], begin: float, t0: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times (k,) [s] and given fields (1 to 3, k, n) of the points from t0 on, in our order."""
+    """Return times (k,) [s] and fields (1 to 3, k, n) of points from t0 on, in the given order."""
     order = [trajectory.joints.index(joint) for joint in joints]
     times = np.array([begin + point.time for point in trajectory.points])
     given = [
@@ -117,14 +117,14 @@ def _remaining_points(
 
 
 def _terms_until(vector: np.ndarray, now: float, t0: float) -> list[Term]:
-    """Terms of the reference that have an effect from now until t0 [s]."""
+    """Return the terms of the reference that have an effect from now until t0 [s]."""
     terms = [term for term in unpack(vector) if term.begin < t0]
     in_force = max((k for k, term in enumerate(terms) if term.settled <= now), default=0)
     return terms[in_force:]
 
 
 def _through_points(times: np.ndarray, points: np.ndarray) -> Term:
-    """Term through the points (1 to 3, k, n), held before the first and after the last."""
+    """Return a term through the points (1 to 3, k, n) that holds the first and the last one."""
     if len(points) == 1:
         return minimum_jerk(times, points[0])
     if len(points) == 3:
@@ -134,7 +134,7 @@ def _through_points(times: np.ndarray, points: np.ndarray) -> Term:
 
 
 def _from_state(present: np.ndarray, t0: float, times: np.ndarray, points: np.ndarray) -> Term:
-    """Term from the present qr, dqr, ddqr (3, n) at t0 [s] through the points."""
+    """Return a term from the present qr, dqr, ddqr (3, n) at t0 [s] through the points."""
     knots = np.concatenate(([t0], times))
     if len(points) == 1:
         return minimum_jerk(knots, np.vstack((present[:1], points[0])), present[1:])
@@ -150,7 +150,7 @@ def _from_state(present: np.ndarray, t0: float, times: np.ndarray, points: np.nd
 
 
 def _problems(trajectory: Trajectory, joints: tuple[str, ...], now: float) -> list[str]:
-    """Everything that is wrong with a trajectory before its motion is computed."""
+    """Return all problems of a trajectory that can be found before its motion is computed."""
     count = len(trajectory.points)
     if count > MOST_POINTS:
         return [f'it has {count} points, more than {MOST_POINTS}: send it in pieces']
@@ -181,7 +181,7 @@ def _point_problems(trajectory: Trajectory) -> Iterator[str]:
         for problem in _problems_of(point, len(trajectory.joints)):
             yield f'point {number} has {problem}'
     if len({tuple(map(bool, point[1:4])) for point in trajectory.points}) > 1:
-        yield 'its points do not all give the same of ' + ', '.join(_FIELDS)
+        yield 'its points do not all give the same fields among ' + ', '.join(_FIELDS)
 
 
 def _problems_of(point: TrajectoryPoint, count: int) -> Iterator[str]:

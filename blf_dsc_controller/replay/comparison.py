@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded against replayed messages of the controller, bit for bit."""
+"""Bit-for-bit comparison of recorded and replayed messages of the controller."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from blf_dsc_controller.run import Floats, Series, Stamps
 
 
 class Difference(NamedTuple):
-    """The first number of a topic that is not the same."""
+    """The first number of a topic that differs."""
 
     topic: str
     field: str
@@ -44,13 +44,13 @@ class Difference(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """One topic."""
+    """Result of comparing one topic."""
 
     topic: str  # name in the bag
     values: int  # numbers compared
-    recorded: int  # numbers in the bag that the replay of all of it would have to give
+    recorded: int  # numbers in the bag that a complete replay would give
     difference: Difference | None
-    left_out: str = ''  # what was not compared, and why not
+    left_out: str = ''  # what was not compared, and why
 
 
 def compare(
@@ -58,7 +58,7 @@ def compare(
 ) -> Iterator[Comparison]:
     """Compare each topic of the controller that the bag holds.
 
-    `gappy` are topics of which the recorder missed messages.
+    `gappy` are the names of topics with messages that the recorder missed.
 
     Raises:
         UnreadableMessageError: a message cannot be decoded.
@@ -78,14 +78,14 @@ def compare(
 
 
 def _of_the_whole_bag(found: Comparison, messages: TopicMessages, content: Content) -> Comparison:
-    """The comparison, with the outputs of later controllers among the recorded ones."""
+    """Return the comparison, counting the outputs of later controllers as recorded too."""
     count = len(messages.raw)
     whole = found.recorded * content.message_counts[messages.name] // count if count else 0
     return found._replace(recorded=whole)
 
 
 def _replayed(config: ControllerConfig, outputs: Outputs) -> dict[Topic, Series]:
-    """Values of every topic with a stamp."""
+    """Return the replayed values of every topic with a stamp."""
     errors, reference = (_names(config.joints, JOINT_STATE_FIELDS[:count]) for count in (3, 2))
     stamp, samples = outputs.stamp, outputs.samples
     return {
@@ -99,7 +99,7 @@ def _replayed(config: ControllerConfig, outputs: Outputs) -> dict[Topic, Series]
 
 
 def _recorded(messages: TopicMessages, *, is_vector: bool) -> Series:
-    """Values of a vector, or those fields of joint states that are not empty."""
+    """Return the values of a vector, or the fields of joint states that are not empty."""
     states = messages.joint_states(messages.layout().names, ())
     if is_vector:
         return states.position
@@ -116,7 +116,7 @@ def _names(joints: Sequence[str], fields: Sequence[str]) -> tuple[str, ...]:
 def _compare_commands(
     recorded: TopicMessages, commands: Commands, names: Sequence[str], *, is_gappy: bool
 ) -> Comparison:
-    """Compare commands by their number in the run: they have no stamp."""
+    """Compare commands by their number in the run, since they have no stamp."""
     count = len(recorded.raw)
     due = int(np.argmin(np.append(commands.of_law, values=False)))
     if count < due or is_gappy:
@@ -124,7 +124,7 @@ def _compare_commands(
         return Comparison(recorded.name, 0, count * len(names), None, reason)
     values = recorded.arrays(len(names))
     if values is None:
-        reason = f'they are not {len(names)} values each'
+        reason = f'they do not have {len(names)} values each'
         return Comparison(recorded.name, 0, count * len(names), None, reason)
     number = commands.number
     # After a dropped state there may be more replayed torques than commands before the next event.
@@ -137,11 +137,11 @@ def _compare_commands(
     rows = rows[alike | (mismatch <= np.maximum.accumulate(np.where(exact, k, -1)))]
     left_out = ''
     rest = np.delete(values, number[rows], axis=0)
-    # The last command of a node that ends in order is zero, and has no state.
+    # The last command of a node that shuts down normally is zero and belongs to no state.
     if len(rest) > 1 or rest.any():
         left_out = (
-            f'{len(rest)} torques that the bag does not determine: out of command, by states that '
-            'the middleware dropped, or by the watchdog at the end'
+            f'{len(rest)} torques that the bag does not determine: out of command, after states '
+            'that the middleware dropped, or from the watchdog at the end'
         )
     stamp, torque = commands.stamp[rows], commands.torque[rows]
     compared = values[number[rows]]
@@ -150,7 +150,7 @@ def _compare_commands(
 
 
 def _compare_series(topic: str, stamp: Stamps, recorded: Series, replayed: Series) -> Comparison:
-    """Compare values of the same name in the samples (N,); NaN between two messages."""
+    """Compare values with the same name in the samples (N,); NaN between two messages."""
     shared = [name for name in replayed.names if name in recorded.names]
     absent = {*replayed.names, *recorded.names}.difference(shared)
     left_out = [name for name in (*replayed.names, *recorded.names) if name in absent]

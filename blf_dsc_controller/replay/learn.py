@@ -5,8 +5,8 @@ The rows X theta = u are those of the controller (see law.prediction), over the 
 them most:  theta = (Phi + rho I)^-1 b  with (21) and (22). The deviations do not assume that the
 residuals are independent: A^-1 S A^-1 / N^2 with A = Phi + rho I and S the sum over blocks of the
 window of g g^T, where g is the sum of X^T (X theta - u) in a block (Liang and Zeger, Longitudinal
-data analysis using generalized linear models, 1986). What an unmodelled torque has in common with
-the columns of X is in the estimates, and no deviation shows it.
+data analysis using generalized linear models, 1986). The part of an unmodelled torque that is
+correlated with the columns of X biases the estimates, which no deviation shows.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from blf_dsc_controller.run import Floats
 _CANDIDATES = 600  # windows
 _BLOCKS = 20  # of a window
 _POSITIONS = 50  # at which the inertia matrix is checked
-_POOR = 0.2  # of the torque, residual
-_LASTING = 0.05  # of the window, correlation length of the residual
+_POOR = 0.2  # of the torque, largest accepted residual
+_LASTING = 0.05  # of the window, longest correlation length of noise
 
 
 class Learned(NamedTuple):
@@ -40,7 +40,7 @@ class Learned(NamedTuple):
     estimate: Floats  # (m,) in the units of the model; NaN for a rejected column
     deviation: Floats  # standard deviation of each (m,)
     excitation: float  # lambda_min(Phi)
-    threshold: float  # of the controller on it, sigma
+    threshold: float  # sigma, the threshold of the controller on it
     begin: float  # of the window, s
     end: float  # of the window, s
     residual: float  # root mean square of X theta - u, N m after the filter
@@ -57,18 +57,18 @@ class Learned(NamedTuple):
 
     @property
     def notes(self) -> Iterator[str]:
-        """What the deviations cannot show."""
+        """Errors that the deviations cannot show."""
         if self.correlation > _LASTING * (self.end - self.begin):
             yield (
                 f'note: the residual is a torque that lasts ({self.correlation:.2g} s), not noise: '
-                'what of it moves as a column does is in the estimate, beyond its interval'
+                'what is correlated with a column biases the estimate beyond its interval'
             )
 
     @property
     def doubts(self) -> Iterator[str]:
         """Why the estimates should not be trusted."""
         if not self.is_excited:
-            yield 'DO NOT TRUST these figures: the motion does not show all of them'
+            yield 'DO NOT TRUST these estimates: the motion does not show all of them'
         if self.least_inertia <= 0.0:
             yield (
                 'UNPHYSICAL: the smallest eigenvalue of the inertia matrix is '
@@ -84,7 +84,7 @@ class Learned(NamedTuple):
 def learn(
     path: Path, config: ControllerConfig, namespace: str = '', names: NameMap = NO_NAMES
 ) -> Learned:
-    """Learn the arm of a bag, whatever moved it; path, namespace and names as for `what_if`.
+    """Learn an arm from a bag, whatever moved it; path, namespace and names as for `what_if`.
 
     `config` gives the model, and the window, columns and filters of the learning.
 
@@ -96,7 +96,7 @@ def learn(
     stamp, sample_time = recorded.states.stamp, config.sample_time
     if stamp.size > 1:
         sample_time = float(np.median(np.diff(stamp))) * 1e-9
-    # Along a reference at rest: the recorded one is not known, and rows count by its speed.
+    # Use a reference at rest: the recorded one is unknown, and its speed would weight the rows.
     held = replace(
         config,
         sample_time=sample_time,
@@ -140,7 +140,7 @@ def learn(
 
 
 def _most_excited(rows: Floats, active: Floats, window: int, start: int) -> int:
-    """End of the window with the largest lambda_min of its Phi."""
+    """Return the end of the window whose Phi has the largest lambda_min."""
     X = rows[:, :, :-1][:, :, active != 0.0]
     sums = np.cumsum(np.einsum('kia,kib->kab', X, X), axis=0)
     ends = np.unique(np.linspace(start, rows.shape[0] - 1, _CANDIDATES).astype(np.intp))
@@ -149,7 +149,7 @@ def _most_excited(rows: Floats, active: Floats, window: int, start: int) -> int:
 
 
 def _solve(X: Floats, u: Floats, rho: float) -> tuple[Floats, Floats, Floats]:
-    """Phi (m, m), theta (m,) and its covariance (m, m), of rows X (N, n, m) and u (N, n)."""
+    """Return Phi (m, m), theta (m,) and its covariance (m, m) of rows X (N, n, m), u (N, n)."""
     N, m = X.shape[0], X.shape[2]
     Phi = np.einsum('kia,kib->ab', X, X) / N
     inverse = np.linalg.pinv(Phi + rho * np.eye(m), hermitian=True)
@@ -161,7 +161,7 @@ def _solve(X: Floats, u: Floats, rho: float) -> tuple[Floats, Floats, Floats]:
 
 
 def _least_inertia(model: ArmModel, estimate: Floats, q: Floats) -> float:
-    """Smallest eigenvalue of M at positions among q (N, n), by the estimate (m,) of P and d."""
+    """Return the smallest eigenvalue of M at some of q (N, n), by the estimate (m,) of P and d."""
     n, p = model.n, len(model.parameter_names)
     Yp, Yr, M = np.zeros((n, p)), np.zeros((n, p)), np.zeros((n, n))
     least = np.inf
@@ -174,7 +174,7 @@ def _least_inertia(model: ArmModel, estimate: Floats, q: Floats) -> float:
 
 
 def correlation_length(left: Floats) -> float:
-    """In samples: 1 + 2 sum of the autocorrelation up to its first zero."""
+    """Return 1 + 2 sum of the autocorrelation up to its first zero, in samples."""
     size = 2 ** int(np.ceil(np.log2(2 * left.shape[0])))
     spectrum = np.abs(np.fft.rfft(left, size, axis=0)) ** 2
     correlation = np.fft.irfft(spectrum.sum(axis=1))[: left.shape[0]]

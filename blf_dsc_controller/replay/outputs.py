@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a guarded controller gives, state by state, as arrays."""
+"""Outputs of a guarded controller, state by state, as arrays."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Outputs:
     """Samples, monitor and torques of a guard."""
 
     def __init__(self, guard: Guard, states: int) -> None:
-        """Make room for the samples of so many states."""
+        """Allocate the samples of this number of states."""
         self._guard = guard
         self._joints, self._estimates = guard.config.joints, estimate_names(guard.config)
         self._stamps: list[int] = []  # ns, of the samples
@@ -39,10 +39,10 @@ class Outputs:
         self._monitor: Monitor | None = None
         self._monitored: list[tuple[int, list[float]]] = []  # ns, values
         self._commands: list[tuple[int, Floats, bool, bool]] = []  # as in Commands
-        self._offsets = [(0, 0)]  # from a torque on: its number in the bag
+        self._offsets = [(0, 0)]  # number of a torque, and its number in the bag
 
     def add_sample(self, stamp: int) -> None:
-        """Add the last sample of the law, of a state with this stamp [ns]."""
+        """Add the last sample of the law, for the state with this stamp [ns]."""
         guard, controller = self._guard, self._guard.controller
         self._rows[len(self._stamps)] = controller.sample_vector
         self._stamps.append(stamp)
@@ -59,12 +59,12 @@ class Outputs:
         self._commands.append((stamp, torque.copy(), of_law, of_law or is_exact))
 
     def count_from(self, own: int, recorded: int) -> None:
-        """Let the torque of a number be the recorded one of another number."""
+        """Match the torques from number `own` on with the commands from number `recorded` on."""
         self._offsets.append((own, recorded))
 
     @property
     def last(self) -> int:
-        """Stamp of the last sample [ns], -1 without any."""
+        """Stamp of the last sample [ns], -1 if there is none."""
         return self._stamps[-1] if self._stamps else -1
 
     @property
@@ -87,7 +87,7 @@ class Outputs:
 
     @cached_property
     def commands(self) -> Commands:
-        """Every torque."""
+        """All commanded torques."""
         count = len(self._commands)
         number = np.arange(count)
         for own, recorded in self._offsets:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The guarded controller on recorded joint states, with every event of its journal.
 
-The journal holds how many joint-state messages were processed before an event, and the stamp of the
-last. Where the bag holds as many in between, each is processed again. Where it holds more, the
+The journal states how many joint-state messages were processed before an event, and the stamp of
+the last. If the bag holds as many in between, each is processed again. If it holds more, the
 middleware has dropped some (in real time): the telemetry shows which ones the law used; out of
-command all are used, and the torques are compared as far as they match.
+command all are used, and the torques are compared as long as they match.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ _UNREADABLE = frozenset(
 
 
 class Rerun:
-    """The guarded controller once more.
+    """Replay of the guarded controller.
 
     Attributes:
-        events: that were replayed.
-        outputs: samples and torques.
+        events: replayed events.
+        outputs: replayed samples and torques.
         passed_over: number of joint states that the law did not use.
-        departure: where it did something else than the journal says; the replay ends there.
-        end: why else the replay ended before the bag; empty if it did not.
+        departure: where the controller departed from the journal, which ends the replay.
+        end: any other reason why the replay ended before the bag, or empty.
     """
 
     def __init__(
@@ -51,8 +51,8 @@ class Rerun:
     ) -> None:
         """Start with `config`.
 
-        `errors` are those of unreadable messages by their number among the joint states; `sampled`
-        are the stamps [ns] with telemetry, None without any.
+        `errors` maps the number of each unreadable joint state to its error; `sampled` are the
+        stamps [ns] with telemetry, None if there is no telemetry.
         """
         self.events: list[Event] = []
         self.passed_over = 0
@@ -66,14 +66,14 @@ class Rerun:
         self._sampled = None if sampled is None else frozenset(sampled.tolist())
         lost = np.setdiff1d([] if sampled is None else sampled, states.stamp)
         self._lost = int(lost[0]) if lost.size else FOREVER
-        self._position = -1  # number of the last joint state before now
-        self._messages = 0  # that were processed by then, according to the journal
+        self._position = -1  # number of the last joint state handled so far
+        self._messages = 0  # processed by then, according to the journal
         self._failed = False
 
     def run(self, events: Sequence[Event], *, in_step: bool) -> None:
-        """Process the joint states with the events after the configuration, in turn.
+        """Process the joint states with the events after the configuration, in order.
 
-        `in_step`: the plant waited for each command, so that none was dropped at the end.
+        `in_step`: the plant waited for each command, so that no state was dropped at the end.
         """
         for event in events:
             if event.number != len(self.events) + 1:
@@ -96,7 +96,7 @@ class Rerun:
     # Between two events.
 
     def _locate(self, event: Event) -> tuple[int, bool]:
-        """Number of the last joint state before an event, and whether none before was dropped."""
+        """Return the number of the last joint state before an event; True if none was dropped."""
         stamps, processed = self._stamps, event.messages - self._messages
         self._messages = event.messages
         end = self._position + processed
@@ -112,7 +112,7 @@ class Rerun:
         return self._position, False
 
     def _seen(self, k: int) -> int:
-        """Stamp of the last readable state up to number k."""
+        """Return the stamp of the last readable state up to number k."""
         while k in self._errors:
             k -= 1
         return self._stamps[k] if k >= 0 else -1
@@ -123,7 +123,7 @@ class Rerun:
             if self._is_over:
                 return
             if k == end and _reason(event) is Reason.FAILED:
-                continue  # nothing shows how far the law came with this one
+                continue  # nothing shows how far the law got with this state
             is_certain = event and (is_exact or k == end or self._stamps[k] == event.stamp)
             if is_certain or self._was_used(k):
                 self._process(k, event, is_exact=is_exact)
@@ -132,7 +132,7 @@ class Rerun:
         self._position = end
 
     def _was_used(self, k: int) -> bool:
-        """Whether the recorded controller must have processed a state that it may have missed."""
+        """Return whether the recorded controller processed a state that it may have missed."""
         stamp = self._stamps[k]
         if not self._guard.supervisor.uses_states:
             return True
@@ -171,7 +171,7 @@ class Rerun:
     # Events.
 
     def _repeat(self, event: Event) -> None:
-        """Do what the journal says, or see that it has happened."""
+        """Repeat an event, or check that the controller has produced it itself."""
         pending = self._guard.journal.pending
         is_own = event.type is EventType.START or (
             event.type is EventType.STOP
@@ -218,7 +218,7 @@ class Rerun:
             self._command(event.stamp, guard.fail(content['text']), is_exact=True)
 
     def _depart_by(self, own: Event, event: Event | None) -> None:
-        """The replayed controller started or stopped where the recorded one did not, or not so."""
+        """Note that the controller started or stopped differently from the recorded one."""
         text = own.content['text'] if own.type is EventType.STOP else own.type
         what = f'stop: {_reason(event)}' if _stops_at(event, own.stamp) else 'used by the law'
         self._depart(f'{what} ({text})', own.stamp)

@@ -14,7 +14,7 @@ from blf_dsc_controller.run import Stamps
 
 
 def law_states(content: Content, joints: Sequence[str]) -> JointStates:
-    """Return the states with telemetry of the law; all of them if the bag has no telemetry.
+    """Return the states with telemetry of the law, or all whose stamps increase if there is none.
 
     `joints` are the names in the bag.
 
@@ -32,7 +32,7 @@ def law_states(content: Content, joints: Sequence[str]) -> JointStates:
 
 
 def sampled_stamps(content: Content) -> Stamps | None:
-    """Stamps of the states with telemetry of the law; one topic may have what another lost."""
+    """Return the stamps of states with telemetry of the law; a topic may hold what another lost."""
     stamps = [
         content.topics[topic].joint_states((), ()).stamp
         for topic in (TRACKING_ERROR, REFERENCE, LEARNING)

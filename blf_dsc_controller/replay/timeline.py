@@ -22,7 +22,7 @@ class Timeline:
         self.paused = True
 
     def position(self, now: int) -> int:
-        """Time in the bag."""
+        """Return the time in the bag."""
         return self._bag if self.paused else self._bag + round((now - self._now) * self._rate)
 
     def pause(self, now: int) -> None:
@@ -38,7 +38,7 @@ class Timeline:
         self._bag, self._now = to, now
 
     def wait(self, until: int, now: int) -> float:
-        """Time until the bag has come to `until` [s]; infinite while paused."""
+        """Return the time [s] until the position reaches `until`; infinite while paused."""
         if self.paused:
             return float('inf')
         left = max(0, until - self.position(now))

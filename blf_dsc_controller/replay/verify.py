@@ -28,14 +28,14 @@ _TURNS = (EventType.ACTIVATE, EventType.DEACTIVATE, EventType.RESET, EventType.S
 
 
 class Verification(NamedTuple):
-    """What a replay found."""
+    """Result of a verification."""
 
     stamp: Stamps  #: (N,) ns, of the states that the law used
     passed_over: int  #: number of states that it did not use
     comparisons: tuple[Comparison, ...]  #: one for each topic of the controller
-    events: tuple[Event, ...]  #: that were replayed
+    events: tuple[Event, ...]  #: replayed events
     safe_torques: int  #: number of replayed torques that are not the law's
-    remarks: tuple[str, ...]  #: what limits the result
+    remarks: tuple[str, ...]  #: limitations of the result
     difference: Difference | None  #: the earliest, in a topic or in an event
 
     @property
@@ -46,7 +46,7 @@ class Verification(NamedTuple):
 
     @property
     def turns(self) -> list[str]:
-        """Activations, deactivations, resets and safe stops in turn."""
+        """Activations, deactivations, resets and safe stops in order."""
         return [
             f'safe stop ({one.content["reason"]})' if one.type is EventType.STOP else one.type
             for one in self.events
@@ -57,13 +57,13 @@ class Verification(NamedTuple):
 def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verification:
     """Replay a bag and compare every message of the controller bit for bit.
 
-    `namespace` is that of the robot, if the bag holds several; `names` are those of topics and
-    joints that have other names in the bag.
+    `namespace` is that of the robot, if the bag holds several; `names` maps topics and joints that
+    have other names in the bag.
 
     Raises:
         ConfigurationError: this version of the package cannot run the configuration.
-        BlfDscError: the bag holds no journal or nothing to compare, it begins after the
-            controller, or it cannot be read.
+        BlfDscError: the bag holds no journal or nothing to compare, begins after the controller,
+            or cannot be read.
     """
     context, content = read_context(path), read_content(path, namespace, names)
     events, content, end = _events(content)
@@ -73,7 +73,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
     if start is not None and start not in states.stamp:
         reason = (
             f'{path} does not hold the first state that the controller used, with the stamp '
-            f'{start} ns, so its state at any later one is not known: start the recorder first'
+            f'{start} ns, so its outputs cannot be reproduced: start the recorder first'
         )
         raise BlfDscError(reason)
     run = Rerun(config, states, errors, sampled_stamps(content))
@@ -95,7 +95,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
 
 
 def _events(content: Content) -> tuple[list[Event], Content, str]:
-    """Events of the first controller of a bag, what came before the next one, and that text."""
+    """Return the events of a bag's first controller, the content up to the next, and a remark."""
     recorded = content.topics.get(JOURNAL)
     if recorded is None:
         raise _nothing_to_compare(content)
@@ -116,10 +116,10 @@ def _events(content: Content) -> tuple[list[Event], Content, str]:
 def _states(
     content: Content, config: ControllerConfig, joints: Sequence[str]
 ) -> tuple[JointStates, dict[int, MessageError]]:
-    """Every joint state, and why some are unreadable.
+    """Return all joint states, and the errors of the unreadable ones by number.
 
     Raises:
-        UnreadableMessageError: not one of them can be read.
+        UnreadableMessageError: none of them can be read.
     """
     recorded = content.topics[JOINT_STATES]
     errors: dict[int, MessageError] = {}
@@ -132,7 +132,7 @@ def _states(
 def _nothing_to_compare(content: Content) -> BlfDscError:
     listing = ''.join(f'\n  {name} ({count})' for name, count in content.message_counts.items())
     return BlfDscError(
-        f'{content.path} holds nothing that the controller published, or not its journal, so '
+        f'{content.path} lacks the messages of the controller or its journal, so '
         f'there is nothing to compare; it holds:{listing}\nTo see what a configuration would '
         'command, use --config'
     )

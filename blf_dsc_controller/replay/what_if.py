@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What another configuration would have commanded on the recorded states of any bag.
 
-Open loop: the arm moved under the recorded torques. Learning therefore gets those as the applied
-ones.
+Open loop: the arm moved under the recorded torques, so learning uses those as the applied ones.
 """
 
 from __future__ import annotations
@@ -34,13 +33,13 @@ class WhatIf(NamedTuple):
     rows: Floats  # of the window's regression in each sample, [X | u] (N, n, m + 1)
     active: Floats  # which disturbance columns are estimated at the end (m,)
     applied: Floats  # torque from each state to the next (N, n), N m; NaN where unknown
-    source: str  # topic that it comes from
-    left_out: int  # states, as in `RecordedStates`
-    error_ratio: Floats  # largest |xi1| / k_c of each joint (n,), against this reference
+    source: str  # topic of the applied torque
+    left_out: int  # number of states, as in `RecordedStates`
+    error_ratio: Floats  # largest |xi1| / k_c of each joint (n,), with this reference
 
     @property
     def difference(self) -> Floats:
-        """Torque of this configuration less the applied one (N, n) [N m]."""
+        """Torque of this configuration minus the applied one (N, n) [N m]."""
         return np.asarray(self.run.torque - self.applied)
 
 
@@ -49,8 +48,8 @@ class RecordedStates(NamedTuple):
 
     states: JointStates  # (N,)
     applied: Floats  # torque from each state to the next (N, n), N m; NaN for the last if unknown
-    source: str  # topic that it comes from
-    left_out: int  # states that are not finite, or have no known torque before them
+    source: str  # topic of the applied torque
+    left_out: int  # number of states that are not finite or follow an unknown torque
 
 
 def read_states(
@@ -58,8 +57,8 @@ def read_states(
 ) -> RecordedStates:
     """Read states and torques of any bag (folder, storage file, or ROS 1 `.bag`).
 
-    `namespace` is that of the robot, if the bag holds several; `names` are those of topics and
-    joints that have other names in the bag.
+    `namespace` is that of the robot, if the bag holds several; `names` maps topics and joints that
+    have other names in the bag.
 
     Raises:
         BlfDscError: the bag cannot be read, or does not hold the applied torques.
@@ -81,7 +80,7 @@ def read_states(
 def what_if(
     path: Path, config: ControllerConfig, namespace: str = '', names: NameMap = NO_NAMES
 ) -> WhatIf:
-    """Run a configuration over the states of any bag; arguments and errors as of `read_states`.
+    """Run a configuration over the states of any bag; arguments and errors as for `read_states`.
 
     Raises:
         StartError: the law cannot take over in the first state, and approaches are disabled.
@@ -91,7 +90,7 @@ def what_if(
 
 
 def run_over(recorded_states: RecordedStates, config: ControllerConfig) -> WhatIf:
-    """Run a configuration over recorded states; errors as of `what_if`."""
+    """Run a configuration over recorded states; errors as for `what_if`."""
     states, applied, source, left_out = recorded_states
     config = replace(config, learning=replace(config.learning, torque_source='effort'))
     controller = controller_of(config)

@@ -2,9 +2,9 @@
 """The closed loop without ROS: the kernels that the nodes run, in one compiled loop.
 
 A lock-step run over ROS and an offline run of the same configuration agree bit for bit, stops and
-safe torques included: the compiled loop runs as long as its checks find nothing to object to.  A
-chunk of samples in which they do is run again, sample by sample, by the guard of the node, and so
-is all that follows a stop.
+safe torques included: the compiled loop runs as long as its checks pass.  A chunk of samples in
+which one fails is run again, sample by sample, by the node's guard, and so is everything after a
+stop.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from sim_plant.arm import Arm
 from sim_plant.arms import parameter_names_of
 from sim_plant.plant import Plant, plant_of, steps_of
 
-_CHUNK = 1000  # samples; the guard takes some 20 ms for them
+_CHUNK = 1000  # samples; the guard takes about 20 ms for them
 _NOTHING = MetricsSettings(0, 0, 0, 0, 0, *np.zeros((3, 0)))
 _NO_METRICS = pack(_NOTHING), new_metrics(_NOTHING)
 
@@ -69,12 +69,12 @@ def run_loop(
     metrics: np.ndarray,
     checks_vector: np.ndarray,
 ) -> bool:
-    """Run the samples from number `first` to `last`; at the end, the torque is not applied.
+    """Run the samples `first` to `last`; with `is_end`, the torque of the last is not applied.
 
-    With checks (`law.checks`) the first sample to object to ends this, and False is returned.
+    With checks (`law.checks`), stop at the first invalid or suspect sample and return False.
 
-    Without `truths`, `measurements` and `samples` have one row, which each sample overwrites, there
-    are no energies, and a number that is not finite ends the run; numba compiles this apart.
+    Without `truths`, `measurements` and `samples` have one row, which each sample overwrites, no
+    energies are computed, and a non-finite number ends the run; numba compiles this separately.
     Metrics are updated if their settings have joints.
     """
     law = settings_of(settings, model)
@@ -119,9 +119,9 @@ def simulate(
     plant_config: PlantConfig,
     progress: Callable[[Record, int], None] | None = None,
 ) -> Record:
-    """Run both configurations against each other for `duration` and return every sample.
+    """Run controller and plant in closed loop for `duration` and return every sample.
 
-    The plant's duration must not be 0.  `progress` is called now and then with the record and the
+    The plant's duration must not be 0.  `progress` is called periodically with the record and the
     number of rows that are filled.
 
     Raises StartError if the law cannot take over and approach.enabled is false, and MotionError if
@@ -146,7 +146,7 @@ def simulate(
 
 
 def _run_compiled(guard: Guard, plant: Plant, record: Record, chunk: range) -> bool:
-    """Run a chunk of samples without a stop; False, with nothing changed, if there is to be one."""
+    """Run a chunk in the compiled loop; return False, with nothing changed, if a check fails."""
     controller = guard.controller
     if not guard.supervisor.running or guard.config.safety.velocity != 'measured':
         return False
@@ -190,7 +190,7 @@ def simulate_law(
     plant_config: PlantConfig,
     metrics: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Record:
-    """Run the law alone, past every limit of its supervisor, and return every sample.
+    """Run the law alone, without a supervisor, and return every sample.
 
     The plant's duration must not be 0.  `metrics` are packed `MetricsSettings` and the vector of
     `new_metrics`, which is updated.
@@ -218,7 +218,7 @@ def simulate_law(
 def run_metrics(
     controller: Controller, plant: Plant, samples: int, settings: MetricsSettings
 ) -> LoopMetrics:
-    """Run so many samples, with a controller that has begun, and return the metrics alone."""
+    """Run `samples` samples with a controller that has begun, and return only the metrics."""
     metrics = new_metrics(settings)
     arrays = (np.zeros((1, 3 * plant.joints)), controller.sample_vector.reshape(1, -1), None)
     _run_samples(controller, plant, (0, samples - 1, True), arrays, (pack(settings), metrics))
@@ -232,7 +232,7 @@ def _run_samples(
     arrays: tuple[np.ndarray, np.ndarray, np.ndarray | None],
     metrics: tuple[np.ndarray, np.ndarray],
 ) -> bool:
-    """Call `run_loop`: first, last, is_end; measurements, samples, truths; the rest as there."""
+    """Call `run_loop` with (first, last, is_end) and arrays (measurements, samples, truths)."""
     return run_loop(
         plant.arm,
         plant.settings,

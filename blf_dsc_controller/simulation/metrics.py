@@ -22,8 +22,8 @@ class MetricsSettings(NamedTuple):
     moments: int
     settled: int  # first sample of the rms error
     limit: Annotated[Array, 'n']  # N m, torque at which a joint is saturated; 0: none
-    order: Annotated[Array, 'p']  # place of each in those of the plant; -1: it has others
-    samples: Annotated[Array, 'moments']  # at which the parameter error is kept
+    order: Annotated[Array, 'p']  # index of each in those of the plant; -1: it has others
+    samples: Annotated[Array, 'moments']  # at which the parameter error is stored
 
 
 class LoopMetrics(NamedTuple):
@@ -47,7 +47,7 @@ metrics_of, _metrics_size = view_of(LoopMetrics), size_of(LoopMetrics)
 
 
 def new_metrics(settings: MetricsSettings) -> np.ndarray:
-    """Vector of the metrics before the first sample."""
+    """Return the vector of the metrics before the first sample."""
     vector = np.zeros(_metrics_size(settings))
     metrics = metrics_of(vector, settings)
     metrics.finite[0] = 1.0
@@ -58,7 +58,7 @@ def new_metrics(settings: MetricsSettings) -> np.ndarray:
 
 @inner
 def is_finite(vector: np.ndarray) -> bool:
-    """Whether all entries are finite."""
+    """Return whether all entries are finite."""
     finite = True
     for i in range(vector.size):
         finite = finite and isfinite(vector[i])
@@ -67,7 +67,7 @@ def is_finite(vector: np.ndarray) -> bool:
 
 @inner
 def relative_error(estimate: np.ndarray, P: np.ndarray, order: np.ndarray) -> float:
-    """|P^ - P| / |P|; NaN if the parameters are not those of the plant."""
+    """Return |P^ - P| / |P|, or NaN if the parameters are not those of the plant."""
     difference = 0.0
     size = 0.0
     for j in range(order.size):
@@ -81,7 +81,7 @@ def relative_error(estimate: np.ndarray, P: np.ndarray, order: np.ndarray) -> fl
 def update_joint(
     settings: MetricsSettings, metrics: LoopMetrics, i: int, t: float, applied: float, s: Sample
 ) -> bool:
-    """Update the metrics of joint i; True if it is saturated."""
+    """Update the metrics of joint i and return whether it is saturated."""
     error = abs(s.xi1[i])
     if error >= s.bound[i] and isnan(metrics.violation[0]):
         metrics.violation[0] = t
@@ -100,9 +100,9 @@ def update_metrics(
     measurement: np.ndarray,
     sample: Sample,
 ) -> None:
-    """Update the metrics, the true parameters in them, with the sample of time t [s].
+    """Update the metrics, which hold the true parameters, with the sample at time t [s].
 
-    A sample that is not finite ends them.
+    They are not updated after a sample that is not finite.
     """
     if not (is_finite(measurement) and is_finite(sample.torque)):
         metrics.finite[0] = 0.0

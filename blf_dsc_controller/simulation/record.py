@@ -22,11 +22,11 @@ START = 1_000_000_000
 
 @dataclass(frozen=True)
 class Record:
-    """All samples of a run, a row each."""
+    """All samples of a run, one row each."""
 
     stamps: np.ndarray  # (k,) ns, since the start
     measurements: np.ndarray  # (k, 3 n) [q, dq, applied torque of the last interval]
-    samples: np.ndarray  # (k, s) rows of `law.state.Sample`; NaN but for bound, torque after a stop
+    samples: np.ndarray  # (k, s) rows of `law.state.Sample`; after a stop NaN except bound, torque
     truths: np.ndarray  # (k, p + 3 n) [P, tau_dist, q, dq]
     parameters: tuple[str, ...]  # names of the entries of P
     config: ControllerConfig
@@ -34,11 +34,11 @@ class Record:
     journal: Journal  # events of the run, their stamps from `START` on
 
     def sample(self, row: int) -> Sample:
-        """Names for one row of `samples`."""
+        """Return one row of `samples` with named fields."""
         return sample_of(self.samples[row], self.controller.settings)
 
     def run(self) -> Run:
-        """All samples as a `Run`, with the truth and, where the law knows it, the terms of (29)."""
+        """Return all samples as a `Run`, with the truth and the terms of (29) that the law has."""
         config = self.config
         run = run_of(config, self.controller, self.stamps, self.measurements, self.samples)
         true = (*self.parameters, *disturbance_names(config.joints))
@@ -61,7 +61,7 @@ def new_record(
     rows: int,
     journal: Journal,
 ) -> Record:
-    """Record of so many samples, to be filled; `parameters` are the names of the plant's."""
+    """Return a record of `rows` samples to fill; `parameters` are the names of the plant's."""
     return Record(
         stamps=np.arange(rows, dtype=np.int64) * plant.period_ns,
         measurements=np.zeros((rows, 3 * plant.joints)),

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Supervision of the law: checks, stops, the safe torque. No ROS."""
+"""Supervision of the law: checks, stops and the safe torque, without ROS."""

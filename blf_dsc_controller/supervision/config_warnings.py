@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Warnings before the start: gains, limits and windows that are valid but cannot work well.
 
-They rest on the initial estimate of the parameters, which is a guess. doc/tuning.md derives them.
+They are based on the initial parameter estimate, which is a guess. doc/tuning.md derives them.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from blf_dsc_controller.supervision.reference_load import (
 
 Floats = NDArray[np.float64]
 
-_MARGIN = 1.25  # of torque beyond what the reference needs
-_PERIODS = 0.02  # by which a window may miss a whole number of periods
-_CLOSE = 0.8  # of the bound
+_MARGIN = 1.25  # recommended torque limit over what the reference needs
+_PERIODS = 0.02  # periods by which a window may differ from a whole number
+_CLOSE = 0.8  # fraction of the bound
 _FUNNEL = 20.0  # times the bound; up to 5 with the presets
 _SLUGGISH = 1.0  # rad/s^2; the weakest joint of the presets has 60
-_IMPOSSIBLE = 1e-3  # of the largest eigenvalue of the pseudo-inertia: more than rounded figures
+_IMPOSSIBLE = 1e-3  # of the pseudo-inertia's largest eigenvalue: more than rounding errors
 _SETTLED = 10.0  # time constants of the filter (8) ...
-_FILTERED = 4.0  # ... and of the regressor's, which both sides of the identity pass
+_FILTERED = 4.0  # ... and of the regressor's filter, applied to both sides of the identity
 
 
 class Finding(NamedTuple):
-    """Gains that cannot work well: of what, by how much beyond 1, and a sentence."""
+    """Gains that cannot work well: what they affect, a ratio (bad above 1), and a sentence."""
 
     of: str
     excess: float
@@ -49,9 +49,9 @@ class Finding(NamedTuple):
 def config_warnings(
     config: ControllerConfig, q: Floats | None = None, load: ReferenceLoad | None = None
 ) -> list[str]:
-    """Warnings, a sentence each that begins with the parameter to change first.
+    """Return the warnings, one sentence each, beginning with the parameter to change first.
 
-    `q` (n,) [rad] are the measured positions at the start, and `load` that of the reference, if
+    `q` (n,) [rad] are the measured positions at the start and `load` the load of the reference, if
     known.
     """
     settings = settings_of_config(config)
@@ -66,7 +66,7 @@ def config_warnings(
 
 
 def worsened(before: ControllerConfig, after: ControllerConfig, load: ReferenceLoad) -> list[str]:
-    """Warnings of gains after a change that were not warned of before it, or less."""
+    """Return the warnings on gains that are new or worse after a change."""
     known = {one.of: one.excess for one in _of_gains(before, load)}
     return [one.text for one in _of_gains(after, load) if one.excess > known.get(one.of, 1.0)]
 
@@ -79,12 +79,12 @@ def _of_start(config: ControllerConfig, q: Floats | None) -> Iterator[str]:
         if _CLOSE * bound <= abs(error) < bound:
             yield (
                 f'barrier.bound: {joint} starts {error:+.4g} rad from the reference, close to its '
-                f'bound of {bound:g} rad: the first error of the estimate may push it outside'
+                f'bound of {bound:g} rad: the initial estimation error may push it outside'
             )
 
 
 def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
-    """Inertias that no body has; defaults that follow from the URDF and are hardly meant."""
+    """Check for impossible inertias, and for defaults from the URDF that are hardly intended."""
     if config.model != 'urdf':
         return
     robot, barrier = config.robot, config.barrier
@@ -92,29 +92,29 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
         moments = np.linalg.eigvalsh(pseudo_inertia(joint.inertia))
         if moments[0] < -_IMPOSSIBLE * moments[-1]:
             yield (
-                f'robot.urdf: no body has the inertia of what {joint.name} moves ({joint.link}): '
-                f'one of its moments is larger than the sum of the other two: are they in kg m^2, '
-                f'about the centre of mass?'
+                f'robot.urdf: the inertia of what {joint.name} moves ({joint.link}) is impossible: '
+                f'one moment is larger than the sum of the other two: are they in kg m^2, about '
+                f'the centre of mass?'
             )
         if math.isinf(joint.effort) and limit == UNKNOWN_EFFORT:
             yield (
-                f'torque.limit: {joint.name} has no effort in the URDF: {limit:g} N m are assumed; '
-                f'give what its drive can bear'
+                f'torque.limit: {joint.name} has no effort in the URDF: {limit:g} N m is assumed; '
+                f'set the torque that its drive can withstand'
             )
     for name, acceleration in zip(
         config.joints, config.torque.limit / load.free_inertia, strict=True
     ):
         if acceleration < _SLUGGISH:
             yield (
-                f'robot.urdf: with all its torque {name} accelerates by {acceleration:.2g} rad/s^2 '
-                f'only: are masses in kg, moments of inertia in kg m^2 and lengths in m?'
+                f'robot.urdf: at its torque limit {name} accelerates at only {acceleration:.2g} '
+                f'rad/s^2: are masses in kg, moments of inertia in kg m^2 and lengths in m?'
             )
     for name, widest, bound in zip(config.joints, barrier.widest, barrier.bound, strict=True):
         if widest > _FUNNEL * bound:
             yield (
                 f'barrier.initial_bound: {name} begins with a bound of {widest:.3g} rad, which '
                 f'narrows to {bound:g}: with gains for robot.lag of {robot.lag:g} s it would sag '
-                f'so far under an undeclared load of {robot.payload:g} kg (robot.payload)'
+                f'that far under an undeclared load of {robot.payload:g} kg (robot.payload)'
             )
 
 
@@ -240,7 +240,7 @@ def _of_window(config: ControllerConfig, settings: Settings, windows: Floats) ->
     pole = learning.filter_pole if filtered else learning.derivative_filter
     if learning.settling_time * pole < (_FILTERED if filtered else _SETTLED):
         yield (
-            f'learning.settling_time: {learning.settling_time:g} s are too short for the filters '
+            f'learning.settling_time: {learning.settling_time:g} s is too short for the filters '
             f'of the prediction error ({pole:g} rad/s): the initial transient is still in the '
             f'first windows'
         )

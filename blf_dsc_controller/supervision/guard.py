@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The guarded law in operation: activated, reset, given trajectories and other gains."""
+"""The guarded law in operation: activation, reset, trajectories and changes of gains."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from blf_dsc_controller.supervision.supervisor import Phase
 
 
 class LatePlanError(TrajectoryError):
-    """The time from which on a trajectory was to be followed has passed while it was planned."""
+    """The time at which a trajectory should take effect passed while it was planned."""
 
     def __init__(self, at: float, now: float) -> None:
-        super().__init__([f'it was to begin at {at:.6g} s and was planned at {now:.6g} s'])
+        super().__init__([f'it should begin at {at:.6g} s, but was planned only at {now:.6g} s'])
 
 
 class Plan(NamedTuple):
     """A planned trajectory."""
 
     trajectory: Trajectory
-    at: float  # s since the start, from which on it has an effect
+    at: float  # s since the start, when it takes effect
     before: np.ndarray  # packed reference that it continues
     motion: Motion
 
 
 class Guard(GuardedLaw):
-    """A controller that stops by itself; it notes every event in its journal."""
+    """The guarded law in operation; it records every event in its journal."""
 
     def activate(self) -> None:
         """Take command with the next state; estimates are kept if so configured."""
         self._note(EventType.ACTIVATE)
         if not self.config.safety.keep_estimates:
             self.controller.reset()
-            self._resumable = False  # t counts the window's filling, too
+            self._resumable = False  # t also counts the filling of the window
         elif self._clean:
             self.controller.state.samples[0] = 0.0
         else:
@@ -50,7 +50,7 @@ class Guard(GuardedLaw):
         self.watchdog.restart()
 
     def deactivate(self) -> None:
-        """Leave command: the torque goes to the safe one on its ramp."""
+        """Leave command: the torque ramps to the safe torque."""
         self._note(EventType.DEACTIVATE)
         self._resumable = self.supervisor.running
         self.supervisor.enter(Phase.INACTIVE)
@@ -60,7 +60,7 @@ class Guard(GuardedLaw):
             self._safe_torque.begin_ramp(self.config.safety.deactivation_ramp)
 
     def reset(self) -> None:
-        """Forget all estimates and faults, and start with the next state."""
+        """Discard all estimates and faults, and restart with the next state."""
         self._note(EventType.RESET)
         self._resumable = False
         self.controller.reset()
@@ -70,7 +70,7 @@ class Guard(GuardedLaw):
         self._start_over()
 
     def plan(self, trajectory: Trajectory, at: float | None = None) -> Plan:
-        """Plan a trajectory, in any thread, to `adopt` until the time `at` [s], by default now.
+        """Plan a trajectory, in any thread, to `adopt` by the time `at` [s], which defaults to now.
 
         Raises:
             TrajectoryError: it cannot be followed.
@@ -84,7 +84,7 @@ class Guard(GuardedLaw):
 
         Raises:
             LatePlanError: it begins in the past.
-            TrajectoryError: it does not continue the present reference, which goes on.
+            TrajectoryError: it does not continue the current reference, which stays in force.
         """
         self._check_running()
         if planned.before is not self.controller.reference_vector:
@@ -100,7 +100,7 @@ class Guard(GuardedLaw):
         self.supervisor.enter(Phase.TRACKING if is_settled else Phase.APPROACHING)
 
     def retune(self, config: ControllerConfig) -> None:
-        """Put a configuration in force, between two samples."""
+        """Apply a configuration, between two samples."""
         self._note(EventType.PARAMETERS, parameters=differences(self.config, config))
         if self.supervisor.running:
             last = self._safe_torque.last.measurement
@@ -111,13 +111,13 @@ class Guard(GuardedLaw):
         self.samples.set_limits(config.safety)
 
     def problems(self, config: ControllerConfig) -> list[str]:
-        """Why a configuration cannot be put in force now; empty if it can."""
+        """Return why a configuration cannot be applied now; empty if it can."""
         if not self.supervisor.running:
             return []
         return list(retuning.problems(self.controller, config, self.time))
 
     def release(self) -> None:
-        """Note the end of the controller."""
+        """Record the controller's release in the journal."""
         self._note(EventType.RELEASE)
 
     def _note(self, event: EventType, **content: Any) -> None:

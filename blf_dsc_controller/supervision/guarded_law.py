@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The law between its checks: for every joint state a torque that is safe to apply.
+"""The law between its checks: a torque that is safe to apply for every joint state.
 
 joint state -> StateCheck -> law -> SampleCheck -> torque
                    |                     |
@@ -42,24 +42,24 @@ _REASONS: dict[type[cdr.MessageError], Reason] = {
 
 
 class GuardedLaw:
-    """The law, its checks, and the torque without it; it notes every start and stop in its journal.
+    """The law with its checks and safe torque; it records every start and stop in its journal.
 
     `update`, `reject`, `watch` and `fail` return the torque (n,) [N m] to command, or None.
 
     Attributes:
-        config: in force.
+        config: configuration in force.
         controller: the law.
         supervisor: phase, and the reason of a stop.
         states, samples: the checks before and after the law.
-        watchdog: the check that states come at all.
-        journal: events, and what has been processed so far.
+        watchdog: the check for missing states.
+        journal: events, and counts of what has been processed so far.
         has_sample: whether the law used the last message, so that there is new telemetry.
         start_error: why the law could not start; None if it could.
         foreign: messages ignored because they name none of the joints.
-        start_stamp: of t = 0 [ns]; -1 before the first start.
-        last_stamp: of the last sample of the law [ns].
-        settled: end of the approach or of a mixed-in trajectory [s].
-        compute_time: of the last sample [s].
+        start_stamp: stamp of t = 0 [ns]; -1 before the first start.
+        last_stamp: stamp of the law's last sample [ns].
+        settled: end of the approach or of the blend into a trajectory [s].
+        compute_time: computation time of the last sample [s].
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class GuardedLaw:
         return self._safe_at(stamp, measurement)
 
     def _use(self, stamp: int, measurement: Vector) -> Vector | None:
-        """Give a state to the law, which does not use invalid ones."""
+        """Pass a state to the law, or stop if the law finds it invalid."""
         law, last = self.controller, self._safe_torque.last
         is_first = self.supervisor.phase is Phase.STARTING
         if is_first:
@@ -147,12 +147,12 @@ class GuardedLaw:
         return torque
 
     def _reject(self, stamp: int, measurement: Vector) -> Vector | None:
-        """Stop at a state that is not valid."""
+        """Stop because of an invalid state."""
         self._stop(*self.states.invalid(self.config.safety, measurement))
         return self._safe_at(stamp, measurement)
 
     def _safe_at(self, stamp: int, measurement: Vector) -> Vector | None:
-        """Safe torque at a state that the law has not used."""
+        """Return the safe torque for a state that the law has not used."""
         limit, dt = self.config.safety.velocity_limit, self.config.sample_time
         self._safe_torque.last.salvage(stamp, measurement, limit, dt)
         return self._safe(dt)
@@ -192,9 +192,9 @@ class GuardedLaw:
             self.supervisor.enter(Phase.TRACKING)
 
     def advance(self, stamp: int, measurement: Vector, count: int) -> None:
-        """Go on to the state of a stamp [ns], the last of `count` that the law has used.
+        """Advance to the state of a stamp [ns], the last of `count` that the law has used.
 
-        There was nothing to object to, and `samples.ratio` and `samples.kept` are up to date.
+        All checks passed, and `samples.ratio` and the kept estimates are up to date.
         """
         self.journal.stamp = stamp
         self.journal.messages += count
@@ -217,22 +217,22 @@ class GuardedLaw:
         return self._safe_without_state(self.config.sample_time)
 
     def watch(self) -> Vector | None:
-        """Return a torque during a silence; to be called when `watchdog.next_check` is over."""
+        """Return a torque during a silence, else None; call it after `watchdog.next_check` [s]."""
         limit = self.config.sample_time + self.config.safety.state_timeout
         silent = self.watchdog.silence(limit)
         if silent == 0.0 or not (self.watchdog.on and self.commanding):
             return None
-        return self.time_out(f'no joint state has come for {silent:.3g} s')
+        return self.time_out(f'no joint state received for {silent:.3g} s')
 
     def time_out(self, text: str) -> Vector | None:
         """Return the torque of one watchdog period without a joint state."""
-        if self.supervisor.phase is not Phase.STARTING:  # which waits for a state
+        if self.supervisor.phase is not Phase.STARTING:  # which is waiting for a state
             self._stop(Reason.STATE_TIMEOUT, text)
         self.watchdog.torques += 1
         return self._safe_without_state(PERIOD)
 
     def end_silence(self) -> None:
-        """Note how many torques the watchdog has commanded."""
+        """Record in the journal how many torques the watchdog has commanded."""
         if self.watchdog.torques:
             self.journal.note(EventType.SILENCE, torques=self.watchdog.torques)
             self.watchdog.torques = 0
@@ -262,9 +262,9 @@ class GuardedLaw:
         return self._safe(dt)
 
     def _safe(self, dt: float) -> Vector | None:
-        """Safe torque, `dt` [s] further on the ramp.
+        """Return the safe torque, `dt` [s] further along the ramp.
 
-        None while no state has been seen, and while inactive from the beginning.
+        None before the first usable state, and while inactive before any torque was commanded.
         """
         if self.supervisor.phase is Phase.INACTIVE and not self.commanding:
             return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the reference demands and excites, followed exactly with the initial estimate."""
+"""Torque and excitation of the reference, followed exactly with the initial estimate."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from blf_dsc_controller.reference.terms import sampled
 
 Floats = NDArray[np.float64]
 
-_POINTS = 400  # on the reference
-_LONGEST = 120.0  # s of it
+_POINTS = 400  # along the reference
+_LONGEST = 120.0  # s of the reference
 _FINE = 0.1  # time constants of the regressor's filter between two points of a window ...
-_WINDOW_POINTS = 400  # ... of which it has at least so many
-_WINDOWS = 8  # that begin within the length of one
+_WINDOW_POINTS = 400  # ... which has at least this many
+_WINDOWS = 8  # windows that begin within the length of one
 
 
 class ReferenceLoad(NamedTuple):
-    """What the reference demands, followed exactly with the initial estimate."""
+    """Torque and inertia of the reference, followed exactly with the initial estimate."""
 
     torque: Floats  # largest magnitude (n,), N m
-    inertia: Floats  # M along it, where it is positive definite (k, n, n), kg m^2
+    inertia: Floats  # M along the reference, where positive definite (k, n, n), kg m^2
 
     def rate(self, settings: Settings) -> float:
-        """Largest eigenvalue of M^-1 K_p + omega_v, 1/s."""
-        Kp = np.diag(settings.Kp)[np.newaxis]  # numpy 1 takes a matrix beside a stack for vectors
+        """Return the largest eigenvalue of M^-1 K_p + omega_v, 1/s."""
+        Kp = np.diag(settings.Kp)[np.newaxis]  # numpy 1 reads a lone matrix as vectors
         roots = np.linalg.eigvals(np.linalg.solve(self.inertia, Kp))
         return float(np.abs(roots).max(initial=0.0)) + settings.damping_rate
 
     @property
     def free_inertia(self) -> Floats:
-        """Inertia of each joint with the others free, at least (n,), kg m^2."""
+        """Smallest inertia (n,) of each joint with the others free, kg m^2."""
         free = 1.0 / np.diagonal(np.linalg.inv(self.inertia), axis1=1, axis2=2)
         least: Floats = free.min(axis=0, initial=np.inf)
         return least
 
     def damping(self, settings: Settings) -> Floats:
-        """Damping of each joint with the others free, at least (n,), N m s/rad."""
+        """Return the smallest damping (n,) of each joint with the others free, N m s/rad."""
         rate = settings.damping_rate
         damped = rate * self.free_inertia if rate > 0.0 else 0.0
         return settings.Kp + damped
@@ -69,7 +69,7 @@ def reference_load(config: ControllerConfig, settings: Settings) -> ReferenceLoa
 
 
 def windows_along(config: ControllerConfig, settings: Settings) -> Floats:
-    """Phi (21) of windows along the reference, followed exactly: (k, m, m), filters included.
+    """Return Phi (21) (k, m, m) of windows along the exactly followed reference, with filters.
 
     The first is full after tau_d + T_a, as in the controller; the last ends a slowest period later.
     """
@@ -95,7 +95,7 @@ def windows_along(config: ControllerConfig, settings: Settings) -> Floats:
 
 
 def _horizon(config: ControllerConfig) -> float:
-    """Time [s] in which the reference does all that it does, at most `_LONGEST`."""
+    """Return the time [s] that covers the whole reference, at most `_LONGEST`."""
     if config.reference.type == 'waypoints':
         return min(max(config.reference.times), _LONGEST)
     frequencies = [w for w in config.reference.frequency if w > 0.0]

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gains changed while the law runs: validation, and the change without a bump.
+"""Changes of gains while the law runs: validation and bumpless transfer.
 
-The errors stay what they are while the gains on them jump, and so would the torque. Two states of
-the law take up the difference: the surface filter moves along with the virtual control, so that
-alpha2' does not change, and the disturbance estimate, the integrator of the law, takes what is
-left; it then returns to its own value at the rate of its gain. A joint whose disturbance gain is 0
-has no integrator, and its torque steps.
+A jump of the gains at unchanged errors would make the torque jump. Two states of the law absorb
+the difference: the surface filter is shifted with the virtual control, so that alpha2' does not
+change, and the disturbance estimate, the integrator of the law, absorbs the rest; it then returns
+to its own value at the rate of its gain. A joint whose disturbance gain is 0 has no integrator, so
+its torque steps.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.settings import LINEAR
 
 Vector = NDArray[np.float64]
-_STABLE = 2.0  # x += -a x diverges from a = 2 on
-_ROUNDED = 1.0 + 1e-9  # of the radius: an estimate that the projection holds lies on it
+_STABLE = 2.0  # x += -a x diverges for a >= 2
+_ROUNDED = 1.0 + 1e-9  # times the radius, on which the projection may hold an estimate
 
 
 def apply(controller: Controller, config: ControllerConfig) -> None:
@@ -35,7 +35,7 @@ def apply(controller: Controller, config: ControllerConfig) -> None:
 def apply_bumpless(
     controller: Controller, config: ControllerConfig, t: float, measurement: Vector
 ) -> None:
-    """Replace the settings of a running law such that its torque does not jump.
+    """Replace the settings of a running law without a jump of its torque.
 
     `t` [s] and `measurement` (3 n,) are those of the last sample.
     """
@@ -53,7 +53,7 @@ def apply_bumpless(
 def _trial(
     controller: Controller, t: float, dt: float, measurement: Vector
 ) -> tuple[Vector, Vector]:
-    """beta2 and demanded torque of an update that leaves the state unchanged."""
+    """Return beta2 and demanded torque of an update, leaving the state unchanged."""
     saved = controller.save()
     controller.update(t, dt, measurement)
     controller.restore(saved)
@@ -61,7 +61,7 @@ def _trial(
 
 
 def problems(controller: Controller, config: ControllerConfig, t: float) -> Iterator[str]:
-    """Why a running law cannot take a valid configuration at the time t [s], a sentence each."""
+    """Yield reasons why a running law cannot accept a valid configuration at time t [s]."""
     state, p, learning = controller.state, controller.settings.p, config.learning
     errors, torques = np.abs(controller.sample.xi1), np.abs(controller.sample.torque)
     barrier.update_bound(settings_of_config(config), controller.signals, t)
@@ -80,8 +80,8 @@ def problems(controller: Controller, config: ControllerConfig, t: float) -> Iter
     norm = float(np.linalg.norm(state.estimate[:p]))
     if norm > _ROUNDED * learning.radius:
         yield (
-            f'learning.radius: the estimate is at {norm:.4g} kg m^2 now, outside of a ball of '
-            f'{learning.radius:g} kg m^2: choose a larger one'
+            f'learning.radius: the norm of the estimate is {norm:.4g} kg m^2 now, above a '
+            f'radius of {learning.radius:g} kg m^2: choose a larger one'
         )
     gain = max(*learning.adaptation_gain, learning.column_gain if len(state.estimate) > p else 0.0)
     stretch = 1.0 if learning.update == 'newton' else float(np.linalg.norm(state.Phi, 2))
@@ -89,6 +89,6 @@ def problems(controller: Controller, config: ControllerConfig, t: float) -> Iter
     if state.latched[0] and step >= _STABLE:
         yield (
             f'learning.weight: with the update {learning.update}, each sample would correct the '
-            f'estimates by {step:.3g} times their error, which diverges from {_STABLE:g} on: lower '
-            'learning.weight or learning.adaptation_gain'
+            f'estimates by {step:.3g} times their error, which diverges at {_STABLE:g} or more: '
+            'lower learning.weight or learning.adaptation_gain'
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The safe torque, what it knows of the arm, the ramp to it from the law, and the way back."""
+"""The safe torque, the state it is computed from, and the ramps between it and the law."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ Vector = NDArray[np.float64]
 
 
 class LastState:
-    """The last joint state that can be used.
+    """The last usable joint state.
 
     Attributes:
         measurement: [q, dq, applied torque] (3 n,) [rad, rad/s, N m].
-        q, dq: views on it; a velocity that is not known now is zero.
-        age: time without such a state [s]; infinite before the first.
+        q, dq: views of it; a velocity that is currently unknown is zero.
+        age: time without a usable state [s]; infinite before the first.
     """
 
     def __init__(self, n: int) -> None:
@@ -33,7 +33,7 @@ class LastState:
         self._stamp = -1
 
     def take(self, stamp: int, measurement: Vector) -> None:
-        """Take a valid state with its stamp [ns]."""
+        """Store a valid state with its stamp [ns]."""
         self.measurement[:] = measurement
         self.age = 0.0
         self._stamp = stamp
@@ -41,9 +41,9 @@ class LastState:
     def salvage(
         self, stamp: int, measurement: Vector, velocity_limit: float, period: float
     ) -> None:
-        """Take what can be used of any other state, `period` [s] after the last.
+        """Store the usable part of any other state, `period` [s] after the last.
 
-        Positions that are not finite and a repeated stamp say nothing of where the arm is now.
+        Positions that are not finite or have a repeated stamp do not show where the arm is now.
         """
         q, dq, _ = measurement.reshape(3, -1)
         if stamp == self._stamp or not np.isfinite(q).all():
@@ -55,16 +55,16 @@ class LastState:
         self._stamp = stamp
 
     def miss(self, period: float) -> None:
-        """Let `period` [s] pass without a state."""
+        """Account for `period` [s] without a usable state."""
         self.dq[:] = 0.0
         self.age += period
 
 
 def safe_torque(safety: Safety, settings: Settings, last: LastState, estimate: Vector) -> Vector:
-    """Safe torque (n,) [N m], within the torque limit and always finite.
+    """Return the safe torque (n,) [N m], within the torque limit and always finite.
 
-    It is zero, damping -D dq, or damping with the gravity H(q, 0, 0, 0) P^, and fades to zero
-    while no state comes.
+    It is zero, damping -D dq, or damping plus gravity H(q, 0, 0, 0) P^, and fades to zero while no
+    usable state arrives.
     """
     torque = np.zeros(settings.n)
     if last.age >= safety.fade_time:
@@ -84,11 +84,11 @@ def safe_torque(safety: Safety, settings: Settings, last: LastState, estimate: V
 
 
 class SafeTorque:
-    """The torque without the law: on a ramp from the last torque to the safe one.
+    """The torque without the law: a ramp from the last torque to the safe torque.
 
     Attributes:
-        commanded: the last torque (n,) [N m], of the law or of this.
-        last: the last joint state that can be used.
+        commanded: the last torque (n,) [N m], from the law or this ramp.
+        last: the last usable joint state.
     """
 
     def __init__(self, n: int) -> None:
@@ -98,14 +98,14 @@ class SafeTorque:
         self._duration = self._elapsed = 0.0
 
     def begin_ramp(self, duration: float) -> None:
-        """Start a straight line in time at the last torque; it lasts `duration` [s]."""
+        """Start a linear ramp of `duration` [s] at the last torque."""
         self._start[:] = self.commanded
         self._duration, self._elapsed = duration, 0.0
 
     def advance(
         self, safety: Safety, settings: Settings, estimate: Vector, dt: float
     ) -> Vector | None:
-        """Return the torque (n,) [N m] after `dt` [s] more; None while no state has been seen."""
+        """Return the torque (n,) [N m] `dt` [s] later; None before the first usable state."""
         if self.last.age == inf:
             return None
         goal = safe_torque(safety, settings, self.last, estimate)
@@ -120,7 +120,7 @@ class SafeTorque:
 def limit_first_torque(controller: Controller, last: Vector, dt: float) -> None:
     """Limit the rate of the law's first torque, `dt` [s] after the torque `last` (n,) [N m].
 
-    The law does not know that one.
+    The law does not know `last`.
     """
     settings, state, sample = controller.settings, controller.state, controller.sample
     step = np.where(settings.rate_limit > 0.0, settings.rate_limit * dt, inf)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What follows from the compiled checks of a sample, before its torque is commanded."""
+"""The faults found by the compiled checks of a sample, before its torque is commanded."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ Vector = NDArray[np.float64]
 
 
 class SampleCheck:
-    """Judges each sample of a controller, and keeps the estimates of the last valid one.
+    """Checks each sample of a controller, and keeps the estimates of the last valid one.
 
     Attributes:
         ratio: largest |xi1| / k_c of each joint since the start (n,).
         outside: samples past the bound since the start.
         saturated: samples with a torque at its limit since the start.
-        saturated_time: time that they have lasted without a break [s].
+        saturated_time: duration of the current saturation [s].
     """
 
     def __init__(self, safety: Safety, joints: Sequence[str], controller: Controller) -> None:
-        """Switch on the checks of the controller."""
+        """Enable the checks of the controller."""
         self._joints = tuple(joints)
         self._controller = controller
         self.ratio = controller.checks.ratio
@@ -38,12 +38,12 @@ class SampleCheck:
         self.restart()
 
     def set_limits(self, safety: Safety) -> None:
-        """Check the next samples by these limits."""
+        """Apply these limits to the next samples."""
         self._safety, checks = safety, self._controller.checks
         checks.velocity_limit[0], checks.error_ratio[0] = safety.velocity_limit, safety.error_ratio
 
     def restart(self) -> None:
-        """Count from the next sample on."""
+        """Reset the counts, starting with the next sample."""
         self.ratio[:] = 0.0
         self.outside = self.saturated = 0
         self.saturated_time = 0.0
@@ -54,12 +54,12 @@ class SampleCheck:
         return self._kept[: self._controller.settings.m]
 
     def keep(self) -> None:
-        """Keep the present estimates."""
+        """Keep the current estimates."""
         state = self._controller.state
         np.concatenate((state.estimate, state.disturbance), out=self._kept)
 
     def restore(self) -> None:
-        """Reset the controller but for its estimates, which are the kept ones then."""
+        """Reset the controller, but set its estimates to the kept ones."""
         self._controller.reset()
         state = self._controller.state
         state.estimate[:], state.disturbance[:] = self.estimate, self._kept[state.estimate.size :]
@@ -85,7 +85,7 @@ class SampleCheck:
         if not (np.isfinite(state.estimate).all() and np.isfinite(state.disturbance).all()):
             text = f'an estimate is not finite: {state.estimate}, disturbance {state.disturbance}'
             return Fault(Reason.ESTIMATE, text)
-        # Saturation makes a finite torque of an infinite demand.
+        # Saturation turns an infinite demand into a finite torque.
         if not (np.isfinite(demand).all() and np.isfinite(self._controller.sample.torque).all()):
             return Fault(Reason.TORQUE, f'the demanded torque is not finite: {demand}')
         return None

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The check of every joint state before the law uses it: stamps, values, missed states.
 
-It reads no clock: the same states have the same faults.
+It reads no clock, so the same states always have the same faults.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ class StateCheck:
 
     Attributes:
         repeated: states ignored because their stamp was repeated.
-        missed: states that the stamps jump over, since the start.
-        missed_fraction: of all, from 0 to 1, averaged exponentially over safety.overrun_window; it
-            counts in the plant's time: a slow computer in lock-step misses none.
+        missed: states missing between consecutive stamps, since the start.
+        missed_fraction: fraction of missed states, averaged exponentially over
+            safety.overrun_window; by their stamps, so a slow computer in lock-step misses none.
     """
 
     def __init__(self, joints: Sequence[str], sample_time: float) -> None:
-        """Start; `sample_time` is T [s]."""
+        """`sample_time` is T [s]."""
         self._joints = tuple(joints)
         self._sample_time = sample_time
         self._one_sample = (0.5e9 * sample_time, 1.5e9 * sample_time)  # ns
@@ -47,7 +47,7 @@ class StateCheck:
         self._repeats = 0
 
     def advance(self, stamp: int) -> None:
-        """Take all states up to a stamp [ns] for checked."""
+        """Mark all states up to a stamp [ns] as checked."""
         self._last_stamp = stamp
 
     def check(self, safety: Safety, stamp: int) -> Fault | None:
@@ -116,14 +116,14 @@ class StateCheck:
         return Fault(Reason.OVERRUN, text)
 
     def invalid(self, safety: Safety, measurement: Vector) -> Fault:
-        """Return why the invalid [q (n,) rad, dq (n,) rad/s, effort (n,) N m] must not be used."""
+        """Return the fault of an invalid [q (n,) rad, dq (n,) rad/s, effort (n,) N m]."""
         q, dq, effort = measurement.reshape(3, -1)
         if not (np.isfinite(q).all() and np.isfinite(dq).all()):
             text = f'the joint state is not finite: positions {q}, velocities {dq}'
             return Fault(Reason.NOT_FINITE, text)
         worst = int(np.argmax(np.abs(dq)))
         if abs(dq[worst]) <= safety.velocity_limit:
-            return Fault(Reason.NOT_FINITE, f'the efforts used for learning are {effort}')
+            return Fault(Reason.NOT_FINITE, f'efforts used for learning are not finite: {effort}')
         text = (
             f'the velocity of joint {self._joints[worst]!r} is {dq[worst]:+.6g} rad/s: more '
             f'than safety.velocity_limit, {safety.velocity_limit:g} rad/s'

@@ -48,7 +48,7 @@ class Reason(str, Enum):
 
 
 class Fault(NamedTuple):
-    """Why the controller must stop, in a sentence with the figures."""
+    """Why the controller must stop: the reason, and a sentence with the values."""
 
     reason: Reason
     text: str
@@ -60,10 +60,10 @@ class Supervisor:
     Attributes:
         phase: what the controller is doing.
         reason, text: why it stopped; `NONE` and empty if it did not.
-        stops: since the controller was configured.
+        stops: number of stops since the controller was configured.
         revision: how often phase, reason or text have been set.
         running: whether the law is in command.
-        uses_states: whether joint states are for the law, which runs or is about to start.
+        uses_states: whether the law uses joint states: it runs or is about to start.
     """
 
     def __init__(self) -> None:
@@ -75,7 +75,7 @@ class Supervisor:
         self._set(phase, Reason.NONE, '')
 
     def stop(self, reason: Reason, text: str) -> bool:
-        """Enter the safe stop; returns False if stopped already or inactive."""
+        """Enter the safe stop; return False if already stopped or inactive."""
         if not self.uses_states:
             return False
         self._set(Phase.SAFE_STOP, reason, text)

@@ -10,7 +10,7 @@ Vector = NDArray[np.float64]
 
 
 class Velocity:
-    """Replaces velocities by difference quotients."""
+    """Replaces velocities with finite differences of positions."""
 
     def __init__(self, n: int) -> None:
         self._stamp = -1
@@ -18,11 +18,11 @@ class Velocity:
         self._dq = np.zeros(n)
 
     def reset(self) -> None:
-        """Forget the last state: the arm is taken to be at rest in the next one."""
+        """Forget the last state: the arm is assumed to be at rest in the next one."""
         self._stamp = -1
 
     def replace(self, stamp: int, measurement: Vector) -> None:
-        """Overwrite dq in [q (n,) rad, dq (n,) rad/s, torque (n,)], which has a stamp [ns]."""
+        """Overwrite dq in [q (n,) rad, dq (n,) rad/s, torque (n,)] with a stamp [ns]."""
         q, dq, _ = measurement.reshape(3, -1)
         if self._stamp < 0 or stamp < self._stamp:
             self._dq[:] = 0.0

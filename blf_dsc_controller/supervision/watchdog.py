@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The watchdog on the steady clock: no joint state has come for too long."""
+"""The watchdog on the steady clock: detects that no joint state has arrived for too long."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ PERIOD = 0.008
 """Time [s] between two checks of the steady clock during a silence."""
 
 _SAME_CLOCK = 60.0  # s that a live stamp may differ from this computer's time
-_MARGIN = 0.001  # s past the limit, for a state that is on its way
+_MARGIN = 0.001  # s past the limit, for a state in transit
 _NANO = 1e-9
 
 
 class Watchdog:
     """Measures the silence since the last joint state.
 
-    A check that is itself late proves nothing, since states may wait in the queue behind it; the
-    next one decides.
+    A check that is itself late proves nothing, since states may be waiting in the queue; the next
+    check decides.
 
     Attributes:
         on: whether a silence leads to a stop.
-        why_off: why it does not although safety.watchdog is `auto`; else empty.
+        why_off: why it is off although safety.watchdog is `auto`; else empty.
         next_check: time [s] from the last check to the next.
-        torques: commanded in the present silence.
+        torques: number commanded in the current silence.
     """
 
     def __init__(self, steady: Callable[[], int], wall: Callable[[], int]) -> None:
@@ -37,27 +37,27 @@ class Watchdog:
         self._last_check = -1
 
     def switch(self, mode: str, stamp: int) -> None:
-        """Switch on or off; `auto`: on if the stamps [ns] are of a clock like `wall`."""
+        """Switch on or off; `auto`: on if the stamps [ns] are close to the `wall` clock."""
         self.why_off = ''
         behind = (self._wall() - stamp) * _NANO
         if mode == 'auto' and abs(behind) >= _SAME_CLOCK:
             where = f'{abs(behind):.4g} s {"behind" if behind > 0.0 else "ahead of"}'
             self.why_off = (
                 f"the stamps of the joint states are {where} this computer's clock: a silence is "
-                'not noticed; for an arm set safety.watchdog to on, for a simulation to off'
+                'not detected; set safety.watchdog to on for an arm, or to off for a simulation'
             )
         self.on = mode != 'off' and not self.why_off
 
     def restart(self) -> None:
-        """Measure from now on."""
+        """Measure the silence from now on."""
         self._last_state = self._steady()
 
     def wait(self) -> None:
-        """Measure from the next state on."""
+        """Measure the silence from the next state on."""
         self._last_state = -1
 
     def silence(self, limit: float) -> float:
-        """Return the length of a silence [s] past `limit` [s], else 0."""
+        """Return the length of a silence [s] if it exceeds `limit` [s], else 0."""
         now = self._steady()
         is_late = (now - self._last_check) * _NANO > self.next_check + PERIOD
         self._last_check = now

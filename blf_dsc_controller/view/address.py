@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the page is served: this computer only, unless told otherwise."""
+"""Host and port of the page, which is served to this computer only by default."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ import socket
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 
 LOCAL = ('127.0.0.1', 'localhost', '::1')
-"""Hosts that only this computer reaches."""
+"""Hosts that can be reached from this computer only."""
 
-_PORTS = 100  # tried from the wanted one on
+_PORTS = 100  # tried, from the requested one on
 _NOT_HERE = 99  # EADDRNOTAVAIL
 
 
 def url_of(host: str, port: int) -> str:
-    """Address to open in a browser."""
+    """Return the address to open in a browser."""
     return f'http://{"localhost" if host in LOCAL else host}:{port}'
 
 
 def open_to_others(host: str) -> str:
-    """Warning about a page that is not served to this computer alone."""
+    """Return the warning about a page that is not served to this computer only."""
     return f'at {host} the page and its controls are open to other computers, without a password'
 
 
 def require_viser() -> None:
-    """Raise MissingExtraError unless viser is installed, with what it needs for URDFs."""
+    """Raise MissingExtraError unless viser and its URDF support are installed."""
     for module in ('viser', 'yourdfpy'):
         if importlib.util.find_spec(module) is None:
             raise MissingExtraError(module, 'view', 'the page')
 
 
 def free_port(host: str, port: int) -> int:
-    """First free port from the wanted one on; BlfDscError if the host is none of this computer."""
+    """Return the first free port from `port` on; BlfDscError if `host` is not this computer."""
     for candidate in range(port, min(port + _PORTS, 65536)):
         family = socket.AF_INET6 if ':' in host else socket.AF_INET
         with socket.socket(family) as claim:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arm as the page draws it: the shapes of its URDF, else a cylinder along each link."""
+"""The arm as drawn on the page: the shapes of its URDF or, without any, cylinders."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from blf_dsc_controller.configuration.robot import chain_of
 from blf_dsc_controller.configuration.share import resolve
 from blf_dsc_controller.errors import BlfDscError
 
-_THICKNESS = 0.025  # radius of a link over the length of all
-_SHORTEST = 1e-3  # m, of a link that is drawn
+_THICKNESS = 0.025  # radius of a link relative to the length of all links
+_SHORTEST = 1e-3  # m, length below which a link is not drawn
 
 
 class Arm(NamedTuple):
-    """The text of a URDF, and the chain of the controlled joints in it."""
+    """The text of a URDF and the chain of its controlled joints."""
 
     text: str
     chain: Chain
 
     @property
     def reach(self) -> float:
-        """Length of all links together [m]."""
+        """Total length of all links [m]."""
         offsets = [joint.placement[:3, 3] for joint in self.chain.joints]
         steps = np.array([*offsets, self.chain.tip_placement[:3, 3]])
         return float(np.linalg.norm(steps, axis=1).sum())
 
     def model(self) -> Any:
-        """Model of yourdfpy, whose shapes are those of the URDF if they are found."""
+        """Return the yourdfpy model, with the URDF's shapes if any are found, else cylinders."""
         model = _load(self.text)
         return model if model.scene.geometry else _load(with_cylinders(self.text, self.reach))
 
 
 def arm_of(config: ControllerConfig, lengths: Sequence[float] = ()) -> Arm:
-    """Arm of a controller; planar links have these lengths [m], or that of the first."""
+    """Return the arm of a controller; planar links have these lengths [m], or all `arm.l1`."""
     robot = config.robot
     if config.model == 'urdf':
         return Arm(robot.text, robot.chain(config.joints))
@@ -50,7 +50,7 @@ def arm_of(config: ControllerConfig, lengths: Sequence[float] = ()) -> Arm:
 
 
 def planar_urdf(joints: Sequence[str], lengths: Sequence[float]) -> str:
-    """URDF without shapes of links of these lengths [m] in the x-z plane, with the link `tip`."""
+    """Return a URDF of links of these lengths [m] in the x-z plane, without shapes, to `tip`."""
     robot = ET.Element('robot', name='arm')
     ET.SubElement(robot, 'link', name='base')
     parent = 'base'
@@ -70,7 +70,7 @@ def planar_urdf(joints: Sequence[str], lengths: Sequence[float]) -> str:
 
 
 def with_cylinders(text: str, reach: float) -> str:
-    """URDF with a cylinder from each joint to the next, and a ball at each that moves."""
+    """Replace a URDF's visuals: a cylinder between joints, a ball at each joint that moves."""
     robot = ET.fromstring(text)  # noqa: S314 - as trusted as the robot that it describes
     links = {link.get('name'): link for link in robot.findall('link')}
     for link in links.values():
@@ -101,15 +101,15 @@ def _add(link: ET.Element, at: Sequence[float], rpy: str, shape: str, **size: st
 def _load(text: str) -> Any:
     import yourdfpy
 
-    logging.getLogger('yourdfpy').setLevel(logging.ERROR)  # meshes that are not found
+    logging.getLogger('yourdfpy').setLevel(logging.ERROR)  # it warns about missing meshes
     model = yourdfpy.URDF.load(io.BytesIO(text.encode()), filename_handler=_file)
     for joint in model.robot.joints:
-        if joint.axis is not None:  # it slides along them by their length
+        if joint.axis is not None:  # yourdfpy scales prismatic motion by its length
             joint.axis = joint.axis / np.linalg.norm(joint.axis)
     return model
 
 
-def _file(fname: str) -> str:  # the name of the argument is that of yourdfpy
+def _file(fname: str) -> str:  # yourdfpy prescribes the argument's name
     try:
         return str(resolve(fname.removeprefix('file://')))
     except (BlfDscError, OSError):

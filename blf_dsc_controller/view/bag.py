@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag on the page: play, pause, and go to any time."""
+"""Playback of a bag on the page: play, pause and seek."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from blf_dsc_controller.view.arm import arm_of
 from blf_dsc_controller.view.moment import Confidence, Moment, estimates_of
 from blf_dsc_controller.view.page import PAST, Page
 
-_RATE = 30.0  # moments a second
-_MOST = 20_000  # moments of a bag
+_RATE = 30.0  # moments per second
+_MOST = 20_000  # moments per bag
 _PERIOD = 1.0 / 30.0  # s
-_PLOTTED = 6  # pictures from one plot to the next
+_PLOTTED = 6  # frames between updates of the plots
 _SPEEDS = ('0.1', '0.5', '1', '2', '5', '10')
 
 
 class BagPlayer:
-    """Plays a bag; raises BlfDscError if it cannot be read or has no configuration of a controller.
+    """Player of a bag; BlfDscError if it cannot be read or has no controller configuration.
 
     Attributes:
-        slider: of the time [s].
-        button: plays and pauses.
+        slider: time [s].
+        button: toggles between play and pause.
     """
 
     def __init__(
@@ -57,13 +57,13 @@ class BagPlayer:
         page.state('BAG', f'{bag.name}, {run.duration:.1f} s')
 
     def toggle(self) -> None:
-        """Play, or pause; at the end from the start."""
+        """Toggle between play and pause; at the end, start over."""
         self._playing = not self._playing
         if self._playing and self.slider.value >= self._times[-1]:
             self.slider.value = 0.0
 
     def update(self, elapsed: float) -> None:
-        """Go on by the time that has elapsed [s] if it plays, and draw the moment of the slider."""
+        """Advance by the elapsed time [s] while playing, and draw the moment at the slider."""
         if self._playing:
             goal = self.slider.value + elapsed * float(self.speed.value)
             self._playing = goal < self._times[-1]
@@ -93,7 +93,7 @@ class BagPlayer:
 
 
 def moments(run: Run, estimates: tuple[str, ...]) -> list[Moment]:
-    """Moments of a run, some thirty a second, with the values last known at each."""
+    """Return about thirty moments per second of a run, each with the last known values."""
     count = int(min(_MOST, max(2.0, _RATE * run.duration)))
     rows = np.unique(np.searchsorted(run.time, np.linspace(0.0, run.duration, count)))
     rows = rows[rows < run.time.size]
@@ -113,7 +113,7 @@ def moments(run: Run, estimates: tuple[str, ...]) -> list[Moment]:
 
 
 def _held(series: Series | None, stamps: Stamps, names: tuple[str, ...]) -> Floats:
-    """Values (k, m) of some names, NaN where they are not known."""
+    """Return the values (k, m) of these names, NaN where unknown."""
     found = np.full((len(stamps), len(names)), np.nan)
     if series is not None:
         held = series.held(stamps)

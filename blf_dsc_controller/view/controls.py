@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Buttons and sliders of the page of a running system; what they do is the node's."""
+"""Buttons and sliders of the live page; the node implements their actions."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ from blf_dsc_controller.configuration.schema import Kind, Parameter, Value, flat
 
 _GAINS = ('barrier', 'surface', 'feedback', 'disturbance', 'torque', 'learning')
 _OF_OTHER_LAWS = ('comparison',)
-_HEADROOM = 4.0  # a slider without a limit ends at so many times the present value
+_HEADROOM = 4.0  # end of a slider without a limit, as a multiple of the current value
 _STEPS = 400
 
 
 class Actions(Protocol):
-    """What the controls ask for; called in threads of the page's server."""
+    """Actions of the controls, called in threads of the page's server."""
 
     def reset(self) -> None:
-        """Start the arm and its controller again."""
+        """Reset the arm and its controller."""
 
     def push(self, torque: Sequence[float]) -> None:
-        """Push the joints for a moment [N m]."""
+        """Push the joints briefly by these torques [N m]."""
 
     def payload(self, mass: float) -> None:
-        """Hang a mass on the tip [kg]."""
+        """Attach a mass [kg] to the tip."""
 
     def go_to(self, position: Mapping[str, float], duration: float) -> None:
-        """Send a reference: to a position of each joint [rad] in a time [s]."""
+        """Send a reference to a position of each joint [rad], reached after `duration` [s]."""
 
     def set_gain(self, name: str, value: Value) -> None:
         """Set a parameter of the controller."""
 
 
 class Controls:
-    """Adds the tabs `Try` and `Gains` to those of a page.
+    """The tabs `Try` and `Gains` of a page.
 
     Attributes:
-        buttons: by what is on them.
-        sliders: of each gain by its name, one for each entry.
+        buttons: by their label.
+        sliders: by the name of the gain, one for each entry.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Controls:
         self.buttons: dict[str, Any] = {}
         self.sliders: dict[str, list[Any]] = {}
         with tabs.add_tab('Try'):
-            self._button('Reset', actions.reset, 'the arm to its start, all learned forgotten')
+            self._button('Reset', actions.reset, 'return to the start, forget what was learned')
             if simulated:
                 self._add_disturbances(config.joints)
             self._add_reference(config)
@@ -62,7 +62,7 @@ class Controls:
                         self._add_gain(one, values[one.name], config.joints)
 
     def show(self, changed: Mapping[str, Value]) -> None:
-        """Show the values in force of some parameters."""
+        """Move the sliders of these parameters to the values in force."""
         for name, value in changed.items():
             for slider, entry in zip(self.sliders.get(name, ()), _entries(value), strict=False):
                 slider.max = max(slider.max, entry)
@@ -73,16 +73,16 @@ class Controls:
         button.on_click(lambda _: action())
 
     def _add_disturbances(self, joints: Sequence[str]) -> None:
-        joint = self._gui.add_dropdown('joint', tuple(joints), hint='to push')
+        joint = self._gui.add_dropdown('joint', tuple(joints), hint='joint to push')
         torque = self._gui.add_slider('push [N m]', -10.0, 10.0, 0.1, 2.0)
         self._button(
             'Push',
             lambda: self._actions.push([torque.value * (one == joint.value) for one in joints]),
-            'this joint by this torque for half a second',
+            'push this joint with this torque for half a second',
         )
         mass = self._gui.add_slider('payload [kg]', 0.0, 5.0, 0.05, 0.5)
-        self._button('Pick up', lambda: self._actions.payload(mass.value), 'this payload')
-        self._button('Put down', lambda: self._actions.payload(0.0), 'all payload')
+        self._button('Pick up', lambda: self._actions.payload(mass.value), 'attach this payload')
+        self._button('Put down', lambda: self._actions.payload(0.0), 'remove the payload')
 
     def _add_reference(self, config: ControllerConfig) -> None:
         limits = zip(config.limits.position_lower, config.limits.position_upper, strict=True)
@@ -97,7 +97,7 @@ class Controls:
             lambda: self._actions.go_to(
                 {joint: one.value for joint, one in sliders.items()}, duration.value
             ),
-            'and stay; Reset returns to the configured reference',
+            'move there and stay; Reset returns to the configured reference',
         )
 
     def _add_gain(self, one: Parameter, value: Value, joints: Sequence[str]) -> None:
@@ -133,7 +133,7 @@ class Controls:
 
 
 def live_gains() -> Iterable[Parameter]:
-    """Numbers of the controller, or one for each joint, that can change while it runs."""
+    """Yield the controller's gains, scalar or per joint, that can change while it runs."""
     for one in parameters(ControllerConfig):
         scalar = one.kind is Kind.DOUBLE
         if not one.read_only and (scalar or one.length == ('joints',)):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the page shows of one moment, and what the motion up to it tells of each estimate."""
+"""The values that the page shows for one moment, and the confidence in each estimate."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from blf_dsc_controller.law.factory import (
 from blf_dsc_controller.law.prediction import rows_along
 from blf_dsc_controller.run import Floats
 
-_FEWEST = 8  # moments, to differentiate twice
-_INDEPENDENT = 100.0  # rows of a window whose unmodelled torques are independent
+_FEWEST = 8  # moments needed to differentiate twice
+_INDEPENDENT = 100.0  # independent values of the unmodelled torque in a window
 
 
 class Moment(NamedTuple):
@@ -35,23 +35,23 @@ class Moment(NamedTuple):
     estimate: Floats  # (m,) theta^; NaN: a rejected column
     truth: Floats  # (m,)
     lambda_min: float
-    loaded: bool = False  # the true parameters are not those of the start
+    loaded: bool = False  # the true parameters differ from those at the start
 
 
 def estimates_of(config: ControllerConfig) -> dict[str, str]:
-    """Units of the estimates of a controller, by name and in their order."""
+    """Return the units of a controller's estimates by name, in their order."""
     friction = {one: 'N m s/rad' if 'viscous' in one else 'N m' for one in column_names(config)}
     model = model_of(config)
     return dict(zip(model.parameter_names, model.parameter_units, strict=True)) | friction
 
 
 class Confidence:
-    """How far the motion of a window determines each estimate.
+    """How well the motion of a window determines each estimate.
 
-    The window's excitation Phi of the reference adds to the information R of the prior:
+    The excitation Phi of the reference over the window adds to the information R of the prior:
     covariance = (R + Phi / a)^-1, where a is the mean square of the unmodelled torque
-    (`learning.residual_floor`) over the number of its independent values in a window, as in
-    `excite`.
+    (`learning.residual_floor`) divided by the number of its independent values in a window, as
+    in `excite`.
     """
 
     def __init__(self, config: ControllerConfig) -> None:
@@ -63,7 +63,7 @@ class Confidence:
         self._noise = settings.prior_weight or least * least / _INDEPENDENT
 
     def deviations(self, past: Sequence[Moment]) -> Floats:
-        """Standard deviation (m,) of each estimate after the last window of some moments."""
+        """Return the standard deviation (m,) of each estimate after the last window of `past`."""
         settings = self._settings
         recent = [one for one in past if one.time > past[-1].time - self.window]
         recent = [one for one in recent if np.isfinite(one.error).all()]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `view`: feeds the page from the topics.
+"""The node `view`, which feeds the page from the topics.
 
-It is a process of its own that gives way to the control loop, takes the newest messages thirty
-times a second, and asks for none that is lost. The controller's configuration is in its journal.
+It runs in its own low-priority process, takes the newest messages thirty times a second, and
+tolerates lost ones. The controller's configuration comes from its journal.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ from blf_dsc_controller.view.page import PAST, Page
 from blf_dsc_controller.view.requests import Requests
 
 _PERIOD = 1.0 / 30.0  # s
-_PLOTTED = 6  # pictures from one plot to the next
-_CHECKED = 30  # pictures from one look at what is identified to the next
-_SILENCE = 30  # pictures without a joint state after which the page says so
+_PLOTTED = 6  # frames between updates of the plots
+_CHECKED = 30  # frames between updates of the deviations
+_SILENCE = 30  # frames without a joint state before the page reports it
 _OUTDATED = 500_000_000  # ns
-_NICE = 10  # less urgent than the loop
+_NICE = 10  # lower priority than the loop
 _NEWEST = Quality(depth=1, reliability='best_effort')
 _STREAMS = (topics.JOINT_STATES, topics.TRACKING_ERROR, topics.BOUND, topics.MONITOR, topics.TRUTH)
 _EVENTS = (topics.JOURNAL, topics.CHANGES, topics.STATE, topics.DIAGNOSTICS)
@@ -52,10 +52,10 @@ _LEVELS = dict(enumerate(('OK', 'WARN', 'ERROR', 'STALE')))
 
 
 class ViewNode(PlainNode):
-    """Serves the page.
+    """Node that serves the page.
 
     Raises:
-        ConfigurationError: a parameter is wrong.
+        ConfigurationError: a parameter is invalid.
         MissingExtraError: viser is not installed.
         BlfDscError: the page cannot be served at this host.
     """
@@ -67,13 +67,13 @@ class ViewNode(PlainNode):
         self.controls: Controls | None = None
         self.past: deque[Moment] = deque()
         self._config: ControllerConfig | None = None
-        self._plant: dict[str, Any] = {}  # parameters of the simulated one
-        self._noted = -1.0  # s, up to which its events are on the page
+        self._plant: dict[str, Any] = {}  # parameters of the simulated plant
+        self._noted = -1.0  # s, time up to which its events are on the page
         self._state = 'STALE', f'waiting for {self.resolve_topic_name(topics.JOURNAL.relative)}'
-        self._start = self._sampled = -1  # ns, stamps: of the start, of the last tracking error
+        self._start = self._sampled = -1  # ns, stamps of start and last tracking error
         self._pictures = self._silent = 0
         self._clients_seen: frozenset[int] = frozenset()
-        self._rejected = -1  # trajectories; -1: not known
+        self._rejected = -1  # number of trajectories; -1: unknown
         self._worker = ThreadPoolExecutor(1, 'confidence')
         self._check: Future[tuple[Floats, Floats]] | None = None
         self._newest = self._subscribe(_STREAMS, _NEWEST)
@@ -95,14 +95,14 @@ class ViewNode(PlainNode):
         return made
 
     def close(self) -> None:
-        """End the page and the subscriptions."""
+        """Close the page and the subscriptions."""
         self._worker.shutdown(wait=False, cancel_futures=True)
         self.page.close()
         self._newest.close()
         self._kept.close()
 
     def update(self) -> None:
-        """Take what has come, do what was asked for, and draw."""
+        """Process new messages, carry out requests, and draw."""
         self._reader.poll()
         for message in self._kept.take():
             self._note(_EVENTS[message.handle], message.raw)
@@ -116,15 +116,15 @@ class ViewNode(PlainNode):
             self._draw(config, clients)
 
     def _health(self) -> tuple[str, str]:
-        """State of the controller, or that it says nothing any more."""
+        """Return the state of the controller, or that it or the arm has gone silent."""
         if self._config is None or self._silent < _SILENCE:
             return self._state
         for topic, node in ((topics.TRACKING_ERROR, 'controller'), (topics.JOINT_STATES, 'arm')):
             if not self._newest.node.count_publishers(self.resolve_topic_name(topic.relative)):
-                return 'ERROR', f'the {node} is gone: nobody publishes {topic.relative} any more'
-        return self._state[0], f'{self._state[1]} (no joint state comes)'
+                return 'ERROR', f'the {node} is gone: {topic.relative} is no longer published'
+        return self._state[0], f'{self._state[1]} (no joint states received)'
 
-    # What comes.
+    # Incoming messages.
 
     def _note(self, topic: Topic, raw: bytes) -> None:
         if topic is topics.JOURNAL:
@@ -195,18 +195,18 @@ class ViewNode(PlainNode):
             )
 
     def _restore(self) -> None:
-        """Let the sliders show the values in force."""
+        """Move the sliders to the values in force."""
         if self._config is not None and self.controls is not None:
             self.controls.show(flatten(self._config))
 
     def _time(self, stamp: int) -> float:
-        """Time [s] since the controller's start, or since the first stamp that is known."""
+        """Return the time [s] since the controller's start, or since the first known stamp."""
         if self._start < 0 <= stamp:
             self._start = stamp
         return max(0.0, (stamp - self._start) * 1e-9)
 
     def _take(self, messages: Sequence[RawMessage]) -> bool:
-        """Take the newest of each topic; whether there was a joint state."""
+        """Take the newest message of each topic; return whether there was a joint state."""
         stamp = sampled = -1
         for message in messages:
             topic = _STREAMS[message.handle]
@@ -224,7 +224,7 @@ class ViewNode(PlainNode):
                 self.get_logger().warning(f'not shown: {error}', throttle_duration_sec=10.0)
         self._sampled = max(sampled, self._sampled)
         if stamp >= 0:
-            if stamp - self._sampled > _OUTDATED:  # the law does not run
+            if stamp - self._sampled > _OUTDATED:  # the law is not running
                 self._decoders[topics.TRACKING_ERROR].values[:] = np.nan
             self._keep(self._time(stamp))
         return stamp >= 0
@@ -232,7 +232,7 @@ class ViewNode(PlainNode):
     def _learn(self, values: Floats) -> None:
         before, self._learned = self._learned[-1], values
         if self.past and values[-1] != before and np.isfinite(before):
-            text = 'an excited window' if values[-1] else 'restarts: the arm has changed'
+            text = 'excited window latched' if values[-1] else 'restarts: the arm has changed'
             self.page.event(self.past[-1].time, 'learning', text)
 
     def _keep(self, time: float) -> None:
@@ -248,7 +248,7 @@ class ViewNode(PlainNode):
             self.past.popleft()
 
     def _payload(self, time: float) -> float:
-        """Payload of the simulated arm [kg]; notes its events that began or ended by now."""
+        """Return the payload of the simulated arm [kg]; list events that have begun or ended."""
         get = self._plant.get
         begin = get('events.begin', ())
         none = (0.0,) * len(begin)
@@ -279,13 +279,13 @@ class ViewNode(PlainNode):
         self._clients_seen = clients
 
     def _deviations(self, config: ControllerConfig, past: list[Moment]) -> tuple[Floats, Floats]:
-        """Standard deviations before and after a window; compiles at first, beside the page."""
+        """Return the deviations before and after a window; compiles at first, off the page."""
         confidence = self._confidence = self._confidence or Confidence(config)
         return confidence.prior, confidence.deviations(past)
 
 
 def _named(raw: bytes, names: Sequence[str]) -> Floats:
-    """Values (m,) of some names in a message, NaN where it does not have them."""
+    """Return the values (m,) of these names in a message, NaN where it lacks them."""
     decoder = JointStateDecoder(joint_state_layout(raw).names, ('position',))
     decoder.decode(raw)
     found = dict(zip(joint_state_layout(raw).names, decoder.position, strict=True))
@@ -293,7 +293,7 @@ def _named(raw: bytes, names: Sequence[str]) -> Floats:
 
 
 def main() -> int:
-    """Run the node, less urgently than others."""
+    """Run the node at low priority."""
     os.nice(_NICE)
     return run(ViewNode)
 

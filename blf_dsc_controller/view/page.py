@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page: the arm in space, plots, numbers and events, from the arrays of moments.
+"""The page: 3D view of the arm, plots, tables and events, drawn from moments of any source.
 
-It does not know where they come from. viser serves it, with all that the browser needs: nothing is
-loaded from elsewhere.
+viser serves the page with everything that the browser needs: nothing is loaded from elsewhere.
 """
 
 from __future__ import annotations
@@ -25,25 +24,25 @@ from blf_dsc_controller.view.moment import Moment
 from blf_dsc_controller.view.tables import estimate_table, event_table, joint_table
 
 PAST = 20.0
-"""Time that the plots show [s]."""
+"""Time span of the plots [s]."""
 
 _TRAIL = 4.0  # s of the tip's path
 _EVENTS = 12
-_PLAIN = (86, 110, 150)  # of an arm without colours
+_PLAIN = (86, 110, 150)  # colour of an arm without any
 _GHOST = (0, 200, 120, 0.35)
-_HALO = 0.005  # of the reach
+_HALO = 0.005  # thickness relative to the reach
 _LEVELS = {'OK': GREEN, 'WARN': ORANGE, 'ERROR': ALARM, 'STALE': MUTED, 'BAG': MUTED}
 
 
 class Page:
-    """A page at a host and the first free port from the given one on.
+    """Page at a host, on the first free port from the given one on.
 
     Raises:
         MissingExtraError: viser is not installed.
         BlfDscError: the page cannot be served there.
 
     Attributes:
-        server: viser's.
+        server: the viser server.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -51,7 +50,7 @@ class Page:
         import viser
 
         free = free_port(host, port)
-        with contextlib.redirect_stdout(io.StringIO()):  # its own greeting
+        with contextlib.redirect_stdout(io.StringIO()):  # hides its banner
             self.server = viser.ViserServer(host, free, label='blf_dsc', verbose=False)
         self.url = url_of(host, self.server.get_port())
         self._events: deque[tuple[float, str, str]] = deque(maxlen=_EVENTS)
@@ -59,7 +58,7 @@ class Page:
         self.clear()
 
     def clear(self) -> None:
-        """Show the state only, until `draw_arm`."""
+        """Show only the state until `draw_arm` is called."""
         server, gui = self.server, self.server.gui
         self._list: Any = None
         server.scene.reset()
@@ -71,7 +70,7 @@ class Page:
         self.state(*self._state)
 
     def draw_arm(self, arm: Arm, estimates: Mapping[str, str]) -> Any:
-        """Draw an arm with the units of its estimates by name; returns the page's tabs."""
+        """Draw an arm, given the units of its estimates by name; return the page's tabs."""
         from trimesh import Trimesh
         from viser.extras import ViserUrdf
 
@@ -85,7 +84,7 @@ class Page:
         self._drawn = ViserUrdf(server, model, root_node_name='/arm', mesh_color_override=colour)
         ghost = arm.model()
         shapes = ghost.scene.geometry
-        for name, shape in list(shapes.items()):  # around the arm where both are in one place
+        for name, shape in list(shapes.items()):  # a shell around the arm where both coincide
             corners = shape.vertices + _HALO * reach * shape.vertex_normals
             shapes[name] = Trimesh(corners, shape.faces, process=False)
         self._ghost = ViserUrdf(
@@ -104,9 +103,7 @@ class Page:
             self._plots = [
                 self._plot('tracking error [% of the bound]', self._joints, ('bound',), 110.0),
                 self._plot('torque [N m]', self._joints, ()),
-                self._plot(
-                    'estimates less the truth [% of the prior]', tuple(estimates), (), 100.0
-                ),
+                self._plot('estimates minus truth [% of the prior]', tuple(estimates), (), 100.0),
                 self._plot('excitation: log10 of lambda_min', ('lambda_min',), ()),
             ]
             self._table = gui.add_html('')
@@ -136,7 +133,7 @@ class Page:
         )
 
     def state(self, level: str, text: str) -> None:
-        """Show the state of the controller: OK, WARN, ERROR or STALE, and what it is."""
+        """Show the controller's state: level (OK, WARN, ERROR, STALE or BAG) and description."""
         self._state = level, text
         self._header.content = (
             f'<div style="margin:4px 12px;padding:6px 10px;border-radius:6px;color:white;'
@@ -156,18 +153,18 @@ class Page:
             self._list.content = event_table(reversed(self._events))
 
     def events(self, events: Sequence[tuple[float, str, str]]) -> None:
-        """Replace the list by the last of these events."""
+        """Replace the list with the last of these events."""
         if list(self._events) != list(events[-_EVENTS:]):
             self._events.clear()
             self._events.extend(events)
             self.event(np.nan, '', '')
 
     def learned(self, prior: Floats, deviation: Floats) -> None:
-        """Take the standard deviations (m,) of the estimates: before, and after the window."""
+        """Set the standard deviations (m,) of the estimates before and after the window."""
         self._prior, self._deviation = prior, deviation
 
     def move(self, past: Sequence[Moment]) -> None:
-        """Move the arm to the last of some moments."""
+        """Move the arm to the last of these moments."""
         now = past[-1]
         chain, reach, scene = self._arm.chain, self._arm.reach, self.server.scene
         with self.server.atomic():
@@ -194,7 +191,7 @@ class Page:
                 )
 
     def plot(self, past: Sequence[Moment]) -> None:
-        """Draw the plots and tables of the last of some moments."""
+        """Draw these moments in the plots, and the last one in the tables."""
         now = past[-1]
         shown = [one for one in past if one.time > now.time - PAST]
         t = np.array([one.time for one in shown])
@@ -217,13 +214,13 @@ class Page:
         return self._held | dict(zip(self._joints, q.tolist(), strict=True))
 
     def _at(self, placement: Floats) -> Floats:
-        """Origins (..., 3) of placements in the base, in the root of the URDF."""
+        """Transform the origins (..., 3) of placements from the base to the root of the URDF."""
         at: Floats = placement[..., :3, 3] @ self._base[:3, :3].T + self._base[:3, 3]
         return at
 
     def close(self) -> None:
-        """End the server."""
-        with contextlib.redirect_stdout(io.StringIO()):  # its own farewell
+        """Stop the server."""
+        with contextlib.redirect_stdout(io.StringIO()):  # hides its message
             self.server.stop()
 
 
@@ -231,5 +228,5 @@ _NO_POINTS = {'show': False}
 
 
 def _hangs(arm: Arm) -> bool:
-    """Whether links along x turn in a vertical plane, below their base as well."""
+    """Return whether the links turn in a vertical plane, also below their base."""
     return not any(joint.placement[2, 3] for joint in arm.chain.joints)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the controls of the page do to a running system: by its services, parameters and topics."""
+"""Actions of the page's controls on a running system, by services, parameters and topics."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PUSH = 0.5  # s
 
 
 class Requests:
-    """The `Actions` of the controls: called in the threads of the page, done by `update`."""
+    """The `Actions` of the controls: queued in the page's threads, carried out by `update`."""
 
     def __init__(
         self,
@@ -34,11 +34,11 @@ class Requests:
         notify: Callable[[str, str], None],
         restore: Callable[[], None],
     ) -> None:
-        """Create publisher and clients.
+        """Create the publisher and the clients.
 
         `node` publishes; `waiting` is in no executor, so that its responses are taken here.
-        `prefix` stands before the names of controller and plant. `notify` shows a title and a text,
-        and `restore` the parameters in force, after a request was rejected.
+        `prefix` precedes the names of controller and plant. `notify` shows a title and a text;
+        `restore` shows the parameters in force after a request was rejected.
         """
         self._names = {name: f'{prefix}/{name}' for name in (topics.CONTROLLER, topics.PLANT)}
         self._clients: dict[str, Any] = {
@@ -52,18 +52,18 @@ class Requests:
         )
         self._notify, self._restore = notify, restore
         self._queue: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self._gains: dict[str, Value] = {}  # moved and not yet sent
+        self._gains: dict[str, Value] = {}  # moved but not yet sent
         self._pending: list[tuple[Any, Callable[[Any], None]]] = []
         self._has_plant = False
         self._torque: Value = ()  # without a push [N m]
         self._time, self._push_ends = 0.0, inf
 
     def meet_plant(self, values: Mapping[str, Value]) -> None:
-        """Take the parameters of the simulated arm, which has answered."""
+        """Store the parameters of the simulated arm, once it has responded."""
         self._has_plant, self._torque = True, values.get('load.torque', ())
 
     def reset(self) -> None:
-        """Reset the simulated plant, which resets the controller, or the controller alone."""
+        """Reset the simulated plant, which resets the controller; without one, the controller."""
 
         def done(response: Trigger.Response) -> None:
             if not response.success:
@@ -73,7 +73,7 @@ class Requests:
         self._queue.put(partial(self._call, f'{name}/reset', Trigger.Request(), done))
 
     def push(self, torque: Sequence[float]) -> None:
-        """Push the joints [N m] for half a second of the plant's time."""
+        """Push the joints by these torques [N m] for half a second of plant time."""
 
         def begin() -> None:
             self._push_ends = self._time + _PUSH
@@ -82,11 +82,11 @@ class Requests:
         self._queue.put(begin)
 
     def payload(self, mass: float) -> None:
-        """Hang a mass on the tip of the simulated arm [kg]."""
+        """Attach a mass [kg] to the tip of the simulated arm."""
         self._queue.put(partial(self._set, topics.PLANT, 'load.payload', mass))
 
     def go_to(self, position: Mapping[str, float], duration: float) -> None:
-        """Send a trajectory of one point: a position of each joint [rad] after a time [s]."""
+        """Send a trajectory of one point: joint positions [rad] reached after `duration` [s]."""
         point = JointTrajectoryPoint(positions=list(position.values()))
         point.time_from_start.sec = int(duration)
         point.time_from_start.nanosec = int(1e9 * (duration % 1.0))
@@ -94,11 +94,11 @@ class Requests:
         self._queue.put(partial(self._trajectories.publish, message))
 
     def set_gain(self, name: str, value: Value) -> None:
-        """Set a parameter of the controller: the last value before the next update."""
+        """Set a parameter of the controller; the next update sends the last value."""
         self._gains[name] = value
 
     def update(self, time: float) -> None:
-        """Send what was asked for, at a time of the plant [s], and take the responses."""
+        """Send the queued requests at a plant time [s], and process the responses."""
         self._time = time
         while not self._queue.empty():
             self._queue.get()()
@@ -133,4 +133,4 @@ class Requests:
             client.call_async(request)
             self._pending.append((client, done))
         else:
-            self._notify(service, 'nobody offers this service: has the node ended?')
+            self._notify(service, 'this service is not available: has the node exited?')

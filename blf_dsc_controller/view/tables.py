@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of the page, in HTML."""
+"""HTML tables of the page."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from blf_dsc_controller.analysis.style import GREEN, MUTED
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.moment import Moment
 
-_NOT_SHOWN = 0.5  # a deviation that is more than this of the prior's: not identified
+_NOT_SHOWN = 0.5  # share of the prior's deviation above which an estimate is not identified
 _CELL = 'padding:1px 6px;text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums'
 
 
 def joint_table(joints: Sequence[str], now: Moment) -> str:
-    """Error, bound, torque and limit of each joint, by its name."""
+    """Return the table of error, bound, torque and limit by joint."""
     head = _row('th', f't = {now.time:.2f} s', 'error [mrad]', 'bound', 'torque [N m]', 'limit')
     columns = 1e3 * now.error, 1e3 * now.bound, now.torque, now.torque_limit
     rows = zip(joints, *columns, strict=True)
@@ -25,7 +25,7 @@ def joint_table(joints: Sequence[str], now: Moment) -> str:
 
 
 def estimate_table(units: Mapping[str, str], now: Moment, prior: Floats, deviation: Floats) -> str:
-    """Each estimate by name and unit, with its standard deviations before and now (m,)."""
+    """Return the table of estimates; `prior` and `deviation` are standard deviations (m,)."""
     rows = [_row('th', 'estimate', '', '±', 'truth', 'unit', 'identified')]
     columns = now.estimate, deviation, now.truth, deviation / prior
     for name, unit, value, spread, truth, left in zip(units, units.values(), *columns, strict=True):
@@ -39,7 +39,7 @@ def estimate_table(units: Mapping[str, str], now: Moment, prior: Floats, deviati
 
 
 def event_table(events: Iterable[tuple[float, str, str]]) -> str:
-    """Events: time [s], kind and text."""
+    """Return the table of events: time [s], kind and text."""
     return _in_table(
         f'<tr><td style="{_CELL}">{t:.2f} s</td><td><b>{escape(k)}</b> {escape(e)}</td></tr>'
         for t, k, e in events

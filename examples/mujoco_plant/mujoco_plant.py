@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The same arm simulated by MuJoCo, behind the same two topics.
 
-It publishes `joint_states` with the joints in another order than the controller's and a gripper
-among them, and takes a step for each torque on `blf_dsc_controller/commands` (lock-step).
-Its parameters are those of `sim_plant`; the arm is that of arm.xml or, read by MuJoCo, of a URDF.
-Encoders and drives are those of `sim_plant`, all mechanics are MuJoCo's.
+It publishes `joint_states` in a different joint order than the controller's and with a gripper
+among them, and takes one step per torque on `blf_dsc_controller/commands` (lock-step).
+Its parameters are those of `sim_plant`; the arm comes from arm.xml or from a URDF that MuJoCo
+reads. Encoders and drives are those of `sim_plant`, all mechanics are MuJoCo's.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from sim_plant.plant import settings_of
 from sim_plant.sensors import EncoderReading, generator, is_noisy, sense
 
 FIRST_STAMP = 1.0  # s
-REPEAT = 1.0  # s, for a state that nobody has answered
-TIP = 'link2'  # of arm.xml: a point mass at the tip
-PAYLOAD = 'payload of mujoco_plant'  # the same in a URDF, without mass
+REPEAT = 1.0  # s, before an unanswered state is published again
+TIP = 'link2'  # body of arm.xml: a point mass at the tip
+PAYLOAD = 'payload of mujoco_plant'  # massless body at the tip of a URDF
 
 
 def model_of(config: PlantConfig) -> mujoco.MjModel:
-    """The arm in MuJoCo, with its drives."""
+    """Build the MuJoCo model of the arm."""
     if not config.robot.urdf:
         return mujoco.MjModel.from_xml_path(str(Path(__file__).with_name('arm.xml')))
     chain = config.robot.chain(config.joints)
@@ -44,7 +44,7 @@ def model_of(config: PlantConfig) -> mujoco.MjModel:
     for unused in (*spec.geoms, *spec.meshes):
         spec.delete(unused)
     for joint in spec.joints:
-        if joint.name not in config.joints:  # fingers and the like stand still
+        if joint.name not in config.joints:  # fingers and the like are fixed
             spec.delete(joint)
     spec.body(chain.tip).add_body(name=PAYLOAD)
     model = spec.compile()
@@ -57,7 +57,7 @@ def model_of(config: PlantConfig) -> mujoco.MjModel:
 
 
 def _apply_truth(config: PlantConfig, model: mujoco.MjModel) -> None:
-    """Scale and shift the masses of all that a joint moves; a shift is along its body's axes."""
+    """Scale and shift the masses that each joint moves; shifts are along its body's axes."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     for joint, factor, shift in zip(
@@ -73,7 +73,7 @@ def _apply_truth(config: PlantConfig, model: mujoco.MjModel) -> None:
 
 
 class MujocoArm:
-    """The arm and what happens to it; all arrays are in the order of the parameter `joints`."""
+    """The arm with its loads and events; arrays are in the order of the parameter `joints`."""
 
     def __init__(self, config: PlantConfig) -> None:
         self.config = config
@@ -95,7 +95,7 @@ class MujocoArm:
         return np.zeros((rows, self.n))
 
     def measure(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Measured angles [rad], velocities [rad/s], torques applied last [N m], (n,) each."""
+        """Return measured angles [rad], velocities [rad/s], last torques [N m], (n,) each."""
         reading = self._reading
         if reading.sample[0] != self._sample:
             if is_noisy(self._settings.encoders):
@@ -109,7 +109,7 @@ class MujocoArm:
         return reading.position, reading.velocity, self._drives.applied
 
     def step(self, torque: np.ndarray) -> None:
-        """Take a step with this torque (n,) [N m] and what else acts at its start."""
+        """Take a step with this torque (n,) [N m] and the loads that act at its start."""
         load, friction, data = self.config.load, self.config.disturbance, self.data
         self._tip.mass[0] = self._mass + load.payload + self._sum('payload', 1)[0]
         viscous = friction.viscous + self._sum('viscous', self.n)
@@ -130,20 +130,20 @@ class MujocoArm:
         self._sample += 1
 
     def _sum(self, name: str, size: int) -> np.ndarray:
-        """Sum (size,) of an effect of the events that are on."""
+        """Return the sum (size,) of one effect over the active events."""
         events = self.config.events
         if not getattr(events, name):
             return np.zeros(size)
         begin, none = np.array(events.begin), (0.0,) * len(events.begin)
         duration, ramp = np.array(events.duration or none), np.array(events.ramp or none)
-        since = self.data.time - begin + 1e-9  # s, past the rounding of the time
+        since = self.data.time - begin + 1e-9  # s, with a margin for rounding of the time
         after = np.where(duration > 0.0, since - duration, -np.inf)
         ramp = np.maximum(ramp, 1e-12)
         present = np.clip(since / ramp, 0.0, 1.0) - np.clip(after / ramp, 0.0, 1.0)
         return np.asarray(present @ np.reshape(getattr(events, name), (begin.size, size)))
 
     def _wall_force(self, tip: int) -> np.ndarray:
-        """Force (3,) [N] of the wall at the tip, the centre of mass of the last link."""
+        """Return the force (3,) [N] of the wall on the tip, the last link's centre of mass."""
         wall = self.config.wall
         if wall.stiffness == 0.0:
             return np.zeros(3)
@@ -161,7 +161,7 @@ class MujocoPlant(Node):
 
     Attributes:
         arm: the simulated arm.
-        steps: taken so far.
+        steps: number of steps taken so far.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -203,7 +203,7 @@ class MujocoPlant(Node):
 
 
 def main() -> int:
-    """Run the node until it is stopped."""
+    """Run the node until it is interrupted."""
     rclpy.init()
     node = MujocoPlant()
     try:
