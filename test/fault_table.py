@@ -18,7 +18,7 @@ from fault_rig import JOINTS, MILLISECOND, Rig
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
-LEAD = 40  # samples without a fault, before it
+LEAD = 40  # fault-free samples before the fault
 WATCHED = 120  # samples after the fault
 
 R = Reason
@@ -26,7 +26,7 @@ R = Reason
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault: how to inject it, and the expected outcome with its delay."""
+    """One fault: how to inject it, and the expected outcome and delay."""
 
     name: str
     inject: Callable[[Rig], None]
@@ -117,13 +117,13 @@ def named(*names: str, fields=('position', 'velocity', 'effort')) -> JointStateE
     return JointStateEncoder(names, fields)
 
 
-def turned(state):
+def reordered(state):
     """Send the joints in reverse order."""
     q, dq, effort = (values[::-1] for values in (state.q, state.dq, state.effort))
     return [state.raw(named(*JOINTS[::-1]), q=q, dq=dq, effort=effort)]
 
 
-def accompanied(state):
+def among_others(state):
     """Send the joints among others, one of which is NaN."""
     wide = [np.array([np.nan, v[1], 7.0, v[0]]) for v in (state.q, state.dq, state.effort)]
     names = ('gripper', 'joint2', 'rail', 'joint1')
@@ -167,7 +167,7 @@ def silence(milliseconds: int, *, queued: bool = False) -> Callable[[Rig], None]
 
 
 def stalled(rig: Rig) -> None:
-    """Let the process sleep for 200 ms: the watchdog wakes before the queued states arrive."""
+    """Stall the process for 200 ms: the watchdog wakes before the queued states arrive."""
     rig.steady += 200 * MILLISECOND
     rig.guard.watch()
 
@@ -194,7 +194,7 @@ def delayed(rig: Rig) -> None:
     old = [
         rig.state()._replace(stamp=rig.state().stamp - k * MILLISECOND) for k in range(20, 0, -1)
     ]
-    rig.sense = lambda _: [one.raw() for one in old]
+    rig.sense = lambda _: [state.raw() for state in old]
 
 
 def frozen(rig: Rig) -> None:
@@ -222,8 +222,8 @@ def reversed_motor(rig: Rig) -> None:
     rig.actuate = lambda raw: [Float64MultiArrayEncoder(2).encode(-np.frombuffer(raw[-16:], '<f8'))]
 
 
-def wired(values: np.ndarray) -> Callable[[Rig], None]:
-    """Send these values to the plant, whatever is commanded."""
+def every_command(values: np.ndarray) -> Callable[[Rig], None]:
+    """Send these values to the plant instead of every command."""
     raw = Float64MultiArrayEncoder(values.size).encode(values)
 
     def inject(rig):
@@ -232,7 +232,7 @@ def wired(values: np.ndarray) -> Callable[[Rig], None]:
     return inject
 
 
-def wired_once(values: np.ndarray) -> Callable[[Rig], None]:
+def one_command(values: np.ndarray) -> Callable[[Rig], None]:
     """Replace one command."""
     replaced = Float64MultiArrayEncoder(values.size).encode(values)
 
@@ -263,7 +263,7 @@ def retuned(**changes) -> Callable[[Rig], None]:
     return lambda rig: rig.guard.retune(change(rig.guard.config, given))
 
 
-def storm(rig: Rig) -> None:
+def random_gains(rig: Rig) -> None:
     """Change all gains by up to a fifth in every sample, as `ros2 param set` does."""
     from blf_dsc_controller.configuration.schema import change
 
@@ -284,7 +284,7 @@ def storm(rig: Rig) -> None:
     rig.sense = sense
 
 
-def refused(**changes) -> Callable[[Rig], None]:
+def rejection(**changes) -> Callable[[Rig], None]:
     """Request a change that must be rejected."""
     from blf_dsc_controller.configuration.schema import change
 
@@ -293,7 +293,7 @@ def refused(**changes) -> Callable[[Rig], None]:
     def inject(rig):
         problems = rig.guard.problems(change(rig.guard.config, given))
         assert problems
-        assert all(one.startswith(tuple(given)) for one in problems)
+        assert all(problem.startswith(tuple(given)) for problem in problems)
 
     return inject
 
@@ -320,7 +320,7 @@ def replaced(*, possible: bool) -> Callable[[Rig], None]:
     return inject
 
 
-def clock_back(rig: Rig) -> None:
+def wall_clock_back(rig: Rig) -> None:
     """Set the wall clock back by an hour; stamps of a driver with its own clock continue."""
     rig.wall -= 3600 * 10**9
 
@@ -345,9 +345,9 @@ FAULTS = (
     Fault('position of joint2 is infinite', spoil('q', 1, INF), R.NOT_FINITE),
     Fault('velocity of joint1 is NaN', spoil('dq', 0, NAN), R.NOT_FINITE),
     Fault('velocity of joint2 is minus infinity', spoil('dq', 1, -INF), R.NOT_FINITE),
-    Fault('effort is NaN, and is not used', spoil('effort', 0, NAN), R.NONE),
+    Fault('effort is NaN but not used', spoil('effort', 0, NAN), R.NONE),
     Fault(
-        'effort is NaN, and is learned from',
+        'effort is NaN and used for learning',
         spoil('effort', 0, NAN),
         R.NOT_FINITE,
         given={'learning.torque_source': 'effort'},
@@ -356,48 +356,46 @@ FAULTS = (
     Fault('position of joint2 is 1e300 rad', spoil('q', 1, 1e300), R.OUTSIDE_BOUND),
     Fault('velocity of joint1 is 60 rad/s', spoil('dq', 0, 60.0), R.VELOCITY),
     Fault('velocity of joint2 is -1e300 rad/s', spoil('dq', 1, -1e300), R.VELOCITY),
-    Fault('joints in another order', every(turned), R.NONE),
-    Fault('joints among others, one of them NaN', every(accompanied), R.NONE),
-    Fault('a joint twice', once(duplicated), R.JOINT_DUPLICATED),
-    Fault('a joint missing', once(renamed('joint1', 'joint3')), R.JOINT_MISSING),
+    Fault('joints in another order', every(reordered), R.NONE),
+    Fault('extra joints, one of them NaN', every(among_others), R.NONE),
+    Fault('duplicate joint', once(duplicated), R.JOINT_DUPLICATED),
+    Fault('missing joint', once(renamed('joint1', 'joint3')), R.JOINT_MISSING),
+    Fault('no joints', once(lambda s: [s.raw(named(), q=[], dq=[], effort=[])]), R.JOINT_MISSING),
     Fault(
-        'no joint at all', once(lambda s: [s.raw(named(), q=[], dq=[], effort=[])]), R.JOINT_MISSING
-    ),
-    Fault(
-        "another robot's states in between",
+        'states of another robot in between',
         every(lambda s: [s.raw(named('a', 'b')), s.raw()]),
         R.NONE,
     ),
-    Fault("only another robot's states", every(renamed('a', 'b')), R.STATE_TIMEOUT, 60, live=True),
+    Fault('only states of another robot', every(renamed('a', 'b')), R.STATE_TIMEOUT, 60, live=True),
     Fault('no positions', once(unmeasured('position')), R.FIELD_MISSING),
     Fault('no velocities', once(unmeasured('velocity')), R.FIELD_MISSING),
     Fault(
-        'no velocities, to be estimated',
+        'no velocities, estimated from positions',
         every(unmeasured('velocity', 'effort')),
         R.NONE,
         given={'safety.velocity': 'estimated'},
     ),
     Fault('no efforts', every(unmeasured('effort')), R.NONE),
-    Fault('message cut off', once(lambda s: [s.raw()[:-9]]), R.BAD_MESSAGE),
-    Fault('message of no bytes', once(lambda _: [b'']), R.BAD_MESSAGE),
+    Fault('truncated message', once(lambda s: [s.raw()[:-9]]), R.BAD_MESSAGE),
+    Fault('empty message', once(lambda _: [b'']), R.BAD_MESSAGE),
     Fault(
         'message in another encoding', once(lambda s: [b'\x00\x03' + s.raw()[2:]]), R.BAD_MESSAGE
     ),
-    Fault('message of noise', once(lambda _: [b'\x00\x01\x00\x00' + b'\xff' * 60]), R.BAD_MESSAGE),
-    Fault('a state twice', once(lambda s: [s.raw(), s.raw()]), R.NONE),
-    Fault('each state four times', every(lambda s: [s.raw()] * 4), R.NONE),
-    Fault('the same stamp for ever', same_stamp, R.STAMP_REPEATED, 5),
-    Fault('stamp 2 ms back', shifted(-2 * MILLISECOND), R.STAMP_BACKWARD),
-    Fault('stamp half a second back', shifted(-500 * MILLISECOND), R.STAMP_BACKWARD),
-    Fault('stamp 10 s ahead', shifted(10**10), R.STAMP_JUMP),
-    Fault('stamp of zero', once(lambda s: [s.raw(stamp=0)]), R.STAMP_MISSING),
+    Fault('garbage message', once(lambda _: [b'\x00\x01\x00\x00' + b'\xff' * 60]), R.BAD_MESSAGE),
+    Fault('one state sent twice', once(lambda s: [s.raw(), s.raw()]), R.NONE),
+    Fault('every state sent four times', every(lambda s: [s.raw()] * 4), R.NONE),
+    Fault('stamp stops advancing', same_stamp, R.STAMP_REPEATED, 5),
+    Fault('stamp jumps back by 2 ms', shifted(-2 * MILLISECOND), R.STAMP_BACKWARD),
+    Fault('stamp jumps back by 0.5 s', shifted(-500 * MILLISECOND), R.STAMP_BACKWARD),
+    Fault('stamp jumps ahead by 10 s', shifted(10**10), R.STAMP_JUMP),
+    Fault('stamp is zero', once(lambda s: [s.raw(stamp=0)]), R.STAMP_MISSING),
     Fault('stamp before 1970', once(lambda s: [s.raw(stamp=-1)]), R.STAMP_MISSING),
-    Fault('twenty old states in a burst', delayed, R.STAMP_BACKWARD),
-    Fault('10 ms of silence, then all its states at once', silence(10, queued=True), R.NONE),
+    Fault('burst of twenty old states', delayed, R.STAMP_BACKWARD),
+    Fault('10 ms of silence, then all delayed states at once', silence(10, queued=True), R.NONE),
     Fault('50 ms of silence', silence(50), R.STATE_TIMEOUT, 50, live=True),
-    Fault('50 ms of silence, not watched by the clock', silence(50), R.STAMP_JUMP, 50),
-    Fault('the arm falls silent for good', every(lambda _: []), R.STATE_TIMEOUT, 60, live=True),
-    Fault('the controller sleeps for 200 ms', stalled, R.NONE, live=True),
+    Fault('50 ms of silence, watchdog off', silence(50), R.STAMP_JUMP, 50),
+    Fault('joint states stop for good', every(lambda _: []), R.STATE_TIMEOUT, 60, live=True),
+    Fault('controller process stalls for 200 ms', stalled, R.NONE, live=True),
     Fault(
         'only every third state arrives',
         sparse(3),
@@ -405,9 +403,9 @@ FAULTS = (
         100,
         given={'safety.overrun_window': 0.1},
     ),
-    Fault('time of day set back by an hour', clock_back, R.NONE, live=True),
+    Fault('wall clock set back by an hour', wall_clock_back, R.NONE, live=True),
     Fault(
-        'encoders stand still',
+        'encoders frozen',
         frozen,
         R.OUTSIDE_BOUND,
         120,
@@ -417,7 +415,7 @@ FAULTS = (
     Fault('arm pushed with 40 N m', pushed, R.OUTSIDE_BOUND, 40),
     Fault('motors reversed', reversed_motor, R.OUTSIDE_BOUND, 40),
     Fault(
-        'torque limit below what gravity needs',
+        'torque limit below the gravity torque',
         retuned(torque__limit=(5.0, 5.0)),
         R.OUTSIDE_BOUND,
         60,
@@ -439,24 +437,24 @@ FAULTS = (
         R.NONE,
         given={'learning.radius': 0.6, 'learning.initial_estimate': [0.55, 0.16, 0.16]},
     ),
-    Fault('all gains changed in every sample', storm, R.NONE),
-    Fault('reference replaced on the way, again and again', replaced(possible=True), R.NONE),
-    Fault('reference asked for that is too fast', replaced(possible=False), R.NONE),
-    Fault('bound asked for below the error', refused(barrier__bound=[1e-9, 1e-9]), R.NONE),
-    Fault('torque limit asked for below the torque', refused(torque__limit=[1.0, 1.0]), R.NONE),
-    Fault('one command of a wrong length', wired_once(np.zeros(3)), R.NONE),
-    Fault('one command without values', wired_once(np.zeros(0)), R.NONE),
-    Fault('one command that is NaN', wired_once(np.array([NAN, 1.0])), R.NONE),
-    Fault('one command that is infinite', wired_once(np.array([1.0, INF])), R.NONE),
-    Fault('all commands come as NaN', wired(np.array([NAN, NAN])), R.OUTSIDE_BOUND, 80),
-    Fault('plant killed and started again', restarted_plant, R.STAMP_BACKWARD),
+    Fault('all gains changed in every sample', random_gains, R.NONE),
+    Fault('trajectory replaced repeatedly in motion', replaced(possible=True), R.NONE),
+    Fault('requested trajectory too fast', replaced(possible=False), R.NONE),
+    Fault('requested bound below the error', rejection(barrier__bound=[1e-9, 1e-9]), R.NONE),
+    Fault('requested torque limit below the torque', rejection(torque__limit=[1.0, 1.0]), R.NONE),
+    Fault('one command of the wrong length', one_command(np.zeros(3)), R.NONE),
+    Fault('one command without values', one_command(np.zeros(0)), R.NONE),
+    Fault('one command that is NaN', one_command(np.array([NAN, 1.0])), R.NONE),
+    Fault('one command that is infinite', one_command(np.array([1.0, INF])), R.NONE),
+    Fault('all commands are NaN', every_command(np.array([NAN, NAN])), R.OUTSIDE_BOUND, 80),
+    Fault('plant killed and restarted', restarted_plant, R.STAMP_BACKWARD),
     Fault(
-        'controller killed, started far away',
+        'controller killed and restarted outside the bound',
         restarted_controller,
         R.START_REJECTED,
         given={'approach.enabled': False},
     ),
-    Fault('controller killed, led back by an approach', restarted_controller, R.NONE),
+    Fault('controller killed and restarted, with an approach', restarted_controller, R.NONE),
 )
 
 
@@ -474,12 +472,11 @@ def rows() -> Iterator[str]:
 PREFACE = """\
 # Faults
 
-What the controller does when something breaks: each row is run by
-`test/test_supervision_faults.py`, in a loop of 1 kHz with the recommended settings,
-and this page is made by `python test/fault_table.py
-doc/faults.md`. *Detected* counts the samples from the fault to the safe stop; a fault that is
-tolerated does no harm: tracking continues within the bound. *Torque* is the largest commanded from
-then on. A stop lasts until `~/reset`, after which the loop runs again.
+What the controller does when something breaks. Each row is run by
+`test/test_supervision_faults.py` in a 1 kHz loop with the recommended settings; the page is written
+by `python test/fault_table.py doc/faults.md`. *Detected* counts the samples from the fault to the
+safe stop; a tolerated fault does no harm: tracking continues within the bound. *Torque* is the
+largest commanded from then on. A stop lasts until `~/reset`, after which the loop runs again.
 
 | fault | detected after | reason | torque [N m] | runs after reset |
 | --- | --- | --- | --- | --- |

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures show the run: all of its panels, and no peak lost."""
+"""The figures show every panel of the run and keep its peaks."""
 
 from __future__ import annotations
 
@@ -35,24 +35,24 @@ def pixels(path):
 
 
 def amount(image, colour):
-    """Number of pixels of about this colour."""
-    wanted = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
-    return int((np.abs(image - wanted).max(axis=2) < 0.08).sum())
+    """Number of pixels close to this colour."""
+    target = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    return int((np.abs(image - target).max(axis=2) < 0.08).sum())
 
 
 def lightened(colour, opacity=0.75):
-    """Colour of a line of that opacity on white."""
+    """Colour of a line with this opacity on white."""
     return to_hex(np.array(to_rgb(colour)) * opacity + 1.0 - opacity)
 
 
-def test_both_pictures_are_drawn(run, tmp_path):
+def test_draw_writes_both_figures(run, tmp_path):
     assert draw(run, tmp_path) == [tmp_path / 'tracking.png', tmp_path / 'parameters.png']
     tracking = pixels(tmp_path / 'tracking.png')
     parameters = pixels(tmp_path / 'parameters.png')
-    # Wide enough that its labels can be read on a page.
+    # Wide enough for readable labels on a page.
     assert tracking.shape[1] > 1200
     assert parameters.shape[1] > 1200
-    # The shaded bound, the error and the torque; the lines of three parameters.
+    # The shaded bound, the error and the torque; one line for each of three parameters.
     assert amount(tracking, '#DCE9F5') > 20_000
     assert amount(tracking, '#0072B2') > 1000
     assert amount(tracking, '#D55E00') > 1000
@@ -60,7 +60,7 @@ def test_both_pictures_are_drawn(run, tmp_path):
         assert amount(parameters, lightened(colour)) > 500
 
 
-def test_a_violation_is_marked(run, tmp_path):
+def test_bound_violation_is_marked(run, tmp_path):
     error = run.error.copy()
     error[2000, 1] = 0.003
     for shown, marked in ((run, False), (dataclasses.replace(run, error=error), True)):
@@ -69,7 +69,7 @@ def test_a_violation_is_marked(run, tmp_path):
         assert red > 100 if marked else red == 0
 
 
-def test_mouth_of_a_funnel_does_not_hide_the_error(run, tmp_path):
+def test_error_stays_visible_beside_the_wide_start_of_a_funnel(run, tmp_path):
     draw(run, tmp_path)
     shown = amount(pixels(tmp_path / 'tracking.png'), '#0072B2')
     widening = np.linspace(20.0, 1.0, len(run.bound))[:, None]
@@ -77,37 +77,37 @@ def test_mouth_of_a_funnel_does_not_hide_the_error(run, tmp_path):
     assert amount(pixels(tmp_path / 'tracking.png'), '#0072B2') > 0.8 * shown
 
 
-def test_less_in_the_bag_is_a_smaller_picture(run, tmp_path):
+def test_missing_series_give_smaller_figures(run, tmp_path):
     draw(run, tmp_path)
     full = [pixels(tmp_path / name).shape for name in ('tracking.png', 'parameters.png')]
     unknown_torque = np.full_like(run.torque, np.nan)
-    little = dataclasses.replace(run, error=None, truth=None, torque=unknown_torque)
-    assert len(draw(little, tmp_path)) == 2
+    partial = dataclasses.replace(run, error=None, truth=None, torque=unknown_torque)
+    assert len(draw(partial, tmp_path)) == 2
     assert pixels(tmp_path / 'tracking.png').shape[0] < full[0][0] / 2
 
     (tmp_path / 'alone').mkdir()
-    least = dataclasses.replace(little, reference=None, bound=None, learning=None)
-    assert draw(least, tmp_path / 'alone') == [tmp_path / 'alone' / 'tracking.png']
+    minimal = dataclasses.replace(partial, reference=None, bound=None, learning=None)
+    assert draw(minimal, tmp_path / 'alone') == [tmp_path / 'alone' / 'tracking.png']
     assert not (tmp_path / 'alone' / 'parameters.png').exists()
 
 
-def test_a_small_error_is_seen_beside_a_large_one_on_a_logarithmic_axis(run):
+def test_logarithmic_error_panel_shows_small_and_large_errors(run):
     error = 1e-6 * np.ones_like(run.error)
     error[700, 1] = 0.0015
     found = panels([dataclasses.replace(run, error=error)])
-    (panel,) = (one for one in found if one.title == '|error| of elbow')
-    size, bound = panel.lines
+    (panel,) = (panel for panel in found if panel.title == '|error| of elbow')
+    magnitude, bound = panel.lines
     assert panel.log
-    assert size.values.size == 300
-    assert (size.values.max(), size.time[size.values.argmax()]) == (
+    assert magnitude.values.size == 300
+    assert (magnitude.values.max(), magnitude.time[magnitude.values.argmax()]) == (
         1.5,
         pytest.approx(0.7, abs=0.02),
     )
-    assert np.median(size.values) == pytest.approx(1e-3)  # mrad
+    assert np.median(magnitude.values) == pytest.approx(1e-3)  # mrad
     assert set(bound.values) == {2.0}
 
 
-def test_no_panel_is_drawn_twice_and_every_line_of_monitors_is_named(run, tmp_path, monkeypatch):
+def test_panels_are_drawn_once_and_monitor_lines_are_named(run, tmp_path, monkeypatch):
     learning = run.learning
     drawn = {}
 
@@ -125,7 +125,7 @@ def test_no_panel_is_drawn_twice_and_every_line_of_monitors_is_named(run, tmp_pa
 
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('level', [0.0001, np.nan])
-def test_a_level_alone_on_a_logarithmic_axis_is_drawn(run, tmp_path, level):
+def test_constant_series_on_a_logarithmic_axis_is_drawn(run, tmp_path, level):
     learning = run.learning
     values = learning.values.copy()
     values[:, learning.names.index('lambda_min')] = level
@@ -139,17 +139,17 @@ def test_gaps_and_a_single_sample_are_drawn(run, tmp_path):
     error[100:200] = np.nan
     assert draw(dataclasses.replace(run, error=error), tmp_path)
     optional = ('reference', 'error', 'bound', 'torque_limit')
-    one = dataclasses.replace(
+    single = dataclasses.replace(
         run,
         **{
             name: getattr(run, name)[:1]
             for name in ('stamp', 'received', 'position', 'velocity', 'torque', *optional)
         },
     )
-    assert draw(one, tmp_path)
+    assert draw(single, tmp_path)
 
 
-def test_drawing_leaves_no_trace_in_the_process(run, tmp_path):
+def test_drawing_leaves_no_open_figures_and_no_changed_settings(run, tmp_path):
     before = dict(rcParams)
     draw(run, tmp_path)
     assert dict(rcParams) == before
@@ -157,7 +157,7 @@ def test_drawing_leaves_no_trace_in_the_process(run, tmp_path):
 
 
 @given(st.integers(1, 400), st.integers(1, 50), st.randoms(use_true_random=False))
-def test_envelope_keeps_the_peaks_of_every_piece(size, pieces, random):
+def test_envelope_keeps_the_extremes_of_every_piece(size, pieces, random):
     values = np.array([random.choice([random.gauss(0, 1), np.nan]) for _ in range(size)])
     time = np.arange(size) * 0.5
     thin_time, thin = envelope(time, values, pieces)
@@ -167,10 +167,10 @@ def test_envelope_keeps_the_peaks_of_every_piece(size, pieces, random):
     np.testing.assert_array_equal(thin, values[kept])
     for piece in np.split(np.arange(size), np.linspace(0, size, pieces + 1).astype(int)[1:-1]):
         known = values[piece][~np.isnan(values[piece])]
-        there = thin[np.isin(kept, piece)]
+        remaining = thin[np.isin(kept, piece)]
         if known.size:
-            assert np.nanmax(there) == known.max()
-            assert np.nanmin(there) == known.min()
+            assert np.nanmax(remaining) == known.max()
+            assert np.nanmin(remaining) == known.min()
 
 
 @pytest.mark.parametrize(
@@ -182,5 +182,5 @@ def test_envelope_keeps_the_peaks_of_every_piece(size, pieces, random):
         ('inertia', 'inertia'),
     ],
 )
-def test_formulas_are_set_as_such(name, shown):
+def test_formulas_are_typeset_as_mathematics(name, shown):
     assert formula(name) == shown

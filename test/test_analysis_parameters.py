@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimates are compared with the plant's parameters by name, or not at all."""
+"""Estimates are compared with the plant's parameters by name only."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def record():
 
 
 @pytest.mark.parametrize('source', ['simulation', 'bag'])
-def test_the_planar_chain_of_two_links_has_the_error_of_the_two_link_arm(record, source, tmp_path):
+def test_planar_chain_of_two_links_has_the_error_of_the_two_link_arm(record, source, tmp_path):
     run = record.run()
     if source == 'bag':
         write_bag(tmp_path / 'bag', record, record.config, 'none')
@@ -48,7 +48,7 @@ def test_the_planar_chain_of_two_links_has_the_error_of_the_two_link_arm(record,
     assert learning['true'] == same['true']
 
 
-def test_the_progress_compares_by_name(record, capsys):
+def test_progress_compares_parameters_by_name(record, capsys):
     config = loop()
     names = ('(m1+m2)*l1^2', 'm2*l1*l2', 'm2*l2^2')
     for shown, line in (
@@ -61,16 +61,16 @@ def test_the_progress_compares_by_name(record, capsys):
         assert line in capsys.readouterr().err
 
 
-def test_a_study_compares_by_name(tmp_path):
+def test_study_compares_parameters_by_name(tmp_path):
     same = study(tmp_path, LOOP + STUDY)
     chain = loop().controller
     learning = replace(same.controller.learning, initial_estimate=chain.learning.initial_estimate)
     other = replace(same, controller=replace(same.controller, model=chain.model, learning=learning))
-    errors = [run_chunk(one, 0, 4)['parameter_error.end'] for one in (same, other)]
+    errors = [run_chunk(case, 0, 4)['parameter_error.end'] for case in (same, other)]
     np.testing.assert_allclose(errors[1], errors[0], rtol=1e-3)
 
 
-def test_other_names_give_no_error_but_the_reason(tmp_path):
+def test_unknown_parameter_names_give_a_reason_instead_of_an_error(tmp_path):
     messages = Synthetic(200).messages()
     run = read_run(synthetic_bag.write(tmp_path / 'bag', messages))
     names = ('mass 1', 'mass 2', *run.learning.names[2:])

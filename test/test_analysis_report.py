@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the page of a bag is made of: every panel, event and parameter, without a browser."""
+"""Contents of the page of a bag, without a browser: panels, events and parameters."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp('bags')
     recorded_run.record(path / 'one')
     recorded_run.record(path / 'other', **{'feedback.gain': [30.0, 10.0]})
-    made = Synthetic(4000)
-    made.error[1234, 0] = -0.005  # one sample far outside
-    made.torque[2000:2010, 1] = 20.0  # ten at the limit
-    pushed = json.dumps({'stamp': START + 2_500_000_000, 'parameters': {'load.torque': [1.0, 0.0]}})
-    message = typestore().types[CHANGES.type](data=pushed)
+    synthetic = Synthetic(4000)
+    synthetic.error[1234, 0] = -0.005  # one sample far outside
+    synthetic.torque[2000:2010, 1] = 20.0  # ten samples at the limit
+    data = json.dumps({'stamp': START + 2_500_000_000, 'parameters': {'load.torque': [1.0, 0.0]}})
+    message = typestore().types[CHANGES.type](data=data)
     change = (CHANGES, START, bytes(typestore().serialize_cdr(message, CHANGES.type)))
-    synthetic_bag.write(path / 'synthetic', [*made.messages(with_timing=True), change])
+    synthetic_bag.write(path / 'synthetic', [*synthetic.messages(with_timing=True), change])
     return path
 
 
@@ -42,11 +42,11 @@ def by_title(bags):
     return {plot['title']: plot for plot in plots(panels([bag.run for bag in bags]), bags)}
 
 
-def test_every_quantity_has_its_panel(folder):
+def test_every_quantity_has_a_panel(folder):
     titles = set(by_title(read_bags([folder / 'synthetic'])))
     expected = {
-        f'{what} of {joint}'
-        for what in ('error', '|error|', 'position', 'torque')
+        f'{quantity} of {joint}'
+        for quantity in ('error', '|error|', 'position', 'torque')
         for joint in JOINTS
     }
     expected |= {'(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2', 'relative parameter error'}
@@ -55,7 +55,7 @@ def test_every_quantity_has_its_panel(folder):
     assert titles == {*expected, 'computing time of the law'}
 
 
-def test_a_peak_of_one_sample_is_not_thinned_away(folder):
+def test_peak_of_one_sample_survives_thinning(folder):
     panel = by_title(read_bags([folder / 'synthetic']))['error of shoulder']
     error, bound, _ = panel['traces']
     k = int(np.argmin(error['y']))
@@ -64,7 +64,7 @@ def test_a_peak_of_one_sample_is_not_thinned_away(folder):
     assert set(bound['y']) == {2.0}
 
 
-def test_events_are_violations_saturation_the_latch_and_changes_of_the_plant(folder):
+def test_events_list_violation_latch_saturation_and_plant_change(folder):
     (bag,) = read_bags([folder / 'synthetic'])
     events = {(event.kind, round(event.time, 3)): event.text for event in bag.events}
     assert events == {
@@ -75,12 +75,12 @@ def test_events_are_violations_saturation_the_latch_and_changes_of_the_plant(fol
     }
 
 
-def test_several_bags_lie_over_each_other_and_their_differences_are_listed(folder, tmp_path):
+def test_several_bags_are_overlaid_and_their_parameter_differences_listed(folder, tmp_path):
     bags = read_bags([folder / 'one', folder / 'other'])
     panel = by_title(bags)['error of joint1']
     names = [trace['name'] for trace in panel['traces']]
     assert names == [
-        f'{bag}: {what}' for bag in ('one', 'other') for what in ('error', *['bound'] * 2)
+        f'{bag}: {line}' for bag in ('one', 'other') for line in ('error', *['bound'] * 2)
     ]
     assert panel['traces'][0]['line']['color'] != panel['traces'][3]['line']['color']
     write_report(bags, tmp_path / 'page.html')
@@ -90,55 +90,55 @@ def test_several_bags_lie_over_each_other_and_their_differences_are_listed(folde
     assert row in text
 
 
-def test_legends_name_what_is_alike_in_all_bags_once(folder):
+def test_legend_names_lines_shared_by_all_bags_once(folder):
     bags = read_bags([folder / 'one', folder / 'other'])
     traces = by_title(bags)['error of joint1']['traces']
     shown = [trace['name'] for trace in traces if trace['showlegend']]
     assert shown == ['one: error', 'one: bound', 'other: error']
 
 
-def test_the_page_says_how_long_series_are_thinned(folder, tmp_path):
+def test_page_explains_how_long_series_are_thinned(folder, tmp_path):
     thinned = 'the largest sample of every 2.67 ms, zoomed or not; every sample is in the table'
-    for name, words in (('synthetic', thinned), ('one', 'Lines show every sample.')):
+    for name, text in (('synthetic', thinned), ('one', 'Lines show every sample.')):
         write_report(read_bags([folder / name]), tmp_path / f'{name}.html')
-        assert words in (tmp_path / f'{name}.html').read_text()
+        assert text in (tmp_path / f'{name}.html').read_text()
 
 
-def test_bags_of_one_name_are_numbered(folder):
-    with_bag = [folder / 'one', folder / '..' / folder.name / 'other', folder / 'one']
-    assert [one.name for one in read_bags(with_bag)] == ['one (1)', 'other', 'one (2)']
+def test_bags_with_the_same_name_are_numbered(folder):
+    paths = [folder / 'one', folder / '..' / folder.name / 'other', folder / 'one']
+    assert [bag.name for bag in read_bags(paths)] == ['one (1)', 'other', 'one (2)']
 
 
-def test_the_arm_has_its_lengths_and_moves_as_measured(folder):
+def test_drawn_arm_has_the_link_lengths_and_the_measured_motion(folder):
     (bag,) = read_bags([folder / 'one'])
     moving = arm(bag, 0)
     assert [joint.offset for joint in moving['joints']] == [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
-    assert moving['tip'] == [0.8, 0.0, 0.0]  # of the plant's configuration
-    assert len(moving['time']) == 50  # a second, at fifty pictures
+    assert moving['tip'] == [0.8, 0.0, 0.0]  # from the plant's configuration
+    assert len(moving['time']) == 50  # one second at 50 frames per second
     assert moving['angles'][-1] == pytest.approx(bag.run.position[-1], abs=1e-4)
     assert moving['reference'][0] == pytest.approx(bag.run.reference[0], abs=1e-4)
 
 
-def test_a_page_is_one_file_whose_data_no_name_can_break(folder, tmp_path):
+def test_page_is_self_contained_and_escapes_names(folder, tmp_path):
     (bag,) = read_bags([folder / 'one'])
     nasty = '</script><b>&{{data}}'
     write_report([replace(bag, name=nasty)], tmp_path / 'page.html')
     text = (tmp_path / 'page.html').read_text()
-    ours = text.split('<script>')[0] + text.rsplit('<script>', 1)[1]  # without plotly's own script
-    assert not re.search(r'(?:src|href)="(?!#|data:)|https?:', ours)
+    own = text.split('<script>')[0] + text.rsplit('<script>', 1)[1]  # without plotly's own script
+    assert not re.search(r'(?:src|href)="(?!#|data:)|https?:', own)
     embedded = re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1]
     assert json.loads(embedded)['arms'][0]['name'] == nasty
-    assert '<b>' not in ours.replace(embedded, '')
+    assert '<b>' not in own.replace(embedded, '')
 
 
-def test_joint_states_alone_make_a_page(tmp_path):
-    states = [one for one in Synthetic(500).messages() if one[0] is JOINT_STATES]
+def test_joint_states_alone_suffice_for_a_page(tmp_path):
+    states = [entry for entry in Synthetic(500).messages() if entry[0] is JOINT_STATES]
     synthetic_bag.write(tmp_path / 'bag', states)
     assert main(['report', str(tmp_path / 'bag'), '--out', str(tmp_path / 'page.html')]) == 0
     assert 'not recorded in the bag' in (tmp_path / 'page.html').read_text()
 
 
-def test_what_is_wrong_is_one_message(tmp_path, capsys):
+def test_missing_bag_is_reported_as_one_message(tmp_path, capsys):
     assert main(['report', str(tmp_path / 'nowhere'), '--out', str(tmp_path / 'page.html')]) == 1
     assert capsys.readouterr().err.startswith('blf_dsc report: ')
     assert not (tmp_path / 'page.html').exists()

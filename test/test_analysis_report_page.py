@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a bag in a browser: it draws and zooms without errors. `make test-browser`.
+"""The page of a bag draws and zooms in a browser without errors; runs in `make test-browser`.
 
-What is plotted is checked without a browser in test_analysis_report.py.
+The contents of the page are checked without a browser in test_analysis_report.py.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ def pages(tmp_path_factory):
 
 @pytest.fixture
 def browser(tmp_path):
-    one = chromium.Browser(tmp_path / 'profile')
-    yield one
-    one.close()
+    instance = chromium.Browser(tmp_path / 'profile')
+    yield instance
+    instance.close()
 
 
 def show(browser, path):
@@ -73,9 +73,7 @@ def test_every_panel_is_drawn_without_errors(browser, pages, name):
 
 @pytest.mark.parametrize('name', ['one', 'both'])
 @pytest.mark.parametrize('width', [400, 1400])
-def test_a_page_fits_its_window_and_no_legend_covers_a_title_or_an_axis(
-    browser, pages, name, width
-):
+def test_page_fits_the_window_and_legends_cover_no_title_or_axis(browser, pages, name, width):
     metrics = {'width': width, 'height': 900, 'deviceScaleFactor': 1, 'mobile': False}
     browser.call('Emulation.setDeviceMetricsOverride', **metrics)
     show(browser, pages / f'{name}.html')
@@ -93,20 +91,20 @@ def test_a_page_fits_its_window_and_no_legend_covers_a_title_or_an_axis(
     browser.screenshot(SHOTS / f'report_{name}_{width}.png', whole=True)
 
 
-def test_nothing_is_loaded_from_elsewhere(browser, pages):
+def test_page_loads_no_external_resources(browser, pages):
     show(browser, pages / 'one.html')
     assert browser.value('performance.getEntriesByType("resource").length') == 0
 
 
-def test_dragging_zooms_all_panels_over_time_and_a_double_click_undoes_it(browser, pages):
+def test_dragging_zooms_all_time_panels(browser, pages):
     show(browser, pages / 'one.html')
     before = ranges(browser)
-    assert all(one == pytest.approx([0.0, 4.0]) for one in before)
-    place = browser.value(
+    assert all(limits == pytest.approx([0.0, 4.0]) for limits in before)
+    box = browser.value(
         f"(() => {{ const r = {PLOTS}[0].querySelector('.nsewdrag').getBoundingClientRect();"
         'return [r.left, r.top, r.width, r.height]; })()'
     )
-    left, top, width, height = place
+    left, top, width, height = box
     middle = top + height / 2
     browser.drag((left + width * 0.25, middle), (left + width * 0.5, middle))
     browser.wait(f'{PLOTS}[0].layout.xaxis.range[1] < 2.5')
@@ -118,7 +116,7 @@ def test_dragging_zooms_all_panels_over_time_and_a_double_click_undoes_it(browse
     assert browser.complaints == []
 
 
-def test_the_arm_moves(browser, pages):
+def test_arm_is_animated(browser, pages):
     show(browser, pages / 'one.html')
     browser.value("document.getElementById('arm-play').click()")
     browser.wait("document.getElementById('arm').dataset.time > 0.2")

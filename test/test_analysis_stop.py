@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A safe stop is in the table, the summary, the pictures and the page, with its reason and time.
+"""Table, summary, figures and page show a safe stop with its reason and time.
 
-The sample that leads to it is published without its error: only the journal shows what happened.
+The sample that causes it is published without its error: only the journal has the cause.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from blf_dsc_controller.messages.topics import (
 from blf_dsc_controller.supervision.supervisor import Reason
 
 STOP_S = 2.345
-LATE = 40 * MILLISECOND  # from a stamp to its reception
+LATE = 40 * MILLISECOND  # from the stamp of a message to its reception
 
 
 def stopped(folder, reason=Reason.OUTSIDE_BOUND):
@@ -47,10 +47,10 @@ def stopped(folder, reason=Reason.OUTSIDE_BOUND):
         if topic not in (TRACKING_ERROR, REFERENCE, LEARNING) or stamp < stop
     ]
     messages.append((JOURNAL, stop + 2 * LATE, event.encode()))
-    return synthetic_bag.write(folder / 'bag', sorted(messages, key=lambda one: one[1]))
+    return synthetic_bag.write(folder / 'bag', sorted(messages, key=lambda entry: entry[1]))
 
 
-def test_an_error_past_the_bound_is_a_violation_at_the_stamp_of_the_last_state(tmp_path):
+def test_stop_outside_the_bound_is_a_violation_at_the_stamp_of_the_last_state(tmp_path):
     run = read_run(stopped(tmp_path))
     assert np.nanmax(np.abs(run.error)) < synthetic_bag.BOUND_RAD
     tracking = summarize(run)['tracking']
@@ -66,7 +66,7 @@ def test_an_error_past_the_bound_is_a_violation_at_the_stamp_of_the_last_state(t
     assert 'held' not in table
 
 
-def test_any_other_stop_limits_what_was_held(tmp_path):
+def test_stop_for_another_reason_keeps_the_bound_held_until_then(tmp_path):
     summary = summarize(read_run(stopped(tmp_path, Reason.VELOCITY)))
     assert summary['tracking']['held'] is True
     table = format_table(summary)
@@ -74,7 +74,7 @@ def test_any_other_stop_limits_what_was_held(tmp_path):
     assert 'stopped     at 2.345 s, velocity not plausible' in table
 
 
-def test_pictures_and_page_show_the_stop(tmp_path, capsys):
+def test_figures_and_page_show_the_stop(tmp_path, capsys):
     path = stopped(tmp_path)
     run = read_run(path)
     shown = [panel for panel in panels([run]) if panel.group in ('Motion', 'Tracking', 'Torque')]
@@ -86,9 +86,9 @@ def test_pictures_and_page_show_the_stop(tmp_path, capsys):
         assert panel.marks[0].time == pytest.approx(STOP_S)
         assert panel.marks[0].until == run.duration
     draw(run, tmp_path)
-    picture = pixels(tmp_path / 'tracking.png')
-    assert amount(picture, ALARM) > 100
-    assert amount(picture, lightened(ALARM, 0.1)) > 50_000  # shaded from the stop on
+    figure = pixels(tmp_path / 'tracking.png')
+    assert amount(figure, ALARM) > 100
+    assert amount(figure, lightened(ALARM, 0.1)) > 50_000  # shaded after the stop
     (bag,) = read_bags([path])
     (event,) = (event for event in bag.events if event.kind == 'stop')
     assert event.time == pytest.approx(STOP_S)
@@ -102,25 +102,25 @@ def test_pictures_and_page_show_the_stop(tmp_path, capsys):
     assert 'VIOLATED' in capsys.readouterr().out
 
 
-def test_a_stop_is_shaded_until_the_controller_starts_again(tmp_path):
+def test_stop_is_shaded_until_the_controller_restarts(tmp_path):
     stop, start = (START + k * MILLISECOND for k in (1000, 1800))
     events = [
         Event(1, EventType.STOP, stop, 1, 1, {'reason': Reason.VELOCITY, 'text': 'too fast'}),
         Event(2, EventType.START, start, 1, 1, {'resumed': False}),
     ]
-    messages = [*Synthetic(4000).messages(), *((JOURNAL, START, one.encode()) for one in events)]
+    messages = [*Synthetic(4000).messages(), *((JOURNAL, START, each.encode()) for each in events)]
     path = synthetic_bag.write(tmp_path / 'bag', messages)
     (bag,) = read_bags([path])
     pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
     from blf_dsc_controller.analysis.report import plots
 
-    (plot,) = (one for one in plots(panels([bag.run]), [bag]) if one['title'] == 'torque of elbow')
+    (plot,) = (p for p in plots(panels([bag.run]), [bag]) if p['title'] == 'torque of elbow')
     assert plot['marks'] == [
         (pytest.approx(1.0), 'stop: velocity not plausible', ALARM, pytest.approx(1.8))
     ]
 
 
-def test_a_guarded_loop_that_is_pushed_out_is_reported_so(tmp_path):
+def test_push_out_of_the_bound_is_reported_for_a_guarded_loop(tmp_path):
     rig = Rig()
     states, bound = JointStateEncoder(JOINTS), JointStateEncoder(JOINTS, ('position', 'effort'))
     errors = JointStateEncoder(JOINTS)

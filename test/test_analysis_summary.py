@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The summary of a made-up run has the numbers it was made of."""
+"""The summary of a synthetic run has the numbers it was generated from."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_tracking(run):
     assert summary['tracking']['held'] is True
     assert summary['tracking']['first_violation'] is None
     shoulder, elbow = (summary['tracking']['joints'][joint] for joint in JOINTS)
-    # Whole periods of sinusoids: the rms is the amplitude over the root of two.
+    # Whole periods of sinusoids: the rms is the amplitude over sqrt(2).
     assert shoulder['max_abs_error_rad'] == pytest.approx(0.0008)
     assert shoulder['rms_error_rad'] == pytest.approx(0.0008 / np.sqrt(2))
     assert elbow['max_abs_error_rad'] == pytest.approx(0.0005)
@@ -47,7 +47,7 @@ def test_tracking(run):
 def test_first_violation_is_the_earliest_of_all_joints(run):
     error = run.error.copy()
     error[4000, 0] = 0.0021
-    error[3000, 1] = -BOUND_RAD  # on the bound is outside: the barrier is infinite there
+    error[3000, 1] = -BOUND_RAD  # on the bound counts as outside: the barrier is infinite there
     tracking = summarize(dataclasses.replace(run, error=error))['tracking']
     assert tracking['held'] is False
     assert tracking['first_violation'] == {'time_s': pytest.approx(3.0), 'joint': 'elbow'}
@@ -57,7 +57,7 @@ def test_learning(run):
     learning = summarize(run)['learning']
     assert learning['latch_time_s'] == pytest.approx(LATCH_S)
     errors = learning['relative_error_at_s']
-    # The run ends one sample before 10 s, which counts as having reached it.
+    # The run ends one sample before 10 s, which counts as 10 s.
     assert list(errors) == ['5', '10']
     assert errors['5'] == pytest.approx(0.5 * np.exp(-3.5))
     assert errors['10'] == learning['final_relative_error']
@@ -68,7 +68,7 @@ def test_learning(run):
     assert list(learning['final_estimate']) == list(PARAMETERS)
 
 
-def test_one_percent_counts_only_if_it_lasts(run):
+def test_time_to_one_percent_requires_staying_below_it(run):
     values = run.learning.values.copy()
     values[-1, 0] = 0.0
     learning = dataclasses.replace(run.learning, values=values)
@@ -84,7 +84,7 @@ def test_timing(run):
     assert timing['latency_us'] == pytest.approx(expected)
     assert timing['late_steps'] == 99
     assert summarize(run)['compute_time_us']['p50'] == pytest.approx(4.9995)
-    slow = dataclasses.replace(run, received=run.received * 2)  # the rate is of the wall clock
+    slow = dataclasses.replace(run, received=run.received * 2)  # the rate is by the wall clock
     assert summarize(slow)['timing']['rate_hz'] == pytest.approx(500.0)
 
 
@@ -95,7 +95,7 @@ def test_messages_are_counted(run):
     assert messages[BOUND.resolved] == 1
 
 
-def test_unknown_is_null_and_never_nan(run, tmp_path):
+def test_unknown_values_are_null_and_never_nan(run, tmp_path):
     optional = ('reference', 'error', 'bound', 'torque_limit', 'learning', 'truth', 'timing')
     unknown = dict.fromkeys(optional) | {'torque': np.full_like(run.torque, np.nan)}
     summary = summarize(dataclasses.replace(run, **unknown))
@@ -111,12 +111,12 @@ def summary_without(topic, folder):
     return summarize(read_run(synthetic_bag.write(folder / 'bag', messages)))
 
 
-def test_unknown_truth_leaves_the_estimates(tmp_path):
+def test_estimates_are_summarized_without_the_truth(tmp_path):
     learning = summary_without(TRUTH, tmp_path)['learning']
     assert learning['final_relative_error'] is None
     assert learning['true'] is None
     assert list(learning['final_estimate']) == list(PARAMETERS)
-    assert learning['latch_time_s'] is None  # too short a run
+    assert learning['latch_time_s'] is None  # the run is too short
 
 
 def test_learning_is_optional_in_a_bag(tmp_path):
@@ -125,7 +125,7 @@ def test_learning_is_optional_in_a_bag(tmp_path):
     assert summary['compute_time_us'] is None
 
 
-def test_compute_time_that_was_not_measured_is_null(run):
+def test_unmeasured_compute_time_is_null(run):
     learning = run.learning
     values = learning.values.copy()
     values[:, learning.names.index('compute_time')] = np.nan
@@ -133,7 +133,7 @@ def test_compute_time_that_was_not_measured_is_null(run):
     assert summarize(unmeasured)['compute_time_us'] is None
 
 
-def test_a_bound_that_was_wider_is_in_the_table(run):
+def test_table_shows_the_widest_bound(run):
     bound = run.bound.copy()
     bound[:100, 1] = 0.0123
     table = format_table(summarize(dataclasses.replace(run, bound=bound)))
@@ -141,7 +141,7 @@ def test_a_bound_that_was_wider_is_in_the_table(run):
     assert 'at widest' not in format_table(summarize(run))
 
 
-def test_a_computer_too_busy_for_real_time_is_named(run):
+def test_table_warns_of_late_steps(run):
     timing = run.timing
     late = timing.values.copy()
     late[-1, timing.names.index(LATE_STEPS)] = 0.02 * SAMPLES
@@ -151,9 +151,9 @@ def test_a_computer_too_busy_for_real_time_is_named(run):
     assert 'too busy' not in format_table(summarize(run))
 
 
-def test_the_table_shows_the_summary(run):
+def test_table_shows_the_summary(run):
     table = format_table(summarize(run))
-    for words in (
+    for text in (
         'shoulder  0.800 mrad  0.566 mrad  2.000 mrad     8.00 N m    5.66 N m  20.00 N m',
         'held by every joint',
         'began at 1.500 s',
@@ -162,7 +162,7 @@ def test_the_table_shows_the_summary(run):
         '1000.00 Hz',
         '99 late steps',
     ):
-        assert words in table
+        assert text in table
     assert max(map(len, table.splitlines())) <= 120
 
 
@@ -188,16 +188,16 @@ def test_learning_begins_only_in_a_law_that_learns(changes, line, source, tmp_pa
     assert (summary['learning']['latch_time_s'] is None) == bool(changes)
 
 
-def test_the_table_shows_a_violation_and_leaves_out_the_unknown(run):
+def test_table_shows_a_violation_and_an_unknown_bound(run):
     error = run.error + 1.0
     assert 'VIOLATED, first by shoulder at 0.000 s' in format_table(
         summarize(dataclasses.replace(run, error=error))
     )
-    little = dataclasses.replace(run, error=None, learning=None, timing=None)
-    assert 'bound       unknown' in format_table(summarize(little))
+    partial = dataclasses.replace(run, error=None, learning=None, timing=None)
+    assert 'bound       unknown' in format_table(summarize(partial))
 
 
-def test_a_simulation_and_its_bag_have_the_same_metrics(tmp_path):
+def test_simulation_and_its_bag_have_the_same_metrics(tmp_path):
     config = recorded_run.loop_config()
     simulated = summarize(simulate(config.controller, config.plant).run())
     recorded = summarize(read_run(recorded_run.record(tmp_path / 'bag')))

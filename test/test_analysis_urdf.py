@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs of arms from a URDF: seven joints and their parameters readable, errors in torques."""
+"""Runs of arms from a URDF: readable figures of seven joints, model errors in torque."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from blf_dsc_controller.run import LearnedArm, Run, Series
 
 PERIOD = 10_000_000  # ns
 TIME = np.arange(1001) * PERIOD * 1e-9
-P = np.array([2.0, 3.0, 5.0])  # kg m^2, kg m, and one that no torque shows
+P = np.array([2.0, 3.0, 5.0])  # kg m^2, kg m, and one without effect on the torque
 
 
 def pendulum(_q, _dq, _v, a, H):
@@ -35,7 +35,7 @@ def pendulum(_q, _dq, _v, a, H):
 
 
 def run_of(estimate, true=P, regressor=pendulum):
-    """One joint on sin t whose estimates are these, (3,) or (N, 3)."""
+    """One joint following sin t with these estimates, (3,) or (N, 3)."""
     stamp = np.arange(TIME.size) * PERIOD
     names = ('Izz1', 'm*cx1', 'Ixx1')
     one = np.ones((TIME.size, 1))
@@ -60,7 +60,7 @@ def run_of(estimate, true=P, regressor=pendulum):
     )
 
 
-def test_error_is_that_of_the_torques_along_the_reference():
+def test_parameter_error_is_the_torque_error_along_the_reference():
     assert measure(run_of(1.1 * P)).final_parameter_error == pytest.approx(0.1)
     assert measure(run_of(P * (1.0, 1.0, 7.0))).final_parameter_error == pytest.approx(0.0)
     off = measure(run_of(P * (1.25, 1.0, 1.0))).final_parameter_error
@@ -68,21 +68,21 @@ def test_error_is_that_of_the_torques_along_the_reference():
     assert off == pytest.approx(expected, rel=0.01)
 
 
-def test_regressor_is_asked_along_the_motion_of_the_reference():
-    asked = []
+def test_regressor_is_evaluated_along_the_reference():
+    calls = []
 
-    def noting(q, dq, v, a, _H):
-        asked.append((q[0], dq[0], v[0], a[0]))
+    def record(q, dq, v, a, _H):
+        calls.append((q[0], dq[0], v[0], a[0]))
 
-    estimates_of(run_of(P, regressor=noting))
-    q, dq, v, a = np.transpose(asked)
+    estimates_of(run_of(P, regressor=record))
+    q, dq, v, a = np.transpose(calls)
     t = np.arcsin(q)
     np.testing.assert_allclose(a, -q, atol=1e-4)
     np.testing.assert_array_equal(dq, v)
     np.testing.assert_allclose(np.abs(dq), np.cos(t), atol=1e-4)
 
 
-def test_table_and_summary_tell_the_torque_error_by_its_name():
+def test_table_and_summary_name_the_torque_error():
     summary = summarize(run_of(1.1 * P))
     assert summary['learning']['final_torque_error'] == pytest.approx(0.1)
     assert 'final_relative_error' not in summary['learning']
@@ -90,20 +90,20 @@ def test_table_and_summary_tell_the_torque_error_by_its_name():
     assert f'model       {line}' in format_table(summary).splitlines()
 
 
-def test_without_a_motion_the_error_is_unknown():
+def test_torque_error_is_unknown_without_a_reference():
     run = run_of(P)
     still = replace(run, reference=np.full_like(run.reference, np.nan))
     assert np.isnan(measure(still).final_parameter_error)
     assert 'torque error' not in format_table(summarize(still))
 
 
-def test_estimates_are_shown_in_deviations_of_their_prior():
+def test_estimate_errors_are_shown_in_deviations_of_the_prior():
     found = {panel.title: panel for panel in panels([run_of(P + 1.0)])}
     lines = {line.name: line.values[-1] for line in found['errors of link 1, joint1'].lines}
     assert lines == pytest.approx({'Izz1': 2.0, 'm*cx1': 1.0, 'Ixx1': 0.5})
 
 
-def test_a_change_of_the_true_arm_is_marked():
+def test_change_of_the_true_arm_is_marked():
     true = np.tile(P, (TIME.size, 1))
     true[400:500] *= np.linspace(1.01, 1.5, 100)[:, np.newaxis]
     true[500:] *= 1.5
@@ -113,7 +113,7 @@ def test_a_change_of_the_true_arm_is_marked():
         assert marks == pytest.approx([4.0] if first else [])
 
 
-def test_seven_joints_and_sixty_parameters_fit_into_the_pictures(tmp_path):
+def test_seven_joints_and_sixty_parameters_fit_into_the_figures(tmp_path):
     config = panda()
     arm = learned_arm(config)
     names = tuple(arm.units)
@@ -126,18 +126,18 @@ def test_seven_joints_and_sixty_parameters_fit_into_the_pictures(tmp_path):
         arm=arm,
     )
     with warnings.catch_warnings():
-        warnings.simplefilter('error')  # of matplotlib, that there is no room for the axes
+        warnings.simplefilter('error')  # matplotlib warns when there is no room for the axes
         tracking, parameters = draw(run, tmp_path)
     for path in (tracking, parameters):
         assert 1200 < matplotlib.image.imread(path).shape[1] < 2000
     shown = [panel for panel in panels([run]) if panel.group == 'Parameters']
     assert all(len(panel.lines) <= 8 for panel in shown)  # as many as there are colours
-    told = [line.name for panel in shown for line in panel.lines]
+    drawn = [line.name for panel in shown for line in panel.lines]
     joints = list(config.joints)
-    assert sorted(told) == sorted([*names[:48], *joints, *joints])
+    assert sorted(drawn) == sorted([*names[:48], *joints, *joints])
 
 
-def test_the_arm_of_a_bag_is_that_of_its_recorded_configuration(tmp_path):
+def test_arm_of_a_bag_comes_from_its_recorded_configuration(tmp_path):
     config = panda()
     text = dumps({'blf_dsc_controller': config})
     messages = recorded_run.messages(recorded_run.record(tmp_path / 'two_links', 0.1))
@@ -147,26 +147,26 @@ def test_the_arm_of_a_bag_is_that_of_its_recorded_configuration(tmp_path):
     assert reported.arm == arm_of_chain(config.robot.chain(config.joints))
     assert run.arm is not None
     assert run.arm.deviations == learned_arm(config).deviations
-    # It learned parameters of other names: those have a norm.
+    # It learned parameters with other names: their error is a norm.
     assert estimates_of(run).torques is None
     assert read_run(tmp_path / 'two_links').arm is None
 
 
-def test_the_page_draws_the_arm_in_space():
+def test_page_draws_the_arm_in_space():
     chain = panda().robot.chain(panda().joints)
     drawn = arm_of_chain(chain)
-    tip, turned = np.zeros(3), np.eye(3)
+    tip, rotation = np.zeros(3), np.eye(3)
     for joint in drawn.joints:
-        tip = tip + turned @ joint.offset
-        turned = turned @ joint.rotation
-    # Stretched out to its full height: 0.333, 0.316, 0.384 m up, flange and hand 0.2104 m down.
-    tip = tip + turned @ drawn.tip
+        tip = tip + rotation @ joint.offset
+        rotation = rotation @ joint.rotation
+    # Fully stretched upwards: 0.333, 0.316, 0.384 m up, flange and hand 0.2104 m down.
+    tip = tip + rotation @ drawn.tip
     np.testing.assert_allclose(tip, [0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.2104], atol=1e-5)
     assert drawn.joints[3].axis == [0.0, 0.0, 1.0]
     assert not any(joint.slides for joint in drawn.joints)
 
 
-def test_a_page_says_where_it_cannot_draw_the_recorded_arm(tmp_path):
+def test_page_reports_that_it_cannot_draw_the_recorded_arm(tmp_path):
     messages = recorded_run.messages(recorded_run.record(tmp_path / 'two_links', 0.1))
     text = dumps({'blf_dsc_controller': panda()}).replace('<robot', '<gone')
     (reported,) = read_bags([recorded_run.write(tmp_path / 'bag', messages, text, model='urdf')])

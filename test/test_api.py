@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The public interface: README's example runs, and nothing is loaded before it is used."""
+"""The public interface: documented names, lazy imports, errors that can be pickled."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_every_public_name_is_documented():
         assert getattr(blf, name).__doc__, name
 
 
-def test_importing_the_package_loads_none_of_it(tmp_path):
+def test_importing_the_package_does_not_import_numpy(tmp_path):
     program = 'import sys, blf_dsc_controller; print("numpy" in sys.modules)'
     assert run_python('-c', program, folder=tmp_path).strip() == 'False'
 
@@ -36,7 +36,7 @@ def test_importing_the_package_loads_none_of_it(tmp_path):
         MissingExtraError('dask', 'dask', 'a cluster'),
     ],
 )
-def test_errors_pass_between_processes(error):
+def test_errors_can_be_passed_between_processes(error):
     copied = copy.copy(error)  # as pickle does
     assert type(copied) is type(error)
     assert str(copied) == str(error)

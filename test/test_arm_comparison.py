@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Laws side by side on arms from URDFs: the baselines' identities, and the command."""
+"""The comparison of laws on arms from URDFs: identities of the baselines, and the command."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ IDEAL = {
 }
 HOLD = (0.15, -1.85, 1.36, -1.63, -1.71, 0.42)  # rad
 E0 = 0.004 * np.array([1.0, -0.5, 0.2, 0.8, -1.0, 0.6])  # rad, inside the bound
-REST = {  # sinusoids without amplitude, for a hold would begin where the arm is
+REST = {  # sinusoids of zero amplitude, as a hold would begin where the arm is
     'reference.offset': list(HOLD),
     'reference.amplitude': [0.0] * 18,
 }
 
 
 def ideal(period, duration, law=None, **plant):
-    """A UR5e as its URDF says, all sensors and drives ideal, that starts E0 off the reference."""
+    """A UR5e true to its URDF with ideal sensors and drives, which starts E0 off the reference."""
     loop = load_loop('ur5e')
     config, step = loop.controller, {'sample_time': period}
     chain = config.robot.chain(config.joints)
@@ -85,16 +85,16 @@ def error_of(period):
 
 
 def test_computed_torque_with_the_true_model_has_linear_error_dynamics():
-    """But for the torque being held for a sample: of first order in the sample time."""
-    (coarse, line), (fine, finer_line) = error_of(1e-3), error_of(1e-4)
-    deviations = np.abs(coarse - line).max(), np.abs(fine - finer_line).max()
+    """The deviation is of first order in the sample time, as the torque is held for a sample."""
+    (coarse, line), (fine, fine_line) = error_of(1e-3), error_of(1e-4)
+    deviations = np.abs(coarse - line).max(), np.abs(fine - fine_line).max()
     np.testing.assert_allclose(coarse[0], E0, atol=1e-15)
     assert deviations[0] < 0.02 * np.abs(E0).max()
     assert deviations[0] / deviations[1] == pytest.approx(10.0, rel=0.1)
 
 
-def test_computed_torque_with_the_true_model_follows_a_motion():
-    """Where the model is true, the reference's acceleration leaves no error."""
+def test_computed_torque_with_the_true_model_follows_a_moving_reference():
+    """With the true model, the acceleration of the reference causes no error."""
     loop = ideal(1e-3, 2.0)
     loop = loop._replace(plant=change(loop.plant, {'initial.position': list(HOLD)}))
     m = joint_inertia(loop.controller)
@@ -113,11 +113,11 @@ def resting(gains, **plant):
 
 def test_gravity_compensation_holds_the_arm_at_rest():
     _, (errors, torques) = resting({})
-    assert np.abs(errors).max() < 1e-10  # rad, of 1 s^2 of rounding
+    assert np.abs(errors).max() < 1e-10  # rad, from rounding
     assert np.abs(torques[0]).max() > 10.0
 
 
-def test_a_push_leaves_a_spring_s_error_that_the_integrator_removes():
+def test_integrator_removes_the_static_error_of_a_push():
     push = np.array([3.0, -2.0, 1.0, 0.3, -0.2, 0.1])  # N m
     gains = {'position': 900.0, 'velocity': 50.0}
     inertia, (errors, _) = resting(gains, **{'load.torque': push.tolist()})
@@ -126,22 +126,22 @@ def test_a_push_leaves_a_spring_s_error_that_the_integrator_removes():
     assert np.all(np.abs(integrated[-1]) < 1e-3 * np.abs(errors[-1]))
 
 
-def test_friction_that_is_known_is_compensated_along_the_reference():
+def test_known_friction_is_compensated_along_the_reference():
     config = load_loop('ur5e').controller
     ((q, dq, _),) = terms.sampled(reference_of(config), np.zeros(1))
     start = {'initial.position': q.tolist(), 'initial.velocity': dq.tolist()}  # no approach
     loop = ideal(1e-3, 0.01, **start)
     m = joint_inertia(config)
-    (_, with_it), (_, without) = (
+    (_, compensated), (_, uncompensated) = (
         simulate_baseline(loop, m, {}, computed=False, friction=on) for on in (True, False)
     )
     robot, v = config.robot, config.learning.coulomb_velocity
     friction = robot.viscous * dq + robot.coulomb * np.tanh(dq / v)
-    np.testing.assert_allclose(with_it[0] - without[0], friction, atol=1e-12)
+    np.testing.assert_allclose(compensated[0] - uncompensated[0], friction, atol=1e-12)
     assert np.abs(friction).min() > 0.1
 
 
-def test_integrator_of_slotine_li_is_the_gain_of_its_disturbance_estimate():
+def test_integral_gain_of_slotine_li_is_the_gain_of_its_disturbance_estimate():
     config = load_loop('ur5e').controller
     chosen = {'law': 'slotine_li', 'comparison.integral_gain': [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]}
     settings = settings_of_config(change(config, chosen))
@@ -149,15 +149,15 @@ def test_integrator_of_slotine_li_is_the_gain_of_its_disturbance_estimate():
     assert not settings_of_config(change(config, {'law': 'slotine_li'})).gamma.any()
 
 
-@pytest.mark.parametrize('name', [k for k, one in CONTENDERS.items() if one.law not in BASELINES])
-def test_every_gain_of_a_search_is_a_valid_configuration(name):
+@pytest.mark.parametrize('name', [k for k, c in CONTENDERS.items() if c.law not in BASELINES])
+def test_limits_of_the_gain_search_are_valid_configurations(name):
     config, contender = load_loop('panda').controller, CONTENDERS[name]
     for side in ('least', 'most'):
         values = {gain.name: getattr(gain, side) for gain in contender.gains}
         change(config, law_changes(contender, config, values))
 
 
-def test_every_trial_has_a_truth_a_motion_and_noise_of_its_own():
+def test_every_trial_has_its_own_truth_motion_and_noise():
     trials = [trial('ur5e', seed) for seed in range(4)]
     for get in (
         lambda loop: loop.controller.reference.phase,
@@ -170,7 +170,7 @@ def test_every_trial_has_a_truth_a_motion_and_noise_of_its_own():
     assert len({each.controller.learning.initial_estimate for each in trials}) == 1
 
 
-def test_a_rough_torque_costs_ten_decades_a_decade_and_a_diverged_run_the_most():
+def test_cost_penalises_rough_torque_and_is_largest_for_a_diverged_run():
     figures = Figures((1e-3, 1e-2, 1e-1, 1e0), 200.0, ROUGHEST / 2.0, ())
     assert cost_of(figures) == pytest.approx(1.5)
     assert cost_of(figures._replace(roughness=10.0 * ROUGHEST)) == pytest.approx(11.5)
@@ -178,17 +178,17 @@ def test_a_rough_torque_costs_ten_decades_a_decade_and_a_diverged_run_the_most()
     assert cost_of(figures._replace(errors=(1e300,) * 4)) == 30.0
 
 
-def made(pick_up, model=()):
-    """Two runs with 1 and 2 mrad but at the pick-up, of which the second leaves the bound."""
-    one = Figures((1e-3, 1e-3, pick_up, 1e-3), 0.9, 0.01, model)
-    return Result({}, None, [one, one._replace(errors=(2e-3, 2e-3, pick_up, 2e-3), ratio=1.0)])
+def result(pick_up, model=()):
+    """Two runs with errors of 1 and 2 mrad except at the pick-up; the second leaves the bound."""
+    first = Figures((1e-3, 1e-3, pick_up, 1e-3), 0.9, 0.01, model)
+    return Result({}, None, [first, first._replace(errors=(2e-3, 2e-3, pick_up, 2e-3), ratio=1.0)])
 
 
-def test_best_is_the_law_whose_worst_run_is_the_least_whoever_it_is():
+def test_best_law_is_the_one_with_the_smallest_worst_error():
     laws = {
-        'proposed': made(3e-3, (0.02, 0.01)),
-        'proposed_tuned': made(2.5e-3, (0.03, 0.04)),
-        'pd_gravity_i': made(1.5e-3),
+        'proposed': result(3e-3, (0.02, 0.01)),
+        'proposed_tuned': result(2.5e-3, (0.03, 0.04)),
+        'pd_gravity_i': result(1.5e-3),
     }
     rows = {row[1]: row[2:] for row in least_errors({'arm': laws})}
     assert rows['pick-up [mrad]'] == ['PD + gravity + integrator', '1.5', '3', '2.5']
@@ -204,14 +204,14 @@ def test_best_is_the_law_whose_worst_run_is_the_least_whoever_it_is():
 
 @pytest.fixture(scope='module')
 def page(tmp_path_factory):
-    """The command at its smallest: one arm, one truth, the first population alone."""
+    """The smallest run of the command: one arm, one truth, only the first population."""
     out = tmp_path_factory.mktemp('arms') / 'page'
     small = ['--config', 'ur5e', '--truths', '1', '--generations', '0']
     assert main(['arms', *small, '--out', str(out)]) == 0
     return out
 
 
-def test_page_has_every_law_and_needs_nothing_beside_it(page):
+def test_page_shows_every_law_and_is_self_contained(page):
     text = (page / 'index.html').read_text(encoding='utf-8')
     assert not re.search(r'(?:src|href)="(?!data:)', text)
     for contender in CONTENDERS.values():
@@ -227,23 +227,23 @@ def test_page_has_every_law_and_needs_nothing_beside_it(page):
 
 
 @pytest.mark.parametrize('name', ['proposed_tuned', 'slotine_li_tuned', 'pd_gravity_if'])
-def test_figures_come_again_from_the_gains_of_the_page(page, name):
-    """The same seed, the same figures: of a run in this process, too."""
+def test_figures_are_reproduced_from_the_gains_of_the_page(page, name):
+    """The same seed gives the same figures, in this process too."""
     found = json.loads((page / 'figures.json').read_text(encoding='utf-8'))['ur5e'][name]
     rows = torque_rows(trial('ur5e', 1000).controller)
     again = run(name, trial('ur5e', 1), found['gains'], rows)
     assert json.loads(json.dumps(again._asdict())) == found['runs'][0]
 
 
-def test_what_learns_knows_the_arm_better_than_its_urdf(page):
+def test_learned_model_is_better_than_the_urdf(page):
     found = json.loads((page / 'figures.json').read_text(encoding='utf-8'))['ur5e']
     before, after = (
         [found[name]['runs'][0]['model'][k] for name in ('proposed', 'no_learning')] for k in (0, 1)
     )
     assert before[0] < before[1] / 2.0
-    assert after[0] < after[1] / 5.0  # the URDF knows nothing of the payload
+    assert after[0] < after[1] / 5.0  # the URDF does not include the payload
 
 
-def test_an_arm_without_a_urdf_is_rejected(tmp_path, capsys):
+def test_arm_without_a_urdf_is_rejected(tmp_path, capsys):
     assert main(['arms', '--config', 'recommended', '--out', str(tmp_path / 'out')]) == 1
     assert 'got model two_link' in capsys.readouterr().err

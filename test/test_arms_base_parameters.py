@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Base parameters: as many as torques show, the same torques, and a prior that covers truths."""
+"""Base parameters: their number, their torques, and a prior that covers likely arms."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CHAINS = [PANDA_CHAIN, UR5E_CHAIN, *(read_chain(t, 'base', 'tip', j) for t, j in
 
 @pytest.mark.parametrize('rotors', [True, False])
 @pytest.mark.parametrize('chain', CHAINS)
-def test_they_give_the_torques_of_all_inertias_and_no_fewer_do(chain, rotors):
+def test_base_parameters_are_the_smallest_set_that_gives_the_same_torques(chain, rotors):
     base = base_parameters(chain, WALL, rotors=rotors)
     whole = serial_chain(chain, WALL)
     n, p = base.model.n, base.model.p
@@ -41,17 +41,17 @@ def test_they_give_the_torques_of_all_inertias_and_no_fewer_do(chain, rotors):
     shown = [k for k in range(whole.p) if rotors or k % (ROTOR + 1) != ROTOR]
     singular = np.linalg.svd(rows[:, :, shown].reshape(-1, len(shown)), compute_uv=False)
     assert singular[p - 1] > 1e-3
-    assert p == len(shown) or singular[p] < 1e-7  # pi / 2 in the UR5e's file has ten digits
+    assert p == len(shown) or singular[p] < 1e-7  # pi / 2 has ten digits in the UR5e's file
 
 
-def test_an_arm_on_the_floor_shows_as_many_as_in_the_literature():
-    """43 of a Panda (Gaz et al., 2019), 36 of an arm like the UR; rotors but those of the base."""
-    for chain, without, rotors in ((PANDA_CHAIN, 43, 5), (UR5E_CHAIN, 36, 4)):
-        assert base_parameters(chain, rotors=False).model.p == without
-        assert base_parameters(chain).model.p == without + rotors
+def test_number_of_base_parameters_on_the_floor_agrees_with_the_literature():
+    """43 for a Panda (Gaz et al., 2019), 36 for an arm like the UR; rotors except at the base."""
+    for chain, inertial, rotors in ((PANDA_CHAIN, 43, 5), (UR5E_CHAIN, 36, 4)):
+        assert base_parameters(chain, rotors=False).model.p == inertial
+        assert base_parameters(chain).model.p == inertial + rotors
 
 
-def test_the_usual_grouping_comes_out_by_name():
+def test_combinations_have_the_usual_grouping():
     base = base_parameters(PANDA_CHAIN, rotors=False)
     sums = dict(zip(base.model.parameter_names, base.combinations, strict=True))
     assert sums['Ixx7'] == 'Ixx7 - Iyy7'
@@ -61,8 +61,8 @@ def test_the_usual_grouping_comes_out_by_name():
 
 
 @pytest.mark.parametrize('chain', CHAINS)
-def test_prior_holds_heavier_links_moved_centres_and_the_payload(chain):
-    """What is one deviation off in one respect is at the distance 1 or nearer, all else beyond."""
+def test_prior_covers_heavier_links_moved_centres_and_the_payload(chain):
+    """A deviation in a single respect has a distance of at most 1, larger ones have more."""
     base = base_parameters(chain, WALL)
     n = base.model.n
     rotors = np.full(n, 0.02)
@@ -79,14 +79,14 @@ def test_prior_holds_heavier_links_moved_centres_and_the_payload(chain):
         assert distance(heavier) < 1.0 + 1e-6
         moved = chain.inertias
         T = np.eye(4)
-        T[0, 3] = CENTRE / 100.0  # beyond the first order, it is only nearly so
+        T[0, 3] = CENTRE / 100.0  # small, as this holds to first order only
         moved[i] = inertia_of(T @ pseudo_inertia(moved[i]) @ T.T)
         assert distance(moved) < 1.05 / 100.0
     loaded = chain.inertias
     tip = chain.tip_placement[:3, 3]
     point = np.append(tip, 1.0)
     loaded[-1] += inertia_of(3.0 * np.outer(point, point))
-    assert distance(loaded) < 1.5  # a point, where a body of some extent is expected
+    assert distance(loaded) < 1.5  # a point mass, where an extended body is expected
     other = rotors.copy()
     other[-1] += 0.02
     assert distance(chain.inertias, other) < 1.0 + 1e-6
@@ -95,7 +95,7 @@ def test_prior_holds_heavier_links_moved_centres_and_the_payload(chain):
     assert distance(loaded) > 2.0
 
 
-def test_a_prior_without_payload_is_tighter():
+def test_prior_without_payload_is_tighter():
     base = base_parameters(UR5E_CHAIN)
     loaded, empty = (prior_factor(UR5E_CHAIN, base, load, np.full(6, 0.02)) for load in (5.0, 0.0))
     for L in (loaded, empty):

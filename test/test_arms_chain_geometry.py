@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joints, axes and tip of a chain as pinocchio has them, and how far the tip can be off."""
+"""Joints, axes and tip of a chain against pinocchio, and how far the tip can be off."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.configuration.nodes import MarkersConfig
 
 
-def test_corners_and_axes_are_those_of_pinocchio():
+def test_corners_and_axes_agree_with_pinocchio():
     text, joints = random_urdf(6, 5)
     chain = read_chain(text, 'base', 'tip', joints)
     assert {joint.kind for joint in chain.joints} >= {'revolute', 'prismatic'}
@@ -30,7 +30,7 @@ def test_corners_and_axes_are_those_of_pinocchio():
     np.testing.assert_allclose(corners[-1], tip, atol=1e-12)
 
 
-def test_the_tip_is_off_by_what_all_joints_together_can_move_it():
+def test_tip_radius_is_the_sum_of_what_each_joint_moves_the_tip():
     text, joints = random_urdf(6, 5)
     chain = read_chain(text, 'base', 'tip', joints)
     random = np.random.default_rng(0)
@@ -42,14 +42,14 @@ def test_the_tip_is_off_by_what_all_joints_together_can_move_it():
     np.testing.assert_allclose(tip_radius(chain, q, bound), reach @ bound, rtol=1e-8)
 
 
-def test_a_straight_arm_reaches_that_far_off():
+def test_straight_arm_attains_the_tip_radius():
     chain = MarkersConfig().chain
     straight, errors = np.array([0.4, 0.0]), np.array([1e-6, 2e-6])
     off = skeleton(chain, straight + errors)[0][-1] - skeleton(chain, straight)[0][-1]
     np.testing.assert_allclose(np.linalg.norm(off), tip_radius(chain, straight, errors), rtol=1e-5)
 
 
-def test_the_arm_that_is_drawn_without_a_urdf_is_that_of_section_iv():
+def test_arm_drawn_without_a_urdf_is_that_of_section_iv():
     corners, axes = skeleton(MarkersConfig().chain, np.array([0.7, -1.9]))
     np.testing.assert_allclose(corners[1:], points(1.0, 0.8, (0.7, -1.9)), atol=1e-15)
     np.testing.assert_allclose(axes, [[0.0, -1.0, 0.0]] * 2, atol=1e-15)

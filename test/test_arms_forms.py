@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Forms with few unknowns: the torques of all inertias, and truths that they can reach."""
+"""Forms with few unknowns: their torques, and the arms that they can represent."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Case:
         self.names = self.form.model.parameter_names
 
     def assert_same_torques(self, P, inertias, rotors):
-        """All regressors give the same with P as those of the base parameters, and each other."""
+        """All regressors times P agree with those of the base parameters and with each other."""
         random = np.random.default_rng(1)
         expected = self.base.of(inertias, rotors)
         for _ in range(5):
@@ -43,21 +43,21 @@ class Case:
             self.form.model.regressor(q, dq, v, a, separate[0])
             self.form.model.momentum_regressor(q, dq, *separate[1:])
             self.base.model.regressors(q, dq, v, a, *whole)
-            for one, alone, other in zip((H, Yp, Yr), separate, whole, strict=True):
-                np.testing.assert_array_equal(one[:, :-2], alone)
+            for combined, alone, other in zip((H, Yp, Yr), separate, whole, strict=True):
+                np.testing.assert_array_equal(combined[:, :-2], alone)
                 np.testing.assert_allclose(alone @ P, other @ expected, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize('form', FORMS)
 @pytest.mark.parametrize('chain', [*CHAINS, ONE_JOINT])
-def test_the_urdf_gives_the_torques_of_its_base_parameters(chain, form):
+def test_initial_parameters_give_the_torques_of_the_base_parameters(chain, form):
     case = Case(chain, form)
     assert case.form.model.p == case.form.initial.size == len(case.form.model.parameter_units)
     case.assert_same_torques(case.form.initial, chain.inertias, case.rotors)
 
 
 def load_at(chain):
-    """Ten of a random load in the tip's frame, and of all bodies with it."""
+    """Inertial parameters of a random load in the frame of the tip, and of all bodies with it."""
     random, inertias = np.random.default_rng(2), chain.inertias
     points = np.vstack((random.normal(0.05, 0.1, (3, 5)), np.ones(5)))
     load = points @ np.diag(random.uniform(0.1, 0.8, 5)) @ points.T
@@ -65,8 +65,8 @@ def load_at(chain):
     return inertia_of(load), inertias
 
 
-@pytest.mark.parametrize('chain', [one for one in CHAINS if len(one.joints) > 5])
-def test_any_load_is_among_the_parameters_by_name(chain):
+@pytest.mark.parametrize('chain', [c for c in CHAINS if len(c.joints) > 5])
+def test_parameters_represent_any_load(chain):
     case = Case(chain, 'payload')
     ten, inertias = load_at(chain)
     heavier = case.rotors.copy()
@@ -77,23 +77,23 @@ def test_any_load_is_among_the_parameters_by_name(chain):
     case.assert_same_torques(P, inertias, heavier)
 
 
-@pytest.mark.parametrize('chain', [ONE_JOINT, *(one for one in CHAINS if len(one.joints) < 6)])
-def test_a_load_of_which_a_short_arm_shows_less_is_reached_all_the_same(chain):
+@pytest.mark.parametrize('chain', [ONE_JOINT, *(c for c in CHAINS if len(c.joints) < 6)])
+def test_short_arm_with_fewer_load_parameters_still_represents_any_load(chain):
     case = Case(chain, 'payload')
     assert len(case.names) < case.n + 11
     _, inertias = load_at(chain)
     known = case.base.of(inertias, case.rotors)
     motions = np.random.default_rng(5).normal(size=(40, 4, case.n))
     H, whole = np.zeros((40, case.n, len(case.names))), np.zeros((40, case.n, known.size))
-    for motion, one, other in zip(motions, H, whole, strict=True):
-        case.form.model.regressor(*motion, one)
-        case.base.model.regressor(*motion, other)
+    for motion, rows, all_rows in zip(motions, H, whole, strict=True):
+        case.form.model.regressor(*motion, rows)
+        case.base.model.regressor(*motion, all_rows)
     P = np.linalg.lstsq(np.vstack(H), np.vstack(whole) @ known, rcond=None)[0]
     case.assert_same_torques(P, inertias, case.rotors)
 
 
-def test_a_payload_moves_the_plant_as_its_parameters_say():
-    """The plant computes by Newton and Euler: another algorithm, and a point mass at the tip."""
+def test_load_parameters_agree_with_the_payload_of_the_plant():
+    """The plant uses Newton-Euler, an independent algorithm, with a point mass at the tip."""
     case = Case(PANDA_CHAIN, 'payload')
     arm = rigid_arm(PANDA_CHAIN, WALL, PANDA_CHAIN.inertias, case.rotors, case.base)
     P = case.form.initial + 2.0 * case.form.load
@@ -106,7 +106,7 @@ def test_a_payload_moves_the_plant_as_its_parameters_say():
 
 
 @pytest.mark.parametrize('chain', CHAINS)
-def test_any_factors_of_the_bodies_are_among_the_parameters(chain):
+def test_parameters_represent_any_scale_factors_of_the_bodies(chain):
     case = Case(chain, 'scale')
     kept = [i for i in range(case.n) if f'scale{i + 1}' in case.names]
     assert len(kept) >= case.n - 1
@@ -117,7 +117,7 @@ def test_any_factors_of_the_bodies_are_among_the_parameters(chain):
     case.assert_same_torques(P, factors[:, None] * chain.inertias, case.rotors)
 
 
-def test_an_arm_on_the_floor_shows_of_its_first_body_the_inertia_with_the_rotor():
+def test_first_body_of_an_arm_on_the_floor_is_learned_with_its_rotor():
     base = base_parameters(PANDA_CHAIN)
     learned = learned_parameters(PANDA_CHAIN, base, 'scale', RATED, np.full(7, 0.2))
     assert learned.model.parameter_names[:2] == ('rotor1', 'rotor2')
@@ -126,7 +126,7 @@ def test_an_arm_on_the_floor_shows_of_its_first_body_the_inertia_with_the_rotor(
     assert set(learned.initial[7:]) == {1.0}
 
 
-def test_prior_is_wide_where_the_form_looks_and_tight_elsewhere():
+def test_prior_is_wide_for_what_the_form_learns_and_tight_elsewhere():
     deviation = {}
     for form in FORMS:
         case = Case(PANDA_CHAIN, form)
@@ -141,13 +141,13 @@ def test_prior_is_wide_where_the_form_looks_and_tight_elsewhere():
     assert deviation['scale7'] >= heaviest / PANDA_CHAIN.inertias[-1, 0] - 1.0
 
 
-def test_units_tell_a_sliding_joint_from_a_turning_one():
+def test_units_distinguish_prismatic_from_revolute_joints():
     for chain in CHAINS[2:]:
         for form in FORMS:
             model = Case(chain, form).form.model
             units = dict(zip(model.parameter_names, model.parameter_units, strict=True))
             for i, joint in enumerate(chain.joints, 1):
-                slides = joint.kind == 'prismatic'
-                assert units[f'rotor{i}'] == ('kg' if slides else 'kg m^2')
+                prismatic = joint.kind == 'prismatic'
+                assert units[f'rotor{i}'] == ('kg' if prismatic else 'kg m^2')
                 assert units.get(f'scale{i}', '') == ''
     assert Case(PANDA_CHAIN, 'payload').form.model.parameter_units[7:9] == ('kg', 'kg m')

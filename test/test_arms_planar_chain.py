@@ -16,11 +16,11 @@ R = 9.8  # 1/s^2, r = g / l1 with l1 = 1 m
 SIZES = (1, 2, 3, 7)
 
 PER_JOINT = {
-    one.name: flatten(ControllerConfig())[one.name][0]
-    for one in parameters(ControllerConfig)
-    if one.length == ('joints',) and not one.omittable and not one.name.startswith('reference')
+    item.name: flatten(ControllerConfig())[item.name][0]
+    for item in parameters(ControllerConfig)
+    if item.length == ('joints',) and not item.omittable and not item.name.startswith('reference')
 }
-"""Every setting that has one entry per joint, with the first of its default."""
+"""Every parameter with one value per joint, and the first value of its default."""
 
 
 def case(n):
@@ -56,13 +56,13 @@ def energies(lengths, masses, q, dq):
 
 
 def complex_gradient(function, x):
-    """Exact to rounding: the derivative along an imaginary step of 1e-30."""
+    """Gradient by complex steps of 1e-30, exact to rounding."""
     steps = 1e-30j * np.eye(x.size)
     return np.array([function(x + step).imag for step in steps]) / 1e-30
 
 
 @pytest.mark.parametrize('n', SIZES)
-def test_momentum_and_gravity_are_those_of_the_lagrangian(n):
+def test_momentum_and_gravity_agree_with_the_lagrangian(n):
     lengths, masses, P, (q, dq, _, _) = case(n)
     Yp, Yr = momentum(q, dq)
 
@@ -77,8 +77,8 @@ def test_momentum_and_gravity_are_those_of_the_lagrangian(n):
 
 
 @pytest.mark.parametrize('n', SIZES)
-def test_regressor_is_the_equation_of_motion(n):
-    """H(q, dq, dq, ddq) P = d/dt(Yp P) + Yr P along a motion with that acceleration."""
+def test_regressor_agrees_with_the_momentum_balance(n):
+    """H(q, dq, dq, ddq) P = d/dt(Yp P) + Yr P along a motion with this acceleration."""
     _, _, P, (q, dq, _, ddq) = case(n)
     h = 1e-6
     ahead, behind = (momentum(q + s * dq, dq + s * ddq)[0] @ P for s in (h, -h))
@@ -92,20 +92,20 @@ def test_coriolis_is_in_christoffel_form(n):
     _, _, P, (q, dq, xi, _) = case(n)
     h = 1e-6
     rate = (momentum(q + h * dq, xi)[0] - momentum(q - h * dq, xi)[0]) @ P / (2.0 * h)
-    still = np.zeros(n)
-    C_xi = (regressor(q, dq, xi, still) - regressor(q, dq, still, still)) @ P
+    zero = np.zeros(n)
+    C_xi = (regressor(q, dq, xi, zero) - regressor(q, dq, zero, zero)) @ P
     assert abs(xi @ rate - 2.0 * xi @ C_xi) < 1e-7 * max(1.0, abs(xi @ rate))
 
 
-def test_two_links_are_the_arm_of_section_iv():
+def test_two_link_chain_is_the_arm_of_section_iv():
     _, _, _, (q, dq, v, a) = case(2)
     H = np.zeros((2, 3))
     TwoLink(R).regressor(q, dq, v, a, H)
     np.testing.assert_allclose(regressor(q, dq, v, a)[:, [0, 2, 1]], H, atol=1e-13)
 
 
-def test_the_law_runs_on_three_links():
-    """A configuration of three joints makes a controller that answers and learns its columns."""
+def test_law_runs_on_three_links():
+    """A configuration of three joints gives a controller with a torque and all its estimates."""
     config = build(
         ControllerConfig,
         {
@@ -121,6 +121,6 @@ def test_the_law_runs_on_three_links():
     controller = controller_of(config)
     torque = controller.update(0.0, 1e-3, np.array([0.1, 0.1, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
     at_rest = regressor(np.full(3, 0.1), np.zeros(3), np.zeros(3), np.zeros(3)) @ np.full(6, 0.5)
-    # On the reference, at its turning point, all that is asked for is to hold the arm.
+    # On the reference, at its turning point, the torque only has to hold the arm.
     np.testing.assert_allclose(torque, at_rest, atol=0.01)
     assert controller.state.estimate.size == 6 + 3

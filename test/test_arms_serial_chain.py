@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The regressors of a serial chain against pinocchio, on random arms with prismatic joints too."""
+"""Regressors of serial chains against pinocchio, on random arms, also with prismatic joints."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from blf_dsc_controller.arms.chain_kernels import ROTOR
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import read_chain
 
-# The base stands on a floor, hangs on a wall, or leans.
+# The base stands on the floor, is mounted on a wall, or is tilted.
 ARMS = {
     'one': (*random_urdf(1, 11), 'base', 'tip', (0.0, 0.0, -9.81)),
     'two': (*random_urdf(2, 12), 'base', 'tip', (0.0, 9.81, 0.0)),
@@ -33,7 +33,7 @@ ARMS = {
 
 
 class Case:
-    """An arm, its inertias phi, a random state, and the same in pinocchio."""
+    """An arm, its inertias phi, a random state, and the same arm in pinocchio."""
 
     def __init__(self, name):
         text, joints, base, tip, gravity = ARMS[name]
@@ -61,7 +61,7 @@ class Case:
         return Yp, Yr
 
     def matrices(self):
-        """M, C and G of pinocchio."""
+        """M, C and G computed by pinocchio."""
         M = pinocchio.crba(self.model, self.data, self.theirs).copy()
         C = pinocchio.computeCoriolisMatrix(self.model, self.data, self.theirs, self.dq).copy()
         G = pinocchio.computeGeneralizedGravity(self.model, self.data, self.theirs).copy()
@@ -73,21 +73,21 @@ def case(request):
     return Case(request.param)
 
 
-def test_torque_is_that_of_pinocchio(case):
-    """Property III for v and a that are not the derivatives of q, with the Christoffel C."""
+def test_torque_agrees_with_pinocchio(case):
+    """Property III with the Christoffel C, where v and a are not the derivatives of q."""
     M, C, G = case.matrices()
     ours = case.H(case.q, case.dq, case.v, case.a) @ case.phi
     np.testing.assert_allclose(ours, M @ case.a + C @ case.v + G, atol=1e-10)
 
 
-def test_inverse_dynamics_are_those_of_pinocchio(case):
+def test_inverse_dynamics_agree_with_pinocchio(case):
     torque = pinocchio.rnea(case.model, case.data, case.theirs, case.dq, case.a)
     np.testing.assert_allclose(
         case.H(case.q, case.dq, case.dq, case.a) @ case.phi, torque, atol=1e-10
     )
 
 
-def test_columns_are_those_of_the_joint_torque_regressor(case):
+def test_columns_agree_with_the_joint_torque_regressor_of_pinocchio(case):
     theirs = pinocchio.computeJointTorqueRegressor(
         case.model, case.data, case.theirs, case.dq, case.a
     )
@@ -96,7 +96,7 @@ def test_columns_are_those_of_the_joint_torque_regressor(case):
     np.testing.assert_array_equal(ours[:, :, ROTOR], np.diag(case.a))
 
 
-def test_momentum_and_rest_are_those_of_pinocchio(case):
+def test_momentum_and_rest_agree_with_pinocchio(case):
     M, C, G = case.matrices()
     Yp, Yr = case.momentum(case.q, case.dq)
     np.testing.assert_allclose(Yp @ case.phi, M @ case.dq, atol=1e-10)
@@ -105,15 +105,15 @@ def test_momentum_and_rest_are_those_of_pinocchio(case):
 
 def test_coriolis_is_in_christoffel_form(case):
     """xi^T (dM/dt - 2 C) xi = 0 (Property I), M' by a central difference."""
-    h, rest = 1e-5, np.zeros(case.n)
+    h, zero = 1e-5, np.zeros(case.n)
     ahead, behind = (case.momentum(case.q + s * case.dq, case.v)[0] for s in (h, -h))
     rate = (ahead - behind) @ case.phi / (2.0 * h)  # M' xi, with xi = v
-    C_xi = (case.H(case.q, case.dq, case.v, rest) - case.H(case.q, rest, rest, rest)) @ case.phi
-    size = np.linalg.norm(case.v) * np.linalg.norm(rate)
-    assert abs(case.v @ (rate - 2.0 * C_xi)) < 1e-7 * max(1.0, size)
+    C_xi = (case.H(case.q, case.dq, case.v, zero) - case.H(case.q, zero, zero, zero)) @ case.phi
+    scale = np.linalg.norm(case.v) * np.linalg.norm(rate)
+    assert abs(case.v @ (rate - 2.0 * C_xi)) < 1e-7 * max(1.0, scale)
 
 
-def test_torque_is_the_rate_of_momentum_and_the_rest(case):
+def test_torque_is_the_rate_of_momentum_plus_the_rest(case):
     """d/dt(Yp P) + Yr P = H(q, dq, dq, ddq) P, column by column, along a motion."""
     h = 1e-5
     ahead, behind = (
@@ -132,7 +132,7 @@ def all_three(model, q, dq, v, a, separate, together):
     model.regressors(q, dq, v, a, together[0], together[1], together[2])
 
 
-def test_kernels_compute_what_python_does_together_and_apart():
+def test_kernels_agree_with_python_together_and_apart():
     case = Case('six')
     separate, together = np.full((2, 3, case.n, case.arm.p), np.nan)
     all_three(case.arm, case.q, case.dq, case.v, case.a, separate, together)
@@ -141,12 +141,12 @@ def test_kernels_compute_what_python_does_together_and_apart():
     np.testing.assert_array_equal(together, separate)
 
 
-def test_chosen_columns_are_those_of_the_whole_with_names_and_units():
+def test_chosen_columns_keep_their_values_names_and_units():
     whole = Case('three')
     chosen = [(0, ROTOR), (1, 0), (1, 3), (2, 9)]
     part = serial_chain(whole.chain, ARMS['three'][-1], chosen)
     columns = [body * (ROTOR + 1) + entry for body, entry in chosen]
-    rows = np.full((2, 3, 6), np.nan)  # wider, as with disturbance columns beside
+    rows = np.full((2, 3, 6), np.nan)  # wider, as with disturbance columns beside them
     part.momentum_regressor(whole.q, whole.dq, *rows)
     np.testing.assert_array_equal(
         rows[:, :, :4], np.array(whole.momentum(whole.q, whole.dq))[:, :, columns]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two-link regressors are those of one arm: identities on random states, and against physics.
+"""Two-link regressors: identities on random states, and a comparison with the simulated arm.
 
 Derivatives are taken by a five-point stencil of step 1e-3, whose truncation h^4 / 30 and rounding
 1e-16 / h both stay below 1e-12 for functions of size one; hence 1e-9 where terms reach 1e2.
@@ -64,11 +64,11 @@ def random(request):
 
 @pytest.fixture
 def state(random):
-    """P, q [rad], dq [rad/s]: parameters of no arm in particular, to leave no term out."""
+    """P, q [rad], dq [rad/s], with random parameters so that every term counts."""
     return random.normal(size=3), random.uniform(-np.pi, np.pi, 2), random.uniform(-3.0, 3.0, 2)
 
 
-def test_regressor_times_parameters_is_the_dynamics(state, random):
+def test_regressor_times_parameters_gives_the_dynamics(state, random):
     P, q, dq = state
     v, a = random.uniform(-5.0, 5.0, (2, 2))
     H = filled(MODEL.regressor, (2, 3), q, dq, v, a)
@@ -78,7 +78,7 @@ def test_regressor_times_parameters_is_the_dynamics(state, random):
     )
 
 
-def test_momentum_regressor_times_parameters_is_the_momentum_and_the_rest(state):
+def test_momentum_regressors_times_parameters_give_momentum_and_rest(state):
     P, q, dq = state
     Yp, Yr = momentum_regressor(q, dq)
 
@@ -99,7 +99,7 @@ def test_both_regressors_describe_the_same_motion(state, random):
     np.testing.assert_allclose(rate + Yr, H, **CLOSE)
 
 
-def test_inertia_rate_minus_twice_coriolis_is_skew(state):
+def test_inertia_rate_minus_twice_coriolis_is_skew_symmetric(state):
     P, q, dq = state
 
     S = derivative(lambda s: inertia(P, q + s * dq)) - 2.0 * coriolis(P, q, dq)
@@ -115,8 +115,8 @@ def test_gravity_is_the_gradient_of_the_potential(state):
     np.testing.assert_allclose(gradient, gravity(P, q), **CLOSE)
 
 
-def test_model_is_that_of_the_simulated_arm(state):
-    """M ddq + C dq + G = tau with the acceleration of the plant."""
+def test_model_agrees_with_the_simulated_arm(state):
+    """M ddq + C dq + G = tau holds with the acceleration of the plant."""
     _, q, dq = state
     tau = np.array([3.0, -1.0])
     ddq = filled(physics.acceleration, 2, ARM, q, dq, tau)
@@ -125,7 +125,7 @@ def test_model_is_that_of_the_simulated_arm(state):
 
 
 def test_momentum_balance_holds_along_a_simulated_motion():
-    """d/dt(Yp P) + Yr P = tau - tau_dist: the torque is held, so that the motion is smooth."""
+    """d/dt(Yp P) + Yr P = tau - tau_dist: a constant torque keeps the motion smooth."""
     arm = plant(viscous=0.3)
     tau = np.array([-2.0, 1.0])
     motion = []
@@ -149,10 +149,10 @@ def test_model_names_its_parameters():
 
 
 @pytest.mark.parametrize('model', [MODEL, PlanarChain(3, R)], ids=['two', 'chain'])
-def test_both_regressors_at_once_are_each_of_them(random, model):
+def test_regressors_computed_at_once_equal_the_separate_ones(random, model):
     q, dq, v, a = random.normal(size=(4, model.n))
-    each, both = np.full((2, 3, model.n, len(model.parameter_names)), np.nan)
-    model.regressor(q, dq, v, a, each[0])
-    model.momentum_regressor(q, dq, each[1], each[2])
-    model.regressors(q, dq, v, a, *both)
-    np.testing.assert_array_equal(both, each)
+    separate, together = np.full((2, 3, model.n, len(model.parameter_names)), np.nan)
+    model.regressor(q, dq, v, a, separate[0])
+    model.momentum_regressor(q, dq, separate[1], separate[2])
+    model.regressors(q, dq, v, a, *together)
+    np.testing.assert_array_equal(together, separate)

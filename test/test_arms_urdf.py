@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The chain read from a URDF is pinocchio's, and what cannot work is rejected with a remedy."""
+"""Chains read from a URDF agree with pinocchio; unusable files are rejected with a remedy."""
 
 from __future__ import annotations
 
@@ -25,48 +25,48 @@ ARMS = (
 
 
 @pytest.mark.parametrize(('text', 'joints', 'base', 'tip'), ARMS)
-def test_frames_axes_and_inertias_are_those_of_pinocchio(text, joints, base, tip):
+def test_frames_axes_and_inertias_agree_with_pinocchio(text, joints, base, tip):
     chain = read_chain(text, base, tip, joints)
     model = pinocchio_model(text, joints)
     data = model.createData()
-    assert [one.name for one in chain.joints] == list(model.names[1:])
-    for i, one in enumerate(chain.joints):
-        theirs = model.inertias[i + 1].toDynamicParameters()
-        np.testing.assert_allclose(one.inertia, theirs, atol=1e-12)
+    assert [joint.name for joint in chain.joints] == list(model.names[1:])
+    for i, joint in enumerate(chain.joints):
+        expected = model.inertias[i + 1].toDynamicParameters()
+        np.testing.assert_allclose(joint.inertia, expected, atol=1e-12)
         np.testing.assert_allclose(
-            one.placement, model.jointPlacements[i + 1].homogeneous, atol=1e-12
+            joint.placement, model.jointPlacements[i + 1].homogeneous, atol=1e-12
         )
         q = configuration(model, np.eye(len(joints))[i])
         twist = pinocchio.computeJointJacobian(model, data, q, i + 1).reshape(6, -1)[:, i]
-        own = twist[:3] if one.kind == 'prismatic' else twist[3:]
-        np.testing.assert_allclose(own, one.axis, atol=1e-12)
+        axis = twist[:3] if joint.kind == 'prismatic' else twist[3:]
+        np.testing.assert_allclose(axis, joint.axis, atol=1e-12)
     frame = model.frames[model.getFrameId(tip)]
     np.testing.assert_allclose(chain.tip_placement, frame.placement.homogeneous, atol=1e-12)
 
 
-def test_limits_are_those_of_the_file():
+def test_limits_are_read_from_the_file():
     first = read_chain(PANDA_TEXT, 'panda_link0', 'panda_hand_tcp', PANDA).joints[0]
     assert (first.lower, first.upper) == (-2.8973, 2.8973)
     assert (first.velocity, first.effort) == (2.175, 87.0)
 
 
-def test_limits_that_are_not_there_are_infinite():
+def test_missing_limits_are_infinite():
     text = '<limit lower="-2.8973" upper="2.8973" velocity="2.175" effort="87" />'
     assert text in PANDA_TEXT
     for changed in ('', '<limit effort="0" velocity="0" lower="-9" upper="9" />'):
-        one = read_chain(
+        joint = read_chain(
             PANDA_TEXT.replace(text, changed, 1), 'panda_link0', 'panda_link8', PANDA
         ).joints[0]
-        assert (one.velocity, one.effort) == (inf, inf)
-        assert (one.lower, one.upper) == ((-9.0, 9.0) if changed else (-inf, inf))
+        assert (joint.velocity, joint.effort) == (inf, inf)
+        assert (joint.lower, joint.upper) == ((-9.0, 9.0) if changed else (-inf, inf))
     continuous = PANDA_TEXT.replace(
         '"panda_joint1" type="revolute"', '"panda_joint1" type="continuous"'
     )
-    one = read_chain(continuous, 'panda_link0', 'panda_link8', PANDA).joints[0]
-    assert (one.lower, one.upper, one.effort) == (-inf, inf, 87.0)
+    joint = read_chain(continuous, 'panda_link0', 'panda_link8', PANDA).joints[0]
+    assert (joint.lower, joint.upper, joint.effort) == (-inf, inf, 87.0)
 
 
-def test_friction_is_that_of_the_file_or_none():
+def test_friction_is_read_from_the_file_and_zero_by_default():
     text = changed(
         '<axis xyz="0 0 1" />', '<axis xyz="0 0 1" /><dynamics damping="3" friction="2" />', 1
     )
@@ -75,7 +75,7 @@ def test_friction_is_that_of_the_file_or_none():
     assert (second.damping, second.friction) == (0.0, 0.0)
 
 
-def test_a_gripper_is_carried_whatever_the_tip_and_its_fingers_are_named():
+def test_gripper_is_carried_for_every_tip_and_its_fingers_are_listed_as_held():
     whole = read_chain(PANDA_TEXT, 'panda_link0', 'panda_hand_tcp', PANDA)
     assert whole.held == ('panda_finger_joint1', 'panda_finger_joint2')
     assert whole.joints[6].inertia[0] == pytest.approx(0.735522 + 0.73 + 2 * 0.015)
@@ -83,7 +83,7 @@ def test_a_gripper_is_carried_whatever_the_tip_and_its_fingers_are_named():
     np.testing.assert_allclose(shorter.joints[6].inertia, whole.joints[6].inertia)
 
 
-def test_a_chain_may_begin_and_end_inside_the_arm():
+def test_chain_may_begin_and_end_inside_the_arm():
     chain = read_chain(PANDA_TEXT, 'panda_link2', 'panda_link4', PANDA[2:4])
     whole = read_chain(PANDA_TEXT, 'panda_link0', 'panda_hand_tcp', PANDA)
     np.testing.assert_allclose(chain.joints[0].inertia, whole.joints[2].inertia)
@@ -91,12 +91,12 @@ def test_a_chain_may_begin_and_end_inside_the_arm():
     assert chain.joints[1].inertia[0] == pytest.approx(sum(j.inertia[0] for j in whole.joints[3:]))
 
 
-def test_pseudo_inertia_is_positive_exactly_for_possible_bodies():
-    ten = read_chain(UR5E_TEXT, 'world', 'tool0', UR5E).joints[1].inertia
-    np.testing.assert_allclose(inertia_of(pseudo_inertia(ten)), ten, atol=1e-15)
-    assert np.linalg.eigvalsh(pseudo_inertia(ten))[0] > 0.0
-    ten[9] = 3.0 * ten[4] + 3.0 * ten[6]  # Izz > Ixx + Iyy
-    assert np.linalg.eigvalsh(pseudo_inertia(ten))[0] < 0.0
+def test_pseudo_inertia_is_positive_only_for_physical_bodies():
+    inertia = read_chain(UR5E_TEXT, 'world', 'tool0', UR5E).joints[1].inertia
+    np.testing.assert_allclose(inertia_of(pseudo_inertia(inertia)), inertia, atol=1e-15)
+    assert np.linalg.eigvalsh(pseudo_inertia(inertia))[0] > 0.0
+    inertia[9] = 3.0 * inertia[4] + 3.0 * inertia[6]  # Izz > Ixx + Iyy
+    assert np.linalg.eigvalsh(pseudo_inertia(inertia))[0] < 0.0
 
 
 def changed(old, new, count=-1):
@@ -192,7 +192,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize('case', WRONG)
-def test_what_cannot_work_is_rejected_with_a_remedy(case):
+def test_unusable_urdf_is_rejected_with_a_remedy(case):
     changes, message = WRONG[case]
     arguments = {'text': PANDA_TEXT, 'base': 'panda_link0', 'tip': 'panda_hand_tcp'}
     with pytest.raises(UrdfError) as caught:
@@ -200,6 +200,6 @@ def test_what_cannot_work_is_rejected_with_a_remedy(case):
     assert message in str(caught.value)
 
 
-def test_an_expanded_file_may_still_name_the_xacro_namespace():
+def test_expanded_file_may_still_declare_the_xacro_namespace():
     text = changed('<robot name', '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name')
     assert len(read_chain(text, 'panda_link0', 'panda_hand_tcp', PANDA).joints) == 7

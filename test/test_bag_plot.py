@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc plot` as a user runs it: a process of its own, without ROS."""
+"""`blf_dsc plot` in its own process without ROS, as a user runs it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def bag_plot(*arguments):
 
 
 @pytest.mark.parametrize('part', ['.', 'bag_0.mcap'])
-def test_pictures_and_summary_are_written(tmp_path, part):
+def test_figures_and_summary_are_written(tmp_path, part):
     synthetic_bag.write(tmp_path / 'bag', Synthetic(2000).messages())
     run = bag_plot(tmp_path / 'bag' / part, '--out', tmp_path / 'new' / 'folder')
     assert run.returncode == 0, run.stderr
@@ -36,7 +36,7 @@ def test_pictures_and_summary_are_written(tmp_path, part):
     assert 'held by every joint' in run.stdout
 
 
-def test_what_is_wrong_with_a_bag_is_one_message(tmp_path):
+def test_missing_bag_is_reported_as_one_message(tmp_path):
     run = bag_plot(tmp_path / 'nowhere', '--out', tmp_path / 'out')
     assert run.returncode == 1
     assert run.stderr.startswith('blf_dsc plot: ')

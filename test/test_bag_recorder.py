@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder in one process with its publishers: what it takes, and what it says."""
+"""The recorder in one process with its publishers: what it records and what it reports."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from blf_dsc_controller.nodes import recorder_node
 from blf_dsc_controller.nodes.raw_subscriptions import quality_of
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 
-PATIENCE = 300.0  # s, until a test gives up on what should take a moment
+PATIENCE = 300.0  # s, timeout of waits that normally take a moment
 
 
 class Loop:
@@ -54,14 +54,14 @@ class Loop:
         self.executor.add_node(self.recorder)
 
     def spin_until(self, condition):
-        """Let both nodes work until the condition holds."""
+        """Spin both nodes until the condition holds."""
         deadline = time.monotonic() + PATIENCE
         while not condition():
             assert time.monotonic() < deadline, 'still waiting'
             self.executor.spin_once(timeout_sec=0.05)
 
     def spin_until_recorded(self, **counts):
-        """Let both nodes work until the recorder has that many messages of these topics."""
+        """Spin both nodes until the recorder has at least these numbers of messages by topic."""
         self.spin_until(
             lambda: all(
                 self.recorder._sink.message_counts.get(f'/{topic}', 0) >= count
@@ -92,14 +92,14 @@ def loop(tmp_path):
         return loops[-1]
 
     yield make
-    for one in loops:
-        one.close()
-        one.executor.remove_node(one.source)
-        one.source.destroy_node()
-        one.context.try_shutdown()
+    for each in loops:
+        each.close()
+        each.executor.remove_node(each.source)
+        each.source.destroy_node()
+        each.context.try_shutdown()
 
 
-def test_bytes_are_recorded_as_they_were_published(loop):
+def test_messages_are_recorded_byte_for_byte(loop):
     run = loop()
     publisher = run.source.create_publisher(JointState, 'joint_states', 100)
     encoder = JointStateEncoder(['joint1', 'joint2'])
@@ -119,14 +119,14 @@ def test_bytes_are_recorded_as_they_were_published(loop):
     assert before <= stamps[0] <= stamps[-1] <= after
 
 
-def test_what_has_arrived_by_the_end_is_recorded(loop):
+def test_messages_received_before_closing_are_recorded(loop):
     run = loop()
     publisher = run.source.create_publisher(JointState, 'joint_states', 100)
     run.spin_until(lambda: publisher.get_subscription_count() > 0)
     for _ in range(50):
         publisher.publish(JointState())
     assert publisher.wait_for_all_acked()
-    topics = [topic for topic, _, _ in run.messages()]  # without one more turn of the executor
+    topics = [topic for topic, _, _ in run.messages()]  # without spinning the executor once more
     assert topics.count('/joint_states') == 50
 
 
@@ -141,7 +141,7 @@ def test_only_chosen_topics_are_recorded(loop):
     assert [topic for topic, _, _ in run.messages()] == ['/chosen']
 
 
-def test_a_latched_message_from_before_the_recorder_is_recorded(loop):
+def test_latched_message_from_before_the_recorder_is_recorded(loop):
     run = loop()
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     run.source.create_publisher(JointState, 'bound', latched).publish(JointState(name=['early']))
@@ -149,7 +149,7 @@ def test_a_latched_message_from_before_the_recorder_is_recorded(loop):
     assert [b'early' in raw for topic, _, raw in run.messages() if topic == '/bound'] == [True]
 
 
-def test_a_best_effort_publisher_is_recorded(loop):
+def test_best_effort_publisher_is_recorded(loop):
     run = loop()
     quality = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
     publisher = run.source.create_publisher(JointState, 'sensor', quality)
@@ -158,7 +158,7 @@ def test_a_best_effort_publisher_is_recorded(loop):
     run.spin_until_recorded(sensor=1)
 
 
-def test_publishers_of_unlike_quality_are_both_recorded(loop):
+def test_publishers_with_different_quality_are_both_recorded(loop):
     run = loop()
     publishers = [
         run.source.create_publisher(JointState, 'mixed', QoSProfile(depth=10, **policies))
@@ -168,13 +168,13 @@ def test_publishers_of_unlike_quality_are_both_recorded(loop):
         )
     ]
     run.spin_until(lambda: run.source.count_publishers('mixed') == len(publishers))
-    run.spin_until(lambda: all(one.get_subscription_count() > 0 for one in publishers))
+    run.spin_until(lambda: all(each.get_subscription_count() > 0 for each in publishers))
     for publisher in publishers:
         publisher.publish(JointState())
     run.spin_until_recorded(mixed=2)
 
 
-def test_quality_and_type_are_those_of_the_graph(loop):
+def test_quality_and_type_are_taken_from_the_graph(loop):
     run = loop()
     quality = QoSProfile(depth=7, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     run.source.create_publisher(Float64MultiArray, 'commands', quality)
@@ -187,13 +187,13 @@ def test_quality_and_type_are_those_of_the_graph(loop):
     assert [profile.durability.name for profile in found.ext.offered_qos_profiles] == [
         'TRANSIENT_LOCAL'
     ]
-    # The graph tells neither history nor depth.
+    # The graph knows neither history nor depth.
     assert quality_of(seen.qos_profile) == Quality(
         depth=0, durability='transient_local', history='unknown', deadline=FOREVER
     )
 
 
-def test_a_type_that_is_not_common_is_read_from_its_package(loop):
+def test_uncommon_type_is_read_from_its_package(loop):
     run = loop()
     publisher = run.source.create_publisher(Goals, 'goals', 10)
     run.spin_until(lambda: publisher.get_subscription_count() > 0)
@@ -207,7 +207,7 @@ def test_a_type_that_is_not_common_is_read_from_its_package(loop):
     assert 'geometry_msgs/Quaternion' in found.msgdef.data
 
 
-def test_a_type_that_is_not_installed_is_warned_of_once(loop, monkeypatch, capfd):
+def test_missing_type_is_warned_of_once(loop, monkeypatch, capfd):
     def not_installed(type_name):
         if type_name == JOINT_STATES.type:
             raise ModuleNotFoundError
@@ -224,12 +224,12 @@ def test_a_type_that_is_not_installed_is_warned_of_once(loop, monkeypatch, capfd
     other.publish(Float64MultiArray())
     run.spin_until_recorded(commands=1)
     assert '/joint_states' not in {topic for topic, _, _ in run.messages()}
-    said = capfd.readouterr().err
-    assert said.count('/joint_states is not recorded') == 1
-    assert 'its type sensor_msgs/msg/JointState is not installed here' in said
+    output = capfd.readouterr().err
+    assert output.count('/joint_states is not recorded') == 1
+    assert 'its type sensor_msgs/msg/JointState is not installed here' in output
 
 
-def test_nothing_waits_in_the_recorder_while_it_imports_a_type(loop, monkeypatch):
+def test_received_messages_are_on_disk_before_a_type_is_imported(loop, monkeypatch):
     def import_slowly(type_name):
         on_disk.append(messages_on_disk(run.bag / 'bag_0.mcap'))
         return original(type_name)
@@ -244,13 +244,13 @@ def test_nothing_waits_in_the_recorder_while_it_imports_a_type(loop, monkeypatch
         publisher.publish(JointState())
     assert publisher.wait_for_all_acked()
     deadline = time.monotonic() + PATIENCE
-    while not on_disk:  # only the search for topics: no other turn of the recorder
+    while not on_disk:  # only the topic discovery runs, nothing else of the recorder
         assert time.monotonic() < deadline, 'still waiting'
         run.recorder._discover()
     assert on_disk == [50]
 
 
-def test_the_end_tells_what_was_recorded(loop, capfd):
+def test_closing_reports_what_was_recorded(loop, capfd):
     run = loop(topics=['joint_states', 'commands'])
     publisher = run.source.create_publisher(JointState, 'joint_states', 100)
     run.spin_until(lambda: publisher.get_subscription_count() > 0)
@@ -258,12 +258,12 @@ def test_the_end_tells_what_was_recorded(loop, capfd):
         publisher.publish(JointState())
     run.spin_until_recorded(joint_states=3)
     run.close()
-    said = capfd.readouterr().err
-    assert '/joint_states: 3 messages, 0 missed' in said
-    assert '/commands: never appeared' in said
+    output = capfd.readouterr().err
+    assert '/joint_states: 3 messages, 0 missed' in output
+    assert '/commands: never appeared' in output
 
 
-def test_messages_that_the_queue_could_not_hold_are_counted_as_missed(loop):
+def test_messages_dropped_by_a_full_queue_are_counted_as_missed(loop):
     run = loop(topics=['joint_states'], queue_depth=5)
     publisher = run.source.create_publisher(JointState, 'joint_states', 100)
     run.spin_until(lambda: publisher.get_subscription_count() > 0)
@@ -278,11 +278,11 @@ def test_messages_that_the_queue_could_not_hold_are_counted_as_missed(loop):
     assert losses.missed > 0
 
 
-def test_a_beginning_that_was_not_heard_is_told_in_the_bag_and_by_what_reads_it(loop, capfd):
+def test_messages_sent_before_the_recorder_connected_are_reported_as_lost(loop, capfd):
     run = loop()
     publisher = run.source.create_publisher(JointState, 'joint_states', 100)
     encoder = JointStateEncoder(['joint1'])
-    for k in range(7):  # nobody listens yet, and nothing is kept
+    for k in range(7):  # nobody subscribes yet, and nothing is kept
         publisher.publish(encoder.encode(k, [k], [0], [0]))
     run.spin_until(lambda: publisher.get_subscription_count() > 0)
     for k in range(7, 10):
@@ -292,15 +292,15 @@ def test_a_beginning_that_was_not_heard_is_told_in_the_bag_and_by_what_reads_it(
     lost = '0 missed, 7 sent before the recorder connected'
     assert f'/joint_states: 3 messages, {lost}' in capfd.readouterr().err
     assert read_context(run.bag).losses == {'/joint_states': lost}
-    (subject,) = read_bags([run.bag])
-    assert [(event.kind, event.text) for event in subject.events] == [
+    (bag,) = read_bags([run.bag])
+    assert [(event.kind, event.text) for event in bag.events] == [
         ('lost', f'/joint_states: {lost}')
     ]
 
 
-def test_losses_are_gaps_in_the_numbers():
+def test_gaps_in_sequence_numbers_are_counted_as_losses():
     losses = Losses(publishers=1)
-    for sequence in (4, 5, 8, 9, 2, 3):  # the 2 is of a new publisher
+    for sequence in (4, 5, 8, 9, 2, 3):  # the 2 is from a new publisher
         losses.count(sequence)
     assert losses.text() == ', 2 missed, 4 sent before the recorder connected'
     losses.publishers_seen(2)
@@ -308,12 +308,12 @@ def test_losses_are_gaps_in_the_numbers():
     assert losses.text() == ''
 
 
-def test_an_existing_folder_is_refused(loop, tmp_path):
+def test_existing_folder_is_rejected(loop, tmp_path):
     (tmp_path / 'bag').mkdir()
     with pytest.raises(BagError, match='bag exists already'):
         loop()
 
 
-def test_a_wrong_parameter_is_refused(loop):
+def test_invalid_parameter_is_rejected(loop):
     with pytest.raises(ConfigurationError, match='compression'):
         loop(compression='zip')

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording beside the loop in real time, on the same processors, costs no message.
+"""Recording beside a real-time loop, on the same processors, loses no message.
 
-What is missed shows in the publishers' own numbers. `make test-long` runs and prints a minute.
+Sequence numbers of the publishers reveal losses. `make test-long` records and prints a minute.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ EACH_SAMPLE = (
 )
 
 
-def numbers(bag):
-    """Number that its publisher gave to each message, by topic."""
+def sequence_numbers(bag):
+    """Sequence numbers that the publisher gave its messages, by topic."""
     found = defaultdict(list)
     with (bag / 'bag_0.mcap').open('rb') as stream:
         for _, channel, message in make_reader(stream).iter_messages():
@@ -41,26 +41,26 @@ def numbers(bag):
     return found
 
 
-def test_every_message_of_a_loop_in_real_time_is_in_the_bag(tmp_path):
+def test_every_message_of_a_real_time_loop_is_in_the_bag(tmp_path):
     run = closed_loop('--mode', 'realtime', '--duration', DURATION, '--out', tmp_path / 'out')
-    # On a busy machine the controller may stop: all is recorded nevertheless.
+    # On a busy machine the controller may stop: everything is still recorded.
     assert run.returncode in (0, STOPPED), run.stderr
-    recorded = numbers(tmp_path / 'out' / 'bag')
+    recorded = sequence_numbers(tmp_path / 'out' / 'bag')
     facts = read_context(tmp_path / 'out' / 'bag').facts
     for topic in EACH_SAMPLE:
-        said = facts[f'messages {topic.resolved}']
-        print(f'{topic.resolved}: {said}')  # noqa: T201 - shown by make test-long
+        counts = facts[f'messages {topic.resolved}']
+        print(f'{topic.resolved}: {counts}')  # noqa: T201 - shown by make test-long
         count = len(recorded[topic.resolved])
         assert recorded[topic.resolved] == list(range(1, count + 1))
-        assert said == f'{count} written, 0 missed'
+        assert counts == f'{count} written, 0 missed'
     logs = tmp_path / 'out' / 'logs'
-    # On a busy machine the first torque may take seconds; then the plant sends its state again.
+    # On a busy machine the first torque may take seconds, and the plant sends its state again.
     again = (logs / f'{topics.PLANT}.log').read_text().count('sending the state again')
     assert len(recorded[topics.JOINT_STATES.resolved]) == SAMPLES + again
     assert len(recorded[topics.TIMING.resolved]) == SAMPLES - 1  # one for each step between them
-    # On a busy machine the controller may pass over a state, and then says nothing of it at all.
+    # On a busy machine the controller may skip a state; it then publishes nothing for it.
     answered = (topics.REFERENCE, topics.TRACKING_ERROR, topics.LEARNING)
     assert len({len(recorded[topic.resolved]) for topic in answered}) == 1
-    # Nor did the last ones get lost, of which no later number would tell.
+    # Nor were the last ones lost, which no later sequence number would reveal.
     for node in (topics.PLANT, topics.CONTROLLER):
         assert 'not reach every' not in (logs / f'{node}.log').read_text()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""kill -9 of the recorder at random moments: all but the last 0.1 s is recovered.
+"""kill -9 of the recorder at random times: everything but the last 0.1 s is recovered.
 
-`make test-long` kills ten times within a minute of recording and prints what each kill cost.
+`make test-long` kills ten times within a minute of recording and prints the loss of each kill.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from blf_dsc_controller.bags.recover import recover
 
 LONG = bool(os.environ.get('LONG_TESTS'))
 KILLS = 10 if LONG else 3
-LONGEST = 12.0 if LONG else 1.0  # s of recording until a kill: a minute of ten, on average
+LONGEST = 12.0 if LONG else 1.0  # s of recording before a kill: ten take a minute on average
 PERIOD = 1_000_000  # ns between two messages of a topic
-PROMISE = 100_000_000  # ns, all of which a kill may cost
+PROMISE = 100_000_000  # ns, the most that a kill may lose
 TOPICS = ('a', 'b', 'c', 'd', 'e')
 
 
 class Waiting:
-    """How long the threads of a process have waited for a processor, which is not their fault."""
+    """Time that the threads of a process spent waiting for a processor, excused in the test."""
 
     def __init__(self, pid):
         self._pid = pid
@@ -43,36 +43,36 @@ class Waiting:
         self._waited = []  # ns of each thread, at these times
 
     def look(self):
-        """Take note of it."""
+        """Record the waiting times."""
         self._times.append(time.time_ns())
         self._waited.append(self._of_threads())
 
-    def since(self, moment):
-        """Sum over the threads [ns] from a moment [ns] to the last look."""
-        first = self._waited[max(0, bisect_right(self._times, moment) - 1)]
+    def since(self, start):
+        """Sum over the threads [ns] from a time [ns] to the last look."""
+        first = self._waited[max(0, bisect_right(self._times, start) - 1)]
         last = self._waited[-1]
         return sum(waited - first.get(thread, 0) for thread, waited in last.items())
 
     def _of_threads(self):
-        found = dict(self._waited[-1]) if self._waited else {}  # with those that have ended since
+        found = dict(self._waited[-1]) if self._waited else {}  # keeps threads that have ended
         for path in Path(f'/proc/{self._pid}/task').glob('*/schedstat'):
             try:
                 found[path.parent.name] = int(path.read_text().split()[1])
-            except (OSError, ValueError, IndexError):  # it has ended; or the system does not tell
+            except (OSError, ValueError, IndexError):  # thread ended; or not supported
                 continue
         return found
 
 
 class Stream:
-    """A message of each topic a millisecond, numbered."""
+    """Numbered messages, one per topic and millisecond."""
 
     def __init__(self, rig):
         self._rig = rig
         self._begin = time.time_ns()
-        self.sent = []  # ns, when the publishing of each number began
+        self.sent = []  # ns, time at which publishing of each number began
 
     def go_on_until(self, condition, each):
-        """Publish until a condition holds, which is looked at every 10 ms, as `each` is called."""
+        """Publish until a condition holds; check it and call `each` every 10 ms."""
         while not condition():
             each()
             for _ in range(10):
@@ -90,7 +90,7 @@ class Stream:
 
 @pytest.fixture
 def memory():
-    """A folder in memory: how long a busy disk keeps a write waiting is not the recorder's."""
+    """A folder in memory, so that a busy disk does not delay the recorder."""
     with tempfile.TemporaryDirectory(dir='/dev/shm') as folder:
         yield Path(folder)
 
@@ -105,7 +105,7 @@ def size(bag):
 def recovered(bag, out):
     """Numbers of the recovered messages by topic; both independent readers agree on them."""
     recovery = recover(bag, out)
-    missed = {topic: one.missed for topic, one in recovery.missing.items()}
+    missed = {topic: losses.missed for topic, losses in recovery.missing.items()}
     assert missed == {f'/{topic}': 0 for topic in TOPICS}
     assert not recovery.losses or recovery.losses[0].reason == 'cut off'
     (file,) = out.glob('*.mcap')
@@ -121,8 +121,8 @@ def recovered(bag, out):
 
 
 @pytest.mark.parametrize('k', range(KILLS))
-def test_all_but_the_last_tenth_of_a_second_before_a_kill_is_recovered(k, memory, tmp_path):
-    # Publishers of its own: those that still know a reader that was killed keep others waiting.
+def test_kill_loses_at_most_the_last_tenth_of_a_second(k, memory, tmp_path):
+    # Each kill has its own publishers: those that knew a killed reader delay others.
     rig = Rig(TOPICS, QoSProfile(depth=5000))
     try:
         process = rig.start(memory / 'bag')
@@ -133,11 +133,11 @@ def test_all_but_the_last_tenth_of_a_second_before_a_kill_is_recovered(k, memory
             own.look()
 
         stream = Stream(rig)
-        stream.go_on_until(lambda: size(memory / 'bag') > 50_000, look)  # it listens
+        stream.go_on_until(lambda: size(memory / 'bag') > 50_000, look)  # it is recording
         stream.go_on_for(random.Random(k).uniform(0.0, LONGEST), look)  # noqa: S311
         killed = time.time_ns()
         process.send_signal(signal.SIGKILL)
-        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)  # its last wait is told then
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)  # /proc then has its last wait
         look()
     finally:
         rig.close()
@@ -150,5 +150,5 @@ def test_all_but_the_last_tenth_of_a_second_before_a_kill_is_recovered(k, memory
             f'killed after {len(numbers):5} of /{topic}: without the last {lost * 1e-6:5.1f} ms; '
             f'it and the publisher waited for a processor {excused * 1e-6:.1f} ms of these'
         )
-        # What is lost had been sent, perhaps even received, for no longer than this.
+        # Lost messages had been sent, perhaps even received, no longer ago than this.
         assert lost <= PROMISE + excused

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder as a process of its own: every way to end it, and full load."""
+"""The recorder in its own process: all ways to stop it, and full load."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sensor_msgs.msg import JointState
 
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 
-PATIENCE = 300.0  # s, until a test gives up on what should take a moment
+PATIENCE = 300.0  # s, timeout of waits that normally take a moment
 RECORDER = (sys.executable, '-m', 'blf_dsc_controller.nodes.recorder_node')
 TOPICS = ('a', 'b', 'c', 'd', 'e')
 
@@ -35,12 +35,12 @@ def wait_for(condition):
         time.sleep(0.01)
 
 
-# A reader and its writer find each other one after the other: what is kept cannot fall between.
+# Discovery of reader and writer is not simultaneous: kept messages are not lost in between.
 KEPT = QoSProfile(depth=2000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Recording:
-    """A recorder process and publishers that it listens to."""
+    """A recorder process and the publishers that it records."""
 
     def __init__(self, bag):
         names = ', '.join(TOPICS)
@@ -54,12 +54,12 @@ class Recording:
         self.node = Node('source', context=self.context)
         self.publishers = [self.node.create_publisher(JointState, topic, KEPT) for topic in TOPICS]
 
-    def wait_until_it_listens(self):
+    def wait_for_subscriptions(self):
         """Wait until every topic has the recorder as its subscriber."""
-        wait_for(lambda: all(one.get_subscription_count() for one in self.publishers))
+        wait_for(lambda: all(each.get_subscription_count() for each in self.publishers))
 
     def publish(self, count, start=0):
-        """Publish messages numbered from `start` on every topic, as fast as goes."""
+        """Publish messages numbered from `start` on every topic, as fast as possible."""
         encoder = JointStateEncoder(['joint1', 'joint2'])
         for k in range(start, start + count):
             raw = encoder.encode(k, [k, 0], [0, 0], [0, 0])
@@ -68,14 +68,14 @@ class Recording:
             if k % 20 == 0:  # not faster than the 20,000 messages a second of a fast lock-step run
                 time.sleep(0.005)
 
-    def end(self, signal_number):
-        """End the recorder; return its exit code and what it said."""
+    def stop(self, signal_number):
+        """Stop the recorder with a signal; return its exit code and output."""
         self.process.send_signal(signal_number)
-        _, said = self.process.communicate(timeout=PATIENCE)
-        return self.process.returncode, said
+        _, output = self.process.communicate(timeout=PATIENCE)
+        return self.process.returncode, output
 
     def close(self):
-        """Leave nothing behind."""
+        """Kill the recorder if it still runs, and clean up."""
         if self.process.poll() is None:
             self.process.kill()
             self.process.communicate()
@@ -85,9 +85,9 @@ class Recording:
 
 @pytest.fixture
 def recording(tmp_path):
-    one = Recording(tmp_path / 'bag')
-    yield one
-    one.close()
+    instance = Recording(tmp_path / 'bag')
+    yield instance
+    instance.close()
 
 
 def counts(bag):
@@ -96,30 +96,30 @@ def counts(bag):
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_completes_the_bag(recording, tmp_path, number):
-    recording.wait_until_it_listens()
+def test_signal_completes_the_bag(recording, tmp_path, number):
+    recording.wait_for_subscriptions()
     recording.publish(2000)
     for publisher in recording.publishers:
         publisher.wait_for_all_acked()
-    code, said = recording.end(number)
+    code, output = recording.stop(number)
 
-    assert code == 0, said
+    assert code == 0, output
     assert counts(tmp_path / 'bag') == {f'/{topic}': 2000 for topic in TOPICS}
     for topic in TOPICS:
-        assert f'/{topic}: 2000 messages, 0 missed' in said
-    assert 'Traceback' not in said
-    assert 'invalid' not in said  # a context that is gone
+        assert f'/{topic}: 2000 messages, 0 missed' in output
+    assert 'Traceback' not in output
+    assert 'invalid' not in output  # a context that was shut down
 
 
-def test_a_signal_before_any_message_leaves_an_empty_bag(recording, tmp_path):
+def test_signal_before_any_message_leaves_an_empty_bag(recording, tmp_path):
     wait_for((tmp_path / 'bag').exists)
-    code, said = recording.end(signal.SIGTERM)
-    assert code == 0, said
+    code, output = recording.stop(signal.SIGTERM)
+    assert code == 0, output
     assert counts(tmp_path / 'bag') == {}
-    assert '/a: never appeared' in said
+    assert '/a: never appeared' in output
 
 
-def test_an_existing_folder_ends_it_with_one_clear_line(tmp_path):
+def test_existing_folder_is_rejected_without_a_traceback(tmp_path):
     run = subprocess.run(
         [*RECORDER, '--ros-args', '-p', f'output:={tmp_path}'],
         capture_output=True,
@@ -132,11 +132,11 @@ def test_an_existing_folder_ends_it_with_one_clear_line(tmp_path):
     assert 'Traceback' not in run.stderr
 
 
-def test_a_kill_loses_nothing_but_the_last_moment(recording, tmp_path):
-    recording.wait_until_it_listens()
+def test_kill_loses_only_the_last_messages(recording, tmp_path):
+    recording.wait_for_subscriptions()
     file = tmp_path / 'bag' / 'bag_0.mcap'
     recording.publish(1000)
-    # All of it is on disk while the recorder runs on, with no further message to push it out.
+    # All of it reaches the disk while the recorder runs, without another message to flush it.
     wait_for(lambda: messages_on_disk(file) == 5000)
     recording.publish(500, start=1000)
     os.kill(recording.process.pid, signal.SIGKILL)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder as a process of its own: on a full disk, asked for a ring, asking for parameters."""
+"""The recorder in its own process: full disk, ring buffer, parameters of nodes, odd types."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from std_srvs.srv import Trigger
 from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.recover import recover
 
-ENCODED = ENCODER.encode(1, [1, 2], [3, 4], [5, 6])[12:]  # behind the stamp
+ENCODED = ENCODER.encode(1, [1, 2], [3, 4], [5, 6])[12:]  # after the stamp
 
 
 @pytest.fixture
 def rig():
-    one = Rig()
-    yield one
-    one.close()
+    instance = Rig()
+    yield instance
+    instance.close()
 
 
-def test_a_full_disk_ends_it_with_one_clear_error_and_a_whole_bag(rig, tmp_path):
+def test_full_disk_stops_the_recorder_with_one_error_and_a_whole_bag(rig, tmp_path):
     with small_disk(tmp_path / 'disk', 4) as disk:
         process = rig.record(disk / 'bag')
         deadline = time.monotonic() + PATIENCE
@@ -37,31 +37,31 @@ def test_a_full_disk_ends_it_with_one_clear_error_and_a_whole_bag(rig, tmp_path)
             for _ in range(100):
                 rig.publish(0)
             time.sleep(0.005)
-        _, said = process.communicate()
+        _, output = process.communicate()
         assert process.returncode == 1
-        assert said.count('the disk is full') == 1
-        assert 'Traceback' not in said
+        assert output.count('the disk is full') == 1
+        assert 'Traceback' not in output
         assert len(read(disk / 'bag')) > 1000
         assert recover(disk / 'bag', tmp_path / 'clean').is_whole
 
 
-def test_its_ring_is_written_when_it_is_asked_to(rig, tmp_path):
+def test_ring_is_written_on_a_trigger(rig, tmp_path):
     rig.record(tmp_path / 'bag', ring=0.5)
     client = rig.node.create_client(Trigger, '/bag_recorder/trigger')
     rig.wait_for(client.service_is_ready)
     rig.publish_for(1.5)
-    answer = client.call_async(Trigger.Request())
-    rig.wait_for(answer.done)
-    assert answer.result().success, answer.result().message
-    assert answer.result().message.endswith(f'messages into {tmp_path / "bag"}')
-    stamps = [at for topic, at, _ in read(tmp_path / 'bag') if topic == '/a']
-    assert stamps[-1] - stamps[1] <= 0.5e9  # the first is older: the topic is a latched one
+    future = client.call_async(Trigger.Request())
+    rig.wait_for(future.done)
+    assert future.result().success, future.result().message
+    assert future.result().message.endswith(f'messages into {tmp_path / "bag"}')
+    stamps = [stamp for topic, stamp, _ in read(tmp_path / 'bag') if topic == '/a']
+    assert stamps[-1] - stamps[1] <= 0.5e9  # the first is older, as the topic is latched
     again = client.call_async(Trigger.Request())
     rig.wait_for(again.done)
     assert (tmp_path / 'bag-2' / 'metadata.yaml').exists()
 
 
-def test_the_parameters_of_who_publishes_are_in_the_bag(rig, tmp_path):
+def test_parameters_of_publishing_nodes_are_in_the_bag(rig, tmp_path):
     process = rig.record(tmp_path / 'bag')
     file = tmp_path / 'bag' / 'bag_0.mcap'
     rig.wait_for(lambda: b'gain: [1.0, 2.0]' in file.read_bytes())
@@ -72,30 +72,30 @@ def test_the_parameters_of_who_publishes_are_in_the_bag(rig, tmp_path):
     assert context.facts['messages /a'].startswith('0 written, 0 missed')
 
 
-def test_parameters_are_read_before_the_first_message_when_they_are_waited_for(rig, tmp_path):
+def test_parameters_are_read_before_the_first_message_if_waited_for(rig, tmp_path):
     process = rig.record(tmp_path / 'bag', wait_for_parameters=PATIENCE)
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=PATIENCE)
     assert 'gain: [1.0, 2.0]' in read_context(tmp_path / 'bag').configuration
 
 
-def test_a_node_that_never_responds_is_recorded_after_the_wait(rig, tmp_path):
+def test_unresponsive_node_is_recorded_after_the_wait(rig, tmp_path):
     process = rig.start(tmp_path / 'bag', wait_for_parameters=0.3)
-    while not rig.publishers[0].get_subscription_count():  # its parameter services are not served
+    while not rig.publishers[0].get_subscription_count():  # nobody serves its parameters
         assert process.poll() is None
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=PATIENCE)
-    assert '/source: its parameters could not be read' in said
+    _, output = process.communicate(timeout=PATIENCE)
+    assert '/source: its parameters could not be read' in output
 
 
-def test_names_that_no_ros_package_has_import_nothing_and_end_nothing(rig, tmp_path):
+def test_unknown_message_packages_are_not_imported_and_do_not_stop_the_recorder(rig, tmp_path):
     process = rig.record(tmp_path / 'bag', topics='[a, b, c, d, e]')
     names = {'b': 'unittest::__main__::X', 'c': 'foo::X', 'd': 'unittest::msg::X', 'e': 'X'}
     rig.start_odd(*(f'{topic}={name}' for topic, name in names.items()))
-    said = wait_for_lines(process, [f'/{topic} is not recorded: its type' for topic in names])
-    assert '/b is not recorded: its type unittest/__main__/X is not installed here' in said
-    assert '/c is not recorded: its type foo/X is not installed here' in said
+    output = wait_for_lines(process, [f'/{topic} is not recorded: its type' for topic in names])
+    assert '/b is not recorded: its type unittest/__main__/X is not installed here' in output
+    assert '/c is not recorded: its type foo/X is not installed here' in output
     rig.publish(1)
     rig.start_odd('f=std_msgs::msg::\udce4')  # not UTF-8
     wait_for_lines(process, ['the name of a topic or type is not UTF-8'])
@@ -108,10 +108,10 @@ def test_names_that_no_ros_package_has_import_nothing_and_end_nothing(rig, tmp_p
 
 
 def wait_for_lines(process, expected):
-    """Read what a recorder says until all of this was said; return it."""
-    said = ''
-    while not all(text in said for text in expected):
+    """Read the output of a recorder until it has all expected texts; return it."""
+    output = ''
+    while not all(text in output for text in expected):
         line = process.stderr.readline()
-        assert line, f'it has ended: {said}'
-        said += line
-    return said
+        assert line, f'it has ended: {output}'
+        output += line
+    return output

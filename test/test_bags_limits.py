@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag at its limits: a full disk, files that are split, a ring in memory."""
+"""Bags at their limits: a full disk, split files, a ring in memory."""
 
 from __future__ import annotations
 
@@ -26,56 +26,56 @@ def message(k):
     return ENCODER.encode(k, [k, 0], [0, 0], [0, 0])
 
 
-def write_without_end(bag, handle, times):
+def write_endlessly(bag, handle, times):
     for k in itertools.count():
         bag.write(handle, message(k) * times, k)
 
 
 @pytest.mark.parametrize('compression', ['none', 'zstd'])
 @pytest.mark.parametrize('interval', [0.0, None])  # a chunk for each message; chunks of 1 MiB
-def test_a_full_disk_leaves_a_whole_bag_and_one_clear_error(tmp_path, compression, interval):
+def test_full_disk_leaves_a_whole_bag_and_one_error(tmp_path, compression, interval):
     with small_disk(tmp_path / 'disk', 3) as disk:
         bag = BagWriter(disk / 'bag', compression=compression, flush_interval=interval)
         handle = bag.add_topic('/a', JOINT_STATES.type, [STREAM])
         with pytest.raises(DiskFullError, match='the disk is full') as caught:
-            write_without_end(bag, handle, 8 if interval is None else 1)
+            write_endlessly(bag, handle, 8 if interval is None else 1)
         bag.close()
         written = caught.value.messages
-        assert written == bag.message_counts['/a']  # with the one that filled the disk
+        assert written == bag.message_counts['/a']  # including the one that filled the disk
         assert f'{written} messages' in str(caught.value)
         assert len(read(disk / 'bag')) == written
         with (disk / 'bag' / 'bag_0.mcap').open('rb') as stream:
             assert make_reader(stream).get_summary().statistics.message_count == written
         assert recover(disk / 'bag', tmp_path / 'clean').is_whole
-        assert sorted(one.name for one in (disk / 'bag').iterdir()) == [
+        assert sorted(path.name for path in (disk / 'bag').iterdir()) == [
             'bag_0.mcap',
             'metadata.yaml',
         ]
 
 
-def test_room_for_the_index_grows_with_it(tmp_path):
+def test_reserve_for_the_index_grows_with_it(tmp_path):
     # A chunk for each message: the index of 16 MB of them is larger than the first reserve, 2 MB.
     with small_disk(tmp_path / 'disk', 16) as disk:
         bag = BagWriter(disk / 'bag', flush_interval=0.0)
         handle = bag.add_topic('/a', JOINT_STATES.type, [STREAM])
         with pytest.raises(DiskFullError):
-            write_without_end(bag, handle, 1)
+            write_endlessly(bag, handle, 1)
         with (disk / 'bag' / 'bag_0.mcap').open('rb') as stream:
             summary = make_reader(stream).get_summary()
         assert summary.statistics.message_count == bag.message_counts['/a']
         assert len(summary.chunk_indexes) == bag.message_counts['/a'] > 20_000
 
 
-def test_no_room_at_all_is_an_error_at_the_start(tmp_path):
+def test_disk_without_room_for_the_reserve_is_an_error_at_the_start(tmp_path):
     with small_disk(tmp_path / 'disk', 1) as disk, pytest.raises(OSError, match='No space left'):
         BagWriter(disk / 'bag')
 
 
-def test_the_reserve_is_gone_when_the_bag_is_closed(tmp_path):
+def test_closing_the_bag_removes_the_reserve(tmp_path):
     with BagWriter(tmp_path / 'bag') as bag:
         assert len(list((tmp_path / 'bag').iterdir())) == 2
         bag.flush()
-    assert sorted(one.name for one in (tmp_path / 'bag').iterdir()) == [
+    assert sorted(path.name for path in (tmp_path / 'bag').iterdir()) == [
         'bag_0.mcap',
         'metadata.yaml',
     ]
@@ -84,11 +84,11 @@ def test_the_reserve_is_gone_when_the_bag_is_closed(tmp_path):
 @pytest.mark.parametrize(
     ('limits', 'count'),
     [
-        ({'split_size': 20_000}, 3),  # 200 messages, each with its chunk and index some 290 bytes
+        ({'split_size': 20_000}, 3),  # 200 messages, about 290 bytes each with chunk and index
         ({'split_duration': 0.5}, 4),  # of 2 s
     ],
 )
-def test_a_bag_is_split_and_reads_as_one(tmp_path, limits, count):
+def test_split_bag_is_read_as_one(tmp_path, limits, count):
     now = 0.0
     bag = BagWriter(tmp_path / 'bag', flush_interval=0.01, clock=lambda: now, **limits)
     bag.configure(CONFIGURATION, 5)
@@ -114,7 +114,7 @@ def test_a_bag_is_split_and_reads_as_one(tmp_path, limits, count):
     assert read(tmp_path / 'clean') == read(tmp_path / 'bag')
 
 
-def test_a_ring_keeps_the_last_seconds_and_what_is_latched(tmp_path):
+def test_ring_keeps_the_last_seconds_and_latched_messages(tmp_path):
     ring = Ring(2.0, 'none')
     ring.configure(CONFIGURATION, 5)
     states = ring.add_topic('/joint_states', JOINT_STATES.type, [STREAM])
@@ -128,14 +128,14 @@ def test_a_ring_keeps_the_last_seconds_and_what_is_latched(tmp_path):
     assert found[0] == ('/bound', 1, message(8))
     assert [raw for _, _, raw in found[1:]] == [message(k) for k in range(79, 100)]
     assert read_context(tmp_path / 'bag').configurations == ((5, CONFIGURATION),)
-    # It goes on: a second trigger writes what has come since.
+    # It keeps recording: a second trigger writes newer messages.
     ring.write(states, message(100), 10 * SECOND, 100, 100)
     ring.dump(tmp_path / 'again', {})
     assert read(tmp_path / 'again')[-1][2] == message(100)
 
 
-def test_a_split_bag_knows_its_run_though_the_first_file_does_not(tmp_path):
-    """The parameters come after the first split, what was missed is known at the end."""
+def test_split_bag_has_the_context_that_its_first_file_lacks(tmp_path):
+    """Parameters arrive after the first split, missed messages are known at the end."""
     now = 0.0
     bag = BagWriter(tmp_path / 'bag', flush_interval=0.0, clock=lambda: now, split_duration=0.1)
     handle = bag.add_topic('/joint_states', JOINT_STATES.type, [STREAM])
@@ -152,7 +152,7 @@ def test_a_split_bag_knows_its_run_though_the_first_file_does_not(tmp_path):
     assert context.losses == {'/joint_states': '7 missed'}
 
 
-def test_no_file_is_begun_without_a_message_for_it(tmp_path):
+def test_no_file_is_started_without_a_message(tmp_path):
     now = 0.0
     bag = BagWriter(tmp_path / 'bag', flush_interval=0.0, clock=lambda: now, split_duration=0.1)
     handle = bag.add_topic('/a', JOINT_STATES.type, [STREAM])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag whose messages are compressed one by one (`compression_mode: message`) is read as any."""
+"""Bags with individually compressed messages (`compression_mode: message`) are read as others."""
 
 from __future__ import annotations
 
@@ -37,33 +37,33 @@ def packed(bag, request, tmp_path_factory):
     return pack(bag, tmp_path_factory.mktemp('packed') / 'bag', request.param)
 
 
-def test_it_replays_bit_for_bit(packed, capsys):
+def test_compressed_bag_replays_bit_for_bit(packed, capsys):
     assert main(['replay', str(packed)]) == 0
     assert 'bit-equal: all outputs' in capsys.readouterr().out
 
 
-def test_it_is_read_reported_exported_and_learned_from(bag, packed, tmp_path, capsys):
+def test_compressed_bag_works_with_every_command(bag, packed, tmp_path, capsys):
     np.testing.assert_array_equal(read_run(packed).error, read_run(bag).error)
-    for words in (
+    for arguments in (
         ['report', str(packed), '--out', str(tmp_path / 'page.html')],
         ['plot', str(packed), '--out', str(tmp_path / 'plots')],
         ['export', str(packed), '--out', str(tmp_path / 'packed.csv')],
         ['export', str(bag), '--out', str(tmp_path / 'plain.csv')],
         ['replay', str(packed), '--config', 'recommended'],
     ):
-        assert main(words) == 0, capsys.readouterr().err
+        assert main(arguments) == 0, capsys.readouterr().err
     assert (tmp_path / 'packed.csv').read_bytes() == (tmp_path / 'plain.csv').read_bytes()
 
 
-def test_its_file_alone_is_read(bag, packed):
-    """Only metadata.yaml says that the messages are compressed."""
+def test_single_compressed_file_is_read_without_metadata(bag, packed):
+    """Only metadata.yaml declares that the messages are compressed."""
     (file,) = {*packed.glob('*.mcap'), *packed.glob('*.db3')}
     np.testing.assert_array_equal(read_run(file).error, read_run(bag).error)
 
 
-def test_it_is_recovered_as_a_bag_that_needs_no_unpacking(bag, tmp_path, capsys):
+def test_compressed_bag_is_recovered_as_an_uncompressed_one(bag, tmp_path, capsys):
     packed = pack(bag, tmp_path / 'bag', StoragePlugin.MCAP)
-    (packed / 'metadata.yaml').unlink()  # as a killed recorder leaves it
+    (packed / 'metadata.yaml').unlink()  # as after a kill of the recorder
     assert main(['recover', str(packed), '--out', str(tmp_path / 'clean')]) == 0
     assert recorded_run.messages(tmp_path / 'clean') == recorded_run.messages(bag)
     assert main(['replay', str(tmp_path / 'clean')]) == 0, capsys.readouterr().err

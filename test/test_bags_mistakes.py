@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag that is not what a command needs: one clear line from each of them, and no traceback.
+"""Unusable bags give one clear error line from every command, and no traceback.
 
 A wrong topic, a missing type definition, an empty bag, the bag of another robot, another version.
 """
@@ -21,7 +21,7 @@ from blf_dsc_controller.messages.types import definition
 
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 
-ODD = 'my_msgs/msg/Odd'  # of a package that nobody has
+ODD = 'my_msgs/msg/Odd'  # of a package that does not exist
 ODD_MESSAGE = ['/odd', ODD, 5, b'\0\1\0\0\7\0\0\0']
 METADATA = 'metadata.yaml'
 
@@ -38,20 +38,20 @@ def entries(bag):
 
 @pytest.fixture
 def copy(bag, tmp_path):
-    """A copy of the bag, to be damaged."""
+    """A copy of the bag that a test may damage."""
     return shutil.copytree(bag, tmp_path / 'copy')
 
 
 @pytest.fixture
 def rewritten(bag, tmp_path):
-    """Writes a bag of other messages under the configuration of the first."""
+    """Writes a bag of other messages with the configuration of the recorded one."""
     configuration = read_context(bag).configuration
     return lambda entries: recorded_run.write(tmp_path / 'changed', entries, configuration)
 
 
 @pytest.fixture
 def readers(tmp_path):
-    """Every way to read a bag, by the name of its command."""
+    """Every way to read a bag, by command."""
     return {
         'replay': lambda bag: main(['replay', str(bag)]),
         'replay --config': lambda bag: main(['replay', str(bag), '--config', 'recommended']),
@@ -64,9 +64,9 @@ def readers(tmp_path):
 
 @pytest.fixture
 def all_say(readers, capsys):
-    """Asserts that every command ends with these words in its one error."""
+    """Asserts that every command fails with an error that contains these words."""
 
-    def assert_it(bag, *words):
+    def check(bag, *words):
         for name, command in readers.items():
             assert command(bag) == 1, name
             out, error = capsys.readouterr()
@@ -75,11 +75,11 @@ def all_say(readers, capsys):
                 assert word in error, name
             assert out == ''
 
-    return assert_it
+    return check
 
 
 def write_mcap(folder, entries, schema, configuration=''):
-    """Write one MCAP file; `schema` gives encoding and text of a type, or None for no schema."""
+    """Write one MCAP file; `schema` returns encoding and text of a type, or None for no schema."""
     folder.mkdir()
     with (folder / 'bag_0.mcap').open('wb') as stream:
         writer = Writer(stream)
@@ -96,19 +96,19 @@ def write_mcap(folder, entries, schema, configuration=''):
     return folder / 'bag_0.mcap'
 
 
-def test_a_wrong_topic(entries, rewritten, all_say):
+def test_bag_without_joint_states_is_rejected(entries, rewritten, all_say):
     others = [entry for entry in entries if entry[0] != JOINT_STATES.resolved]
-    held = '/blf_dsc_controller/commands (std_msgs/msg/Float64MultiArray)'
-    all_say(rewritten(others), "no topic whose name ends in 'joint_states' of type", held)
+    present = '/blf_dsc_controller/commands (std_msgs/msg/Float64MultiArray)'
+    all_say(rewritten(others), "no topic whose name ends in 'joint_states' of type", present)
 
 
-def test_a_topic_of_a_wrong_type(entries, rewritten, all_say):
+def test_topic_of_wrong_type_is_rejected(entries, rewritten, all_say):
     states = [(*entry[:1], 'std_msgs/msg/String', *entry[2:]) for entry in entries]
     all_say(rewritten(states), 'of type sensor_msgs/msg/JointState', '(std_msgs/msg/String)')
 
 
 @pytest.mark.parametrize('schema', [('', b''), ('ros2msg', b'{{ no definition'), None])
-def test_a_missing_definition_of_another_topic_costs_no_other_message(
+def test_missing_definition_of_another_topic_loses_no_other_message(
     entries, readers, tmp_path, capsys, schema
 ):
     file = write_mcap(
@@ -121,27 +121,27 @@ def test_a_missing_definition_of_another_topic_costs_no_other_message(
     for name in ('replay --config', 'report', 'export', 'plot'):
         assert readers[name](file) == 0, capsys.readouterr().err
     assert main(['recover', str(file), '--out', str(tmp_path / 'clean')]) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     with Reader(tmp_path / 'clean') as reader:
-        found = {one.topic: one.msgcount for one in reader.connections}
+        found = {c.topic: c.msgcount for c in reader.connections}
     assert found['/joint_states'] == 301
-    if schema is None:  # not even its name is there
-        assert 'LOST 1 messages of topics whose name or type is unknown' in said
+    if schema is None:  # not even the type's name is known
+        assert 'LOST 1 messages of topics whose name or type is unknown' in output
     else:
         assert found['/odd'] == 1
 
 
-def test_the_types_of_this_package_need_no_definition(entries, readers, tmp_path, capsys):
+def test_types_of_this_package_need_no_definition(entries, readers, tmp_path, capsys):
     file = write_mcap(tmp_path / 'bag', entries, lambda _: ('', b''))
     assert readers['replay --config'](file) == 0
     assert main(['recover', str(file), '--out', str(tmp_path / 'clean')]) == 0
     capsys.readouterr()
     with Reader(tmp_path / 'clean') as reader:
-        text = {one.msgtype: one.msgdef.data for one in reader.connections}
+        text = {c.msgtype: c.msgdef.data for c in reader.connections}
     assert 'float64[] position' in text[JOINT_STATE]
 
 
-def test_topics_without_any_type(bag, entries, tmp_path, all_say, capsys):
+def test_topics_of_unknown_type(bag, entries, tmp_path, all_say, capsys):
     configuration = read_context(bag).configuration
     file = write_mcap(tmp_path / 'bag', entries, lambda _: None, configuration)
     all_say(file, '/joint_states (of unknown type)')
@@ -149,21 +149,21 @@ def test_topics_without_any_type(bag, entries, tmp_path, all_say, capsys):
     assert f'LOST {len(entries)} messages of topics whose' in capsys.readouterr().out
 
 
-def test_an_empty_bag(rewritten, all_say, tmp_path, capsys):
+def test_empty_bag(rewritten, all_say, tmp_path, capsys):
     path = rewritten([])
     all_say(path, f'{path} is empty: it holds no message')
     assert main(['recover', str(path), '--out', str(tmp_path / 'clean')]) == 0
     assert 'none of the recorded messages was lost' in capsys.readouterr().out
 
 
-def test_a_bag_whose_metadata_promises_what_is_not_there(copy, entries, all_say, tmp_path):
+def test_metadata_that_lists_missing_messages(copy, entries, all_say, tmp_path):
     others = [entry for entry in entries if entry[0] != JOINT_STATES.resolved]
     other = recorded_run.write(tmp_path / 'bag', others, read_context(copy).configuration)
     shutil.copy(other / 'bag_0.mcap', copy)
     all_say(copy, 'is empty: it holds no message of /joint_states')
 
 
-def test_a_folder_without_its_file(copy, all_say, tmp_path, capsys):
+def test_bag_folder_without_its_mcap_file(copy, all_say, tmp_path, capsys):
     (copy / 'bag_0.mcap').unlink()
     all_say(copy, f'{copy} cannot be read as a bag', 'bag_0.mcap')
     assert main(['recover', str(copy), '--out', str(tmp_path / 'clean')]) == 1
@@ -171,7 +171,7 @@ def test_a_folder_without_its_file(copy, all_say, tmp_path, capsys):
 
 
 @pytest.mark.parametrize('joints', [('wheel', 'arm'), ('base', 'shoulder', 'elbow')])
-def test_the_bag_of_another_robot(entries, rewritten, all_say, joints):
+def test_bag_of_another_robot(entries, rewritten, all_say, joints):
     encoder = JointStateEncoder(joints)
     zero = [0.0] * len(joints)
     changed = [
@@ -188,7 +188,7 @@ def test_the_bag_of_another_robot(entries, rewritten, all_say, joints):
     )
 
 
-def test_joint_states_that_name_no_joint(readers, tmp_path, capsys):
+def test_joint_states_without_joint_names(readers, tmp_path, capsys):
     nameless = JointStateEncoder(())
     path = recorded_run.write(
         tmp_path / 'bag',
@@ -200,34 +200,34 @@ def test_joint_states_that_name_no_joint(readers, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ('here', 'there', 'words'),
+    ('original', 'replacement', 'words'),
     [
         ('version: 9', 'version: 99', 'its rosbag2 version is 99, but only versions up to 9 are'),
         ('identifier: mcap', 'identifier: tape', "its storage is 'tape', but only mcap and sqlit"),
         ('rosbag2_bagfile_information', 'other', 'its metadata.yaml does not describe a bag'),
     ],
 )
-def test_a_bag_of_another_format(copy, all_say, here, there, words, tmp_path, capsys):
+def test_bag_of_another_format(copy, all_say, original, replacement, words, tmp_path, capsys):
     text = (copy / METADATA).read_text()
-    assert here in text
-    (copy / METADATA).write_text(text.replace(here, there))
+    assert original in text
+    (copy / METADATA).write_text(text.replace(original, replacement))
     all_say(copy, words, f'to save the undamaged part: bag_recover {copy}')
     assert main(['recover', str(copy), '--out', str(tmp_path / 'clean')]) == 0
     assert 'none of the recorded messages was lost' in capsys.readouterr().out
 
 
-def test_a_configuration_that_is_damaged(entries, readers, tmp_path, capsys):
+def test_damaged_configuration(entries, readers, tmp_path, capsys):
     path = recorded_run.write(tmp_path / 'bag', entries, '{{{')
     assert readers['replay --learn'](path) == 1
-    said = capsys.readouterr().err
-    assert 'holds a configuration that cannot be read' in said
-    assert '--config recommended' in said
+    error = capsys.readouterr().err
+    assert 'holds a configuration that cannot be read' in error
+    assert '--config recommended' in error
     # The replay takes the configuration from the journal.
     for name in ('replay', 'report', 'export', 'plot', 'replay --config'):
         assert readers[name](path) == 0, name
     assert '<p>not recorded in the bag</p>' in (tmp_path / 'page.html').read_text()
 
 
-def test_the_bag_in_the_folder_of_a_run_is_named(copy, capsys):
+def test_folder_of_a_run_suggests_the_bag_in_it(copy, capsys):
     assert main(['replay', str(copy.parent)]) == 1
     assert f'did you mean {copy}?' in capsys.readouterr().err

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages in memory: all bytes of all of them, in less room than the file has."""
+"""Packed messages keep every byte, in less memory than the file takes."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from blf_dsc_controller.bags.reader import read_run
 
 @pytest.mark.parametrize('count', [0, 1, BLOCK, BLOCK + 1, 2 * BLOCK + 7])
 @pytest.mark.parametrize('lengths', [(16,), (3, 5)])
-def test_every_message_comes_back(count, lengths):
-    made = np.random.default_rng(count)
-    messages = [b'head' + made.bytes(made.choice(lengths)) for _ in range(count)]
+def test_packed_messages_round_trip(count, lengths):
+    rng = np.random.default_rng(count)
+    messages = [b'head' + rng.bytes(rng.choice(lengths)) for _ in range(count)]
     packed = PackedMessages(messages)
     assert (len(packed), bool(packed)) == (count, count > 0)
     assert list(packed) == messages
@@ -29,7 +29,7 @@ def test_every_message_comes_back(count, lengths):
         packed[count]
 
 
-def test_a_bag_is_read_in_less_memory_than_its_file(tmp_path):
+def test_reading_a_bag_takes_less_memory_than_its_file(tmp_path):
     path = synthetic_bag.write(tmp_path / 'bag', Synthetic(5 * BLOCK).messages())
     tracemalloc.start()
     try:

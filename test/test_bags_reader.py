@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag comes back as the arrays it was made of, under any topic names, and as a table."""
+"""Bags are read back as the arrays they were made of, under any topic names, and as a table."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def without(messages, *topics):
     return [entry for entry in messages if entry[0] not in topics]
 
 
-def test_arrays_come_back(tmp_path, made, messages):
+def test_arrays_round_trip(tmp_path, made, messages):
     run = read_run(synthetic_bag.write(tmp_path / 'bag', messages))
     assert run.joints == JOINTS
     assert run.stamp.tolist() == made.stamp.tolist()
@@ -79,7 +79,7 @@ def test_topics_under_other_names_are_found(tmp_path, made, messages, rename):
     assert run.bound is not None
 
 
-def test_a_topic_of_another_type_is_not_taken(tmp_path, messages):
+def test_topic_of_another_type_is_ignored(tmp_path, messages):
     with_decoy = [(DIAGNOSTICS, 0, b'\0\1\0\0'), *without(messages, LEARNING)]
     path = synthetic_bag.write(
         tmp_path / 'bag',
@@ -89,7 +89,7 @@ def test_a_topic_of_another_type_is_not_taken(tmp_path, messages):
     assert read_run(path).learning is None
 
 
-def test_one_of_several_robots_is_read_by_its_namespace(tmp_path, messages):
+def test_namespace_selects_one_of_several_robots(tmp_path, messages):
     with synthetic_bag.BagWriter(tmp_path / 'bag') as bag:
         for side, stamps in (('left', 0), ('right', 7)):
             handles = {}
@@ -104,7 +104,7 @@ def test_one_of_several_robots_is_read_by_its_namespace(tmp_path, messages):
     assert read_run(tmp_path / 'bag', '/right').stamp.size < SAMPLES
 
 
-def test_only_joint_states_are_essential(tmp_path, made, messages):
+def test_only_joint_states_are_required(tmp_path, made, messages):
     states = [entry for entry in messages if entry[0] is JOINT_STATES]
     run = read_run(synthetic_bag.write(tmp_path / 'bag', states))
     assert run.joints == JOINTS[::-1]
@@ -113,12 +113,12 @@ def test_only_joint_states_are_essential(tmp_path, made, messages):
     assert unknown == (None,) * len(unknown)
 
 
-def test_the_error_follows_from_the_reference(tmp_path, made, messages):
+def test_tracking_error_is_computed_from_the_reference(tmp_path, made, messages):
     path = synthetic_bag.write(tmp_path / 'bag', without(messages, TRACKING_ERROR))
     np.testing.assert_allclose(read_run(path).error, made.error, atol=1e-15)
 
 
-def test_torque_without_a_command_for_each_state(tmp_path, made, messages):
+def test_torque_where_commands_are_missing(tmp_path, made, messages):
     lost = next(k for k, entry in enumerate(messages) if entry[0] is COMMANDS)
     path = synthetic_bag.write(tmp_path / 'one', messages[:lost] + messages[lost + 1 :])
     np.testing.assert_array_equal(read_run(path).torque, made.torque)
@@ -128,7 +128,7 @@ def test_torque_without_a_command_for_each_state(tmp_path, made, messages):
         (JOINT_STATES, k, states.encode(k, [0, 0], [0, 0], [k, -k])) for k in range(SAMPLES)
     ]
     torque = read_run(synthetic_bag.write(tmp_path / 'none', with_effort)).torque
-    # The effort of a state is the torque that led to it.
+    # The effort in a state is the torque that led to it.
     assert torque[:-1, 0].tolist() == list(range(1, SAMPLES))
     assert np.isnan(torque[-1]).all()
 
@@ -136,18 +136,18 @@ def test_torque_without_a_command_for_each_state(tmp_path, made, messages):
 @pytest.fixture
 def lost(tmp_path, made, messages):
     """A bag without one sample of the reference."""
-    kept = [one for one in messages if not (one[0] is REFERENCE and one[1] == made.stamp[5])]
+    kept = [m for m in messages if not (m[0] is REFERENCE and m[1] == made.stamp[5])]
     return synthetic_bag.write(tmp_path / 'bag', kept)
 
 
-def test_a_sample_that_was_lost_is_a_gap_and_shifts_nothing(made, lost):
+def test_lost_sample_leaves_a_gap_and_shifts_no_other(made, lost):
     reference = read_run(lost).reference
     assert np.isnan(reference[5]).all()
     np.testing.assert_array_equal(reference[6:], made.reference[6:])
 
 
-def test_messages_out_of_order_and_twice_are_put_right(tmp_path, made, messages):
-    shuffled = without(messages, COMMANDS)  # which have no stamp to go by
+def test_messages_are_sorted_and_deduplicated(tmp_path, made, messages):
+    shuffled = without(messages, COMMANDS)  # commands have no stamp to sort by
     shuffled = shuffled[::-1] + shuffled[:40]
     run = read_run(synthetic_bag.write(tmp_path / 'bag', shuffled))
     np.testing.assert_array_equal(run.stamp, made.stamp)
@@ -158,7 +158,7 @@ def test_messages_out_of_order_and_twice_are_put_right(tmp_path, made, messages)
 @pytest.mark.parametrize(
     'mode', [CompressionMode.NONE, CompressionMode.FILE, CompressionMode.MESSAGE]
 )
-def test_bags_of_another_writer_are_read(tmp_path, made, messages, storage, mode):
+def test_bags_from_rosbags_writer_are_read(tmp_path, made, messages, storage, mode):
     writer = Writer(tmp_path / 'bag', version=9, storage_plugin=storage)
     writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
@@ -174,7 +174,7 @@ def test_bags_of_another_writer_are_read(tmp_path, made, messages, storage, mode
     np.testing.assert_array_equal(run.torque, made.torque)
 
 
-def test_no_bag_and_a_broken_one_are_distinguished(tmp_path, messages):
+def test_missing_and_broken_bags_are_distinguished(tmp_path, messages):
     with pytest.raises(BagError, match='there is no such folder'):
         read_run(tmp_path / 'nowhere')
     path = synthetic_bag.write(tmp_path / 'bag', messages)
@@ -186,7 +186,7 @@ def test_no_bag_and_a_broken_one_are_distinguished(tmp_path, messages):
         read_run(path)
 
 
-def test_a_message_that_cannot_be_decoded_is_named_by_topic_and_number(tmp_path, messages):
+def test_undecodable_message_is_reported_with_topic_and_number(tmp_path, messages):
     bad = [*messages[:100], (LEARNING, messages[100][1], b'\0\1\0\0'), *messages[100:]]
     path = synthetic_bag.write(tmp_path / 'bag', bad)
     with Reader(path) as reader:
@@ -206,7 +206,7 @@ def read_table(path):
 
 
 @pytest.mark.parametrize('ending', ['csv', 'parquet'])
-def test_every_number_of_the_table_reads_back_equal_in_its_row(tmp_path, made, lost, ending):
+def test_exported_table_round_trips_row_by_row(tmp_path, made, lost, ending):
     if ending == 'parquet':
         pytest.importorskip('pyarrow', reason='needs pyarrow')
     out = tmp_path / f'table.{ending}'
@@ -216,9 +216,9 @@ def test_every_number_of_the_table_reads_back_equal_in_its_row(tmp_path, made, l
     np.testing.assert_array_equal(found['position elbow'], made.position[:, 1])
     np.testing.assert_array_equal(found['torque shoulder'], made.torque[:, 0])
     np.testing.assert_array_equal(found['learning m2*l2^2'], made.estimate[:, 1])
-    assert np.isnan(found['reference elbow'][5])  # lost, and no other row has moved up
+    assert np.isnan(found['reference elbow'][5])  # lost, but the following rows have not moved up
     np.testing.assert_array_equal(found['reference elbow'][6:], made.reference[6:, 1])
-    # Told each tenth sample, and held in between.
+    # Published every tenth sample, and held in between.
     np.testing.assert_array_equal(
         found['truth disturbance elbow'], np.repeat(made.disturbance[::10, 1], 10)
     )
@@ -229,14 +229,14 @@ def units(path):
     if path.suffix == '.parquet':
         parquet = pytest.importorskip('pyarrow.parquet', reason='needs pyarrow')
         schema = parquet.read_schema(path)
-        return {one.name: (one.metadata or {}).get(b'unit', b'').decode() for one in schema}
+        return {c.name: (c.metadata or {}).get(b'unit', b'').decode() for c in schema}
     (resource,) = json.loads(path.with_suffix('.datapackage.json').read_text())['resources']
     assert resource['path'] == path.name
-    return {one['name']: one.get('unit', '') for one in resource['schema']['fields']}
+    return {field['name']: field.get('unit', '') for field in resource['schema']['fields']}
 
 
 @pytest.mark.parametrize('ending', ['csv', 'parquet'])
-def test_every_column_of_the_table_has_its_unit(tmp_path, ending):
+def test_every_exported_column_has_a_unit(tmp_path, ending):
     path = recorded_run.record(tmp_path / 'bag', 0.1)
     out = tmp_path / f'table.{ending}'
     assert main(['export', str(path), '--out', str(out)]) == 0
@@ -280,6 +280,6 @@ def decoded(raw):
     return decoder.values.reshape(3, 2)
 
 
-def test_a_table_of_another_ending_is_rejected(tmp_path, lost, capsys):
+def test_unknown_table_format_is_rejected(tmp_path, lost, capsys):
     assert main(['export', str(lost), '--out', str(tmp_path / 'table.xlsx')]) == 1
     assert 'neither .csv nor .parquet' in capsys.readouterr().err

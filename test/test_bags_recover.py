@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A damaged bag gives up every whole chunk, says what was lost, and is left as it is."""
+"""Every intact chunk of a damaged bag is recovered, losses are reported, the bag is untouched."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CONFIGURATION = '/blf_dsc_controller:\n  ros__parameters:\n    law: "blf_dsc"\n'
 
 
 def write(path, compression='none'):
-    """Write a bag of two topics: a chunk each five milliseconds, the last one flushed, too."""
+    """Write a bag of two topics with a chunk every five milliseconds, each of them flushed."""
     states, torques = JointStateEncoder(['joint1']), Float64MultiArrayEncoder(1)
     with BagWriter(path, flush_interval=None, compression=compression) as bag:
         bag.configure(CONFIGURATION, 17)
@@ -50,14 +50,14 @@ def write(path, compression='none'):
 
 
 def chunks(data):
-    """Place, end and index entry of each chunk of a whole file."""
+    """Start, end and index entry of each chunk of an intact file."""
     indexes = make_reader(BytesIO(data)).get_summary().chunk_indexes
-    starts = [one.chunk_start_offset for one in indexes]
-    return [(at, at + one.chunk_length, one) for at, one in zip(starts, indexes, strict=True)]
+    starts = [index.chunk_start_offset for index in indexes]
+    return [(at, at + index.chunk_length, index) for at, index in zip(starts, indexes, strict=True)]
 
 
 def indexed(path):
-    """Number of messages that the index of a clean bag leads to."""
+    """Number of messages found through the index of a recovered bag."""
     (file,) = path.glob('*.mcap')
     with file.open('rb') as stream:
         return sum(1 for _ in make_reader(stream).iter_messages())
@@ -74,17 +74,17 @@ def plain(tmp_path_factory):
 
 
 def damaged(folder, data):
-    """A bag of one file with this content, as a killed recorder leaves it."""
+    """A bag folder with only this file content, as a killed recorder leaves it."""
     folder.mkdir()
     (folder / 'bag_0.mcap').write_bytes(data)
     return folder
 
 
-def test_every_truncation_gives_every_whole_chunk(plain, tmp_path):
+def test_every_intact_chunk_is_recovered_at_any_truncation(plain, tmp_path):
     data = plain.read_bytes()
     ends = [end for _, end, _ in chunks(data)]
-    all_of_it = read(plain.parent)
-    # Every byte through the reading, which is quick; writing thousands of bags would take minutes.
+    all_messages = read(plain.parent)
+    # Reading is quick enough for every length; writing thousands of bags would take minutes.
     for size in range(len(data) + 1):
         expected = 2 * PER_CHUNK * sum(end <= size for end in ends)
         salvage = Salvage(plain)
@@ -93,15 +93,15 @@ def test_every_truncation_gives_every_whole_chunk(plain, tmp_path):
             continue
         recovery = recover(damaged(tmp_path / str(size), data[:size]), tmp_path / f'{size}_clean')
         assert sum(recovery.messages.values()) == expected
-        assert read(recovery.path) == all_of_it[:expected]
+        assert read(recovery.path) == all_messages[:expected]
         assert indexed(recovery.path) == expected
         assert recovery.is_whole == salvage.is_complete
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
-def test_any_damage_is_survived(whole, tmp_path_factory, data):
-    # Flip some bytes anywhere: what is recovered was written, and no other chunk is lost.
+def test_flipped_bytes_lose_only_the_chunks_they_hit(whole, tmp_path_factory, data):
+    # Flip some bytes anywhere: only what was written is recovered, and no other chunk is lost.
     original = whole.read_bytes()
     places = data.draw(st.lists(st.integers(0, len(original) - 1), min_size=1, max_size=4))
     content = bytearray(original)
@@ -111,20 +111,20 @@ def test_any_damage_is_survived(whole, tmp_path_factory, data):
     recovery = recover(damaged(folder / 'bag', content), folder / 'clean')
     written = set(read(whole.parent))
     assert set(read(recovery.path)) <= written
-    # Schemas and channels are in the first chunk and, again, behind the last one; without either
+    # Schemas and channels are in the first chunk and again after the last one; if both are hit,
     # a message has no topic, and is only counted.
     (first, *_, last) = chunks(original)
     defined = not any(first[0] <= place < first[1] for place in places)
     found = sum(recovery.messages.values())
     if not defined and any(place >= last[1] for place in places):
         found += recovery.unknown
-    # A chunk is lost with itself alone; its neighbours' records in between may hide one more.
+    # A hit on a chunk loses that chunk alone; a hit on the records in between may hide one more.
     hit = sum(any(at <= place < end for place in places) for at, end, _ in chunks(original))
     outside = sum(not any(a <= place < e for a, e, _ in chunks(original)) for place in places)
     assert found >= 2 * PER_CHUNK * (CHUNKS - hit - outside)
 
 
-def test_any_damage_to_the_head_of_a_chunk_is_survived(whole, tmp_path):
+def test_damaged_chunk_header_loses_at_most_that_chunk(whole, tmp_path):
     original = whole.read_bytes()
     _, (at, _, _), *_ = chunks(original)
     for place in range(at, at + 60):
@@ -136,8 +136,8 @@ def test_any_damage_to_the_head_of_a_chunk_is_survived(whole, tmp_path):
         assert sum(recovery.messages.values()) >= 2 * PER_CHUNK * (CHUNKS - 1)
 
 
-def test_a_topic_is_never_recovered_under_a_damaged_name(plain, tmp_path):
-    """Outside the chunks, where no checksum of MCAP protects it, a topic's name is repeated."""
+def test_topic_is_never_recovered_under_a_damaged_name(plain, tmp_path):
+    """MCAP has no checksum for a topic's name outside the chunks, where it is repeated."""
     original = plain.read_bytes()
     inside = [range(at, end) for at, end, _ in chunks(original)]
     name = COMMANDS.resolved.encode()
@@ -156,7 +156,7 @@ def test_a_topic_is_never_recovered_under_a_damaged_name(plain, tmp_path):
         assert recovery.unknown == (2 - found) * PER_CHUNK * (CHUNKS - 1)
 
 
-def test_a_corrupted_chunk_is_skipped_and_reported_with_its_times_and_messages(whole, tmp_path):
+def test_corrupted_chunk_is_skipped_and_reported_with_times_and_message_counts(whole, tmp_path):
     content = bytearray(whole.read_bytes())
     at, end, chunk = chunks(content)[2]
     content[(at + end) // 2] ^= 0x40
@@ -166,16 +166,16 @@ def test_a_corrupted_chunk_is_skipped_and_reported_with_its_times_and_messages(w
     assert (chunk.message_start_time, chunk.message_end_time) == (start, stop)
     assert (loss.start, loss.end) == (start, stop)
     assert loss.messages == {JOINT_STATES.resolved: PER_CHUNK, COMMANDS.resolved: PER_CHUNK}
-    missed = {topic: one.missed for topic, one in recovery.missing.items()}
+    missed = {topic: missing.missed for topic, missing in recovery.missing.items()}
     assert missed == {JOINT_STATES.resolved: PER_CHUNK, COMMANDS.resolved: PER_CHUNK}
-    remaining = [one for one in read(whole.parent) if not start <= one[1] <= stop]
+    remaining = [m for m in read(whole.parent) if not start <= m[1] <= stop]
     assert read(recovery.path) == remaining
     assert 'from 1734000000.010000000 s (2024-12-12 10:40:00 UTC)' in str(loss)
     assert 'messages lost: 5 of /joint_states' in str(loss)
 
 
-def test_the_topics_are_known_without_the_first_chunk(plain, tmp_path):
-    # Of a recording that was killed, too: there is no index at the end.
+def test_topics_are_known_without_the_first_chunk(plain, tmp_path):
+    # Even of a recording that was killed, which has no index at the end.
     content = bytearray(plain.read_bytes())
     (first, *_, last) = chunks(content)
     content[(first[0] + first[1]) // 2] ^= 1
@@ -184,7 +184,7 @@ def test_the_topics_are_known_without_the_first_chunk(plain, tmp_path):
     assert read(recovery.path) == read(plain.parent)[2 * PER_CHUNK :]
 
 
-def test_what_was_known_of_the_run_is_kept(plain, tmp_path):
+def test_context_of_the_run_is_kept(plain, tmp_path):
     content = plain.read_bytes()[: chunks(plain.read_bytes())[3][1]]
     recovery = recover(damaged(tmp_path / 'bag', content), tmp_path / 'clean')
     context = read_context(recovery.path)
@@ -198,17 +198,17 @@ def test_what_was_known_of_the_run_is_kept(plain, tmp_path):
             assert clean.ext.offered_qos_profiles == original.ext.offered_qos_profiles
 
 
-def test_the_damaged_bag_is_not_touched(plain, tmp_path):
+def test_damaged_bag_is_not_modified(plain, tmp_path):
     folder = damaged(tmp_path / 'bag', plain.read_bytes()[:-2000])
     digest = hashlib.sha256((folder / 'bag_0.mcap').read_bytes()).hexdigest()
     recover(folder, tmp_path / 'clean')
-    assert [one.name for one in folder.iterdir()] == ['bag_0.mcap']
+    assert [file.name for file in folder.iterdir()] == ['bag_0.mcap']
     assert hashlib.sha256((folder / 'bag_0.mcap').read_bytes()).hexdigest() == digest
     with pytest.raises(BagError):
         recover(folder, tmp_path / 'clean')
 
 
-def test_a_whole_bag_has_lost_nothing(whole, tmp_path, capsys):
+def test_intact_bag_has_no_losses(whole, tmp_path, capsys):
     recovery = recover(whole.parent, tmp_path / 'clean')
     assert recovery.is_whole
     assert read(recovery.path) == read(whole.parent)
@@ -216,14 +216,14 @@ def test_a_whole_bag_has_lost_nothing(whole, tmp_path, capsys):
     assert 'none of the recorded messages was lost' in capsys.readouterr().out
 
 
-def test_lost_messages_are_recorded_in_the_clean_bag_too(tmp_path, capsys):
+def test_recovered_bag_records_lost_messages(tmp_path, capsys):
     with BagWriter(tmp_path / 'bag') as bag:
         handle = bag.add_topic(JOINT_STATES.resolved, JOINT_STATES.type, [JOINT_STATES.offered])
         for number in (6, 7, 9):
             bag.write(handle, JointStateEncoder(['x']).encode(0, [0], [0], [0]), 0, 0, number)
     assert main(['recover', str(tmp_path / 'bag'), '--out', str(tmp_path / 'clean')]) == 0
-    said = capsys.readouterr().out
-    assert '3 messages, 1 numbers missing in between, 5 numbers missing before the first' in said
+    output = capsys.readouterr().out
+    assert '3 messages, 1 numbers missing in between, 5 numbers missing before the first' in output
     assert read_context(tmp_path / 'clean').losses == {
         '/joint_states': '1 missed, 5 sent before the recorder connected'
     }
@@ -240,7 +240,7 @@ def test_files_of_a_split_bag_are_recovered_together(plain, tmp_path, name):
     assert recovery.unfinished == [(name, None)]
 
 
-def test_a_bag_of_another_writer_is_recovered(tmp_path):
+def test_bag_from_rosbags_writer_is_recovered(tmp_path):
     with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connection = writer.add_connection('/x', COMMANDS.type, typestore=typestore())
         for k in range(100):
@@ -251,7 +251,7 @@ def test_a_bag_of_another_writer_is_recovered(tmp_path):
     assert read(recovery.path) == expected
 
 
-def test_what_is_no_bag_is_one_message(tmp_path, capsys):
+def test_folder_without_a_bag_is_one_error_line(tmp_path, capsys):
     with pytest.raises(BagError, match='there is no MCAP file'):
         recover(tmp_path, tmp_path / 'clean')
     assert main(['recover', str(tmp_path / 'nowhere')]) == 1
@@ -259,28 +259,28 @@ def test_what_is_no_bag_is_one_message(tmp_path, capsys):
     assert not Path(tmp_path / 'clean').exists()
 
 
-def test_the_command_tells_what_was_lost_in_words(plain, tmp_path, capsys):
+def test_command_reports_what_was_lost(plain, tmp_path, capsys):
     folder = damaged(tmp_path / 'bag', plain.read_bytes()[: chunks(plain.read_bytes())[-1][0]])
     assert main(['recover', str(folder)]) == 0
-    said = capsys.readouterr().out
-    assert 'bag_0.mcap: the recording was not closed; it ends at 1734000000.024000001 s' in said
-    assert 'at most' not in said  # how much came later depends on the computer's load
-    assert 'missing' not in said
-    assert f'wrote {tmp_path / "bag_recovered"}' in said
+    output = capsys.readouterr().out
+    assert 'bag_0.mcap: the recording was not closed; it ends at 1734000000.024000001 s' in output
+    assert 'at most' not in output  # how much came later depends on the CPU load
+    assert 'missing' not in output
+    assert f'wrote {tmp_path / "bag_recovered"}' in output
 
 
-def test_where_all_is_lost_the_exit_code_says_so(plain, tmp_path, capsys):
+def test_exit_code_is_nonzero_if_everything_is_lost(plain, tmp_path, capsys):
     for k, data in enumerate([b'', plain.read_bytes()[: chunks(plain.read_bytes())[0][0]]]):
         folder = damaged(tmp_path / f'{k}', data)
         assert main(['recover', str(folder)]) == 1
         assert 'ALL LOST' in capsys.readouterr().out
 
 
-def test_a_record_of_a_damaged_kind_neither_hides_messages_nor_invents_one(plain, tmp_path):
-    """A chunk may look like a footer then, and an index like a message or like the end."""
+def test_damaged_record_type_neither_hides_nor_invents_messages(plain, tmp_path):
+    """A chunk may then look like a footer, and an index like a message or like the end."""
     original = plain.read_bytes()
     topics = {JOINT_STATES.resolved, COMMANDS.resolved}
-    whole_file = list(read_messages(plain, topics))
+    expected_messages = list(read_messages(plain, topics))
     written = set(Salvage(plain).messages(original))
     file = tmp_path / 'bag_0.mcap'
     for at in [piece.at for piece in scan(original)]:
@@ -289,7 +289,7 @@ def test_a_record_of_a_damaged_kind_neither_hides_messages_nor_invents_one(plain
             content[at] ^= 1 << bit
             file.write_bytes(content)
             with suppress(MalformedRecordError):
-                assert list(read_messages(file, topics)) == whole_file
+                assert list(read_messages(file, topics)) == expected_messages
             salvage = Salvage(file)
             found = list(salvage.messages(bytes(content)))
-            assert {one for one in found if salvage.channel(one[0])} <= written
+            assert {message for message in found if salvage.channel(message[0])} <= written

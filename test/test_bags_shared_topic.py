@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A gripper beside the arm on /joint_states: what the controller ignores, every reader ignores."""
+"""A gripper that shares /joint_states with the arm is ignored by every reader of bags."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def alone(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def entries(alone):
-    """Those of the arm, with a message of the gripper before each third state of it."""
+    """Messages of the arm, with one of the gripper before every third joint state."""
     both = []
     for k, entry in enumerate(recorded_run.messages(alone)):
         if entry[0] == JOINT_STATES.resolved and k % 3 == 0:
@@ -50,21 +50,21 @@ def shared(entries, tmp_path_factory):
     return recorded_run.write(tmp_path_factory.mktemp('shared') / 'bag', entries)
 
 
-def test_the_run_is_that_of_the_arm_alone(alone, shared):
+def test_run_equals_that_of_the_arm_alone(alone, shared):
     run, expected = read_run(shared), read_run(alone)
     assert run.joints == expected.joints
     for name in ('stamp', 'position', 'torque', 'error'):
         np.testing.assert_array_equal(getattr(run, name), getattr(expected, name))
 
 
-def test_other_gains_and_the_learning_see_the_arm_alone(alone, shared):
+def test_what_if_and_learn_replays_ignore_the_gripper(alone, shared):
     torque = what_if(alone, CONFIG).run.torque
     np.testing.assert_array_equal(what_if(shared, CONFIG).run.torque, torque)
     np.testing.assert_array_equal(learn(shared, CONFIG).estimate, learn(alone, CONFIG).estimate)
 
 
-def test_commands_in_the_order_of_the_states_are_those_of_the_arm(alone, entries, tmp_path):
-    # Three commands a state: the third joint of the arm's driver is none of the controller's.
+def test_commands_in_driver_joint_order_are_matched_to_the_arm(alone, entries, tmp_path):
+    # Three torques per command: the driver has a third joint that is not the controller's.
     decoder, driver = JointStateDecoder(CONFIG.joints), JointStateEncoder(('x', *CONFIG.joints))
     kept = []
     for topic, type_name, at, raw in entries:
@@ -81,7 +81,7 @@ def test_commands_in_the_order_of_the_states_are_those_of_the_arm(alone, entries
     np.testing.assert_array_equal(found.applied, what_if(alone, CONFIG).applied)
 
 
-def test_without_the_controller_the_arm_is_the_one_with_most_joints(entries, tmp_path):
+def test_without_controller_topics_the_device_with_most_joints_is_the_arm(entries, tmp_path):
     states = recorded_run.of(entries, JOINT_STATES)
     assert read_run(recorded_run.write(tmp_path / 'a', states)).joints == ('joint1', 'joint2')
     names = NameMap.parse(['grip=left_finger'])
@@ -90,7 +90,7 @@ def test_without_the_controller_the_arm_is_the_one_with_most_joints(entries, tmp
     assert set(run.position[:, 0]) == {0.01}
 
 
-def test_every_command_takes_the_bag(shared, tmp_path, capsys):
+def test_every_command_reads_the_shared_bag(shared, tmp_path, capsys):
     for words in (
         ['replay', str(shared)],
         ['replay', str(shared), '--config', 'recommended'],
@@ -106,10 +106,10 @@ def renamed(entries, tmp_path_factory):
     """The same run under the topics of another namespace."""
     names = {JOINT_STATES.resolved: '/arm/states', COMMANDS.resolved: '/arm/torque'}
     path = tmp_path_factory.mktemp('renamed') / 'bag'
-    return recorded_run.write(path, [[names.get(one[0], one[0]), *one[1:]] for one in entries])
+    return recorded_run.write(path, [[names.get(topic, topic), *rest] for topic, *rest in entries])
 
 
-def test_names_of_topics_are_taken_by_every_command(shared, renamed, tmp_path, capsys):
+def test_every_command_maps_topic_names(shared, renamed, tmp_path, capsys):
     words = ['--map', 'joint_states=/arm/states', '--map', 'commands=/arm/torque']
     assert main(['replay', str(renamed), *words]) == 0
     assert '/arm/torque: 2002 values bit-equal' in capsys.readouterr().out
@@ -121,25 +121,25 @@ def test_names_of_topics_are_taken_by_every_command(shared, renamed, tmp_path, c
     assert tables[0] == tables[1]
     for command in ('report', 'plot'):
         assert main([command, str(renamed), '--out', str(tmp_path / command), *words]) == 0
-    # Without them there is nothing to take for the joint states.
+    # Without the mapping, the joint states are not found.
     assert main(['plot', str(renamed), '--out', str(tmp_path / 'none')]) == 1
 
 
-def test_names_that_cannot_have_an_effect_are_rejected(shared, capsys):
+def test_mappings_without_effect_are_rejected(shared, capsys):
     assert main(['replay', str(shared), '--map', 'joint7=x']) == 1
     assert 'joint7 is neither a topic nor one of the joints' in capsys.readouterr().err
     assert main(['replay', str(shared), '--play', '--map', 'joint1=x']) == 1
     assert '--map has no effect on --play' in capsys.readouterr().err
 
 
-def test_states_without_stamps_are_refused_with_the_reason(tmp_path):
+def test_states_without_stamps_are_rejected_with_the_reason(tmp_path):
     driver = JointStateEncoder(('joint1', 'joint2'))
     states = [
         ['/joint_states', JOINT_STATE, k, driver.encode(0, [k, 0], [0, 0], [0, 0])]
         for k in range(1, 50)
     ]
     path = recorded_run.write(tmp_path / 'bag', states)
-    said = 'all 49 messages of /joint_states have the stamp 0 ns'
+    message = 'all 49 messages of /joint_states have the stamp 0 ns'
     for read in (read_run, lambda bag: what_if(bag, CONFIG), lambda bag: learn(bag, CONFIG)):
-        with pytest.raises(BagError, match=said):
+        with pytest.raises(BagError, match=message):
             read(path)

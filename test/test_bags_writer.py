@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag is what rosbag2 would have written, and other people's software reads it."""
+"""Bags are what rosbag2 would have written, and third-party software reads them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from blf_dsc_controller.messages.types import Definition, UnknownTypeError
 START = 1_734_000_000_000_000_000
 MILLISECOND = 1_000_000
 
-# Reads a bag with nothing but public libraries and prints what is in it.
+# Reads a bag with public libraries only and prints its contents.
 READER = """
 import json, sys
 from pathlib import Path
@@ -58,7 +58,7 @@ print(json.dumps(found))
 """
 
 
-def write_some(path, count=50, **options):
+def write_messages(path, count=50, **options):
     states = JointStateEncoder(['joint1', 'elbow'])
     torques = Float64MultiArrayEncoder(2)
     with BagWriter(path, **options) as bag:
@@ -70,7 +70,7 @@ def write_some(path, count=50, **options):
             bag.write(second, torques.encode([k, k]), stamp + 1)
 
 
-def read_by_others(path):
+def read_with_public_libraries(path):
     run = subprocess.run(
         [sys.executable, '-c', READER, str(path)], capture_output=True, text=True, check=False
     )
@@ -79,18 +79,18 @@ def read_by_others(path):
 
 
 @pytest.mark.parametrize('compression', ['none', 'zstd'])
-def test_other_libraries_read_all_of_it(tmp_path, compression):
-    write_some(tmp_path / 'bag', count=300, compression=compression)
-    found = read_by_others(tmp_path / 'bag')
+def test_other_libraries_read_the_whole_bag(tmp_path, compression):
+    write_messages(tmp_path / 'bag', count=300, compression=compression)
+    found = read_with_public_libraries(tmp_path / 'bag')
 
     stamps = [START + k * MILLISECOND for k in range(300)]
-    in_turn = [
+    in_order = [
         entry
         for stamp in stamps
         for entry in (['/joint_states', stamp, stamp - 5], [COMMANDS.resolved, *[stamp + 1] * 2])
     ]
-    assert found['mcap'] == in_turn
-    assert found['rosbags'] == [entry[:2] for entry in in_turn]
+    assert found['mcap'] == in_order
+    assert found['rosbags'] == [entry[:2] for entry in in_order]
     assert found['decoded'] == [[stamp, 'joint1', 'elbow', k, -k] for k, stamp in enumerate(stamps)]
     assert found['counts'] == {'/joint_states': 300, COMMANDS.resolved: 300}
     assert found['types'] == {
@@ -104,14 +104,14 @@ def test_other_libraries_read_all_of_it(tmp_path, compression):
 def test_compression_makes_the_bag_smaller(tmp_path):
     sizes = {}
     for compression in ('none', 'zstd'):
-        write_some(tmp_path / compression, count=300, compression=compression)
+        write_messages(tmp_path / compression, count=300, compression=compression)
         sizes[compression] = (tmp_path / compression / f'{compression}_0.mcap').stat().st_size
     # Half: both topics repeat their names and counts in each message.
     assert sizes['zstd'] < sizes['none'] / 2
 
 
-def test_metadata_is_that_of_rosbag2(tmp_path):
-    write_some(tmp_path / 'run', count=3)
+def test_metadata_matches_rosbag2(tmp_path):
+    write_messages(tmp_path / 'run', count=3)
     with BagWriter(tmp_path / 'other') as bag:
         bag.add_topic(
             BOUND.resolved, BOUND.type, [BOUND.offered, Quality(depth=0, history='unknown')]
@@ -192,7 +192,7 @@ def test_metadata_is_that_of_rosbag2(tmp_path):
     assert topic['message_count'] == 0
 
 
-def test_an_existing_folder_is_rejected_and_left_alone(tmp_path):
+def test_existing_folder_is_rejected_and_left_alone(tmp_path):
     (tmp_path / 'bag').mkdir()
     (tmp_path / 'bag' / 'precious').write_text('kept')
     with pytest.raises(BagError, match=r'bag exists already.*choose another folder'):
@@ -200,25 +200,25 @@ def test_an_existing_folder_is_rejected_and_left_alone(tmp_path):
     assert [entry.name for entry in (tmp_path / 'bag').iterdir()] == ['precious']
 
 
-def test_an_unknown_type_is_named_and_the_bag_goes_on(tmp_path):
+def test_unknown_type_is_reported_and_recording_continues(tmp_path):
     with BagWriter(tmp_path / 'bag') as bag:
         with pytest.raises(UnknownTypeError, match='nowhere_msgs/msg/Nothing'):
             bag.add_topic('/nothing', 'nowhere_msgs/msg/Nothing', [])
         known = bag.add_topic('/command', COMMANDS.type, [COMMANDS.offered])
         bag.write(known, Float64MultiArrayEncoder(1).encode([1]), START)
-    assert read_by_others(tmp_path / 'bag')['counts'] == {'/command': 1}
+    assert read_with_public_libraries(tmp_path / 'bag')['counts'] == {'/command': 1}
 
 
-def test_a_given_definition_and_hash_are_stored(tmp_path):
+def test_given_definition_and_hash_are_stored(tmp_path):
     with BagWriter(tmp_path / 'bag') as bag:
         handle = bag.add_topic('/x', 'my_msgs/msg/X', [], Definition('int32 a\n', 'RIHS01_5'))
         bag.write(handle, b'\0\1\0\0\7\0\0\0', START)
-    found = read_by_others(tmp_path / 'bag')
+    found = read_with_public_libraries(tmp_path / 'bag')
     assert found['texts'] == {'my_msgs/msg/X': 'int32 a\n'}
     assert found['hashes'] == {'/x': 'RIHS01_5'}
 
 
-def test_data_leaves_the_process_as_time_goes_by(tmp_path):
+def test_data_is_flushed_periodically(tmp_path):
     now = 0.0
     bag = BagWriter(tmp_path / 'bag', flush_interval=0.1, clock=lambda: now)
     handle = bag.add_topic('/command', COMMANDS.type, [COMMANDS.offered])
@@ -226,9 +226,9 @@ def test_data_leaves_the_process_as_time_goes_by(tmp_path):
     for k in range(1, 1001):
         now = k * 1e-3
         bag.write(handle, raw, START + k)
-        if k % 7 == 0:  # each phase of the interval
+        if k % 7 == 0:  # at every phase of the flush interval
             on_disk = messages_on_disk(tmp_path / 'bag' / 'bag_0.mcap')
-            assert on_disk >= k - 100  # of one message a millisecond
+            assert on_disk >= k - 100  # at one message per millisecond
     bag.close()
 
 
@@ -249,7 +249,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 @pytest.mark.parametrize('compression', ['none', 'zstd'])
-def test_what_was_flushed_survives_a_kill(tmp_path, compression):
+def test_flushed_data_survives_a_kill(tmp_path, compression):
     run = subprocess.run(
         [sys.executable, '-c', KILLED, str(tmp_path / 'bag'), compression], check=False
     )
@@ -257,16 +257,16 @@ def test_what_was_flushed_survives_a_kill(tmp_path, compression):
     assert messages_on_disk(tmp_path / 'bag' / 'bag_0.mcap') == 1000
 
 
-def test_an_empty_bag_is_a_bag(tmp_path):
+def test_empty_bag_is_valid(tmp_path):
     BagWriter(tmp_path / 'bag').close()
-    assert read_by_others(tmp_path / 'bag')['counts'] == {}
+    assert read_with_public_libraries(tmp_path / 'bag')['counts'] == {}
     information = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
     information = information['rosbag2_bagfile_information']
     assert information['duration'] == {'nanoseconds': 0}  # rosbag2 reads it as unsigned
     assert information['files'][0]['duration'] == {'nanoseconds': 0}
 
 
-def test_topics_of_one_type_share_its_definition(tmp_path):
+def test_topics_of_the_same_type_share_one_definition(tmp_path):
     with BagWriter(tmp_path / 'bag') as bag:
         for topic in ('/a', '/b'):
             handle = bag.add_topic(topic, JOINT_STATES.type, [JOINT_STATES.offered])

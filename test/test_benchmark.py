@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmarks run, in a tiny form, and notice a contestant that does not."""
+"""Tiny versions of the benchmarks run, and a contestant that fails is noticed."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ MODULES = [
 
 
 @pytest.fixture(autouse=True)
-def _found(monkeypatch):
+def _importable(monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARK))
     for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE'):
-        monkeypatch.setenv(name, '')  # which the benchmarks set, and which is restored after each
+        monkeypatch.setenv(name, '')  # the benchmarks set them; restored after each test
 
 
 def tiny(monkeypatch, name, **sizes):
-    """A benchmark that runs once, with other sizes where they are given."""
+    """Import a benchmark with one round and the given sizes."""
     module = importlib.import_module(name)
     for constant, value in {'_ROUNDS': 1, **sizes}.items():
         monkeypatch.setattr(module, constant, value)
@@ -36,13 +36,13 @@ def tiny(monkeypatch, name, **sizes):
 
 
 def contestants(rows):
-    """What was measured, each of it a ratio that is a number."""
+    """Names of the measurements, after a check that their ratios are finite."""
     assert all(0.0 < row.low <= row.median <= row.high < math.inf for row in rows)
     return [row.what for row in rows]
 
 
 @pytest.mark.parametrize('name', MODULES)
-def test_every_module_finds_what_it_imports(name):
+def test_every_module_can_be_imported(name):
     importlib.import_module(name)
 
 
@@ -64,7 +64,7 @@ def test_growth_is_written_as_table_and_picture(monkeypatch, tmp_path):
 
 
 @pytest.mark.skipif(shutil.which('cc') is None, reason='there is no C compiler')
-def test_loop_beside_c_and_numpy(monkeypatch):
+def test_loop_compared_with_c_and_numpy(monkeypatch):
     offline = tiny(monkeypatch, 'offline', _LONG=0.1, _SHORT=0.02)
     monkeypatch.setattr(offline, '_PEERS', {'numpy': offline._PEERS['numpy']})
     monkeypatch.setattr(shutil, 'which', lambda _: None)  # no Octave
@@ -73,12 +73,12 @@ def test_loop_beside_c_and_numpy(monkeypatch):
 
 @pytest.mark.skipif(shutil.which('cc') is None, reason='there is no C compiler')
 def test_c_reference_gives_the_same_trajectory():
-    # Issued for 10 s, in which learning begins; angles, torques and estimates are of order 1 to 10.
+    # Over 10 s, in which learning begins; angles, torques and estimates are of order 1 to 10.
     assert importlib.import_module('offline').disagreement() < 1e-9
 
 
 @pytest.mark.skipif(shutil.which('cc') is None, reason='there is no C compiler')
-def test_study_beside_c_and_on_two_processes(monkeypatch):
+def test_study_compared_with_c_and_on_two_processes(monkeypatch):
     sizes = {'_DURATION': 0.05, '_RUNS': 2, '_CHUNKS': 2, '_CHUNK': 1}
     montecarlo = tiny(monkeypatch, 'montecarlo', **sizes)
     assert len(contestants(list(montecarlo.measure()))) == 2
@@ -93,13 +93,13 @@ def test_c_reference_runs_the_same_study(monkeypatch):
     assert montecarlo.disagreement(montecarlo.preset()) < 1e-9
 
 
-def test_node_beside_null_node_in_two_processes_and_in_one(monkeypatch):
+def test_node_compared_with_null_node_in_two_processes_and_in_one(monkeypatch):
     node = tiny(monkeypatch, 'node', _STEPS=20, _WARM_UP=2, _SETTLING=0.05)
     monkeypatch.setattr(node, '_PROCESSES', (node._NULL,))
-    played = []
+    played_groups = []
 
     def counting(group, runs):
-        played.append((group, {name: len(each) for name, each in runs.items()}))
+        played_groups.append((group, {name: len(each) for name, each in runs.items()}))
         return rates(group, runs)
 
     rates = node._rates
@@ -110,14 +110,14 @@ def test_node_beside_null_node_in_two_processes_and_in_one(monkeypatch):
         'controller, telemetry of every 10th sample, a subscriber: steps a second',
         'controller, telemetry on, a subscriber: steps a second',
     ]
-    assert played == [
+    assert played_groups == [
         ('node, lock-step', {node._NULL: 1}),
         ('node and arm in one process, lock-step', dict.fromkeys(node._GUESTS, 1)),
         ('node with seven joints, lock-step', {node._NULL: 1}),
     ]
 
 
-def test_view_beside_the_controller(monkeypatch):
+def test_controller_with_view_running(monkeypatch):
     pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
     tiny(monkeypatch, 'node', _STEPS=20, _WARM_UP=2, _SETTLING=0.05)
     view = tiny(monkeypatch, 'view')
@@ -132,13 +132,13 @@ def test_view_beside_the_controller(monkeypatch):
     )
 
 
-def test_recorder_beside_raw_subscriber(monkeypatch):
+def test_recorder_compared_with_raw_subscriber(monkeypatch):
     sizes = {'_TOPICS': 2, '_MESSAGES': 20, '_SETTLING': 0.0, '_RECORDERS': {'recorder': 'none'}}
     recording = tiny(monkeypatch, 'recording', **sizes)
     assert contestants(list(recording.measure())) == ['recorder: CPU']
 
 
-def test_replay_beside_the_reader_of_mcap(monkeypatch):
+def test_replay_compared_with_mcap_reader(monkeypatch):
     replay = tiny(monkeypatch, 'replay', _DURATION=0.1)
     units = []
 
@@ -149,12 +149,12 @@ def test_replay_beside_the_reader_of_mcap(monkeypatch):
     measured = replay.interleaved
     monkeypatch.setattr(replay, 'interleaved', counting)
     assert len(contestants(list(replay.measure()))) == 2
-    # 101 samples of five messages, two more in each tenth from the first on, the bound, and the
+    # 101 samples of five messages, two more in every tenth from the first on, the bound, and
     # three events of the journal.
     assert units == 3 * [101 * 5 + 11 * 2 + 1 + 3]
 
 
-def test_contestant_that_dies_ends_the_measurement(monkeypatch):
+def test_dead_contestant_aborts_the_measurement(monkeypatch):
     recording = tiny(monkeypatch, 'recording')
     monkeypatch.setattr(recording, '_command', lambda *_: ['-c', 'raise SystemExit("no disk")'])
     error = importlib.import_module('harness').ContestantError
@@ -162,13 +162,13 @@ def test_contestant_that_dies_ends_the_measurement(monkeypatch):
         list(recording.measure())
 
 
-def test_contestant_that_does_not_answer_is_not_waited_for_for_ever():
+def test_waiting_for_a_silent_contestant_times_out():
     harness = importlib.import_module('harness')
     with pytest.raises(harness.ContestantError, match=r'after 0\.1 s waiting for a torque'):
         harness.wait_for(lambda: False, 'a torque', timeout=0.1)
 
 
-def test_changes_are_the_same_with_and_without_learning_and_differences_are_named(tmp_path):
+def test_changes_are_the_same_with_and_without_learning_and_differences_are_reported(tmp_path):
     changes = importlib.import_module('changing_arms')
     config = tmp_path / 'short.yaml'
     text = changes.PRESET.read_text()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arms that change while they are learned, over ROS: the package's plant and the one in MuJoCo.
+"""Arms that change during learning, over ROS: the package's plant and the one in MuJoCo.
 
-The bound holds, the largest error is not above 1.2 times that without learning (nor, after gentle
-changes, above 0.25 mrad), and two windows after the last change the parameters are known again.
+The bound holds, the largest error is at most 1.2 times that without learning (or 0.25 mrad after
+gentle changes), and two windows after the last change the parameters are known again.
 `make test-long` runs all rows, the suite one; `test_law_consistency.py` has them without ROS.
 """
 
@@ -30,11 +30,11 @@ from sim_plant.plant import parameters_of
 
 QUIET = {'telemetry.enabled': False}
 OBSERVED = {'wait_for_subscribers': 1}
-SHOWN = ROWS if os.environ.get('LONG_TESTS') else ['payload to 0.75 kg at 8 s']
+TESTED = ROWS if os.environ.get('LONG_TESTS') else ['payload to 0.75 kg at 8 s']
 
 
-@pytest.mark.parametrize('name', SHOWN)
-def test_bound_holds_in_lockstep_and_learning_costs_nothing(ros, name):
+@pytest.mark.parametrize('name', TESTED)
+def test_bound_holds_in_lockstep_and_learning_does_no_harm(ros, name):
     plant = {**ROWS[name], 'duration': end_of(ROWS[name])}
     commands = ros.listen(topics.COMMANDS)
     ros.listen(topics.JOINT_STATES, raw=True)
@@ -48,14 +48,14 @@ def test_bound_holds_in_lockstep_and_learning_costs_nothing(ros, name):
     assert np.all(np.abs(learning.error) < BOUND)
     changed = learning.time >= begin_of(plant)
     largest, without_learning = (
-        np.abs(one.error[changed]).max(axis=0) for one in (learning, without)
+        np.abs(run.error[changed]).max(axis=0) for run in (learning, without)
     )
     assert np.all(largest <= allowed(plant, without_learning))
     assert_learned(learning.learning.values[-1], plant)
 
 
-@pytest.mark.parametrize('name', SHOWN)
-def test_bound_holds_with_mujoco_and_learning_costs_nothing(ros, example, name):  # noqa: F811
+@pytest.mark.parametrize('name', TESTED)
+def test_bound_holds_with_mujoco_and_learning_does_no_harm(ros, example, name):  # noqa: F811
     without, _ = with_mujoco(ros, example, ROWS[name], OFF)
     largest, estimate = with_mujoco(ros, example, ROWS[name], {})
     assert np.all(largest < 1.0)
@@ -76,11 +76,11 @@ def with_mujoco(ros, example, row, law):  # noqa: F811
 
 
 def offline(plant, law):
-    """Run of these parameters without ROS."""
+    """Run with these parameters without ROS."""
     return simulate(build(ControllerConfig, law), build(PlantConfig, plant)).run()
 
 
 def assert_learned(estimate, plant):
-    """Whether the parameters at the end of a row are known to 1 %."""
+    """Assert that the parameters at the end of a row are known to 1 %."""
     P = parameters_of(build(PlantConfig, plant), end_of(plant))
     assert np.linalg.norm(estimate[:3] - P) < 0.01 * np.linalg.norm(P)

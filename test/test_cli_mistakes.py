@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What goes wrong on the command line is one line on stderr, whatever it is."""
+"""Any mistake on the command line gives one line on stderr."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def bag(tmp_path_factory):
         'monte-carlo',
     ],
 )
-def test_a_place_that_cannot_be_written_is_named(bag, tmp_path, monkeypatch, capfd, command, place):
+def test_unwritable_output_path_is_reported(bag, tmp_path, monkeypatch, capfd, command, place):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'file').touch()
     (tmp_path / 'full.csv').symlink_to('/dev/full')
@@ -63,14 +63,14 @@ def test_a_place_that_cannot_be_written_is_named(bag, tmp_path, monkeypatch, cap
     words = [str(bag)] if command in ('report', 'plot', 'recover', 'export') else []
     options = [place, '--starts', '1'] if command == 'excite' else ['--out', place]
     assert main([*command.split(), *words, *options]) == 1
-    _, said = capfd.readouterr()
-    assert said.startswith(f'blf_dsc {command.split()[0]}: ')
-    assert said.count('\n') == 1
-    assert 'cannot be written (' in said or 'exists already' in said
-    assert 'choose another' in said
+    _, errors = capfd.readouterr()
+    assert errors.startswith(f'blf_dsc {command.split()[0]}: ')
+    assert errors.count('\n') == 1
+    assert 'cannot be written (' in errors or 'exists already' in errors
+    assert 'choose another' in errors
 
 
-def test_infinity_in_a_bag_and_letters_without_a_font_are_not_worth_a_warning(
+def test_infinities_and_characters_missing_from_the_font_raise_no_warning(
     tmp_path, monkeypatch, capfd
 ):
     monkeypatch.setattr(synthetic_bag, 'JOINTS', ('关节', 'elbow'))
@@ -82,12 +82,12 @@ def test_infinity_in_a_bag_and_letters_without_a_font_are_not_worth_a_warning(
     path = synthetic_bag.write(tmp_path / 'bag', made.messages())
     for words in (['plot', '--out', tmp_path], ['export', '--out', tmp_path / 'table.csv']):
         assert main([words[0], str(path), *map(str, words[1:])]) == 0
-    out, said = capfd.readouterr()
+    out, errors = capfd.readouterr()
     assert 'VIOLATED, first by 关节 at 0.100 s' in out
-    assert said == ''
+    assert errors == ''
 
 
-def test_an_interrupt_while_kernels_are_compiled_ends_the_command():
+def test_interrupt_during_kernel_compilation_ends_the_command():
     run = finished(sys.executable, '-c', INTERRUPTED_WHILE_COMPILING)
     assert (run.returncode, run.stdout) == (130, '')
     assert run.stderr == 'blf_dsc plot: interrupted\n'

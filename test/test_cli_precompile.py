@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc precompile` leaves nothing to compile to the nodes."""
+"""`blf_dsc precompile` leaves nothing for the nodes to compile."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ for kernel in (update, _sample, *KERNELS):
 
 
 @pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
-def test_every_kernel_that_a_node_calls_is_compiled():
-    shown = subprocess.run([sys.executable, '-c', SHOW], capture_output=True, text=True, check=True)
-    kernels = dict(line.split() for line in shown.stdout.splitlines())
+def test_every_kernel_called_by_a_node_is_compiled():
+    run = subprocess.run([sys.executable, '-c', SHOW], capture_output=True, text=True, check=True)
+    kernels = dict(line.split() for line in run.stdout.splitlines())
     assert len(kernels) == 5
     assert all(int(count) >= 1 for count in kernels.values()), kernels
 
 
-def test_the_command_says_so(capsys):
+def test_command_reports_that_kernels_are_compiled(capsys):
     assert main(['precompile', '--config', 'recommended']) == 0
     assert 'recommended: the kernels are compiled' in capsys.readouterr().out

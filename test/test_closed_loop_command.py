@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc run` over three processes: what it leaves behind, and that nothing is lost."""
+"""`blf_dsc run` with three processes: its results are complete and nothing is lost."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ COUNTS = {
     '/joint_states': SAMPLES,
     **{f'/blf_dsc_controller/{topic}': SAMPLES for topic in EACH_SAMPLE},
     '/blf_dsc_controller/bound': 1,
-    '/blf_dsc_controller/monitor': 301,  # each tenth sample
+    '/blf_dsc_controller/monitor': 301,  # every tenth sample
     '/sim_plant/truth': 301,
 }
 TYPES = dict.fromkeys(COUNTS, 'sensor_msgs/msg/JointState') | {
@@ -73,7 +73,7 @@ def out(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def reading(out):
-    """Topics with types and counts, by two libraries, and the stamps of all joint states."""
+    """Topics with types and counts from two libraries, and the stamps of all joint states."""
     run = finished(sys.executable, '-I', '-c', STRANGER, out / 'bag', cwd=out)
     assert run.returncode == 0, run.stderr
     return json.loads(run.stdout)
@@ -81,7 +81,7 @@ def reading(out):
 
 @pytest.fixture(scope='module')
 def counts(out, reading):
-    """COUNTS, with the states that the plant sent again where a torque took over 3 s to come."""
+    """COUNTS, plus the states that the plant sent again when a torque took over 3 s to arrive."""
     repeated = [stamp for stamp, after in pairwise(reading[1]) if stamp == after]
     log = (out / 'logs' / 'sim_plant.log').read_text()
     assert len(repeated) == log.count('sending the state again')
@@ -89,7 +89,7 @@ def counts(out, reading):
     return COUNTS | {'/joint_states': SAMPLES + len(repeated), '/sim_plant/truth': 301 + truths}
 
 
-def test_torques_over_three_processes_are_those_of_the_offline_run_bit_for_bit(out, tmp_path):
+def test_torques_of_three_processes_match_the_offline_run_bit_for_bit(out, tmp_path):
     offline = closed_loop(
         '--offline', '--mode', 'lockstep', '--duration', DURATION, '--out', tmp_path / 'out'
     )
@@ -101,15 +101,15 @@ def test_torques_over_three_processes_are_those_of_the_offline_run_bit_for_bit(o
     np.testing.assert_array_equal(recorded.torque, simulated_torques({'duration': float(DURATION)}))
 
 
-def test_also_on_a_machine_that_is_busy(tmp_path):
+def test_torques_match_on_a_busy_machine(tmp_path):
     busy = [sys.executable, '-c', 'while True: pass']
-    hogs = [subprocess.Popen(busy) for _ in range(os.cpu_count() or 1)]
+    busy_processes = [subprocess.Popen(busy) for _ in range(os.cpu_count() or 1)]
     try:
         run = closed_loop('--mode', 'lockstep', '--duration', 1, '--out', tmp_path / 'out')
     finally:
-        for hog in hogs:
-            hog.kill()
-            hog.wait()
+        for process in busy_processes:
+            process.kill()
+            process.wait()
     assert run.returncode == 0, run.stderr
     torque = read_run(tmp_path / 'out' / 'bag').torque
     np.testing.assert_array_equal(torque, simulated_torques({'duration': 1.0}))
@@ -124,7 +124,7 @@ def test_programs_without_this_package_read_the_whole_bag(reading, counts):
     assert sorted(stamps) == stamps
 
 
-def test_results_are_where_the_command_says(out, counts):
+def test_command_reports_where_the_results_are(out, counts):
     summary = json.loads((out / 'summary.json').read_text())
     assert summary['samples'] == SAMPLES
     assert summary['tracking']['held'] is True
@@ -138,13 +138,13 @@ def test_results_are_where_the_command_says(out, counts):
         assert (out / 'logs' / f'{node}.log').read_text()
 
 
-def test_the_configuration_beside_the_bag_is_the_one_that_ran(out):
+def test_configuration_beside_the_bag_is_the_one_that_ran(out):
     config = load_loop(out / 'config.yaml')
     assert (config.plant.mode, config.plant.duration) == ('lockstep', DURATION)
     assert config.recorder.output == str(out / 'bag')
 
 
-def test_in_a_log_progress_is_a_few_lines(out):
+def test_redirected_output_has_plain_progress_lines(out):
     output = (out / 'output.txt').read_text()
     assert '\r' not in output
     progress = [line for line in output.splitlines() if line.startswith('closed loop ')]
@@ -153,7 +153,7 @@ def test_in_a_log_progress_is_a_few_lines(out):
     assert 'parameter error' in progress[-1]
 
 
-def test_real_time_reports_what_it_held(tmp_path):
+def test_real_time_run_reports_its_timing(tmp_path):
     config = tmp_path / 'fifo.yaml'
     fifo = '/**:\n  ros__parameters:\n    realtime: {priority: 10, lock_memory: true}\n'
     config.write_text(fifo + PATIENT)
@@ -174,7 +174,7 @@ def test_real_time_reports_what_it_held(tmp_path):
         assert 'memory' in output
 
 
-def test_the_planar_chain_runs_over_ros_with_its_parameter_error(tmp_path):
+def test_planar_chain_runs_over_ros_and_reports_parameter_error(tmp_path):
     text = (
         'blf_dsc_controller:\n  ros__parameters:\n    model: planar_chain\n'
         '    learning: {initial_estimate: [0.5, 0.2, 0.16]}\n'
@@ -183,6 +183,6 @@ def test_the_planar_chain_runs_over_ros_with_its_parameter_error(tmp_path):
     arguments = ('--config', tmp_path / 'chain.yaml', '--mode', 'lockstep', '--duration', 0.5)
     run = closed_loop(*arguments, '--out', tmp_path / 'out')
     assert run.returncode == 0, run.stderr
-    # That of the model two_link.
+    # As with the model two_link.
     assert 'parameter error 41.89 %' in run.stderr
     assert 'parameters  error end 41.9 %' in run.stdout

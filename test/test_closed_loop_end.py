@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every way a run can end before its time: what was recorded stays, and no process is left."""
+"""However a run ends early, its recording is kept and no process is left running."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from blf_dsc_controller.bags.recover import recover
 
 @pytest.fixture
 def running(tmp_path):
-    one = Running(tmp_path / 'out')
-    yield one
-    one.close()
+    command = Running(tmp_path / 'out')
+    yield command
+    command.close()
 
 
 def whole(bag):
-    """Read a bag in which nothing is missing up to its end; return its number of samples."""
+    """Check that no sample of a bag is missing up to its end; return the number of samples."""
     run = read_run(bag)
     assert set(np.diff(run.stamp)) == {1_000_000}
     return run.stamp.size
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_in_order_with_bag_and_report(running, number):
+def test_signal_shuts_down_cleanly_with_bag_and_report(running, number):
     running.process.send_signal(number)
     code, output, errors = running.end()
     assert code == 130, errors
@@ -45,7 +45,7 @@ def test_a_signal_ends_it_in_order_with_bag_and_report(running, number):
         assert (running.out / result).is_file()
 
 
-def test_a_node_that_is_killed_ends_the_others_and_is_named(running):
+def test_killed_node_is_reported_and_ends_the_others(running):
     os.kill(running.child('controller_node'), signal.SIGKILL)
     code, _, errors = running.end()
     assert code == 1
@@ -65,30 +65,30 @@ def test_no_node_outlives_the_command(running):
     assert whole(bag) > 100
 
 
-def at_the_end(errors):
+def last_progress(errors):
     """Last line of progress."""
     return [line for line in errors.splitlines() if line.startswith('closed loop ')][-1]
 
 
 @pytest.mark.parametrize(('mode', 'duration'), [('lockstep', 20), ('realtime', 5)])
-def test_a_full_disk_ends_the_recording_and_not_the_loop(tmp_path, mode, duration):
-    # Full after 2 s: each takes over 1 MB, and half of the 4 MB are kept for the end of the bag.
+def test_full_disk_stops_the_recording_but_not_the_loop(tmp_path, mode, duration):
+    # Full after 2 s: a second takes over 1 MB, and half of the 4 MB is reserved to close the bag.
     config = tmp_path / 'patient.yaml'
     config.write_text(PATIENT)
     run = ('--config', config, '--mode', mode, '--duration', duration, '--out')
     with small_disk(tmp_path / 'disk', 4) as disk:
         recorded = closed_loop(*run, disk / 'out')
         assert recorded.returncode == 1
-        said = recorded.stderr
-        assert 'bag_recorder has ended: the loop continues unrecorded' in said
-        assert 'bag_recorder exited with code 1 while the loop continued without it' in said
-        assert said.count('the disk is full') == 1
-        assert f'the recording up to then is in {disk / "out" / "bag"}' in said
-        assert 'Traceback' not in said
-        assert at_the_end(said).startswith(f'closed loop {duration}.0/{duration} s, ')
+        errors = recorded.stderr
+        assert 'bag_recorder has ended: the loop continues unrecorded' in errors
+        assert 'bag_recorder exited with code 1 while the loop continued without it' in errors
+        assert errors.count('the disk is full') == 1
+        assert f'the recording up to then is in {disk / "out" / "bag"}' in errors
+        assert 'Traceback' not in errors
+        assert last_progress(errors).startswith(f'closed loop {duration}.0/{duration} s, ')
         bag = disk / 'out' / 'bag'
         assert 500 < whole(bag) < 1000 * duration
         assert recover(bag, tmp_path / 'clean').is_whole
     if mode == 'lockstep':
         alone = closed_loop('--offline', *run, tmp_path / 'alone')
-        assert at_the_end(alone.stderr) == at_the_end(said)
+        assert last_progress(alone.stderr) == last_progress(errors)

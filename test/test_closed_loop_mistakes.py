@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bad input to `blf_dsc run` and to the nodes: one clear paragraph, and nothing lost or left."""
+"""Bad input to `blf_dsc run` and the nodes gives one clear paragraph; no file is lost or left."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ sys.exit(getattr(main, command)())
 PLANT_NODE = (sys.executable, '-m', 'sim_plant.node', '--ros-args')
 
 
-def written(folder, plant='', controller=''):
+def write_params(folder, plant='', controller=''):
     """Write a parameter file with these lines for the nodes."""
     path = folder / 'given.yaml'
     path.write_text(
@@ -52,11 +52,11 @@ def written(folder, plant='', controller=''):
         ),
     ],
 )
-def test_a_configuration_that_cannot_run_is_rejected_before_anything_starts(
+def test_invalid_configuration_is_rejected_before_anything_starts(
     tmp_path, plant, controller, expected
 ):
     out = tmp_path / 'out'
-    run = closed_loop('--config', written(tmp_path, plant, controller), '--out', out)
+    run = closed_loop('--config', write_params(tmp_path, plant, controller), '--out', out)
     assert run.returncode == 1
     assert run.stderr.startswith('blf_dsc run: ')
     assert expected in run.stderr
@@ -65,7 +65,7 @@ def test_a_configuration_that_cannot_run_is_rejected_before_anything_starts(
     assert not out.exists()
 
 
-def test_results_are_never_written_over(tmp_path):
+def test_results_are_never_overwritten(tmp_path):
     kept = tmp_path / 'out' / 'kept.txt'
     kept.parent.mkdir()
     kept.write_text('mine')
@@ -75,7 +75,7 @@ def test_results_are_never_written_over(tmp_path):
     assert [path.name for path in kept.parent.iterdir()] == ['kept.txt']
 
 
-def test_without_a_name_each_run_gets_a_folder_of_its_own(tmp_path):
+def test_runs_without_out_option_get_separate_folders(tmp_path):
     for folder in ('closed_loop', 'closed_loop-2'):
         run = closed_loop('--offline', '--duration', 0.1, cwd=tmp_path, env=_environment())
         assert run.returncode == 0, run.stderr
@@ -84,11 +84,11 @@ def test_without_a_name_each_run_gets_a_folder_of_its_own(tmp_path):
 
 
 def _environment():
-    """Return an environment in which this checkout is found from any folder."""
+    """Return an environment that finds this checkout from any folder."""
     return {**os.environ, 'PYTHONPATH': os.pathsep.join(['', *map(str, sys.path)]).lstrip(':')}
 
 
-def test_a_file_that_is_not_there_is_named_with_the_presets(tmp_path):
+def test_missing_file_error_lists_the_presets(tmp_path):
     run = closed_loop('--config', tmp_path / 'absent.yaml')
     assert run.returncode == 1
     assert f'{tmp_path / "absent.yaml"} does not exist' in run.stderr
@@ -98,7 +98,7 @@ def test_a_file_that_is_not_there_is_named_with_the_presets(tmp_path):
 @pytest.mark.parametrize(
     'command', ['closed_loop', 'sim_plant', 'blf_dsc_controller', 'bag_recorder']
 )
-def test_without_ros_it_is_said_where_to_get_it(tmp_path, command):
+def test_without_ros_the_error_tells_how_to_source_it(tmp_path, command):
     out = tmp_path / 'out'
     run = finished(sys.executable, '-c', WITHOUT_ROS, command, '--out', out)
     assert run.returncode == 1, run.stderr
@@ -108,7 +108,7 @@ def test_without_ros_it_is_said_where_to_get_it(tmp_path, command):
     assert not out.exists()
 
 
-def test_offline_needs_no_ros(tmp_path):
+def test_offline_run_needs_no_ros(tmp_path):
     out = tmp_path / 'out'
     offline = ('closed_loop', '--offline', '--duration', 0.1, '--out', out)
     run = finished(sys.executable, '-c', WITHOUT_ROS, *offline)
@@ -116,8 +116,8 @@ def test_offline_needs_no_ros(tmp_path):
     assert (out / 'bag' / 'metadata.yaml').is_file()
 
 
-def test_a_run_in_which_the_controller_stopped_says_so_by_its_exit_code(tmp_path):
-    path = written(tmp_path, controller='safety.velocity_limit: 0.0001')
+def test_exit_code_shows_that_the_controller_stopped(tmp_path):
+    path = write_params(tmp_path, controller='safety.velocity_limit: 0.0001')
     out = tmp_path / 'out'
     run = closed_loop('--config', path, '--offline', '--duration', 0.1, '--out', out)
     assert run.returncode == 5, run.stderr
@@ -135,7 +135,7 @@ def test_a_run_in_which_the_controller_stopped_says_so_by_its_exit_code(tmp_path
     ],
     ids=['no YAML', 'unknown name'],
 )
-def test_a_node_says_what_is_wrong_with_its_file(tmp_path, content, expected):
+def test_node_reports_what_is_wrong_with_its_parameter_file(tmp_path, content, expected):
     pytest.importorskip('rclpy', reason='needs ROS 2')
     path = tmp_path / 'given.yaml'
     path.write_text(content)
@@ -145,7 +145,7 @@ def test_a_node_says_what_is_wrong_with_its_file(tmp_path, content, expected):
     assert 'Traceback' not in run.stderr
 
 
-def test_a_node_says_which_argument_ros_does_not_know():
+def test_node_reports_unknown_ros_argument():
     pytest.importorskip('rclpy', reason='needs ROS 2')
     run = finished(*PLANT_NODE, '--param', 'seed:=1', '--sede')
     assert run.returncode == 1
@@ -153,7 +153,7 @@ def test_a_node_says_which_argument_ros_does_not_know():
     assert 'Traceback' not in run.stderr
 
 
-def test_the_options_are_listed():
+def test_help_lists_the_options():
     run = closed_loop('--help')
     assert run.returncode == 0
     assert 'usage: blf_dsc run' in run.stdout

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Machine code is cached by the contents of every file that a kernel is compiled from."""
+"""Cached machine code depends on the contents of all files that a kernel is compiled from."""
 
 from __future__ import annotations
 
@@ -28,28 +28,28 @@ def names(kernel):
     return {str(path.relative_to(PACKAGE.parent)) for path in jit.dependencies(kernel)[0]}
 
 
-def test_a_kernel_depends_on_the_files_it_is_compiled_from():
+def test_kernel_depends_on_the_files_it_is_compiled_from():
     assert names(update) >= LAW | REFERENCE | ALWAYS
     assert names(run_loop) >= LAW | REFERENCE | PLANT | ALWAYS
     assert names(step_plant) >= PLANT | ALWAYS
 
 
-def test_a_kernel_does_not_depend_on_other_files():
-    """A change of the plant does not compile the law again, nor one of the configuration any."""
+def test_kernel_does_not_depend_on_other_files():
+    """Changing the plant does not recompile the law; changing the configuration, no kernel."""
     assert not names(update) & PLANT
     assert not names(step_plant) & (LAW | REFERENCE)
     assert not any('configuration' in name for name in names(run_loop))
 
 
-def test_a_kernel_depends_on_its_constants():
+def test_kernel_depends_on_its_constants():
     constants = jit.dependencies(update)[1]
     assert {'SUSPECT=1', 'OUTSIDE=2', 'LINEAR=1'} <= constants
 
 
 @pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is cached')
 @pytest.mark.parametrize('kernel', [update, run_loop, step_plant])
-def test_the_cache_of_a_kernel_is_where_its_dependencies_say(kernel):
-    """What a kernel calls is defined before it, or an edit would run on stale machine code."""
+def test_cache_folder_of_a_kernel_follows_from_its_dependencies(kernel):
+    """A kernel must be defined after what it calls, or edits would run stale machine code."""
     assert str(jit.cache_folder(kernel)) in kernel._cache.cache_path
 
 
@@ -73,7 +73,7 @@ def mean_root(values):
     return sum_of_roots(values) / values.size
 
 
-def test_functions_that_are_only_linked_compute_and_raise():
+def test_linked_functions_compute_and_raise():
     assert mean_root(np.array([1.0, 9.0])) == 2.0
     with pytest.raises(ValueError, match='no root of a negative number'):
         mean_root(np.array([1.0, -9.0]))
@@ -85,7 +85,7 @@ def allocating(x):
 
 
 @pytest.mark.skipif(numba.config.DISABLE_JIT, reason='Python may allocate')
-def test_a_kernel_that_allocates_is_refused_as_nothing_would_free_its_array():
+def test_kernel_that_allocates_an_array_is_rejected():
     with pytest.raises(UnsupportedError, match='the kernel allocating allocates an array'):
         allocating(1.0)
 
@@ -96,10 +96,10 @@ def fill_with_noise(rng, out):
         out[i] = rng.standard_normal()
 
 
-def test_a_kernel_gives_back_the_references_to_its_arguments():
+def test_kernel_releases_references_to_its_arguments():
     arguments = np.random.default_rng(1), np.zeros(3)
     fill_with_noise(*arguments)
-    before = [sys.getrefcount(one) for one in arguments]
+    before = [sys.getrefcount(argument) for argument in arguments]
     for _ in range(3):
         fill_with_noise(*arguments)
-    assert [sys.getrefcount(one) for one in arguments] == before
+    assert [sys.getrefcount(argument) for argument in arguments] == before

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layouts of flat vectors: nested tuples, lengths of other objects, in Python and in kernels."""
+"""Layouts of flat vectors: nested tuples, lengths from other objects, Python and kernels."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ def total(settings_vector, state_vector):
     return settings.gains.sum() + settings.motor.limit.sum()
 
 
-def test_pack_and_view_are_inverse():
+def test_view_is_the_inverse_of_pack():
     settings = settings_of(pack(SETTINGS))
     assert (settings.n, settings.period, settings.motor.delay) == (3, 0.5, 4)
     np.testing.assert_array_equal(settings.motor.limit, SETTINGS.motor.limit)
     np.testing.assert_array_equal(settings.gains, SETTINGS.gains)
 
 
-def test_views_cover_the_vector_once():
+def test_views_cover_the_whole_vector_once():
     sizes = SimpleNamespace(n=2, motor=SimpleNamespace(delay=3))
     vector = np.arange(float(state_size(sizes)))
     assert vector.size == 1 + 6 + 3
@@ -60,7 +60,7 @@ def test_views_cover_the_vector_once():
     np.testing.assert_array_equal(pack(state), vector)
 
 
-def test_kernels_and_python_see_the_same():
+def test_kernels_and_python_agree():
     vector = pack(SETTINGS)
     results = []
     for function in (total, numba.njit(total)):

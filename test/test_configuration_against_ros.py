@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The reader without ROS against ROS's own: the same file must say the same to the same node."""
+"""The reader without ROS against ROS's own: a file must give a node the same parameters."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ def without_ros(path, name):
     except ConfigurationError:
         return None
     matching = [section for section in sections if section.matches(name)]
-    return {key: entry.value for one in matching for key, entry in one.entries.items()}
+    return {key: entry.value for section in matching for key, entry in section.entries.items()}
 
 
 PATTERNS = ('/**', '/*', 'n', '/s/n', '/s/*', '/s/**', '/**/n', '/*/n', '/*/*', 's/t/n', '/**/t/*')
 
 
 @pytest.mark.parametrize('name', ['/n', '/s/n', '/s/t/n', '/m'])
-def test_the_same_sections_count(context, tmp_path, name):
+def test_same_sections_apply(context, tmp_path, name):
     path = tmp_path / 'a.yaml'
     path.write_text(
         ''.join(
@@ -76,15 +76,15 @@ WORDS = """
 """
 
 
-def test_the_same_words_mean_the_same(context, tmp_path):
+def test_scalars_have_the_same_values(context, tmp_path):
     path = tmp_path / 'a.yaml'
     words = [*WORDS.split(), '!!str 1', '1 2', '>-\n      yes', '|\n      12']
     lines = [f'    a{index}: {word}\n' for index, word in enumerate(words)]
     path.write_text('n:\n  ros__parameters:\n' + ''.join(lines))
-    here, there = without_ros(path, '/n'), with_ros(context, path, '/n')
-    assert there
-    assert {key: repr(value) for key, value in here.items()} == {
-        key: repr(value) for key, value in there.items()
+    ours, expected = without_ros(path, '/n'), with_ros(context, path, '/n')
+    assert expected
+    assert {key: repr(value) for key, value in ours.items()} == {
+        key: repr(value) for key, value in expected.items()
     }
 
 
@@ -105,7 +105,7 @@ def test_the_same_words_mean_the_same(context, tmp_path):
         'n: [\n',
     ],
 )
-def test_files_that_ros_rejects_are_rejected(context, tmp_path, text):
+def test_files_rejected_by_ros_are_rejected(context, tmp_path, text):
     path = tmp_path / 'a.yaml'
     path.write_text(text)
     assert with_ros(context, path, '/n') is None
@@ -114,21 +114,21 @@ def test_files_that_ros_rejects_are_rejected(context, tmp_path, text):
 
 @pytest.mark.parametrize('node', ['sim_plant', 'blf_dsc_controller', 'bag_recorder'])
 @pytest.mark.parametrize('preset', ['recommended', 'noisy'])
-def test_the_presets_say_the_same(context, preset, node):
-    here = without_ros(locate(preset), f'/{node}')
-    there = with_ros(context, locate(preset), f'/{node}')
-    # rclpy has no type for an empty list and calls it unset.
-    assert {key: value or None if value == [] else value for key, value in here.items()} == there
+def test_presets_have_the_same_values(context, preset, node):
+    ours = without_ros(locate(preset), f'/{node}')
+    expected = with_ros(context, locate(preset), f'/{node}')
+    # rclpy has no type for an empty list and leaves it unset.
+    assert {key: value or None if value == [] else value for key, value in ours.items()} == expected
 
 
-def test_ros_reads_a_written_configuration_exactly(context, tmp_path):
+def test_ros_reads_a_dumped_configuration_exactly(context, tmp_path):
     path = tmp_path / 'run.yaml'
     config = ControllerConfig()
     dump(path, {'blf_dsc_controller': config})
     values = with_ros(context, path, '/blf_dsc_controller')
-    # ROS has no type for an empty list, and gives no value.
+    # ROS has no type for an empty list, and returns no value.
     values = {name: [] if value is None else value for name, value in values.items()}
-    held = {
+    found = {
         key: tuple(value) if isinstance(value, list) else value for key, value in values.items()
     }
-    assert held == flatten(config)
+    assert found == flatten(config)

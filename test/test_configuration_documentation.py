@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The documented tables of parameters and topics against the code they are made from."""
+"""The documented tables of parameters and topics match the code they are generated from."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from blf_dsc_controller.messages.topics import TOPICS
 COMMITTED = Path(__file__).parents[1] / 'doc' / 'parameters.md'
 
 
-def test_the_committed_table_is_up_to_date():
+def test_parameter_page_is_up_to_date():
     assert COMMITTED.read_text(encoding='utf-8') == parameter_page(), (
         'run: python -m blf_dsc_controller.configuration.documentation doc/parameters.md'
     )
 
 
-def test_the_command_it_names_writes_it(tmp_path):
+def test_command_writes_the_parameter_page(tmp_path):
     page = tmp_path / 'parameters.md'
     module = 'blf_dsc_controller.configuration.documentation'
     subprocess.run([sys.executable, '-m', module, str(page)], check=True, cwd=COMMITTED.parents[1])
@@ -34,7 +34,7 @@ def test_every_parameter_has_a_row_of_eight_cells():
     assert {row.replace('\\|', '').count('|') for row in rows} == {9}
 
 
-def test_the_page_of_topics_is_up_to_date():
+def test_topic_page_is_up_to_date():
     assert (COMMITTED.parent / 'topics.md').read_text(encoding='utf-8') == topic_page(), (
         'run: python -m blf_dsc_controller.messages.documentation doc/topics.md'
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameter files as the record of a run: what is written loads back equal."""
+"""Parameter files as the record of a run: a dumped configuration loads back equal."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ CHANGED = LoopConfig(
 )
 
 
-def test_a_run_is_written_so_that_it_loads_back_equal(tmp_path):
+def test_configuration_of_a_run_round_trips(tmp_path):
     path = tmp_path / 'run.yaml'
     loop = CHANGED._replace(controller=build(ControllerConfig, {'learning.regularization': 3e-300}))
     dump(path, loop.by_node)
     assert load_loop(path) == loop
 
 
-def test_a_node_in_a_namespace_is_written_under_its_full_name(tmp_path):
+def test_node_in_a_namespace_is_written_under_its_full_name(tmp_path):
     path = tmp_path / 'run.yaml'
     dump(path, {'/left/sim_plant': CHANGED.plant})
     assert load(path, '/left/sim_plant', PlantConfig) == CHANGED.plant
@@ -51,7 +51,7 @@ def test_a_node_in_a_namespace_is_written_under_its_full_name(tmp_path):
 @settings(max_examples=200, deadline=None)
 @given(
     st.one_of(
-        # Subnormal numbers are texts to ROS, and no parameter needs them.
+        # ROS reads subnormal numbers as strings, and no parameter needs them.
         st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False),
         st.integers(-(2**63), 2**63 - 1),
         st.booleans(),
@@ -59,11 +59,11 @@ def test_a_node_in_a_namespace_is_written_under_its_full_name(tmp_path):
         st.lists(st.floats(0.001, 1e9), min_size=1).map(tuple),
     )
 )
-def test_a_value_is_read_back_as_itself_here_and_by_any_yaml_library(value):
+def test_formatted_values_round_trip_here_and_through_pyyaml(value):
     text = f'n:\n  ros__parameters:\n    a: {format_value(value)}\n'
-    here = parse(text)[0].entries['a'].value
-    there = yaml.safe_load(text)['n']['ros__parameters']['a']
-    for found in (here, there):
-        same = tuple(found) if isinstance(value, tuple) else found
-        assert same == value
-        assert type(same) is type(value)
+    ours = parse(text)[0].entries['a'].value
+    theirs = yaml.safe_load(text)['n']['ros__parameters']['a']
+    for found in (ours, theirs):
+        restored = tuple(found) if isinstance(value, tuple) else found
+        assert restored == value
+        assert type(restored) is type(value)

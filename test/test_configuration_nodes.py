@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The configurations of the package: presets, agreement with the law, and what is rejected."""
+"""Configurations of the nodes: presets, agreement with the law, and rejected values."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from blf_dsc_controller.configuration.params_file import load_loop, locate, read
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, parameters
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.law import factory as assembly
-from blf_dsc_controller.law import settings
+from blf_dsc_controller.law import factory, settings
 
 DEFAULTS = LoopConfig(PlantConfig(), ControllerConfig(), RecorderConfig())
 
@@ -28,24 +27,24 @@ def problems_of(cls, given):
 
 
 @pytest.mark.parametrize('cls', NODES.values(), ids=NODES)
-def test_the_defaults_are_valid(cls):
+def test_defaults_are_valid(cls):
     assert build(cls, {}) == cls()
 
 
-def test_the_recommended_preset_is_the_defaults():
+def test_recommended_preset_equals_the_defaults():
     assert load_loop('recommended') == DEFAULTS
 
 
 @pytest.mark.parametrize('node', NODES)
-def test_the_recommended_preset_shows_every_parameter(node):
+def test_recommended_preset_lists_every_parameter(node):
     sections = read(locate('recommended'))
-    shown = {
+    listed = {
         name for section in sections if section.matches(f'/{node}') for name in section.entries
     }
-    assert shown >= {one.name for one in parameters(NODES[node])}
+    assert listed >= {parameter.name for parameter in parameters(NODES[node])}
 
 
-def test_the_noisy_preset_changes_sensors_and_delay_alone():
+def test_noisy_preset_changes_only_sensors_and_delay():
     noisy = load_loop('noisy')
     assert noisy.controller == DEFAULTS.controller
     assert noisy.plant == change(
@@ -54,29 +53,29 @@ def test_the_noisy_preset_changes_sensors_and_delay_alone():
     )
 
 
-def test_models_and_choices_are_those_of_the_law():
+def test_models_and_choices_match_the_law():
     assert MODELS == {'two_link': 2, 'planar_chain': None, 'urdf': None}
     for name, n in (('two_link', 2), *(('planar_chain', n) for n in (1, 2, 7))):
         model = arm_model(name, n, l1=1.0, gravity=9.8)
         assert model.n == n
         assert parameter_count(n) == len(model.parameter_names)
-    choices = {one.name: one.choices for one in parameters(ControllerConfig)}
+    choices = {entry.name: entry.choices for entry in parameters(ControllerConfig)}
     for law in choices['law']:
-        given = {'law': law, 'truth.parameters': [1.0, 0.32, 0.4]}  # required by model_based
-        assembly.settings_of_config(build(ControllerConfig, given))
+        given = {'law': law, 'truth.parameters': [1.0, 0.32, 0.4]}  # model_based needs them
+        factory.settings_of_config(build(ControllerConfig, given))
     assert sorted(choices['learning.update']) == sorted(settings.UPDATES)
     assert sorted(choices['learning.torque_source']) == sorted(settings.TORQUE_SOURCES)
 
 
 @pytest.mark.parametrize('node', NODES)
-def test_every_parameter_is_described_and_no_number_goes_without_its_limits(node):
-    for one in parameters(NODES[node]):
-        assert one.description
-        if one.kind.value == 'integer':
-            assert one.at_least is not None, one.name
+def test_every_parameter_has_a_description_and_integers_have_a_minimum(node):
+    for parameter in parameters(NODES[node]):
+        assert parameter.description
+        if parameter.kind.value == 'integer':
+            assert parameter.at_least is not None, parameter.name
 
 
-def test_a_whole_number_of_nanoseconds():
+def test_sample_time_is_a_whole_number_of_nanoseconds():
     assert build(PlantConfig, {'sample_time': 0.0003}).sample_time_ns == 300_000
     assert build(ControllerConfig, {'sample_time': 0.01}).sample_time_ns == 10_000_000
     for cls in (PlantConfig, ControllerConfig):
@@ -85,17 +84,17 @@ def test_a_whole_number_of_nanoseconds():
 
 
 @pytest.mark.parametrize('cls', [PlantConfig, ControllerConfig])
-def test_joints_have_names_of_their_own_and_the_arm_has_two(cls):
+def test_joint_names_are_unique_and_the_arm_has_two(cls):
     assert problems_of(cls, {'joints': ['elbow', 'elbow']}) == [
         "joints: the name 'elbow' is repeated"
     ]
     assert problems_of(cls, {'joints': ['elbow', '']}) == ['joints: a name is empty']
-    one = {
-        one.name: one.default[:1]
-        for one in parameters(cls)
-        if 'joints' in one.length or one.name == 'joints'
+    one_joint = {
+        entry.name: entry.default[:1]
+        for entry in parameters(cls)
+        if 'joints' in entry.length or entry.name == 'joints'
     }
-    (problem,) = problems_of(cls, one)
+    (problem,) = problems_of(cls, one_joint)
     assert problem.startswith('joints: got 1 name, but')
 
 
@@ -140,12 +139,12 @@ def test_joints_have_names_of_their_own_and_the_arm_has_two(cls):
         ({'barier.bound': [1.0, 1.0]}, 'barier.bound: unknown parameter, did you '),
     ],
 )
-def test_a_controller_that_cannot_run_is_rejected(given, message):
+def test_invalid_controller_configuration_is_rejected(given, message):
     (problem,) = problems_of(ControllerConfig, given)
     assert problem.startswith(message)
 
 
-def test_the_shortest_window_and_a_two_tone_reference_are_accepted():
+def test_shortest_window_and_two_tone_reference_are_accepted():
     assert build(ControllerConfig, {'learning.window': 0.01}).learning.window == 0.01
     two_tones = {
         'reference.frequency': [1.0, 2.0],
@@ -155,12 +154,12 @@ def test_the_shortest_window_and_a_two_tone_reference_are_accepted():
     assert build(ControllerConfig, two_tones).reference.amplitude == (0.3, 0.1, 0.2, 0.4)
 
 
-def test_a_plant_that_ends_within_its_first_sample_is_rejected():
+def test_plant_shorter_than_one_sample_is_rejected():
     (problem,) = problems_of(PlantConfig, {'duration': 0.0005})
     assert problem.startswith('duration: got 0.0005 s, shorter than one sample of 0.001 s')
 
 
-def test_a_recorder_without_a_folder_is_rejected():
+def test_recorder_without_output_folder_is_rejected():
     assert problems_of(RecorderConfig, {'output': ' '}) == [
         'output: got no folder name to write the bag into'
     ]
@@ -178,12 +177,12 @@ def test_plant_and_controller_must_agree():
     assert problem.startswith('joints: sim_plant has joint1, elbow, but blf_dsc_controller has')
 
 
-def test_known_names_are_those_of_all_nodes():
+def test_known_names_cover_all_nodes():
     assert {'arm.m2', 'barrier.bound', 'compression'} <= known_names()
     assert 'arm' not in known_names()
 
 
-def test_configurations_are_read_where_there_is_no_ros():
+def test_configurations_load_without_ros():
     program = (
         'import sys; sys.modules.update(rclpy=None, rcl_interfaces=None, ament_index_python=None)\n'
         'from blf_dsc_controller.configuration.params_file import load_loop, locate\n'

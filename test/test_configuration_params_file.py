@@ -57,7 +57,7 @@ def problems_of(path, node='sim_plant', cls=PlantConfig):
         ('left:\n  sim_plant', '/left/sim_plant'),
     ],
 )
-def test_a_section_that_matches_counts(file, pattern, node):
+def test_matching_section_applies(file, pattern, node):
     head, _, nested = pattern.partition('\n')
     if nested:
         text = f'{head}\n{nested}:\n    ros__parameters: {{seed: 7}}\n'
@@ -77,40 +77,40 @@ def test_a_section_that_matches_counts(file, pattern, node):
         ('other', '/sim_plant'),
     ],
 )
-def test_a_section_that_does_not_match_does_not_count(file, pattern, node):
+def test_section_that_does_not_match_is_ignored_or_rejected(file, pattern, node):
     path, own = file(section(pattern, 'seed: 7')), pattern.endswith('sim_plant')
-    if own:  # it is meant for the node, and would be ignored
+    if own:  # meant for the node, but would silently be ignored
         remedy = f'does not match {node}: write /**/sim_plant for the node in any namespace'
         assert problems_of(path, node) == [f'line 2: /{pattern.removeprefix("/")} {remedy}']
         path = file(section(pattern, 'seed: 7') + section(f'{node}', 'duration: 2.0'))
     assert seed_of(path, node) == 0
 
 
-def test_the_later_of_two_sections_wins_whichever_is_more_specific(file):
+def test_later_section_wins_regardless_of_specificity(file):
     wild, own = section('/**', 'seed: 1, duration: 2.0'), section('sim_plant', 'seed: 3')
     assert seed_of(file(wild + own)) == 3
     assert seed_of(file(own + wild)) == 1
     assert load(file(wild + own), 'sim_plant', PlantConfig).duration == 2.0
 
 
-def test_dots_and_nesting_are_the_same(file):
+def test_dots_and_nesting_are_equivalent(file):
     nested = load(file(section('/**', 'arm: {l1: 2.0}, arm.l2: 3.0')), 'sim_plant', PlantConfig)
     assert (nested.arm.l1, nested.arm.l2) == (2.0, 3.0)
 
 
-def test_a_power_of_ten_needs_no_point(file):
+def test_exponent_notation_needs_no_decimal_point(file):
     path = file(section('sim_plant', 'sensor: {position_noise: 1e-5}'))
     assert load(path, 'sim_plant', PlantConfig).sensor.position_noise == 1e-5
 
 
-def test_an_integer_for_a_double_is_rejected_with_its_line(file):
+def test_integer_for_a_double_is_rejected_with_its_line(file):
     path = file('sim_plant:\n  ros__parameters:\n    seed: 3\n    arm:\n      l1: 1\n')
     assert problems_of(path) == [
         'line 5: arm.l1: got 1, but a double is expected: write 1.0 instead of 1'
     ]
 
 
-def test_overrides_count_more_than_the_file(file):
+def test_overrides_take_precedence_over_the_file(file):
     path = file(section('sim_plant', 'seed: 3, duration: -1.0'))
     plant = load(path, 'sim_plant', PlantConfig, {'duration': 5.0})
     assert (plant.seed, plant.duration) == (3, 5.0)
@@ -121,7 +121,7 @@ def test_overrides_count_more_than_the_file(file):
     ]
 
 
-def test_an_unknown_name_in_the_section_of_the_node_is_rejected(file):
+def test_unknown_name_in_the_section_of_a_node_is_rejected(file):
     path = file(section('sim_plant', 'barrier.bound: [1.0, 1.0], sed: 1'))
     assert problems_of(path) == [
         'line 2: barrier.bound: unknown parameter',
@@ -129,7 +129,7 @@ def test_an_unknown_name_in_the_section_of_the_node_is_rejected(file):
     ]
 
 
-def test_a_shared_section_may_name_what_only_another_node_has(file):
+def test_shared_section_may_have_parameters_of_other_nodes(file):
     path = file(section('/**', 'barrier.bound: [1.0, 1.0], seed: 4'))
     assert seed_of(path) == 4
     assert load(path, 'blf_dsc_controller', ControllerConfig).barrier.bound == (1.0, 1.0)
@@ -139,7 +139,7 @@ def test_a_shared_section_may_name_what_only_another_node_has(file):
     ]
 
 
-def test_the_parameters_of_ros_itself_are_accepted(file):
+def test_parameters_of_ros_itself_are_accepted(file):
     content = 'use_sim_time: true, qos_overrides: {/clock: {subscription: {depth: 1}}}, seed: 2'
     assert seed_of(file(section('sim_plant', content))) == 2
     assert seed_of(file(section('/**', content))) == 2
@@ -173,19 +173,19 @@ def test_the_parameters_of_ros_itself_are_accepted(file):
         ('n:\n  ros__parameters: {a: 1}\n---\nm: {}\n', 'line 3: not valid YAML'),
     ],
 )
-def test_a_broken_file_is_rejected_with_its_line(file, text, message):
+def test_malformed_file_is_rejected_with_its_line(file, text, message):
     (problem,) = problems_of(file(text))
     assert problem.startswith(message)
 
 
-def test_a_file_of_bytes_is_rejected(tmp_path):
+def test_binary_file_is_rejected(tmp_path):
     path = tmp_path / 'arm.yaml'
     path.write_bytes(b'\xff\xfe\x00')
     with pytest.raises(ConfigurationError, match=r'arm\.yaml'):
         read(path)
 
 
-def test_a_missing_file_names_the_presets(tmp_path):
+def test_missing_file_error_lists_the_presets(tmp_path):
     assert locate('recommended') == locate('recommended.yaml')
     assert locate('recommended').is_file()
     for given in ('recomended', tmp_path / 'absent.yaml', tmp_path):
@@ -197,7 +197,7 @@ def test_a_missing_file_names_the_presets(tmp_path):
         read(tmp_path / 'absent.yaml')
 
 
-def test_the_name_of_a_preset_means_the_preset_whatever_lies_in_the_folder(tmp_path, monkeypatch):
+def test_preset_name_takes_precedence_over_files_in_the_folder(tmp_path, monkeypatch):
     preset = locate('recommended')
     monkeypatch.chdir(tmp_path)
     for name in ('recommended', 'recommended.yaml'):
@@ -207,7 +207,7 @@ def test_the_name_of_a_preset_means_the_preset_whatever_lies_in_the_folder(tmp_p
         assert locate(path).samefile(tmp_path / path)
 
 
-def test_a_loop_collects_the_problems_of_all_nodes(file):
+def test_load_loop_collects_problems_of_all_nodes(file):
     path = file(
         section('/**', 'sample_time: 1')
         + section('sim_plant', 'seed: -1')
@@ -222,7 +222,7 @@ def test_a_loop_collects_the_problems_of_all_nodes(file):
     ]
 
 
-def test_a_loop_rejects_nodes_that_do_not_agree_and_takes_overrides(file):
+def test_load_loop_rejects_disagreeing_nodes_and_applies_overrides(file):
     path = file(section('sim_plant', 'sample_time: 0.002'))
     with pytest.raises(ConfigurationError, match=r'sim_plant has 0\.002 s, but'):
         load_loop(path)
@@ -232,7 +232,7 @@ def test_a_loop_rejects_nodes_that_do_not_agree_and_takes_overrides(file):
     assert (loop.controller.sample_time, loop.plant.mode) == (0.002, 'lockstep')
 
 
-def test_a_misspelt_node_is_named(file):
+def test_misspelt_node_name_is_reported(file):
     with pytest.raises(ConfigurationError) as caught:
         load_loop(file(section('sim_plnat', 'seed: 1')))
     assert caught.value.problems == ['line 2: unknown node sim_plnat, did you mean sim_plant?']
@@ -243,7 +243,7 @@ def test_a_misspelt_node_is_named(file):
     assert load_loop(file(section('robot_state_publisher', 'a: 1'))).plant == PlantConfig()
 
 
-def test_a_problem_of_several_nodes_is_told_once(file):
+def test_problem_shared_by_several_nodes_is_reported_once(file):
     path = file(section('/**', 'robot: {urdf: panda.urdf, tip: tol}'))
     with pytest.raises(ConfigurationError) as caught:
         load_loop(path)
@@ -251,12 +251,12 @@ def test_a_problem_of_several_nodes_is_told_once(file):
     assert problem.startswith('sim_plant, blf_dsc_controller, arm_markers: line 2: robot.urdf: no ')
 
 
-def test_a_misspelt_preset_is_guessed():
+def test_misspelt_preset_suggests_the_closest():
     with pytest.raises(ConfigurationError, match=r'did you mean recommended\? give a parameter'):
         load_loop('recomended')
 
 
-def test_the_file_for_a_real_arm_in_the_documentation_is_whole(file):
+def test_documented_file_for_a_real_arm_is_valid(file):
     page = (Path(__file__).parents[1] / 'doc/real_arm.md').read_text()
     of_ros2_control, own = re.findall(r'```yaml\n(.*?)```', page, re.DOTALL)[:2]
     path = file(own.replace('topic://robot_description', 'ur5e.urdf'))

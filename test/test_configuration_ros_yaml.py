@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Words of a parameter file, read as ROS reads them."""
+"""Scalars of a parameter file are read as ROS reads them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from blf_dsc_controller.configuration.ros_yaml import parse_scalar
 @pytest.mark.parametrize(
     ('word', 'value'),
     [
-        ('1e-5', 1e-5),  # a text to PyYAML
+        ('1e-5', 1e-5),  # a string to PyYAML
         ('1E3', 1000.0),
         ('.5', 0.5),
         ('5.', 5.0),
@@ -23,7 +23,7 @@ from blf_dsc_controller.configuration.ros_yaml import parse_scalar
         ('0x1F', 31),
         ('-0x10', -16),
         ('017', 15),
-        ('08', 8.0),  # no octal digit, so it is taken for a double
+        ('08', 8.0),  # not octal, so it is a double
         ('0x1p3', 8.0),
         ('9223372036854775807', 2**63 - 1),
         ('-9223372036854775808', -(2**63)),
@@ -46,11 +46,11 @@ from blf_dsc_controller.configuration.ros_yaml import parse_scalar
         ('.', '.'),
     ],
 )
-def test_a_word_means_what_it_means_to_ros(word, value):
+def test_scalar_has_the_value_ros_gives_it(word, value):
     assert parse_scalar(word) == value
     assert type(parse_scalar(word)) is type(value)
 
 
 @pytest.mark.parametrize('word', ['nan', '.NaN', '-nan', 'NAN'])
-def test_not_a_number_is_a_double(word):
+def test_nan_is_a_double(word):
     assert math.isnan(parse_scalar(word))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Dataclasses as parameters: what is found, accepted, and rejected with which messages."""
+"""Dataclasses as parameters: what is found, accepted and rejected, and the error messages."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from blf_dsc_controller.errors import ConfigurationError
 
 @dataclass(frozen=True)
 class Motor:
-    """A group with an array of fixed and one of derived length."""
+    """A group with two arrays whose lengths follow from other parameters."""
 
     gain: Annotated[tuple[float, ...], 'axes'] = parameter(
         (1.0, 2.0), 'gain', unit='N m', at_least=0.0
@@ -45,7 +45,7 @@ class Machine:
     motor: Motor = Motor()
 
     def problems(self) -> list[str]:
-        """Return the one thing that can be wrong between two parameters."""
+        """Return the only problem that two parameters can have together."""
         return ['mode: fast needs armed'] if self.mode == 'fast' and not self.armed else []
 
 
@@ -56,8 +56,8 @@ def problems_of(given: dict[str, object]) -> list[str]:
     return caught.value.problems
 
 
-def test_parameters_are_flat_dotted_and_in_order():
-    assert [(one.name, one.kind) for one in parameters(Machine)] == [
+def test_parameters_have_dotted_names_in_order():
+    assert [(entry.name, entry.kind) for entry in parameters(Machine)] == [
         ('axes', Kind.STRING_ARRAY),
         ('speed', Kind.DOUBLE),
         ('steps', Kind.INTEGER),
@@ -70,7 +70,7 @@ def test_parameters_are_flat_dotted_and_in_order():
     assert parameters(Machine)[0].read_only == 'they are wired'
 
 
-def test_nothing_given_is_the_default_and_flatten_is_the_inverse_of_build():
+def test_build_without_values_gives_defaults_and_flatten_inverts_build():
     assert build(Machine, {}) == Machine()
     given = {'speed': 2.5, 'motor.gain': (3.0, 0.0), 'armed': True, 'mode': 'fast'}
     built = build(Machine, given)
@@ -82,11 +82,11 @@ def test_nothing_given_is_the_default_and_flatten_is_the_inverse_of_build():
 @pytest.mark.parametrize(
     'entries', [[3.0, 4.0], (3.0, 4.0), array.array('d', [3.0, 4.0])], ids=['list', 'tuple', 'ROS']
 )
-def test_an_array_is_held_as_a_tuple(entries):
+def test_arrays_are_stored_as_tuples(entries):
     assert build(Machine, {'motor.gain': entries}).motor.gain == (3.0, 4.0)
 
 
-def test_an_unknown_name_suggests_the_closest():
+def test_unknown_name_suggests_the_closest():
     assert problems_of({'motor.gian': [1.0, 1.0]}) == [
         'motor.gian: unknown parameter, did you mean motor.gain?'
     ]
@@ -99,7 +99,7 @@ def test_an_unknown_name_suggests_the_closest():
 @pytest.mark.parametrize(
     ('given', 'message'),
     [
-        # ROS accepts no integer for a double, so neither does a run without ROS.
+        # ROS does not accept an integer for a double, nor does a run without ROS.
         ({'speed': 1}, 'speed: got 1, but a double is expected: write 1.0 instead of 1'),
         (
             {'motor.gain': [1, 2]},
@@ -123,7 +123,7 @@ def test_an_unknown_name_suggests_the_closest():
         ({'axes': ['x', 1]}, "axes: got ['x', 1], but a string array is expected: write '1' in"),
     ],
 )
-def test_a_wrong_type_names_the_value_and_the_remedy(given, message):
+def test_wrong_type_error_gives_the_value_and_the_remedy(given, message):
     (problem,) = problems_of(given)
     assert problem.startswith(message)
 
@@ -149,17 +149,17 @@ def test_a_wrong_type_names_the_value_and_the_remedy(given, message):
         ({'axes': []}, 'axes: got an empty list, but at least one entry is needed'),
     ],
 )
-def test_a_value_out_of_range_names_the_range(given, message):
+def test_out_of_range_error_gives_the_range(given, message):
     assert problems_of(given) == [message]
 
 
-def test_the_edges_of_inclusive_ranges_are_inside():
+def test_inclusive_limits_are_accepted():
     assert build(Machine, {'steps': 1}).steps == 1
     assert build(Machine, {'steps': 5, 'motor.gain': [0.0, 0.0]}).steps == 5
     assert build(Machine, {'notes': []}).notes == ()
 
 
-def test_lengths_follow_other_parameters():
+def test_lengths_depend_on_other_parameters():
     assert problems_of({'motor.gain': [1.0]}) == [
         'motor.gain: got 1 entry, but 2 are needed (2 of axes)',
         'motor.table: got 4 entries, but 2 are needed (2 of axes times 1 of motor.gain)',
@@ -169,8 +169,8 @@ def test_lengths_follow_other_parameters():
 
 
 def test_all_problems_are_reported_at_once():
-    message = problems_of({'bogus': 1, 'speed': -1.0, 'steps': 'a', 'motor.table': [1.0, 'b', 2.0]})
-    assert [problem.split(':')[0] for problem in message] == [
+    found = problems_of({'bogus': 1, 'speed': -1.0, 'steps': 'a', 'motor.table': [1.0, 'b', 2.0]})
+    assert [problem.split(':')[0] for problem in found] == [
         'bogus',
         'speed',
         'steps',
@@ -178,14 +178,14 @@ def test_all_problems_are_reported_at_once():
     ]
 
 
-def test_problems_between_parameters_are_reported_beside_unknown_names():
+def test_problems_between_parameters_are_reported_along_with_unknown_names():
     assert problems_of({'mode': 'fast', 'bogus': 1}) == [
         'bogus: unknown parameter',
         'mode: fast needs armed',
     ]
 
 
-def test_a_change_keeps_the_rest_and_is_validated_as_a_whole():
+def test_change_keeps_other_values_and_validates_the_result():
     machine = build(Machine, {'speed': 2.0, 'armed': True, 'mode': 'fast'})
     assert flatten(change(machine, {'steps': 5})) == {**flatten(machine), 'steps': 5}
     with pytest.raises(ConfigurationError, match='fast needs armed'):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The presets are found where the package is installed, and nowhere else."""
+"""Presets are found where the package is installed, and nowhere else."""
 
 import sysconfig
 from pathlib import Path
@@ -13,7 +13,7 @@ from blf_dsc_controller.errors import BlfDscError
 
 
 def installed(prefix):
-    """Make a share folder as an installation below `prefix` has it."""
+    """Create the share folder of an installation below `prefix`."""
     folder = prefix / 'share' / 'blf_dsc_controller'
     (folder / 'config').mkdir(parents=True)
     (folder / 'config' / 'recommended.yaml').touch()
@@ -21,7 +21,7 @@ def installed(prefix):
 
 
 def index(prefix):
-    """Enter the package in the ament index of `prefix`."""
+    """Add the package to the ament index of `prefix`."""
     packages = prefix / 'share' / 'ament_index' / 'resource_index' / 'packages'
     packages.mkdir(parents=True)
     (packages / 'blf_dsc_controller').touch()
@@ -29,7 +29,7 @@ def index(prefix):
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
-    """Run from no source tree, with no ROS and nothing installed, in a misleading folder."""
+    """Run outside a source tree, without ROS or an installation, in a misleading folder."""
     here = tmp_path / 'here'
     installed(here)
     (here / 'config').mkdir()
@@ -47,7 +47,7 @@ def data_folder(tmp_path, scheme):
     return tmp_path / f'python_{scheme}'
 
 
-def test_ament_index_knows_it(tmp_path, monkeypatch):
+def test_package_is_found_through_the_ament_index(tmp_path, monkeypatch):
     pytest.importorskip('ament_index_python', reason='no ROS here')
     index(tmp_path / 'workspace')
     folder = installed(tmp_path / 'workspace')
@@ -56,7 +56,7 @@ def test_ament_index_knows_it(tmp_path, monkeypatch):
     assert share_folder() == folder
 
 
-def test_ros_that_does_not_know_it_is_passed_over(tmp_path, monkeypatch):
+def test_ros_without_the_package_is_skipped(tmp_path, monkeypatch):
     (tmp_path / 'opt').mkdir()
     monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path / 'opt'))
     folder = installed(data_folder(tmp_path, sysconfig.get_default_scheme()))
@@ -66,12 +66,12 @@ def test_ros_that_does_not_know_it_is_passed_over(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     'scheme', [sysconfig.get_default_scheme(), sysconfig.get_preferred_scheme('user')]
 )
-def test_pip_installs_it_for_all_or_for_the_user(tmp_path, scheme):
+def test_system_and_user_installations_by_pip_are_found(tmp_path, scheme):
     folder = installed(data_folder(tmp_path, scheme))
     assert share_folder() == folder
 
 
-def test_source_tree_counts_before_an_installation(tmp_path, monkeypatch):
+def test_source_tree_takes_precedence_over_an_installation(tmp_path, monkeypatch):
     installed(data_folder(tmp_path, sysconfig.get_default_scheme()))
     checkout = tmp_path / 'checkout'
     (checkout / 'config').mkdir(parents=True)
@@ -80,20 +80,20 @@ def test_source_tree_counts_before_an_installation(tmp_path, monkeypatch):
     assert share_folder() == checkout
 
 
-def test_current_folder_never_counts():
+def test_current_folder_is_never_used():
     with pytest.raises(BlfDscError, match='install the package again') as error:
         share_folder()
     assert str(Path.cwd()) not in str(error.value)
 
 
 @pytest.mark.parametrize('name', ['recommended', './recommended.yaml'])
-def test_the_name_of_a_preset_means_the_installed_one(tmp_path, name):
+def test_preset_name_refers_to_the_installed_preset(tmp_path, name):
     folder = installed(data_folder(tmp_path, sysconfig.get_default_scheme()))
     found = locate(name)
     assert (found == folder / 'config' / 'recommended.yaml') == (name == 'recommended')
 
 
-def test_unknown_preset_lists_the_presets(tmp_path):
+def test_unknown_preset_error_lists_the_presets(tmp_path):
     folder = installed(data_folder(tmp_path, sysconfig.get_default_scheme()))
     (folder / 'config' / 'paper.yaml').touch()
     with pytest.raises(BlfDscError, match=r'papre does not exist: .* preset: paper, recommended'):

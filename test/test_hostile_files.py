@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that mean harm: one clear line from each command, within seconds and a little memory."""
+"""Malicious files: every command gives one clear line, within seconds and little memory."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controll
 MAGIC = b'\x89MCAP0\r\n'
 BOMB = '- &a [x, x]\n' + ''.join(f'- &{b} [*{a}, *{a}]\n' for a, b in pairwise('abcdefghi'))
 ZEROS = bytes(20_000_000)
-LITTLE = ('--max-unpacked', '0.001')  # GB
+SMALL_LIMIT = ('--max-unpacked', '0.001')  # GB
 
 
 @pytest.fixture(scope='module')
@@ -39,13 +39,13 @@ def bag(tmp_path_factory):
 
 @pytest.fixture
 def copy(bag, tmp_path):
-    """A copy of the bag, to be changed."""
+    """A copy of the bag that a test may change."""
     return shutil.copytree(bag, tmp_path / 'copy')
 
 
 @pytest.fixture
 def refused(tmp_path, capsys):
-    """Asserts that every command that reads bags ends with these words in one line."""
+    """Asserts that every command that reads bags fails with one line with these words."""
 
     def check(bag, words, *options, but=()):
         for command in (
@@ -61,23 +61,23 @@ def refused(tmp_path, capsys):
             if {command[0], command[-1]} & {*but}:
                 continue
             assert main([str(word) for word in (*command, *options)]) == 1, command
-            said = capsys.readouterr().err
-            assert words in said, (command, said)
-            assert said.count('\n') == 1, said
+            error = capsys.readouterr().err
+            assert words in error, (command, error)
+            assert error.count('\n') == 1, error
             shutil.rmtree(tmp_path / 'recovered', ignore_errors=True)
 
     return check
 
 
-def chunk(data, announced, compression='zstd'):
-    """Record of a chunk."""
+def chunk(data, declared, compression='zstd'):
+    """A chunk as an MCAP record."""
     builder = RecordBuilder()
-    Chunk(compression, data, 0, 0, 0, announced).write(builder)
+    Chunk(compression, data, 0, 0, 0, declared).write(builder)
     return builder.end()
 
 
 def with_chunks(file, *added):
-    """Put chunks behind the header of a file, which loses its index thereby."""
+    """Insert chunks after the header of a file and drop its index."""
     _, *others = (piece.raw for piece in scan(file.read_bytes()))
     header = next(scan(file.read_bytes())).raw
     footer = others[-1][:9] + bytes(20)
@@ -85,11 +85,11 @@ def with_chunks(file, *added):
     return file
 
 
-# Where files lead.
+# Links, paths and pipes.
 
 
 @pytest.mark.parametrize('is_link', [False, True])
-def test_files_outside_of_the_folder_are_not_read(bag, copy, refused, tmp_path, is_link):
+def test_files_outside_the_bag_folder_are_not_read(bag, copy, refused, tmp_path, is_link):
     other = tmp_path / 'elsewhere'
     other.mkdir()
     shutil.copy(bag / 'bag_0.mcap', other / 'secret.mcap')
@@ -105,7 +105,7 @@ def test_files_outside_of_the_folder_are_not_read(bag, copy, refused, tmp_path, 
 
 
 @pytest.mark.parametrize('name', ['bag_0.mcap', 'metadata.yaml'])
-def test_a_pipe_is_not_waited_for(copy, refused, name):
+def test_named_pipe_in_a_bag_does_not_block(copy, refused, name):
     (copy / name).unlink()
     os.mkfifo(copy / name)
     refused(copy, 'is not a regular file', but=('recover',) if name == 'metadata.yaml' else ())
@@ -113,7 +113,7 @@ def test_a_pipe_is_not_waited_for(copy, refused, name):
         refused(copy / name, 'is not a regular file')
 
 
-def test_a_pipe_is_neither_a_parameter_file_nor_a_urdf(tmp_path, capsys):
+def test_named_pipe_is_rejected_as_parameter_file_and_urdf(tmp_path, capsys):
     os.mkfifo(tmp_path / 'pipe')
     assert main(['run', '--offline', '--config', str(tmp_path / 'pipe')]) == 1
     with pytest.raises(BlfDscError, match='is not a regular file'):
@@ -121,29 +121,29 @@ def test_a_pipe_is_neither_a_parameter_file_nor_a_urdf(tmp_path, capsys):
     capsys.readouterr()
 
 
-# How much they become.
+# Unpacked size.
 
 
-def test_a_chunk_is_not_unpacked_further_than_it_announces(copy, refused):
+def test_chunk_is_not_unpacked_beyond_its_declared_size(copy, refused):
     (copy / 'metadata.yaml').unlink()
     file = with_chunks(copy / 'bag_0.mcap', chunk(zstandard.compress(ZEROS), 100))
     refused(file, 'more than 100 bytes, unpacked', but=('recover',))
     assert main(['recover', str(file), '--out', str(copy.parent / 'out')]) == 0
 
 
-@pytest.mark.parametrize('announced', [1 << 29 | 1, 1 << 62])
-def test_a_chunk_that_announces_too_much_is_not_unpacked(copy, refused, announced):
-    file = with_chunks(copy / 'bag_0.mcap', chunk(zstandard.compress(b''), announced))
-    refused(file, f'{announced} bytes, unpacked; at most', but=('recover',))
+@pytest.mark.parametrize('declared', [1 << 29 | 1, 1 << 62])
+def test_chunk_that_declares_too_large_a_size_is_not_unpacked(copy, refused, declared):
+    file = with_chunks(copy / 'bag_0.mcap', chunk(zstandard.compress(b''), declared))
+    refused(file, f'{declared} bytes, unpacked; at most', but=('recover',))
 
 
-def test_a_bag_does_not_unpack_to_more_than_is_allowed(copy, refused):
+def test_bag_is_not_unpacked_beyond_the_limit(copy, refused):
     bomb = chunk(zstandard.compress(ZEROS), len(ZEROS))
     file = with_chunks(copy / 'bag_0.mcap', *[bomb] * 3)
     assert file.stat().st_size < 600_000
     for path in (file, copy):
-        refused(path, 'if you trust it, raise --max-unpacked', *LITTLE)
-    # As much as is announced, and not too much by default; but there is no record in it.
+        refused(path, 'if you trust it, raise --max-unpacked', *SMALL_LIMIT)
+    # The size is within the default limit, but the chunks hold no valid record.
     refused(file, 'unknown record type 0', but=('recover',))
     with pytest.raises(BlfDscError, match='unknown record type'), open_bag(file) as opened:
         list(opened.in_order({'/joint_states'}))
@@ -151,7 +151,7 @@ def test_a_bag_does_not_unpack_to_more_than_is_allowed(copy, refused):
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
 @pytest.mark.parametrize('mode', ['file', 'message'])
-def test_nor_do_files_and_messages_that_rosbag2_compressed(tmp_path, refused, storage, mode):
+def test_compressed_files_and_messages_respect_the_limit(tmp_path, refused, storage, mode):
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
     from blf_dsc_controller.messages.types import typestore
@@ -164,10 +164,10 @@ def test_nor_do_files_and_messages_that_rosbag2_compressed(tmp_path, refused, st
         )
         for k in range(3):
             writer.write(topic, k, ZEROS)
-    refused(tmp_path / 'bag', 'raise --max-unpacked', *LITTLE, but=('recover', '--learn'))
+    refused(tmp_path / 'bag', 'raise --max-unpacked', *SMALL_LIMIT, but=('recover', '--learn'))
 
 
-def test_nor_does_a_bag_of_ros_1(tmp_path, refused):
+def test_ros_1_bag_respects_the_limit(tmp_path, refused):
     from rosbags.rosbag1 import Writer
 
     from blf_dsc_controller.messages.types import typestore
@@ -180,7 +180,7 @@ def test_nor_does_a_bag_of_ros_1(tmp_path, refused):
         )
         writer.write(topic, 1, ZEROS)
     assert (tmp_path / 'one.bag').stat().st_size < 10_000
-    refused(tmp_path / 'one.bag', 'raise --max-unpacked', *LITTLE, but=('recover', '--learn'))
+    refused(tmp_path / 'one.bag', 'raise --max-unpacked', *SMALL_LIMIT, but=('recover', '--learn'))
 
 
 # YAML and XML.
@@ -190,7 +190,7 @@ def test_nor_does_a_bag_of_ros_1(tmp_path, refused):
     ('text', 'words'),
     [('[' * 100_000, 'nested more than 50 levels'), (BOMB, 'does not support the alias')],
 )
-def test_unreasonable_yaml_is_refused_wherever_it_is(copy, refused, tmp_path, text, words):
+def test_unreasonable_yaml_is_rejected_everywhere(copy, refused, tmp_path, text, words):
     (copy / 'metadata.yaml').write_text(text)
     refused(copy, words, but=('recover',))
     path = tmp_path / 'given.yaml'
@@ -198,8 +198,8 @@ def test_unreasonable_yaml_is_refused_wherever_it_is(copy, refused, tmp_path, te
     with pytest.raises(BlfDscError, match=words):
         load_loop(path)
     entries = recorded_run.messages(copy / 'bag_0.mcap')
-    told = recorded_run.write(tmp_path / 'told', entries, text)
-    assert main(['report', str(told), '--out', str(tmp_path / 'page.html')]) == 0
+    recorded = recorded_run.write(tmp_path / 'told', entries, text)
+    assert main(['report', str(recorded), '--out', str(tmp_path / 'page.html')]) == 0
 
 
 @pytest.mark.parametrize(
@@ -214,20 +214,20 @@ def test_unreasonable_yaml_is_refused_wherever_it_is(copy, refused, tmp_path, te
     ],
     ids=['entities', 'large', 'deep'],
 )
-def test_an_unreasonable_urdf_is_refused(inner, words):
+def test_unreasonable_urdf_is_rejected(inner, words):
     with pytest.raises(BlfDscError, match=words):
         Robot(urdf=inner).chain(('joint1',))
 
 
 @pytest.mark.parametrize(('name', 'value'), [('izz', '1e308'), ('xyz', '1e200 0 0')])
-def test_figures_of_no_arm_are_refused(name, value):
+def test_absurd_numbers_in_a_urdf_are_rejected(name, value):
     text = (share_folder() / 'config' / 'ur5e.urdf').read_text()
     robot = Robot(urdf=text.replace(f' {name}="', f' {name}="{value}" was="'), tip='tool0')
     with pytest.raises(BlfDscError, match=r'of at most 1e\+06 in magnitude'):
         robot.chain(())
 
 
-# What is written.
+# Output files.
 
 
 def test_nothing_is_overwritten_without_force(bag, tmp_path, capsys):
@@ -240,9 +240,9 @@ def test_nothing_is_overwritten_without_force(bag, tmp_path, capsys):
         ('excite', tmp_path / 'out'),
     ):
         out = tmp_path / {'plot': 'tracking.png', 'export': 'out.csv'}.get(command[0], 'out')
-        for lead in (kept, tmp_path / 'nowhere'):
+        for target in (kept, tmp_path / 'nowhere'):
             kept.write_text('kept')
-            out.symlink_to(lead)
+            out.symlink_to(target)
             words = [str(word) for word in command]
             assert main(words) == 1
             assert f'{out} exists already' in capsys.readouterr().err
@@ -257,7 +257,7 @@ def test_nothing_is_overwritten_without_force(bag, tmp_path, capsys):
                 (tmp_path / name).unlink(missing_ok=True)
 
 
-def test_a_name_ends_no_script_of_the_page(tmp_path, monkeypatch):
+def test_joint_names_cannot_break_out_of_the_page_script(tmp_path, monkeypatch):
     monkeypatch.setattr(synthetic_bag, 'JOINTS', ('<!--<script>', '</script><b>x'))
     bag = synthetic_bag.write(tmp_path / 'bag', synthetic_bag.Synthetic(200).messages())
     assert main(['report', str(bag), '--out', str(tmp_path / 'page.html')]) == 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm is identified from bags of our plant and of MuJoCo, with honest confidence."""
+"""Identification of an arm from bags of our plant and of MuJoCo, with its confidence."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def model_of(text, rotors):
 
 
 def torques(model, seed=77):
-    """Of a motion that no bag has, by pinocchio."""
+    """Torques along a motion that is in no bag, from pinocchio."""
     data, reference, h = model.createData(), reference_of(PANDA_CHAIN, seed), 1e-4
     rows = []
     for t in np.arange(0.0, 20.0, 0.05):
@@ -64,7 +64,7 @@ def text_of(truth):
 
 
 def unseen_error(text, rotors):
-    """Of the torques of an unseen motion, of their norm."""
+    """Relative error of the torques along an unseen motion."""
     expected = torques(model_of(text_of(TRUTH), TRUTH.rotors))
     return np.linalg.norm(torques(model_of(text, rotors)) - expected) / np.linalg.norm(expected)
 
@@ -81,7 +81,7 @@ def recording_of(states, joints=PANDA):
 
 @pytest.fixture(scope='module')
 def states():
-    """A minute of our own plant, of an encoder of 20 bit and a torque sensor of 1 % noise."""
+    """A minute of our own plant, with 20 bit encoders and torque sensors of 1 % noise."""
     return measured(shake(PANDA_CHAIN, TRUTH, reference_of(PANDA_CHAIN, 2), 60.0), 3)
 
 
@@ -96,41 +96,41 @@ def found(bag):
 
 
 def is_physical(text):
-    """Each body, and in it each link of its own."""
+    """Whether the pseudo-inertia of every body is positive definite."""
     chain = read_chain(text, 'panda_link0', 'panda_hand_tcp', PANDA)
-    return all(np.linalg.eigvalsh(pseudo_inertia(ten))[0] > 0.0 for ten in chain.inertias)
+    return all(np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0.0 for body in chain.inertias)
 
 
-def test_an_unseen_motion_takes_the_torques_of_the_corrected_urdf(found):
+def test_corrected_urdf_predicts_the_torques_of_an_unseen_motion(found):
     assert unseen_error(PANDA_TEXT, np.zeros(7)) > 0.1
     text = corrected(found)
     assert unseen_error(text, found.joint_terms[0]) < 0.005
     assert is_physical(text)
-    assert mujoco.MjModel.from_xml_string(text).nq == 9  # loads, the fingers as well
+    assert mujoco.MjModel.from_xml_string(text).nq == 9  # MuJoCo loads it, fingers included
 
 
-def test_the_part_held_back_is_predicted_but_for_its_noise(found):
+def test_held_back_part_is_predicted_to_within_its_noise(found):
     share = found.errors / found.torque
     assert (share[2] < 0.005).all()  # 1 % noise, averaged over windows of 200 samples
     assert (share[0] > 0.1).all()
     assert found.held_back[0] == pytest.approx(48.0, abs=0.2)
 
 
-def test_friction_and_rotors_are_those_of_the_truth(found):
+def test_friction_and_rotor_inertias_match_the_truth(found):
     rotors, viscous, coulomb, offset = found.joint_terms
     np.testing.assert_allclose(viscous, TRUTH.viscous, rtol=0.01)
     np.testing.assert_allclose(coulomb, TRUTH.coulomb, rtol=0.01)
-    # Of the first joint only the sum with its link's inertia is seen.
+    # For the first joint only the sum with its link's inertia can be identified.
     np.testing.assert_allclose(rotors[1:], TRUTH.rotors[1:], rtol=0.02)
     assert (np.abs(offset) < 0.03).all()
 
 
-def test_the_torque_of_a_period_is_found_half_of_it_late(found):
+def test_delay_of_torques_held_over_a_period_is_half_a_period(found):
     assert found.values[-1] == pytest.approx(0.5 * PERIOD, abs=0.2 * PERIOD)
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say():
-    """Of arms drawn as the prior says, and of other noise and motions; 95 % intervals."""
+def test_confidence_intervals_contain_the_truth_as_often_as_stated():
+    """95 % intervals, for arms drawn from the prior with different noise and motions."""
     inside = []
     for seed in range(6):
         truth = truth_of(PANDA_CHAIN, 10 + seed)
@@ -144,18 +144,18 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
         masses = np.arange(0, 70, 10)
         off = np.abs(found.values[masses] - true[masses])
         inside.append(off < 1.96 * np.sqrt(np.diag(found.covariance)[masses]))
-    # 450 intervals, of one arm correlated: a few percent less would be chance; the bounds and the
-    # correlation lengths are on the careful side.
+    # 450 intervals, correlated within an arm: a few percent less would be chance; the bounds and
+    # the correlation lengths are conservative.
     assert 0.92 < np.mean(np.concatenate(inside)) <= 1.0
 
 
-def test_a_simulation_of_somebody_else_is_identified(tmp_path):
-    """MuJoCo: another integrator, true stiction, efforts of the same instant as positions."""
+def test_arm_simulated_in_mujoco_is_identified(tmp_path):
+    """MuJoCo has another integrator, true stiction and efforts simultaneous with positions."""
     model = mujoco.MjModel.from_xml_string(text_of(TRUTH))
     model.opt.timestep = PERIOD
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     model.dof_armature[:7] = TRUTH.rotors
-    model.dof_armature[7:] = 1e3  # fingers that stay where they are
+    model.dof_armature[7:] = 1e3  # keeps the fingers where they are
     data, reference = mujoco.MjData(model), reference_of(PANDA_CHAIN, 5)
     data.qpos[:7], data.qvel[:7] = reference.at(0.0)
     states = np.zeros((30_000, 3, 7))
@@ -172,7 +172,7 @@ def test_a_simulation_of_somebody_else_is_identified(tmp_path):
     assert is_physical(text)
 
 
-def test_two_joints_that_hardly_move_leave_the_rest_to_the_urdf():
+def test_small_motion_of_two_joints_leaves_other_parameters_at_the_prior():
     reference = reference_of(PANDA_CHAIN, 6)
     amplitude = np.zeros_like(reference.amplitude)
     amplitude[0, [1, 3]] = 0.1
@@ -188,12 +188,12 @@ def test_two_joints_that_hardly_move_leave_the_rest_to_the_urdf():
     assert {PANDA[0], PANDA[2], PANDA[4], PANDA[6]} <= set(found.still)
 
 
-def test_the_command_writes_the_urdf_and_the_table(bag, tmp_path, capsys):
+def test_command_writes_the_urdf_and_prints_the_table(bag, tmp_path, capsys):
     urdf, out = tmp_path / 'robot.urdf', tmp_path / 'corrected.urdf'
     urdf.write_text(PANDA_TEXT)
-    call = ['identify', str(bag), '--urdf', str(urdf), '--out', str(out)]
-    assert main(call) == 0
-    said = capsys.readouterr().out
+    command = ['identify', str(bag), '--urdf', str(urdf), '--out', str(out)]
+    assert main(command) == 0
+    output = capsys.readouterr().out
     for word in (
         'panda_link7',
         'rotor inertia',
@@ -201,17 +201,17 @@ def test_the_command_writes_the_urdf_and_the_table(bag, tmp_path, capsys):
         'held back',
         'delay of the torques',
     ):
-        assert word in said
-    assert 'NOT SHOWN' not in said
+        assert word in output
+    assert 'NOT SHOWN' not in output
     assert is_physical(out.read_text())
-    assert main(call) == 1
+    assert main(command) == 1
     assert 'exists already' in capsys.readouterr().err
 
 
-def test_other_publishers_names_and_orders_are_found(states, tmp_path):
-    """A gripper on the same topic, joints in another order and one of another name."""
-    theirs = ('elbow' if name == 'panda_joint4' else name for name in PANDA[::-1])
-    arm, hand = JointStateEncoder(tuple(theirs)), JointStateEncoder(('panda_finger_joint1',))
+def test_other_publishers_joint_names_and_orders_are_recognised(states, tmp_path):
+    """A gripper on the same topic, joints in another order and one with another name."""
+    published = ('elbow' if name == 'panda_joint4' else name for name in PANDA[::-1])
+    arm, hand = JointStateEncoder(tuple(published)), JointStateEncoder(('panda_finger_joint1',))
     with BagWriter(tmp_path / 'bag', flush_interval=None) as bag:
         handle = bag.add_topic('/franka/joint_states', JOINT_STATE, [])
         for k, state in enumerate(states[:8000]):
@@ -219,14 +219,14 @@ def test_other_publishers_names_and_orders_are_found(states, tmp_path):
             bag.write(handle, bytes(arm.encode(stamp, *state[:, ::-1])), stamp)
             bag.write(handle, bytes(hand.encode(stamp, [0.0], [0.0], [0.0])), stamp)
     names = NameMap.parse(['panda_joint4=elbow'])
-    got = read_recording(tmp_path / 'bag', PANDA_TEXT, names=names)
-    assert got.joints == PANDA
-    assert got.source == 'effort of /franka/joint_states'
-    np.testing.assert_allclose(got.q, states[: len(got.q), 0], atol=1e-12)
-    np.testing.assert_allclose(got.torque, states[: len(got.q), 2], atol=1e-12)
+    recording = read_recording(tmp_path / 'bag', PANDA_TEXT, names=names)
+    assert recording.joints == PANDA
+    assert recording.source == 'effort of /franka/joint_states'
+    np.testing.assert_allclose(recording.q, states[: len(recording.q), 0], atol=1e-12)
+    np.testing.assert_allclose(recording.torque, states[: len(recording.q), 2], atol=1e-12)
 
 
-def test_commands_stand_in_for_efforts(states, tmp_path):
+def test_commands_replace_missing_efforts(states, tmp_path):
     q, commands = JointStateEncoder(PANDA, ('position', 'velocity')), Float64MultiArrayEncoder(7)
     with BagWriter(tmp_path / 'bag', flush_interval=None) as bag:
         handle = bag.add_topic('/joint_states', JOINT_STATE, [])
@@ -235,12 +235,12 @@ def test_commands_stand_in_for_efforts(states, tmp_path):
             stamp = 1_000_000_000 + 1_000_000 * k
             bag.write(handle, bytes(q.encode(stamp, state[0], state[1])), stamp)
             bag.write(other, bytes(commands.encode(state[2])), stamp + 1000)
-    got = read_recording(tmp_path / 'bag', PANDA_TEXT)
-    assert got.source == '/arm/commands'
-    np.testing.assert_allclose(got.torque, states[: len(got.q), 2], atol=1e-12)
+    recording = read_recording(tmp_path / 'bag', PANDA_TEXT)
+    assert recording.source == '/arm/commands'
+    np.testing.assert_allclose(recording.torque, states[: len(recording.q), 2], atol=1e-12)
 
 
-def test_lost_states_do_not_bend_the_result(states, found, tmp_path):
+def test_lost_states_do_not_bias_the_result(states, found, tmp_path):
     with_gaps = states.copy()
     with_gaps[10_000:12_000] = np.nan  # neither positions nor torques
     with_gaps[30_000:30_050, 2] = np.nan
@@ -250,53 +250,53 @@ def test_lost_states_do_not_bend_the_result(states, found, tmp_path):
     np.testing.assert_allclose(other.joint_terms[1], found.joint_terms[1], rtol=0.01)
 
 
-def rejected(tmp_path, states, fields=None, joints=PANDA, **options):
+def rejection(tmp_path, states, fields=None, joints=PANDA, **options):
     bag = write_states(tmp_path / 'bag', joints, states, fields=fields, **options)
     with pytest.raises(BlfDscError) as error:
         identify_bag(bag, ROBOT)
     return str(error.value)
 
 
-def test_a_bag_without_efforts_is_rejected(states, tmp_path):
-    said = rejected(tmp_path, states[:8000], ('position', 'velocity'))
-    assert 'does not hold the torques' in said
+def test_bag_without_efforts_is_rejected(states, tmp_path):
+    message = rejection(tmp_path, states[:8000], ('position', 'velocity'))
+    assert 'does not hold the torques' in message
 
 
-def test_a_bag_of_zero_efforts_is_rejected(states, tmp_path):
-    assert 'are zero' in rejected(tmp_path, states[:8000] * [[1.0], [1.0], [0.0]])
+def test_bag_of_zero_efforts_is_rejected(states, tmp_path):
+    assert 'are zero' in rejection(tmp_path, states[:8000] * [[1.0], [1.0], [0.0]])
 
 
-def test_a_bag_of_another_robot_is_rejected(states, tmp_path):
+def test_bag_of_another_robot_is_rejected(states, tmp_path):
     others = tuple(f'ur_{i}' for i in range(7))
-    assert 'no joint of the URDF' in rejected(tmp_path, states[:8000], joints=others)
+    assert 'no joint of the URDF' in rejection(tmp_path, states[:8000], joints=others)
 
 
-def test_a_bag_without_a_joint_in_between_is_rejected(states, tmp_path):
+def test_bag_without_an_inner_joint_is_rejected(states, tmp_path):
     joints = tuple(name.replace('panda_joint4', 'elbow') for name in PANDA)
-    assert "joint 'panda_joint4' is not in" in rejected(tmp_path, states[:8000], joints=joints)
+    assert "joint 'panda_joint4' is not in" in rejection(tmp_path, states[:8000], joints=joints)
 
 
-def test_a_short_bag_is_rejected(states, tmp_path):
-    assert 'the bag holds 2 s' in rejected(tmp_path, states[:2001])
+def test_short_bag_is_rejected(states, tmp_path):
+    assert 'the bag holds 2 s' in rejection(tmp_path, states[:2001])
 
 
-def test_a_slow_bag_is_rejected(states, tmp_path):
-    assert 'at least one in 0.02 s' in rejected(tmp_path, states[:8000], period=0.1)
+def test_slow_bag_is_rejected(states, tmp_path):
+    assert 'at least one in 0.02 s' in rejection(tmp_path, states[:8000], period=0.1)
 
 
-def test_an_arm_at_rest_is_rejected(states, tmp_path):
+def test_arm_at_rest_is_rejected(states, tmp_path):
     still = np.repeat(states[:1], 8000, axis=0)
     still[:, 2] += 1.0
-    assert 'no joint moves' in rejected(tmp_path, still)
+    assert 'no joint moves' in rejection(tmp_path, still)
 
 
-def test_stamps_that_stand_still_are_rejected(states, tmp_path):
+def test_repeated_stamps_are_rejected(states, tmp_path):
     with pytest.raises(BagError, match='a unique stamp'):
         read_recording(write_states(tmp_path / 'b', PANDA, states[:99], period=0.0), PANDA_TEXT)
 
 
-def test_gravity_is_that_of_the_mounting(states):
-    """The same motion, as if the arm hung from the ceiling: it cannot be explained."""
+def test_gravity_depends_on_the_mounting(states):
+    """With the gravity of a ceiling mount the same motion cannot be explained."""
     hanging = Robot(urdf=PANDA_TEXT, gravity=(0.0, 0.0, 9.81))
     wrong = identify_arm(recording_of(states), hanging)
     assert np.linalg.norm(wrong.errors[2]) > 0.1 * np.linalg.norm(wrong.torque)

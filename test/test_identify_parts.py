@@ -22,33 +22,33 @@ from blf_dsc_controller.identification.rows import rows_of
 UNIT = np.array([pseudo_inertia(e) for e in np.eye(10)])  # E_a of sum_a ten_a E_a
 
 
-# What is left at 10 ms is the linear interpolation of torques between samples: (w h)^2 / 8 of them.
+# At 10 ms the error is that of interpolating torques between samples: (w h)^2 / 8 of them.
 @pytest.mark.parametrize(('period', 'tolerance'), [(0.001, 1e-5), (0.01, 1e-3)])
 def test_rows_hold_for_an_exact_motion(period, tolerance):
     """X P = u with the torques of a smooth motion; no acceleration is given."""
     parameters = base_parameters(PANDA_CHAIN, GRAVITY)
     model = parameters.model
     P = parameters.of(PANDA_CHAIN.inertias, np.full(7, 0.1))
-    late = 0.004
+    delay = 0.004
     t = np.arange(0.0, 4.0, period)[:, None]
     speed = np.linspace(1.0, 3.0, 7)
     torque, H = np.zeros((len(t), 7)), np.zeros((7, model.p))
-    for k, angle in enumerate(speed * (t - late)):
+    for k, angle in enumerate(speed * (t - delay)):
         dq = speed * np.cos(angle)
         model.regressor(np.sin(angle), dq, dq, -(speed**2) * np.sin(angle), H)
         torque[k] = H @ P
     gap = np.zeros(len(t), dtype=bool)
     gap[len(t) // 2] = True
     rows = rows_of(Recording(PANDA, period, np.sin(speed * t), torque, gap, ''), model)
-    left = rows.X[:, :, : model.p] @ P - rows.u(late)
+    residual = rows.X[:, :, : model.p] @ P - rows.u(delay)
     inner = slice(1, -1)  # at both ends the torque has no delayed values
     scale = np.abs(torque).max(axis=0)
-    assert (np.abs(left[inner]) < tolerance * scale).all()
-    # No window has the gap in it.
+    assert (np.abs(residual[inner]) < tolerance * scale).all()
+    # No window contains the gap.
     assert np.abs(rows.time - t[len(t) // 2]).min() >= 0.1
 
 
-def test_the_rate_is_the_derivative_of_the_right_hand_side():
+def test_rate_is_the_derivative_of_the_right_hand_side():
     t = np.arange(0.0, 4.0, PERIOD)[:, None]
     torque = np.sin(np.linspace(1.0, 9.0, 7) * t)
     gap = np.zeros(len(t), dtype=bool)
@@ -58,19 +58,19 @@ def test_the_rate_is_the_derivative_of_the_right_hand_side():
     np.testing.assert_allclose(rows.rate(0.0)[1:-1], by_difference[1:-1], atol=1e-3)
 
 
-def test_the_nearest_physical_body_is_found():
-    """Of |J - J_target| in Frobenius' norm the nearest J >= 0 is known: eigenvalues cut at 0."""
+def test_nearest_physical_body_is_found():
+    """The J >= 0 nearest in the Frobenius norm is known: the eigenvalues clipped at zero."""
     target = np.diag([1.0, 2.0, -1.0, 3.0])
-    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
-    target = turn @ target @ turn.T
+    rotation = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
+    target = rotation @ target @ rotation.T
     A = 1e3 * UNIT.reshape(10, 16).T  # so large that |z|^2 and mu hardly count
     z = solve(A, 1e3 * target.ravel(), [Cone(0, np.zeros((4, 4)), UNIT)], inertia_of(np.eye(4)))
-    expected = turn @ np.diag([1.0, 2.0, 0.0, 3.0]) @ turn.T
+    expected = rotation @ np.diag([1.0, 2.0, 0.0, 3.0]) @ rotation.T
     np.testing.assert_allclose(pseudo_inertia(z), expected, atol=2e-3)
     assert np.linalg.eigvalsh(pseudo_inertia(z))[0] > 0.0
 
 
-def test_without_bounds_in_reach_it_is_least_squares():
+def test_solution_far_from_the_bounds_is_least_squares():
     random = np.random.default_rng(1)
     A, b = random.normal(size=(20, 3)), random.normal(size=20)
     far = [Cone(k, np.array([[1e3]]), np.array([[[1.0]]])) for k in range(3)]
@@ -79,8 +79,8 @@ def test_without_bounds_in_reach_it_is_least_squares():
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_a_random_urdf_gets_its_bodies(seed):
-    """With links fixed to links, links without inertias and tags without contents."""
+def test_corrected_random_urdf_has_the_given_bodies(seed):
+    """With links fixed to links, links without inertias and empty tags."""
     text, joints = random_urdf(4, seed)
     chain = read_chain(text, 'base', 'tip', joints)
     bodies = changed(chain, np.random.default_rng(seed))
@@ -89,20 +89,20 @@ def test_a_random_urdf_gets_its_bodies(seed):
     again = read_chain(new, 'base', 'tip', joints)
     np.testing.assert_allclose(again.inertias, bodies, rtol=1e-9, atol=1e-9)
     assert [joint.damping for joint in again.joints] == friction.tolist()
-    theirs = pinocchio_model(new, joints)
-    ours = np.array([inertia.toDynamicParameters() for inertia in list(theirs.inertias)[1:]])
-    np.testing.assert_allclose(ours, bodies, rtol=1e-9, atol=1e-9)
+    model = pinocchio_model(new, joints)
+    inertias = np.array([inertia.toDynamicParameters() for inertia in list(model.inertias)[1:]])
+    np.testing.assert_allclose(inertias, bodies, rtol=1e-9, atol=1e-9)
 
 
-def test_all_else_of_the_file_stays():
+def test_rest_of_the_file_is_unchanged():
     text = PANDA_TEXT.replace('<mass value="0.73" />', '<mass value="0.73" /><!-- a guess -->')
     text = text.replace('name="panda_link1"', "name='panda_link1'  note='a > b'", 1)
     friction = np.ones(7)
     new = corrected_urdf(text, PANDA_CHAIN, 1.1 * PANDA_CHAIN.inertias, friction, friction, 'note')
     changed_parts = r'<inertial>.*?</inertial>|\s*<dynamics[^>]*>|<!--\nnote\n-->\n|\s+(?=</joint>)'
 
-    def rest(one):
-        return re.sub(changed_parts, '', one, flags=re.DOTALL)
+    def rest(urdf):
+        return re.sub(changed_parts, '', urdf, flags=re.DOTALL)
 
     assert rest(new) == rest(text)
     assert new.count('<dynamics damping="1" friction="1" />') == 7
@@ -114,7 +114,7 @@ def test_all_else_of_the_file_stays():
     assert model.body_mass.sum() == pytest.approx(1.1 * moved, rel=1e-6)
 
 
-def test_corrected_twice_is_corrected_once():
+def test_correcting_twice_duplicates_nothing():
     friction = np.ones(7)
     once = corrected_urdf(PANDA_TEXT, PANDA_CHAIN, PANDA_CHAIN.inertias, friction, friction, '')
     chain = read_chain(once, 'panda_link0', 'panda_hand_tcp', PANDA)
@@ -124,7 +124,7 @@ def test_corrected_twice_is_corrected_once():
     assert twice.count('<dynamics') == 7
 
 
-def test_what_hangs_on_the_last_link_is_fixed_or_held():
+def test_links_after_the_last_joint_are_fixed_or_held():
     fixed, held = attached(PANDA_TEXT, 'panda_link7', PANDA)
     assert fixed == ['panda_link8', 'panda_hand', 'panda_hand_tcp']
     assert held[3, 3] == pytest.approx(0.03)  # two fingers

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The launch file and the command line: what the nodes get of what a user gives.
+"""The launch file and the command line: which parameters reach the nodes.
 
-`launch` comes only with a ROS installation: here its few words are stood in for, and the real nodes
-get the arguments that `launch_ros` would give to their processes.
+`launch` comes only with a ROS installation: here stand-ins replace the few classes needed, and the
+real nodes get the arguments that `launch_ros` would pass to their processes.
 """
 
 from __future__ import annotations
@@ -38,37 +38,37 @@ NODES = {
 }
 
 
-def words(**given):
-    return SimpleNamespace(**given)
+def stand_in(**attributes):
+    return SimpleNamespace(**attributes)
 
 
 @pytest.fixture
 def launched(monkeypatch):
-    """Return what the launch file starts, in order, for some arguments."""
+    """Return a function from launch arguments to what the launch file starts, in order."""
     stand_ins = {
         'launch': {'LaunchContext': dict, 'LaunchDescription': list},
         'launch.actions': {
-            'DeclareLaunchArgument': lambda name, **given: words(name=name, **given),
-            'OpaqueFunction': words,
-            'Shutdown': words,
+            'DeclareLaunchArgument': lambda name, **options: stand_in(name=name, **options),
+            'OpaqueFunction': stand_in,
+            'Shutdown': stand_in,
         },
         'launch.substitutions': {
-            'LaunchConfiguration': lambda name: words(perform=lambda context: context[name])
+            'LaunchConfiguration': lambda name: stand_in(perform=lambda context: context[name])
         },
         'launch_ros': {},
-        'launch_ros.actions': {'Node': words},
+        'launch_ros.actions': {'Node': stand_in},
     }
     for name, content in stand_ins.items():
         module = ModuleType(name)
         vars(module).update(content)
         monkeypatch.setitem(sys.modules, name, module)
 
-    def launch(**given):
+    def launch(**arguments):
         code = runpy.run_path(str(ROOT / 'launch/closed_loop.launch.py'))
         *declared, start = code['generate_launch_description']()
-        context = {one.name: one.default_value for one in declared}
-        assert given.keys() <= context.keys()
-        return start.function(context | given)
+        context = {argument.name: argument.default_value for argument in declared}
+        assert arguments.keys() <= context.keys()
+        return start.function(context | arguments)
 
     return launch
 
@@ -78,18 +78,18 @@ def arguments_of(node, folder):
     full = f'{"/" + node.namespace if node.namespace else ""}/{node.name}'
     argv = [node.executable, '--ros-args', '-r', f'__node:={node.name}']
     argv += ['-r', f'__ns:=/{node.namespace}']
-    for number, given in enumerate(node.parameters):
-        path = given
-        if isinstance(given, dict):
+    for number, parameters in enumerate(node.parameters):
+        path = parameters
+        if isinstance(parameters, dict):
             path = folder / f'{node.name}{number}.yaml'
-            dump(path, {full: given})
+            dump(path, {full: parameters})
         argv += ['--params-file', str(path)]
     return argv
 
 
 @pytest.fixture
 def start(monkeypatch):
-    """Start nodes of the package as processes of these arguments would."""
+    """Start nodes of the package as processes with these arguments would."""
     contexts, nodes = [], []
 
     def node(*argv):
@@ -100,19 +100,19 @@ def start(monkeypatch):
         return nodes[-1]
 
     yield node
-    for one in nodes:
-        one.close()
-        one.destroy_node()
+    for started in nodes:
+        started.close()
+        started.destroy_node()
     for context in contexts:
         rclpy.try_shutdown(context=context)
 
 
 @pytest.mark.parametrize('namespace', ['', 'left'])
-def test_the_arguments_of_a_launch_win_over_its_file(launched, start, tmp_path, namespace):
-    """Each section `/**/NODE` of the preset is later than one for any node."""
+def test_launch_arguments_override_the_parameter_file(launched, start, tmp_path, namespace):
+    """A section `/**/NODE` of the preset takes precedence over one for any node."""
     bag = tmp_path / 'run1'
     nodes = launched(mode='lockstep', bag=str(bag), namespace=namespace, markers='true')
-    by_name = {one.name: one for one in nodes}
+    by_name = {node.name: node for node in nodes}
     assert by_name.keys() == NODES.keys()
     plant = start(*arguments_of(by_name['sim_plant'], tmp_path))
     assert (plant.config.mode, plant.config.wait_for_subscribers) == ('lockstep', 1)
@@ -121,29 +121,29 @@ def test_the_arguments_of_a_launch_win_over_its_file(launched, start, tmp_path, 
     assert bag.is_dir()
 
 
-def test_the_loop_ends_with_any_of_its_nodes_and_not_with_what_only_shows_it(launched):
+def test_loop_shuts_down_with_any_of_its_nodes_but_not_with_a_viewer(launched):
     nodes = launched(bag='run1', rviz='true')
-    ends = {one.executable for one in nodes if getattr(one, 'on_exit', None)}
-    assert ends == {'sim_plant', 'blf_dsc_controller', 'bag_recorder'}
+    required = {node.executable for node in nodes if getattr(node, 'on_exit', None)}
+    assert required == {'sim_plant', 'blf_dsc_controller', 'bag_recorder'}
     script = (ROOT / 'setup.py').read_text()
     assert all(f"'{name} = " in script for name in NODES)
 
 
-def test_nothing_is_started_before_what_may_not_be_installed(launched):
-    """`launch_ros` looks for a package when its turn comes, and leaves running what runs."""
-    packages = [one.package for one in launched(bag='run1', rviz='true')]
+def test_packages_that_may_be_missing_are_launched_first(launched):
+    """`launch_ros` looks a package up at its turn, and leaves earlier nodes running if it fails."""
+    packages = [node.package for node in launched(bag='run1', rviz='true')]
     assert packages[:2] == ['robot_state_publisher', 'rviz2']
     assert set(packages[2:]) == {'blf_dsc_controller'}
 
 
 @pytest.mark.parametrize('preset', ['comparison', 'slotine_li'])
-def test_a_preset_holds_in_every_namespace(start, preset):
+def test_preset_applies_in_every_namespace(start, preset):
     argv = ('blf_dsc_controller', '--ros-args', '-r', '__ns:=/left', '--params-file')
     node = start(*argv, locate(preset))
     assert node.config.law == {'comparison': 'backstepping'}.get(preset, preset)
 
 
-def test_a_parameter_on_the_command_line_wins_over_a_file(start):
+def test_command_line_parameter_overrides_a_file(start):
     argv = ('sim_plant', '--ros-args', '--params-file', locate('recommended'))
     given = ('-p', 'mode:=lockstep', '-p', 'arm.l2:=0.7', '-p', 'initial.position:=[2.29, 1.69]')
     config = start(*argv, *given, '-p', 'elsewhere:seed:=3').config
@@ -162,13 +162,13 @@ def test_a_parameter_on_the_command_line_wins_over_a_file(start):
         ),
     ],
 )
-def test_a_section_that_a_node_would_miss_is_an_error(start, tmp_path, section, problem):
+def test_section_that_does_not_match_the_node_is_an_error(start, tmp_path, section, problem):
     path = tmp_path / 'my.yaml'
     path.write_text(f'{section}:\n  ros__parameters: {{seed: 1}}\n')
     argv = ('sim_plant', '--ros-args', '-r', '__ns:=/left', '--params-file', path)
     with pytest.raises(ConfigurationError) as caught:
         start(*argv)
-    assert [one.startswith(problem) for one in caught.value.problems] == [True]
+    assert [found.startswith(problem) for found in caught.value.problems] == [True]
     both = path.read_text().replace(section, '/right/sim_plant') + path.read_text().replace(
         section, '/left/sim_plant'
     ).replace('1', '2')
@@ -177,7 +177,7 @@ def test_a_section_that_a_node_would_miss_is_an_error(start, tmp_path, section, 
 
 
 @pytest.mark.parametrize('module', ['sim_plant.node', 'blf_dsc_controller.nodes.controller_node'])
-def test_a_parameter_file_that_ros_would_ignore_is_refused(module):
+def test_parameter_file_that_ros_would_ignore_is_rejected(module):
     run = finished(sys.executable, '-m', module, '--params-file', locate('recommended'))
     assert run.returncode == 1
     assert run.stderr.startswith('unknown arguments --params-file')
@@ -185,10 +185,10 @@ def test_a_parameter_file_that_ros_would_ignore_is_refused(module):
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_a_node_answers_a_request_for_all_of_its_parameters(ros, tmp_path, name):
-    """As `ros2 param dump` sends it; the answer is empty where one of them has no value."""
-    given = {'output': str(tmp_path / 'bag')} if name == 'bag_recorder' else {}
-    node = ros.add(NODES[name], given)
+def test_all_parameters_of_a_node_can_be_requested_at_once(ros, tmp_path, name):
+    """As `ros2 param dump` does; the response would be empty if one of them had no value."""
+    parameters = {'output': str(tmp_path / 'bag')} if name == 'bag_recorder' else {}
+    node = ros.add(NODES[name], parameters)
     listed = ros.call(ListParameters, f'/{name}/list_parameters', ListParameters.Request())
     names = listed.result.names
     assert len(names) > 3
@@ -200,6 +200,6 @@ def test_a_node_answers_a_request_for_all_of_its_parameters(ros, tmp_path, name)
         node.close()
 
 
-def test_a_value_with_a_comma_or_a_brace_is_one_value():
+def test_value_with_a_comma_or_brace_is_not_split():
     argv = ['node', '--ros-args', '-p', 'output:=run, 1 {a}', '-p', 'topics:=[/a, /b]']
     assert assigned(argv) == {'output': 'run, 1 {a}', 'topics': ['/a', '/b']}

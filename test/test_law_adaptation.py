@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The update laws (20) and (30) against numpy on random states, and what freezes them."""
+"""The update laws (20) and (30) against numpy on random states, and when they freeze."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_update_is_the_written_law(seed, n, p, update):
 
 
 @pytest.mark.parametrize(('n', 'p'), SHAPES)
-def test_before_the_latch_only_the_tracking_error_teaches(n, p):
+def test_only_the_tracking_error_adapts_before_the_latch(n, p):
     settings, state, signals = random_case = case(1, n, p, latched=False)
     expected = state.estimate + DT * tracking_part(settings, signals)
 
@@ -74,7 +74,7 @@ def test_before_the_latch_only_the_tracking_error_teaches(n, p):
 
 
 @pytest.mark.parametrize(('n', 'p'), SHAPES)
-def test_at_a_torque_limit_only_the_prediction_error_teaches(n, p):
+def test_only_the_prediction_error_adapts_at_a_torque_limit(n, p):
     settings, state, _ = random_case = case(2, n, p)
     expected = state.estimate + DT * prediction_part(settings, state)
     d3 = state.disturbance.copy()
@@ -86,7 +86,7 @@ def test_at_a_torque_limit_only_the_prediction_error_teaches(n, p):
 
 
 @pytest.mark.parametrize('saturated', [False, True])
-def test_learning_leaves_the_torque_as_it_is(saturated):
+def test_learning_does_not_change_the_torque(saturated):
     """Only the tracking error changes H theta^ + d^3 (`bumpless`)."""
     settings, state, signals = random_case = case(5, 3, 4, bumpless=1, eta=0.0)
     change = signals.H @ tracking_part(settings, signals) - settings.gamma * signals.xi2
@@ -99,8 +99,8 @@ def test_learning_leaves_the_torque_as_it_is(saturated):
     np.testing.assert_allclose(signals.H @ estimate + disturbance, expected, atol=1e-12)
 
 
-def test_newton_converges_at_one_rate_in_every_direction_and_gradient_does_not():
-    """theta~ shrinks by 1 - Gamma kappa T a step, where Phi's eigenvalues are 1e-2 to 1e2."""
+def test_newton_converges_at_the_same_rate_in_all_directions_unlike_gradient():
+    """theta~ shrinks by 1 - Gamma kappa T per step for eigenvalues of Phi from 1e-2 to 1e2."""
     shrunk = {}
     for update in UPDATES:
         settings, state, signals = case(
@@ -119,11 +119,11 @@ def test_newton_converges_at_one_rate_in_every_direction_and_gradient_does_not()
     )
 
 
-def test_update_is_projected_in_the_parameters_and_free_in_the_columns():
+def test_parameters_are_projected_and_columns_are_not():
     settings, state, signals = case(4, 2, 3, latched=False, radius=1.0)
     p = settings.p
     state.estimate[:p] /= np.linalg.norm(state.estimate[:p]) * (1.0 - 1e-12)
-    state.estimate[p:] = 50.0  # far outside, were they counted
+    state.estimate[p:] = 50.0  # far outside, if they counted
     signals.xi2[:] *= np.sign(tracking_part(settings, signals)[:p] @ state.estimate[:p])  # outward
     v, w, Gamma = tracking_part(settings, signals)[:p], state.estimate[:p].copy(), settings.Gamma
 
@@ -136,7 +136,7 @@ def test_update_is_projected_in_the_parameters_and_free_in_the_columns():
     np.testing.assert_array_equal(estimate[p:], 50.0)
 
 
-def test_without_weight_a_latched_window_changes_nothing():
+def test_latched_window_has_no_effect_without_weight():
     """kappa = 0 is the law without learning, bit for bit."""
     latched, never = controller(quick(kappa=0.0)), controller(quick(sigma=np.inf))
     with_latch, without = (record(law, plant(), 1.5) for law in (latched, never))

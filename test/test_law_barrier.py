@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tan barrier: the gradient of its potential, the paper's inside the knee, a spring past it."""
+"""The tan barrier: gradient of a potential, the paper's inside the knee, a spring past it."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def printed_torque(xi, bound):
 
 
 def complex_step(function, xi):
-    """Derivative to rounding: no difference is taken."""
+    """Derivative to rounding, without taking a difference."""
     return function(xi + 1e-30j).imag / 1e-30
 
 
 @pytest.mark.parametrize('xi', INSIDE)
-def test_inside_the_knee_it_is_the_paper_s_times_the_weight(xi):
+def test_barrier_inside_the_knee_is_that_of_the_paper_times_the_weight(xi):
     assert barrier.potential(xi, *RECOMMENDED) == pytest.approx(
         WEIGHT * printed_potential(xi, BOUND).real, rel=1e-12
     )
@@ -57,7 +57,7 @@ def test_gradient_and_slope_are_the_first_two_derivatives_inside_the_knee(xi):
 @pytest.mark.parametrize('xi', [*INSIDE, KNEE, *PAST])
 @pytest.mark.parametrize('sign', [-1.0, 1.0])
 def test_gradient_is_the_finite_difference_of_the_potential(xi, sign):
-    # Over h = 1e-8 rad the third derivative (below 1e11 N m/rad^3 here) leaves 1e-6 N m of ~10.
+    # With h = 1e-8 rad the third derivative (below 1e11 N m/rad^3) adds 1e-6 N m to ~10.
     h = 1e-8
     around = [barrier.potential(sign * xi + side, *RECOMMENDED) for side in (-h, h)]
     assert np.diff(around)[0] / (2.0 * h) == pytest.approx(
@@ -98,7 +98,7 @@ def test_barrier_is_symmetric(xi):
     assert barrier.potential(-xi, *RECOMMENDED) == barrier.potential(xi, *RECOMMENDED)
 
 
-def test_near_zero_it_is_a_spring_of_the_weight():
+def test_barrier_near_zero_is_a_spring_of_stiffness_weight():
     xi = 1e-9  # s = 4e-13, so the correction 2 s^2 is below rounding
     assert barrier.gradient(0.0, *RECOMMENDED) == 0.0
     assert barrier.potential(0.0, *RECOMMENDED) == 0.0
@@ -106,7 +106,7 @@ def test_near_zero_it_is_a_spring_of_the_weight():
     assert barrier.potential(xi, *RECOMMENDED) == pytest.approx(0.5 * WEIGHT * xi**2, rel=1e-12)
 
 
-def test_without_a_limit_the_potential_grows_beyond_any_value_at_the_bound():
+def test_potential_without_slope_limit_is_unbounded_at_the_bound():
     """With s = pi/2 (1 - e)^2, tan s is 1 / (pi e) to first order in the distance e."""
     knee = barrier.knee(BOUND, 1.0, 1e300)
     for distance in (1e-4, 1e-5, 1e-6):
@@ -114,7 +114,7 @@ def test_without_a_limit_the_potential_grows_beyond_any_value_at_the_bound():
         assert potential == pytest.approx(BOUND**2 / pi / (pi * distance), rel=2.0 * distance)
 
 
-def test_at_and_beyond_the_bound_it_is_finite_and_pushes_back():
+def test_barrier_is_finite_and_pushes_back_at_and_beyond_the_bound():
     torques = [barrier.gradient(xi, *RECOMMENDED) for xi in (BOUND, 2.0 * BOUND, 1.0)]
     assert np.all(np.isfinite(torques))
     assert 0.0 < torques[0] < torques[1] < torques[2]

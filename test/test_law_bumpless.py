@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is learned reaches the torque without a bump, friction included."""
+"""Learned parameters and friction enter the torque without a bump."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_tracking_error_stays_small_over_the_first_latch():
     assert paper.largest(LATCH).max() > 0.4e-3
 
 
-def test_disturbance_estimate_is_right_a_second_after_the_first_latch():
+def test_disturbance_estimate_is_accurate_a_second_after_the_first_latch():
     end = LATCH + 1.0
     true = 0.1 + 0.1 * np.sin(end)
     errors = [
@@ -46,13 +46,13 @@ def test_learned_friction_is_compensated(preset, bound):
     assert without.largest(15.0).max() > 3.0 * bound
 
 
-def test_telemetry_has_the_friction_in_the_disturbance():
+def test_disturbance_in_telemetry_includes_friction():
     config = configured('recommended', 30.0, COLUMNS, FRICTION)
     found = simulate(config.controller, config.plant).run()
     disturbance = [f'disturbance {joint}' for joint in found.joints]
-    told = found.learning.select(disturbance)[found.learning.stamp >= 20e9]
+    estimated = found.learning.select(disturbance)[found.learning.stamp >= 20e9]
     true = found.truth.select(disturbance)[found.truth.stamp >= 20e9]
 
     moving = np.abs(found.velocity[found.stamp >= 20e9]).min(axis=1) > 0.1
-    assert np.abs(true[moving]).max() > 0.5  # more than the 0.2 of the rest
-    np.testing.assert_allclose(told[moving], true[moving], atol=0.02)
+    assert np.abs(true[moving]).max() > 0.5  # more than the 0.2 N m without friction
+    np.testing.assert_allclose(estimated[moving], true[moving], atol=0.02)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the recommended configuration promises of Section IV's case over a minute, without ROS."""
+"""Performance of the recommended configuration in Section IV's case over a minute, without ROS."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from plain_law import dynamics
 from blf_dsc_controller.law import barrier
 
 BOUND = 2e-3  # rad
-DISTURBANCE = 0.1  # N m, the constant part of the case's
+DISTURBANCE = 0.1  # N m, the constant part
 
 
 def test_tracking_stays_within_half_the_bound():
     assert np.abs(recommended_minute().xi1).max(axis=0) == pytest.approx(0.0, abs=0.5 * BOUND)
 
 
-def test_parameters_are_within_one_percent_from_15_s_on_and_half_a_percent_at_the_end():
+def test_parameters_are_within_one_percent_after_15_s_and_half_a_percent_at_the_end():
     run = recommended_minute()
     assert run.parameter_error[0] == pytest.approx(0.5, abs=0.01)  # P^(0) = P / 2
     assert run.parameter_error[run.t >= 15.0].max() < 0.01
@@ -35,17 +35,17 @@ def test_parameters_are_within_one_percent_from_15_s_on_and_half_a_percent_at_th
 
 
 def test_bias_columns_find_the_constant_disturbance():
-    """Of 0.1 + 0.1 sin t the window of one period leaves the constant."""
+    """A window of one period averages the sine of 0.1 + 0.1 sin t to zero."""
     np.testing.assert_allclose(recommended_minute().estimate[-1, 3:], DISTURBANCE, atol=0.01)
 
 
-def test_torque_is_never_cut():
+def test_torque_never_saturates():
     assert np.abs(recommended_minute().torque).max() < recommended().torque_limit.min()
 
 
 @pytest.mark.parametrize('seed', [0, 1])
 def test_noise_differenced_velocity_and_delay_are_tolerated(seed):
-    """Encoders of 1e-5 rad, velocities by difference, torque a sample late: all at once."""
+    """Encoder noise of 1e-5 rad, differenced velocities and a torque one sample late, together."""
     arm = plant(noise=1e-5, differenced=True, delay=1, seed=seed)
     run = record(controller(recommended()), arm, 60.0)
 
@@ -53,8 +53,8 @@ def test_noise_differenced_velocity_and_delay_are_tolerated(seed):
     assert run.parameter_error[-1] < 0.01
 
 
-def test_arm_driven_past_its_bound_comes_back():
-    """Beyond the bound, where the paper's law is not defined, the straight line takes over."""
+def test_arm_beyond_its_bound_comes_back():
+    """There the paper's law is not defined; the barrier continues as a straight line."""
     law = controller(recommended())
     arm = plant(start=(2.2935 + 0.004, 1.6961 - 0.004))
     run = record(law, arm, 1.0)
@@ -85,13 +85,13 @@ def lyapunov_function(law, measurement):
 
 
 @pytest.mark.parametrize('kappa', [0.0, 100.0], ids=['tracking alone', 'learning too'])
-def test_lyapunov_function_falls_from_sample_to_sample(kappa):
+def test_lyapunov_function_decreases_from_sample_to_sample(kappa):
     """(31), (32) without a disturbance; before the latch at 6.8 s both cases are the same."""
     law = controller(recommended(kappa=kappa, gamma=np.full(2, 1.0), bias=False, bumpless=0))
     arm = plant(constant=(0.0, 0.0), amplitude=(0.0, 0.0))
     V = np.array([lyapunov_function(law, s.measurement) for s in closed_loop(law, arm, 10.0)])
 
-    # A sampled loop may ripple where V' is next to nothing: a millionth of the start's.
+    # A sampled loop may ripple where V' is close to zero: by a millionth of the initial V.
     assert np.diff(V).max() < 1e-6 * V[0]
     assert V[6000] < 0.5 * V[0]
     if kappa > 0.0:

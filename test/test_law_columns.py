@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Disturbance columns: what they recover, and which are refused because nobody could tell them."""
+"""Disturbance columns: what they recover, and which are rejected as indistinguishable."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from blf_dsc_controller.law.settings import LATCHES
 from sim_plant.plant import plant_of
 
 
-def test_columns_are_those_of_their_names():
+def test_columns_match_their_names():
     learning = {
         'learning.viscous': True,
         'learning.coulomb': True,
@@ -55,7 +55,7 @@ def learned(preset, duration, learning, arm):
 
 
 def test_friction_columns_recover_friction():
-    """A sinusoidal reference tells viscous from Coulomb friction by the shape of the torque."""
+    """A sinusoidal reference distinguishes viscous from Coulomb friction by the torque's shape."""
     arm = {
         'disturbance.constant': [0.0, 0.0],
         'disturbance.amplitude': [0.0, 0.0],
@@ -76,18 +76,18 @@ def test_friction_columns_recover_friction():
             assert estimate[f'{name} {joint}'] == pytest.approx(value, abs=2e-3)
 
 
-def test_cosine_columns_are_refused_on_the_paper_s_reference():
-    """cos t on both joints IS the column of P2, a1 + a2 = -0.6 cos t, of exact tracking."""
+def test_cosine_columns_are_rejected_on_the_reference_of_the_paper():
+    """With exact tracking cos t on both joints is the column of P2: a1 + a2 = -0.6 cos t."""
     learning = {'learning.frequencies': [1.0], 'learning.bias': False}
     estimate, active = learned('recommended', 8.0, learning, {})
-    refused = {name for name, on in active.items() if not on}
+    rejected = {name for name, on in active.items() if not on}
 
-    assert any(name.startswith('cos 1 rad/s') for name in refused)
+    assert any(name.startswith('cos 1 rad/s') for name in rejected)
     assert active['sin 1 rad/s joint1'] == active['sin 1 rad/s joint2'] == 1.0
-    assert all(estimate[name] == pytest.approx(0.0, abs=1e-12) for name in refused)
+    assert all(estimate[name] == pytest.approx(0.0, abs=1e-12) for name in rejected)
 
 
-def test_the_same_columns_are_accepted_on_a_reference_of_two_tones():
+def test_same_columns_are_accepted_on_a_two_tone_reference():
     estimate, active = learned('two_tone', 9.0, {}, {})
     assert all(active.values())
     for joint in ('joint1', 'joint2'):
@@ -96,17 +96,17 @@ def test_the_same_columns_are_accepted_on_a_reference_of_two_tones():
         assert estimate[f'cos 1 rad/s {joint}'] == pytest.approx(0.0, abs=1e-3)
 
 
-def test_parameters_are_exact_where_the_columns_hold_the_whole_disturbance():
-    """Bias and sine on two tones: what is left is the trapezoid's T^2 and the leakage of rho."""
+def test_parameters_are_exact_if_the_columns_model_the_whole_disturbance():
+    """Bias and sine on two tones: only the trapezoid's T^2 and the leakage of rho remain."""
     assert run(configured('two_tone', 60.0)).parameter_error[-1] < 1e-4
 
 
-def test_a_refused_column_leaves_the_others_as_if_it_had_never_been_configured():
-    """The refused column is out of Phi and b altogether, not merely small."""
+def test_rejected_column_has_no_effect_on_the_others():
+    """It is removed from Phi and b altogether, not merely small."""
     learning = {'learning.frequencies': [1.0], 'learning.bias': False}
     config = configured('recommended', 8.0, learning)
     law, arm = controller_of(config.controller), plant_of(config.plant)
-    for k in range(7991):  # to the sample of a look
+    for k in range(7991):  # ends with an evaluation of Phi
         law.update(k * 1e-3, 1e-3, arm.measure())
         arm.step(law.sample.torque)
     on = law.state.active > 0.0
@@ -122,8 +122,8 @@ def test_a_refused_column_leaves_the_others_as_if_it_had_never_been_configured()
     assert np.linalg.eigvalsh(Phi)[0] >= law.settings.sigma
 
 
-def test_columns_are_not_judged_before_the_parameters_alone_are_excited():
-    """An arm at rest excites nothing: that is not the columns' fault."""
+def test_columns_are_not_checked_before_the_parameters_alone_are_excited():
+    """An arm at rest excites nothing, so no column is rejected."""
     learning = {
         'learning.frequencies': [1.0],
         'reference.amplitude': [0.0, 0.0],
@@ -135,16 +135,16 @@ def test_columns_are_not_judged_before_the_parameters_alone_are_excited():
 
 @pytest.mark.parametrize('latch', LATCHES)
 def test_latch_keeps_the_last_or_the_best_excited_window(latch):
-    """A reference whose excitation dies: `last` follows it down to sigma, `max` does not."""
+    """As the excitation decays, `last` follows it down to sigma and `max` does not."""
     settings = recommended(
         latch=LATCHES.index(latch), window=1000, learning_start=1.0, sigma=1e-9, bias=False
     )
     law = controller(settings)
-    kept, best = [], 0.0
+    history, best = [], 0.0
     for sample in closed_loop(law, plant(), 4.0):
         if law.state.latched[0] and sample.k % settings.interval == 0:
             best = max(best, law.state.lambda_min[0])
-            kept.append((law.state.latched_lambda[0], law.state.lambda_min[0], best))
-    held, present, best_so_far = np.array(kept).T
+            history.append((law.state.latched_lambda[0], law.state.lambda_min[0], best))
+    held, present, best_so_far = np.array(history).T
     np.testing.assert_array_equal(held, present if latch == 'last' else best_so_far)
     assert np.any(present < best_so_far)

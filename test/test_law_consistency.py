@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learning from consistent windows: the bound holds when the arm changes while it is learned."""
+"""Learning from consistent windows: the bound holds when the arm changes during learning."""
 
 from __future__ import annotations
 
@@ -74,8 +74,8 @@ def test_bound_holds_when_the_arm_changes(name, sensors):
 
     assert np.all(learning.largest(0.0) < BOUND)
     begin = begin_of(row)
-    read_to = 0.5 * plant.get('sensor.resolution', 0.0)
-    assert np.all(learning.largest(begin) <= allowed(row, without.largest(begin)) + read_to)
+    quantisation = 0.5 * plant.get('sensor.resolution', 0.0)
+    assert np.all(learning.largest(begin) <= allowed(row, without.largest(begin)) + quantisation)
     assert learning.changes[-1] >= 1.0
     assert learning.error[-1] < 0.01
 
@@ -88,39 +88,39 @@ def test_bound_holds_over_ten_changes_in_a_row():
 
 
 @pytest.mark.parametrize('preset', ['recommended', 'noisy', 'excitation', 'two_tone'])
-def test_no_change_is_found_where_there_is_none(preset):
+def test_no_change_is_detected_where_there_is_none(preset):
     assert run(30.0, preset=preset).changes[-1] == 0.0
 
 
-def test_without_a_change_nothing_is_different():
-    """Bit for bit: the consistency of the windows only decides which of them are latched."""
+def test_change_detection_has_no_effect_without_a_change():
+    """Bit for bit: consistency only decides which windows are latched."""
     with_detection = run(20.0)
     without = run(20.0, law={'learning.change_detection': False})
     np.testing.assert_array_equal(with_detection.torque, without.torque)
 
 
-def test_residual_is_that_of_least_squares():
+def test_residual_matches_least_squares():
     controller = run(8.0, NO_DISTURBANCE | {'disturbance.viscous': [0.1, 0.1]}).controller
     settings, state = controller.settings, controller.state
     assert settings.change_detection == 1
     rows = state.ring.reshape(-1, settings.m + 1)
     _, squares, _, _ = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)
     found = state.residual[0]
-    assert found == pytest.approx(squares[0] / settings.window, rel=0.05)  # of some rows ago
+    assert found == pytest.approx(squares[0] / settings.window, rel=0.05)  # a few rows old
 
 
-def test_estimate_does_not_drift_while_the_arm_stands_still_with_noise():
-    """Before, the second parameter went from 0.16 to 0.48 kg m^2 in the first minute.
+def test_estimate_does_not_drift_at_rest_with_noise():
+    """The second parameter used to drift from 0.16 to 0.48 kg m^2 in the first minute.
 
-    While the window fills the tracking error adapts; from the first full window on, which is not
-    excited, the estimate is held.
+    The tracking error adapts the estimate until the first full window; as that window is not
+    excited, the estimate is held from then on.
     """
     standing = run(60.0, preset='noisy', law={'reference.type': 'hold'})
     assert np.ptp(standing.error[standing.t > WINDOW + 0.1]) == 0.0
     assert np.all(standing.largest(1.0) < 0.5 * BOUND)
 
 
-def test_column_that_was_rejected_while_standing_still_returns():
+def test_column_rejected_at_rest_is_readmitted_in_motion():
     """Hold for a while, then move: the first full window is half at rest and rejects the bias."""
     law = {
         'reference.type': 'waypoints',
@@ -136,8 +136,8 @@ def test_column_that_was_rejected_while_standing_still_returns():
     assert moved.error[-1] < 0.01
 
 
-def test_columns_are_checked_again_after_a_window_that_excites_nothing():
-    """Or all columns would be back for ever, and learning never latch again."""
+def test_columns_are_checked_again_after_a_window_without_excitation():
+    """Otherwise all columns would stay readmitted and no window would ever be latched."""
     controller = run(8.0, law={'learning.frequencies': [1.0]}).controller
     settings, state, signals = controller.settings, controller.state, controller.signals
     assert state.columns_checked[0] == 1.0
@@ -148,7 +148,7 @@ def test_columns_are_checked_again_after_a_window_that_excites_nothing():
     assert state.columns_checked[0] == 0.0
 
 
-def test_a_window_after_a_change_need_not_be_full_and_stays_near_the_estimate_before():
+def test_window_after_a_change_may_be_partial_and_stays_near_the_estimate_before():
     learning = run(CHANGED + 5.0, payload(0.75))
     state = learning.controller.state
     assert state.latched[0] == 1.0
@@ -159,7 +159,7 @@ def test_a_window_after_a_change_need_not_be_full_and_stays_near_the_estimate_be
     )
 
 
-def test_replaced_configuration_keeps_the_detection_off_for_the_laws_without_composite_learning():
+def test_change_detection_is_off_for_laws_without_composite_learning():
     config = configured('comparison', 1.0)
     assert controller_of(config.controller).settings.change_detection == 0
     assert controller_of(replace(config.controller, law='blf_dsc')).settings.change_detection == 1

@@ -20,7 +20,7 @@ END = 0.5  # s
 K, MU, LAMBDA, KP, W, KC = 150.0, 20.0, 0.002, np.array([60.0, 20.0]), 1000.0, 0.002
 GAMMA, GAMMA3, KAPPA, RHO = 0.5, 100.0, 20.0, 1e-5
 PHI = np.array([[60.0, 5.0, 20.0], [5.0, 1.0, 2.0], [20.0, 2.0, 9.0]])
-MOMENTS = np.linspace(0.0, END, 11)
+TIMES = np.linspace(0.0, END, 11)
 
 
 def reference(t):
@@ -54,20 +54,20 @@ def derivative(t, y):
 
 @cache
 def continuous():
-    """Positions and P^ at the moments, to a tolerance far below what the sampling does."""
+    """Positions and P^ at TIMES, to a tolerance far below the sampling error."""
     start = np.array([2.293, 1.696])
     qr, dqr = reference(0.0)
     alpha2 = surface(start - qr, dqr)
     y = np.concatenate([start, np.zeros(2), alpha2, 0.5 * TRUE, np.zeros(2)])
     solution = solve_ivp(
-        derivative, (0.0, END), y, method='LSODA', rtol=1e-10, atol=1e-13, t_eval=MOMENTS
+        derivative, (0.0, END), y, method='LSODA', rtol=1e-10, atol=1e-13, t_eval=TIMES
     )
     assert solution.success
     return solution.y[:2], solution.y[6:9]
 
 
 def sampled(dt):
-    """The same of the sampled loop with the package's own kernels."""
+    """The same for the sampled loop with the package's own kernels."""
     settings = recommended(
         bias=False, Gamma=np.full(3, GAMMA), kappa=KAPPA, learning_start=1e9, window=10
     )
@@ -79,10 +79,10 @@ def sampled(dt):
     cholesky.factor(law.state.factor)
     arm = plant(sample_time=dt)
     q, estimate = [], []
-    each = round(END / dt / (MOMENTS.size - 1))
-    for k in range(each * (MOMENTS.size - 1) + 1):
+    stride = round(END / dt / (TIMES.size - 1))
+    for k in range(stride * (TIMES.size - 1) + 1):
         measurement = arm.measure()
-        if k % each == 0:
+        if k % stride == 0:
             q.append(measurement[:2].copy())
             estimate.append(law.state.estimate[:3].copy())
         law.update(k * dt, dt, measurement)
@@ -90,11 +90,11 @@ def sampled(dt):
     return np.array(q).T, np.array(estimate).T
 
 
-@pytest.mark.parametrize('what', [0, 1], ids=['position', 'estimate'])
-def test_sampled_loop_converges_to_the_continuous_one_at_first_order(what):
-    """Three times half the sample time; a held torque and Euler's adaptation are of order one."""
-    exact = continuous()[what]
-    errors = [np.abs(sampled(dt)[what] - exact).max() for dt in (1e-3, 5e-4, 2.5e-4, 1.25e-4)]
+@pytest.mark.parametrize('quantity', [0, 1], ids=['position', 'estimate'])
+def test_sampled_loop_converges_to_the_continuous_one_at_first_order(quantity):
+    """Halve the sample time three times; held torque and Euler adaptation are of first order."""
+    exact = continuous()[quantity]
+    errors = [np.abs(sampled(dt)[quantity] - exact).max() for dt in (1e-3, 5e-4, 2.5e-4, 1.25e-4)]
     order = np.log2(np.divide(errors[:-1], errors[1:]))
     assert np.all(order > 0.9), (errors, order)
     assert errors[-1] < 0.15 * errors[0]

@@ -32,7 +32,7 @@ def work_around_a_circle(torque, radius=0.3, centre=(2.0, np.pi / 2.0), points=4
 
 
 def test_erratum_4_first_gravity_term_has_cos_q1():
-    """(34) prints cos q2: a gravity that gains work on a closed path."""
+    """(34) prints cos q2: a gravity that does work along a closed path."""
 
     def corrected(q):
         return dynamics(P, R, q, (0.0, 0.0))[2]
@@ -75,8 +75,8 @@ def test_erratum_12_switched_virtual_control_cannot_meet_its_own_condition(mu, t
     assert max(gap) == pytest.approx(2.0 * mu)
 
 
-def test_erratum_12_linear_virtual_control_passes_zero_without_a_jump():
-    """(18) has the slope K/2 + mu there, so the filter's gap is at most lambda + T of its rate."""
+def test_erratum_12_linear_virtual_control_crosses_zero_without_a_jump():
+    """(18) has slope K/2 + mu there: the filter's gap is at most (lambda + T) times its rate."""
     K, mu, bound, time_constant, T = 150.0, 20.0, 0.002, 0.002, 1e-3
     t = np.arange(0.0, 2.0, T)
     beta2 = np.array(
@@ -84,9 +84,9 @@ def test_erratum_12_linear_virtual_control_passes_zero_without_a_jump():
     )
     gain = surface.filter_gain(time_constant, T)
     alpha2, gap = beta2[0], []
-    for each in beta2:
-        gap.append(abs(each - alpha2))
-        alpha2 += gain * (each - alpha2)
+    for target in beta2:
+        gap.append(abs(target - alpha2))
+        alpha2 += gain * (target - alpha2)
 
     fastest = (K / 2.0 + mu) * 1e-3 * 10.0
     assert np.abs(np.diff(beta2)).max() <= fastest * T
@@ -95,10 +95,10 @@ def test_erratum_12_linear_virtual_control_passes_zero_without_a_jump():
 
 
 def damping_torque(d2, xi1, xi2):
-    """The part of (28) that d2 brings, of a law that meets these errors at its first sample."""
+    """Contribution of d2 to (28), for a law with these errors at its first sample."""
     demands = []
-    for each in (np.zeros(2), d2):
-        law = controller(recommended(d2=each))
+    for gain in (np.zeros(2), d2):
+        law = controller(recommended(d2=gain))
         q = np.array([1.9935, 1.3961]) + 0.3 + xi1
         beta2 = [surface.virtual_control(x, 0.002, 150.0, 20.0, 0.0) for x in xi1]
         law.update(0.0, 1e-3, np.concatenate([q, beta2 + xi2, np.zeros(2)]))
@@ -120,13 +120,13 @@ def test_erratum_15_robust_term_dominates_disturbances_bounded_joint_by_joint(se
     assert power + np.sum(d2 * np.abs(xi1) * np.abs(xi2)) == pytest.approx(0.0, abs=1e-10)
     d = 300.0
     of_norms = d * np.linalg.norm(xi1) * np.linalg.norm(xi2)
-    assert of_norms - d * np.abs(xi1) @ np.abs(xi2) > 0.0  # xi3 as printed leaves this power over
+    assert of_norms - d * np.abs(xi1) @ np.abs(xi2) > 0.0  # xi3 as printed leaves this power
     assert (
         of_norms - d * np.linalg.norm(xi1) * np.sum(np.abs(xi2)) <= 0.0
     )  # |xi1| as a norm does not
 
 
-def test_erratum_15_printed_term_is_absent_where_the_errors_are_on_different_joints():
+def test_erratum_15_printed_term_vanishes_if_the_errors_are_on_different_joints():
     d2 = np.full(2, 300.0)
     torque = damping_torque(d2, np.array([0.001, 0.0]), np.array([0.0, 1.0]))
     np.testing.assert_allclose(torque, 0.0, atol=1e-12)

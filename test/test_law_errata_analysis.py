@@ -22,7 +22,7 @@ ACCELERATION = PREDICTIONS.index('acceleration')
 
 
 def rows_of_a_loop(prediction, duration=1.0):
-    """Each sample's row X P - u of a loop without disturbances, with the controller that formed it.
+    """Yield X P - u of each sample without disturbances, with the controller that formed it.
 
     The filter (8) and those of the regressor settle within the first fifth of a second.
     """
@@ -34,16 +34,16 @@ def rows_of_a_loop(prediction, duration=1.0):
             yield row[:, :3] @ P - row[:, 3], law, sample
 
 
-def test_erratum_6_the_known_part_of_the_dynamics_is_subtracted():
+def test_erratum_6_known_part_of_the_dynamics_is_subtracted():
     """(23): M xi2' + C xi2 is the torque LESS M alpha2' + C alpha2 + G; printed is a plus."""
     alpha2, corrected, printed = None, 0.0, np.inf
-    for left, law, sample in rows_of_a_loop(ACCELERATION):
+    for residual, law, sample in rows_of_a_loop(ACCELERATION):
         if alpha2 is not None:
             q, dq = sample.measurement[:2], sample.measurement[2:4]
             M, C, G = dynamics(P, R, q, dq)
             known = M @ law.signals.dalpha2 + C @ alpha2 + G
-            corrected = max(corrected, np.linalg.norm(left))
-            printed = min(printed, np.linalg.norm(left - 2.0 * known))
+            corrected = max(corrected, np.linalg.norm(residual))
+            printed = min(printed, np.linalg.norm(residual - 2.0 * known))
         alpha2 = law.state.alpha2.copy()
     assert corrected < 0.05  # N m, the lag of (8)
     assert printed > 5.0
@@ -60,14 +60,14 @@ def test_erratum_7_lambda_changes_with_the_unit_of_the_angles():
             signals.acceleration[:] = signals.dalpha2 + unit * error * rate
             dq = state.alpha2 + unit * error * xi2
             factors.append(prediction.heuristic_factor(settings, state, signals, dq))
-    assert factors[1] == factors[3] == pytest.approx(1.0)  # only without an error the same
+    assert factors[1] == factors[3] == pytest.approx(1.0)  # the same only without an error
     assert abs(factors[2] - factors[0]) > 0.05
 
 
-def test_erratum_7_only_the_filtered_rows_hold_with_an_error():
+def test_erratum_7_only_filtered_rows_are_exact_with_an_error():
     """Lambda of (24) is a heuristic: its error is of first order in xi2 and xi2'."""
     largest = {
-        kind: max(np.abs(left).max() for left, _, _ in rows_of_a_loop(kind))
+        kind: max(np.abs(residual).max() for residual, _, _ in rows_of_a_loop(kind))
         for kind in (FILTERED, LAMBDA)
     }
     assert recommended().prediction == FILTERED
@@ -75,13 +75,13 @@ def test_erratum_7_only_the_filtered_rows_hold_with_an_error():
     assert largest[LAMBDA] > 100.0 * largest[FILTERED]
 
 
-def test_erratum_11_the_filter_s_gap_enters_the_error_s_rate_with_a_minus():
+def test_erratum_11_filter_gap_enters_the_error_rate_with_a_minus():
     """(12): xi1' = xi2 + beta2 - (beta2 - alpha2) - alpha1'; printed is a plus."""
     law = controller(recommended())
     largest, alpha2 = 0.0, None
     for sample in closed_loop(law, plant(), 0.05):
         signals = law.signals
-        if alpha2 is not None:  # of the filter's state, before this sample moved it
+        if alpha2 is not None:  # the filter's state before this sample
             gap, rate = signals.beta2 - alpha2, sample.measurement[2:4] - signals.dqr
             corrected = signals.xi2 + signals.beta2 - gap - signals.dqr
             np.testing.assert_allclose(corrected, rate, atol=1e-9)
@@ -91,10 +91,10 @@ def test_erratum_11_the_filter_s_gap_enters_the_error_s_rate_with_a_minus():
     assert largest > 1e-2  # rad/s
 
 
-def test_erratum_24_a_disturbance_that_moves_feeds_the_lyapunov_function():
-    """(31) counts tau_dist as constant; its rate adds d3~ tau_dist' / gamma, and V then rises.
+def test_erratum_24_varying_disturbance_can_increase_the_lyapunov_function():
+    """(31) treats tau_dist as constant; its rate adds d3~ tau_dist' / gamma, and V can increase.
 
-    With P^ = P and a constant disturbance V falls all the way; with a sinusoid it does not.
+    With P^ = P and a constant disturbance V always decreases; with a sinusoid it does not.
     """
     frozen = {
         'learning.initial_estimate': list(P),
@@ -112,7 +112,7 @@ def test_erratum_24_a_disturbance_that_moves_feeds_the_lyapunov_function():
     assert rises[1] > 1e-4
 
 
-def test_erratum_24_the_term_is_what_the_disturbance_s_part_of_v_changes_by():
+def test_erratum_24_term_completes_the_rate_of_the_disturbance_part_of_v():
     """From d3^' = -gamma xi2: (V_d)' = d3~ (xi2 + tau_dist' / gamma), exact for the means."""
     gain, T = 5.0, 1e-3
     config = configured('recommended', 4.0, EXACT | {'disturbance.gain': [gain, gain]})
@@ -130,11 +130,11 @@ def test_erratum_24_the_term_is_what_the_disturbance_s_part_of_v_changes_by():
     assert np.abs(term).sum() > 0.1 * np.abs(np.diff(V)).sum()
 
 
-def test_erratum_16_the_disturbance_s_share_is_paid_from_the_velocity_feedback():
-    """(31): with tau_dist = -d1 xi2, as (5) allows, V' holds K_p - d1 I and not K_p.
+def test_erratum_16_disturbance_reduces_the_effective_velocity_feedback():
+    """(31): with tau_dist = -d1 xi2, as (5) allows, V' contains K_p - d1 I and not K_p.
 
-    The law meets a velocity error xi2 on its reference; the energy xi2^T M xi2 / 2 that it
-    publishes is followed over a hundredth of a millisecond.
+    The arm starts on its reference with a velocity error xi2; the published energy
+    xi2^T M xi2 / 2 is differenced over a hundredth of a millisecond.
     """
     T, d1, xi2 = 1e-5, 15.0, np.array([0.02, -0.05])
     settings = recommended(

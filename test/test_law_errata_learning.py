@@ -38,7 +38,7 @@ def test_erratum_1_prediction_error_enters_with_a_minus():
 
 
 def test_erratum_2_both_integrals_carry_the_same_factor():
-    """(21) has no 1/tau_d, (22) and (24) have: the update then comes to rest at P / tau_d."""
+    """(21) lacks the 1/tau_d of (22) and (24): the update then settles at P / tau_d."""
     settings = recommended()
     law = controller(settings)
     record(law, plant(constant=(0.3, -0.2), amplitude=NO_SINE), 8.0)
@@ -59,7 +59,7 @@ def test_erratum_2_both_integrals_carry_the_same_factor():
 
 
 def test_erratum_3_integrand_belongs_to_the_integration_variable():
-    """(21) prints H_a(t)^T H_a(t), which is a window of one sample: of rank n, so never excited."""
+    """(21) prints H_a(t)^T H_a(t), a window of one sample: it has rank n and is never excited."""
     gains = {'bias': False, 'sigma': 1e-6}
     printed, corrected = (
         controller(recommended(**gains | changes)) for changes in ({'window': 1}, {})
@@ -77,13 +77,13 @@ def test_erratum_3_integrand_belongs_to_the_integration_variable():
     assert corrected.state.lambda_min[0] > 0.1  # over a period of the reference
 
 
-def loop_told(law, arm, duration, *, subtract):
-    """Run a loop whose learning is told the applied torque, less d^3 if the paper's (24) asks."""
+def run_loop(law, arm, duration, *, subtract):
+    """Run a loop that learns from the applied torque, less d^3 if `subtract` (the paper's (24))."""
     d3 = np.zeros(2)
     for k in range(round(duration / 1e-3)):
         measurement = arm.measure().copy()
         measurement[4:] -= d3 * subtract
-        d3 = law.state.disturbance.copy()  # the one in the torque that follows
+        d3 = law.state.disturbance.copy()  # contained in the next torque
         law.update(k * 1e-3, 1e-3, measurement)
         arm.step(law.signals.torque)
 
@@ -98,23 +98,23 @@ def test_erratum_8_subtracting_the_disturbance_estimate_hides_any_parameter_erro
     settings = recommended(
         bias=False, torque_source=EFFORT, kappa=0.0, Gamma=np.zeros(3), initial_estimate=guess
     )
-    seen = {}
+    visible = {}
     for subtract in (True, False):
         law = controller(settings)
-        loop_told(law, plant(), 9.0, subtract=subtract)
+        run_loop(law, plant(), 9.0, subtract=subtract)
         eps = law.state.b - law.state.Phi @ guess
-        seen[subtract] = np.linalg.norm(eps) / np.linalg.norm(law.state.Phi @ (P - guess))
+        visible[subtract] = np.linalg.norm(eps) / np.linalg.norm(law.state.Phi @ (P - guess))
 
-    assert seen[True] < 0.03
-    assert seen[False] == pytest.approx(1.0, abs=0.05)  # tau_dist of 0.2 N m is left in it
+    assert visible[True] < 0.03
+    assert visible[False] == pytest.approx(1.0, abs=0.05)  # tau_dist of 0.2 N m remains in it
 
 
-def test_erratum_8_estimates_wander_where_the_disturbance_estimate_is_subtracted():
+def test_erratum_8_estimates_drift_if_the_disturbance_estimate_is_subtracted():
     """The disturbance is estimated as columns instead."""
     printed = controller(recommended(bias=False, torque_source=EFFORT))
     corrected = controller(recommended(torque_source=EFFORT))
-    loop_told(printed, plant(), 20.0, subtract=True)
-    loop_told(corrected, plant(), 20.0, subtract=False)
+    run_loop(printed, plant(), 20.0, subtract=True)
+    run_loop(corrected, plant(), 20.0, subtract=False)
 
     errors = [
         np.linalg.norm(law.state.estimate[:3] - P) / np.linalg.norm(P)
@@ -125,17 +125,17 @@ def test_erratum_8_estimates_wander_where_the_disturbance_estimate_is_subtracted
 
 
 def printed_projection(estimate, rate, radius):
-    """(4): the condition for `rate` to pass, word for word."""
+    """(4) as printed, with its condition for an unchanged `rate`."""
     norm = np.linalg.norm(estimate)
     if norm < radius or (norm == radius and estimate @ rate <= 0.0):
         return rate
     return rate - estimate * (estimate @ rate) / norm**2
 
 
-def test_erratum_19_printed_projection_lets_the_estimate_out_and_never_back():
-    """Ten steps outward cross the sphere; of ten thousand inward ones the printed form takes none.
+def test_erratum_19_printed_projection_lets_the_estimate_leave_for_good():
+    """Ten outward steps cross the sphere; the printed form then blocks ten thousand inward ones.
 
-    Outside, 'otherwise' removes the radial part of whatever direction, inward ones included.
+    Outside, 'otherwise' removes the radial part of any direction, inward ones included.
     """
     radius, dt = 1.0, 0.1
     printed, corrected = np.array([[0.85, 0.1], [0.85, 0.1]])
@@ -171,14 +171,14 @@ def test_erratum_19_projection_is_taken_in_the_metric_of_gamma():
     assert taken <= unprojected
 
 
-def test_erratum_23_the_reference_excites_every_parameter_and_the_second_weakly():
+def test_erratum_23_reference_excites_every_parameter_but_the_second_weakly():
     """Over a period of exact tracking, lambda_min of the mean of H^T H is 0.269."""
     H = np.zeros((2, 3))
     Phi = np.zeros((3, 3))
     t = np.arange(1000) * 2.0 * np.pi / 1000
-    for each in t:
-        q = np.array([1.9935, 1.3961]) + 0.3 * np.cos(each)
-        dq, ddq = np.full(2, -0.3 * np.sin(each)), np.full(2, -0.3 * np.cos(each))
+    for time in t:
+        q = np.array([1.9935, 1.3961]) + 0.3 * np.cos(time)
+        dq, ddq = np.full(2, -0.3 * np.sin(time)), np.full(2, -0.3 * np.cos(time))
         MODEL.regressor(q, dq, dq, ddq, H)
         Phi += H.T @ H / t.size
     values, vectors = np.linalg.eigh(Phi)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The factor and the smallest eigenvalue, against numpy; the latch (27) and when it closes."""
+"""The factor and the minimum eigenvalue, against numpy; the latch (27) and when it closes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def excitation_matrix(random, m, rank):
 
 @pytest.mark.parametrize(('m', 'rank'), [(1, 1), (5, 12), (5, 5), (5, 2), (7, 1), (6, 0)])
 @pytest.mark.parametrize('shift', [1e-5, 1.0])
-def test_factor_is_numpy_s_and_solves(m, rank, shift):
+def test_factor_matches_numpy_and_solves(m, rank, shift):
     """Singular matrices included: the factor is of Phi + rho I."""
     random = np.random.default_rng(m)
     A = excitation_matrix(random, m, rank)
@@ -38,7 +38,7 @@ def test_factor_is_numpy_s_and_solves(m, rank, shift):
     )
 
 
-def test_factor_exists_where_rounding_takes_a_pivot():
+def test_factor_is_finite_when_rounding_destroys_a_pivot():
     """Rank one at 1e12 rounds at 1e-4, so the other two pivots of Phi + 1e-5 I are noise."""
     for seed in range(20):
         row = 1e6 * np.random.default_rng(seed).normal(size=3)
@@ -57,7 +57,7 @@ def test_factor_shows_whether_a_matrix_is_positive_definite():
 
 
 def excited_case(seed):
-    """Case with a window of eight excited rows, which has not been looked at yet."""
+    """Case with a window of eight excited rows that has not been evaluated yet."""
     case = arbitrary(seed, sigma=0.01, learning_start=2.0)
     settings, state, signals = case
     state.running[:] = state.fresh[:] = state.ring[:] = 0.0
@@ -78,16 +78,16 @@ def excited():
     return excited_case(2)
 
 
-def settled_look(case, t):
-    """The looks of a while: the first starts from no direction in particular."""
+def evaluate_until_settled(case, t):
+    """Evaluate the window often: the first evaluation starts from an arbitrary direction."""
     for _ in range(50):
         excitation.update_excitation(*case, t, 1e-3, np.zeros(case[0].n))
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_inverse_iteration_finds_the_smallest_eigenvalue_and_its_direction(seed):
+def test_inverse_iteration_finds_the_minimum_eigenvalue_and_eigenvector(seed):
     case = excited_case(seed)
-    settled_look(case, 0.0)
+    evaluate_until_settled(case, 0.0)
 
     values, vectors = np.linalg.eigh(case.signals.Phi)
     assert case.state.lambda_min[0] == pytest.approx(values[0], rel=1e-10)
@@ -95,16 +95,16 @@ def test_inverse_iteration_finds_the_smallest_eigenvalue_and_its_direction(seed)
     assert np.linalg.norm(case.state.min_eigenvector) == pytest.approx(1.0, rel=1e-14)
 
 
-def test_warm_started_iteration_follows_the_smallest_eigenvalue_along_a_loop():
+def test_warm_started_iteration_tracks_the_minimum_eigenvalue_in_a_loop():
     """Never below it (a Rayleigh quotient cannot be), and close once the window has filled."""
     settings = quick()
     law = controller(settings)
-    looks = [
+    evaluations = [
         (law.state.lambda_min[0], np.linalg.eigvalsh(law.signals.Phi)[0], sample.t)
         for sample in closed_loop(law, plant(), 4.0)
         if sample.k > 0 and sample.k % settings.interval == 0
     ]
-    found, exact, t = np.array(looks).T
+    found, exact, t = np.array(evaluations).T
 
     assert np.all(found >= exact - 1e-13)
     filled = t > 1.0
@@ -114,7 +114,7 @@ def test_warm_started_iteration_follows_the_smallest_eigenvalue_along_a_loop():
 
 def test_latch_keeps_the_whole_window_when_time_and_excitation_suffice(excited):
     settings, state, _ = excited
-    settled_look(excited, settings.learning_start)
+    evaluate_until_settled(excited, settings.learning_start)
 
     rows = state.ring
     Phi = np.einsum('kia,kib->ab', rows[:, :, :-1], rows[:, :, :-1]) / settings.window
@@ -128,26 +128,26 @@ def test_latch_keeps_the_whole_window_when_time_and_excitation_suffice(excited):
 
 
 @pytest.mark.parametrize('early', [True, False])
-def test_latch_stays_open_too_early_or_with_too_little(excited, early):
+def test_latch_stays_open_before_learning_starts_or_without_excitation(excited, early):
     settings, state, signals = excited
     if not early:
         excited = (settings._replace(sigma=1e3), state, signals)
     before = state.Phi.copy(), state.b.copy()
 
-    settled_look(excited, settings.learning_start - (1e-9 if early else 0.0))
+    evaluate_until_settled(excited, settings.learning_start - (1e-9 if early else 0.0))
 
     assert state.latched[0] == 0.0
     np.testing.assert_array_equal(state.Phi, before[0])
     np.testing.assert_array_equal(state.b, before[1])
 
 
-def test_a_latched_window_outlives_the_excitation(excited):
+def test_latched_window_is_kept_after_excitation_ends(excited):
     settings, state, signals = excited
-    settled_look(excited, settings.learning_start)
+    evaluate_until_settled(excited, settings.learning_start)
     kept = state.Phi.copy()
 
     state.running[:] = 0.0
-    settled_look(excited, settings.learning_start + 1.0)
+    evaluate_until_settled(excited, settings.learning_start + 1.0)
 
     assert state.lambda_min[0] == 0.0
     assert (state.latched[0], state.latch_time[0]) == (1.0, settings.learning_start)
@@ -155,7 +155,7 @@ def test_a_latched_window_outlives_the_excitation(excited):
     np.testing.assert_array_equal(signals.Phi, 0.0)
 
 
-def test_law_looks_once_an_interval_and_not_before_learning_may_start():
+def test_excitation_is_evaluated_once_per_interval_after_learning_may_start():
     settings = quick(interval=7, sigma=1e-12)
     law = controller(settings)
     times = [
@@ -187,7 +187,7 @@ def basis(first, second):
     return np.linalg.qr(np.column_stack((first, second, rest)))[0]
 
 
-def test_a_look_improves_the_direction_by_four_iterations():
+def test_each_evaluation_refines_the_direction_by_four_iterations():
     """tan of the angle to the minimum eigenvector falls by lambda_1 / lambda_2 in each."""
     eye = np.eye(7)
     vectors = basis(eye[0] + eye[5], eye[1] - eye[2])
@@ -200,8 +200,8 @@ def test_a_look_improves_the_direction_by_four_iterations():
 
 
 @pytest.mark.parametrize('missing', [1e-6, -1e-6])
-def test_a_column_is_judged_by_the_eigenvalue_however_the_iteration_starts(missing):
-    """The start is next to the wrong eigenvector, whose eigenvalue is only a fifth larger."""
+def test_column_rejection_is_independent_of_the_starting_direction(missing):
+    """The iteration starts near the wrong eigenvector, whose eigenvalue is a fifth larger."""
     p, m = 4, 7
     ones, columns = np.ones(m), np.eye(m)[p] - np.eye(m)[p + 1]
     least = 1.0 - missing  # sigma is 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An exciting reference: as predicted, within limits, and what it is good for."""
+"""Exciting references: their predicted excitation, limits and benefit."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ SIGMA = ControllerConfig().learning.excitation_threshold
 def excitation(name):
     reference = load_loop(name).controller.reference
     names = ('offset', 'amplitude', 'frequency', 'phase')
-    parameters = {one: getattr(reference, one) for one in names}
+    parameters = {entry: getattr(reference, entry) for entry in names}
     return ExcitationProblem(ControllerConfig(), P, 0.8, 2).evaluate(parameters)
 
 
 @cache
 def run(name, phase=0.0):
-    """Samples of 16 s: the window of 2 pi s is then full of the reference alone."""
+    """Record of 16 s: at its end the window of 2 pi s contains only the reference."""
     loop = load_loop(name)
     disturbance = replace(loop.plant.disturbance, phase=(phase, phase))
     plant = replace(loop.plant, disturbance=disturbance, duration=16.0)
@@ -47,16 +47,16 @@ def parameter_error(record):
 
 
 @pytest.mark.parametrize('name', ['recommended', 'excitation'])
-def test_predicted_excitation_is_the_loop_s(name):
-    """The loop's is sampled, and of the arm's own motion, which is within a milliradian."""
+def test_predicted_excitation_matches_the_loop(name):
+    """The loop's is sampled along the motion of the arm, within a milliradian of the reference."""
     measured = run(name).sample(-1).lambda_min[0]
     assert excitation(name).lambda_min == pytest.approx(measured, rel=0.01)
 
 
-def test_chosen_reference_excites_far_more_than_the_paper_s():
+def test_chosen_reference_excites_far_more_than_that_of_the_paper():
     paper, chosen = excitation('recommended').lambda_min, excitation('excitation').lambda_min
     assert SIGMA < paper < 2.0 * SIGMA
-    # A bias column alone brings an eigenvalue of 1: with these columns there is no more to have.
+    # A bias column alone has an eigenvalue of 1: with these columns no more is possible.
     assert 0.99 < chosen <= 1.0
 
 
@@ -67,21 +67,21 @@ def test_chosen_reference_keeps_the_limits_and_is_tracked_within_the_bound():
     assert np.abs(xi1 / bound).max() < 1.0
 
 
-def test_chosen_reference_tells_the_worst_disturbance_from_the_parameters():
-    """A cosine of the paper's frequency looks like one of its parameters there, and not here."""
+def test_chosen_reference_separates_the_worst_disturbance_from_the_parameters():
+    """On the paper's reference, a cosine of its frequency looks like one of the parameters."""
     quarter = 0.5 * np.pi
     assert parameter_error(run('recommended', quarter)) > 0.1
     assert parameter_error(run('excitation', quarter)) < 0.01
 
 
-def test_search_keeps_its_limits_is_repeatable_and_beats_where_it_starts():
+def test_search_keeps_its_limits_is_repeatable_and_beats_random_motions():
     config = replace(ControllerConfig(), limits=MotionLimits(velocity=(0.5, 0.8)))
     problem = ExcitationProblem(config, P, 0.5, 1)
     x, again = (search(problem, 3, 1) for _ in range(2))
     np.testing.assert_array_equal(x, again)
     reached = problem.evaluate(problem.parameters(x))
     assert reached.ratios.max() <= 1.0
-    assert reached.ratios[1].max() > 0.9  # the velocity is what holds it back
+    assert reached.ratios[1].max() > 0.9  # the velocity limit is active
     random = np.random.default_rng(0)
     for _ in range(20):
         other = problem.evaluate(problem.parameters(random.normal(0.0, 0.2, 6)))
@@ -89,16 +89,16 @@ def test_search_keeps_its_limits_is_repeatable_and_beats_where_it_starts():
             assert other.lambda_min < reached.lambda_min
 
 
-def test_without_torque_to_spare_none_is_found():
-    still = replace(
+def test_search_fails_if_no_motion_is_within_the_limits():
+    config = replace(
         ControllerConfig(),
         limits=MotionLimits(position_lower=(0.0, 0.0), position_upper=(0.5, 0.5)),
     )
     with pytest.raises(MotionError, match='in 1 searches'):
-        search(ExcitationProblem(still, P, 0.1, 1), 0, 1)
+        search(ExcitationProblem(config, P, 0.1, 1), 0, 1)
 
 
-def test_the_tool_writes_a_preset_that_loads(tmp_path, capsys):
+def test_tool_writes_a_preset_that_loads(tmp_path, capsys):
     path = tmp_path / 'mine.yaml'
     assert main(['excite', str(path), '--harmonics', '1', '--starts', '1']) == 0
     reference = load_loop(path).controller.reference
@@ -113,12 +113,12 @@ def test_the_tool_writes_a_preset_that_loads(tmp_path, capsys):
 
 # Arms from a URDF.
 
-LIGHT = {'robot.payload': 0.2, 'torque.limit': [60.0] * 3}  # of a random arm, to leave it room
+LIGHT = {'robot.payload': 0.2, 'torque.limit': [60.0] * 3}  # leave a random arm some room
 
 
 @cache
 def chain_problem():
-    """A random arm of three joints, whose base stands high above the floor."""
+    """A random arm of three joints, with its base high above the floor."""
     urdf = random_urdf(3, seed=5)[0]
     config = build(ControllerConfig, {'robot.urdf': urdf, 'robot.tip': 'tip', **LIGHT})
     clearance = Clearance(config.robot.chain(config.joints), 0.02, -3.0)
@@ -131,7 +131,7 @@ def reference_of(config):
     return {name: getattr(config.reference, name) for name in names}
 
 
-def test_predicted_information_of_a_panda_is_that_of_its_loop():
+def test_predicted_information_of_a_panda_matches_its_loop():
     loop = load_loop('panda')
     motion = reference_of(loop.controller)
     plant = replace(loop.plant, duration=11.0)
@@ -140,15 +140,15 @@ def test_predicted_information_of_a_panda_is_that_of_its_loop():
     Phi = upper + np.triu(upper, 1).T
     settings = settings_of_config(loop.controller)
     a = settings.prior_weight
-    loop_s = np.linalg.slogdet(np.linalg.solve(settings.information, Phi) / a + np.eye(len(Phi)))[1]
+    gain = np.linalg.slogdet(np.linalg.solve(settings.information, Phi) / a + np.eye(len(Phi)))[1]
 
     problem = ExcitationProblem(loop.controller, settings.initial_estimate[: settings.p], 0.8, 3)
 
-    assert problem.evaluate(motion).gain == pytest.approx(loop_s, rel=0.01)
+    assert problem.evaluate(motion).gain == pytest.approx(gain, rel=0.01)
     assert problem.evaluate(motion).ratios[1].max() > 0.8
 
 
-def test_a_motion_for_an_arm_keeps_its_limits_and_shows_more_than_others():
+def test_search_for_a_chain_keeps_its_limits_and_beats_random_motions():
     _, problem = chain_problem()
     reached = problem.evaluate(problem.parameters(search(problem, 0, 1)))
     assert reached.ratios.max() <= 1.0
@@ -160,7 +160,7 @@ def test_a_motion_for_an_arm_keeps_its_limits_and_shows_more_than_others():
     assert max(allowed) < reached.gain
 
 
-def test_what_remains_of_the_prior_is_all_at_rest_and_little_where_it_is_shown():
+def test_prior_uncertainty_remains_at_rest_and_shrinks_for_joints_that_move():
     config, problem = chain_problem()
     names = estimate_names(config)
     at_rest = problem.remaining(problem.parameters(np.zeros(9)))
@@ -172,18 +172,18 @@ def test_what_remains_of_the_prior_is_all_at_rest_and_little_where_it_is_shown()
     assert remaining[names.index('viscous j2')] == pytest.approx(1.0, abs=1e-6)
 
 
-def test_the_torque_is_that_of_every_guess():
+def test_torque_ratio_is_the_largest_of_all_guesses():
     config, problem = chain_problem()
     motion = problem.parameters(np.full(9, 0.1))
     P = np.array(config.learning.initial_estimate)
-    either = ExcitationProblem(config, np.array([P, 1.5 * P]), 0.8, 1).evaluate(motion)
+    both = ExcitationProblem(config, np.array([P, 1.5 * P]), 0.8, 1).evaluate(motion)
     heavy = ExcitationProblem(config, 1.5 * P, 0.8, 1).evaluate(motion)
     light = problem.evaluate(motion)
-    np.testing.assert_allclose(either.ratios, np.maximum(heavy.ratios, light.ratios))
+    np.testing.assert_allclose(both.ratios, np.maximum(heavy.ratios, light.ratios))
     assert np.all(heavy.ratios[3] > light.ratios[3])
 
 
-def test_the_tool_names_what_the_motion_of_an_arm_does_not_show(tmp_path, capsys):
+def test_tool_names_the_parameters_that_the_motion_does_not_show(tmp_path, capsys):
     (tmp_path / 'arm.urdf').write_text(random_urdf(3, seed=5)[0])
     config = tmp_path / 'arm.yaml'
     config.write_text(
@@ -196,9 +196,9 @@ def test_the_tool_names_what_the_motion_of_an_arm_does_not_show(tmp_path, capsys
     assert main([*command, '--radius', '0.02', '--floor', '3.0']) == 1
     assert 'a lower floor' in capsys.readouterr().err
     assert main([*command, '--radius', '0.02', '--floor', '-3.0']) == 0
-    told = capsys.readouterr().out
-    assert 'a window leaves' in told
-    combination = re.search(r'100 % of (\S+)', told)
+    output = capsys.readouterr().out
+    assert 'a window leaves' in output
+    combination = re.search(r'100 % of (\S+)', output)
     assert combination
     assert combination[1] in out.read_text()
     config.write_text(config.read_text() + out.read_text())

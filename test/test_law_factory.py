@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the words of a configuration to the symbols of the law."""
+"""From a configuration to the settings of the law."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ def settings(**given):
     return settings_of_config(build(ControllerConfig, given))
 
 
-def test_learning_waits_for_the_window_and_for_the_filters_to_settle():
+def test_learning_waits_for_the_window_and_the_filters_to_settle():
     """tau_d + T_a of (26)."""
     learning = {'learning.window': 0.75, 'learning.settling_time': 0.25}
     assert settings(**learning).learning_start == 1.0
     assert settings(**learning).window == 750
 
 
-def test_parameters_and_columns_have_gains_of_their_own():
+def test_parameters_and_columns_have_separate_gains():
     config = {'learning.adaptation_gain': [1.0, 2.0, 3.0], 'learning.column_gain': 5.0}
     columns = len(column_names(build(ControllerConfig, config)))
     assert columns > 0

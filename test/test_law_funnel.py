@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bound that narrows: its derivative, what it does to V, and that the loop keeps it."""
+"""The narrowing bound: its derivative, its effect on V, and a loop that stays within it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def bound(t):
     return K + (K0 - K) * exp(-RATE * t)
 
 
-def test_bound_falls_from_the_first_to_the_last_at_its_rate():
+def test_bound_decays_from_the_initial_to_the_final_one_at_its_rate():
     settings, begin = at(0.0, funnel_rate=RATE)
     np.testing.assert_allclose(begin.bound, settings.initial_bound, rtol=1e-15)
     _, half = at(np.log(2.0) / RATE, funnel_rate=RATE)
@@ -42,8 +42,8 @@ def test_bound_falls_from_the_first_to_the_last_at_its_rate():
 
 
 @pytest.mark.parametrize('t', [0.0, 0.3, 2.0])
-def test_narrowing_is_the_derivative_over_the_bound(t):
-    # Over h = 1e-5 s the third derivative, below 20 rad/s^3, leaves 1e-9.
+def test_narrowing_is_the_derivative_divided_by_the_bound(t):
+    # With h = 1e-5 s the third derivative, below 20 rad/s^3, adds 1e-9.
     h = 1e-5
     before, after = (at(t + side, funnel_rate=RATE)[1].bound for side in (-h, h))
     _, now = at(t, funnel_rate=RATE)
@@ -51,20 +51,20 @@ def test_narrowing_is_the_derivative_over_the_bound(t):
 
 
 @pytest.mark.parametrize('given', ['no rate', 'no difference'])
-def test_a_bound_that_stands_still_is_the_given_one_to_the_last_bit(given):
+def test_constant_bound_equals_the_given_one_bit_for_bit(given):
     case = arbitrary(0)
-    still = (
+    constant = (
         {'funnel_rate': 0.0, 'initial_bound': case.settings.bound}
         if given == 'no rate'
         else {'funnel_rate': 3.0, 'initial_bound': case.settings.bound}
     )
-    settings, signals = at(1.234, **still)
+    settings, signals = at(1.234, **constant)
     np.testing.assert_array_equal(signals.bound, settings.bound)
     np.testing.assert_array_equal(signals.knee, settings.knee)
     np.testing.assert_array_equal(signals.narrowing, 0.0)
 
 
-def test_the_knee_stays_where_the_slope_reaches_its_limit():
+def test_knee_stays_where_the_slope_reaches_its_limit():
     knee = np.full(3, barrier.knee(K, WEIGHT, LIMIT))
     changes = {'bound': np.full(3, K), 'initial_bound': np.full(3, K0), 'funnel_rate': RATE}
     for t in (0.0, 0.7, 3.0):
@@ -87,7 +87,7 @@ def potential(xi, k):
 
 @pytest.mark.parametrize('share', [0.1, 0.5, 0.75, 1.3, -0.6, -2.0])
 @pytest.mark.parametrize('t', [0.0, 0.4, 1.5])
-def test_potential_changes_by_the_error_that_outruns_the_bound_and_by_the_narrowing(share, t):
+def test_rate_of_the_potential_accounts_for_the_narrowing_bound(share, t):
     """V' = dV/dxi (xi' - xi k'/k) + 2 (k'/k) V, inside the knee and past it."""
     h = 1e-6
     before, after = (potential(motion(share, t + s)[0], bound(t + s)) for s in (-h, h))
@@ -101,8 +101,8 @@ def test_potential_changes_by_the_error_that_outruns_the_bound_and_by_the_narrow
     assert (after - before) / (2.0 * h) == pytest.approx(expected, rel=1e-6)
 
 
-def test_virtual_control_moves_the_error_with_the_bound():
-    """Without the gains, alpha2 = dqr + xi1 k'/k keeps xi1 / k what it is."""
+def test_virtual_control_scales_the_error_with_the_bound():
+    """Without the gains, alpha2 = dqr + xi1 k'/k keeps xi1 / k constant."""
     settings = recommended(K=np.zeros(2), mu=np.zeros(2), **NARROWING)
     law = controller(settings)
     law.update(0.5, 1e-3, np.concatenate((law.reference_at(0.5)[0] + 0.003, np.zeros(4))))
@@ -111,7 +111,7 @@ def test_virtual_control_moves_the_error_with_the_bound():
     np.testing.assert_allclose(law.signals.beta2 - dqr, expected, rtol=1e-12)
 
 
-def test_virtual_control_has_the_gains_of_the_bound_of_its_time():
+def test_virtual_control_uses_the_bound_at_its_time():
     law = controller(recommended(**NARROWING))
     for t, error in ((0.0, 0.011), (1.0, 0.002)):
         law.reset()
@@ -126,7 +126,7 @@ def test_virtual_control_has_the_gains_of_the_bound_of_its_time():
 START = (2.2935 + 0.015, 1.6961 - 0.012)
 
 
-def test_the_loop_keeps_the_narrowing_bound():
+def test_loop_stays_within_the_narrowing_bound():
     law, arm = controller(recommended(**NARROWING)), plant(start=START)
     ratios = []
     for sample in closed_loop(law, arm, 10.0):
@@ -136,8 +136,8 @@ def test_the_loop_keeps_the_narrowing_bound():
     assert np.max(ratios) < 0.8
 
 
-def test_lyapunov_function_falls_while_the_bound_narrows():
-    """(31) for the moving bound, with nothing unknown and nothing disturbed."""
+def test_lyapunov_function_decreases_while_the_bound_narrows():
+    """(31) for the moving bound, with a known model and no disturbance."""
     model_known = {'initial_estimate': np.array([*P, 0.0, 0.0]), 'Gamma': np.zeros(5)}
     quiet = {'gamma': np.zeros(2), 'truth_known': 1, 'true_parameters': P}
     law = controller(recommended(**NARROWING | model_known | quiet))
@@ -146,6 +146,6 @@ def test_lyapunov_function_falls_while_the_bound_narrows():
     for sample in closed_loop(law, arm, 2.0):
         M, _, _ = dynamics(P, R, sample.measurement[:2], sample.measurement[2:4])
         V.append(law.sample.lyapunov[0] + 0.5 * law.signals.xi2 @ M @ law.signals.xi2)
-    # At the first sample alpha2 takes the whole step of the virtual control: V2 begins there.
+    # At the first sample alpha2 jumps to the virtual control: V2 starts there.
     assert np.diff(V).max() < 1e-6 * V[0]
     assert V[-1] < 1e-3 * V[0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The laws by name: each against its own equations, and against the others where they agree."""
+"""The laws by name: each against its own equations, and against each other where they agree."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ UNEVEN = {
 
 
 class PlainComparison:
-    """(35) as printed, P^ by Euler; `slotine_li` is the same without w, mu_bar and W_c."""
+    """(35) as printed, P^ by Euler steps; `slotine_li` is the same without w, mu_bar and W_c."""
 
     def __init__(self, config, *, bare):
-        own = config.comparison
+        gains = config.comparison
         self.Kp = np.array(config.feedback.gain)
         self.layer = config.feedback.boundary_layer
         self.Gamma = np.array(config.learning.adaptation_gain)
-        self.lambda_s = np.array(own.surface_gain)
-        self.w = np.zeros(2) if bare else np.array(own.position_gain)
-        self.mu_bar = np.zeros(2) if bare else np.array(own.robust_gain)
-        self.Wc = 0.0 if bare else own.leakage
+        self.lambda_s = np.array(gains.surface_gain)
+        self.w = np.zeros(2) if bare else np.array(gains.position_gain)
+        self.mu_bar = np.zeros(2) if bare else np.array(gains.robust_gain)
+        self.Wc = 0.0 if bare else gains.leakage
         self.P = np.array(config.learning.initial_estimate)
 
     def update(self, dt, qr, dqr, ddqr, q, dq):
@@ -53,7 +53,7 @@ class PlainComparison:
 
 
 @pytest.mark.parametrize('law', ['backstepping', 'slotine_li'])
-def test_comparison_laws_are_their_equations_over_a_closed_loop(law):
+def test_comparison_laws_follow_their_equations_in_a_closed_loop(law):
     config = configured('recommended', 1.0, UNEVEN | {'law': law}).controller
     controller, plain = controller_of(config), PlainComparison(config, bare=law == 'slotine_li')
     arm = plant()
@@ -70,8 +70,8 @@ def test_comparison_laws_are_their_equations_over_a_closed_loop(law):
     assert np.abs(controller.state.estimate[:3] - [0.5, 0.16, 0.2]).max() > 0.05  # it did adapt
 
 
-def test_comparison_laws_leave_the_barrier_and_the_composite_learning_alone():
-    """Gains of the proposed law do not reach them: the same run bit for bit."""
+def test_comparison_laws_do_not_use_the_barrier_or_composite_learning():
+    """Gains of the proposed law do not affect them: the runs are the same bit for bit."""
     changed = {
         'barrier.weight': [5.0, 7.0],
         'surface.gain': [3.0, 3.0],
@@ -86,8 +86,8 @@ def test_comparison_laws_leave_the_barrier_and_the_composite_learning_alone():
         assert runs[0].latched[-1] == 1.0  # there was something to learn from
 
 
-def test_without_prediction_error_the_loop_is_the_one_without_learning_bit_for_bit():
-    """kappa = 0 against a threshold that is never reached, over the latch at 6.8 s.
+def test_zero_weight_of_the_prediction_error_equals_no_learning_bit_for_bit():
+    """kappa = 0 against a threshold that is never reached, beyond the latch at 6.8 s.
 
     Without change detection, which holds the estimate where a full window is not excited.
     """
@@ -110,14 +110,14 @@ FROZEN = {
 }
 
 
-def test_proposed_law_with_all_known_and_frozen_is_the_model_based_one():
+def test_proposed_law_with_everything_known_and_frozen_equals_model_based():
     frozen = run(configured('recommended', 10.0, EXACT | FROZEN))
     model_based = run(configured('recommended', 10.0, EXACT | {'law': 'model_based'}))
     np.testing.assert_allclose(frozen.torque, model_based.torque, atol=1e-12)
     np.testing.assert_allclose(frozen.xi1, model_based.xi1, atol=1e-15)
 
 
-def test_model_based_law_is_equation_16_over_a_closed_loop():
+def test_model_based_law_follows_equation_16_in_a_closed_loop():
     """Against the plain transcription with P^ = P, d^3 = tau_dist, and nothing adapted."""
     config = configured('recommended', 1.0, EXACT | {'law': 'model_based'}).controller
     controller = controller_of(config)
@@ -143,14 +143,14 @@ def test_every_law_keeps_its_torque_within_the_limit(law):
     assert torque[:, 0].max() == 8.0
 
 
-def floor(changes):
-    """Largest |xi1| [rad] from 1 s on of the model-based law that is told the disturbance."""
+def error_floor(changes):
+    """Largest |xi1| [rad] from 1 s on of the model-based law, which knows the disturbance."""
     loop = run(configured('model_based', 8.0, changes))
     return np.abs(loop.xi1[loop.t >= 1.0]).max(axis=0)
 
 
 def test_error_of_the_oracle_stays_below_twenty_microradians():
-    assert floor({}).max() < 2e-5
+    assert error_floor({}).max() < 2e-5
 
 
 @pytest.mark.parametrize('time_constant', [0.002, 0.004, 0.008, 0.016])
@@ -158,11 +158,11 @@ def test_error_of_the_oracle_stays_below_twenty_microradians():
     ('gain', 'mu', 'weight'),
     [(150.0, 20.0, 1000.0), (60.0, 20.0, 1000.0), (60.0, 60.0, 1.0), (0.0, 40.0, 500.0)],
 )
-def test_error_of_the_oracle_is_the_surface_filter_s_lag(time_constant, gain, mu, weight):
-    """alpha2 lags beta2 by lambda alpha2', which xi1 has to make up for.
+def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(time_constant, gain, mu, weight):
+    """alpha2 lags beta2 by lambda alpha2', which xi1 compensates.
 
     It does so by (K/2 + mu) xi1 in beta2, and by w xi1 = -K_p xi2 in the torque.  The reference's
-    acceleration is 0.3 rad/s^2; a torque that is held adds half a sample to the lag.
+    acceleration is 0.3 rad/s^2; the held torque adds half a sample to the lag.
     """
     changes = {
         'surface.time_constant': time_constant,
@@ -172,22 +172,22 @@ def test_error_of_the_oracle_is_the_surface_filter_s_lag(time_constant, gain, mu
     }
     rate = gain / 2.0 + mu + weight / np.array([60.0, 20.0])
     expected = (time_constant + 0.5e-3) * 0.3 / rate
-    np.testing.assert_allclose(floor(changes), expected, rtol=0.05)
+    np.testing.assert_allclose(error_floor(changes), expected, rtol=0.05)
 
 
-def test_lyapunov_function_of_the_oracle_falls_to_the_floor_of_the_lag():
-    """(17): V falls in every sample until what is left is the barrier's energy of the lag."""
+def test_lyapunov_function_of_the_oracle_decreases_to_the_floor_of_the_lag():
+    """(17): V decreases in every sample until only the barrier's energy of the lag remains."""
     loop = run(configured('model_based', 8.0))
     V = loop.lyapunov.sum(axis=1)
-    lag = 1000.0 * np.sum(loop.xi1[loop.t >= 1.0] ** 2, axis=1).max()  # J, w xi1^2: twice the least
+    lag = 1000.0 * np.sum(loop.xi1[loop.t >= 1.0] ** 2, axis=1).max()  # J, twice the energy
     above = np.flatnonzero(10.0 * lag < V)
-    assert above[-1] > 50  # there is a fall to look at
+    assert above[-1] > 50  # there is a decrease to check
     assert np.all(np.diff(V[: above[-1] + 2]) < 0.0)
     assert V[0] > 1e4 * V[loop.t >= 1.0].max()
 
 
 def test_parameter_error_without_disturbance():
-    """With the disturbance off and exact measurements a window of learning finds P."""
+    """Without disturbance and with exact measurements, learning finds P."""
     loop = run(configured('recommended', 20.0, {}, NO_DISTURBANCE))
     assert loop.parameter_error[-1] < 1e-3
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The terms of (29) that a sample tells, against the formulas written out."""
+"""The terms of (29) in a telemetry sample, against the formulas written out."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ GAINS = {
 
 
 def samples(law, **changes):
-    """Law and measurement of each of 300 samples."""
+    """Yield time, controller and measurement of 300 samples."""
     controller = controller_of(configured('recommended', 1.0, EXACT | {'law': law} | changes)[1])
     arm = plant()
     for k in range(300):
@@ -36,36 +36,36 @@ def test_terms_are_those_of_equation_29(law):
     Gamma, gamma = np.array([0.5, 2.0, 1.5]), np.array([40.0, 10.0])
     w = np.array([800.0, 300.0] if law == 'blf_dsc' else [25.0, 9.0])
     for t, controller, measurement in samples(law, **GAINS):
-        told = controller.sample
-        xi1, xi2 = told.xi1, told.xi2
+        sample = controller.sample
+        xi1, xi2 = sample.xi1, sample.xi2
         M, _, _ = dynamics(P, 9.8, measurement[:2], measurement[2:4])
         tau_dist = 0.1 + 0.1 * np.sin(t + np.array([0.0, 0.4]))
         if law == 'blf_dsc':
             error = np.sum(w * 0.002**2 / np.pi * np.tan(np.pi * xi1**2 / (2.0 * 0.002**2)))
-            disturbance = 0.5 * np.sum((tau_dist - told.disturbance) ** 2 / gamma)
+            disturbance = 0.5 * np.sum((tau_dist - sample.disturbance) ** 2 / gamma)
         else:
             error, disturbance = 0.5 * np.sum(w * xi1**2), 0.0  # (35) has no d^3
         expected = (
             error,
             0.5 * xi2 @ M @ xi2,
-            0.5 * np.sum((P - told.estimate[:3]) ** 2 / Gamma),
+            0.5 * np.sum((P - sample.estimate[:3]) ** 2 / Gamma),
             disturbance,
         )
-        np.testing.assert_allclose(told.lyapunov, expected, rtol=1e-11, atol=1e-18)
+        np.testing.assert_allclose(sample.lyapunov, expected, rtol=1e-11, atol=1e-18)
 
 
-def test_what_is_not_adapted_does_not_count():
+def test_estimates_that_are_not_adapted_do_not_count():
     frozen = {'learning.adaptation_gain': [0.0, 1.0, 0.0], 'disturbance.gain': [0.0, 50.0]}
     for t, controller, _ in samples('blf_dsc', **frozen):
-        told = controller.sample
+        sample = controller.sample
         tau_dist = 0.1 + 0.1 * np.sin(t)
-        np.testing.assert_allclose(told.lyapunov[2], 0.5 * (P[1] - told.estimate[1]) ** 2)
+        np.testing.assert_allclose(sample.lyapunov[2], 0.5 * (P[1] - sample.estimate[1]) ** 2)
         np.testing.assert_allclose(
-            told.lyapunov[3], 0.5 * (tau_dist - told.disturbance[1]) ** 2 / 50.0, rtol=1e-11
+            sample.lyapunov[3], 0.5 * (tau_dist - sample.disturbance[1]) ** 2 / 50.0, rtol=1e-11
         )
 
 
-def test_without_the_truth_only_the_error_s_term_is_told():
+def test_without_the_truth_only_the_term_of_the_error_is_published():
     for _, controller, _ in samples('blf_dsc', **{'truth.parameters': []}):
         assert controller.sample.lyapunov[0] >= 0.0
         assert np.all(np.isnan(controller.sample.lyapunov[1:]))

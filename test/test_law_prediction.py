@@ -25,11 +25,11 @@ BIAS = (0.3, -0.2)
 
 
 @pytest.mark.parametrize(('n', 'p'), [(1, 1), (2, 3), (3, 4)])
-def test_both_sides_pass_two_exact_poles(n, p):
-    """Against the recursion written out, for any n and p: one pole, and the same again."""
+def test_both_sides_are_filtered_by_two_exact_poles(n, p):
+    """Against the recursion written out, for any n and p: the same pole twice."""
     settings, state, signals = arbitrary(5, n, p)
     random = np.random.default_rng(6)
-    one, two = state.filter1.copy(), state.filter2.copy()
+    first, second = state.filter1.copy(), state.filter2.copy()
     for _ in range(50):
         dt = random.uniform(5e-4, 2e-3)
         torque = random.normal(size=n)
@@ -43,9 +43,9 @@ def test_both_sides_pass_two_exact_poles(n, p):
         X = (rest + signals.rest) / 2.0
         X[:, :p] += (signals.momentum - Yp) / dt
         gain = 1.0 - exp(-settings.pole * dt)
-        one = one + gain * (np.column_stack([X, torque]) - one)
-        two = two + gain * (one - two)
-        np.testing.assert_allclose(signals.row, two, atol=1e-9)  # the quotient is of size 1e3
+        first = first + gain * (np.column_stack([X, torque]) - first)
+        second = second + gain * (first - second)
+        np.testing.assert_allclose(signals.row, second, atol=1e-9)  # the quotient is about 1e3
 
 
 def filtered_rows(sample_time, duration=2.0):
@@ -55,14 +55,14 @@ def filtered_rows(sample_time, duration=2.0):
     rows = []
     for k in range(round(duration / sample_time)):
         t = k * sample_time
-        law.update(t, sample_time, arm.measure())  # its torque is not asked for
+        law.update(t, sample_time, arm.measure())  # its torque is not used
         arm.step(np.array([2.0 * np.sin(3.0 * t), 1.5 * np.cos(5.0 * t)]))
         rows.append(law.signals.row.copy())
     return np.array(rows[1:])
 
 
-def test_bias_columns_are_one_torque_for_each_joint():
-    """Constant columns come out of both poles as what the poles have let through so far."""
+def test_bias_columns_are_a_unit_torque_for_each_joint():
+    """The filtered constant columns are the step response of both poles."""
     rows = filtered_rows(1e-3)
     passed = 1.0 - np.exp(-10.0) * (1.0 + 10.0)  # of a step after 1 s, up to the pole's T
     np.testing.assert_allclose(rows[999, :, 3:5], passed * np.eye(2), atol=1e-4)
@@ -82,7 +82,7 @@ def test_filtered_identity_holds_up_to_the_square_of_the_sample_time():
     assert error[-1] < 1e-6 / 12.0 * 500.0
 
 
-def test_bias_column_takes_up_a_constant_disturbance():
+def test_bias_column_absorbs_a_constant_disturbance():
     rows = filtered_rows(1e-3)
     X, u = rows[:, :, :-1].reshape(-1, 5), rows[:, :, -1].ravel()
 
@@ -100,7 +100,7 @@ def test_loop_learns_the_parameters_and_the_constant_disturbance():
     np.testing.assert_allclose(law.state.estimate, [*P, *BIAS], atol=1e-3)
 
 
-def rows_of_a_loop(torque_source):
+def identity_error(torque_source):
     """Largest error of X theta = u while the actuator is three samples late."""
     law = controller(quick(torque_source=torque_source))
     arm = plant(delay=3, constant=BIAS, amplitude=(0.0, 0.0))
@@ -111,16 +111,16 @@ def rows_of_a_loop(torque_source):
     return worst
 
 
-def test_learning_uses_the_torque_that_was_applied():
-    """With 'effort' the identity survives an actuator delay, with 'command' it does not."""
-    late = rows_of_a_loop(0)
-    right = rows_of_a_loop(EFFORT)
-    assert right < 0.01
-    assert late > 10.0 * right
+def test_learning_uses_the_applied_torque():
+    """With 'effort' the identity holds despite an actuator delay, with 'command' it does not."""
+    of_command = identity_error(0)
+    of_effort = identity_error(EFFORT)
+    assert of_effort < 0.01
+    assert of_command > 10.0 * of_effort
 
 
-def test_learning_from_the_command_uses_it_after_the_limit():
-    """A limit the controller keeps itself is known to it: the identity holds while it cuts."""
+def test_learning_from_the_command_uses_the_saturated_torque():
+    """The controller knows its own limit: the identity holds while the torque is cut."""
     law = controller(quick(torque_limit=np.array([8.5, 20.0])))
     arm = plant(constant=BIAS, amplitude=(0.0, 0.0))
     theta = np.concatenate([P, BIAS])

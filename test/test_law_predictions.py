@@ -23,8 +23,8 @@ LAMBDA = PREDICTIONS.index('lambda')
 
 @pytest.mark.parametrize('omega', [1.0, 30.0, 1000.0])
 @pytest.mark.parametrize('dt', [1e-3, 7e-3])
-def test_differentiating_filter_is_scipy_s_exact_discretisation(omega, dt):
-    """(8) without its hat and with damping 1, for an input that is held over each sample."""
+def test_differentiating_filter_matches_the_exact_discretisation_of_scipy(omega, dt):
+    """(8) without its hat and with damping 1, for an input held over each sample."""
     settings, state, signals = arbitrary(4, omega=omega)
     system = (np.array([[0.0, 1.0], [-(omega**2), -2.0 * omega]]), np.array([[0.0], [omega**2]]))
     A, B, *_ = cont2discrete((*system, np.eye(2), np.zeros((2, 1))), dt)
@@ -48,7 +48,7 @@ def test_differentiating_filter_is_scipy_s_exact_discretisation(omega, dt):
 
 
 def transcribed_row(kind, law, q, dq, tau):
-    """[X | u] as the module's heading writes it, from M, C, G of unit parameters."""
+    """[X | u] as written in the module's docstring, from M, C, G of unit parameters."""
     ddq = law.signals.dalpha2 + law.state.observed_rate
     alpha2, dalpha2 = dq - law.signals.xi2, law.signals.dalpha2
     parts = [dynamics(e, R, q, dq) for e in np.eye(3)]
@@ -60,7 +60,7 @@ def transcribed_row(kind, law, q, dq, tau):
 
 
 @pytest.mark.parametrize('kind', [ACCELERATION, LAMBDA], ids=['acceleration', 'lambda'])
-def test_row_is_its_equation_over_a_closed_loop(kind):
+def test_row_follows_its_equation_in_a_closed_loop(kind):
     law = controller(recommended(prediction=kind, torque_source=EFFORT, omega=60.0))
     for sample in closed_loop(law, plant(delay=1), 0.5):
         q, dq, applied = sample.measurement.reshape(3, 2)
@@ -68,7 +68,7 @@ def test_row_is_its_equation_over_a_closed_loop(kind):
         np.testing.assert_allclose(law.signals.row, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_lambda_is_exact_where_the_error_is_zero_and_of_first_order_elsewhere():
+def test_lambda_is_exact_without_error_and_of_first_order_otherwise():
     """u = Lambda tau against H P for tau = M (alpha2' + xi2') + C (alpha2 + xi2) + G."""
     random = np.random.default_rng(7)
     settings, state, signals = arbitrary(1, 2, 3)
@@ -89,7 +89,7 @@ def test_lambda_is_exact_where_the_error_is_zero_and_of_first_order_elsewhere():
 @pytest.mark.parametrize('kind', ['acceleration', 'lambda', 'filtered'])
 @pytest.mark.parametrize('update', ['gradient', 'newton'])
 def test_every_prediction_learns_the_parameters_without_disturbance(kind, update):
-    """`filtered` at its exactness; the others to the lag of (8) in a window of decayed errors."""
+    """`filtered` is exact; the others are so up to the lag of (8), once the errors have decayed."""
     gains = {'newton': 100.0, 'gradient': 4.0}
     law = {
         'learning.prediction': kind,
@@ -119,18 +119,18 @@ def error_with_filter(omega):
     return np.linalg.norm(found - P) / np.linalg.norm(P)
 
 
-def test_erratum_9_the_filter_s_frequency_is_to_be_large():
-    """Printed is: omega sufficiently small.  The slower (8), the worse its derivative."""
+def test_erratum_9_frequency_of_the_filter_must_be_large():
+    """The paper prints "omega sufficiently small"; the slower (8), the worse its derivative."""
     errors = [error_with_filter(omega) for omega in (1.0, 5.0, 20.0, 100.0)]
     assert np.all(np.diff(errors) < 0.0)
     assert errors[0] > 5e-3  # with 1 / omega = 1 s the start of the run is still in the window
     assert errors[-1] < 5e-4
 
 
-def test_erratum_21_the_filter_starts_at_its_input_with_no_slope():
-    """From anywhere else (8) reports a slope of omega z / e that is not there; 10 / omega ends it.
+def test_erratum_21_filter_starts_at_its_input_with_zero_slope():
+    """From elsewhere (8) reports a false slope of up to omega z / e, which lasts for 10 / omega.
 
-    Printed are hatted initial values, which nobody has before the first sample.
+    The paper prints hatted initial values, which are unknown before the first sample.
     """
     omega, dt, z = 100.0, 1e-3, 0.3
     settings, state, signals = arbitrary(4, omega=omega)
@@ -142,8 +142,8 @@ def test_erratum_21_the_filter_starts_at_its_input_with_no_slope():
         state.samples[0] += 1.0
         slopes.append(abs(state.observed_rate).max())
         if k == 0:
-            own = slopes.pop()
-            assert own == 0.0
+            initial = slopes.pop()
+            assert initial == 0.0
             prediction.differentiate(settings, state, signals, dt)
             assert abs(state.observed_rate).max() == 0.0
             state.observed[:] = 0.0  # as if z^(0) had been taken for zero

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of different units: what the information R of their prior does in the law."""
+"""Parameters of different units: the effect of the information R of their prior."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def window_case(seed, **changes):
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_excitation_is_the_smallest_eigenvalue_relative_to_the_information(seed):
+def test_excitation_is_the_minimum_eigenvalue_relative_to_the_information(seed):
     settings, state, signals, Phi, _ = window_case(seed, prior_weight=0.0)
     found = window.excitation(settings, state, signals, 200)
 
@@ -49,7 +49,7 @@ def test_prior_pulls_the_solution_to_the_initial_estimate_in_its_own_metric():
     np.testing.assert_allclose(signals.b, b + 0.5 * R @ settings.initial_estimate, rtol=1e-12)
 
 
-def test_tracking_error_teaches_each_parameter_in_its_scale():
+def test_tracking_error_adapts_each_parameter_in_its_scale():
     settings, state, signals = arbitrary(1, variance=SCALE**2, kappa=0.0)
     state.latched[0] = 0.0
     before = state.estimate.copy()
@@ -75,7 +75,7 @@ def test_damping_by_the_initial_inertia_is_omega_v_M_xi2():
     )
 
 
-def test_window_of_every_fifth_row_learns_the_same():
+def test_window_of_every_fifth_row_gives_the_same_estimate():
     sparse = controller(quick(row_interval=5, window=200, sigma=1e-9))
     dense = controller(quick(sigma=1e-9))
     runs = [record(law, plant(constant=(0, 0), amplitude=(0, 0)), 4.0) for law in (sparse, dense)]
@@ -86,10 +86,10 @@ def test_window_of_every_fifth_row_learns_the_same():
 
 
 def test_rows_of_a_joint_at_rest_count_less():
-    """Both sides of X theta = u by |dqr| / sqrt(dqr^2 + v^2)."""
+    """Both sides of X theta = u are scaled by |dqr| / sqrt(dqr^2 + v^2)."""
     scaled, plain = (controller(quick(motion_scale=scale)) for scale in (0.05, 0.0))
-    pair = zip(*(closed_loop(law, plant(), 0.5) for law in (scaled, plain)), strict=True)
-    for _ in pair:
+    samples = zip(*(closed_loop(law, plant(), 0.5) for law in (scaled, plain)), strict=True)
+    for _ in samples:
         dqr = abs(plain.signals.dqr[0])
         weight = dqr / sqrt(dqr**2 + 0.05**2)
         np.testing.assert_allclose(scaled.signals.row, weight * plain.signals.row, rtol=1e-9)
@@ -105,7 +105,7 @@ def test_only_estimates_with_a_positive_inertia_are_physical(P2, physical):
     assert consistency.is_physical(law.settings, law.signals, q, theta) == physical
 
 
-def test_damping_needs_no_regressor_where_it_is_off():
+def test_momentum_regressor_is_not_evaluated_without_damping():
     law = controller(recommended())
     law.update(0.0, 1e-3, np.array([2.2935, 1.6961, 0.3, -0.2, 0.0, 0.0]))
     Yp = law.signals.momentum.copy()

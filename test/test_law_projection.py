@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The projection keeps P^ in its ball, and keeps the Lyapunov function (29) falling."""
+"""The projection keeps P^ in its ball, and keeps the Lyapunov function (29) decreasing."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_no_step_leaves_the_ball(seed, size, speed, radius):
         assert np.linalg.norm(estimate) <= radius * (1.0 + 1e-15)
 
 
-def test_inside_the_ball_nothing_is_changed():
+def test_nothing_is_changed_inside_the_ball():
     estimate, rate = np.array([1.0, -2.0, 1.9]), np.array([1e3, -5.0, 7.0])
     np.testing.assert_array_equal(projected(estimate, rate), rate)
     before = estimate.copy()
@@ -54,14 +54,14 @@ def test_inside_the_ball_nothing_is_changed():
     np.testing.assert_array_equal(estimate, before)
 
 
-def test_at_the_ball_what_leads_inward_or_along_is_kept():
+def test_inward_and_tangential_rates_are_kept_on_the_sphere():
     estimate = np.array([RADIUS, 0.0, 0.0])
     for rate in (np.array([-1.0, 4.0, 2.0]), np.array([0.0, 4.0, 2.0])):
         np.testing.assert_array_equal(projected(estimate, rate), rate)
 
 
 @pytest.mark.parametrize('seed', range(10))
-def test_at_the_ball_nothing_outward_is_left(seed):
+def test_outward_part_of_the_rate_is_removed_on_the_sphere(seed):
     random = np.random.default_rng(seed)
     w = on_sphere(random)
     v = random.normal(size=3)
@@ -74,8 +74,8 @@ def test_at_the_ball_nothing_outward_is_left(seed):
     assert w @ rate == pytest.approx(0.0, abs=1e-13)
 
 
-def test_a_retracted_estimate_counts_as_on_the_sphere():
-    """It is there up to a rounding, either way: or half the steps would go unprojected."""
+def test_retracted_estimate_counts_as_on_the_sphere():
+    """Even if rounding puts it just inside: otherwise half the steps would not be projected."""
     for seed in range(100):
         random = np.random.default_rng(seed)
         w, v = random.normal(size=(2, 3))
@@ -87,7 +87,7 @@ def test_a_retracted_estimate_counts_as_on_the_sphere():
 
 
 @pytest.mark.parametrize('seed', range(200))
-def test_projection_never_slows_the_fall_of_the_lyapunov_function(seed):
+def test_projection_never_slows_the_decrease_of_the_lyapunov_function(seed):
     """d/dt (1/2 P~^T Gamma^-1 P~) = -P~^T Gamma^-1 P^', for any true P inside the ball."""
     random = np.random.default_rng(seed)
     w, v = on_sphere(random), random.normal(size=3)
@@ -98,8 +98,8 @@ def test_projection_never_slows_the_fall_of_the_lyapunov_function(seed):
 
 
 @pytest.mark.parametrize('seed', range(100))
-def test_a_retracted_estimate_is_the_nearest_of_the_ball_in_the_metric_of_gamma(seed):
-    """Then no true P inside the ball gets farther: 1/2 P~^T Gamma^-1 P~ does not grow."""
+def test_retracted_estimate_is_the_nearest_in_the_ball_in_the_metric_of_gamma(seed):
+    """Then 1/2 P~^T Gamma^-1 P~ does not grow for any true P inside the ball."""
     random = np.random.default_rng(seed)
     gain = 10.0 ** random.uniform(-3.0, 3.0, 4)
     outside = random.normal(size=4)
@@ -108,7 +108,7 @@ def test_a_retracted_estimate_is_the_nearest_of_the_ball_in_the_metric_of_gamma(
 
     projection.retract(inside, gain, RADIUS)
 
-    # Nearest: what is left of the way out is Gamma w nu, in each direction with the same nu > 0.
+    # Nearest: the difference is Gamma w nu, with the same nu > 0 in each direction.
     nu = (outside - inside) / (gain * inside)
     np.testing.assert_allclose(nu, np.full(4, nu.max()), rtol=1e-6)
     assert nu.min() > 0.0
@@ -119,14 +119,14 @@ def test_a_retracted_estimate_is_the_nearest_of_the_ball_in_the_metric_of_gamma(
         assert after <= before * (1.0 + 1e-9)
 
 
-def test_an_even_gamma_retracts_along_the_radius():
+def test_uniform_gamma_retracts_along_the_radius():
     estimate = np.array([3.0, 4.0])
     projection.retract(estimate, np.array([0.5, 0.5]), 2.5)
     np.testing.assert_allclose(estimate, [1.5, 2.0], rtol=1e-15)
 
 
 @pytest.mark.parametrize('bad', [np.nan, np.inf])
-def test_what_is_no_number_is_left_for_the_supervisor_to_see(bad):
+def test_non_finite_estimates_are_left_for_the_supervisor(bad):
     estimate = np.array([bad, 1.0, 1.0])
     projection.retract(estimate, GAIN, RADIUS)
     assert not np.isfinite(estimate[0])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The limits on the torque and on its rate: what is cut, what is counted, what learns of it."""
+"""The limits on the torque and on its rate: cuts, their counts and their effect on learning."""
 
 from __future__ import annotations
 
@@ -33,32 +33,32 @@ def cut(demand, last, *, level=10.0, rate=500.0, samples=7.0):
         (12.0, 9.5, 10.0, LEVEL_CUT),
         (12.0, 5.0, 6.0, LEVEL_CUT + RATE_CUT),
         (-12.0, -9.0, -10.0, LEVEL_CUT),
-        (13.0, 14.0, 10.0, LEVEL_CUT + RATE_CUT),  # the level has been lowered below the last one
+        (13.0, 14.0, 10.0, LEVEL_CUT + RATE_CUT),  # the level was lowered below the last torque
     ],
 )
-def test_torque_saturated_at_its_level_and_at_its_rate(demand, last, torque, cuts):
-    answer, told, saturated, state = cut(demand, last)
-    assert (answer, told) == (torque, cuts)
+def test_torque_saturates_at_its_level_and_at_its_rate(demand, last, torque, cuts):
+    applied, reported, saturated, state = cut(demand, last)
+    assert (applied, reported) == (torque, cuts)
     assert bool(saturated) is (cuts > 0.0)
     assert state.level_cuts[0] == (cuts in {LEVEL_CUT, LEVEL_CUT + RATE_CUT})
     assert state.rate_cuts[0] == (cuts in {RATE_CUT, LEVEL_CUT + RATE_CUT})
 
 
-def test_without_a_rate_limit_any_change_is_allowed():
+def test_any_change_is_allowed_without_a_rate_limit():
     assert cut(9.0, -9.0, rate=0.0)[:2] == (9.0, 0.0)
 
 
-def test_the_first_torque_has_none_before_it():
+def test_rate_limit_does_not_apply_to_the_first_torque():
     assert cut(9.0, 0.0, samples=0.0)[:2] == (9.0, 0.0)
 
 
-def test_a_demand_that_is_no_number_stays_none():
-    """It must not turn into a torque that looks like one."""
+def test_nan_demand_stays_nan():
+    """It must not turn into a torque that looks valid."""
     assert np.isnan(cut(np.nan, 3.0)[0])
     assert np.isnan(cut(np.nan, 3.0, rate=0.0)[0])
 
 
-def test_over_a_loop_no_step_is_larger_than_the_rate_and_every_cut_is_counted_by_joint():
+def test_loop_keeps_the_rate_limit_and_counts_every_cut_by_joint():
     rates = np.array([450.0, 80.0])
     law = controller(recommended(rate_limit=rates))  # which hardly disturbs the loop
     torques, cuts = [], []
@@ -74,7 +74,7 @@ def test_over_a_loop_no_step_is_larger_than_the_rate_and_every_cut_is_counted_by
     np.testing.assert_array_equal(law.state.level_cuts, 0.0)
 
 
-def test_while_one_joint_saturated_the_tracking_error_teaches_nothing():
+def test_tracking_error_does_not_adapt_while_one_joint_is_saturated():
     law = controller(quick(rate_limit=np.array([0.1, 0.0])))
     loop = closed_loop(law, plant(), 0.3)
     next(loop)
@@ -90,8 +90,8 @@ def test_while_one_joint_saturated_the_tracking_error_teaches_nothing():
     [{'rate_limit': np.array([400.0, 150.0])}, {'torque_limit': np.array([10.5, 4.0])}],
     ids=['rate', 'level'],
 )
-def test_learning_sees_the_torque_that_was_applied(changes):
-    """The torque is cut in many samples; had they been learned from as asked for, P^ were wrong."""
+def test_learning_uses_the_applied_torque(changes):
+    """Many samples are cut; learning from their demanded torque would make P^ wrong."""
     law = controller(recommended(**changes))
     run = record(law, plant(), 12.0)
     assert np.maximum(law.state.level_cuts, law.state.rate_cuts).max() > 30.0

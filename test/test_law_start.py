@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A start outside the barrier is refused, naming joint, error and bound."""
+"""A start outside the barrier is rejected, naming joint, error and bound."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from blf_dsc_controller.errors import BlfDscError, OutsideBarrierError
 
 @pytest.mark.parametrize('error', [0.002, -0.0021, 1.5, np.nan])
 @pytest.mark.parametrize('joint', [0, 1])
-def test_a_start_outside_the_barrier_is_refused_by_name(joint, error):
+def test_start_outside_the_barrier_is_rejected_by_name(joint, error):
     law = controller(recommended())
     q = np.array([1.9935, 1.3961]) + 0.3  # the reference at t = 0
     law.check_start(JOINTS, q)
     q[joint] += error * (1.0 + 1e-9)
 
-    with pytest.raises(OutsideBarrierError) as refusal:
+    with pytest.raises(OutsideBarrierError) as caught:
         law.check_start(JOINTS, q)
 
-    assert isinstance(refusal.value, BlfDscError)
-    assert (refusal.value.joint, refusal.value.bound) == (JOINTS[joint], 0.002)
-    assert refusal.value.error == pytest.approx(error, rel=1e-6, nan_ok=True)
+    assert isinstance(caught.value, BlfDscError)
+    assert (caught.value.joint, caught.value.bound) == (JOINTS[joint], 0.002)
+    assert caught.value.error == pytest.approx(error, rel=1e-6, nan_ok=True)
     for part in (JOINTS[joint], f'{error:+.6g} rad', '0.002 rad'):
-        assert part in str(refusal.value)
+        assert part in str(caught.value)
 
 
-def test_a_start_is_judged_by_the_reference_of_its_time():
+def test_start_is_checked_against_the_reference_at_its_time():
     law = controller(recommended())
     law.check_start(JOINTS, np.array(START))
     with pytest.raises(OutsideBarrierError):

@@ -41,7 +41,7 @@ SIZES = ('n', 'p', 'm', 'tones', 'model')
 
 
 def distinct_settings(n, p):
-    """Settings in which no two numbers are the same, but n, p and m are what they must be."""
+    """Settings whose numbers are all distinct, except for the sizes."""
     settings = arbitrary_settings(np.random.default_rng(0), n, p)
     number = iter(range(1000, 10_000))
     values = {}
@@ -56,7 +56,7 @@ def distinct_settings(n, p):
 
 
 @pytest.mark.parametrize(('n', 'p'), SHAPES)
-def test_settings_come_out_of_their_vector_as_they_went_in(n, p):
+def test_settings_survive_packing_and_unpacking(n, p):
     settings = distinct_settings(n, p)
 
     unpacked = settings_of(pack(settings), settings.model)
@@ -74,7 +74,7 @@ def test_views_cover_their_vectors_exactly_once(n, p):
     sizes = state_size(settings), signals_size(settings), sample_size(settings)
     state, signals, sample = (np.arange(float(size)) for size in sizes)
 
-    for places, size in zip(
+    for views, size in zip(
         (
             state_of(state, settings),
             signals_of(signals, settings),
@@ -84,17 +84,17 @@ def test_views_cover_their_vectors_exactly_once(n, p):
         strict=True,
     ):
         np.testing.assert_array_equal(
-            np.sort(np.concatenate([part.ravel() for part in places])), np.arange(size)
+            np.sort(np.concatenate([part.ravel() for part in views])), np.arange(size)
         )
 
 
-def assert_shapes(view, named):
-    for shape, names in named.items():
+def assert_shapes(view, shapes):
+    for shape, names in shapes.items():
         for name in names.split():
             assert getattr(view, name).shape == shape, name
 
 
-def test_state_has_the_shapes_it_is_documented_with():
+def test_state_has_the_documented_shapes():
     n, p, m, N = 3, 4, 7, 8
     settings = arbitrary_settings(np.random.default_rng(0), n, p)
     assert_shapes(
@@ -113,7 +113,7 @@ def test_state_has_the_shapes_it_is_documented_with():
     )
 
 
-def test_signals_have_the_shapes_they_are_documented_with():
+def test_signals_have_the_documented_shapes():
     n, p, m = 3, 4, 7
     settings = arbitrary_settings(np.random.default_rng(0), n, p)
     assert_shapes(
@@ -130,7 +130,7 @@ def test_signals_have_the_shapes_they_are_documented_with():
     )
 
 
-def test_sample_tells_what_the_update_computed():
+def test_sample_contains_what_the_update_computed():
     law = controller(quick(sigma=-1.0))
     record(law, plant(), 1.3)
     assert law.state.latched[0] == 1.0
@@ -142,8 +142,8 @@ def test_sample_tells_what_the_update_computed():
         assert np.all(getattr(law.sample, name) != 0.0), name
 
 
-def test_a_restored_loop_continues_bit_for_bit():
-    """From any sample, also in another controller; the state vector is all there is."""
+def test_restored_loop_continues_bit_for_bit():
+    """The state vector is the complete state, so another controller can continue from it too."""
     law, arm = controller(quick()), plant(noise=1e-5, differenced=True, delay=2)
     record(law, arm, 1.337)
     saved, saved_arm = law.save(), arm.save()
@@ -174,7 +174,7 @@ def many_updates(model, settings, law, state, signals, measurement, sample, chec
 
 
 def test_updates_in_a_compiled_loop_allocate_nothing():
-    """Handing over the vectors costs a few, the same however many updates there are."""
+    """Passing the vectors allocates a little, independently of the number of updates."""
     law = controller(quick(window=50, learning_start=0.01, sigma=-1.0))
     measurement = np.array([*START, *np.zeros(4)])
     vectors = (
@@ -208,8 +208,8 @@ print(*record(controller(settings), plant(), 0.4).torque[-1])
 """
 
 
-def test_interpreted_kernels_compute_the_same():
-    """Without numba's compiler the last bits differ (its libm, its order), and no more."""
+def test_interpreted_kernels_compute_the_same_torque():
+    """Without numba's compiler only the last bits differ (its libm, its order of operations)."""
     here = Path(__file__).parent
     environment = os.environ | {
         'NUMBA_DISABLE_JIT': '1',
@@ -229,8 +229,8 @@ def test_interpreted_kernels_compute_the_same():
     np.testing.assert_allclose(np.array(run.stdout.split(), dtype=float), torque, rtol=1e-9)
 
 
-def test_the_first_answer_holds_the_virtual_control():
-    """alpha2(0) = beta2(0) is set by the first sample and not by the constructor's warm-up."""
+def test_first_update_starts_the_filter_at_the_virtual_control():
+    """alpha2(0) = beta2(0) is set by the first sample, not by the constructor's warm-up."""
     law = controller(recommended())
     next(closed_loop(law, plant(), 1.0))
     np.testing.assert_array_equal(law.signals.dalpha2, 0.0)

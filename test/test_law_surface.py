@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The virtual control (15), (18) without its 0/0, and the filter (13) without a step error."""
+"""The virtual control (15), (18) without 0/0, and the filter (13) without discretisation error."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def virtual_control(xi1):
 
 
 @pytest.mark.parametrize('xi1', [*np.linspace(-0.999, -0.01, 9), *np.linspace(0.01, 0.999, 9)])
-def test_virtual_control_is_the_printed_one_away_from_zero(xi1):
+def test_virtual_control_matches_the_paper_away_from_zero(xi1):
     xi1 *= BOUND
     s = pi * xi1**2 / (2.0 * BOUND**2)
     tau_aux = -K * BOUND**2 / (xi1 * pi) * sin(s) * cos(s)
@@ -41,7 +41,7 @@ def test_virtual_control_near_zero_is_linear(xi1):
 
 
 @pytest.mark.parametrize('xi1', [BOUND, 1.2 * BOUND, 10.0 * BOUND])
-def test_at_and_beyond_the_bound_only_the_linear_part_is_left(xi1):
+def test_only_the_linear_part_remains_at_and_beyond_the_bound(xi1):
     assert virtual_control(xi1) == DQR - MU * xi1
     assert virtual_control(-xi1) == DQR + MU * xi1
 
@@ -53,7 +53,7 @@ def test_barrier_part_falls_to_zero_at_the_bound_continuously():
     assert part == pytest.approx(K / 2.0 * BOUND * 2.0 * e, abs=1e-15)
 
 
-def test_sinc_series_meets_the_quotient():
+def test_sinc_series_matches_the_quotient():
     switch = 1e-4
     assert surface.sinc(0.0) == 1.0
     assert surface.sinc(np.nextafter(switch, 0.0)) == pytest.approx(surface.sinc(switch), abs=3e-16)
@@ -63,7 +63,7 @@ def test_sinc_series_meets_the_quotient():
 
 
 @pytest.mark.parametrize('dt', [1e-5, 1e-3, 2e-3, 1.0])
-def test_filter_step_is_the_solution_for_a_held_input(dt):
+def test_filter_step_is_exact_for_a_held_input(dt):
     """lambda alpha' + alpha = beta from alpha0: alpha = beta + (alpha0 - beta) exp(-t / lambda)."""
     time_constant, alpha, beta = 0.002, 0.7, -0.4
     step = surface.filter_gain(time_constant, dt) * (beta - alpha)
@@ -73,7 +73,7 @@ def test_filter_step_is_the_solution_for_a_held_input(dt):
     )
 
 
-def test_two_half_steps_are_one_step():
+def test_two_half_steps_equal_one_full_step():
     whole, half = surface.filter_gain(0.002, 1e-3), surface.filter_gain(0.002, 0.5e-3)
     assert 1.0 - (1.0 - half) ** 2 == pytest.approx(whole, rel=1e-14)
 
@@ -99,7 +99,7 @@ def test_law_follows_the_filter_from_the_first_virtual_control():
 
         np.testing.assert_allclose(law.signals.beta2, beta2, atol=1e-12)
         np.testing.assert_allclose(law.signals.xi2, dq - alpha2, atol=1e-12)
-        following = beta2 + (alpha2 - beta2) * exp(-1e-3 / settings.time_constant)
-        np.testing.assert_allclose(law.signals.dalpha2, (following - alpha2) / 1e-3, atol=1e-9)
-        alpha2 = following
+        next_alpha2 = beta2 + (alpha2 - beta2) * exp(-1e-3 / settings.time_constant)
+        np.testing.assert_allclose(law.signals.dalpha2, (next_alpha2 - alpha2) / 1e-3, atol=1e-9)
+        alpha2 = next_alpha2
         np.testing.assert_allclose(law.state.alpha2, alpha2, atol=1e-12)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The torque (28) over whole closed loops, against the law written in plain numpy; its limit."""
+"""The torque (28) in closed loop against the law written in plain numpy, and the torque limit."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from plain_law import PlainLaw
 
 from blf_dsc_controller.law.settings import EFFORT, UPDATES
 
-# A window that is no multiple of the interval, and nearly a second more to learn in. So short a
-# window conditions Phi as 1e7; rho = 10 keeps the rounding that this multiplies below 1e-12, but
-# would spoil the inverse iteration: every window counts as excited.
+# The window is not a multiple of the interval, and learning lasts nearly a second. For so short
+# a window the condition number of Phi is 1e7; rho = 10 keeps the amplified rounding below 1e-12,
+# but would spoil the inverse iteration, so every window counts as excited.
 SHORT = {'window': 497, 'interval': 7, 'learning_start': 0.6, 'rho': 10.0, 'sigma': -1.0}
 ROUNDING = 1e-12
 GRADIENT = UPDATES.index('gradient')
@@ -41,7 +41,7 @@ CASES = {
 
 
 def differences(settings, arm, duration=1.5):
-    """Largest difference of torque, estimate and d^3 between the law and its oracle in a loop."""
+    """Largest difference of torque, estimate and d^3 between law and oracle in closed loop."""
     law, plain = controller(settings), PlainLaw(settings)
     worst, dt = np.zeros(3), arm.period_ns * 1e-9
     for sample in closed_loop(law, arm, duration):
@@ -52,37 +52,37 @@ def differences(settings, arm, duration=1.5):
             (law.state.estimate, plain.theta),
             (law.state.disturbance, plain.d3),
         )
-        worst = np.maximum(worst, [np.abs(mine - other).max() for mine, other in pairs])
+        worst = np.maximum(worst, [np.abs(actual - expected).max() for actual, expected in pairs])
     assert law.state.latched[0] == 1.0
     assert plain.latched is not None
     return worst
 
 
 @pytest.mark.parametrize(('gains', 'arm'), CASES.values(), ids=CASES)
-def test_torque_and_estimates_are_the_written_law_s_over_a_closed_loop(gains, arm):
+def test_torque_and_estimates_match_the_plain_law_in_closed_loop(gains, arm):
     np.testing.assert_array_less(differences(quick(**SHORT | gains), plant(**arm)), ROUNDING)
 
 
-def test_recommended_gains_give_the_written_law_s_torque_up_to_the_conditioning():
-    """With rho = 1e-5 the same 1e-16 of the window's terms comes out 1e7 times as large."""
+def test_recommended_gains_match_the_plain_law_up_to_conditioning():
+    """With rho = 1e-5 the rounding of 1e-16 in the window's terms is amplified by 1e7."""
     np.testing.assert_array_less(
         differences(quick(**SHORT | {'rho': 1e-5, 'sigma': 5e-6}), plant()), 1e-8
     )
 
 
-def test_torque_never_exceeds_its_limit_and_the_demand_is_told():
+def test_torque_never_exceeds_its_limit_and_the_demand_is_reported():
     limit = np.array([8.0, 5.0])
     law = controller(quick(torque_limit=limit))
-    cut = 0
+    saturated = 0
     for _ in closed_loop(law, plant(), 1.0):
         np.testing.assert_array_equal(
             law.signals.torque, np.clip(law.signals.demand, -limit, limit)
         )
-        cut += np.any(law.signals.torque != law.signals.demand)
-    assert cut > 0
+        saturated += np.any(law.signals.torque != law.signals.demand)
+    assert saturated > 0
 
 
-def test_at_its_limit_the_torque_stops_the_learning_from_the_tracking_error():
+def test_saturated_torque_stops_learning_from_the_tracking_error():
     """One joint at its limit freezes d^3 and, without a latched window, all parameters."""
     law = controller(quick(torque_limit=np.array([1e-3, 20.0])))
     estimate = law.state.estimate.copy()
@@ -92,14 +92,14 @@ def test_at_its_limit_the_torque_stops_the_learning_from_the_tracking_error():
     np.testing.assert_array_equal(law.state.disturbance, 0.0)
 
 
-def test_same_run_twice_is_the_same_bit_for_bit():
+def test_repeated_run_is_identical_bit_for_bit():
     runs = [record(controller(quick()), plant(noise=1e-5, seed=3), 1.5) for _ in range(2)]
     np.testing.assert_array_equal(runs[0].torque, runs[1].torque)
 
 
-def test_reset_forgets_everything():
+def test_reset_clears_everything():
     law = controller(quick())
     first = record(law, plant(), 1.5)
     law.reset()
-    again = record(law, plant(), 1.5)
-    np.testing.assert_array_equal(first.torque, again.torque)
+    second = record(law, plant(), 1.5)
+    np.testing.assert_array_equal(first.torque, second.torque)

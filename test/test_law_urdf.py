@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller of an arm from its URDF: what follows from the file, and the law with it."""
+"""The controller of an arm given by its URDF: defaults derived from the file, and the law."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def panda(**changes):
     return build(ControllerConfig, ARM | {k.replace('__', '.'): v for k, v in changes.items()})
 
 
-def test_an_arm_needs_no_more_than_its_urdf_and_its_tip():
+def test_urdf_and_tip_are_enough_to_configure_an_arm():
     config = panda()
 
     assert config.joints == tuple(f'panda_joint{i}' for i in range(1, 8))
@@ -38,7 +38,7 @@ def test_an_arm_needs_no_more_than_its_urdf_and_its_tip():
     assert {'m*cx7', 'rotor7', 'viscous panda_joint1', 'coulomb panda_joint7'} <= set(names)
 
 
-def test_what_is_given_counts_and_the_rest_follows():
+def test_given_parameters_override_the_derived_ones():
     config = panda(barrier__bound=[0.01] * 7, robot__lag=0.002)
     assert config.barrier.bound == (0.01,) * 7
     assert config.feedback.damping_rate == pytest.approx(
@@ -47,7 +47,7 @@ def test_what_is_given_counts_and_the_rest_follows():
     assert change(config, {'feedback.damping_rate': 5.0}).feedback.damping_rate == 5.0
 
 
-def test_text_of_a_urdf_is_as_good_as_its_file():
+def test_urdf_may_be_given_as_text_or_file():
     file = CONFIG / 'panda.urdf'
     assert panda(robot__urdf=file.read_text()).learning == panda(robot__urdf=str(file)).learning
 
@@ -69,7 +69,7 @@ def test_text_of_a_urdf_is_as_good_as_its_file():
         ),
     ],
 )
-def test_what_is_wrong_with_an_arm_is_said(changes, message):
+def test_problems_with_an_arm_are_reported(changes, message):
     with pytest.raises(ConfigurationError, match=message):
         build(ControllerConfig, ARM | changes)
 
@@ -104,9 +104,9 @@ def test_gravity_is_compensated_with_the_initial_estimate():
     np.testing.assert_allclose(torque, gravity, atol=0.02)  # P^(0) has four digits
 
 
-def test_bound_begins_as_a_funnel_where_an_unknown_load_makes_the_arm_sag():
+def test_bound_starts_as_a_funnel_where_an_unknown_load_makes_the_arm_sag():
     barrier = panda().barrier
-    assert barrier.initial_bound[0] == 0.0  # about the vertical
+    assert barrier.initial_bound[0] == 0.0  # its axis is vertical
     assert 0.01 < barrier.initial_bound[5] < 0.03
     assert panda(robot__payload=0.0).barrier.initial_bound[5] < 0.2 * barrier.initial_bound[5]
     wide = panda(barrier__bound=[0.03] * 7).barrier
@@ -115,7 +115,7 @@ def test_bound_begins_as_a_funnel_where_an_unknown_load_makes_the_arm_sag():
 
 
 @pytest.mark.parametrize('seed', range(2))
-def test_undeclared_rated_load_is_within_the_bound_from_the_start(seed):
+def test_bound_holds_from_the_start_with_an_undeclared_rated_load(seed):
     plant = {'duration': 1.5, 'truth.seed': seed, 'events.payload': [3.0]}
     plant |= {'events.begin': [0.0], 'events.duration': [0.0]}
 
@@ -123,16 +123,16 @@ def test_undeclared_rated_load_is_within_the_bound_from_the_start(seed):
         loop = load_loop('panda', {'sim_plant': plant, 'blf_dsc_controller': law})
         return simulate(loop.controller, loop.plant).run()
 
-    found = run()
-    assert np.abs(found.error).max() > 0.005
-    assert np.all(np.abs(found.error) < 0.6 * found.bound)
-    assert np.all(found.bound[-1] < 0.0051)
-    assert not found.stops
+    result = run()
+    assert np.abs(result.error).max() > 0.005
+    assert np.all(np.abs(result.error) < 0.6 * result.bound)
+    assert np.all(result.bound[-1] < 0.0051)
+    assert not result.stops
     assert run(**{'barrier.initial_bound': [0.0] * 7}).stops  # with a constant bound
 
 
 @pytest.mark.parametrize('learn', ['base', 'payload', 'scale'])
-def test_drives_of_unknown_effort_are_learned_from_zero(learn):
+def test_drives_with_unknown_effort_limit_get_a_finite_prior(learn):
     text = (CONFIG / 'panda.urdf').read_text().replace('effort="12"', 'effort="0"')
     config = panda(robot__urdf=text, robot__learn=learn)
     assert np.all(np.isfinite(settings_of_config(config).information))
@@ -140,8 +140,8 @@ def test_drives_of_unknown_effort_are_learned_from_zero(learn):
     assert deviation[estimate_names(config).index('rotor7')] >= 0.01
 
 
-def test_prismatic_joints_and_a_third_arm_need_nothing_else():
-    given = {'model': 'urdf', 'robot.urdf': random_urdf(4, seed=3)[0]}  # it does not branch
+def test_random_arm_with_prismatic_joints_needs_only_its_urdf():
+    given = {'model': 'urdf', 'robot.urdf': random_urdf(4, seed=3)[0]}  # one chain: no tip needed
     config = build(ControllerConfig, given)
     assert config.joints == ('j1', 'j2', 'j3', 'j4')
     assert np.all(np.isfinite(settings_of_config(config).information))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sliding window is the direct sum over what it holds: always, for any shape, without drift."""
+"""The sliding window equals the direct sum over its rows: always, for any shape, without drift."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from blf_dsc_controller.law import window
 
 
 class Window:
-    """A window beside its history, and beside the running sum that never starts afresh."""
+    """A window, its history, and for comparison a running sum that is never restarted."""
 
     def __init__(self, n, m, length):
         self.ring = np.zeros((length, n, m + 1))
@@ -50,7 +50,7 @@ def terms(row):
 @given(
     st.integers(1, 4), st.integers(1, 7), st.integers(1, 9), st.integers(1, 40), st.integers(0, 99)
 )
-def test_window_is_the_direct_sum_filled_or_not(n, m, length, pushes, seed):
+def test_window_equals_the_direct_sum_whether_full_or_not(n, m, length, pushes, seed):
     random = np.random.default_rng(seed)
     sliding = Window(n, m, length)
     for _ in range(pushes):
@@ -68,8 +68,8 @@ def test_window_is_the_direct_sum_filled_or_not(n, m, length, pushes, seed):
     np.testing.assert_allclose(b, np.einsum('kia,ki->a', X, u) / len(rows), atol=1e-13 * n * pushes)
 
 
-def test_at_every_wrap_the_sum_is_exactly_that_of_the_ring():
-    """However long it has run: the last bit is that of summing the ring, so nothing can drift."""
+def test_sum_equals_that_of_the_ring_exactly_at_every_wrap():
+    """At each wrap every bit is that of a new sum over the ring, so nothing can drift."""
     random = np.random.default_rng(3)
     sliding = Window(2, 3, 25)
     for push in range(1, 200 * 25 + 1):
@@ -80,8 +80,8 @@ def test_at_every_wrap_the_sum_is_exactly_that_of_the_ring():
     assert not np.array_equal(sliding.naive, sliding.direct())
 
 
-def test_a_large_transient_leaves_no_trace_after_a_wrap():
-    """Terms of 1e16 round at 1; a running sum keeps that error for ever, the window one wrap."""
+def test_large_transient_leaves_no_trace_after_a_wrap():
+    """Terms of 1e16 round at 1; a running sum keeps that error forever, the window for one wrap."""
     random = np.random.default_rng(4)
     sliding = Window(2, 3, 10)
     for push in range(60):
@@ -93,7 +93,7 @@ def test_a_large_transient_leaves_no_trace_after_a_wrap():
 
 
 @pytest.mark.parametrize('length', [1, 7])
-def test_constant_rows_average_to_themselves_from_the_first_on(length):
+def test_constant_rows_average_to_themselves_from_the_first_row_on(length):
     row = np.array([[1.0, 2.0, 5.0], [0.5, -1.0, 3.0]])
     sliding = Window(2, 2, length)
     for _ in range(3 * length):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parameter `robot.learn` from the file to the pictures: an arm whose load alone is unknown."""
+"""The parameter `robot.learn` from file to figures: an arm of which only the load is unknown."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ LEARN_PAYLOAD = {
 }
 
 
-def written(path, **robot):
-    """Parameter file of that arm, with changes of its group `robot`."""
-    sections = {name: {'ros__parameters': dict(one)} for name, one in LEARN_PAYLOAD.items()}
+def write_config(path, **robot):
+    """Write the parameter file of that arm, with changes to its group `robot`."""
+    sections = {name: {'ros__parameters': dict(values)} for name, values in LEARN_PAYLOAD.items()}
     common = sections['/**']['ros__parameters']
     common['robot'] = common['robot'] | robot
     path.write_text(yaml.safe_dump(sections), encoding='utf-8')
@@ -52,48 +52,48 @@ def written(path, **robot):
 
 @pytest.fixture(scope='module')
 def out(tmp_path_factory):
-    """Folder of a run, over ROS if it is there."""
+    """Folder of a run, over ROS if it is installed."""
     folder = tmp_path_factory.mktemp('run')
     mode = ['--mode', 'lockstep'] if importlib.util.find_spec('rclpy') else ['--offline']
-    arguments = ['--config', written(folder / 'my.yaml'), '--duration', DURATION]
+    arguments = ['--config', write_config(folder / 'my.yaml'), '--duration', DURATION]
     before = dict(os.environ)
     assert main(['run', *mode, *map(str, [*arguments, '--out', folder / 'out'])]) == 0
-    assert dict(os.environ) == before  # not in the domain of the run, which the next may take
+    assert dict(os.environ) == before  # the ROS domain of the run is not left behind
     return folder / 'out'
 
 
-def test_a_load_is_known_within_a_window_of_poor_motion(out):
+def test_load_is_learned_within_a_window_of_poor_excitation(out):
     summary = json.loads((out / 'summary.json').read_text(encoding='utf-8'))
     learning = summary['learning']
     assert learning['latch_time_s'] < 2.5
-    # The arm moves almost ideally; what is left is the weight of the prior.
+    # The simulated arm is nearly ideal; the rest is due to the weight of the prior.
     assert learning['final_torque_error'] < 0.01
     assert learning['final_estimate']['load m'] == pytest.approx(2.0, rel=0.02)
     assert learning['final_estimate']['links'] == pytest.approx(1.0, abs=0.001)
     assert learning['true_parameters_of_other_names'] == []
 
 
-def test_torque_error_is_that_of_the_base_parameters_of_the_plant(out):
+def test_torque_error_is_relative_to_the_base_parameters_of_the_plant(out):
     run = read_run(out / 'bag')
     estimates, loop = estimates_of(run), load_loop(out / 'config.yaml')
     names, regressor = run.arm.base
     P = parameters_of(loop.plant)
-    H, whole = np.zeros((7, len(estimates.names))), np.zeros((7, P.size))
-    off, size = 0.0, 0.0
+    H, H_base = np.zeros((7, len(estimates.names))), np.zeros((7, P.size))
+    error, total = 0.0, 0.0
     for q in run.reference[1::7]:
-        at = (q, np.zeros(7), np.zeros(7), np.zeros(7))
-        run.arm.regressor(*at, H)
-        regressor(*at, whole)
-        off += np.sum((H @ estimates.estimate[-1] - whole @ P) ** 2)
-        size += np.sum((whole @ P) ** 2)
+        state = (q, np.zeros(7), np.zeros(7), np.zeros(7))
+        run.arm.regressor(*state, H)
+        regressor(*state, H_base)
+        error += np.sum((H @ estimates.estimate[-1] - H_base @ P) ** 2)
+        total += np.sum((H_base @ P) ** 2)
     assert run.truth.names[: P.size] == names
-    # It hardly moves: nearly all of its torque is gravity.
-    assert estimates.relative_error[-1] == pytest.approx(np.sqrt(off / size), rel=0.1)
+    # The arm hardly moves: nearly all of its torque is gravity.
+    assert estimates.relative_error[-1] == pytest.approx(np.sqrt(error / total), rel=0.1)
 
 
-def test_pictures_show_the_load_in_its_units(out):
+def test_figures_show_the_load_in_its_units(out):
     assert (out / 'parameters.png').stat().st_size > 10_000
-    shown = {one.title: one for one in panels([read_run(out / 'bag')])}
+    shown = {panel.title: panel for panel in panels([read_run(out / 'bag')])}
     (mass,) = shown['load [kg]'].lines
     assert (mass.name, shown['load [kg]'].unit) == ('m', 'kg')
     assert mass.values[-1] == pytest.approx(2.0, rel=0.02)
@@ -105,13 +105,13 @@ def test_pictures_show_the_load_in_its_units(out):
     assert 'torque error' in shown
 
 
-def test_replay_without_ros_is_the_same_bit_for_bit(out):
+def test_replay_without_ros_is_identical_bit_for_bit(out):
     result = verify(out / 'bag')
     assert result.difference is None
-    assert sum(one.values for one in result.comparisons) > 50 * DURATION * 1000
+    assert sum(comparison.values for comparison in result.comparisons) > 50 * DURATION * 1000
 
 
-def test_defaults_fit_the_form():
+def test_defaults_depend_on_the_learned_form():
     base, payload, scale = (panda(robot__learn=form) for form in ('base', 'payload', 'scale'))
     assert estimate_names(payload)[7:9] == ('load m', 'load m*cx')
     assert payload.learning.initial_estimate[7:] == (*(0.0,) * 10, 1.0)
@@ -120,7 +120,7 @@ def test_defaults_fit_the_form():
     for config in (payload, scale):
         p = model_of(config).p
         assert len(config.learning.initial_estimate) == p == len(config.learning.adaptation_gain)
-        # Gains are those of the same URDF.
+        # The gains are derived from the same URDF.
         np.testing.assert_allclose(config.barrier.weight, base.barrier.weight, rtol=2e-3)
         assert config.learning.radius >= 10.0 * config.robot.payload
     deviation = np.sqrt(np.diag(prior_covariance(scale)))[: len(scale.learning.initial_estimate)]
@@ -141,8 +141,8 @@ def test_two_controllers_do_not_share_working_memory():
         ({'payload': 0.0}, 'robot.payload: got 0 kg, but learn: payload needs the mass'),
     ],
 )
-def test_what_is_wrong_is_said_with_its_line(tmp_path, robot, message):
-    path = written(tmp_path / 'my.yaml', **robot)
+def test_problems_are_reported_with_their_line(tmp_path, robot, message):
+    path = write_config(tmp_path / 'my.yaml', **robot)
     (name,) = robot
     lines = path.read_text(encoding='utf-8').splitlines()
     line = next(k for k, text in enumerate(lines, 1) if text.strip().startswith(f'{name}:'))
@@ -150,7 +150,7 @@ def test_what_is_wrong_is_said_with_its_line(tmp_path, robot, message):
         load_loop(path)
 
 
-def test_an_arm_that_is_not_from_a_urdf_has_no_choice():
+def test_arm_without_urdf_learns_base_parameters_only():
     message = 'robot.learn: got scale, but model two_link learns base only'
     with pytest.raises(ConfigurationError, match=message):
         panda(model='two_link', robot__urdf='', robot__tip='', robot__learn='scale')

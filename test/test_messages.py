@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages to bytes and back: the same as ROS 2's own serialisation, and clear about bad ones."""
+"""Messages to bytes and back: identical to ROS 2's serialisation, clear errors for bad ones."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_arrays_of_equal_total_length_are_distinguished():
     decoder.decode(raw_joint_state('ab', [1, 2], [], [5, 6]))
     assert np.isnan(decoder.velocity).all()
     assert decoder.effort.tolist() == [5, 6]
-    # With the zeros that rclpy may leave behind a message, even the last length looks the same.
+    # With the zeros that rclpy may append to a message, even the length of the last array matches.
     decoder.decode(raw_joint_state('ab', [1, 2], [3, 4], []))
     decoder.decode(raw_joint_state('ab', [1, 2], [], [7, 8]) + bytes(4))
     assert np.isnan(decoder.velocity).all()
@@ -136,7 +136,7 @@ def test_duplicated_joint_is_named_only_when_it_is_wanted():
 
 
 @pytest.mark.parametrize('velocity', [[], [1.0], [1.0, 2.0, 3.0]])
-def test_velocity_of_another_length_is_rejected(velocity):
+def test_velocity_of_wrong_length_is_rejected(velocity):
     decoder = JointStateDecoder('ab')
     decoder.decode(raw_joint_state('ab', [1, 2], [3, 4], []))
     with pytest.raises(ShortArrayError, match=f'`velocity`.* {len(velocity)} values for 2 names'):
@@ -169,7 +169,7 @@ def test_other_encodings_are_rejected():
         decoder.decode(good)
 
 
-def test_a_bad_message_does_not_disturb_the_next():
+def test_bad_message_does_not_affect_the_next():
     good = raw_joint_state('ab', [1, 2], [3, 4], [5, 6])
     decoder = JointStateDecoder('ab')
     decoder.decode(good)
@@ -179,7 +179,7 @@ def test_a_bad_message_does_not_disturb_the_next():
     assert decoder.decode(good) == STAMP
 
 
-def test_encoder_rejects_arrays_of_another_length():
+def test_encoder_rejects_arrays_of_wrong_length():
     encoder = JointStateEncoder(['a', 'b'], ('position',))
     with pytest.raises(ValueError, match='shape'):
         encoder.encode(0, [1, 2, 3])
@@ -206,7 +206,7 @@ def test_multi_array_with_dimensions(little_endian):
     assert decoder.values.tolist() == [1, 2, 3]
 
 
-def test_multi_array_of_another_size_returns_its_length():
+def test_decoder_returns_the_length_of_a_multi_array_of_another_size():
     decoder = Float64MultiArrayDecoder(2)
     decoder.decode(Float64MultiArrayEncoder(2).encode([1, 2]))
     assert decoder.decode(Float64MultiArrayEncoder(3).encode([4, 5, 6])) == 3

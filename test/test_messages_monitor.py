@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The slow topic: distance to the bound, (29) term by term, and the bound (32) on it."""
+"""The monitor topic: distance to the bound, (29) term by term, and its bound (32)."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ def test_largest_inertia_is_that_of_the_stretched_arm():
         ({'feedback.gain': [9.0, 0.4]}, 2.0 * 0.4 / LARGEST),
     ],
 )
-def test_rate_is_the_least_of_the_four_of_equation_32(law, rate):
+def test_decay_rate_is_the_smallest_of_the_four_in_equation_32(law, rate):
     assert decay_rate(settings(LEAKY | law)) == pytest.approx(rate)
 
 
-def test_bound_begins_at_the_latch_and_ends_at_theta_over_kappa_e():
-    """Theta = eta |d3|^2 / 2, of which the largest on each joint is 0.1 + 0.1 N m."""
+def test_bound_starts_at_the_latch_and_decays_to_theta_over_kappa_e():
+    """Theta = eta |d3|^2 / 2, where |d3| is at most 0.1 + 0.1 N m on each joint."""
     bound = ExponentialBound(settings(LEAKY))
     floor = 0.5 * 0.02 * 2.0 * 0.2**2 / bound.rate
     assert bound.floor == pytest.approx(floor)
@@ -71,14 +71,14 @@ def decoded(monitor, names, *arguments):
 
 
 @pytest.mark.parametrize('known', [True, False])
-def test_message_tells_distance_and_the_terms_where_the_truth_is_known(known):
+def test_message_contains_the_distance_and_with_known_truth_the_terms(known):
     config = configured('recommended', 1.0, LEAKY if known else {}).controller
     law = controller_of(config)
     law.update(0.0, 1e-3, np.array([2.293, 1.696, 0.0, 0.0, 0.0, 0.0]))
     monitor = Monitor(config.joints, estimate_names(config), law.settings)
     names = [
-        f'{what} {joint}'
-        for what in ('max_error_ratio', 'distance_to_bound')
+        f'{quantity} {joint}'
+        for quantity in ('max_error_ratio', 'distance_to_bound')
         for joint in config.joints
     ]
     names += [*estimate_names(config), 'lambda_min', 'latched']
@@ -97,7 +97,7 @@ def test_message_tells_distance_and_the_terms_where_the_truth_is_known(known):
 
 @pytest.fixture(scope='module')
 def rejecting_run(tmp_path_factory):
-    """Run from a bag, 8 s, with a cosine column that the reference does not excite, truth known."""
+    """Run of 8 s from a bag, truth known, with a cosine column that the reference cannot excite."""
     learning = {'learning.frequencies': [1.0], 'learning.bias': False}
     config = configured('recommended', 8.0, LEAKY | learning)
     path = tmp_path_factory.mktemp('refusing') / 'bag'
@@ -107,14 +107,14 @@ def rejecting_run(tmp_path_factory):
 
 def test_rejected_columns_reach_the_summary_with_their_reason(rejecting_run):
     learning = summarize(rejecting_run)['learning']
-    ((refused, reason),) = learning['rejected_columns'].items()
-    assert refused.startswith('cos 1 rad/s ')
-    assert reason.startswith(f'{refused} is not estimated: this window cannot distinguish it from ')
+    ((column, reason),) = learning['rejected_columns'].items()
+    assert column.startswith('cos 1 rad/s ')
+    assert reason.startswith(f'{column} is not estimated: this window cannot distinguish it from ')
     assert f'rejected    {reason}' in format_table(summarize(rejecting_run))
     assert learning['final_relative_error'] < 0.5
 
 
-def test_a_run_without_rejected_columns(tmp_path):
+def test_run_without_rejected_columns(tmp_path):
     config = configured('recommended', 8.0)
     write_bag(tmp_path / 'bag', simulate(*config[1::-1]), config.controller, 'none')
     run = read_run(tmp_path / 'bag')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Our bytes and those of rclpy say the same, in both directions."""
+"""Our serialisation and that of rclpy are interchangeable, in both directions."""
 
 from __future__ import annotations
 
@@ -83,9 +83,9 @@ def test_rclpy_reads_what_is_encoded(frame_id, names):
         STAMP, message.position, message.velocity, message.effort
     )
     assert deserialize_message(raw, JointState) == message
-    theirs = serialize_message(message)
-    assert len(raw) == len(theirs)
-    assert without_padding(raw) == without_padding(theirs)
+    expected = serialize_message(message)
+    assert len(raw) == len(expected)
+    assert without_padding(raw) == without_padding(expected)
 
 
 @pytest.mark.parametrize('fields', [(), ('position',), ('position', 'velocity'), ('effort',)])

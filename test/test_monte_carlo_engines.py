@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results do not depend on what computes them, nor on what is lost on the way."""
+"""Results depend neither on the engine that computes them nor on lost workers."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from blf_dsc_controller.monte_carlo.store import Span
 
 @pytest.fixture(scope='module')
 def a_study(tmp_path_factory):
-    one = study(tmp_path_factory.mktemp('study'))
-    warm_up(one)
-    return one
+    prepared = study(tmp_path_factory.mktemp('study'))
+    warm_up(prepared)
+    return prepared
 
 
 @pytest.fixture(scope='module')
@@ -42,7 +42,7 @@ def joined(parts):
     return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
 
 
-def computed(a_study, engine, size, warn=pytest.fail):
+def results_of(a_study, engine, size, warn=pytest.fail):
     parts = {}
     compute(a_study, spans(size), engine, parts.__setitem__, warn)
     return joined(parts)
@@ -53,7 +53,7 @@ def local_dask():
     return engines.dask(2)
 
 
-def ranks_of_mpi():
+def mpi_ranks():
     pytest.importorskip('mpi4py', reason='the extra mpi is not installed')
     return engines.mpi(2)
 
@@ -66,15 +66,15 @@ def ranks_of_mpi():
         (lambda: engines.processes(1), RUNS),
         (lambda: engines.processes(2), 4),
         (local_dask, 5),
-        (ranks_of_mpi, 5),
+        (mpi_ranks, 5),
     ],
     ids=['threads', 'thread', 'process', 'processes', 'dask', 'mpi'],
 )
-def test_every_engine_gives_the_same(a_study, undisturbed, make, size):
-    assert same(computed(a_study, make(), size), undisturbed)
+def test_every_engine_gives_the_same_results(a_study, undisturbed, make, size):
+    assert same(results_of(a_study, make(), size), undisturbed)
 
 
-def killing(engine, kills):
+def losing_workers(engine, kills):
     """Let the engine lose a worker to SIGKILL when the first chunk of each pool is done."""
     pools, hit = [], []
 
@@ -92,8 +92,8 @@ def killing(engine, kills):
     return engine._replace(open=start), kill
 
 
-def test_killed_worker_loses_nothing(a_study, undisturbed):
-    engine, kill = killing(engines.processes(2), kills=1)
+def test_killed_worker_loses_no_results(a_study, undisturbed):
+    engine, kill = losing_workers(engines.processes(2), kills=1)
     parts, warnings = {}, []
 
     def keep(span, columns):
@@ -114,7 +114,7 @@ class Broken(Executor):
         raise BrokenExecutor('out of memory')
 
 
-def test_workers_that_are_always_lost_are_given_up(a_study):
+def test_study_is_given_up_when_workers_are_always_lost(a_study):
     warnings = []
     engine = engines.Engine(lambda: nullcontext(Broken()), 2)
     with pytest.raises(BlfDscError, match=r'out of memory.* 24 chunks are left'):
@@ -122,7 +122,7 @@ def test_workers_that_are_always_lost_are_given_up(a_study):
     assert len(warnings) == RETRIES
 
 
-def test_error_of_a_run_is_no_lost_worker(a_study):
+def test_error_in_a_run_is_not_taken_for_a_lost_worker(a_study):
     with pytest.raises(ZeroDivisionError):
         compute(a_study, spans(1), engines.threads(2), lambda *_: 1 / 0, pytest.fail)
 
@@ -130,5 +130,5 @@ def test_error_of_a_run_is_no_lost_worker(a_study):
 @pytest.mark.parametrize(('runs', 'workers'), [(1, 8), (10_000, 2), (10**8, 64)])
 def test_chunks_are_few_but_enough_for_all_workers(runs, workers):
     size = chunk_size(runs, workers)
-    assert 1 <= size <= 1000  # some ten seconds of work that a crash would cost
+    assert 1 <= size <= 1000  # a crash costs about ten seconds of work
     assert runs / size >= min(runs, 20 * workers)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is measured of a run without recording it is what its whole record says."""
+"""Metrics measured without recording a run match those of its full record."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from blf_dsc_controller.simulation.loop import simulate_law
 
 LIMITS = 'blf_dsc_controller:\n  ros__parameters:\n'
 WEAK = LOOP.replace(LIMITS, LIMITS + '    torque: {limit: [8.0, 20.0]}\n')
-# Motors that are weaker than the law thinks.
+# Motors that are weaker than the law assumes.
 MOTORS = LOOP.replace(
     '    duration: 0.3\n', '    duration: 0.3\n    actuator: {torque_limit: [9.0, 0.0]}\n'
 )
-# Far above what a loop of 1 kHz can hold, and with nothing to cut it.
+# A gain far above what a 1 kHz loop can take, and no effective torque limit.
 UNSTABLE = LOOP.replace(
     LIMITS,
     LIMITS + '    torque: {limit: [1.0e+308, 1.0e+308]}\n    feedback: {gain: [1.0e+9, 1.0e+9]}\n',
 )
 
 
-def plainly(a_study, run):
-    """Figures of a run from its whole record, as their definitions say."""
+def metrics_of_record(a_study, run):
+    """Metrics of a run from its full record, straight from their definitions."""
     plant = plant_of_run(a_study, run)
     record = simulate_law(a_study.controller, plant)
     names = sample_of(np.arange(record.samples.shape[1]), record.controller.settings)
@@ -41,7 +41,7 @@ def plainly(a_study, run):
     motors = np.array(a_study.plant.actuator.torque_limit)
     limit[motors > 0.0] = np.minimum(limit, motors)[motors > 0.0]
     distance = np.linalg.norm(estimate - P, axis=1) / np.linalg.norm(P, axis=1)
-    figures = {
+    metrics = {
         'first_violation_s': t[outside[0]] if outside.size else np.nan,
         'latch_time_s': t[latched[0]] if latched.size else np.nan,
         'saturated_fraction': (torque >= limit).any(axis=1).mean(),
@@ -50,43 +50,43 @@ def plainly(a_study, run):
         'parameter_error.end': distance[300],
     }
     for i, joint in enumerate(('joint1', 'joint2')):
-        figures[f'max_error_ratio.{joint}'] = error[:, i].max() / 0.002
-        figures[f'rms_error_rad.{joint}'] = np.sqrt(np.mean(error[200:, i] ** 2))
-        figures[f'peak_torque_nm.{joint}'] = np.abs(record.measurements[:, 4 + i]).max()
-    return figures
+        metrics[f'max_error_ratio.{joint}'] = error[:, i].max() / 0.002
+        metrics[f'rms_error_rad.{joint}'] = np.sqrt(np.mean(error[200:, i] ** 2))
+        metrics[f'peak_torque_nm.{joint}'] = np.abs(record.measurements[:, 4 + i]).max()
+    return metrics
 
 
 @pytest.mark.parametrize('loop', [LOOP, WEAK, MOTORS], ids=['strong', 'weak', 'motors'])
-def test_figures_are_those_of_the_record(tmp_path, loop):
+def test_metrics_match_the_full_record(tmp_path, loop):
     a_study = study(tmp_path, loop + STUDY, runs=6)
     results = whole(a_study)
     for run in range(6):
-        for name, value in plainly(a_study, run).items():
-            # Sums in another order.
+        for name, value in metrics_of_record(a_study, run).items():
+            # Sums are taken in another order.
             assert results[name][run] == pytest.approx(value, rel=1e-12, nan_ok=True), name
 
 
-def test_study_of_these_tests_has_all_kinds_of_figures(tmp_path):
+def test_studies_used_here_cover_all_kinds_of_metrics(tmp_path):
     strong = whole(study(tmp_path, LOOP + STUDY))
     weak = whole(study(tmp_path, WEAK + STUDY))
     assert (strong['outcome'] == 'kept').sum() > 12
     assert (weak['outcome'] == 'violated').sum() > 12
-    # Windows of 0.1 s say little: with change detection some solutions are no possible arm.
+    # Windows of 0.1 s tell little: with change detection some solutions are physically impossible.
     any_arm = LOOP.replace('learning: {', 'learning: {change_detection: false, ')
     assert np.isfinite(whole(study(tmp_path, any_arm + STUDY))['latch_time_s']).all()
     assert (weak['saturated_fraction'] > 0.1).any()
     assert (strong['first_violation_s'] >= 0).sum() == (strong['outcome'] != 'kept').sum()
 
 
-def test_loss_of_all_numbers_is_noticed_and_ends_the_run(tmp_path):
+def test_divergence_is_detected_and_ends_the_run(tmp_path):
     results = whole(study(tmp_path, UNSTABLE + STUDY, runs=3))
     assert results['outcome'].tolist() == ['diverged'] * 3
     assert (results['first_violation_s'] < 0.3).all()
     assert np.isnan(results['parameter_error.end']).all()
 
 
-def test_start_that_the_controller_rejects_has_its_own_outcome(tmp_path):
-    """With noise of ten times the bound nearly every start is measured outside."""
+def test_start_rejected_by_the_controller_has_its_own_outcome(tmp_path):
+    """With noise of ten times the bound nearly every start is measured outside it."""
     text = STUDY.replace('loguniform(1.0e-6, 2.0e-5)', 'choice(0.02)')
     results = whole(study(tmp_path, LOOP + text))
     rejected = results['outcome'] == 'rejected'
@@ -97,7 +97,7 @@ def test_start_that_the_controller_rejects_has_its_own_outcome(tmp_path):
     assert np.isnan(results['latch_time_s'][rejected]).all()
 
 
-def test_memory_of_one_run_is_not_seen_by_the_next(tmp_path):
+def test_state_of_one_run_does_not_leak_into_the_next(tmp_path):
     a_study = study(tmp_path, runs=4)
     together = whole(a_study)
     alone = run_chunk(a_study, 3, 1)

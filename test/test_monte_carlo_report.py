@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report says how many runs kept the bound, and its worst runs can be looked at."""
+"""The report states how many runs kept the bound, and its worst runs can be reproduced."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from blf_dsc_controller.simulation.loop import simulate_law
 @pytest.fixture(scope='module')
 def store(tmp_path_factory):
     folder = tmp_path_factory.mktemp('study')
-    made = Store.create_or_open(folder / 'my study', study(folder))
-    made.keep(Span(0, RUNS), whole(made.study))
-    return made
+    created = Store.create_or_open(folder / 'my study', study(folder))
+    created.keep(Span(0, RUNS), whole(created.study))
+    return created
 
 
-def test_worst_runs_come_first_and_lost_numbers_before_all(store):
+def test_runs_are_sorted_worst_first_with_diverged_runs_before_all_others(store):
     results = store.results()
     ratio = np.linspace(0.1, 0.5, RUNS)
     results['max_error_ratio.joint1'] = ratio
@@ -41,10 +41,10 @@ def test_worst_runs_come_first_and_lost_numbers_before_all(store):
     outcome[:] = 'kept'
     outcome[5] = 'diverged'
     results['outcome'] = outcome
-    # The worse of both joints: ends before the middle, equal ones in their order.
+    # The worse of both joints counts: ends before the middle, ties in the order of the runs.
     assert worst_first(store.study, results)[:5].tolist() == [5, 0, 23, 1, 22]
     summary = summarize(store.study, results)
-    assert [one['run'] for one in summary['worst'][:3]] == [5, 0, 23]
+    assert [entry['run'] for entry in summary['worst'][:3]] == [5, 0, 23]
     assert summary['outcomes'] == {'kept': 23, 'violated': 0, 'diverged': 1, 'rejected': 0}
     assert summary['kept']['fraction'] == 23 / 24
     # (23 + z^2 / 2 -+ z sqrt(23 / 24 + z^2 / 4)) / (24 + z^2), z = 1.959964, Wilson (1927)
@@ -52,11 +52,11 @@ def test_worst_runs_come_first_and_lost_numbers_before_all(store):
     assert summary['kept']['high'] == pytest.approx(0.992607, abs=1e-6)
 
 
-def test_influence_also_sees_that_both_ends_are_bad(store):
-    """A start near either side of the bound: no correlation at all, yet it explains everything."""
+def test_influence_detects_that_both_ends_are_bad(store):
+    """The start does not correlate with the error, bad near both ends, yet explains all of it."""
     rng = np.random.default_rng(3)
     runs = 2000
-    results = {one.column: rng.random(runs) for one in store.study.variations}
+    results = {variation.column: rng.random(runs) for variation in store.study.variations}
     start = rng.uniform(-1.0, 1.0, runs)
     results['plant.initial.error.joint1'] = start
     results['outcome'] = np.full(runs, 'kept')
@@ -87,7 +87,7 @@ def test_report_is_written(store):
         assert matplotlib.image.imread(store.folder / picture).shape[1] > 1200
 
 
-def test_worst_ten_are_reproduced_by_the_commands_of_the_report(store, tmp_path, monkeypatch):
+def test_commands_in_the_report_reproduce_the_worst_runs(store, tmp_path, monkeypatch):
     write_report(store)
     page = html.unescape((store.folder / 'report.html').read_text())
     commands = re.findall(r'>blf_dsc (monte-carlo --reproduce .*?)<', page)
@@ -98,22 +98,22 @@ def test_worst_ten_are_reproduced_by_the_commands_of_the_report(store, tmp_path,
     run, out = int(arguments[3]), tmp_path / arguments[5]
     written = {path.name for path in out.iterdir()}
     assert {'bag', 'config.yaml', 'summary.json', 'tracking.png', 'parameters.png'} <= written
-    row = store.results()
+    results = store.results()
     bag = read_run(out / 'bag')
     peak = np.abs(bag.error).max(axis=0) / 0.002
-    expected = [row[f'max_error_ratio.joint{i}'][run] for i in (1, 2)]
-    # The bag's errors are divided here in another order than in the kernel.
+    expected = [results[f'max_error_ratio.joint{i}'][run] for i in (1, 2)]
+    # The order of operations is not the same as in the kernel.
     np.testing.assert_allclose(peak, expected, rtol=1e-15)
-    # The run is an ordinary configuration too.
+    # The run can also be repeated from its configuration.
     loop = load_loop(out / 'config.yaml')
     assert loop.plant == plant_of_run(store.study, run)
     again = simulate_law(loop.controller, loop.plant)
     np.testing.assert_array_equal(again.measurements[:, :2], bag.position)
-    # It does not overwrite.
+    # An existing folder is not overwritten.
     assert main(arguments) == 1
 
 
-def test_run_that_is_not_what_it_was_is_reported(store, tmp_path):
+def test_run_that_differs_from_its_stored_results_is_reported(store, tmp_path):
     folder = tmp_path / 'tampered'
     other = Store.create_or_open(folder, store.study)
     results = store.results()
@@ -124,13 +124,13 @@ def test_run_that_is_not_what_it_was_is_reported(store, tmp_path):
         reproduce(other, 4, tmp_path / 'run')
 
 
-def test_run_that_is_not_there_is_reported(store, tmp_path, capsys):
+def test_missing_run_is_reported(store, tmp_path, capsys):
     out = str(tmp_path / 'run')
     assert main(['monte-carlo', '--reproduce', str(store.folder), '24', '--out', out]) == 1
     assert 'has no run 24' in capsys.readouterr().err
 
 
-def test_columns_carry_what_was_drawn(store):
+def test_columns_contain_the_drawn_values(store):
     table = pyarrow.parquet.read_table(store.folder / 'runs')
     plant = plant_of_run(store.study, 9)
     row = table.slice(9, 1).to_pylist()[0]

@@ -21,7 +21,7 @@ from blf_dsc_controller.monte_carlo import store as stores
 from blf_dsc_controller.monte_carlo.runs import run_chunk
 from blf_dsc_controller.monte_carlo.store import Span, Store
 
-PATIENCE = 300.0  # s; the machine may be busy, and kernels may have to be compiled
+TIMEOUT = 300.0  # s; the machine may be busy, and kernels may have to be compiled
 
 
 @pytest.fixture
@@ -40,13 +40,13 @@ def stamps(folder):
 
 
 def until(condition):
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + TIMEOUT
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)
 
 
-def marked(mark):
+def processes_with(mark):
     """Processes with this mark in their environment."""
     found = []
     for path in Path('/proc').glob('[0-9]*/environ'):
@@ -58,7 +58,7 @@ def marked(mark):
     return found
 
 
-def test_study_killed_in_the_middle_goes_on(tmp_path):
+def test_killed_study_resumes(tmp_path):
     loop = LOOP.replace('duration: 0.3', 'duration: 3.0')
     path, out = write(tmp_path, loop + STUDY), tmp_path / 'out'
     command = [
@@ -78,13 +78,13 @@ def test_study_killed_in_the_middle_goes_on(tmp_path):
     ) as process:
         until(lambda: (out / 'runs').is_dir() and len(list((out / 'runs').glob('r*'))) >= 3)
         process.send_signal(signal.SIGKILL)
-    until(lambda: not marked(mark))  # nor do its workers go on
+    until(lambda: not processes_with(mark))  # its workers have ended too
     before = stamps(out)
     assert 3 <= len(before) < RUNS
     (out / 'runs' / '.runs-000000023-000000023.parquet.1').write_bytes(b'half a fi')
 
-    again = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert f'{sum(name[0] == "r" for name in before)} of 24 runs are done already' in again.stderr
+    resumed = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert f'{sum(name[0] == "r" for name in before)} of 24 runs are done already' in resumed.stderr
     after = stamps(out)
     assert not [name for name in after if name.startswith('.')]
     kept = {name: stamp for name, stamp in before.items() if name.startswith('r')}
@@ -94,7 +94,7 @@ def test_study_killed_in_the_middle_goes_on(tmp_path):
     assert same(opened.results(), whole(opened.study))
 
 
-def test_complete_study_is_not_computed_again(tmp_path, capsys):
+def test_complete_study_is_not_recomputed(tmp_path, capsys):
     path, out = write(tmp_path), tmp_path / 'out'
     command = ['monte-carlo', '--config', str(path), '--out', str(out), '--engine', 'threads']
     assert main(command) == 0
@@ -104,7 +104,7 @@ def test_complete_study_is_not_computed_again(tmp_path, capsys):
     assert 'of the runs kept the bound' in capsys.readouterr().out
 
 
-def test_missing_runs_are_found_between_those_done(store):
+def test_missing_runs_are_found_between_completed_ones(store):
     filled(store, (3, 4), (10, 1))
     assert store.done() == [Span(3, 4), Span(10, 1)]
     missing = store.missing(5)
@@ -113,7 +113,7 @@ def test_missing_runs_are_found_between_those_done(store):
     assert sorted([*runs, 3, 4, 5, 6, 10]) == list(range(RUNS))
 
 
-def test_pyarrow_alone_reads_the_results(store):
+def test_results_can_be_read_with_pyarrow_alone(store):
     filled(store, (12, 12), (0, 12))
     table = pyarrow.parquet.read_table(store.folder / 'runs')
     assert table['run'].to_pylist() == list(range(RUNS))
@@ -134,7 +134,7 @@ def test_pyarrow_alone_reads_the_results(store):
         ('window: 0.1', 'window: 0.12', r'learning.window: there 0.1, here 0.12'),
     ],
 )
-def test_other_study_is_rejected_and_the_difference_named(
+def test_other_study_is_rejected_and_the_difference_is_named(
     tmp_path, store, before, after, difference
 ):
     other = study(tmp_path, (LOOP + STUDY).replace(before, after, 1))
@@ -150,7 +150,7 @@ def test_other_version_is_rejected(store, monkeypatch):
         Store.create_or_open(store.folder, store.study)
 
 
-def test_folder_of_something_else_is_left_alone(tmp_path, capsys):
+def test_folder_without_a_study_is_left_alone(tmp_path, capsys):
     out = tmp_path / 'thesis'
     out.mkdir()
     (out / 'chapter1.txt').write_text('In the beginning')
@@ -161,7 +161,7 @@ def test_folder_of_something_else_is_left_alone(tmp_path, capsys):
     assert [path.name for path in out.iterdir()] == ['chapter1.txt']
 
 
-def test_two_cannot_write_into_one_folder(store):
+def test_two_processes_cannot_write_into_one_folder(store):
     with (
         store.locked(),
         pytest.raises(BlfDscError, match='another monte-carlo is running'),

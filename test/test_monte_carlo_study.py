@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A study's file says what varies, or what is wrong with it; each run is drawn for itself."""
+"""Studies are read from a file, with clear errors; each run is drawn independently."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def drawn_values(a_study, run):
     ],
 )
 @given(u=FRACTIONS)
-def test_distributions_are_those_of_their_names(text, reference, u):
+def test_distributions_match_scipy(text, reference, u):
     distribution = parse(text, Kind.DOUBLE)
     assert distribution.at(u) == pytest.approx(reference.ppf(u), rel=1e-9, abs=1e-9)
     low, high = distribution.extremes
@@ -47,13 +47,13 @@ def test_distributions_are_those_of_their_names(text, reference, u):
 
 
 @pytest.mark.parametrize('text', ['integers(-1, 3)', 'choice(-1, 0, 1, 2, 3)'])
-def test_every_integer_comes_as_often(text):
+def test_integers_are_equally_frequent(text):
     distribution = parse(text, Kind.INTEGER)
     values = [distribution.at(u) for u in np.arange(1000) / 1000]
     assert [values.count(i) for i in range(-1, 4)] == [200] * 5
 
 
-def test_one_value_is_allowed():
+def test_distribution_of_a_single_value_is_allowed():
     assert parse('uniform(0.5, 0.5)', Kind.DOUBLE).at(0.9) == 0.5
     assert parse('choice(brake)', Kind.STRING).at(0.9) == 'brake'
 
@@ -85,7 +85,7 @@ def test_preset_is_a_study_of_ten_thousand_runs():
         ('uniform(0.3, 0.7)', 'uniform(0.7, 0.3)', r'must not be above the second'),
         ('uniform(0.3, 0.7)', 'normal(0.3, -0.1)', r'a deviation cannot be below 0'),
         ('loguniform(1.0e-6', 'loguniform(0.0', r'loguniform distribution begins above 0'),
-        # Four deviations below the mean there would be no mass.
+        # Four standard deviations below the mean, the mass would be zero.
         (
             'uniform(0.3, 0.7)',
             'normal(0.4, 0.1)',
@@ -125,7 +125,7 @@ def test_all_problems_are_named_at_once(tmp_path):
     assert len(error.value.problems) == 3
 
 
-def test_written_study_is_the_same_study(tmp_path):
+def test_written_study_reads_back_unchanged(tmp_path):
     text = STUDY.replace('constant: uniform(-0.2, 0.2)', 'constant: ["choice(1, 2)", "choice(3)"]')
     original = study(tmp_path, LOOP + text)
     write_study(original, tmp_path / 'again.yaml')
@@ -133,15 +133,15 @@ def test_written_study_is_the_same_study(tmp_path):
 
 
 def test_run_depends_on_seed_and_index_alone(tmp_path):
-    one = study(tmp_path)
-    assert draw(one, 5) == draw(study(tmp_path, runs=100), 5)
-    assert draw(one, 5) != draw(one, 6)
-    assert draw(one, 5).seed != draw(one, 6).seed
-    assert draw(one, 5) != draw(study(tmp_path, seed=8), 5)
+    a_study = study(tmp_path)
+    assert draw(a_study, 5) == draw(study(tmp_path, runs=100), 5)
+    assert draw(a_study, 5) != draw(a_study, 6)
+    assert draw(a_study, 5).seed != draw(a_study, 6).seed
+    assert draw(a_study, 5) != draw(study(tmp_path, seed=8), 5)
 
 
-def test_what_else_varies_does_not_change_a_draw(tmp_path):
-    """The same arms for two studies that differ in what comes before in the file."""
+def test_draw_does_not_depend_on_other_variations(tmp_path):
+    """Two studies that differ in an earlier line of the file draw the same arms."""
     more = 'arm.l2: uniform(0.5, 1.0)\n      arm.m2'
     before = drawn_values(study(tmp_path), 3)
     after = drawn_values(study(tmp_path, LOOP + STUDY.replace('arm.m2', more)), 3)
@@ -149,7 +149,7 @@ def test_what_else_varies_does_not_change_a_draw(tmp_path):
     assert before == after
 
 
-def test_draws_become_the_plant_of_the_run(tmp_path):
+def test_drawn_values_are_used_in_the_plant_of_the_run(tmp_path):
     a_study = study(tmp_path)
     origin = origin_of(controller_of(a_study.controller))
     drawn = draw(a_study, 2)
@@ -182,25 +182,25 @@ def test_events_are_drawn_entry_by_entry(tmp_path):
     assert (events.torque[1], events.torque[3]) == (0.0, 0.0)
 
 
-def test_events_leave_the_other_draws_as_they_were(tmp_path):
+def test_events_do_not_change_the_other_draws(tmp_path):
     without = [line for line in (LOOP + STUDY).splitlines() if 'events' not in line]
     before = drawn_values(study(tmp_path, '\n'.join(without)), 3)
     assert len(before) == 10
     assert before.items() <= drawn_values(study(tmp_path), 3).items()
 
 
-def test_events_vary_only_where_there_are_some(tmp_path):
+def test_variations_of_events_require_events(tmp_path):
     text = '\n'.join(line for line in LOOP.splitlines() if 'events' not in line)
     with pytest.raises(ConfigurationError, match=r'events.payload: .* no events: give events.beg'):
         study(tmp_path, f'{text}\n{STUDY}')
 
 
-def test_start_as_configured_where_it_does_not_vary(tmp_path):
+def test_start_is_as_configured_if_it_does_not_vary(tmp_path):
     text = '\n'.join(line for line in STUDY.splitlines() if 'initial' not in line) + '\n'
     a_study = study(tmp_path, LOOP + text)
     origin = origin_of(controller_of(a_study.controller))
     assert plant_of_draw(a_study, draw(a_study, 0), origin).initial == a_study.plant.initial
 
 
-def test_overrides_count_more_than_the_file(tmp_path):
+def test_overrides_take_precedence_over_the_file(tmp_path):
     assert load_study(write(tmp_path), {'runs': 3}).settings.runs == 3

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A plant that shares no code with ours, joints in another order: a controller that cannot tell."""
+"""The example plant in MuJoCo, which shares no code with ours: same motion, same controller."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def example():
     return module
 
 
-def test_its_arm_has_the_inertia_and_the_weight_that_the_model_says(example):
+def test_mujoco_arm_has_the_inertia_and_gravity_of_the_model(example):
     """MuJoCo's M(q) and its bias torque at rest against the paper's (33), (34)."""
     import mujoco
 
@@ -52,9 +52,9 @@ def test_its_arm_has_the_inertia_and_the_weight_that_the_model_says(example):
         theirs = np.zeros((2, 2))
         for i in range(2):
             mujoco.mj_mulM(model, data, theirs[i], np.eye(2)[i])
-        ours, _, weight = dynamics(P, 9.8, q, (0.0, 0.0))
-        np.testing.assert_allclose(theirs, ours, atol=1e-8)  # the masses have 1e-9 kg m^2
-        np.testing.assert_allclose(data.qfrc_bias, weight, atol=1e-8)
+        ours, _, gravity = dynamics(P, 9.8, q, (0.0, 0.0))
+        np.testing.assert_allclose(theirs, ours, atol=1e-8)  # the point masses have 1e-9 kg m^2
+        np.testing.assert_allclose(data.qfrc_bias, gravity, atol=1e-8)
     assert example.MujocoArm(PlantConfig()).config.joints == ('joint1', 'joint2')
     assert [model.joint(k).name for k in range(model.njnt)] == ['joint1', 'joint2']
 
@@ -71,10 +71,10 @@ def test_its_arm_has_the_inertia_and_the_weight_that_the_model_says(example):
         ('coulomb', 1.3e-3),  # dry friction here, smoothed by tanh there
     ],
 )
-def test_events_move_it_as_they_move_the_simulated_plant(example, kind, tolerance):
+def test_events_move_it_like_the_simulated_plant(example, kind, tolerance):
     names = ('events.begin', 'events.duration', 'events.ramp', f'events.{kind}', f'{kind}.')
     given = {name: value for name, value in ALL_KINDS.items() if name.startswith(names)}
-    ours, without = (simulated_angles(one) for one in (given, {}))
+    ours, without = (simulated_angles(events) for events in (given, {}))
     theirs = angles_of(example.MujocoArm(build(PlantConfig, given)))
     np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=tolerance)
     assert np.abs(ours - without).max() > 3.0 * tolerance
@@ -121,16 +121,16 @@ REAL = {
 
 
 @pytest.mark.parametrize('name', URDFS)
-def test_the_arm_of_a_urdf_moves_as_in_the_simulated_plant(example, name):
+def test_urdf_arm_moves_like_the_simulated_plant(example, name):
     """Truth, sensors, drives and events included."""
     given = URDFS[name] | REAL
     n = len(build(PlantConfig, given).joints)
     given['disturbance.viscous'] = [1.0] * n
-    theirs, ours = (swung(make, given) for make in (example.MujocoArm, plant_of))
+    theirs, ours = (swing(make, given) for make in (example.MujocoArm, plant_of))
     np.testing.assert_allclose(theirs[:, :n], ours[:, :n], rtol=0.0, atol=1e-5)
     np.testing.assert_allclose(theirs[:, n : 2 * n], ours[:, n : 2 * n], rtol=0.0, atol=1e-2)
     np.testing.assert_array_equal(theirs[:, 2 * n :], ours[:, 2 * n :])
-    assert np.abs(ours - swung(plant_of, URDFS[name]))[:, :n].max() > 0.05
+    assert np.abs(ours - swing(plant_of, URDFS[name]))[:, :n].max() > 0.05
 
 
 @pytest.mark.parametrize(
@@ -140,29 +140,27 @@ def test_the_arm_of_a_urdf_moves_as_in_the_simulated_plant(example, name):
         ({'disturbance.stribeck': 0.5, 'disturbance.coulomb': [1.0] * 7}, 4e-3),  # dry here
     ],
 )
-def test_ripple_and_the_friction_of_breaking_away_are_those_of_the_simulated_plant(
-    example, given, tolerance
-):
+def test_ripple_and_stribeck_friction_match_the_simulated_plant(example, given, tolerance):
     _, *others = given.items()
     without = URDFS['panda'] | dict(others)
-    theirs, ours = (swung(make, without | given) for make in (example.MujocoArm, plant_of))
+    theirs, ours = (swing(make, without | given) for make in (example.MujocoArm, plant_of))
     np.testing.assert_allclose(theirs[:, :7], ours[:, :7], rtol=0.0, atol=tolerance)
-    assert np.abs(ours - swung(plant_of, without))[:, :7].max() > 3.0 * tolerance
+    assert np.abs(ours - swing(plant_of, without))[:, :7].max() > 3.0 * tolerance
 
 
-def test_a_closed_loop_runs_alike_in_both(example):
-    """With every imperfection but dry friction and ripple, which differ over a sample."""
+def test_closed_loop_runs_the_same_with_both_plants(example):
+    """With every imperfection except dry friction and ripple, which differ over a sample."""
     loop = load_loop('panda')
     given = {'disturbance.coulomb': [0.0] * 7, 'actuator.ripple': 0.0, 'load.payload': 0.3}
     config = change(loop.plant, given)
     theirs, ours = (
-        closed(loop.controller, make(config), 2000) for make in (example.MujocoArm, plant_of)
+        close_loop(loop.controller, make(config), 2000) for make in (example.MujocoArm, plant_of)
     )
     np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=1e-8)
     assert np.ptp(ours, axis=0).min() > 1e-3  # rad
 
 
-def closed(config, arm, samples):
+def close_loop(config, arm, samples):
     """Measured angles (samples, n) of either arm under the controller."""
     guard = Guard(config, lambda: 0, lambda: 0)
     guard.activate()
@@ -175,14 +173,14 @@ def closed(config, arm, samples):
     return np.array(rows)
 
 
-def swung(make, given):
+def swing(make, given):
     """Measurements (300, 3 n) of an arm whose joints all swing."""
     config = build(PlantConfig, given)
     t = 1e-3 * np.arange(300)[:, None]
     return measured(make(config), 0.1 * np.sin(20.0 * t) * config.actuator.torque_limit)
 
 
-def test_the_controller_keeps_the_bound_and_learns_the_parameters(example):
+def test_controller_keeps_the_bound_and_learns_the_parameters(example):
     ros = RosRig()
     try:
         law = ros.add(ControllerNode, telemetry__enabled=False)
@@ -190,8 +188,8 @@ def test_the_controller_keeps_the_bound_and_learns_the_parameters(example):
         ros.until(lambda: arm.steps >= 8000 or law.guard.supervisor.text)
         assert law.guard.supervisor.phase is Phase.TRACKING, law.guard.supervisor.text
         assert law.guard.samples.ratio.max() < 1.0
-        # Learning begins after 6.8 s; a second later 0.1 % is left with our own plant, whose torque
-        # is held the same way.  Before, half of each parameter was missing.
+        # Learning begins after 6.8 s, with half of each parameter missing; a second later an error
+        # of 0.1 % is left with our own plant, which holds its torque the same way.
         np.testing.assert_allclose(law.guard.controller.state.estimate[:3], P, rtol=0.01)
     finally:
         ros.close()

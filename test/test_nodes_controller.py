@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller node before states sent by hand: joints by name, rejections, live gains."""
+"""The controller node with states sent by hand: joints by name, rejections, live gains."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 
-NOTHING = (0.0, 0.0)
+ZERO = (0.0, 0.0)
 VELOCITY = (0.01, -0.02)  # rad/s
 
 
@@ -42,7 +42,7 @@ def law_torques(*measurements):
     ],
     ids=['as configured', 'turned round', 'among others'],
 )
-def test_joints_are_found_by_name_not_by_place(ros, names, order):
+def test_joints_are_found_by_name_not_by_position(ros, names, order):
     ros.add(ControllerNode)
     arm = Arm(ros, names)
 
@@ -53,47 +53,47 @@ def test_joints_are_found_by_name_not_by_place(ros, names, order):
     np.testing.assert_array_equal(torque, law_torques((START, VELOCITY))[0])
 
 
-def test_a_state_that_is_not_finite_stops_the_arm_for_good(ros):
+def test_non_finite_state_stops_the_arm_for_good(ros):
     node = ros.add(ControllerNode)
     arm = Arm(ros)
     assert arm.torque_for(0, START).any()
-    np.testing.assert_array_equal(arm.torque_for(1, (START[0], np.nan)), NOTHING)
+    np.testing.assert_array_equal(arm.torque_for(1, (START[0], np.nan)), ZERO)
     assert 'not finite' in node.guard.supervisor.text
-    np.testing.assert_array_equal(arm.torque_for(2, START), NOTHING)
+    np.testing.assert_array_equal(arm.torque_for(2, START), ZERO)
 
 
-def test_a_state_without_one_of_the_joints_stops_the_arm_and_names_it(ros):
+def test_state_with_a_missing_joint_stops_the_arm_and_names_the_joint(ros):
     node = ros.add(ControllerNode)
     arm = Arm(ros)
     assert arm.torque_for(0, START).any()
-    stranger = JointStateEncoder(('joint1', 'joint3'))
-    np.testing.assert_array_equal(arm.torque_for(1, START, encoder=stranger), NOTHING)
+    encoder = JointStateEncoder(('joint1', 'joint3'))
+    np.testing.assert_array_equal(arm.torque_for(1, START, encoder=encoder), ZERO)
     assert "'joint2' is not in the message" in node.guard.supervisor.text
     assert 'joint1, joint3' in node.guard.supervisor.text
 
 
-def test_an_arm_that_falls_silent_gets_the_safe_torque_again_and_again(ros):
+def test_safe_torque_is_repeated_when_the_arm_falls_silent(ros):
     clock = FakeClock()
     node = ros.add(ControllerNode, {'safety.watchdog': 'on'}, clock=clock)
     arm = Arm(ros)
-    heard = ros.listen(topics.COMMANDS)
+    commands = ros.listen(topics.COMMANDS)
     assert arm.torque_for(0, START).any()
     assert not node.guard.supervisor.text
     clock.advance(0.1)
-    ros.until(lambda: node.guard.supervisor.text)  # with the clock as its only reason
+    ros.until(lambda: node.guard.supervisor.text)  # only the clock has advanced
     assert 'no joint state received for' in node.guard.supervisor.text
-    before = len(heard)
-    ros.until(lambda: clock.advance(0.01) or len(heard) >= before + 20)
-    np.testing.assert_array_equal(torques(heard)[-1], NOTHING)
+    before = len(commands)
+    ros.until(lambda: clock.advance(0.01) or len(commands) >= before + 20)
+    np.testing.assert_array_equal(torques(commands)[-1], ZERO)
 
 
-def test_a_start_outside_the_bound_names_joint_error_and_bound(ros):
+def test_start_outside_the_bound_is_reported_with_joint_error_and_bound(ros):
     node = ros.add(ControllerNode, {'approach.enabled': False})
     states = ros.publisher(topics.JOINT_STATES)
     ros.listen(topics.COMMANDS)
     ros.until(lambda: states.get_subscription_count() > 0)
-    away = (START[0], START[1] - 0.0021)
-    states.publish(JointStateEncoder(JOINTS).encode(10**9, away, NOTHING, NOTHING))
+    outside = (START[0], START[1] - 0.0021)
+    states.publish(JointStateEncoder(JOINTS).encode(10**9, outside, ZERO, ZERO))
     ros.until(lambda: node.finished)
     error = node.failure
     assert isinstance(error, OutsideBarrierError)
@@ -114,7 +114,7 @@ def test_a_start_outside_the_bound_names_joint_error_and_bound(ros):
         ({'sample_time': 1}, 'sample_time: got 1'),
     ],
 )
-def test_a_parameter_that_will_not_do_is_named(ros, given, problem):
+def test_invalid_parameter_is_named(ros, given, problem):
     with pytest.raises(ConfigurationError) as caught:
         ros.add(ControllerNode, given)
     assert problem in str(caught.value)
@@ -122,13 +122,13 @@ def test_a_parameter_that_will_not_do_is_named(ros, given, problem):
 
 def set_parameters(ros, node, **values):
     """Do what `ros2 param set` does; return whether it was accepted, and why not."""
-    given = [Parameter(name.replace('__', '.'), value=value) for name, value in values.items()]
-    request = SetParameters.Request(parameters=[one.to_parameter_msg() for one in given])
+    parameters = [Parameter(name.replace('__', '.'), value=value) for name, value in values.items()]
+    request = SetParameters.Request(parameters=[p.to_parameter_msg() for p in parameters])
     results = ros.call(SetParameters, f'{node.get_name()}/set_parameters', request).results
     return all(result.successful for result in results), [result.reason for result in results]
 
 
-def test_a_gain_changed_while_running_acts_from_the_next_sample_on(ros):
+def test_gain_change_takes_effect_at_the_next_sample(ros):
     node = ros.add(ControllerNode)
     arm = Arm(ros)
     gain = [30.0, 10.0]
@@ -139,7 +139,7 @@ def test_a_gain_changed_while_running_acts_from_the_next_sample_on(ros):
     assert not np.array_equal(torque, law_torques(*[(START, VELOCITY)] * 2)[1])
 
 
-def test_a_gain_that_will_not_do_changes_nothing_and_says_why(ros):
+def test_invalid_gain_changes_nothing_and_is_rejected_with_a_reason(ros):
     node = ros.add(ControllerNode)
     arm = Arm(ros)
     arm.torque_for(0, START, VELOCITY)
@@ -150,7 +150,7 @@ def test_a_gain_that_will_not_do_changes_nothing_and_says_why(ros):
     np.testing.assert_array_equal(torque, law_torques(*[(START, VELOCITY)] * 2)[1])
 
 
-def test_a_gain_that_the_start_would_warn_of_is_refused_while_it_runs(ros):
+def test_gain_with_a_configuration_warning_is_rejected_at_run_time(ros):
     node = ros.add(ControllerNode)
     arm = Arm(ros)
     arm.torque_for(0, START, VELOCITY)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The URDF on a latched topic: waited for, and kept as if it had been given as a file."""
+"""The URDF on a latched topic: the node waits for it and uses it as if given as a file."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def publish(ros, topic, quality=topics.ROBOT_DESCRIPTION.offered):
     publisher.publish(String(data=TEXT))
 
 
-def test_a_controller_takes_the_arm_that_is_published(ros):
+def test_controller_uses_the_published_urdf(ros):
     ros.add(PlantNode, {'robot.urdf': TEXT, 'robot.tip': 'tip'})
     node = ros.add(ControllerNode, ON_TOPIC)
     assert node.config == build(ControllerConfig, ON_TOPIC | {'robot.urdf': TEXT})
-    assert node.get_parameter('robot.urdf').value == TEXT  # what the recorder asks for
+    assert node.get_parameter('robot.urdf').value == TEXT  # the recorder reads it
 
 
-def test_the_name_is_that_of_the_node_unless_it_begins_with_a_slash(ros):
+def test_topic_is_in_the_namespace_of_the_node_unless_it_begins_with_a_slash(ros):
     publish(ros, '/left/robot_description')
     publish(ros, '/elsewhere')
     for urdf in ('topic://robot_description', 'topic:///elsewhere'):
@@ -46,17 +46,17 @@ def test_the_name_is_that_of_the_node_unless_it_begins_with_a_slash(ros):
 
 
 @pytest.mark.parametrize(
-    ('publishers', 'told'), [(0, 'nobody publishes there'), (1, 'may not be latched')]
+    ('publishers', 'hint'), [(0, 'nobody publishes there'), (1, 'may not be latched')]
 )
-def test_where_none_comes_the_node_says_what_to_do(ros, monkeypatch, publishers, told):
+def test_missing_urdf_is_reported_with_a_hint(ros, monkeypatch, publishers, hint):
     monkeypatch.setattr(description, 'TIMEOUT', 1.0)
     if publishers:
         publish(ros, 'robot_description', Quality(1, 'reliable', 'volatile'))
         ros.until(lambda: ros.tester.count_publishers('/robot_description') == 1)
-    with pytest.raises(ConfigurationError, match=f'/robot_description within 1 s, and .*{told}'):
+    with pytest.raises(ConfigurationError, match=f'/robot_description within 1 s, and .*{hint}'):
         ros.add(ControllerNode, ON_TOPIC)
 
 
-def test_without_a_node_a_topic_is_rejected():
+def test_topic_is_rejected_outside_a_node():
     with pytest.raises(ConfigurationError, match=r'robot.urdf: .* is a topic, which only a node'):
         build(ControllerConfig, ON_TOPIC)

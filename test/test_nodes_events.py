@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events of the plant over ROS: on schedule, and by a parameter that changes while it runs."""
+"""Events of the plant over ROS: on schedule, and by changing a parameter at run time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ QUIET = {'telemetry.enabled': False}
 PUSHED = {'load.payload': 0.2, 'load.torque': [0.4, -0.3], 'sensor.offset': [1e-5, 0.0]}
 
 
-def test_every_kind_of_event_in_lockstep_is_that_of_the_offline_run_bit_for_bit(ros):
+def test_all_kinds_of_events_in_lockstep_match_the_offline_run_bit_for_bit(ros):
     plant = {'duration': 0.2, **ALL_KINDS}
     commands, truth = ros.listen(topics.COMMANDS), ros.listen(topics.TRUTH, raw=True)
     ros.listen(topics.JOINT_STATES)
@@ -38,7 +38,7 @@ def test_every_kind_of_event_in_lockstep_is_that_of_the_offline_run_bit_for_bit(
     np.testing.assert_allclose(P[[0, 2, 4], 1], 0.64 * np.array([0.5, 0.5 + 0.3 + 0.2, 0.7]))
 
 
-def test_a_parameter_that_changes_acts_from_the_sample_that_is_told(ros):
+def test_parameter_change_takes_effect_at_the_published_sample(ros):
     changes = ros.listen(topics.CHANGES)
     commands = ros.listen(topics.COMMANDS)
     ros.listen(topics.JOINT_STATES)
@@ -56,6 +56,6 @@ def test_a_parameter_that_changes_acts_from_the_sample_that_is_told(ros):
     assert change['parameters'] == PUSHED
     at = (change['stamp'] - LOCKSTEP_START) * 1e-9
     assert 0.05 < at < 1.0
-    same = {f'events.{name.partition(".")[2]}': np.ravel(v).tolist() for name, v in PUSHED.items()}
-    expected = simulated_torques({'duration': 1.0, 'events.begin': [at], **same})
+    load = {f'events.{name.partition(".")[2]}': np.ravel(v).tolist() for name, v in PUSHED.items()}
+    expected = simulated_torques({'duration': 1.0, 'events.begin': [at], **load})
     np.testing.assert_array_equal(torques(commands), expected)

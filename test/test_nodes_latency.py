@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arm's waiting time, against a clock of the test's own [ms]."""
+"""The plant's waiting time for a torque, at times given by the test [ms]."""
 
 from __future__ import annotations
 
 from sim_plant.command_input import Latency
 
 
-def test_a_torque_in_time_counts_from_its_state():
+def test_latency_of_a_torque_in_time_counts_from_its_state():
     latency = Latency()
     latency.state_published(0.0)
     latency.torque_received(0.2)
@@ -14,11 +14,11 @@ def test_a_torque_in_time_counts_from_its_state():
     assert latency.late_steps == 0
 
 
-def test_a_late_torque_counts_with_all_of_its_lateness():
+def test_latency_of_a_late_torque_includes_all_of_its_lateness():
     """A controller that is 2.5 samples late must not pass for one that is half a sample late."""
     latency = Latency()
     latency.state_published(0.0)
-    assert latency.step(1.0) == 1.0  # waited in vain so far
+    assert latency.step(1.0) == 1.0  # no torque so far
     latency.state_published(1.0)
     assert latency.step(2.0) == 2.0
     latency.state_published(2.0)
@@ -27,7 +27,7 @@ def test_a_late_torque_counts_with_all_of_its_lateness():
     assert latency.late_steps == 2
 
 
-def test_the_longest_wait_of_a_sample_is_published_once():
+def test_longest_wait_of_a_sample_is_published_once():
     latency = Latency()
     latency.state_published(0.0)
     latency.step(1.0)

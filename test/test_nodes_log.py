@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the nodes say of what they do, of how to go on, and how their processes end."""
+"""What the nodes log, how to continue after a stop, and how their processes end."""
 
 from __future__ import annotations
 
@@ -33,40 +33,40 @@ FATAL = int.from_bytes(Log.FATAL, 'little') if isinstance(Log.FATAL, bytes) else
 
 @pytest.fixture
 def log(ros):
-    """What the nodes in a namespace have logged; each test has one of its own (see KEPT)."""
-    heard = []
-    ros.tester.create_subscription(Log, '/rosout', heard.append, KEPT)
+    """Return what the nodes of a namespace logged; each test uses its own (see KEPT)."""
+    received = []
+    ros.tester.create_subscription(Log, '/rosout', received.append, KEPT)
 
-    def said(namespace, words, level=0):
+    def logged(namespace, words, level=0):
         return [
-            one.msg
-            for one in heard
-            if one.name.startswith(namespace) and words in one.msg and one.level >= level
+            entry.msg
+            for entry in received
+            if entry.name.startswith(namespace) and words in entry.msg and entry.level >= level
         ]
 
-    return said
+    return logged
 
 
-def test_each_phase_is_said_and_after_a_stop_how_to_go_on(ros, log):
-    away = {'initial.position': [START[0] - 0.01, START[1]]}
-    arm, law = ros.loop(plant=away, namespace='phases')
-    said = partial(log, 'phases')
-    ros.until(lambda: said('tracking the reference'))
-    assert len(said('approaching the reference, for ')) == 1
+def test_each_phase_is_logged_and_after_a_stop_how_to_continue(ros, log):
+    outside = {'initial.position': [START[0] - 0.01, START[1]]}
+    arm, law = ros.loop(plant=outside, namespace='phases')
+    logged = partial(log, 'phases')
+    ros.until(lambda: logged('tracking the reference'))
+    assert len(logged('approaching the reference, for ')) == 1
 
     states = ros.tester.create_publisher(JointState, '/phases/joint_states', 1)
     ros.until(states.get_subscription_count)
     states.publish(b'')
-    ros.until(lambda: said('zero torque: ', FATAL))
-    (stop,) = said('zero torque: ', FATAL)
+    ros.until(lambda: logged('zero torque: ', FATAL))
+    (stop,) = logged('zero torque: ', FATAL)
     assert stop.endswith('/phases/sim_plant/reset returns the arm to its start and starts again')
     ros.reset(arm)
-    ros.until(lambda: len(said('tracking the reference')) == 2)
+    ros.until(lambda: len(logged('tracking the reference')) == 2)
     deactivate(ros, law)
-    ros.until(lambda: said('deactivated: zero torque'))
+    ros.until(lambda: logged('deactivated: zero torque'))
 
 
-def test_without_a_simulated_arm_the_controller_itself_is_reset(ros, log):
+def test_log_suggests_resetting_the_controller_without_a_simulated_arm(ros, log):
     ros.add(ControllerNode, namespace='real')
     driver = (Float64MultiArray, '/real/blf_dsc_controller/commands', lambda _: None, 1)
     ros.tester.create_subscription(*driver)
@@ -78,7 +78,7 @@ def test_without_a_simulated_arm_the_controller_itself_is_reset(ros, log):
     assert stop.endswith('/real/blf_dsc_controller/reset starts again from where the arm is')
 
 
-def test_the_end_of_a_run_in_real_time_is_no_fault(ros, log):
+def test_end_of_a_real_time_run_is_not_a_fault(ros, log):
     clock = FakeClock()
     arm = ros.add(PlantNode, {'duration': 0.02}, clock=clock)
     law = ros.add(ControllerNode, clock=clock)
@@ -91,7 +91,7 @@ def test_the_end_of_a_run_in_real_time_is_no_fault(ros, log):
     assert not log('blf_dsc_controller', '', FATAL)
 
 
-def test_a_compilation_is_announced_by_the_node_that_waits_for_it(ros, log):
+def test_compilation_is_announced_by_the_node_that_waits_for_it(ros, log):
     class Compiling(PlantNode):
         def configure(self):
             super().configure()
@@ -103,7 +103,7 @@ def test_a_compilation_is_announced_by_the_node_that_waits_for_it(ros, log):
     assert log('compiles', COMPILATION_NOTICE) == [COMPILATION_NOTICE]
 
 
-def test_a_torque_that_is_too_old_again_and_again_does_not_fill_the_log(ros, log):
+def test_repeatedly_stale_torques_do_not_flood_the_log(ros, log):
     clock = FakeClock()
     states = ros.listen(topics.JOINT_STATES)
     commands = ros.publisher(topics.COMMANDS)
@@ -139,7 +139,7 @@ class Last:
     def __del__(self, kill=os.kill, pid=os.getpid(), number=signal.{}):
         kill(pid, number)
 
-last = Last()  # goes when Python has taken back the handlers of signals
+last = Last()  # deleted after Python has restored the signal handlers
 from blf_dsc_controller.cli.main import {}
 sys.argv.append('--unknown')
 sys.exit({}())
@@ -148,13 +148,13 @@ sys.exit({}())
 
 @pytest.mark.parametrize('number', ['SIGINT', 'SIGTERM'])
 @pytest.mark.parametrize('node', ['sim_plant', 'blf_dsc_controller'])
-def test_a_signal_during_the_imports_ends_a_node_without_a_word(node, number):
+def test_signal_during_imports_ends_a_node_silently(node, number):
     run = finished(sys.executable, '-c', INTERRUPTED.format(number, node, node))
     assert (run.returncode, run.stdout, run.stderr) == (0, '', '')
 
 
 @pytest.mark.parametrize('number', ['SIGINT', 'SIGTERM'])
-def test_a_second_signal_does_not_kill_a_node_that_is_ending(number):
+def test_second_signal_does_not_kill_a_node_that_is_shutting_down(number):
     run = finished(sys.executable, '-c', SECOND.format(number, 'sim_plant', 'sim_plant'))
     assert run.returncode == 1
     assert run.stderr.startswith('unknown arguments --unknown')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plant and controller as nodes in one process: the loop they close, and whose time counts."""
+"""Plant and controller as nodes in one process: the closed loop, and whose clock counts."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NOISY = {'sensor.position_noise': 1e-5, 'sensor.velocity': 'differenced', 'actua
 
 
 def run_lockstep(ros, plant, controller=None):
-    """Run to the end; return torques and what else was heard."""
+    """Run to the end; return the torques and the stamps of the states."""
     commands = ros.listen(topics.COMMANDS)
     joint_states = ros.listen(topics.JOINT_STATES, raw=True)
     arm = ros.add(PlantNode, {'mode': 'lockstep', **OBSERVED, **plant})
@@ -44,14 +44,14 @@ def run_lockstep(ros, plant, controller=None):
     [{'duration': 10.0}, {'duration': 2.0, 'seed': 5, **NOISY}],
     ids=['learning', 'noise, differenced velocity and delay'],
 )
-def test_lockstep_torques_are_those_of_the_offline_run_bit_for_bit(ros, plant):
+def test_lockstep_torques_match_the_offline_run_bit_for_bit(ros, plant):
     over_ros, stamps = run_lockstep(ros, plant)
     np.testing.assert_array_equal(over_ros, simulated_torques(plant))
     np.testing.assert_array_equal(stamps, LOCKSTEP_START + MILLISECOND * np.arange(len(stamps)))
 
 
-def test_an_arm_from_a_urdf_is_the_same_over_ros_bit_for_bit(ros):
-    """Three joints of other kinds, with an event and everything that a window learns."""
+def test_urdf_arm_over_ros_matches_the_offline_run_bit_for_bit(ros):
+    """Three joints of different kinds, with an event and everything that a window learns."""
     arm = {'robot.urdf': random_urdf(3, seed=5)[0], 'robot.tip': 'tip'}
     plant = arm | {'duration': 3.0, 'truth.mass_deviation': 0.3, 'actuator.delay': 1}
     plant |= {'events.begin': [2.0], 'events.payload': [0.3]}
@@ -65,12 +65,12 @@ def test_an_arm_from_a_urdf_is_the_same_over_ros_bit_for_bit(ros):
     assert np.abs(over_ros[2100] - over_ros[1900]).max() > 0.01  # it carries a payload now
 
 
-def test_a_seed_is_heard_in_the_torques(ros):
+def test_seed_changes_the_torques(ros):
     over_ros, _ = run_lockstep(ros, {'duration': 0.5, 'seed': 5, **NOISY})
     assert not np.array_equal(over_ros, simulated_torques({'duration': 0.5, 'seed': 6, **NOISY}))
 
 
-def test_the_clock_is_the_plants_and_nodes_on_simulated_time_follow_it(ros):
+def test_nodes_on_simulated_time_follow_the_clock_of_the_plant(ros):
     clock = ros.listen(topics.CLOCK)
     plant = {'duration': 0.5, 'publish_clock': True}
     over_ros, _ = run_lockstep(ros, plant, {'use_sim_time': True})
@@ -80,8 +80,8 @@ def test_the_clock_is_the_plants_and_nodes_on_simulated_time_follow_it(ros):
     np.testing.assert_array_equal(over_ros, simulated_torques({'duration': 0.5}))
 
 
-def test_real_time_is_counted_by_the_plant_in_whole_samples(ros):
-    heard = {
+def test_plant_counts_real_time_in_whole_samples(ros):
+    received = {
         topic: ros.listen(topic, raw=True)
         for topic in (topics.JOINT_STATES, topics.REFERENCE, topics.TIMING, topics.TRUTH)
     }
@@ -89,9 +89,9 @@ def test_real_time_is_counted_by_the_plant_in_whole_samples(ros):
     given = {'mode': 'realtime', 'duration': 0.3, **OBSERVED}
     plant = ros.add(PlantNode, given, clock=clock)
     controller = ros.add(ControllerNode, clock=clock)
-    ros.until(lambda: clock.advance(0.01) or heard[topics.JOINT_STATES])
+    ros.until(lambda: clock.advance(0.01) or received[topics.JOINT_STATES])
     ros.until(plant.input.torque.any)
-    # In time, but for three steps that the plant has to take at once.
+    # In time, except for three steps that the plant has to take at once.
     for steps in [1] * 100 + [3] + [1] * 197:
         ros.until(lambda: plant._has_torque)
         goal = plant.plant.sample + steps
@@ -100,14 +100,14 @@ def test_real_time_is_counted_by_the_plant_in_whole_samples(ros):
     assert not plant.finished
     clock.advance(0.05)
     ros.until(lambda: plant.finished)
-    ros.until(lambda: len(heard[topics.REFERENCE]) == controller.guard.controller.samples)
-    ros.until(lambda: len(heard[topics.TIMING]) == 300)
+    ros.until(lambda: len(received[topics.REFERENCE]) == controller.guard.controller.samples)
+    ros.until(lambda: len(received[topics.TIMING]) == 300)
 
-    stamps, _ = states(heard[topics.JOINT_STATES])
+    stamps, _ = states(received[topics.JOINT_STATES])
     np.testing.assert_array_equal(stamps, stamps[0] + MILLISECOND * np.arange(301))
 
     # However late the torque for a state was, the reference is that of the state's own time.
-    reference_stamps, values = states(heard[topics.REFERENCE])
+    reference_stamps, values = states(received[topics.REFERENCE])
     assert set(reference_stamps) <= set(stamps)
     vector = reference_of(ControllerConfig())
     qr, dqr, ddqr = np.zeros((3, 2))
@@ -115,13 +115,13 @@ def test_real_time_is_counted_by_the_plant_in_whole_samples(ros):
         reference.evaluate(vector, (stamp - stamps[0]) * 1e-9, qr, dqr, ddqr)
         np.testing.assert_array_equal(value[0], qr)
 
-    stamps_of_steps, timing = states(heard[topics.TIMING], ('latency', 'lateness', 'late_steps'))
+    stamps_of_steps, timing = states(received[topics.TIMING], ('latency', 'lateness', 'late_steps'))
     np.testing.assert_array_equal(stamps_of_steps, stamps[1:])
     latency, lateness, late_steps = timing[:, 0].T
     assert not latency.any()  # the clock stands still while the plant waits for a torque
     expected = np.zeros(300)
     expected[100:102] = 0.002, 0.001
     np.testing.assert_allclose(lateness, expected, atol=1e-9)
-    # Two of the three steps had no torque yet; what comes after the last step is none.
+    # Two of the three steps had no torque yet; nothing counts after the last step.
     np.testing.assert_array_equal(late_steps, np.clip(np.arange(300) - 100, 0, 2))
     assert late_steps[-1] == plant.latency.late_steps

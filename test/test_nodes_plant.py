@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plant node before torques sent by hand."""
+"""The plant node with torques sent by hand."""
 
 from __future__ import annotations
 
@@ -23,51 +23,51 @@ from sim_plant.plant import plant_of
 TORQUE = (5.0, 3.0)  # N m
 
 
-def started(ros, **values):
+def start_plant(ros, **values):
     """Start a plant in lock-step; return it, what it publishes, and a way to send torques."""
-    heard = ros.listen(topics.JOINT_STATES, raw=True)
+    received = ros.listen(topics.JOINT_STATES, raw=True)
     node = ros.add(PlantNode, {'mode': 'lockstep', **values})
     commands = ros.publisher(topics.COMMANDS)
-    ros.until(lambda: len(heard) == 1 and commands.get_subscription_count() > 0)
+    ros.until(lambda: len(received) == 1 and commands.get_subscription_count() > 0)
 
     def send(torque):
         commands.publish(Float64MultiArrayEncoder(len(torque)).encode(torque))
 
-    return node, heard, send
+    return node, received, send
 
 
 @pytest.mark.parametrize(
-    'wrong',
+    'invalid',
     [(1.0,), (1.0, 2.0, 3.0), (1.0, np.nan), (np.inf, 0.0), (1e300, 1.0), (0.0, -2e4)],
     ids=str,
 )
-def test_a_command_that_will_not_do_moves_nothing_and_is_counted(ros, wrong):
-    node, heard, send = started(ros)
+def test_invalid_command_is_counted_but_not_applied(ros, invalid):
+    node, received, send = start_plant(ros)
     send(TORQUE)
     ros.until(lambda: node.plant.sample == 1)
-    send(wrong)
+    send(invalid)
     ros.until(lambda: node.input.rejected == 1)
     assert node.plant.sample == 1
     send(TORQUE)
-    ros.until(lambda: len(heard) == 3)
+    ros.until(lambda: len(received) == 3)
 
-    alone = plant_of(PlantConfig())
-    alone.step(np.array(TORQUE))
-    alone.step(np.array(TORQUE))
-    _, measured = states(heard)
-    np.testing.assert_array_equal(measured[2].ravel(), alone.measure())
+    expected = plant_of(PlantConfig())
+    expected.step(np.array(TORQUE))
+    expected.step(np.array(TORQUE))
+    _, measured = states(received)
+    np.testing.assert_array_equal(measured[2].ravel(), expected.measure())
     assert node.input.rejected == 1
 
 
-def test_an_arm_driven_too_fast_breaks_and_stands_still_until_it_is_reset(ros):
-    node, heard, send = started(ros, **{'actuator.torque_limit': (0.0, 0.0)})
+def test_arm_driven_too_fast_breaks_and_stands_still_until_reset(ros):
+    node, received, send = start_plant(ros, **{'actuator.torque_limit': (0.0, 0.0)})
     broken = 0
-    while broken < 3 and len(heard) < 500:
-        count = len(heard)
+    while broken < 3 and len(received) < 500:
+        count = len(received)
         send((0.0, 9e3))
-        ros.until(lambda k=count: len(heard) == k + 1)
+        ros.until(lambda k=count: len(received) == k + 1)
         broken += node.plant.is_broken
-    _, measured = states(heard)
+    _, measured = states(received)
     assert np.isfinite(measured).all()
     assert np.abs(measured[:, 1]).max() < 1e3
     np.testing.assert_array_equal(measured[-3:, 0], measured[[-3] * 3, 0])
@@ -76,32 +76,32 @@ def test_an_arm_driven_too_fast_breaks_and_stands_still_until_it_is_reset(ros):
     assert not node.plant.is_broken
 
 
-def test_the_arm_of_a_urdf_is_simulated_described_and_its_truth_named(ros):
+def test_urdf_arm_is_simulated_and_its_description_and_truth_are_published(ros):
     description, truth = ros.listen(topics.ROBOT_DESCRIPTION), ros.listen(topics.TRUTH)
     given = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp', 'truth.mass_factor': 1.2}
-    _, heard, send = started(ros, **given)
+    _, received, send = start_plant(ros, **given)
     torque = np.linspace(5.0, 1.0, 7)
     for count in range(2, 12):
         send(torque)
-        ros.until(lambda k=count: len(heard) == k)
+        ros.until(lambda k=count: len(received) == k)
     ros.until(lambda: description and len(truth) == 2)
 
     config = build(PlantConfig, given)
-    alone = plant_of(config)
+    expected = plant_of(config)
     for _ in range(10):
-        alone.measure()
-        alone.step(torque)
-    _, measured = states(heard, config.joints)
-    np.testing.assert_array_equal(measured[-1].ravel(), alone.measure())
+        expected.measure()
+        expected.step(torque)
+    _, measured = states(received, config.joints)
+    np.testing.assert_array_equal(measured[-1].ravel(), expected.measure())
     assert description[0].data == config.robot.text
     names = (*parameter_names_of(config), *disturbance_names(config.joints))
     assert tuple(truth[-1].name[: len(names)]) == names
-    np.testing.assert_array_equal(truth[-1].position, alone.truth())
+    np.testing.assert_array_equal(truth[-1].position, expected.truth())
 
 
-def test_the_brake_holds_until_the_first_torque(ros):
-    node, heard, send = started(ros)
-    _, measured = states(heard)
+def test_brake_holds_until_the_first_torque(ros):
+    node, received, send = start_plant(ros)
+    _, measured = states(received)
     np.testing.assert_array_equal(measured[0][0], PlantConfig().initial.position)
     for _ in range(10):
         ros.executor.spin_once(timeout_sec=0.01)
@@ -110,16 +110,16 @@ def test_the_brake_holds_until_the_first_torque(ros):
     ros.until(lambda: node.plant.sample == 1)
 
 
-def test_it_ends_when_the_last_state_has_got_its_torque(ros):
-    node, heard, send = started(ros, duration=0.003)
+def test_plant_finishes_when_the_last_state_has_received_its_torque(ros):
+    node, received, send = start_plant(ros, duration=0.003)
     for steps in range(1, 5):
         assert not node.finished
         send(TORQUE)
-        ros.until(lambda k=steps: node.finished or len(heard) > k)
+        ros.until(lambda k=steps: node.finished or len(received) > k)
     assert node.finished
-    assert len(heard) == 4
+    assert len(received) == 4
 
 
-def test_a_parameter_that_will_not_do_is_named(ros):
+def test_invalid_parameter_is_named(ros):
     with pytest.raises(ConfigurationError, match=r'arm\.m1: got -0\.5'):
         ros.add(PlantNode, {'arm.m1': -0.5})

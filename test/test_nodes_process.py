@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node's process ends in order, whatever its end meets."""
+"""A node's process ends cleanly, even if its shutdown fails."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ print(run(lambda: Broken('broken')), rclpy.ok())
 
 
 @pytest.mark.parametrize('error', ['RCLError', 'OSError', 'BlfDscError'])
-def test_an_error_at_the_end_leaves_neither_node_nor_ros(error):
+def test_error_during_shutdown_leaves_neither_node_nor_context(error):
     process = subprocess.run(
         [sys.executable, '-c', BROKEN.format(error=error)],
         capture_output=True,

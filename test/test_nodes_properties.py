@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whatever comes, in whatever order: no callback raises, and no torque is bad.
+"""Arbitrary input in arbitrary order: no callback raises, and every torque is valid.
 
-`make test-nightly` runs ten thousand examples of each, `make test` some hundreds in all.
+`make test-nightly` runs ten thousand examples of each, `make test` a few hundred in all.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ names = st.lists(st.sampled_from(['joint1', 'joint2', 'joint3', '', 'ü']), max_
 
 @st.composite
 def joint_states(draw):
-    """Serialised joint states: good ones, wrong ones, and mere bytes."""
+    """Serialised joint states: valid ones, invalid ones, and random bytes."""
     kind = draw(st.sampled_from(['good', 'good', 'good', 'near', 'wrong', 'names', 'bytes', 'cut']))
     step = draw(st.sampled_from([1, 1, 1, 1, 0, 2, 60, -1, -1000, 10**7]))
     q = [start + draw(st.floats(-1e-3, 1e-3)) for start in START]
@@ -111,8 +111,8 @@ transitions = st.sampled_from(
 
 
 def events(messages):
-    """Sequences of what can happen to a node; messages are most of it."""
-    one = st.one_of(
+    """Sequences of events that a node can meet, mostly messages."""
+    event = st.one_of(
         st.tuples(st.just('message'), messages),
         st.tuples(st.just('message'), messages),
         st.tuples(st.just('parameter'), parameters),
@@ -120,7 +120,7 @@ def events(messages):
         st.tuples(st.just('reset'), st.none()),
         st.tuples(st.just('tick'), st.none()),
     )
-    return st.lists(one, max_size=30)
+    return st.lists(event, max_size=30)
 
 
 @pytest.fixture(scope='module')
@@ -133,23 +133,23 @@ def context():
 
 @pytest.fixture(scope='module')
 def bystander(context):
-    """Keeps the middleware up between examples, which then cost a tenth."""
+    """Keep the middleware up between examples, which makes them ten times faster."""
     node = rclpy.create_node('bystander', context=context)
     yield node
     node.destroy_node()
 
 
-def happen(node, what, content):
-    """Let one thing happen to a node, through the callbacks that ROS would call."""
-    if what == 'transition':
+def apply_event(node, kind, content):
+    """Apply one event to a node, through the callbacks that ROS would call."""
+    if kind == 'transition':
         request = ChangeState.Request(transition=Transition(id=content))
         node._service_change_state.callback(request, ChangeState.Response())
-    elif what == 'reset':
+    elif kind == 'reset':
         node._on_reset(Trigger.Request(), Trigger.Response())
-    elif what == 'tick':
+    elif kind == 'tick':
         node._on_poll()
         node._report()
-    elif what == 'parameter':
+    elif kind == 'parameter':
         name, value = content
         if not node.has_parameter(name):  # of the other node
             return
@@ -160,19 +160,19 @@ def happen(node, what, content):
 @pytest.mark.usefixtures('bystander')
 @given(events(joint_states()))
 @SETTINGS
-def test_the_controller_bears_everything(context, sequence):
+def test_controller_survives_arbitrary_input(context, sequence):
     node = ControllerNode(context=context, cli_args=[], enable_rosout=False)
     commands = []
     node._command = lambda torque: torque is None or commands.append(torque.copy())
     node._is_observed = lambda: True
     stamp = 10**9
     try:
-        for what, content in sequence:
-            if what == 'message':
+        for kind, content in sequence:
+            if kind == 'message':
                 step, raw = content
                 stamp = max(1, stamp + step * 1_000_000)
                 node._on_joint_state(raw(stamp))
-            happen(node, what, content)
+            apply_event(node, kind, content)
             limit = np.array(node.config.torque.limit)
             for torque in commands:
                 assert np.isfinite(torque).all()
@@ -184,7 +184,7 @@ def test_the_controller_bears_everything(context, sequence):
 
 @st.composite
 def commands(draw):
-    """Serialised torques of any number of values, and mere bytes."""
+    """Serialised torques of any number of values, and random bytes."""
     if draw(st.booleans()):
         values = draw(st.lists(numbers, max_size=4))
         return Float64MultiArrayEncoder(len(values)).encode(values)
@@ -194,7 +194,7 @@ def commands(draw):
 @pytest.mark.usefixtures('bystander')
 @given(events(commands()))
 @SETTINGS
-def test_the_plant_bears_everything(context, sequence):
+def test_plant_survives_arbitrary_input(context, sequence):
     overrides = [
         Parameter('mode', value='lockstep'),
         Parameter('actuator.torque_limit', value=[20.0, 20.0]),
@@ -205,10 +205,10 @@ def test_the_plant_bears_everything(context, sequence):
     node._is_observed = lambda: True
     node._handshake._complete_since = 0.0
     try:
-        for what, content in sequence:
-            if what == 'message':
+        for kind, content in sequence:
+            if kind == 'message':
                 node._on_command(content)
-            happen(node, what, content)
+            apply_event(node, kind, content)
             assert np.isfinite(node.input.torque).all()
             if node.state_label == 'active':
                 measured = node.plant.measure()

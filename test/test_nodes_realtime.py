@@ -16,7 +16,7 @@ from blf_dsc_controller.nodes.process import request_realtime
 
 
 class Log:
-    """Takes what is logged."""
+    """A logger that keeps what is logged."""
 
     def __init__(self):
         self.logged = []
@@ -31,7 +31,7 @@ class Log:
 
 @pytest.fixture
 def system(monkeypatch):
-    """A system that takes notes, and refuses what `refused` names."""
+    """A system that records requests, and refuses those named in `refused`."""
 
     class System:
         def __init__(self):
@@ -51,41 +51,41 @@ def system(monkeypatch):
             self.locked.append(flags)
             return 0
 
-    one = System()
-    monkeypatch.setattr(os, 'sched_setscheduler', one.schedule)
-    monkeypatch.setattr(ctypes, 'CDLL', lambda *_, **__: one)
-    return one
+    fake = System()
+    monkeypatch.setattr(os, 'sched_setscheduler', fake.schedule)
+    monkeypatch.setattr(ctypes, 'CDLL', lambda *_, **__: fake)
+    return fake
 
 
-def requested(**values):
+def log_of_request(**values):
     log = Log()
     request_realtime(Realtime(**values), log)
     return log
 
 
 def test_nothing_is_requested_by_default(system):
-    log = requested()
+    log = log_of_request()
     assert (system.scheduled, system.locked) == ([], [])
     assert (log.logged, log.warned) == ([], [])
 
 
 def test_every_thread_gets_the_priority(system):
-    log = requested(priority=50)
+    log = log_of_request(priority=50)
     threads = {int(name) for name in os.listdir('/proc/self/task')}  # noqa: PTH208
     assert {thread for thread, *_ in system.scheduled} == threads
     assert {(policy, level) for _, policy, level in system.scheduled} == {(os.SCHED_FIFO, 50)}
     assert log.logged == ['running with SCHED_FIFO priority 50']
 
 
-def test_memory_is_locked_now_and_for_all_to_come(system):
-    log = requested(lock_memory=True)
+def test_present_and_future_memory_is_locked(system):
+    log = log_of_request(lock_memory=True)
     assert system.locked == [1 | 2]  # MCL_CURRENT | MCL_FUTURE of Linux
     assert log.logged == ['memory locked']
 
 
-def test_a_refusal_is_logged_with_its_remedy_and_survived(system):
+def test_refusal_is_logged_with_its_remedy_and_survived(system):
     system.refused = ('schedule', 'lock')
-    log = requested(priority=50, lock_memory=True)
+    log = log_of_request(priority=50, lock_memory=True)
     assert log.logged == []
     schedule, lock = log.warned
     assert 'priority 50 refused (Operation not permitted)' in schedule

@@ -32,7 +32,7 @@ def phase(law):
     return law.guard.supervisor.phase
 
 
-def test_an_approach_over_ros_is_the_offline_one_bit_for_bit(ros):
+def test_approach_over_ros_matches_the_offline_run_bit_for_bit(ros):
     commands = ros.listen(topics.COMMANDS)
     arm, law = ros.loop({'initial__position': AWAY, 'duration': 4.0})
     ros.run(arm, 10)
@@ -47,7 +47,7 @@ def test_an_approach_over_ros_is_the_offline_one_bit_for_bit(ros):
     np.testing.assert_array_equal(torques(commands)[:4001], offline.samples[:, 8:10])
 
 
-def test_an_approach_that_cannot_be_made_is_rejected_with_a_reason(ros):
+def test_infeasible_approach_is_rejected_with_a_reason(ros):
     _, law = ros.loop(
         {'initial__position': AWAY},
         {'limits__velocity': [0.2, 1.5]},  # the paper's reference moves at 0.3 rad/s
@@ -62,7 +62,7 @@ def sender(ros):
     return partial(send, ros)
 
 
-def test_a_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ros, sender):
+def test_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ros, sender):
     references = ros.listen(topics.REFERENCE)
     errors = ros.listen(topics.TRACKING_ERROR)
     arm, law = ros.loop(None, BRISK)
@@ -70,8 +70,8 @@ def test_a_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ro
     shifts = ([0.0, 0.0], [0.1, -0.2], [-0.15, 0.1])
     orders = (JOINTS, JOINTS[::-1], JOINTS)
     for shift, joints, fields in zip(shifts, orders, (3, 2, 3), strict=True):
-        sent = trajectory(joints, np.array(shift), duration=3.0, fields=fields)
-        assert sender(law, sent) == ''
+        message = trajectory(joints, np.array(shift), duration=3.0, fields=fields)
+        assert sender(law, message) == ''
         ros.run(arm, 1800)
     begin = law.guard.start_stamp
     last = [1e-9 * (law.guard.last_stamp - begin)]
@@ -79,14 +79,14 @@ def test_a_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ro
 
     assert inputs(law).accepted == 3
     assert inputs(law).rejected == 0
-    # On the last of the three, then held at its end.
-    now = law.guard.controller.reference_at(last[0] + 3.4)
-    np.testing.assert_allclose(now, [two_tones(3.95, np.array(shifts[2]))[0], [0, 0], [0, 0]])
+    # The last of the three has ended, and its last point is held.
+    reference = law.guard.controller.reference_at(last[0] + 3.4)
+    np.testing.assert_allclose(reference, [two_tones(3.95, np.array(shifts[2]))[0], [0, 0], [0, 0]])
     assert law.guard.samples.ratio.max() < 1.0
-    assert np.max([np.abs(one.position) for one in errors]) < 2e-3
-    positions = np.array([one.position for one in references])
-    velocities = np.array([one.velocity for one in references])
-    # At most 4 rad/s^2 for a millisecond, and nothing jumps where one replaces another.
+    assert np.max([np.abs(message.position) for message in errors]) < 2e-3
+    positions = np.array([message.position for message in references])
+    velocities = np.array([message.velocity for message in references])
+    # At most 4 rad/s^2 over a millisecond: no jump where one trajectory replaces another.
     assert np.abs(np.diff(velocities, axis=0)).max() < 4.1e-3
     np.testing.assert_allclose(
         np.diff(positions, axis=0), 0.5e-3 * (velocities[1:] + velocities[:-1]), atol=1e-8
@@ -94,7 +94,7 @@ def test_a_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ro
     assert phase(law) is Phase.TRACKING
 
 
-def test_a_trajectory_that_is_refused_changes_nothing(ros, sender):
+def test_rejected_trajectory_changes_nothing(ros, sender):
     arm, law = ros.loop()
     ros.run(arm, 20)
     before = law.guard.controller.reference_vector.copy()
@@ -107,7 +107,7 @@ def test_a_trajectory_that_is_refused_changes_nothing(ros, sender):
     assert phase(law) is Phase.TRACKING
 
 
-def test_a_stamp_says_when_it_begins(ros, sender):
+def test_header_stamp_sets_the_start_of_a_trajectory(ros, sender):
     arm, law = ros.loop(None, BRISK)
     ros.run(arm, 20)
     begin = law.guard.start_stamp + 3 * SECOND
@@ -118,58 +118,58 @@ def test_a_stamp_says_when_it_begins(ros, sender):
     assert phase(law) is Phase.TRACKING
 
 
-def test_before_the_start_a_trajectory_is_refused_with_the_reason(ros, sender):
+def test_trajectory_before_the_start_is_rejected_with_the_reason(ros, sender):
     law = ros.loop()[1]
     sender(law, trajectory(JOINTS, np.zeros(2), duration=0.1))
     assert 'not in command: starting' in inputs(law).reason
 
 
-def test_the_moving_bound_is_published_each_sample_and_a_still_one_once(ros):
+def test_moving_bound_is_published_at_every_sample(ros):
     bounds = ros.listen(replace(topics.BOUND, requested=topics.STREAM))
     arm, _ = ros.loop(None, {'barrier__initial_bound': [0.02, 0.01], 'barrier__funnel_rate': 5.0})
     ros.run(arm, 300)
     ros.until(lambda: len(bounds) >= 300)
     t = np.arange(300) * 1e-3
-    published = np.array([one.position for one in bounds[:300]])
+    published = np.array([message.position for message in bounds[:300]])
     np.testing.assert_allclose(published[:, 0], 0.002 + 0.018 * np.exp(-5.0 * t), rtol=1e-12)
     np.testing.assert_allclose(published[:, 1], 0.002 + 0.008 * np.exp(-5.0 * t), rtol=1e-12)
 
 
-def lasting(seconds):
-    sent = trajectory(JOINTS, np.zeros(2), duration=0.1)
-    sent.points[-1].time_from_start.sec = seconds
-    return sent
+def long_trajectory(seconds):
+    message = trajectory(JOINTS, np.zeros(2), duration=0.1)
+    message.points[-1].time_from_start.sec = seconds
+    return message
 
 
 @pytest.mark.parametrize('watchdog', ['on', 'off'])
 @pytest.mark.parametrize('seconds', [100_000, 2_000_000_000])
-def test_a_trajectory_of_years_is_rejected_and_the_loop_goes_on(ros, sender, seconds, watchdog):
+def test_too_long_trajectory_is_rejected_and_the_loop_continues(ros, sender, seconds, watchdog):
     arm, law = ros.loop(None, {'safety__watchdog': watchdog, 'safety__state_timeout': 60.0})
     ros.run(arm, 20)
-    assert f'it takes {seconds:g} s, longer than 3600 s' in sender(law, lasting(seconds))
+    assert f'it takes {seconds:g} s, longer than 3600 s' in sender(law, long_trajectory(seconds))
     ros.run(arm, 20)
     assert phase(law) is Phase.TRACKING
 
 
-def test_a_message_that_is_too_large_to_read_is_rejected(ros, sender):
+def test_oversized_trajectory_message_is_rejected(ros, sender):
     arm, law = ros.loop()
     ros.run(arm, 20)
-    sent = trajectory(JOINTS, np.zeros(2), duration=0.1)
-    sent.points *= 1000
-    assert 'bytes, more than 1000 points can have' in sender(law, sent)
+    message = trajectory(JOINTS, np.zeros(2), duration=0.1)
+    message.points *= 1000
+    assert 'bytes, more than 1000 points can have' in sender(law, message)
 
 
 @pytest.mark.parametrize('fields', [1, 2, 3])
-def test_a_trajectory_is_read_as_rclpy_reads_it(fields):
-    sent = trajectory(JOINTS, np.zeros(2), duration=0.2, fields=fields, stamp=5 * SECOND + 7)
-    sent.header.frame_id = 'base'
-    sent.points[0].effort = [1.0, 2.0, 3.0]
-    raw = serialize_message(sent)
+def test_trajectory_message_is_decoded_as_by_rclpy(fields):
+    message = trajectory(JOINTS, np.zeros(2), duration=0.2, fields=fields, stamp=5 * SECOND + 7)
+    message.header.frame_id = 'base'
+    message.points[0].effort = [1.0, 2.0, 3.0]
+    raw = serialize_message(message)
     read = joint_trajectory(raw)
     assert (read.stamp, read.names) == (5 * SECOND + 7, JOINTS)
-    for (time, arrays), point in zip(read.points, sent.points, strict=True):
-        given = (point.positions, point.velocities, point.accelerations, point.effort)
-        assert arrays == [tuple(one) for one in given]
+    for (time, arrays), point in zip(read.points, message.points, strict=True):
+        expected = (point.positions, point.velocities, point.accelerations, point.effort)
+        assert arrays == [tuple(values) for values in expected]
         assert time == point.time_from_start.sec * SECOND + point.time_from_start.nanosec
     for end in range(0, len(raw) // 2, 7):
         with pytest.raises(MessageError):
@@ -177,34 +177,32 @@ def test_a_trajectory_is_read_as_rclpy_reads_it(fields):
 
 
 @pytest.mark.parametrize('watchdog', ['on', 'off'])
-def test_an_unexpected_error_while_planning_rejects_the_trajectory(
-    ros, sender, monkeypatch, watchdog
-):
+def test_unexpected_planning_error_rejects_the_trajectory(ros, sender, monkeypatch, watchdog):
     def fail(*_):
         raise MemoryError('no room')
 
     monkeypatch.setattr('blf_dsc_controller.supervision.guard.plan_trajectory', fail)
     arm, law = ros.loop(None, {'safety__watchdog': watchdog, 'safety__state_timeout': 60.0})
     ros.run(arm, 20)
-    sent = trajectory(JOINTS, np.zeros(2), duration=0.1)
-    assert sender(law, sent) == 'trajectory rejected: MemoryError: no room'
+    message = trajectory(JOINTS, np.zeros(2), duration=0.1)
+    assert sender(law, message) == 'trajectory rejected: MemoryError: no room'
     ros.run(arm, 20)
     assert phase(law) is Phase.TRACKING
 
 
-def test_a_trajectory_planned_aside_leads_on_without_a_jump(ros, sender):
+def test_trajectory_planned_in_the_background_joins_without_a_jump(ros, sender):
     references = ros.listen(topics.REFERENCE)
-    watched = {'safety__watchdog': 'on', 'safety__state_timeout': 60.0}
-    arm, law = ros.loop(None, BRISK | watched)
+    watchdog = {'safety__watchdog': 'on', 'safety__state_timeout': 60.0}
+    arm, law = ros.loop(None, BRISK | watchdog)
     ros.run(arm, 20)
     assert sender(law, trajectory(JOINTS, np.zeros(2), duration=3.0)) == ''
     ros.run(arm, 1500)
-    velocities = np.array([one.velocity for one in references])
+    velocities = np.array([message.velocity for message in references])
     assert np.abs(np.diff(velocities, axis=0)).max() < 4.1e-3  # 4 rad/s^2 for a millisecond
     assert law.guard.samples.ratio.max() < 1.0
 
 
-def test_an_error_that_escapes_from_a_callback_is_a_safe_stop(ros):
+def test_uncaught_callback_error_causes_a_safe_stop(ros):
     commands = ros.listen(topics.COMMANDS)
     arm, law = ros.loop()
     ros.run(arm, 20)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the controller node warns of: rejected columns with their reason, gains that cannot work."""
+"""Warnings of the controller node: rejected columns with their reason, gains that cannot work."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ OBSERVED = {'wait_for_subscribers': 0}
 COSINE = {'learning.frequencies': [1.0], 'learning.bias': False}
 
 
-# /rosout keeps what was logged before anyone had found the node. rcl keeps a publisher of it for
-# each logger: so the nodes of each test are in a namespace of their own.
-KEPT = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# Transient local, to get from /rosout what was logged before discovery. rcl keeps one publisher
+# for each logger name, so the nodes of each test are in a namespace of their own.
+LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def listen(ros, kind, topic, quality=100):
-    heard = []
-    ros.tester.create_subscription(kind, topic, heard.append, quality)
-    return heard
+def listen(ros, kind, topic, qos=100):
+    received = []
+    ros.tester.create_subscription(kind, topic, received.append, qos)
+    return received
 
 
-def test_rejected_columns_are_logged_and_diagnosed_with_what_they_are_like(ros):
-    """On the paper's reference cos t on both joints is the column of m2 l2^2."""
+def test_rejected_columns_are_logged_and_diagnosed_with_the_reason(ros):
+    """On the paper's reference, cos t on both joints is indistinguishable from m2 l2^2."""
     log, diagnostics = (
-        listen(ros, Log, '/rosout', KEPT),
+        listen(ros, Log, '/rosout', LATCHED),
         listen(ros, DiagnosticArray, '/diagnostics'),
     )
     ros.add(ControllerNode, COSINE, namespace='rejected')
@@ -51,40 +51,40 @@ def test_rejected_columns_are_logged_and_diagnosed_with_what_they_are_like(ros):
     message, value = rejected()[-1]
     assert message.startswith('not estimated: cos 1 rad/s')
     assert 'cannot distinguish it from m2*l2^2' in value.value
-    warned = [one.msg for one in log if 'is not estimated' in one.msg]
-    assert len(warned) == 1  # once, not in every sample
-    assert 'cannot distinguish it from m2*l2^2' in warned[0]
+    warnings = [line.msg for line in log if 'is not estimated' in line.msg]
+    assert len(warnings) == 1  # once, not in every sample
+    assert 'cannot distinguish it from m2*l2^2' in warnings[0]
 
 
-def test_config_warnings_are_logged_before_the_first_state(ros):
-    log = listen(ros, Log, '/rosout', KEPT)
+def test_configuration_warnings_are_logged_before_the_first_state(ros):
+    log = listen(ros, Log, '/rosout', LATCHED)
     ros.add(ControllerNode, {'learning.window': 5.0}, namespace='warned')
-    ros.until(lambda: any('learning.window: 5 s' in one.msg for one in log))
+    ros.until(lambda: any('learning.window: 5 s' in line.msg for line in log))
 
 
-def test_stamps_that_switch_the_watchdog_off_are_warned_of_once(ros):
-    log = listen(ros, Log, '/rosout', KEPT)
+def test_stamps_that_disable_the_watchdog_cause_one_warning(ros):
+    log = listen(ros, Log, '/rosout', LATCHED)
     ros.add(ControllerNode, namespace='unwatched')
     arm = ros.add(PlantNode, {'mode': 'lockstep', 'duration': 0.1}, namespace='unwatched')
 
-    def warned():
-        return [one.msg for one in log if 'a silence is not detected' in one.msg]
+    def warnings():
+        return [line.msg for line in log if 'a silence is not detected' in line.msg]
 
-    ros.until(lambda: arm.finished and warned())
-    assert len(warned()) == 1
+    ros.until(lambda: arm.finished and warnings())
+    assert len(warnings()) == 1
 
 
 @pytest.mark.parametrize('kind', [ControllerNode, PlantNode])
-def test_a_second_node_on_the_same_topic_is_noticed(ros, kind):
+def test_second_publisher_on_the_same_topic_is_reported(ros, kind):
     space = f'rivals_{kind.__name__}'
-    log = listen(ros, Log, '/rosout', KEPT)
+    log = listen(ros, Log, '/rosout', LATCHED)
     diagnostics = listen(ros, DiagnosticArray, '/diagnostics')
     first = ros.add(kind, namespace=space)
     second = ros.add(kind, namespace=space)
     ros.until(lambda: first.rivals == second.rivals == 1)
     name = 'joint_states' if kind is PlantNode else 'blf_dsc_controller/commands'
     ros.until(
-        lambda: any(f'another node publishes on /{space}/{name}, too' in one.msg for one in log)
+        lambda: any(f'another node publishes on /{space}/{name}, too' in line.msg for line in log)
     )
     if kind is ControllerNode:
         ros.until(
@@ -98,8 +98,8 @@ def test_a_second_node_on_the_same_topic_is_noticed(ros, kind):
     ros.until(lambda: first.rivals == 0)
 
 
-def test_states_that_come_too_often_are_noticed(ros):
-    log = listen(ros, Log, '/rosout', KEPT)
+def test_joint_states_at_too_high_a_rate_are_reported(ros):
+    log = listen(ros, Log, '/rosout', LATCHED)
     ros.add(ControllerNode, namespace='often')
     ros.add(PlantNode, mode='lockstep', sample_time=0.0005, namespace='often')
-    ros.until(lambda: any('joint states arrive every 0.0005 s, but' in one.msg for one in log))
+    ros.until(lambda: any('joint states arrive every 0.0005 s, but' in line.msg for line in log))

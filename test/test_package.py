@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The package as pip, colcon and ROS see it: what is installed, and that its papers agree."""
+"""The package as pip, colcon and ROS see it: what is installed, and that its metadata agree."""
 
 import ast
 import configparser
@@ -50,7 +50,7 @@ ROSDEP_KEYS = {
     'scipy': 'python3-scipy',
     'jinja2': 'python3-jinja2',
     'mcap': 'mcap-ros2-support',
-    'lz4': 'mcap-ros2-support',  # by way of mcap
+    'lz4': 'mcap-ros2-support',  # through mcap
     'zstandard': 'mcap-ros2-support',
     'rosbags': 'python3-rosbags-pip',
 }
@@ -74,9 +74,9 @@ def wheel(tmp_path_factory):
     copy = tmp_path_factory.mktemp('source') / NAME
     unwanted = ('.*', 'build', 'install', 'log', 'out', '*.egg-info', '__pycache__')
     shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*unwanted))
-    told = (copy / 'package.xml').read_text()
-    url = f'<url type="website">{URL}</url>'  # as whoever publishes it writes it
-    (copy / 'package.xml').write_text(told.replace('<exec_depend>', f'{url}<exec_depend>', 1))
+    text = (copy / 'package.xml').read_text()
+    url = f'<url type="website">{URL}</url>'  # as its publisher would add it
+    (copy / 'package.xml').write_text(text.replace('<exec_depend>', f'{url}<exec_depend>', 1))
     build = [sys.executable, '-m', 'pip', 'wheel', '--quiet', '--no-deps', '--no-index']
     out = tmp_path_factory.mktemp('wheel')
     subprocess.run(
@@ -88,7 +88,7 @@ def wheel(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def metadata(wheel):
-    """What the wheel tells pip, as a list of (field, value)."""
+    """Metadata of the wheel, as a list of (field, value)."""
     (name,) = (name for name in wheel.namelist() if name.endswith('.dist-info/METADATA'))
     header = wheel.read(name).decode().split('\n\n')[0]
     return [tuple(line.split(': ', 1)) for line in header.splitlines() if ': ' in line]
@@ -113,7 +113,7 @@ def requirements(metadata, extra=None):
     return {re.match(r'[\w-]+', line).group().lower() for line in wanted}
 
 
-def test_one_version_everywhere(metadata):
+def test_version_is_the_same_everywhere(metadata):
     version = blf_dsc_controller.__version__
     citation = re.search(r'^version: (.+)$', (ROOT / 'CITATION.cff').read_text(), re.MULTILINE)
     assert dict(metadata)['Version'] == version
@@ -122,20 +122,20 @@ def test_one_version_everywhere(metadata):
     assert version in (ROOT / 'CHANGELOG.rst').read_text()
 
 
-def test_metadata_is_that_of_the_manifest_and_readme(wheel, metadata):
-    told = dict(metadata)
+def test_metadata_matches_the_manifest_and_readme(wheel, metadata):
+    fields = dict(metadata)
     (name,) = (name for name in wheel.namelist() if name.endswith('.dist-info/METADATA'))
     assert wheel.read(name).decode().endswith((ROOT / 'README.md').read_text())
-    assert told['Description-Content-Type'] == 'text/markdown'
-    assert told['Project-URL'] == f'website, {URL}'
-    assert told['Author'] == told['Maintainer'] == manifest().findtext('maintainer')
-    assert told['Maintainer-email'] == manifest().find('maintainer').get('email')
-    stated = told.get('License-Expression') or told['License']  # by the age of setuptools
-    assert stated == manifest().findtext('license') == 'Apache-2.0'
-    assert told['Keywords']
+    assert fields['Description-Content-Type'] == 'text/markdown'
+    assert fields['Project-URL'] == f'website, {URL}'
+    assert fields['Author'] == fields['Maintainer'] == manifest().findtext('maintainer')
+    assert fields['Maintainer-email'] == manifest().find('maintainer').get('email')
+    license_name = fields.get('License-Expression') or fields['License']  # depends on setuptools
+    assert license_name == manifest().findtext('license') == 'Apache-2.0'
+    assert fields['Keywords']
 
 
-def test_continuous_integration_runs_every_python_that_is_supported(metadata):
+def test_continuous_integration_runs_every_supported_python(metadata):
     jobs = yaml.safe_load((ROOT / '.github/workflows/ci.yml').read_text())['jobs']
     classified = {value.split(' :: ')[-1] for _, value in metadata if 'Python :: 3.' in value}
     assert set(jobs['suite']['strategy']['matrix']['python']) == classified
@@ -145,16 +145,16 @@ def test_continuous_integration_runs_every_python_that_is_supported(metadata):
         subprocess.run(['/bin/bash', '-n', ROOT / '.ci' / script], check=True)
 
 
-def test_manifest_is_of_an_ament_python_package():
+def test_manifest_describes_an_ament_python_package():
     root = manifest()
     assert root.get('format') == '3'
     assert root.findtext('name') == NAME
     assert root.findtext('export/build_type') == 'ament_python'
-    # colcon takes a package with an invalid address for plain Python, without a word.
+    # colcon silently treats a package with an invalid address as plain Python.
     assert re.fullmatch(r'[\w.+-]+@([\w-]+\.)+[a-zA-Z]{2,}', root.find('maintainer').get('email'))
 
 
-def test_wheel_holds_every_module_and_no_test(wheel):
+def test_wheel_contains_every_module_and_no_tests(wheel):
     installed = [name for name in wheel.namelist() if '.data/' not in name]
     modules = {name for name in installed if name.endswith('.py')}
     assert modules == {path.relative_to(ROOT).as_posix() for path in sources()}
@@ -166,11 +166,11 @@ def test_every_folder_of_modules_is_a_package():
     }
 
 
-def test_wheel_says_it_is_typed(wheel):
+def test_wheel_is_marked_as_typed(wheel):
     assert {f'{package}/py.typed' for package in PACKAGES} <= set(wheel.namelist())
 
 
-def test_wheel_shares_what_ros_looks_for(wheel):
+def test_wheel_installs_the_share_files_that_ros_expects(wheel):
     start = f'{NAME}-{blf_dsc_controller.__version__}.data/data/share/'
     shared = {name.removeprefix(start) for name in wheel.namelist() if name.startswith(start)}
     assert {
@@ -186,21 +186,21 @@ def test_wheel_shares_what_ros_looks_for(wheel):
     }
 
 
-def test_every_executable_has_its_main(entry_points):
+def test_every_executable_has_a_callable_entry_point(entry_points):
     assert {entry.name for entry in entry_points} == EXECUTABLES
     for entry in entry_points:
         assert callable(entry.load())
 
 
-def test_setup_runs_in_the_folder_of_links_of_colcon_symlink_install(tmp_path):
+def test_setup_runs_in_the_links_of_a_colcon_symlink_install(tmp_path):
     for name in ('setup.py', 'setup.cfg', 'package.xml', *PACKAGES):
         (tmp_path / name).symlink_to(ROOT / name)
     run = [sys.executable, 'setup.py', '--version']
-    told = subprocess.run(run, cwd=tmp_path, check=True, capture_output=True, text=True).stdout
-    assert told.split()[-1] == blf_dsc_controller.__version__
+    output = subprocess.run(run, cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+    assert output.split()[-1] == blf_dsc_controller.__version__
 
 
-def test_executables_go_where_ros2_run_looks():
+def test_executables_are_installed_where_ros2_run_looks():
     setup = configparser.ConfigParser()
     setup.read(ROOT / 'setup.cfg')
     assert setup['develop']['script_dir'] == f'$base/lib/{NAME}'
@@ -217,7 +217,7 @@ def test_colcon_finds_pytest(metadata):
 
 
 def imports(path):
-    """Top-level names of the packages a source file imports, wherever it does."""
+    """Top-level names of the packages that a source file imports, anywhere in it."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name.split('.')[0] for alias in node.names)
@@ -225,7 +225,7 @@ def imports(path):
             yield node.module.split('.')[0]
 
 
-def test_all_that_is_imported_is_declared(metadata):
+def test_every_import_is_a_declared_dependency(metadata):
     used = {name for path in sources() for name in imports(path)}
     used |= set(imports(ROOT / 'launch/closed_loop.launch.py'))
     foreign = used - set(sys.stdlib_module_names) - set(PACKAGES) - {'llvmlite'}  # a part of numba
@@ -235,6 +235,6 @@ def test_all_that_is_imported_is_declared(metadata):
     assert distributions <= requirements(metadata) | optional | depends('exec_depend')
 
 
-def test_rosdep_installs_what_pip_would(metadata):
+def test_rosdep_and_pip_install_the_same_dependencies(metadata):
     assert requirements(metadata) == set(ROSDEP_KEYS)
     assert set(ROSDEP_KEYS.values()) <= depends('exec_depend')

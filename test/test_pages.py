@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What README and doc/ say can be done: their code runs, their files load, their commands exist."""
+"""README and doc/: their code runs, their parameter files load, their commands exist."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ PAGES = [*(ROOT / name for name in OUTSIDE), *sorted((ROOT / 'doc').glob('*.md')
 MAKEFILE = (ROOT / 'Makefile').read_text()
 LAUNCH = (ROOT / 'launch/closed_loop.launch.py').read_text()
 SETUP = (ROOT / 'setup.py').read_text()
-OF_ROS2_CONTROL = {'controller_manager', 'effort_controller'}
-# What the pages may call beside the commands of this package, and is not checked here.
+ROS2_CONTROL_NODES = {'controller_manager', 'effort_controller'}
+# Other programs that the pages may call; they are not checked.
 FOREIGN = {
     'cd',
     'colcon',
@@ -52,23 +52,23 @@ def tokens(page):
 
 
 def fences(page, language):
-    return [one.content for one in tokens(page) if one.type == 'fence' and one.info == language]
+    return [item.content for item in tokens(page) if item.type == 'fence' and item.info == language]
 
 
-def named(pages):
+def each_page(pages):
     return pytest.mark.parametrize(
         'page', pages, ids=lambda page: page.relative_to(ROOT).as_posix()
     )
 
 
-@named([page for page in PAGES[1:] if fences(page, 'python')])
-def test_python_of_a_page_runs_and_prints_what_stands_below_it(page, tmp_path, monkeypatch):
-    """Blocks of a page follow each other in one program, beside the files that the page writes."""
+@each_page([page for page in PAGES[1:] if fences(page, 'python')])
+def test_python_blocks_run_and_print_the_output_shown_below_them(page, tmp_path, monkeypatch):
+    """The blocks of a page are run as one program, in a folder with the page's YAML file."""
     monkeypatch.chdir(tmp_path)
     for text in fences(page, 'yaml'):
         Path('my.yaml').write_text(text)
     program = {'__name__': page.stem}
-    blocks = [one for one in tokens(page) if one.type == 'fence']
+    blocks = [token for token in tokens(page) if token.type == 'fence']
     for block, below in pairwise([*blocks, None]):
         if block.info == 'python':
             printed = io.StringIO()
@@ -78,7 +78,7 @@ def test_python_of_a_page_runs_and_prints_what_stands_below_it(page, tmp_path, m
                 assert printed.getvalue() == below.content
 
 
-def test_example_of_the_readme_keeps_its_bound(tmp_path):
+def test_readme_example_stays_within_the_bound(tmp_path):
     (example,) = fences(ROOT / 'README.md', 'python')
     assert len(example.splitlines()) <= 10
     run = [sys.executable, '-c', example]
@@ -87,17 +87,17 @@ def test_example_of_the_readme_keeps_its_bound(tmp_path):
     assert (tmp_path / 'pictures' / 'tracking.png').stat().st_size > 0
 
 
-@named([page for page in PAGES if fences(page, 'yaml')])
-def test_files_of_a_page_load(page, tmp_path, monkeypatch):
+@each_page([page for page in PAGES if fences(page, 'yaml')])
+def test_parameter_files_of_a_page_load(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     urdf = (ROOT / 'config/ur5e.urdf').as_posix()
     for text in fences(page, 'yaml'):
         file = Path('my.yaml')
-        for given in ('/path/to/my.urdf', 'topic://robot_description'):
-            text = text.replace(given, urdf)  # noqa: PLW2901
+        for placeholder in ('/path/to/my.urdf', 'topic://robot_description'):
+            text = text.replace(placeholder, urdf)  # noqa: PLW2901
         file.write_text(text)
         found = {section.pattern.rpartition('/')[2] for section in read(file)}
-        sections = found - OF_ROS2_CONTROL
+        sections = found - ROS2_CONTROL_NODES
         assert sections <= {'**', 'monte_carlo', *NODES}
         if 'monte_carlo' in sections:
             load_study(file)
@@ -107,25 +107,25 @@ def test_files_of_a_page_load(page, tmp_path, monkeypatch):
 
 
 def lines(page):
-    """Commands of a page: each line of its blocks `sh` and of its indented blocks."""
-    for one in tokens(page):
-        if one.type == 'code_block' or (one.type == 'fence' and one.info == 'sh'):
-            yield from one.content.replace('\\\n', ' ').splitlines()
+    """Lines with commands of a page: those of its `sh` blocks and of its indented blocks."""
+    for token in tokens(page):
+        if token.type == 'code_block' or (token.type == 'fence' and token.info == 'sh'):
+            yield from token.content.replace('\\\n', ' ').splitlines()
 
 
 def commands(line):
-    """Words of each command of a line, without what the shell makes of them."""
+    """Words of each command of a line, without redirections and environment variables."""
     words = []
     line = re.sub(r'>\s*\S+', '', line)
     for word in [*shlex.split(line, comments=True), '&&']:
         if word in ('&&', '&', '|'):
             yield words
             words = []
-        elif words or '=' not in word:  # not a variable of the environment
+        elif words or '=' not in word:  # not an environment variable
             words.append(word)
 
 
-@named([page for page in PAGES if any(lines(page))])
+@each_page([page for page in PAGES if any(lines(page))])
 def test_commands_of_a_page_exist_with_their_options(page):
     for line in lines(page):
         for words in commands(line):
@@ -149,7 +149,7 @@ def check(words):
 
 
 def check_own(program, rest):
-    """An executable of the package: its options are parsed, its parameters are known."""
+    """Check an executable of the package: its options parse and its parameters are known."""
     function = command_line.main if program == 'blf_dsc' else getattr(command_line, program)
     if function is command_line.main or function.func is command_line._alias:
         parse([*getattr(function, 'args', ()), *(word for word in rest if word[0] != '[')])
@@ -160,14 +160,14 @@ def check_own(program, rest):
 def parse(words):
     try:
         make_parser().parse_args(words)
-    except SystemExit as end:
-        if end.code:
-            pytest.fail(f'{shlex.join(words)}: {end}')  # argparse has printed why
+    except SystemExit as error:
+        if error.code:
+            pytest.fail(f'{shlex.join(words)}: {error}')  # argparse has printed why
 
 
 def check_parameters(rest):
-    for before, word in pairwise(['', *rest]):
-        if before == '-p':
+    for previous, word in pairwise(['', *rest]):
+        if previous == '-p':
             assert word.split(':=')[0] in known_names(), word
 
 
@@ -202,16 +202,16 @@ def check_ros2(rest):
 
 def check_pip(rest):
     for extra in re.findall(r'blf_dsc_controller\[(.+?)\]', ' '.join(rest)):
-        assert all(f"'{one}': " in SETUP for one in extra.split(',')), extra
+        assert all(f"'{name}': " in SETUP for name in extra.split(',')), extra
 
 
 def check_pre_commit(rest):
     assert rest == ['install']
 
 
-@named(PAGES)
-def test_commands_in_the_text_of_a_page_exist(page):
-    """Sub-commands and their options, and what can be made, in `code` within a sentence."""
+@each_page(PAGES)
+def test_inline_commands_of_a_page_exist(page):
+    """Subcommands with their options, and make targets, in `code` within a sentence."""
     for code in re.findall(r'(?<!`)`((?:blf_dsc|make) [^`]+)`', page.read_text()):
         program, first, *rest = shlex.split(code)
         if program == 'make':

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The study of the paper: its numbers, its claims, and a report that stands by itself."""
+"""The paper's study: its numbers, its claims, and a self-contained report."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ BOUND = np.array([0.002, 0.004])
 TRUE = np.array([3.0, 4.0])
 
 
-def made(period=0.01, **changes):
-    """1001 samples of a made-up run, by default at 100 Hz."""
+def fake_run(period=0.01, **changes):
+    """A run of 1001 samples, by default at 100 Hz."""
     stamp = np.arange(1001) * round(period * 1e9)
     time = stamp * 1e-9
-    falling = np.exp(-time)[:, np.newaxis]
-    error = changes.pop('error', falling * [0.001, -0.002])
-    estimate = changes.pop('estimate', (1.0 - falling) * TRUE)
+    decay = np.exp(-time)[:, np.newaxis]
+    error = changes.pop('error', decay * [0.001, -0.002])
+    estimate = changes.pop('estimate', (1.0 - decay) * TRUE)
     latched = (time >= 2.0).astype(float)
     run = Run(
         joints=('one', 'two'),
@@ -51,8 +51,8 @@ def made(period=0.01, **changes):
     return replace(run, **changes)
 
 
-def test_metrics_are_those_of_the_run():
-    found = measure(made())
+def test_metrics_describe_the_run():
+    found = measure(fake_run())
     assert found.max_error == pytest.approx((0.001, 0.002))
     assert found.rms_error[0] == pytest.approx(0.001 * np.sqrt(0.05), rel=1e-2)
     assert found.peak_torque == (30.0, 1.0)
@@ -65,33 +65,33 @@ def test_metrics_are_those_of_the_run():
     assert found.latch_time == 2.0
 
 
-def test_first_violation_and_a_late_error_resets_the_time_to_one_percent():
-    error, estimate = made().error.copy(), made().learning.values[:, :2].copy()
+def test_first_violation_is_found_and_a_late_error_resets_the_time_to_one_percent():
+    error, estimate = fake_run().error.copy(), fake_run().learning.values[:, :2].copy()
     error[300, 1] = -0.004
     estimate[900] = 0.0
-    found = measure(made(error=error, estimate=estimate))
+    found = measure(fake_run(error=error, estimate=estimate))
     assert (found.held, found.first_violation) == (False, 3.0)
     assert found.time_to_1_percent == pytest.approx(9.01)
 
 
 def test_verdict_follows_from_the_runs():
     runs = (True, True), (True, False), (False, False)
-    assert [verdict(*one) for one in runs] == [HOLDS, ONLY_IF, FAILS]
+    assert [verdict(*pair) for pair in runs] == [HOLDS, ONLY_IF, FAILS]
 
 
-def test_tuning_searches_as_hard_for_every_law():
-    """Same optimiser, seed and budget; a shared gain has one range; as many for both of Fig. 2."""
+def test_every_law_is_tuned_with_the_same_effort():
+    """Same optimiser, seed and budget; one range per shared gain; as many for both of Fig. 2."""
     ranges = {}
     for task in tune.TASKS.values():
         for gain in task.gains:
-            place = gain.name, gain.joint
-            assert ranges.setdefault(place, (gain.least, gain.most)) == (gain.least, gain.most)
+            key = gain.name, gain.joint
+            assert ranges.setdefault(key, (gain.least, gain.most)) == (gain.least, gain.most)
     assert len(tune.TASKS['proposed'].gains) == len(tune.TASKS['comparison'].gains)
 
 
 @pytest.mark.parametrize('name', ['proposed', 'comparison', 'slotine_li'])
 def test_committed_gains_beat_the_middle_of_their_ranges(name):
-    """By a decade or more of the search's objective, which is the one stated in their file."""
+    """By at least a decade of the search's objective, whose value is stated in their file."""
     task = tune.TASKS[name]
     preset = {'proposed': 'paper_tuned'}.get(name, name)
     tuned = {case.name: case for case in SIDE_BY_SIDE}[preset].loop().controller
@@ -106,7 +106,7 @@ def test_committed_gains_beat_the_middle_of_their_ranges(name):
 
 @pytest.fixture(scope='module')
 def report(tmp_path_factory):
-    """The whole study, once: some 20 s of two cores."""
+    """The report of the whole study, run once: about 20 s on two cores."""
     out = tmp_path_factory.mktemp('study') / 'report'
     assert main(['paper', '--out', str(out)]) == 0
     return out
@@ -117,7 +117,7 @@ def rows(path):
         return list(csv.DictReader(file))
 
 
-def test_report_is_one_page_that_needs_nothing_beside_it(report):
+def test_report_is_one_self_contained_page(report):
     page = (report / 'index.html').read_text(encoding='utf-8')
     pictures = sorted(report.glob('*.png'))
     assert len(pictures) == 8
@@ -127,7 +127,7 @@ def test_report_is_one_page_that_needs_nothing_beside_it(report):
         assert claim['says'].split("'")[0] in page
 
 
-def test_tables_hold_every_run(report):
+def test_tables_list_every_run(report):
     assert len(rows(report / 'side_by_side.csv')) == len(SIDE_BY_SIDE)
     sweeps = rows(report / 'robustness.csv')
     assert len(sweeps) == sum(len(sweep.values) * len(sweep.laws) for sweep in SWEEPS)
@@ -136,7 +136,7 @@ def test_tables_hold_every_run(report):
 
 def test_kept_bounds_are_listed_by_condition_and_law():
     bounds = (np.full((1001, 2), k) for k in (0.004, 0.001))
-    held, left = (measure(made(bound=bound)) for bound in bounds)
+    held, left = (measure(fake_run(bound=bound)) for bound in bounds)
     metrics = {
         case.name: left if case.name.endswith((' 10', ' 0')) else held
         for sweep in SWEEPS
@@ -151,20 +151,20 @@ def test_kept_bounds_are_listed_by_condition_and_law():
 
 
 def test_verdicts_follow_from_the_runs_of_the_report(report):
-    """The verdicts that the mathematics leaves no doubt about."""
-    by_words = {row['says']: row['verdict'] for row in rows(report / 'claims.csv')}
-    assert len(by_words) >= 11
-    assert by_words['The reference does not fully excite the system.'] == FAILS
-    assert by_words['With everything known V decreases for all time.'] == ONLY_IF
-    assert by_words['It is superior in tracking and in estimation.'] == ONLY_IF
-    assert by_words['The proposed controller always stays within the boundaries.'] == HOLDS
+    """Those verdicts about which the mathematics leaves no doubt."""
+    verdicts = {row['says']: row['verdict'] for row in rows(report / 'claims.csv')}
+    assert len(verdicts) >= 11
+    assert verdicts['The reference does not fully excite the system.'] == FAILS
+    assert verdicts['With everything known V decreases for all time.'] == ONLY_IF
+    assert verdicts['It is superior in tracking and in estimation.'] == ONLY_IF
+    assert verdicts['The proposed controller always stays within the boundaries.'] == HOLDS
     for row in rows(report / 'claims.csv'):
         assert row['command'].startswith('blf_dsc ')
         assert bool(row['condition']) or row['verdict'] != ONLY_IF
 
 
-def test_kept_configurations_are_those_that_ran(report):
-    """One of a sweep, run again from its file, gives the number of the report."""
+def test_saved_configurations_are_those_that_ran(report):
+    """Running one case of a sweep again from its file reproduces the number in the report."""
     name = case_name('delay', 'comparison', 1.0)
     loop = load_loop(report / 'configurations' / f'{name.replace(" ", "_")}.yaml')
     again = measure(simulate_law(loop.controller, loop.plant).run())
@@ -174,26 +174,26 @@ def test_kept_configurations_are_those_that_ran(report):
     assert len(list((report / 'configurations').iterdir())) == len(metrics) == len(CASES)
 
 
-def test_barrier_of_the_paper_gives_next_to_nothing_where_it_is_needed(report):
-    """w = 1 N m/rad is a spring of 2 mN m at 2 mrad, and 8 N m push through it."""
+def test_papers_barrier_is_too_weak_to_hold_the_bound_against_a_push(report):
+    """w = 1 N m/rad is a spring with 2 mN m at 2 mrad, and the push is 8 N m."""
     metrics = json.loads((report / 'metrics.json').read_text(encoding='utf-8'))
     assert metrics['paper_pushed']['max_error_ratio'] > 1.0
     assert metrics['recommended_pushed']['max_error_ratio'] < 0.5
 
 
-def test_study_does_not_overwrite(report, capsys):
+def test_study_does_not_overwrite_a_report(report, capsys):
     before = (report / 'index.html').stat().st_mtime_ns
     assert main(['paper', '--out', str(report)]) == 1
     assert 'not overwritten' in capsys.readouterr().err
     assert (report / 'index.html').stat().st_mtime_ns == before
 
 
-def test_exponential_fit_distinguishes_a_line_from_a_bend():
+def test_exponential_fit_distinguishes_exponential_from_algebraic_decay():
     time = np.arange(1001) * 0.02
-    line, bend = np.exp(-time), 1.0 / (1.0 + time) ** 3
+    exponential, algebraic = np.exp(-time), 1.0 / (1.0 + time) ** 3
     fits = [
-        claims._exponential_fit(made(period=0.02, estimate=(1.0 - error)[:, np.newaxis] * TRUE))
-        for error in (line, bend)
+        claims._exponential_fit(fake_run(period=0.02, estimate=(1.0 - error)[:, np.newaxis] * TRUE))
+        for error in (exponential, algebraic)
     ]
     assert fits[0] > 0.999
     assert fits[1] < fits[0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the pages about the paper refer to is there: tests, presets, parameters, errata, figures."""
+"""Tests, presets, parameters, errata and numbers on the pages about the paper exist and agree."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TESTS = ''.join(path.read_text() for path in (ROOT / 'test').glob('test_*.py'))
 
 
 @pytest.mark.parametrize('page', PAGES)
-def test_every_test_and_preset_a_page_names_exists(page):
+def test_every_test_and_preset_named_on_a_page_exists(page):
     text = PAGES[page]
     for name in re.findall(r'`(test_\w+)`', text):
         assert f'def {name}' in TESTS, name
@@ -29,7 +29,7 @@ def test_every_test_and_preset_a_page_names_exists(page):
         assert locate(preset).is_file()
 
 
-def test_every_erratum_has_its_row_and_every_test_of_one_its_row():
+def test_every_erratum_and_every_test_of_one_has_a_row():
     rows = [int(number) for number in re.findall(r'^\| (\d+)', PAGES['errata'], re.MULTILINE)]
     assert rows == list(range(1, 27))
     tested = {int(number) for number in re.findall(r'def test_erratum_(\d+)_', TESTS)}
@@ -39,7 +39,7 @@ def test_every_erratum_has_its_row_and_every_test_of_one_its_row():
             assert '`test_' in line, line
 
 
-def test_every_parameter_the_tuning_page_names_exists():
+def test_every_parameter_named_on_the_tuning_page_exists():
     names = re.findall(r'`((?:\w+\.)+\w+)`', PAGES['tuning'])
     groups = {name.split('.')[0] for name in known_names()}
     wanted = [name for name in names if name.split('.')[0] in groups]
@@ -47,8 +47,8 @@ def test_every_parameter_the_tuning_page_names_exists():
     assert set(wanted) <= known_names()
 
 
-def test_table_of_the_laws_is_that_of_the_presets():
-    """As `make paper` writes them: joint1 / joint2. README has some of its rows."""
+def test_table_of_the_laws_matches_the_presets():
+    """Columns as `make paper` writes them: joint1 / joint2. README has some of the rows."""
     row = r'^\| `(\w+)`[^|]*\| ([\d.]+) / ([\d.]+) \| ([\d.]+) / ([\d.]+) \| ([\d.]+)?'
     page = (ROOT / 'doc' / 'comparison.md').read_text()
     rows = re.findall(row, page, re.MULTILINE)
@@ -56,37 +56,37 @@ def test_table_of_the_laws_is_that_of_the_presets():
     assert short
     assert set(short) <= set(rows)
     assert len(rows) == 7
-    for preset, *figures, learned in rows:
+    for preset, *errors, parameter_error in rows:
         loop = run(configured(preset, 60.0))
-        largest = 1e3 * np.abs(loop.xi1).max(axis=0)
-        typical = 1e3 * np.sqrt(np.mean(loop.xi1**2, axis=0))
-        np.testing.assert_allclose([*largest, *typical], np.array(figures, float), rtol=0.01)
-        if learned:
-            assert 100 * loop.parameter_error[-1] == pytest.approx(float(learned), rel=0.1)
+        peak = 1e3 * np.abs(loop.xi1).max(axis=0)
+        rms = 1e3 * np.sqrt(np.mean(loop.xi1**2, axis=0))
+        np.testing.assert_allclose([*peak, *rms], np.array(errors, float), rtol=0.01)
+        if parameter_error:
+            assert 100 * loop.parameter_error[-1] == pytest.approx(float(parameter_error), rel=0.1)
 
 
-def phased(preset, phase):
-    """Relative parameter error after a minute, with the sinusoid of the disturbance at a phase."""
+def error_at_phase(preset, phase):
+    """Relative parameter error after a minute, with this phase of the disturbance's sinusoid."""
     arm = {'disturbance.phase': [phase, phase]}
     return run(configured(preset, 60.0, arm=arm)).parameter_error[-1]
 
 
-def test_the_parameter_error_depends_on_the_phase_of_the_disturbance_as_the_pages_say():
+def test_parameter_error_depends_on_the_phase_of_the_disturbance_as_documented():
     """0.1 cos t N m on both joints looks like 0.1 / 0.6 kg m^2 of the second parameter."""
-    assert phased('recommended', np.pi / 2) == pytest.approx(
+    assert error_at_phase('recommended', np.pi / 2) == pytest.approx(
         0.1 / 0.6 / np.linalg.norm(P), abs=1e-3
     )
-    assert phased('recommended', 17.0) == pytest.approx(0.143, abs=5e-4)
+    assert error_at_phase('recommended', 17.0) == pytest.approx(0.143, abs=5e-4)
     for phase in (0.0, np.pi / 2, 17.0):
-        assert phased('two_tone', phase) < 5e-5
-        assert 0.004 < phased('excitation', phase) < 0.008
+        assert error_at_phase('two_tone', phase) < 5e-5
+        assert 0.004 < error_at_phase('excitation', phase) < 0.008
     for page in ('README.md', 'doc/theory.md', 'doc/comparison.md'):
         text = ' '.join((ROOT / page).read_text().split())
         assert '14.8 %' in text
         assert 'below 0.005 %' in text
 
 
-def test_figures_of_the_pages_are_those_of_the_runs():
+def test_numbers_on_the_pages_match_the_runs():
     assert 'a fifth is left' in ' '.join(PAGES['theory'].split())
     errors = [
         run(configured('recommended', 60.0, {'learning.weight': weight})).parameter_error[-1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Changing the parameters of a real node while it runs: all of a request, or none of it."""
+"""Changing the parameters of a running node: a request is applied as a whole or not at all."""
 
 from __future__ import annotations
 
@@ -56,18 +56,18 @@ def tuned(context):
     tuned.node.destroy_node()
 
 
-def test_a_good_change_is_handed_over_once_as_a_whole_configuration(tuned):
+def test_valid_change_is_passed_on_once_as_a_whole_configuration(tuned):
     assert tuned.request(feedback__gain=[70.0, 30.0], learning__weight=2.0).successful
-    wanted = change(ControllerConfig(), {'feedback.gain': (70.0, 30.0), 'learning.weight': 2.0})
-    assert tuned.applied == [wanted]
-    assert tuned.config == wanted
+    expected = change(ControllerConfig(), {'feedback.gain': (70.0, 30.0), 'learning.weight': 2.0})
+    assert tuned.applied == [expected]
+    assert tuned.config == expected
 
 
-def test_changes_add_up(tuned):
+def test_successive_changes_accumulate(tuned):
     tuned.request(learning__weight=2.0)
     tuned.request(disturbance__leakage=0.5)
-    assert [one.learning.weight for one in tuned.applied] == [2.0, 2.0]
-    assert [one.disturbance.leakage for one in tuned.applied] == [0.0, 0.5]
+    assert [config.learning.weight for config in tuned.applied] == [2.0, 2.0]
+    assert [config.disturbance.leakage for config in tuned.applied] == [0.0, 0.5]
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_changes_add_up(tuned):
         ({'sample_time': 0.002}, 'Trying to set a read-only parameter: sample_time'),
     ],
 )
-def test_a_bad_change_is_rejected_with_the_reason_and_none_of_it_applied(tuned, given, message):
+def test_invalid_change_is_rejected_with_the_reason_and_none_of_it_applied(tuned, given, message):
     result = tuned.request(disturbance__gain=[3.0, 3.0], **given)
     assert not result.successful
     assert result.reason.startswith(message)
@@ -97,7 +97,7 @@ def test_a_bad_change_is_rejected_with_the_reason_and_none_of_it_applied(tuned, 
     assert tuned.config == ControllerConfig()
 
 
-def test_two_changes_that_are_right_only_together_are_taken_together(tuned):
+def test_changes_that_are_valid_only_together_are_applied_together(tuned):
     assert not tuned.request(barrier__weight=[3e4, 3e4]).successful
     assert tuned.request(barrier__weight=[3e4, 3e4], barrier__slope_limit=[5e4, 5e4]).successful
     assert tuned.applied[-1].barrier.weight == (3e4, 3e4)
@@ -105,7 +105,7 @@ def test_two_changes_that_are_right_only_together_are_taken_together(tuned):
     assert not tuned.request(barrier__slope_limit=[2.5e4, 2.5e4]).successful
 
 
-def test_a_node_can_reject_a_valid_configuration(tuned):
+def test_node_can_reject_a_valid_configuration(tuned):
     tuned.problems = ['barrier.bound: joint1 is 0.0015 rad off now']
     result = tuned.request(barrier__bound=[0.001, 0.001])
     assert (result.successful, result.reason) == (False, tuned.problems[0])
@@ -114,14 +114,14 @@ def test_a_node_can_reject_a_valid_configuration(tuned):
     assert tuned.request(barrier__bound=[0.001, 0.001]).successful
 
 
-def test_parameters_of_others_on_the_node_are_left_alone(tuned):
+def test_other_parameters_of_the_node_are_left_alone(tuned):
     tuned.problems = ['never']
     tuned.node.declare_parameter('lamp.on', value=False)
     assert tuned.request(lamp__on=True).successful
     assert tuned.applied == []
 
 
-def test_the_service_that_tools_call_works_the_same(context, tuned):
+def test_set_parameters_service_behaves_the_same(context, tuned):
     executor = SingleThreadedExecutor(context=context)
     client_node = Node('client_node', context=context, enable_rosout=False)
     client = client_node.create_client(
@@ -140,6 +140,6 @@ def test_the_service_that_tools_call_works_the_same(context, tuned):
     assert result([65.0, 25.0]).successful
     rejection = result([65.0, -25.0])
     assert rejection.reason.startswith('feedback.gain: got -25.0 at entry 2 of [65.0, -25.0]')
-    assert [one.feedback.gain for one in tuned.applied] == [(65.0, 25.0)]
+    assert [config.feedback.gain for config in tuned.applied] == [(65.0, 25.0)]
     executor.shutdown()
     client_node.destroy_node()

@@ -56,15 +56,15 @@ def problems_of(node, cls):
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_a_node_without_parameters_has_the_defaults(start, name):
+def test_node_without_overrides_has_the_defaults(start, name):
     node, cls = start(name), NODES[name]
     assert declare(node, cls) == cls()
     assert read(node, cls) == cls()
-    assert {one.name for one in parameters(cls)} <= node._parameters.keys()
+    assert {parameter.name for parameter in parameters(cls)} <= node._parameters.keys()
 
 
 @pytest.mark.parametrize('preset', ['recommended', 'noisy'])
-def test_a_node_reads_a_preset_as_a_run_without_ros_does(start, preset):
+def test_node_reads_a_preset_like_an_offline_run(start, preset):
     loop = load_loop(preset)
     for name, config in loop.by_node.items():
         node = start(name, path=locate(preset))
@@ -72,7 +72,7 @@ def test_a_node_reads_a_preset_as_a_run_without_ros_does(start, preset):
         assert read(node, type(config)) == config
 
 
-def test_a_parameter_describes_itself(start):
+def test_parameters_have_descriptors(start):
     node = start('blf_dsc_controller')
     declare(node, ControllerConfig)
     bound = node.describe_parameter('barrier.bound')
@@ -90,7 +90,7 @@ def test_a_parameter_describes_itself(start):
     assert node.describe_parameter('surface.time_constant').floating_point_range[0].from_value == 0
 
 
-def test_an_empty_list_stays_empty(start):
+def test_empty_list_stays_empty(start):
     text = 'bag_recorder:\n  ros__parameters: {topics: [], output: here}\n'
     node = start('bag_recorder', text)
     assert declare(node, RecorderConfig) == RecorderConfig(output='here')
@@ -123,12 +123,12 @@ def test_all_problems_are_reported_at_once_and_nothing_is_declared(start):
         ({'mode': True}, 'mode: got true, but a string is expected'),
     ],
 )
-def test_a_plant_that_cannot_run_is_rejected(start, overrides, message):
+def test_invalid_plant_is_rejected(start, overrides, message):
     (problem,) = problems_of(start(overrides=overrides), PlantConfig)
     assert problem.startswith(message)
 
 
-def test_parameters_of_other_nodes_and_of_ros_itself_are_ignored(start):
+def test_parameters_of_other_nodes_and_of_ros_are_ignored(start):
     overrides = {
         'barrier.bound': [1.0, 1.0],
         'use_sim_time': True,
@@ -141,7 +141,7 @@ def test_parameters_of_other_nodes_and_of_ros_itself_are_ignored(start):
     assert node.get_parameter('use_sim_time').value is True
 
 
-def test_ros_has_the_values_under_the_types_of_the_schema(start):
+def test_ros_parameters_have_the_values_and_types_of_the_schema(start):
     node = start('blf_dsc_controller')
     declare(node, ControllerConfig)
     values = {
@@ -157,9 +157,9 @@ def test_ros_has_the_values_under_the_types_of_the_schema(start):
     assert node.get_parameter('reference.times').type_ is Parameter.Type.DOUBLE_ARRAY
 
 
-def test_an_empty_list_keeps_its_type_and_its_description(start):
+def test_empty_list_keeps_its_type_and_description(start):
     node = start('bag_recorder')
     declare(node, RecorderConfig)
-    described = node.describe_parameter('topics')
-    assert (described.type, described.read_only) == (ParameterType.PARAMETER_STRING_ARRAY, True)
-    assert described.description == 'topics to record; empty: all'
+    descriptor = node.describe_parameter('topics')
+    assert (descriptor.type, descriptor.read_only) == (ParameterType.PARAMETER_STRING_ARRAY, True)
+    assert descriptor.description == 'topics to record; empty: all'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arm's equation of motion against mechanics, and against the controller's regressor."""
+"""The arm's equation of motion against Lagrangian mechanics and the controller's regressor."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def vector(kernel, *arguments, size=2):
     return out
 
 
-def slope(function, x):
+def gradient(function, x):
     """Central difference of a function of a vector, per entry."""
     return np.array(
         [(function(x + d) - function(x - d)) / (2 * STEP) for d in STEP * np.eye(x.size)]
@@ -33,24 +33,24 @@ def slope(function, x):
 
 
 @ARMS
-def test_acceleration_obeys_euler_and_lagrange(arm, state):
-    """d/dt dL/ddq - dL/dq = torque, of the energies of two point masses alone."""
+def test_acceleration_satisfies_the_euler_lagrange_equation(arm, state):
+    """d/dt dL/ddq - dL/dq = torque, from nothing but the energies of two point masses."""
     q, dq, torque = state
     ddq = vector(acceleration, arm, q, dq, torque)
 
     def momentum(x):
-        return slope(lambda v: energies(arm, x[:2], v)[0], x[2:])
+        return gradient(lambda v: energies(arm, x[:2], v)[0], x[2:])
 
     rate = np.concatenate([dq, ddq])
     coarse = 1e-4  # s; the inner difference's rounding of 1e-10 / coarse is 1e-6
     x = np.concatenate([q, dq])
     momentum_rate = (momentum(x + coarse * rate) - momentum(x - coarse * rate)) / (2 * coarse)
-    force = slope(lambda y: np.subtract(*energies(arm, y, dq)), q)
+    force = gradient(lambda y: np.subtract(*energies(arm, y, dq)), q)
     assert momentum_rate - force == pytest.approx(torque, abs=2e-4)
 
 
 @ARMS
-def test_regressor_of_the_controller_describes_this_arm(arm, state):
+def test_controllers_regressor_reproduces_the_torque(arm, state):
     """H P = torque along the motion, two independent derivations of the same physics."""
     q, dq, torque = state
     ddq = vector(acceleration, arm, q, dq, torque)
@@ -59,5 +59,5 @@ def test_regressor_of_the_controller_describes_this_arm(arm, state):
     assert H @ vector(parameters, arm, size=3) == pytest.approx(torque, abs=1e-11)
 
 
-def test_the_papers_arm_has_the_papers_parameters():
+def test_papers_arm_has_the_papers_parameters():
     assert vector(parameters, ARM, size=3) == pytest.approx([1.0, 0.32, 0.4], rel=1e-15)

@@ -35,7 +35,7 @@ ALL_KINDS = {
 
 
 def truths(config, samples=SAMPLES):
-    """Truths (samples, 9) under the usual torques."""
+    """True values (samples, 9) under the usual torques."""
     arm = plant_of(config)
     rows = np.empty((samples, 9))
     for row, torque in zip(rows, commands(samples), strict=True):
@@ -58,7 +58,7 @@ def truths(config, samples=SAMPLES):
         ({'offset': [1e-3, -1e-3]}, {'sensor.offset': [1e-3, -1e-3]}),
     ],
 )
-def test_an_event_is_a_change_of_the_plant_at_its_time(events, lasting):
+def test_event_is_equivalent_to_changing_the_plant_at_its_time(events, lasting):
     given = {f'events.{name}': value for name, value in events.items()}
     config = build(PlantConfig, {'events.begin': [AT * 1e-3], **given})
     scheduled, changed = plant_of(config), plant_of(PlantConfig())
@@ -74,7 +74,7 @@ def test_an_event_is_a_change_of_the_plant_at_its_time(events, lasting):
     assert np.any(measurements(unchanged, torques)[AT:] != after[0])
 
 
-def test_a_payload_comes_and_goes_within_its_ramp_and_the_truth_follows():
+def test_payload_is_ramped_in_and_out_and_the_truth_follows():
     events = {'begin': [0.01], 'duration': [0.02], 'ramp': [0.004], 'payload': [0.5]}
     config = build(PlantConfig, {f'events.{name}': value for name, value in events.items()})
     m2_l2_squared = truths(config)[:, 1]
@@ -86,22 +86,22 @@ def test_a_payload_comes_and_goes_within_its_ramp_and_the_truth_follows():
 def test_events_add_up_in_any_order():
     config = build(PlantConfig, ALL_KINDS)
     count = len(config.events.begin)
-    turned = {
+    reversed_events = {
         name: np.reshape(value, (count, -1))[::-1].ravel().tolist()
         for name, value in ALL_KINDS.items()
         if name.startswith('events.')
     }
-    np.testing.assert_allclose(truths(change(config, turned)), truths(config), rtol=1e-12)
+    np.testing.assert_allclose(truths(change(config, reversed_events)), truths(config), rtol=1e-12)
 
 
-def test_friction_does_not_fall_below_zero():
-    less = {'events.begin': [0.0], 'events.viscous': [-1.0, -0.1]}
-    config = build(PlantConfig, {'disturbance.viscous': [0.3, 0.3], **less})
-    same = build(PlantConfig, {'disturbance.viscous': [0.0, 0.3 - 0.1]})
-    np.testing.assert_array_equal(truths(config), truths(same))
+def test_events_do_not_make_friction_negative():
+    decrease = {'events.begin': [0.0], 'events.viscous': [-1.0, -0.1]}
+    config = build(PlantConfig, {'disturbance.viscous': [0.3, 0.3], **decrease})
+    expected = build(PlantConfig, {'disturbance.viscous': [0.0, 0.3 - 0.1]})
+    np.testing.assert_array_equal(truths(config), truths(expected))
 
 
-def test_an_offset_is_measured_and_moves_nothing():
+def test_encoder_offset_is_measured_but_does_not_move_the_arm():
     config = build(PlantConfig, {'sensor.offset': [0.01, -0.02]})
     arm, true = plant_of(config), plant_of(PlantConfig())
     torques = commands(SAMPLES)
@@ -111,17 +111,17 @@ def test_an_offset_is_measured_and_moves_nothing():
 
 
 @pytest.mark.parametrize('q', np.random.default_rng(0).uniform(-3.0, 3.0, (5, 2)))
-def test_a_force_at_the_tip_does_the_work_of_its_joint_torques(q):
+def test_tip_force_does_the_same_work_as_its_joint_torques(q):
     """J^T f, the gradient of the work f . x of a constant force."""
     force, step = np.array([1.0, -2.0, 3.0]), 1e-6
 
     def work(angles):
         return force @ points(ARM.l1, ARM.l2, angles)[2]
 
-    slope = [(work(q + d) - work(q - d)) / (2 * step) for d in step * np.eye(2)]
+    gradient = [(work(q + d) - work(q - d)) / (2 * step) for d in step * np.eye(2)]
     load = np.empty(2)
     disturbing_torque(motion(force=force), 0.0, q, np.zeros(2), load)
-    np.testing.assert_allclose(-load, slope, atol=1e-8)
+    np.testing.assert_allclose(-load, gradient, atol=1e-8)
 
     position, jacobian = np.empty(3), np.empty((3, 2))
     tip(ARM, q, position, jacobian)
@@ -129,7 +129,7 @@ def test_a_force_at_the_tip_does_the_work_of_its_joint_torques(q):
     np.testing.assert_allclose(force @ jacobian, -load, rtol=1e-12)
 
 
-def test_a_wall_pushes_inside_and_never_pulls():
+def test_wall_pushes_on_contact_and_never_pulls():
     wall = NOWHERE._replace(normal=np.array([0.0, 0.0, 1.0]), stiffness=100.0, damping=5.0)
     rest, leaving = np.zeros(3), np.array([0.0, 0.0, 3.0])
     inside, outside = np.array([7.0, 0.0, -0.1]), np.array([7.0, 0.0, 0.1])
@@ -139,8 +139,8 @@ def test_a_wall_pushes_inside_and_never_pulls():
     assert wall_force(wall, outside, -leaving) == 0.0
 
 
-def test_an_arm_that_falls_on_a_floor_comes_to_rest_in_it():
-    """Without motors the weight of both links then rests on the floor, and friction has no say."""
+def test_falling_arm_comes_to_rest_on_a_floor():
+    """Without motors the floor then balances the weight of both links; at rest friction is zero."""
     floor = {'wall.point': [0.0, 0.0, -0.5], 'wall.normal': [0.0, 0.0, 2.0]}
     config = build(
         PlantConfig,
@@ -180,6 +180,6 @@ def test_an_arm_that_falls_on_a_floor_comes_to_rest_in_it():
         ({'wall.normal': [0.0, 0.0, 0.0]}, 'wall.normal: got .* a direction is needed'),
     ],
 )
-def test_events_that_cannot_be_are_rejected(given, problem):
+def test_invalid_events_are_rejected(given, problem):
     with pytest.raises(ConfigurationError, match=problem):
         build(PlantConfig, given)

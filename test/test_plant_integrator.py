@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fixed steps against scipy, their own order, and the conservation of energy."""
+"""The fixed-step integrators: order, agreement with scipy, and conservation of energy."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def states(method, load, torque, h, steps):
     return rows
 
 
-def slope(load, torque):
+def rhs(load, torque):
     """Right-hand side for scipy."""
 
     def evaluate(t, x):
@@ -40,8 +40,8 @@ def slope(load, torque):
 
 
 def exact(load, t, h, torque, x):
-    """State after h seconds by scipy's DOP853, to nearly the last digit."""
-    solution = solve_ivp(slope(load, torque), (t, t + h), x, 'DOP853', rtol=1e-13, atol=1e-14)
+    """State after h seconds by scipy's DOP853, accurate to almost the last digit."""
+    solution = solve_ivp(rhs(load, torque), (t, t + h), x, 'DOP853', rtol=1e-13, atol=1e-14)
     return solution.y[:, -1]
 
 
@@ -50,20 +50,20 @@ def energy(rows):
 
 
 @pytest.mark.parametrize(('method', 'order'), [(RK4, 4), (DOPRI5, 5)], ids=['rk4', 'dopri5'])
-def test_halving_the_step_divides_the_error_by_two_to_the_order(method, order):
+def test_error_converges_with_the_order_of_the_method(method, order):
     load = disturbance(amplitude=5.0, frequency=[20.0, 26.0], coulomb=0.2, coulomb_velocity=2.0)
     reference = exact(load, 0.0, 0.5, TORQUE, INITIAL)
     coarse, fine = (
         np.linalg.norm(states(method, load, TORQUE, 0.5 / n, n)[-1] - reference) for n in (128, 256)
     )
-    # Dormand and Prince chose their coefficients for a small h^5, so the h^6 behind it shows still;
-    # a finer step meets the rounding. The nearest whole number is what tells the order.
+    # Dormand and Prince chose coefficients with a small h^5 error, so the h^6 term still shows, and
+    # finer steps run into rounding: the order is the nearest whole number.
     assert np.log2(coarse / fine) == pytest.approx(order, abs=0.4)
 
 
-def test_dopri5_is_the_step_of_scipys_rk45():
+def test_dopri5_step_matches_scipys_rk45():
     load, h = rough_disturbance(), 0.05
-    rk45 = RK45(slope(load, TORQUE), 0.3, INITIAL, 1.0, first_step=h, rtol=1e9, atol=1e9)
+    rk45 = RK45(rhs(load, TORQUE), 0.3, INITIAL, 1.0, first_step=h, rtol=1e9, atol=1e9)
     rk45.step()
     assert rk45.t == 0.3 + h
     x = INITIAL.copy()
@@ -71,23 +71,23 @@ def test_dopri5_is_the_step_of_scipys_rk45():
     assert x == pytest.approx(rk45.y, rel=1e-14)
 
 
-def test_held_torques_take_the_arm_where_dop853_takes_it():
+def test_motion_under_sampled_torques_matches_dop853():
     load, x = rough_disturbance(), INITIAL.copy()
     expected = INITIAL.copy()
     for k, torque in enumerate(commands(100)):
         advance(DOPRI5, load, k * PERIOD, PERIOD, torque, x)
         expected = exact(load, k * PERIOD, PERIOD, torque, expected)
-    # 100 steps of scipy's 1e-13 each
+    # 100 steps with scipy's tolerance of 1e-13 each
     assert x == pytest.approx(expected, abs=1e-11)
 
 
 def test_energy_is_conserved_without_torque_and_disturbance():
-    fallen = energy(states(DOPRI5, disturbance(), np.zeros(2), PERIOD, 2000))
-    # 5 J, an error of (h / 0.1 s)^5 of it
-    assert np.abs(fallen - fallen[0]).max() < 5e-10
+    total = energy(states(DOPRI5, disturbance(), np.zeros(2), PERIOD, 2000))
+    # 5 J times a relative error of (h / 0.1 s)^5
+    assert np.abs(total - total[0]).max() < 5e-10
 
 
-def test_viscous_friction_takes_exactly_the_power_it_should():
+def test_viscous_friction_dissipates_the_expected_power():
     """The energy gained is the integral of dq^T (torque - viscous dq)."""
     viscous, steps = np.array([0.3, 0.1]), 1000
     rows = states(DOPRI5, disturbance(viscous=viscous), TORQUE, PERIOD, steps)
@@ -99,8 +99,8 @@ def test_viscous_friction_takes_exactly_the_power_it_should():
     assert np.abs(viscous * dq).max() > 0.1
 
 
-def test_the_disturbance_is_followed_within_the_step():
-    """A disturbance that swings five times a step is far from its value at the start of it."""
+def test_disturbance_is_evaluated_within_the_step():
+    """Within a step the disturbance moves far from its value at the start of the step."""
     load = disturbance(amplitude=1.0, frequency=50.0)
     h = 0.02  # 1 rad of the disturbance's phase
     x = INITIAL.copy()

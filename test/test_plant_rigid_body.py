@@ -15,7 +15,7 @@ from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.compiled.layout import size_of, view_of
 from sim_plant.rigid_body import Motion, acceleration, locate, rigid_bodies, tip
 
-LEANING = (1.0, -3.0, 5.0)
+TILTED_GRAVITY = (1.0, -3.0, 5.0)
 ARMS = {
     'one': (*random_urdf(1, 21), 'base', 'tip'),
     'two': (*random_urdf(2, 22), 'base', 'tip'),
@@ -28,9 +28,9 @@ motion_of, motion_size = view_of(Motion), size_of(Motion)
 
 
 class Case:
-    """An arm in a random state, and the same in pinocchio."""
+    """An arm in a random state, and its model in pinocchio."""
 
-    def __init__(self, name, gravity=LEANING):
+    def __init__(self, name, gravity=TILTED_GRAVITY):
         self.text, joints, base, self.tip = ARMS[name]
         self.chain = read_chain(self.text, base, self.tip, joints)
         self.n = len(joints)
@@ -43,7 +43,7 @@ class Case:
         self.model.gravity.linear[:] = gravity
         self.model.armature[:] = self.rotors
         self.data = self.model.createData()
-        self.theirs = configuration(self.model, self.q)
+        self.model_q = configuration(self.model, self.q)
 
     def acceleration(self, payload=0.0):
         ddq = self.torque.copy()
@@ -52,10 +52,10 @@ class Case:
         return ddq
 
     def jacobian(self):
-        """Of the tip, in the base (3, n)."""
+        """Jacobian of the tip in the base frame (3, n)."""
         frame = self.model.getFrameId(self.tip)
         reference = pinocchio.LOCAL_WORLD_ALIGNED
-        arguments = self.model, self.data, self.theirs, frame, reference
+        arguments = self.model, self.data, self.model_q, frame, reference
         return pinocchio.computeFrameJacobian(*arguments).reshape(6, -1)[:3]
 
 
@@ -64,14 +64,14 @@ def case(request):
     return Case(request.param)
 
 
-def test_acceleration_is_that_of_the_articulated_body_algorithm(case):
-    expected = pinocchio.aba(case.model, case.data, case.theirs, case.dq, case.torque)
+def test_acceleration_matches_the_articulated_body_algorithm(case):
+    expected = pinocchio.aba(case.model, case.data, case.model_q, case.dq, case.torque)
     np.testing.assert_allclose(case.acceleration(), expected, rtol=1e-10, atol=1e-10)
 
 
-def test_tip_and_bodies_are_where_pinocchio_has_them(case):
+def test_tip_and_body_placements_match_pinocchio(case):
     locate(case.arm, case.q, case.dq, case.now)
-    pinocchio.framesForwardKinematics(case.model, case.data, case.theirs)
+    pinocchio.framesForwardKinematics(case.model, case.data, case.model_q)
     position, jacobian = np.zeros(3), np.zeros((3, case.n))
     tip(case.arm, case.now, position, jacobian)
     expected = case.data.oMf[case.model.getFrameId(case.tip)].translation
@@ -82,33 +82,33 @@ def test_tip_and_bodies_are_where_pinocchio_has_them(case):
         np.testing.assert_allclose(case.now.rotation[i], case.data.oMi[i].rotation, atol=1e-12)
 
 
-def test_inertia_is_that_of_pinocchio(case):
+def test_inertia_matrix_matches_pinocchio(case):
     case.acceleration()
-    M = pinocchio.crba(case.model, case.data, case.theirs)
+    M = pinocchio.crba(case.model, case.data, case.model_q)
     np.testing.assert_allclose(case.now.M, M, atol=1e-12)
 
 
-def test_the_controllers_regressor_gives_the_torque_back(case):
-    """H(q, dq, dq, ddq) P = torque, by two derivations that share nothing but the geometry."""
+def test_controllers_regressor_reproduces_the_torque(case):
+    """H(q, dq, dq, ddq) P = torque, from two derivations that share only the geometry."""
     ddq = case.acceleration()
-    model = serial_chain(case.chain, LEANING)
+    model = serial_chain(case.chain, TILTED_GRAVITY)
     H = np.zeros((case.n, model.p))
     model.regressor(case.q, case.dq, case.dq, ddq, H)
     phi = np.column_stack((case.chain.inertias, case.rotors)).ravel()
     np.testing.assert_allclose(H @ phi, case.torque, rtol=1e-9, atol=1e-9)
 
 
-def test_other_inertias_and_a_load_are_felt():
-    """A truth that is not the URDF's: links 20 % heavier, 2 kg at the tip."""
+def test_acceleration_accounts_for_other_inertias_and_a_payload():
+    """A truth that differs from the URDF: links 20 % heavier, 2 kg at the tip."""
     case = Case('panda')
     point = case.chain.tip_placement[:3, 3]
     inertias = 1.2 * case.chain.inertias
-    case.arm = rigid_bodies(case.chain, LEANING, inertias, case.rotors)
+    case.arm = rigid_bodies(case.chain, TILTED_GRAVITY, inertias, case.rotors)
     for i in range(case.n):
         heavier = 1.2 * case.chain.inertias[i]
         case.model.inertias[i + 1] = pinocchio.Inertia.FromDynamicParameters(heavier)
     case.model.inertias[case.n] += pinocchio.Inertia(2.0, point, np.zeros((3, 3)))
-    expected = pinocchio.aba(case.model, case.data, case.theirs, case.dq, case.torque)
+    expected = pinocchio.aba(case.model, case.data, case.model_q, case.dq, case.torque)
     np.testing.assert_allclose(case.acceleration(2.0), expected, rtol=1e-10, atol=1e-10)
 
 
@@ -118,7 +118,7 @@ def test_mujoco_reads_the_same_arm_from_the_urdf(name):
     spec = mujoco.MjSpec.from_string(case.text)
     spec.compiler.boundmass = spec.compiler.boundinertia = 0.0
     model = spec.compile()
-    model.opt.gravity[:] = LEANING
+    model.opt.gravity[:] = TILTED_GRAVITY
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
     model.dof_armature[:] = case.rotors
@@ -137,7 +137,7 @@ def compiled(arm, vector, q, dq, torque, ddq):
     acceleration(arm, now, 2.0, torque, ddq)
 
 
-def test_kernels_compute_what_python_does():
+def test_compiled_kernels_match_python():
     case = Case('four')
     ddq = np.zeros(case.n)
     vector = np.zeros(motion_size(case.arm))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sampled plant as a whole: repeatable, restorable, and the same however it is called."""
+"""The sampled plant as a whole: repeatable, restorable, and independent of how it is called."""
 
 import json
 import os
@@ -18,7 +18,7 @@ from sim_plant.integrator import DOPRI5, RK4, Stages, integrate
 from sim_plant.kernels import draw_noise, observe, plant_views, step
 from sim_plant.sensors import DIFFERENCED, MEASURED
 
-EVERYTHING = {
+IMPERFECTIONS = {
     'position_noise': 1e-5,
     'velocity_noise': 1e-3,
     'resolution': 1e-5,
@@ -32,11 +32,11 @@ REPOSITORY = Path(__file__).parents[1]
 
 
 def full_plant(**changes):
-    """A plant with every imperfection there is."""
+    """A plant with every kind of imperfection."""
     load = rough_disturbance()._replace(
         stribeck=0.5, ripple=np.array([0.1, 0.05]), ripple_frequency=20.0
     )
-    return plant(load=load, **{**EVERYTHING, **changes})
+    return plant(load=load, **{**IMPERFECTIONS, **changes})
 
 
 @kernel
@@ -51,7 +51,7 @@ def compiled_run(arm, settings, state, rng, torques, rows):
 @pytest.mark.parametrize('source', [MEASURED, DIFFERENCED])
 @pytest.mark.parametrize('integrator', [RK4, DOPRI5])
 @pytest.mark.parametrize('noise', [0.0, 1e-5])
-def test_a_compiled_loop_and_python_calls_give_the_same_bits(source, integrator, noise):
+def test_compiled_loop_and_python_calls_are_bit_identical(source, integrator, noise):
     changes = {'velocity_source': source, 'integrator': integrator, 'position_noise': noise}
     arm, other = (full_plant(seed=11, **changes) for _ in range(2))
     rows = np.empty((300, 6))
@@ -61,15 +61,15 @@ def test_a_compiled_loop_and_python_calls_give_the_same_bits(source, integrator,
     assert arm.rng.bit_generator.state == other.rng.bit_generator.state
 
 
-def test_without_noise_a_compiled_loop_draws_nothing():
+def test_compiled_loop_without_noise_draws_no_random_numbers():
     arm = plant()
     before = arm.rng.bit_generator.state
     compiled_run(arm.arm, arm.settings, arm.state, arm.rng, commands(10), np.empty((10, 6)))
     assert arm.rng.bit_generator.state == before
 
 
-def test_a_sample_begins_when_whole_nanoseconds_say():
-    """The disturbance is that of t_k = (k T_ns) 1e-9 s, to the last bit."""
+def test_sample_times_are_whole_nanoseconds():
+    """The disturbance is evaluated at t_k = (k T_ns) 1e-9 s, to the last bit."""
     period_ns, load = 333_333, rough_disturbance()
     arm = plant(load=load, period_ns=period_ns)
     x, stages = np.array([*START, 0.0, 0.0]), Stages(np.empty(4), np.empty((6, 4)))
@@ -81,7 +81,7 @@ def test_a_sample_begins_when_whole_nanoseconds_say():
     assert (arm.truth()[5:] == x).all()
 
 
-def test_a_reset_plant_repeats_its_run():
+def test_reset_plant_repeats_its_run():
     arm = full_plant(seed=2)
     first = run(arm, commands(50))
     arm.reset()
@@ -90,7 +90,7 @@ def test_a_reset_plant_repeats_its_run():
 
 
 @pytest.mark.parametrize('source', [MEASURED, DIFFERENCED])
-def test_a_restored_plant_goes_on_as_if_nothing_had_happened(source):
+def test_restored_plant_continues_bit_for_bit(source):
     torques = commands(120)
     arm = full_plant(velocity_source=source)
     run(arm, torques[:60])
@@ -103,7 +103,7 @@ def test_a_restored_plant_goes_on_as_if_nothing_had_happened(source):
     assert (other.state == arm.state).all()
 
 
-def test_an_arm_that_was_too_fast_stands_also_where_it_is_restored():
+def test_arm_stopped_for_excessive_speed_stays_stopped_when_restored():
     arm = plant()
     run(arm, np.full((300, 2), 9e3))
     assert arm.is_broken
@@ -123,8 +123,8 @@ def test_time_is_counted_in_whole_nanoseconds():
 
 
 @pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason='compares compiled code with Python')
-def test_without_compilation_the_numbers_are_the_same():
-    """The interpreter's libm and order of operations are the compiler's, to rounding."""
+def test_results_are_the_same_without_compilation():
+    """The interpreter's libm and order of operations agree with the compiler's up to rounding."""
     program = (
         'import json, sys\n'
         'from plants import commands, run\n'
@@ -141,7 +141,7 @@ def test_without_compilation_the_numbers_are_the_same():
 
 
 @pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason='counts allocations of compiled code')
-def test_a_step_allocates_nothing():
+def test_step_allocates_no_memory():
     arm = full_plant()
 
     def allocations(samples):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the encoders tell: noise, resolution and the two kinds of velocity, all repeatable."""
+"""Encoders: noise, resolution and the two kinds of velocity, all repeatable."""
 
 import numpy as np
 import pytest
@@ -18,14 +18,14 @@ def true_states(samples, **changes):
     return rows
 
 
-def test_an_ideal_sensor_tells_the_truth_and_draws_nothing():
+def test_ideal_sensor_measures_the_true_state_without_random_numbers():
     arm = plant()
     before = arm.rng.bit_generator.state
     assert (run(arm, commands(50))[:, :4] == true_states(50)).all()
     assert arm.rng.bit_generator.state == before
 
 
-def test_noise_has_the_deviation_asked_for():
+def test_noise_has_the_configured_standard_deviation():
     samples = 2000
     read = run(plant(position_noise=1e-5, velocity_noise=1e-3), commands(samples))
     noise = read[:, :4] - true_states(samples)
@@ -43,7 +43,7 @@ def test_noise_does_not_move_the_arm():
     assert (noisy.truth() == ideal.truth()).all()
 
 
-def test_the_seed_decides_the_noise():
+def test_seed_determines_the_noise():
     def read(seed):
         return run(plant(seed=seed, position_noise=1e-5), commands(50))
 
@@ -51,13 +51,13 @@ def test_the_seed_decides_the_noise():
     assert (read(3) != read(4))[:, :2].all()
 
 
-def test_compiled_draws_are_those_of_numpy():
+def test_compiled_draws_match_numpy():
     numbers = np.empty(1000)
     draw(generator(8), numbers)
     assert (numbers == generator(8).standard_normal(1000)).all()
 
 
-def test_a_quantised_position_is_the_nearest_multiple_of_the_resolution():
+def test_quantised_position_is_the_nearest_multiple_of_the_resolution():
     resolution = 2 * np.pi / 2**14
     read = run(plant(resolution=resolution), commands(200))[:, :2]
     counts = read / resolution
@@ -68,7 +68,7 @@ def test_a_quantised_position_is_the_nearest_multiple_of_the_resolution():
     assert error.max() > resolution / 4
 
 
-def test_a_differenced_velocity_is_that_of_the_positions_read():
+def test_differenced_velocity_is_that_of_the_measured_positions():
     arm = plant(
         position_noise=1e-5, resolution=1e-5, velocity_source=DIFFERENCED, velocity=(0.4, -0.3)
     )
@@ -78,7 +78,7 @@ def test_a_differenced_velocity_is_that_of_the_positions_read():
 
 
 @pytest.mark.parametrize('source', [MEASURED, DIFFERENCED])
-def test_a_filtered_velocity_is_the_step_response_of_its_pole(source):
+def test_velocity_is_low_pass_filtered_with_its_pole(source):
     options = {'velocity_source': source, 'position_noise': 1e-5, 'velocity_noise': 1e-3}
     raw = run(plant(**options), commands(30))[:, 2:4]
     read = run(plant(velocity_pole=400.0, **options), commands(30))[:, 2:4]
@@ -88,7 +88,7 @@ def test_a_filtered_velocity_is_the_step_response_of_its_pole(source):
     np.testing.assert_allclose(read, expected, rtol=1e-13)
 
 
-def test_a_differenced_velocity_spans_the_samples_that_nobody_read():
+def test_differenced_velocity_spans_skipped_samples():
     arm = plant(velocity_source=DIFFERENCED)
     first = arm.measure().copy()
     for torque in commands(7):
@@ -98,7 +98,7 @@ def test_a_differenced_velocity_spans_the_samples_that_nobody_read():
 
 
 @pytest.mark.parametrize('source', [0, DIFFERENCED])
-def test_a_sample_read_twice_reads_the_same(source):
+def test_reading_a_sample_twice_gives_the_same_values(source):
     once = plant(position_noise=1e-5, velocity_source=source)
     twice = plant(position_noise=1e-5, velocity_source=source)
     for torque in commands(20):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sampled plant of a URDF's arm: mechanics, events, and what its configuration follows from."""
+"""The sampled plant of an arm from a URDF: mechanics, events, and its configuration."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from blf_dsc_controller.errors import ConfigurationError
 from sim_plant.arms import true_inertias
 from sim_plant.plant import parameters_of, plant_of
 
-PANDA_GIVEN = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
-FREE = {'disturbance.viscous': [0.0] * 7, 'disturbance.coulomb': [0.0] * 7}
+PANDA_CONFIG = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
+FRICTIONLESS = {'disturbance.viscous': [0.0] * 7, 'disturbance.coulomb': [0.0] * 7}
 
 
 def panda(**given):
     return build(
         PlantConfig,
-        {**PANDA_GIVEN, **{name.replace('__', '.'): value for name, value in given.items()}},
+        {**PANDA_CONFIG, **{name.replace('__', '.'): value for name, value in given.items()}},
     )
 
 
 def swinging_torques(samples):
-    """Torques (samples, 7) that hold the arm up roughly and swing it."""
+    """Torques (samples, 7) that swing the arm."""
     t = 1e-3 * np.arange(samples)[:, None]
     amplitude = np.array([20.0, 10.0, 10.0, 10.0, 2.0, 2.0, 1.0])
     return amplitude * np.sin(2.0 * np.pi * t * np.linspace(1.0, 2.0, 7))
 
 
-def test_a_urdf_is_all_that_is_needed():
+def test_urdf_and_tip_are_a_complete_configuration():
     config = panda()
     assert config.joints == tuple(PANDA)
     assert config.initial.position == pytest.approx((0, 0, 0, -1.5708, 0, 1.8675, 0), abs=1e-9)
@@ -44,7 +44,7 @@ def test_a_urdf_is_all_that_is_needed():
     assert change(config, {'seed': 3}).joints == config.joints
 
 
-def test_what_is_given_comes_before_what_the_urdf_says():
+def test_given_parameters_override_the_urdf():
     config = panda(actuator__torque_limit=[50.0] * 7, initial__position=[0.1] * 7)
     assert config.actuator.torque_limit == (50.0,) * 7
     assert config.initial.position == (0.1,) * 7
@@ -54,19 +54,19 @@ def test_what_is_given_comes_before_what_the_urdf_says():
     ('given', 'problem'),
     [
         ({'robot.urdf': 'panda.urdf'}, 'robot.urdf: neither a tip nor joints were given'),
-        (PANDA_GIVEN | {'joints': ['panda_joint1']}, 'the moving joints from base to tip are'),
+        (PANDA_CONFIG | {'joints': ['panda_joint1']}, 'the moving joints from base to tip are'),
         ({'truth.mass_factor': 1.1}, 'truth: it applies only to a URDF: give robot.urdf'),
         ({'actuator.ripple': 0.1}, 'actuator.ripple: .* give actuator.torque_limit'),
-        (PANDA_GIVEN | {'load.torque': [1.0]}, 'load.torque: got 1 entry, but 7 are needed'),
+        (PANDA_CONFIG | {'load.torque': [1.0]}, 'load.torque: got 1 entry, but 7 are needed'),
     ],
 )
-def test_a_configuration_that_does_not_fit_the_urdf_is_rejected(given, problem):
+def test_configuration_inconsistent_with_the_urdf_is_rejected(given, problem):
     with pytest.raises(ConfigurationError, match=problem):
         build(PlantConfig, given)
 
 
-class InMujoco:
-    """The arm of a URDF in MuJoCo, its fingers stuck, with its own integrator of order 4."""
+class MujocoArm:
+    """The arm of a URDF in MuJoCo, with locked fingers and MuJoCo's RK4 integrator."""
 
     def __init__(self, config, payload=0.0):
         spec = mujoco.MjSpec.from_string(config.robot.text)
@@ -88,14 +88,14 @@ class InMujoco:
         self.model.dof_damping[:] = config.disturbance.viscous
         self.model.dof_armature[:] = config.robot.rotors(config.robot.chain(config.joints))
         self.data = mujoco.MjData(self.model)
-        self.put(config.initial.position, config.initial.velocity)
+        self.set_state(config.initial.position, config.initial.velocity)
 
-    def put(self, q, dq):
+    def set_state(self, q, dq):
         self.data.qpos[:], self.data.qvel[:] = q, dq
         mujoco.mj_forward(self.model, self.data)
 
     def energy(self, q, dq):
-        self.put(q, dq)
+        self.set_state(q, dq)
         return self.data.energy.sum()
 
     def step(self, torque):
@@ -113,31 +113,31 @@ def states(config, torques):
     return np.array(rows)
 
 
-def test_an_arm_without_friction_and_torque_keeps_its_energy():
-    config = panda(**{**FREE, 'load.payload': 1.5})
+def test_energy_is_conserved_without_friction_and_torque():
+    config = panda(**{**FRICTIONLESS, 'load.payload': 1.5})
     rows = states(config, np.zeros((500, 7)))
-    theirs = InMujoco(config, payload=1.5)
-    energies = [theirs.energy(row[:7], row[7:]) for row in rows]
-    kinetic = energies[0] - [theirs.energy(row[:7], np.zeros(7)) for row in rows][-1]
+    mujoco_arm = MujocoArm(config, payload=1.5)
+    energies = [mujoco_arm.energy(row[:7], row[7:]) for row in rows]
+    kinetic = energies[0] - [mujoco_arm.energy(row[:7], np.zeros(7)) for row in rows][-1]
     assert kinetic > 10.0  # J, it has fallen
     np.testing.assert_allclose(energies, energies[0], rtol=0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize('payload', [0.0, 2.0])
-def test_it_moves_as_in_mujoco(payload):
+def test_motion_matches_mujoco(payload):
     config = panda(**{'disturbance.viscous': [0.5] * 7, 'load.payload': payload})
     torques = swinging_torques(500)
     rows = states(config, torques)
-    theirs = InMujoco(config, payload)
+    mujoco_arm = MujocoArm(config, payload)
     for torque in torques:
-        theirs.step(torque)
+        mujoco_arm.step(torque)
     moved = np.abs(rows[-1, :7] - rows[0, :7])
     assert moved.max() > 0.5
-    ends = np.concatenate((theirs.data.qpos, theirs.data.qvel))
-    np.testing.assert_allclose(rows[-1], ends, rtol=0.0, atol=1e-6)
+    expected = np.concatenate((mujoco_arm.data.qpos, mujoco_arm.data.qvel))
+    np.testing.assert_allclose(rows[-1], expected, rtol=0.0, atol=1e-6)
 
 
-def test_the_truth_has_the_base_parameters_with_the_payload():
+def test_truth_contains_the_base_parameters_with_the_payload():
     config = panda(**{'events.begin': [0.5], 'events.payload': [2.0]})
     chain = config.robot.chain(config.joints)
     base, rotors = base_parameters(chain), config.robot.rotors(chain)
@@ -149,24 +149,24 @@ def test_the_truth_has_the_base_parameters_with_the_payload():
     np.testing.assert_allclose(parameters_of(config, 0.6), base.of(loaded, rotors), rtol=1e-12)
 
 
-def test_a_truth_by_factors_scales_every_body():
+def test_truth_factors_scale_every_body():
     config = panda(truth__mass_factor=1.3, truth__rotor_factor=1.2)
     chain = config.robot.chain(config.joints)
     expected = base_parameters(chain).of(1.3 * chain.inertias, 1.2 * config.robot.rotors(chain))
     np.testing.assert_allclose(parameters_of(config), expected, rtol=1e-12, atol=1e-15)
 
 
-def test_a_truth_by_seed_deviates_as_it_says_and_stays_possible():
+def test_random_truth_deviates_as_configured_and_stays_physical():
     config = panda(truth__mass_deviation=0.3, truth__centre_deviation=0.01)
     chain = config.robot.chain(config.joints)
     masses, shifts = [], []
     for seed in range(100):
         inertias = true_inertias(chain, change(config, {'truth.seed': seed}).truth)
         masses.append(inertias[:, 0] / chain.inertias[:, 0] - 1.0)
-        centres = (one[:, 1:4] / one[:, :1] for one in (inertias, chain.inertias))
+        centres = (rows[:, 1:4] / rows[:, :1] for rows in (inertias, chain.inertias))
         shifts.append(np.subtract(*centres))
-        for true, ours in zip(inertias, chain.inertias, strict=True):
-            least, expected = (np.linalg.eigvalsh(pseudo_inertia(one))[0] for one in (true, ours))
+        for true, urdf in zip(inertias, chain.inertias, strict=True):
+            least, expected = (np.linalg.eigvalsh(pseudo_inertia(phi))[0] for phi in (true, urdf))
             assert least > -1e-12 * abs(expected)
     assert 0.29 < np.max(masses) < 0.3
     assert -0.3 < np.min(masses) < -0.29
@@ -177,36 +177,36 @@ def test_a_truth_by_seed_deviates_as_it_says_and_stays_possible():
     np.testing.assert_array_equal(again[:, 0] / chain.inertias[:, 0] - 1.0, masses[-1])
 
 
-def test_a_shifted_body_is_the_same_body_elsewhere():
-    """Its inertia about its centre of mass does not change, only where that is."""
+def test_shifted_body_keeps_its_inertia_about_the_centre_of_mass():
+    """Only the position of its centre of mass changes."""
     config = panda(truth__centre_deviation=0.01, truth__seed=1)
     chain = config.robot.chain(config.joints)
-    for true, ours in zip(true_inertias(chain, config.truth), chain.inertias, strict=True):
-        here, there = (pinocchio.Inertia.FromDynamicParameters(one) for one in (true, ours))
-        np.testing.assert_allclose(here.inertia, there.inertia, atol=1e-12)
+    for true, urdf in zip(true_inertias(chain, config.truth), chain.inertias, strict=True):
+        shifted, original = (pinocchio.Inertia.FromDynamicParameters(phi) for phi in (true, urdf))
+        np.testing.assert_allclose(shifted.inertia, original.inertia, atol=1e-12)
 
 
-def test_events_on_seven_joints_are_changes_of_the_plant_at_their_time():
-    """A push of the tip is the torque of its Jacobian; friction, torques and offsets add up."""
+def test_events_act_on_all_seven_joints_at_their_time():
+    """A push at the tip acts through its Jacobian; friction, torques and offsets add up."""
     names = ('force', 'torque', 'viscous', 'coulomb', 'offset')
     values = ([3.0, -2.0, 5.0], *(np.linspace(low, 2.0 * low, 7) for low in (2.0, 1.0, 0.5, 1e-3)))
     given = {f'events.{name}': list(value) for name, value in zip(names, values, strict=True)}
     arm = plant_of(panda(**{'events.begin': [0.1], **given}))
-    push = arm.truth().copy()
+    truth = arm.truth().copy()
     for torque in swinging_torques(101):
-        push = arm.truth().copy()
+        truth = arm.truth().copy()
         arm.step(torque)
     P = arm.arm.p
-    q, dq = push[P + 7 : P + 14], push[P + 14 :]
+    q, dq = truth[P + 7 : P + 14], truth[P + 14 :]
     position, jacobian = np.zeros(3), np.zeros((3, 7))
     arm.arm.fill_tip(q, position, jacobian)
     expected = -values[1] + values[2] * dq + values[3] * np.tanh(dq / 0.01) - values[0] @ jacobian
-    np.testing.assert_allclose(push[P : P + 7], expected, rtol=1e-12)
+    np.testing.assert_allclose(truth[P : P + 7], expected, rtol=1e-12)
     measured = arm.measure()[:7] - arm.truth()[-14:-7]
     np.testing.assert_allclose(measured, values[4], atol=1e-12)
 
 
-def test_a_wall_pushes_the_tip_back():
+def test_wall_pushes_the_tip_back():
     floor = {'wall.point': [0.0, 0.0, 0.3], 'wall.stiffness': 2e4, 'wall.damping': 200.0}
     arm = plant_of(panda(**{'disturbance.viscous': [20.0] * 7, **floor}))
     for _ in range(2000):
@@ -220,22 +220,22 @@ def test_a_wall_pushes_the_tip_back():
     np.testing.assert_allclose(20.0 * dq - torque, force * jacobian[2], rtol=1e-9, atol=1e-9)
 
 
-def test_two_plants_of_a_urdf_do_not_disturb_each_other_and_repeat():
+def test_two_plants_of_a_urdf_are_independent_and_repeatable():
     torques = swinging_torques(50)
-    one, other = plant_of(panda()), plant_of(panda(**{'load.payload': 1.0}))
+    first, second = plant_of(panda()), plant_of(panda(**{'load.payload': 1.0}))
     rows = []
     for torque in torques:
-        one.step(torque)
-        other.step(torque)
-        rows.append(one.measure().copy())
-    one.reset()
+        first.step(torque)
+        second.step(torque)
+        rows.append(first.measure().copy())
+    first.reset()
     for torque, row in zip(torques, rows, strict=True):
-        one.step(torque)
-        np.testing.assert_array_equal(one.measure(), row)
+        first.step(torque)
+        np.testing.assert_array_equal(first.measure(), row)
 
 
-def test_any_chain_will_do():
-    """Four joints, which turn or slide."""
+def test_plant_simulates_a_random_chain():
+    """Four joints, revolute and prismatic."""
     text, joints = random_urdf(4, 23)
     config = build(PlantConfig, {'robot.urdf': text, 'robot.tip': 'tip'})
     assert config.joints == joints

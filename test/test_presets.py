@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every preset is a loop that runs, by its name, offline and over ROS."""
+"""Every preset runs by its name, offline and over ROS."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LAW = {'comparison': 'backstepping', 'comparison_detuned': 'backstepping'} | {
     name: name for name in ('model_based', 'slotine_li')
 }
 
-# Each law is drawn once, and the paper's set; the others have the same panels.
+# Figures are drawn once for each law, and for the paper's set; the others have the same panels.
 DRAWN = {'recommended', 'paper', 'comparison', 'model_based', 'slotine_li', 'panda'}
 
 
@@ -29,24 +29,24 @@ def offline(preset, out, duration):
 
 
 @pytest.mark.parametrize('preset', PRESETS)
-def test_preset_runs_by_name_and_is_kept_as_it_ran(preset, tmp_path, capsys, monkeypatch):
+def test_preset_runs_by_name_and_saves_its_configuration(preset, tmp_path, capsys, monkeypatch):
     if preset not in DRAWN:
         monkeypatch.setattr('blf_dsc_controller.cli.run.draw', lambda *_: [])
     assert offline(preset, tmp_path / 'out', 0.5) == 0
     printed = capsys.readouterr().out
     summary = json.loads((tmp_path / 'out' / 'summary.json').read_text(encoding='utf-8'))
     assert summary['samples'] == round(0.5 / load_loop(preset).plant.sample_time) + 1
-    kept = load_loop(tmp_path / 'out' / 'config.yaml').controller
-    assert kept.law == LAW.get(preset, 'blf_dsc')
+    saved = load_loop(tmp_path / 'out' / 'config.yaml').controller
+    assert saved.law == LAW.get(preset, 'blf_dsc')
     held = preset != 'comparison_detuned'
     assert summary['tracking']['held'] is held
     assert ('held by every joint' in printed) is held
-    of_urdf = kept.model == 'urdf'
-    assert ('torque error of the learned model' in printed) is of_urdf
-    assert ('final_torque_error' in summary['learning']) is of_urdf
+    from_urdf = saved.model == 'urdf'
+    assert ('torque error of the learned model' in printed) is from_urdf
+    assert ('final_torque_error' in summary['learning']) is from_urdf
 
 
-def test_offline_run_warns_of_a_refused_column_and_what_it_is_like(tmp_path, capsys):
+def test_offline_run_warns_about_a_rejected_column_with_the_reason(tmp_path, capsys):
     path = tmp_path / 'cosine.yaml'
     path.write_text(
         'blf_dsc_controller:\n  ros__parameters:\n'
@@ -61,8 +61,8 @@ def test_offline_run_warns_of_a_refused_column_and_what_it_is_like(tmp_path, cap
 
 
 @pytest.mark.skipif(importlib.util.find_spec('rclpy') is None, reason='needs ROS 2')
-def test_a_variant_over_ros_is_its_offline_run_bit_for_bit(tmp_path):
-    """Lambda prediction, gradient, all columns off, the truth given: not the defaults' path."""
+def test_papers_preset_over_ros_matches_its_offline_run_bit_for_bit(tmp_path):
+    """Lambda prediction, gradient, no columns and a known truth: paths the defaults do not take."""
     assert offline('paper', tmp_path / 'offline', 1.0) == 0
     over_ros = ['--config', 'paper', '--mode', 'lockstep', '--duration', '1.0']
     assert main(['run', *over_ros, '--out', str(tmp_path / 'ros')]) == 0

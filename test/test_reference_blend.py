@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The way on to a reference: from where the arm is, within limits, ending as the reference."""
+"""Approaches: from the state of the arm to the reference, within the limits."""
 
 from __future__ import annotations
 
@@ -27,93 +27,93 @@ def limits(velocity=(1.5, 1.5), acceleration=(2.0, 2.0), reach=(6.0, 6.0), longe
     return ControllerConfig(JOINTS, limits=allowed, approach=Approach(longest=longest))
 
 
-def led(main, start, limits):
+def approach_to(main, start, limits):
     """Motion to `main` from a measured state."""
     return blend([stop(T0, *start, limits)], main, T0, limits)
 
 
-def one(vector, t):
+def at(vector, t):
     return sampled(vector, np.array([t]))[0]
 
 
 @pytest.mark.parametrize('main', [PAPER, POINTS], ids=['sinusoids', 'points'])
 @pytest.mark.parametrize('start', [AT_REST, MOVING], ids=['at rest', 'moving'])
-def test_it_begins_as_the_arm_and_ends_as_the_reference(main, start):
-    motion = led(main, start, limits())
+def test_approach_begins_at_the_measured_state_and_ends_on_the_reference(main, start):
+    motion = approach_to(main, start, limits())
     before, after = motion.settled - 1e-7, motion.settled
 
-    np.testing.assert_allclose(one(motion.vector, T0), [*start, (0.0, 0.0)], atol=1e-12)
+    np.testing.assert_allclose(at(motion.vector, T0), [*start, (0.0, 0.0)], atol=1e-12)
     for t in (after, after + 1.0, 1e4):
-        np.testing.assert_array_equal(one(motion.vector, t), one(pack(2, [main]), t))
-    # Jerk and its change over 1e-7 s: position, velocity and acceleration go over without a jump.
-    np.testing.assert_allclose(one(motion.vector, before), one(motion.vector, after), atol=1e-5)
+        np.testing.assert_array_equal(at(motion.vector, t), at(pack(2, [main]), t))
+    # 1e-5 allows for the jerk over 1e-7 s: position, velocity and acceleration do not jump.
+    np.testing.assert_allclose(at(motion.vector, before), at(motion.vector, after), atol=1e-5)
 
 
 @pytest.mark.parametrize('main', [PAPER, POINTS], ids=['sinusoids', 'points'])
 @pytest.mark.parametrize('start', [AT_REST, MOVING], ids=['at rest', 'moving'])
-def test_all_of_it_keeps_the_limits_and_a_little_less_time_would_not(main, start):
-    motion = led(main, start, limits())
+def test_approach_keeps_the_limits_and_a_slightly_shorter_one_would_not(main, start):
+    motion = approach_to(main, start, limits())
     fine = np.linspace(T0, motion.settled + 10.0, 100_001)
     _, dqr, ddqr = sampled(motion.vector, fine).transpose(1, 0, 2)
 
-    # Between the looks, a 200th of the way apart or closer, a peak hides less than a thousandth.
+    # The planner looks at times a 200th of the approach apart or closer: it misses at most 0.1 %.
     assert np.all(np.abs(dqr).max(axis=0) <= 1.001 * np.array(limits().limits.velocity))
     assert np.all(np.abs(ddqr).max(axis=0) <= 1.001 * np.array(limits().limits.acceleration))
     shorter = 0.98 * (motion.settled - T0)
     with pytest.raises(MotionError):
-        led(main, start, limits(longest=shorter))
+        approach_to(main, start, limits(longest=shorter))
 
 
 def test_each_joint_keeps_its_own_limits():
-    motion = led(PAPER, AT_REST, limits(velocity=(0.4, 3.0), acceleration=(9.0, 1.0)))
+    motion = approach_to(PAPER, AT_REST, limits(velocity=(0.4, 3.0), acceleration=(9.0, 1.0)))
     _, dqr, ddqr = sampled(motion.vector, np.linspace(T0, 40.0, 40_001)).transpose(1, 0, 2)
-    assert np.abs(dqr[:, 0]).max() == pytest.approx(0.4, rel=0.05)  # what decides is used
+    assert np.abs(dqr[:, 0]).max() == pytest.approx(0.4, rel=0.05)  # the active limit is reached
     assert np.abs(ddqr[:, 1]).max() <= 1.001
 
 
-def test_a_running_reference_goes_over_into_another_without_a_jump():
+def test_running_reference_blends_into_another_without_a_jump():
     motion = blend([PAPER], POINTS, T0, limits())
     np.testing.assert_allclose(
-        one(motion.vector, T0), one(pack(2, [PAPER]), T0), rtol=1e-14, atol=1e-14
+        at(motion.vector, T0), at(pack(2, [PAPER]), T0), rtol=1e-14, atol=1e-14
     )
     np.testing.assert_array_equal(
-        one(motion.vector, motion.settled), one(pack(2, [POINTS]), motion.settled)
+        at(motion.vector, motion.settled), at(pack(2, [POINTS]), motion.settled)
     )
 
 
-def test_a_reference_that_breaks_the_limits_by_itself_is_rejected_by_name():
+def test_reference_beyond_the_limits_is_rejected_with_the_name_of_the_joint():
     with pytest.raises(MotionError) as rejection:
-        led(PAPER, AT_REST, limits(velocity=(1.0, 0.25)))
+        approach_to(PAPER, AT_REST, limits(velocity=(1.0, 0.25)))
 
-    found = rejection.value.violation
-    assert (found.joint, found.quantity) == ('elbow', 'velocity')
-    assert abs(found.value) == pytest.approx(0.3, rel=1e-4)  # 0.3 sin t
-    assert abs(found.limit) == 0.25
+    violation = rejection.value.violation
+    assert (violation.joint, violation.quantity) == ('elbow', 'velocity')
+    assert abs(violation.value) == pytest.approx(0.3, rel=1e-4)  # 0.3 sin t
+    assert abs(violation.limit) == 0.25
     assert 'limits.velocity' in str(rejection.value)
 
 
-def test_an_arm_that_is_too_fast_already_is_rejected_by_name():
+def test_arm_that_is_already_too_fast_is_rejected_with_the_name_of_the_joint():
     start = MOVING.copy()
     start[1, 0] = -1.7
     with pytest.raises(MotionError) as rejection:
-        led(PAPER, start, limits())
+        approach_to(PAPER, start, limits())
 
-    found = rejection.value.violation
-    assert (found.joint, found.quantity, found.limit) == ('shoulder', 'velocity', -1.5)
-    assert found.value <= -1.7
+    violation = rejection.value.violation
+    assert (violation.joint, violation.quantity, violation.limit) == ('shoulder', 'velocity', -1.5)
+    assert violation.value <= -1.7
     for part in ('shoulder', '-1.5 rad/s', 'at most 30 s', 'approach.longest'):
         assert part in str(rejection.value)
 
 
-def test_a_way_that_would_take_too_long_is_rejected():
+def test_approach_that_would_take_too_long_is_rejected():
     with pytest.raises(MotionError):
-        led(PAPER, AT_REST, limits(longest=0.5))
+        approach_to(PAPER, AT_REST, limits(longest=0.5))
 
 
-def test_positions_count_from_the_middle_of_what_is_allowed():
+def test_positions_are_checked_relative_to_the_middle_of_their_range():
     allowed = MotionLimits((-1.0, 0.5), (3.0, 1.5), (9.0, 9.0), (9.0, 9.0))
     config = ControllerConfig(JOINTS, limits=allowed)
-    found = worst_violation(pack(2, [PAPER]), np.linspace(0.0, 7.0, 1001), config)
-    assert (found.joint, found.quantity, found.limit) == ('elbow', 'position', 1.5)
-    assert found.value == pytest.approx(1.6961, abs=1e-5)
+    violation = worst_violation(pack(2, [PAPER]), np.linspace(0.0, 7.0, 1001), config)
+    assert (violation.joint, violation.quantity, violation.limit) == ('elbow', 'position', 1.5)
+    assert violation.value == pytest.approx(1.6961, abs=1e-5)
     assert worst_violation(pack(2, [PAPER]), np.linspace(2.0, 4.0, 101), config) is None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splines pass their points, and those of least jerk have less of it than their neighbours."""
+"""Splines pass through their points; minimum-jerk splines have less jerk than their neighbours."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def jerk_cost(term):
     return np.sum(jerk**2) * (fine[1] - fine[0])
 
 
-def test_hermite_has_what_it_is_given_at_every_point_from_both_sides():
+def test_hermite_has_the_given_values_at_every_point_from_both_sides():
     h = 1e-9
     for k, t in enumerate(TIMES):
         sides = [t + h] if k == 0 else [t - h, t] if k + 1 < len(TIMES) else [t - h]
@@ -37,7 +37,7 @@ def test_hermite_has_what_it_is_given_at_every_point_from_both_sides():
 
 
 @pytest.mark.parametrize('begin', [None, BEGIN], ids=['at rest', 'moving'])
-def test_minimum_jerk_passes_its_points_from_its_beginning_to_rest(begin):
+def test_minimum_jerk_passes_through_its_points_and_ends_at_rest(begin):
     motion = minimum_jerk(TIMES, POINTS[0], begin)
     now = at(motion, TIMES)
     np.testing.assert_allclose(now[:, 0], POINTS[0], atol=1e-12)
@@ -47,7 +47,7 @@ def test_minimum_jerk_passes_its_points_from_its_beginning_to_rest(begin):
     np.testing.assert_allclose(at(motion, [4.0 - 1e-9])[0, 1:], 0.0, atol=1e-6)
 
 
-def test_no_other_velocity_or_acceleration_at_a_point_has_less_jerk():
+def test_other_velocities_or_accelerations_at_a_point_cost_more_jerk():
     inner = at(minimum_jerk(TIMES, POINTS[0]), TIMES).transpose(1, 0, 2)
     least = jerk_cost(hermite(TIMES, inner))
     assert least == pytest.approx(jerk_cost(minimum_jerk(TIMES, POINTS[0])))
@@ -59,7 +59,7 @@ def test_no_other_velocity_or_acceleration_at_a_point_has_less_jerk():
                 assert jerk_cost(hermite(TIMES, other)) > least * (1.0 + 1e-6)
 
 
-def test_between_two_points_it_is_the_known_step():
+def test_minimum_jerk_between_two_points_is_the_known_polynomial():
     x = np.linspace(0.0, 1.0, 11)
     step = at(minimum_jerk(np.array([0.0, 2.0]), np.array([[0.0, 1.0], [1.0, 3.0]])), 2.0 * x)
     expected = 10.0 * x**3 - 15.0 * x**4 + 6.0 * x**5

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starts from anywhere: approach, hand-over and tracking, all within the bound; or a refusal."""
+"""Starts from anywhere: approach, hand-over and tracking within the bound, or a rejection."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def run(config, start, duration, velocity=(0.0, 0.0)):
 
 
 @pytest.mark.parametrize('start', STARTS, ids=range(len(STARTS)))
-def test_from_anywhere_the_arm_comes_to_the_reference_within_the_bound(start):
+def test_arm_reaches_the_reference_from_anywhere_within_the_bound(start):
     law = controller_of(CONFIG)
     settled = begin(law, CONFIG, start, STILL)
     record = run(CONFIG, start, 12.0)
@@ -56,14 +56,14 @@ def test_from_anywhere_the_arm_comes_to_the_reference_within_the_bound(start):
     assert np.abs(qr[t < settled] - paper[t < settled]).max() > BOUND
 
 
-def test_a_fast_reference_is_approached_by_way_of_its_middle_at_rest():
-    """At 96 % of the velocity limit it leaves too little speed for four radians straight away."""
+def test_fast_reference_is_approached_through_rest_at_its_middle():
+    """At 96 % of the velocity limit it leaves too little speed to cover four radians directly."""
     fast = {'amplitude': (0.72, 0.72), 'frequency': (2.0,), 'phase': (0.0,)}
     config = replace(
         CONFIG,
         reference=Reference(**fast),
         limits=replace(CONFIG.limits, acceleration=(3.0, 3.0)),
-        approach=Approach(longest=15.0),  # s; the straight way takes 19 s
+        approach=Approach(longest=15.0),  # s; the direct approach takes 19 s
     )
     start = np.array(config.reference.offset) + 4.0
     motion = plan_start(config, np.full(2, BOUND), start, STILL)
@@ -80,21 +80,21 @@ def test_a_fast_reference_is_approached_by_way_of_its_middle_at_rest():
     np.testing.assert_array_equal(q[after], sampled(reference_of(config), t[after])[:, 0])
 
 
-def test_a_start_inside_the_bound_needs_no_approach():
+def test_start_inside_the_bound_needs_no_approach():
     law = controller_of(CONFIG)
     assert begin(law, CONFIG, PAPER + 0.9 * BOUND, STILL, 0.0) == 0.0
     np.testing.assert_array_equal(law.reference_vector, reference_of(CONFIG))
 
 
-def test_without_approaches_a_start_outside_is_refused():
+def test_start_outside_the_bound_is_rejected_if_approaches_are_disabled():
     config = replace(CONFIG, approach=Approach(enabled=False))
     with pytest.raises(OutsideBarrierError):
         begin(controller_of(config), config, PAPER + 1.1 * BOUND, STILL)
 
 
-def test_an_approach_may_begin_later():
+def test_approach_may_begin_later():
     law = controller_of(CONFIG)
-    settled = begin(law, CONFIG, PAPER, STILL, 3.0)  # the paper's reference is 0.6 rad away then
+    settled = begin(law, CONFIG, PAPER, STILL, 3.0)  # the paper's reference is 0.6 rad away by then
     assert settled > 3.0
     np.testing.assert_allclose(law.reference_at(3.0), [PAPER, STILL, STILL], atol=1e-12)
 
@@ -102,31 +102,31 @@ def test_an_approach_may_begin_later():
 MOVING = {'reference.phase': [-np.pi / 2]}  # passes its middle at 0.3 rad/s at t = 0
 
 
-def test_a_start_at_rest_on_a_moving_reference_is_an_approach():
+def test_start_at_rest_on_a_moving_reference_leads_to_an_approach():
     config = build(ControllerConfig, MOVING)
     record = run(config, config.reference.offset, 4.0)
-    reached = np.abs(record.samples[:, 4:6]).max(axis=0)
-    np.testing.assert_array_less(reached, 0.5 * BOUND)
+    largest = np.abs(record.samples[:, 4:6]).max(axis=0)
+    np.testing.assert_array_less(largest, 0.5 * BOUND)
     assert np.abs(record.samples[:, 8:10]).max() < 15.0  # 12 N m are gravity; the limit is 20
     paper = sampled(reference_of(config), record.stamps * 1e-9)[:, 0]
     np.testing.assert_allclose(record.samples[-1, :2], paper[-1], atol=1e-14)
 
 
-def test_without_approaches_a_start_that_is_too_slow_is_refused_with_the_velocities():
+def test_start_that_is_too_slow_is_rejected_if_approaches_are_disabled():
     config = build(ControllerConfig, MOVING | {'approach.enabled': False})
     law = controller_of(config)
     offset, moving = np.array(config.reference.offset), np.full(2, 0.3)
     with pytest.raises(VelocityMismatchError, match='starts -0'):
         begin(law, config, offset, STILL)
     assert begin(law, config, offset, moving) == 0.0
-    # v^2 / (2 a) = 0.9 bounds at a = 2 rad/s^2, from where there is a tenth of it left, or more.
+    # Catching up takes v^2 / (2 a) = 0.9 bounds at a = 2 rad/s^2, which leaves a tenth of it.
     slower = moving - np.sqrt(2.0 * 2.0 * 0.9 * BOUND)
     assert begin(law, config, offset + 0.09 * BOUND, slower) == 0.0
     with pytest.raises(VelocityMismatchError):
         begin(law, config, offset + 0.11 * BOUND, slower)
 
 
-def test_an_arm_that_moves_is_stopped_before_it_is_held():
+def test_moving_arm_is_stopped_before_it_is_held():
     config = build(ControllerConfig, {'reference.type': 'hold'})
     record = run(config, PAPER, 6.0, velocity=(0.5, -0.5))
     np.testing.assert_array_equal(record.samples[-1, :2], PAPER)
@@ -135,8 +135,8 @@ def test_an_arm_that_moves_is_stopped_before_it_is_held():
 
 @pytest.mark.parametrize('velocity', ['measured', 'estimated'])
 @pytest.mark.parametrize('rest', [True, False])
-def test_activated_again_on_the_reference_the_law_takes_over_only_at_its_velocity(rest, velocity):
-    """Held by the brakes where the reference passes, the arm is led to it; moving, it goes on."""
+def test_reactivation_on_the_reference_tracks_at_once_only_at_its_velocity(rest, velocity):
+    """An arm that the brakes hold needs an approach; one that moves with the reference does not."""
     rig = Rig({'safety.velocity': velocity, 'torque.limit': [40.0, 40.0]})
     rig.step(1500)  # at 0.3 rad/s
     rig.guard.deactivate()
@@ -152,7 +152,7 @@ def test_activated_again_on_the_reference_the_law_takes_over_only_at_its_velocit
     assert np.abs(rig.commands[first:]).max() < 15.0
 
 
-def test_hold_stays_where_the_arm_is():
+def test_hold_reference_stays_where_the_arm_is():
     config = replace(CONFIG, reference=Reference(type='hold'))
     start = PAPER - 0.7
     record = run(config, start, 1.0)
@@ -160,7 +160,7 @@ def test_hold_stays_where_the_arm_is():
     assert np.abs(record.samples[:, 4:6]).max() < BOUND
 
 
-def test_waypoints_are_passed_at_their_times_and_the_last_is_kept():
+def test_waypoints_are_passed_at_their_times_and_the_last_is_held():
     points = np.array([[2.0, 1.0], [2.4, 1.5], [1.8, 1.2]])
     reference = Reference(type='waypoints', times=(0.0, 1.5, 3.5), points=tuple(points.T.ravel()))
     config = replace(CONFIG, reference=reference)
@@ -191,29 +191,29 @@ def test_waypoints_are_passed_at_their_times_and_the_last_is_kept():
         ),
     ],
 )
-def test_what_makes_no_reference_is_refused_with_the_reason(given, problem):
-    with pytest.raises(ConfigurationError) as refusal:
+def test_invalid_reference_is_rejected_with_the_reason(given, problem):
+    with pytest.raises(ConfigurationError) as rejection:
         build(ControllerConfig, given)
-    assert problem in str(refusal.value)
+    assert problem in str(rejection.value)
 
 
-def test_the_bag_of_an_offline_run_tells_the_moving_bound(tmp_path):
+def test_bag_of_an_offline_run_contains_the_moving_bound(tmp_path):
     config = build(
         ControllerConfig, {'barrier.initial_bound': [0.02, 0.01], 'barrier.funnel_rate': 4.0}
     )
     record = run(config, PAPER + 0.009, 0.5)
     write_bag(tmp_path / 'bag', record, config, 'none')
-    told = read_run(tmp_path / 'bag')
+    recorded = read_run(tmp_path / 'bag')
 
     t = record.stamps[:, np.newaxis] * 1e-9
     expected = BOUND + np.array([0.018, 0.008]) * np.exp(-4.0 * t)
-    np.testing.assert_allclose(told.bound, expected, rtol=1e-12)
-    ratios = np.abs(told.error / told.bound).max(axis=0)
+    np.testing.assert_allclose(recorded.bound, expected, rtol=1e-12)
+    ratios = np.abs(recorded.error / recorded.bound).max(axis=0)
     assert ratios[1] == pytest.approx(0.9)  # at the start
-    assert told.monitor.column('max_error_ratio joint2')[-1] == pytest.approx(0.9)
+    assert recorded.monitor.column('max_error_ratio joint2')[-1] == pytest.approx(0.9)
 
 
-def test_a_new_bound_is_judged_by_how_wide_it_is_now():
+def test_new_bound_is_validated_by_its_present_width():
     funnel = {'barrier.initial_bound': [0.02, 0.02], 'barrier.funnel_rate': 1.0}
     guard = (rig := Rig(funnel)).guard
     rig.step(60)
@@ -224,8 +224,8 @@ def test_a_new_bound_is_judged_by_how_wide_it_is_now():
 
 
 @pytest.mark.parametrize('at', [120.0, -2.0 * np.pi - 0.11])
-def test_an_arm_far_past_its_limits_is_not_held(at):
-    """Such as one that sends degrees."""
+def test_arm_far_beyond_its_limits_is_not_held(at):
+    """For example, an arm that reports degrees."""
     config = replace(CONFIG, reference=Reference(type='hold'))
     bound = np.array(config.barrier.bound)
     with pytest.raises(StartError, match=r"joint 'joint2' is at .* rad, and its limits are -6.2"):

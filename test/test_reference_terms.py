@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The reference is that of the term in force, or a mixture, and its derivatives are derivatives."""
+"""Terms of the reference: their values, the blending between them, and consistent derivatives."""
 
 from __future__ import annotations
 
@@ -43,20 +43,20 @@ def test_sinusoids_are_the_sum_of_their_tones(t):
 
 
 @pytest.mark.parametrize(('piece', 't'), [(0, 0.4), (0, 0.9), (1, 1.0), (2, 1.5), (3, 3.0), (3, 5)])
-def test_spline_is_the_polynomial_of_the_piece_of_its_time(piece, t):
+def test_spline_is_the_polynomial_of_the_current_piece(piece, t):
     qr, _, _ = at([SPLINE], t)
     expected = [np.polynomial.polynomial.polyval(t - KNOTS[piece], c) for c in COEFFICIENTS[piece]]
     np.testing.assert_allclose(qr, expected, rtol=1e-13)
 
 
-def test_spline_stands_where_it_begins_until_it_does():
+def test_spline_rests_at_its_first_point_before_it_begins():
     np.testing.assert_array_equal(at([SPLINE], 0.39), [COEFFICIENTS[0, :, 0], [0] * 3, [0] * 3])
 
 
 @pytest.mark.parametrize('terms', KINDS.values(), ids=KINDS)
 @pytest.mark.parametrize('t', [0.1, 0.7, 1.05, 1.234, 3.5])
-def test_derivatives_are_those_of_the_reference(terms, t):
-    # Five points of step 1e-3: the fifth derivative, below 1e3 here, leaves 1e-10.
+def test_velocity_and_acceleration_are_the_derivatives_of_the_reference(terms, t):
+    # Five-point stencil with step 1e-3: the fifth derivative, below 1e3 here, leaves 1e-10.
     h = 1e-3
     points = np.array([at(terms, t + side * h) for side in (-2, -1, 1, 2)])
     rate = (points[0] - 8.0 * points[1] + 8.0 * points[2] - points[3]) / (12.0 * h)
@@ -67,13 +67,13 @@ def test_derivatives_are_those_of_the_reference(terms, t):
 
 
 @pytest.mark.parametrize(('t', 's'), [(0.5, 0.0), (1.3, 0.5), (2.1, 1.0)])
-def test_a_term_is_mixed_into_the_one_before_by_the_minimum_jerk_step(t, s):
+def test_terms_are_blended_by_the_minimum_jerk_step(t, s):
     old, new = at([SINUSOIDS], t)[0], at([SPLINE], t)[0]
     expected = (1.0 - s) * old + s * new
     np.testing.assert_allclose(at([SINUSOIDS, LATER], t)[0], expected, rtol=1e-13)
 
 
-def test_before_and_after_the_mixture_each_term_is_alone_to_the_last_bit():
+def test_before_and_after_blending_only_one_term_counts_to_the_last_bit():
     for t in (0.0, 0.49, 0.5):
         np.testing.assert_array_equal(at([SINUSOIDS, LATER], t), at([SINUSOIDS], t))
     for t in (2.1, 2.2, 50.0):
@@ -81,30 +81,30 @@ def test_before_and_after_the_mixture_each_term_is_alone_to_the_last_bit():
 
 
 @pytest.mark.parametrize('t', [0.5, 2.1])
-def test_mixing_begins_and_ends_without_a_jump(t):
+def test_blending_begins_and_ends_without_a_jump(t):
     # Over 2e-9 s the jerk, below 1e4 here, moves the acceleration by 2e-5.
     before, after = (at([SINUSOIDS, LATER], t + side) for side in (-1e-9, 1e-9))
     np.testing.assert_allclose(before, after, atol=1e-4)
 
 
-def test_a_term_without_a_fade_takes_over_at_once():
+def test_term_without_a_fade_takes_over_at_once():
     terms = [SINUSOIDS, SPLINE._replace(begin=1.5)]
     np.testing.assert_array_equal(at(terms, 1.4999), at([SINUSOIDS], 1.4999))
     np.testing.assert_array_equal(at(terms, 1.5), at([SPLINE], 1.5))
 
 
-def test_terms_come_out_of_their_vector_as_they_went_in():
+def test_packing_and_unpacking_preserves_the_terms():
     terms = [SINUSOIDS, LATER, SPLINE]
-    for one, other in zip(terms, unpack(pack(3, terms)), strict=True):
-        assert (one.code, one.begin, one.fade) == (other.code, other.begin, other.fade)
-        np.testing.assert_array_equal(one.content, other.content)
+    for term, unpacked in zip(terms, unpack(pack(3, terms)), strict=True):
+        assert (term.code, term.begin, term.fade) == (unpacked.code, unpacked.begin, unpacked.fade)
+        np.testing.assert_array_equal(term.content, unpacked.content)
 
 
-def test_many_times_at_once_give_what_each_gives():
+def test_many_times_at_once_match_single_evaluations():
     times = np.linspace(0.0, 4.0, 9)
     together = reference.sampled(pack(3, [SINUSOIDS, LATER]), times)
     apart = np.array([at([SINUSOIDS, LATER], t) for t in times])
-    np.testing.assert_allclose(together, apart, rtol=1e-14, atol=1e-14)  # two libraries' cosines
+    np.testing.assert_allclose(together, apart, rtol=1e-14, atol=1e-14)  # cosines of two libraries
 
 
 def test_papers_reference_is_at_rest_at_the_start():

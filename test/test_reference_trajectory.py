@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectories that are sent: what is followed, how it is joined on, and every rejection."""
+"""Sent trajectories: how they are tracked and joined to the reference, and every rejection."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ PAPER = pack(2, [sinusoids_term((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))])
 NOW = 3.3  # s
 GOALS = np.array([[1.6, 1.2], [2.0, 1.5], [1.8, 1.0]])
 FAR = np.array([[1.6, 1.2], [2.0, 3.5], [1.8, 1.0]])
-SPEEDS = np.array([[0.2, 0.0], [0.1, -0.2], [0.0, 0.0]])
-CHANGES = np.array([[0.1, 0.4], [-0.3, 0.2], [0.0, 0.0]])
+VELOCITIES = np.array([[0.2, 0.0], [0.1, -0.2], [0.0, 0.0]])
+ACCELERATIONS = np.array([[0.1, 0.4], [-0.3, 0.2], [0.0, 0.0]])
 TIMES = (1.0, 2.0, 3.5)
 FIELDS = {
     'positions': (GOALS,),
-    'positions and velocities': (GOALS, SPEEDS),
-    'positions, velocities and accelerations': (GOALS, SPEEDS, CHANGES),
+    'positions and velocities': (GOALS, VELOCITIES),
+    'positions, velocities and accelerations': (GOALS, VELOCITIES, ACCELERATIONS),
 }
 
 
@@ -43,52 +43,52 @@ def trajectory(fields=(GOALS,), times=TIMES, joints=JOINTS, begin=None):
     return Trajectory(joints, points, begin)
 
 
-def one(vector, t):
+def at(vector, t):
     return sampled(vector, np.array([t]))[0]
 
 
 @pytest.mark.parametrize('fields', FIELDS.values(), ids=FIELDS)
-def test_points_are_passed_at_their_times_with_what_is_given(fields):
+def test_points_are_passed_at_their_times_with_the_given_derivatives(fields):
     motion = plan_trajectory(trajectory(fields), PAPER, NOW, LIMITS)
     for k, t in enumerate(TIMES):
-        now = one(motion.vector, NOW + t)
+        reference = at(motion.vector, NOW + t)
         for row, given in enumerate(fields):
-            np.testing.assert_allclose(now[row], given[k], atol=1e-12)
+            np.testing.assert_allclose(reference[row], given[k], atol=1e-12)
 
 
 @pytest.mark.parametrize('fields', FIELDS.values(), ids=FIELDS)
-def test_it_leads_on_from_the_present_reference_without_a_jump(fields):
+def test_trajectory_continues_the_present_reference_without_a_jump(fields):
     motion = plan_trajectory(trajectory(fields), PAPER, NOW, LIMITS)
-    np.testing.assert_allclose(one(motion.vector, NOW), one(PAPER, NOW), atol=1e-13)
-    np.testing.assert_allclose(one(motion.vector, NOW + 1e-8), one(PAPER, NOW), atol=1e-6)
+    np.testing.assert_allclose(at(motion.vector, NOW), at(PAPER, NOW), atol=1e-13)
+    np.testing.assert_allclose(at(motion.vector, NOW + 1e-8), at(PAPER, NOW), atol=1e-6)
     assert motion.settled == NOW
 
 
 @pytest.mark.parametrize('fields', FIELDS.values(), ids=FIELDS)
-def test_it_has_no_jump_in_velocity_anywhere_and_is_held_at_the_end(fields):
+def test_trajectory_has_no_jump_in_velocity_and_is_held_at_the_end(fields):
     motion = plan_trajectory(trajectory(fields), PAPER, NOW, LIMITS)
     times = np.linspace(NOW, NOW + 4.0, 40_001)
     qr, dqr, ddqr = sampled(motion.vector, times).transpose(1, 0, 2)
     # 6 rad/s^2 times 1e-4 s is the most that a velocity may change from one time to the next.
     assert np.abs(np.diff(dqr, axis=0)).max() <= 6.0e-4 * 1.001
-    if len(fields) != 2:  # cubics jump in acceleration, as there
+    if len(fields) != 2:  # cubics jump in acceleration at their points
         assert np.abs(np.diff(ddqr, axis=0)).max() < 0.02  # a jerk below 200 rad/s^3
     np.testing.assert_array_equal(qr[times > NOW + 3.5][-1], GOALS[-1])
-    np.testing.assert_array_equal(one(motion.vector, 1e4), [GOALS[-1], (0, 0), (0, 0)])
+    np.testing.assert_array_equal(at(motion.vector, 1e4), [GOALS[-1], (0, 0), (0, 0)])
 
 
-def test_the_way_to_the_first_point_of_cubics_arrives_with_their_acceleration():
-    motion = plan_trajectory(trajectory((GOALS, SPEEDS)), PAPER, NOW, LIMITS)
-    before, after = (one(motion.vector, NOW + 1.0 + side)[2] for side in (-1e-9, 1e-9))
+def test_lead_in_to_cubics_ends_with_their_initial_acceleration():
+    motion = plan_trajectory(trajectory((GOALS, VELOCITIES)), PAPER, NOW, LIMITS)
+    before, after = (at(motion.vector, NOW + 1.0 + side)[2] for side in (-1e-9, 1e-9))
     np.testing.assert_allclose(before, after, atol=1e-6)
     assert np.abs(after).min() > 0.1
 
 
-def test_cubics_are_hermite_s():
-    """Halfway between two points, h apart: their mean, and h/8 times the fall of the velocity."""
-    motion = plan_trajectory(trajectory((GOALS, SPEEDS)), PAPER, NOW, LIMITS)
-    halfway = one(motion.vector, NOW + 1.5)[0]
-    expected = 0.5 * (GOALS[0] + GOALS[1]) + (SPEEDS[0] - SPEEDS[1]) / 8.0
+def test_cubics_are_hermite_splines():
+    """Halfway between two points, h apart: their mean plus h/8 times the decrease in velocity."""
+    motion = plan_trajectory(trajectory((GOALS, VELOCITIES)), PAPER, NOW, LIMITS)
+    halfway = at(motion.vector, NOW + 1.5)[0]
+    expected = 0.5 * (GOALS[0] + GOALS[1]) + (VELOCITIES[0] - VELOCITIES[1]) / 8.0
     np.testing.assert_allclose(halfway, expected, atol=1e-12)
 
 
@@ -102,48 +102,48 @@ def test_joints_are_matched_by_name(fields):
     )
 
 
-def test_a_trajectory_that_begins_now_somewhere_else_is_mixed_in():
+def test_trajectory_that_begins_now_at_another_position_is_blended_in():
     fields = (np.vstack((GOALS[2], GOALS[1], GOALS[0])),)
     motion = plan_trajectory(trajectory(fields, times=(0.0, 4.0, 8.0)), PAPER, NOW, LIMITS)
     assert NOW < motion.settled < NOW + 4.0
-    np.testing.assert_allclose(one(motion.vector, NOW), one(PAPER, NOW), atol=1e-13)
-    np.testing.assert_allclose(one(motion.vector, NOW + 4.0)[0], GOALS[1], atol=1e-12)
+    np.testing.assert_allclose(at(motion.vector, NOW), at(PAPER, NOW), atol=1e-13)
+    np.testing.assert_allclose(at(motion.vector, NOW + 4.0)[0], GOALS[1], atol=1e-12)
 
 
-def test_one_point_at_once_is_gone_to_as_fast_as_the_limits_allow():
+def test_single_point_at_time_zero_is_reached_as_fast_as_the_limits_allow():
     motion = plan_trajectory(trajectory((GOALS[:1],), times=(0.0,)), PAPER, NOW, LIMITS)
-    after = one(motion.vector, motion.settled)
+    after = at(motion.vector, motion.settled)
     np.testing.assert_allclose(after, [GOALS[0], (0, 0), (0, 0)], atol=1e-12)
     _, dqr, ddqr = sampled(motion.vector, np.linspace(NOW, motion.settled, 5001)).transpose(1, 0, 2)
     used = max((np.abs(dqr) / 1.5).max(), (np.abs(ddqr) / 6.0).max())
     assert used == pytest.approx(1.0, abs=0.05)
 
 
-def test_until_it_begins_the_present_reference_goes_on():
+def test_present_reference_continues_until_the_trajectory_begins():
     motion = plan_trajectory(trajectory(begin=5.0), PAPER, NOW, LIMITS)
     for t in (NOW, 4.0, 4.999):
-        np.testing.assert_array_equal(one(motion.vector, t), one(PAPER, t))
-    np.testing.assert_allclose(one(motion.vector, 5.0), one(PAPER, 5.0), atol=1e-13)
-    np.testing.assert_allclose(one(motion.vector, 6.0)[0], GOALS[0], atol=1e-12)
+        np.testing.assert_array_equal(at(motion.vector, t), at(PAPER, t))
+    np.testing.assert_allclose(at(motion.vector, 5.0), at(PAPER, 5.0), atol=1e-13)
+    np.testing.assert_allclose(at(motion.vector, 6.0)[0], GOALS[0], atol=1e-12)
 
 
-def test_points_whose_time_is_over_are_passed_over():
+def test_points_in_the_past_are_skipped():
     motion = plan_trajectory(trajectory(begin=NOW - 1.5), PAPER, NOW, LIMITS)
-    np.testing.assert_allclose(one(motion.vector, NOW), one(PAPER, NOW), atol=1e-13)
-    np.testing.assert_allclose(one(motion.vector, NOW + 0.5)[0], GOALS[1], atol=1e-12)
+    np.testing.assert_allclose(at(motion.vector, NOW), at(PAPER, NOW), atol=1e-13)
+    np.testing.assert_allclose(at(motion.vector, NOW + 0.5)[0], GOALS[1], atol=1e-12)
 
 
-def test_a_later_one_replaces_those_that_run_or_wait():
+def test_later_trajectory_replaces_running_and_waiting_ones():
     first = plan_trajectory(trajectory(), PAPER, NOW, LIMITS).vector
     waiting = plan_trajectory(trajectory(begin=20.0), first, NOW + 1.0, LIMITS).vector
     last = plan_trajectory(trajectory((GOALS[::-1] + 0.1,)), waiting, NOW + 1.5, LIMITS).vector
-    np.testing.assert_allclose(one(last, NOW + 1.5), one(first, NOW + 1.5), atol=1e-12)
-    np.testing.assert_allclose(one(last, NOW + 5.0)[0], GOALS[0] + 0.1, atol=1e-12)
-    np.testing.assert_allclose(one(last, 22.0)[0], GOALS[0] + 0.1, atol=1e-12)
+    np.testing.assert_allclose(at(last, NOW + 1.5), at(first, NOW + 1.5), atol=1e-12)
+    np.testing.assert_allclose(at(last, NOW + 5.0)[0], GOALS[0] + 0.1, atol=1e-12)
+    np.testing.assert_allclose(at(last, 22.0)[0], GOALS[0] + 0.1, atol=1e-12)
     assert len(unpack(last)) == 2
 
 
-def test_what_is_over_is_forgotten():
+def test_finished_trajectories_are_forgotten():
     vector = PAPER
     for k in range(20):
         vector = plan_trajectory(trajectory((GOALS + 0.01 * k,)), vector, NOW + k, LIMITS).vector
@@ -188,7 +188,7 @@ BAD = {
         'point 1 has positions that are not finite: [1.6, nan]',
     ),
     'infinite velocity': (
-        trajectory((GOALS, SPEEDS + np.array([[0.0], [np.inf], [0.0]]))),
+        trajectory((GOALS, VELOCITIES + np.array([[0.0], [np.inf], [0.0]]))),
         'point 2 has velocities that are not finite',
     ),
     'equal times': (trajectory(times=(1.0, 1.0, 2.0)), 'point 2 is at 1 s, not after'),
@@ -196,7 +196,7 @@ BAD = {
     'negative time': (trajectory(times=(-1.0, 1.0, 2.0)), 'point 1 is 1 s before the beginning'),
     'all in the past': (trajectory(begin=-0.5), 'it ended 0.3 s ago'),
     'moving at the end': (
-        trajectory((GOALS, SPEEDS[::-1])),
+        trajectory((GOALS, VELOCITIES[::-1])),
         'it ends with shoulder at 0.2 rad/s, but the last point is held',
     ),
     'too fast': (
@@ -216,7 +216,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(('bad', 'reason'), BAD.values(), ids=BAD)
-def test_what_cannot_be_followed_is_rejected_with_the_reason(bad, reason):
+def test_invalid_trajectory_is_rejected_with_the_reason(bad, reason):
     with pytest.raises(TrajectoryError) as rejection:
         plan_trajectory(bad, PAPER, NOW, LIMITS)
     assert isinstance(rejection.value, MotionError)
@@ -233,15 +233,15 @@ def test_all_problems_are_reported_at_once():
 
 
 @pytest.mark.parametrize(
-    ('times', 'said'),
+    ('times', 'message'),
     [
         ((1.0, 2e9), 'it takes 2e+09 s, longer than 3600 s'),
         ((3601.0,), 'it takes 3601 s, longer than 3600 s'),
         (range(1, 1002), 'it has 1001 points, more than 1000'),
     ],
 )
-def test_what_takes_too_long_to_plan_is_rejected(times, said):
+def test_trajectory_that_takes_too_long_to_plan_is_rejected(times, message):
     points = tuple(TrajectoryPoint(float(t), (1.0, 1.0)) for t in times)
     with pytest.raises(TrajectoryError, match='send it in pieces') as rejection:
         plan_trajectory(Trajectory(JOINTS, points), PAPER, NOW, LIMITS)
-    assert said in str(rejection.value)
+    assert message in str(rejection.value)

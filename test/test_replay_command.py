@@ -27,7 +27,7 @@ def bag(tmp_path_factory):
     return recorded_run.record(tmp_path_factory.mktemp('recorded') / 'bag', 0.3)
 
 
-def test_equal_bags_end_with_zero_and_a_verdict(bag):
+def test_identical_replay_exits_with_zero_and_a_verdict(bag):
     command = [sys.executable, '-c', WITHOUT_ROS, str(bag)]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
@@ -35,7 +35,7 @@ def test_equal_bags_end_with_zero_and_a_verdict(bag):
     assert 'x real time' in run.stdout
 
 
-def test_a_difference_is_the_exit_code_and_the_last_line(bag, tmp_path, capsys):
+def test_difference_sets_the_exit_code_and_the_last_line(bag, tmp_path, capsys):
     entries = recorded_run.messages(bag)
     second = [entry for entry in entries if entry[0] == COMMANDS.resolved][1]
     second[3] = second[3][:-1] + bytes([second[3][-1] ^ 0x80])  # the sign
@@ -47,8 +47,8 @@ def test_a_difference_is_the_exit_code_and_the_last_line(bag, tmp_path, capsys):
 
 
 @pytest.mark.parametrize('topic', [JOINT_STATES, COMMANDS])
-def test_a_part_that_is_equal_is_a_verdict_of_its_own(bag, tmp_path, capsys, topic):
-    """A third of the way a state was lost, and the replay ends; without a command, the others."""
+def test_partial_comparison_has_a_verdict_of_its_own(bag, tmp_path, capsys, topic):
+    """A lost state ends the replay after a third; a lost command leaves the others to compare."""
     entries = recorded_run.messages(bag)
     lost = recorded_run.of(entries, topic)[100]
     kept = [entry for entry in entries if entry is not lost]
@@ -56,27 +56,27 @@ def test_a_part_that_is_equal_is_a_verdict_of_its_own(bag, tmp_path, capsys, top
     assert main(['replay', str(path)]) == PARTIAL
     last = capsys.readouterr().out.splitlines()[-1]
     percent = float(last.removeprefix('PARTLY COMPARED: ').split()[0])
-    # Of 24 numbers a sample two are commands.
+    # Two of the 24 numbers of a sample are commands.
     assert percent == pytest.approx(33.2 if topic is JOINT_STATES else 91.4, abs=1.5)
 
 
-def test_another_configuration_is_said_to_be_open_loop(bag, capsys):
+def test_replay_with_another_configuration_is_reported_as_open_loop(bag, capsys):
     assert main(['replay', str(bag), '--config', 'recommended']) == 0
-    said = capsys.readouterr().out
-    assert 'OPEN LOOP' in said
-    assert 'joint2: torque differs from the recorded one by rms' in said
+    output = capsys.readouterr().out
+    assert 'OPEN LOOP' in output
+    assert 'joint2: torque differs from the recorded one by rms' in output
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'said'),
+    ('arguments', 'message'),
     [
         (['nowhere'], 'nowhere cannot be read as a bag: there is no such folder'),
         (['nowhere', '--config', 'recomended'], 'recomended does not exist'),
         (['nowhere', '--config', 'recommended', '--map', 'joint1'], 'one side is missing'),
     ],
 )
-def test_what_is_wrong_is_one_message(arguments, said, capsys):
+def test_error_is_reported_in_one_message(arguments, message, capsys):
     assert main(['replay', *arguments]) == 1
     error = capsys.readouterr().err
     assert error.startswith('blf_dsc replay: ')
-    assert said in error
+    assert message in error

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags that other software wrote: other topics, other joint names and orders, joints too many."""
+"""Bags written by other software: other topics, other joint names and orders, extra joints."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CONFIG = recorded_run.loop_config().controller
 
 @pytest.fixture(scope='module')
 def run(tmp_path_factory):
-    """Stamps, [q, dq, effort] and torques of a run of ours."""
+    """Stamps, [q, dq, effort] and what-if replay of a run of our own."""
     path = recorded_run.record(tmp_path_factory.mktemp('ours') / 'bag', 0.5)
     content = read_content(path)
     states = content.topics[JOINT_STATES].joint_states(CONFIG.joints)
@@ -40,7 +40,7 @@ def run(tmp_path_factory):
 
 
 def spread(values):
-    """Two values among those of four joints, as SHUFFLED orders them."""
+    """Place two values among those of the four joints of SHUFFLED."""
     return [77.0, values[1], -5.0, values[0]]
 
 
@@ -97,48 +97,48 @@ def write_ros1(path, messages):
 
 @pytest.mark.parametrize('torque', ['array', 'pair', 'state'])
 @pytest.mark.parametrize('storage', [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
-def test_shuffled_joints_and_two_more_replay_to_the_same_torques(run, tmp_path, storage, torque):
+def test_shuffled_and_extra_joints_replay_to_the_same_torques(run, tmp_path, storage, torque):
     path = write(tmp_path / 'bag', foreign(run, torque), storage)
-    found = what_if(path, CONFIG, names=NameMap.parse(MAP))
-    np.testing.assert_array_equal(found.run.torque, run[2].run.torque)
-    np.testing.assert_array_equal(found.applied, run[2].applied)
+    result = what_if(path, CONFIG, names=NameMap.parse(MAP))
+    np.testing.assert_array_equal(result.run.torque, run[2].run.torque)
+    np.testing.assert_array_equal(result.applied, run[2].applied)
 
 
-@pytest.mark.parametrize('version', [5, 8])  # of Humble, whose bags hold no definitions, and Iron
-def test_bags_of_earlier_releases_are_read(run, tmp_path, version):
+@pytest.mark.parametrize('version', [5, 8])  # Humble (without message definitions) and Iron
+def test_bags_of_earlier_ros_releases_are_read(run, tmp_path, version):
     path = write(tmp_path / 'bag', foreign(run), StoragePlugin.SQLITE3, max(version, 8))
     if version == 5:
         text = (path / 'metadata.yaml').read_text()
         (path / 'metadata.yaml').write_text(text.replace('version: 8', 'version: 5'))
-    found = what_if(path, CONFIG, names=NameMap.parse(MAP))
-    assert np.abs(found.difference).max() == 0.0
+    result = what_if(path, CONFIG, names=NameMap.parse(MAP))
+    assert np.abs(result.difference).max() == 0.0
 
 
-def test_a_bag_of_ros_1_is_read(run, tmp_path):
+def test_ros1_bag_is_read(run, tmp_path):
     path = write_ros1(tmp_path / 'run.bag', foreign(run))
-    found = what_if(path, CONFIG, names=NameMap.parse(MAP))
-    np.testing.assert_array_equal(found.run.torque, run[2].run.torque)
+    result = what_if(path, CONFIG, names=NameMap.parse(MAP))
+    np.testing.assert_array_equal(result.run.torque, run[2].run.torque)
 
 
-def test_without_commands_the_effort_is_the_torque(run, tmp_path):
+def test_effort_is_taken_as_torque_if_there_are_no_commands(run, tmp_path):
     path = write(tmp_path / 'bag', foreign(run, 'effort'))
     names = NameMap.parse([entry for entry in MAP if 'commands' not in entry])
-    found = what_if(path, CONFIG, names=names)
-    assert found.source == 'effort of /arm/states'
-    # The effort of a state is the torque that led to it: the last one is not known.
-    np.testing.assert_array_equal(found.applied[:-1], run[2].applied[:-1])
-    assert np.isnan(found.applied[-1]).all()
+    result = what_if(path, CONFIG, names=names)
+    assert result.source == 'effort of /arm/states'
+    # The effort of a state is the torque that led to it: the last torque is unknown.
+    np.testing.assert_array_equal(result.applied[:-1], run[2].applied[:-1])
+    assert np.isnan(result.applied[-1]).all()
 
 
-def test_commands_at_another_rate_are_those_that_had_come(run, tmp_path):
+def test_commands_at_another_rate_are_held_until_the_next_one(run, tmp_path):
     messages = list(foreign(run, 'pair'))
-    kept = [one for k, one in enumerate(messages) if one[0] != '/arm/torque' or k % 4 == 1]
-    found = what_if(write(tmp_path / 'bag', kept), CONFIG, names=NameMap.parse(MAP))
-    np.testing.assert_array_equal(found.applied[1], run[2].applied[0])  # of two states, one command
-    np.testing.assert_array_equal(found.applied[2], run[2].applied[2])
+    kept = [entry for k, entry in enumerate(messages) if entry[0] != '/arm/torque' or k % 4 == 1]
+    result = what_if(write(tmp_path / 'bag', kept), CONFIG, names=NameMap.parse(MAP))
+    np.testing.assert_array_equal(result.applied[1], run[2].applied[0])  # previous command held
+    np.testing.assert_array_equal(result.applied[2], run[2].applied[2])
 
 
-def test_the_command_reads_them_too(run, tmp_path, capsys):
+def test_replay_command_reads_a_foreign_bag(run, tmp_path, capsys):
     path = write(tmp_path / 'bag', foreign(run), StoragePlugin.SQLITE3)
     words = [word for entry in MAP for word in ('--map', entry)]
     assert main(['replay', str(path), '--config', 'recommended', *words]) == 0
@@ -151,7 +151,7 @@ def names_of(**changes):
 
 
 @pytest.mark.parametrize(
-    ('changes', 'error', 'said'),
+    ('changes', 'error', 'message'),
     [
         ({'joint_states': '/arm/state'}, BagError, r"'/arm/state' of type sensor_msgs"),
         (
@@ -163,14 +163,14 @@ def names_of(**changes):
         ({'joint3': 'base'}, BlfDscError, 'joint3 is neither a topic nor one of the joints'),
     ],
 )
-def test_a_wrong_name_is_reported_with_those_in_the_bag(run, tmp_path, changes, error, said):
+def test_wrong_name_is_reported_with_the_names_in_the_bag(run, tmp_path, changes, error, message):
     path = write(tmp_path / 'bag', foreign(run))
-    with pytest.raises(error, match=said):
+    with pytest.raises(error, match=message):
         what_if(path, CONFIG, names=names_of(**changes))
 
 
-def test_without_any_torque_it_is_said_where_it_was_looked_for(run, tmp_path):
-    states = [one for one in foreign(run) if one[0] == '/arm/states']
+def test_bag_without_torques_is_rejected_with_a_hint_to_map_commands(run, tmp_path):
+    states = [message for message in foreign(run) if message[0] == '/arm/states']
     empty = JointStateEncoder(SHUFFLED, ('position', 'velocity'))
     bare = [
         (topic, type_, at, empty.encode(at, spread(run[1][k, 0]), spread(run[1][k, 1])))
@@ -181,24 +181,24 @@ def test_without_any_torque_it_is_said_where_it_was_looked_for(run, tmp_path):
         what_if(write(tmp_path / 'bag', bare), CONFIG, names=names)
 
 
-def test_commands_that_are_of_unknown_order_are_rejected(run, tmp_path):
+def test_commands_in_unknown_joint_order_are_rejected(run, tmp_path):
     three = Float64MultiArrayEncoder(3)
     messages = [
-        one if one[0] == '/arm/states' else (*one[:3], three.encode([1, 2, 3]))
-        for one in foreign(run)
+        message if message[0] == '/arm/states' else (*message[:3], three.encode([1, 2, 3]))
+        for message in foreign(run)
     ]
     with pytest.raises(BlfDscError, match='3 values, but there are 2 joints, and 4 in'):
         what_if(write(tmp_path / 'bag', messages), CONFIG, names=NameMap.parse(MAP))
 
 
-def test_an_empty_bag_is_called_empty(tmp_path):
+def test_empty_bag_is_reported_as_empty(tmp_path):
     with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         writer.add_connection('/joint_states', JOINT_STATE, typestore=typestore())
     with pytest.raises(BagError, match='is empty: it holds no message of /joint_states'):
         what_if(tmp_path / 'bag', CONFIG)
 
 
-def test_a_bag_of_a_later_format_is_rejected(run, tmp_path):
+def test_bag_of_a_newer_format_is_rejected(run, tmp_path):
     path = write(tmp_path / 'bag', foreign(run))
     text = (path / 'metadata.yaml').read_text()
     (path / 'metadata.yaml').write_text(text.replace('version: 9', 'version: 99'))
@@ -207,11 +207,11 @@ def test_a_bag_of_a_later_format_is_rejected(run, tmp_path):
 
 
 @pytest.mark.parametrize('entry', ['joint1', '=x', 'joint1='])
-def test_an_entry_with_one_side_is_rejected(entry):
+def test_map_entry_with_one_side_missing_is_rejected(entry):
     with pytest.raises(BlfDscError, match='one side is missing'):
         NameMap.parse([entry])
 
 
-def test_a_name_given_twice_is_rejected():
+def test_name_mapped_twice_is_rejected():
     with pytest.raises(BlfDscError, match='given twice'):
         NameMap.parse(['joint1=a', 'joint2=a'])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every event of a controller replays from its journal, with every torque; without ROS."""
+"""Controller events replay from the journal with identical torques; without ROS."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES, JOURNAL, 
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.replay.verify import verify
 
-# A spoilt memory of the law is in no message, nor is the end of a process.
-IN_MESSAGES = [one for one in FAULTS if 'poison' not in one.inject.__qualname__]
-DAMPED = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.02}  # never twice the same
+# Messages show neither a corrupted state of the law nor the end of a process.
+IN_MESSAGES = [fault for fault in FAULTS if 'poison' not in fault.inject.__qualname__]
+DAMPED = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.02}  # no two torques alike
 
 
 class Recorder(Rig):
-    """A rig with a bag of all that the node would publish."""
+    """A rig that records everything the node would publish."""
 
     def __init__(self, given=None, **options):
         self.entries = []
         super().__init__(given, **options)
         self.telemetry = ControllerTelemetry(JOINTS, estimate_names(self.config), 1)
-        self.drops = ()  # numbers of the joint states that the controller does not get
+        self.drops = ()  # indices of joint states that never reach the controller
         self.count = 0
 
-    def note(self, topic, raw):
+    def record(self, topic, raw):
         self.entries.append([topic.resolved, topic.type, len(self.entries), raw])
 
     def publish_events(self):
         while self.guard.journal.pending:
-            self.note(JOURNAL, self.guard.journal.pending.popleft().encode())
+            self.record(JOURNAL, self.guard.journal.pending.popleft().encode())
 
     def deliver(self, raw):
         self.publish_events()
-        self.note(JOINT_STATES, raw)
+        self.record(JOINT_STATES, raw)
         self.count += 1
         if self.count - 1 in self.drops:
             return None
@@ -52,13 +52,13 @@ class Recorder(Rig):
             for topic, message in self.telemetry.sample(
                 guard.last_stamp, guard.controller.sample, 0.0
             ):
-                self.note(topic, message)
+                self.record(topic, message)
         self.publish_events()
         return torque
 
     def _command(self, torque):
         if torque is not None:
-            self.note(*self.telemetry.command(torque))
+            self.record(*self.telemetry.command(torque))
         super()._command(torque)
 
     def verify(self, path, **facts):
@@ -69,21 +69,21 @@ class Recorder(Rig):
 
 
 @pytest.mark.parametrize('fault', IN_MESSAGES, ids=lambda fault: fault.name)
-def test_every_fault_replays_with_every_torque(fault, tmp_path):
+def test_every_fault_replays_with_identical_torques(fault, tmp_path):
     rig = Recorder(fault.given, live=fault.live)
     outcome = run(fault, rig)
     result = rig.verify(tmp_path, clock='lockstep')
     assert result.difference is None
-    if any('another controller' in one for one in result.remarks):
-        return  # what was killed ends there
+    if any('another controller' in remark for remark in result.remarks):
+        return  # the replay ends where the controller was killed
     assert compared(result)['commands'] == 2 * len(of(rig.entries, COMMANDS))
     assert compared(result)['tracking_error'] == 6 * len(of(rig.entries, TRACKING_ERROR))
     assert ('safe stop' in ' '.join(result.turns)) == (outcome.noticed >= 0)
-    assert [one for one in result.comparisons if 'torques' in one.left_out] == []
+    assert [item for item in result.comparisons if 'torques' in item.left_out] == []
 
 
 def eventful():
-    """Every kind of event, one after the other."""
+    """Run a rig through every kind of event."""
     rig = Recorder({**DAMPED, 'safety.watchdog': 'on', 'limits.acceleration': [40.0, 40.0]})
     rig.step(50)
     point = TrajectoryPoint(0.4, (2.2, 1.6), (0.0, 0.0), (0.0, 0.0))
@@ -108,7 +108,7 @@ def eventful():
     return rig
 
 
-def test_the_watchdog_s_torques_replay_too(tmp_path):
+def test_watchdog_torques_replay(tmp_path):
     rig = eventful()
     rig.guard.release()
     result = rig.verify(tmp_path)
@@ -121,15 +121,15 @@ def test_the_watchdog_s_torques_replay_too(tmp_path):
         'reset',
         'safe stop (bad message)',
     ]
-    assert [one.type for one in result.events].count(EventType.SILENCE) == 2
-    assert [one.type for one in result.events].count(EventType.TRAJECTORY) == 2
+    assert [event.type for event in result.events].count(EventType.SILENCE) == 2
+    assert [event.type for event in result.events].count(EventType.TRAJECTORY) == 2
     assert compared(result)['commands'] == 2 * len(of(rig.entries, COMMANDS))
     states = len(of(rig.entries, JOINT_STATES))
     assert len(of(rig.entries, COMMANDS)) > states + 10
 
 
-def test_dropped_states_are_found_by_the_journal(tmp_path):
-    """In real time: while running by the telemetry, out of command as far as torques match."""
+def test_dropped_states_are_detected(tmp_path):
+    """In real time: by the telemetry while tracking, by matching torques while inactive."""
     rig = Recorder({**DAMPED, 'safety.deactivation_ramp': 1.0})
     rig.drops = (20, 70, 130)
     rig.step(50)
@@ -142,18 +142,18 @@ def test_dropped_states_are_found_by_the_journal(tmp_path):
     assert result.difference is None
     assert result.passed_over == 2
     assert compared(result)['tracking_error'] == 6 * len(of(rig.entries, TRACKING_ERROR))
-    # The ramp differs from the dropped state on until the law is in command again.
+    # From the dropped state on, the ramp differs until the law is in command again.
     assert compared(result)['commands'] == 2 * (49 + 20 + 49)
-    (commands,) = (one for one in result.comparisons if one.topic.endswith('commands'))
+    (commands,) = (item for item in result.comparisons if item.topic.endswith('commands'))
     assert commands.left_out.startswith('29 torques')
 
 
-def test_an_unexpected_error_is_replayed_as_a_stop(tmp_path):
+def test_unexpected_error_replays_as_a_stop(tmp_path):
     rig = Recorder(DAMPED)
     rig.step(50)
-    rig.note(JOINT_STATES, rig.state().raw())
+    rig.record(JOINT_STATES, rig.state().raw())
     stamp = rig.state().stamp
-    rig.guard.journal.messages += 1  # as far as the message came
+    rig.guard.journal.messages += 1  # the message was counted before the error
     rig.guard.journal.stamp = stamp
     rig._command(rig.guard.fail('ZeroDivisionError: x'))
     rig.plant.step(rig.input.torque)
@@ -166,7 +166,7 @@ def test_an_unexpected_error_is_replayed_as_a_stop(tmp_path):
     assert compared(result)['commands'] >= 2 * (50 + 30)
 
 
-def test_a_changed_stop_reason_is_a_departure(tmp_path):
+def test_changed_stop_reason_is_a_difference(tmp_path):
     """The recorded controller stopped where the replayed one does not."""
     rig = eventful()
     for entry in of(rig.entries, JOURNAL):
@@ -177,7 +177,7 @@ def test_a_changed_stop_reason_is_a_departure(tmp_path):
     assert rig.verify(tmp_path).difference.field.startswith('stop: stamp jump (')
 
 
-def test_a_stop_that_is_moved_is_named(tmp_path):
+def test_moved_stop_is_located(tmp_path):
     rig = Recorder(DAMPED)
     rig.step(50)
     rig.deliver(b'')
@@ -192,7 +192,7 @@ def test_a_stop_that_is_moved_is_named(tmp_path):
     assert difference.field.startswith('used by the law (')
 
 
-def test_a_second_controller_in_a_bag_is_not_replayed(tmp_path):
+def test_second_controller_in_a_bag_is_not_replayed(tmp_path):
     rig = Recorder()
     rig.step(40)
     rig.guard = rig.controller()
@@ -205,8 +205,8 @@ def test_a_second_controller_in_a_bag_is_not_replayed(tmp_path):
     assert np.array_equal(result.stamp, LOCKSTEP + np.arange(40) * MILLISECOND)
 
 
-def test_the_state_at_which_a_controller_was_killed_is_the_next_ones(tmp_path):
-    """In lock-step the arm sends it again, until somebody answers."""
+def test_state_at_which_a_controller_was_killed_belongs_to_the_next_one(tmp_path):
+    """In lock-step the plant sends it again until a controller answers."""
     rig = Recorder()
     rig.step(40)
     rig.drops = (40,)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Playing a bag: the right message at the right time, and over ROS the very bytes."""
+"""Playing a bag: messages at the right time, and byte for byte over ROS."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from blf_dsc_controller.messages.topics import ROBOT_DESCRIPTION
 from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.replay.timeline import Timeline
 
-PATIENCE = 300.0  # s, until a test gives up on what should take a moment
+PATIENCE = 300.0  # s, timeout of waits that should take a moment
 MEGABYTE = 10**6
 COMMAND = [sys.executable, '-m', 'blf_dsc_controller', 'replay']
 PLAY_AND_SHOW_PEAK = """
@@ -36,14 +36,14 @@ def playing(rate):
     return timeline
 
 
-def test_a_bag_runs_with_the_clock():
+def test_bag_plays_in_real_time():
     timeline = playing(1.0)
     assert timeline.wait(110, 1000) == pytest.approx(10e-9)
     assert timeline.wait(110, 1010) == 0.0
     assert timeline.position(1020) == 120
 
 
-def test_the_rate_stretches_time_and_zero_knows_none():
+def test_rate_scales_time_and_zero_means_no_waiting():
     timeline = playing(10.0)
     assert timeline.wait(200, 1002) == pytest.approx(8e-9)
     assert timeline.position(1002) == 120
@@ -52,7 +52,7 @@ def test_the_rate_stretches_time_and_zero_knows_none():
     assert fast.position(2000) == 100
 
 
-def test_a_pause_stops_the_time():
+def test_pause_stops_the_timeline():
     timeline = playing(1.0)
     timeline.pause(1005)
     assert timeline.wait(100, 5000) == float('inf')
@@ -64,20 +64,20 @@ def test_a_pause_stops_the_time():
 def string(text):
     message = typestore().types[ROBOT_DESCRIPTION.type](data=text)
     raw = bytes(typestore().serialize_cdr(message, ROBOT_DESCRIPTION.type))
-    return raw + bytes(-len(raw) % 4)  # as the middleware hands it over
+    return raw + bytes(-len(raw) % 4)  # as the middleware delivers it
 
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
-    """200 samples, and two URDFs; the second comes after 50 of them."""
+    """200 samples and two URDFs, the second one after 50 samples."""
     messages = list(Synthetic(200).messages())
     urdfs = [(ROBOT_DESCRIPTION, START + k, string(f'<robot {k}/>')) for k in (0, 50_000_000)]
-    ordered = sorted([*urdfs, *messages], key=lambda one: one[1])
+    ordered = sorted([*urdfs, *messages], key=lambda message: message[1])
     return synthetic_bag.write(tmp_path_factory.mktemp('played') / 'bag', ordered)
 
 
 class Player:
-    """A player of a bag in a process of its own, and a node that listens to it."""
+    """A bag player in a separate process, and a node that listens to it."""
 
     def __init__(self, bag, *options):
         import rclpy
@@ -97,10 +97,10 @@ class Player:
     def listen(self, type_, name, **quality):
         from rclpy.qos import QoSProfile
 
-        came = []
+        received = []
         profile = QoSProfile(depth=1000, **quality)
-        self.node.create_subscription(type_, name, came.append, profile, raw=True)
-        return came
+        self.node.create_subscription(type_, name, received.append, profile, raw=True)
+        return received
 
     def spin(self):
         self._executor.spin_once(timeout_sec=0.02)
@@ -121,10 +121,10 @@ class Player:
         return future.result()
 
     def end(self):
-        """Wait for the end; return what was printed."""
-        out, said = self._process.communicate(timeout=PATIENCE)
-        assert self._process.returncode == 0, said
-        return out, said
+        """Wait for the end; return the output and the errors printed."""
+        out, err = self._process.communicate(timeout=PATIENCE)
+        assert self._process.returncode == 0, err
+        return out, err
 
     def close(self):
         self._process.kill()
@@ -153,32 +153,32 @@ def latched():
     return {'durability': DurabilityPolicy.TRANSIENT_LOCAL}
 
 
-def test_a_bag_is_played_over_ros_byte_by_byte_under_another_name(play, bag):
+def test_bag_is_played_over_ros_byte_for_byte_under_another_name(play, bag):
     from sensor_msgs.msg import JointState
     from std_msgs.msg import String
 
     sent = [raw for topic, _, _, raw in recorded_run.messages(bag) if topic == '/joint_states']
     player = play('--rate', '0', '--remap', 'joint_states:=again')
-    came = player.listen(JointState, '/again')
+    received = player.listen(JointState, '/again')
     player.until(lambda: player.node.count_publishers('/again') > 0)
     player.until(lambda: player.call('is_paused').success)
-    assert came == []
-    while not came:  # the first messages are of other topics
+    assert received == []
+    while not received:  # the first messages are of other topics
         assert player.call('play_next').success
         player.spin()
-    assert bytes(came[0]) == sent[0]
-    # RViz starts later than the publisher of the URDF, and gets it.
+    assert bytes(received[0]) == sent[0]
+    # A late subscriber, such as RViz, still receives the URDF.
     urdf = player.listen(String, '/robot_description', **latched())
     player.until(lambda: urdf)
     assert bytes(urdf[0]) == string('<robot 0/>')
     assert player.call('resume').success
-    player.until(lambda: len(came) == len(sent))
-    assert [bytes(raw) for raw in came] == sent
-    out, said = player.end()
+    player.until(lambda: len(received) == len(sent))
+    assert [bytes(raw) for raw in received] == sent
+    out, err = player.end()
     assert f'/rosbag2_player plays 0.199 s of {bag} as fast as possible' in out
     assert '/again' in out.split()
     assert 'ros2 service call /rosbag2_player/resume' in out
-    assert said == 'played 0.2/0.199 s\n'
+    assert err == 'played 0.2/0.199 s\n'
 
 
 def test_publishers_have_the_recorded_quality_of_service(play):
@@ -196,7 +196,7 @@ def test_publishers_have_the_recorded_quality_of_service(play):
         assert found.qos_profile.durability is durability, name
 
 
-def test_a_part_of_a_bag_begins_with_what_was_latched_before(play):
+def test_part_of_a_bag_starts_with_the_messages_latched_before_it(play):
     from sensor_msgs.msg import JointState
     from std_msgs.msg import String
 
@@ -210,30 +210,30 @@ def test_a_part_of_a_bag_begins_with_what_was_latched_before(play):
     assert player.call('resume').success
     player.end()
     player.until(lambda: urdf)
-    assert [bytes(one) for one in urdf] == [string('<robot 50000000/>')]
+    assert [bytes(raw) for raw in urdf] == [string('<robot 50000000/>')]
     player.until(lambda: len(states) == 52)
     from rclpy.serialization import deserialize_message
 
     stamps = [deserialize_message(raw, JointState).header.stamp.nanosec for raw in states]
-    assert stamps[0] == 99 * MEGABYTE  # where the arm stood; then from the offset on
+    assert stamps[0] == 99 * MEGABYTE  # the last state before the offset
     assert stamps[1:] == [k * MEGABYTE for k in range(100, 151)]
     assert all(before < after for before, after in pairwise(stamps))
 
 
-def test_a_bag_larger_than_the_memory_is_read_as_it_is_played(tmp_path):
+def test_large_bag_is_not_loaded_into_memory(tmp_path):
     pytest.importorskip('rclpy', reason='needs ROS 2')
     size = 300
     large = ((ROBOT_DESCRIPTION, START + k, bytes(MEGABYTE)) for k in range(size))
     path = synthetic_bag.write(tmp_path / 'bag', large, lambda _: '/large')
     command = [sys.executable, '-c', PLAY_AND_SHOW_PEAK, str(path)]
     shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    # Of this program alone: ru_maxrss has that of the process that started it.
+    # Of this program alone: ru_maxrss starts with that of the parent process.
     peak = int(shown.rsplit('VmHWM:', 1)[1].split()[0])  # KiB
     assert peak * 1024 < size * MEGABYTE
 
 
 @pytest.mark.parametrize(
-    ('options', 'words'),
+    ('options', 'message'),
     [
         (['--rate', 'nan'], '--rate nan: expected a speed from 0.001 to 1e+06, or 0'),
         (['--rate', 'inf'], '--rate inf: expected'),
@@ -245,15 +245,15 @@ def test_a_bag_larger_than_the_memory_is_read_as_it_is_played(tmp_path):
         (['--topics', '/x'], 'the bag has no topic /x; it holds /'),
     ],
 )
-def test_a_wrong_option_is_refused_in_one_line(bag, capfd, options, words):
+def test_invalid_option_is_rejected_in_one_line(bag, capfd, options, message):
     pytest.importorskip('rclpy', reason='needs ROS 2')
     assert main(['replay', str(bag), '--play', *options]) == 1
-    out, said = capfd.readouterr()
-    assert said.startswith(f'blf_dsc replay: {words}')
-    assert (out, said.count('\n')) == ('', 1)
+    out, err = capfd.readouterr()
+    assert err.startswith(f'blf_dsc replay: {message}')
+    assert (out, err.count('\n')) == ('', 1)
 
 
-def test_a_bag_with_nothing_to_play_is_called_empty(tmp_path):
+def test_bag_without_messages_is_reported_as_empty(tmp_path):
     pytest.importorskip('rclpy', reason='needs ROS 2')
     path = recorded_run.write(tmp_path / 'bag', [])
     run = subprocess.run(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What happens between two samples is in the bag of the running nodes, and replays bit for bit."""
+"""Events between two samples are in the bag of the running nodes and replay bit for bit."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ from blf_dsc_controller.replay.verify import verify
 
 MILLISECOND = 1_000_000  # ns
 BRISK = {
-    'limits__acceleration': [4.0, 4.0],  # rad/s^2, for a lead of a second
+    'limits__acceleration': [4.0, 4.0],  # rad/s^2, for a trajectory of one second
     'barrier__bound': [0.02, 0.02],  # rad, twenty times what this run needs
 }
-DAMPED = {'safety__torque': 'hold_gravity', 'safety__damping': [2.0, 1.0]}  # never twice the same
+DAMPED = {'safety__torque': 'hold_gravity', 'safety__damping': [2.0, 1.0]}  # no two torques alike
 
 
 class Recording:
@@ -53,7 +53,7 @@ class Recording:
         waiting = complete | {'autostart': False}
         self.arm, self.law = self.ros.loop(waiting, complete | controller, clock=clock)
         configure(self.ros, self.arm)
-        # What is changed from here on is not in the configuration that the bag begins with.
+        # Later changes are not in the configuration at the start of the bag.
         name = self.law.get_fully_qualified_name()
         self.ros.until(lambda: name in self.recorder.parameters_of)
         activate(self.ros, self.arm)
@@ -66,7 +66,7 @@ class Recording:
         assert result.successful, result.reason
 
     def end(self):
-        """Hold the time, let the recorder have everything, and complete the bag."""
+        """Stop the plant, let the recorder receive everything, and complete the bag."""
         deactivate(self.ros, self.arm)
         self.ros.until(lambda: self.law.guard.journal.stamp == self.arm.stamp)
         for node in (self.arm, self.law):
@@ -78,7 +78,7 @@ class Recording:
 
 @pytest.fixture(scope='module')
 def moved(tmp_path_factory):
-    """Two trajectories, the second of which waits, and a gain that changes in between."""
+    """Bag with two trajectories, the second one delayed, and a gain change in between."""
     run = Recording(tmp_path_factory.mktemp('moved') / 'bag', **BRISK)
     run.run(200)
     assert send(run.ros, run.law, trajectory(JOINTS, np.zeros(2), duration=1.0)) == ''
@@ -95,7 +95,7 @@ def moved(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def stopped(tmp_path_factory):
-    """A pause, two safe stops with a gain changed in the first, starts and a reset after them."""
+    """Bag with a pause, two safe stops (a gain changes in the first), activations and a reset."""
     run = Recording(tmp_path_factory.mktemp('stopped') / 'bag', **DAMPED)
     run.run(100)
     deactivate(run.ros, run.law)
@@ -113,7 +113,7 @@ def stopped(tmp_path_factory):
     run.run(100)
     run.ros.reset(run.law)
     run.run(100)
-    deactivate(run.ros, run.arm)  # so that what follows has a place among the states
+    deactivate(run.ros, run.arm)  # so that the next message has a defined place among the states
     name, type_ = JOINT_STATES.relative, message_class(JOINT_STATES.type)
     publisher = run.ros.tester.create_publisher(type_, name, qos_profile(JOINT_STATES.offered))
     run.ros.until(lambda: publisher.get_subscription_count() >= 2)
@@ -127,7 +127,7 @@ def stopped(tmp_path_factory):
 
 @pytest.fixture
 def rewritten(tmp_path):
-    """Writes a bag again with other messages."""
+    """Writes a copy of a bag with changed messages."""
 
     def write(bag, change):
         entries = [change(list(entry)) for entry in recorded_run.messages(bag)]
@@ -138,7 +138,7 @@ def rewritten(tmp_path):
 
 
 def flipped(topic, number):
-    """Change the last bit of a double at the end of the message with this number."""
+    """Flip the lowest bit of the double at the end of the message with this number."""
     count = iter(range(10**6))
 
     def change(entry):
@@ -167,24 +167,24 @@ def altered(event_type, change):
 
 
 def trajectories(bag):
-    """Events of the trajectories in a bag."""
+    """Trajectory events of a bag."""
     events = [decode(entry[3]) for entry in of(recorded_run.messages(bag), JOURNAL)]
     return [event for event in events if event.type is EventType.TRAJECTORY]
 
 
-def test_trajectories_and_a_gain_replay_where_they_took_effect(moved):
+def test_trajectories_and_gain_change_replay_where_they_took_effect(moved):
     result = verify(moved)
     assert result.difference is None
     assert result.remarks == ()
-    assert [one.type for one in result.events].count(EventType.PARAMETERS) == 1
-    assert [one.type for one in result.events].count(EventType.TRAJECTORY) == 2
+    assert [event.type for event in result.events].count(EventType.PARAMETERS) == 1
+    assert [event.type for event in result.events].count(EventType.TRAJECTORY) == 2
     samples = result.stamp.size
     assert samples >= 1300
     assert compared(result)['commands'] == 2 * samples
     assert compared(result)['reference'] == 4 * samples
 
 
-def test_the_journal_holds_each_trajectory_as_it_was_sent(moved):
+def test_journal_holds_each_trajectory_as_sent(moved):
     first, second = [event.content for event in trajectories(moved)]
     assert (tuple(first['joints']), tuple(second['joints'])) == (JOINTS, JOINTS[::-1])
     assert first['begin'] is None
@@ -192,12 +192,12 @@ def test_the_journal_holds_each_trajectory_as_it_was_sent(moved):
     begin = int((moved.parent / 'begin').read_text())
     assert second['begin'] == (begin - start) * 1e-9
     sent = trajectory(JOINTS, np.zeros(2), duration=1.0)
-    for one, other in zip(first['points'], sent.points, strict=True):
-        np.testing.assert_array_equal(one['positions'], other.positions)
-        np.testing.assert_array_equal(one['accelerations'], other.accelerations)
+    for recorded, point in zip(first['points'], sent.points, strict=True):
+        np.testing.assert_array_equal(recorded['positions'], point.positions)
+        np.testing.assert_array_equal(recorded['accelerations'], point.accelerations)
 
 
-def test_a_trajectory_taken_a_sample_later_is_another_run(moved, rewritten):
+def test_trajectory_adopted_one_sample_later_is_a_difference(moved, rewritten):
     def later(event):
         return event._replace(stamp=event.stamp + MILLISECOND, messages=event.messages + 1)
 
@@ -205,22 +205,22 @@ def test_a_trajectory_taken_a_sample_later_is_another_run(moved, rewritten):
     assert verify(bag).difference.stamp == trajectories(moved)[0].stamp + MILLISECOND
 
 
-def test_a_trajectory_with_another_value_is_another_run(moved, rewritten):
+def test_changed_trajectory_value_is_a_difference(moved, rewritten):
     def changed(event):
         event.content['points'][0]['positions'][1] += 1e-9
         return event
 
     result = verify(rewritten(moved, altered(EventType.TRAJECTORY, changed)))
-    (reference,) = [one for one in result.comparisons if one.topic == REFERENCE.resolved]
+    (reference,) = [item for item in result.comparisons if item.topic == REFERENCE.resolved]
     assert reference.difference.stamp == result.difference.stamp
     assert reference.difference.field in ('position of joint2', 'velocity of joint2')
 
 
-def test_stops_ramps_and_starts_replay_with_every_torque(stopped):
+def test_stops_ramps_and_activations_replay_with_identical_torques(stopped):
     result = verify(stopped)
     assert result.difference is None
     assert result.remarks == ()
-    assert [one.type for one in result.events].count(EventType.PARAMETERS) == 1
+    assert [event.type for event in result.events].count(EventType.PARAMETERS) == 1
     assert ', '.join(result.turns) == (
         'activate, deactivate, activate, safe stop (stamp jump), deactivate, '
         'activate, reset, safe stop (joint missing)'
@@ -238,8 +238,8 @@ def stamps(bag, topic):
     return seconds * SECOND + nanoseconds
 
 
-@pytest.mark.parametrize('part', [0.02, 0.5, 0.9, 0.99])  # on the ramp, after it, in either stop
-def test_one_flipped_bit_of_a_safe_torque_is_found(stopped, rewritten, part):
+@pytest.mark.parametrize('part', [0.02, 0.5, 0.9, 0.99])  # on the ramp, after it, in each stop
+def test_flipped_bit_of_a_safe_torque_is_found(stopped, rewritten, part):
     states = stamps(stopped, JOINT_STATES)
     safe = np.flatnonzero(~np.isin(states, stamps(stopped, TRACKING_ERROR)))
     number = safe[int(part * safe.size)]  # in lock-step the k-th command answers the k-th state
@@ -252,24 +252,24 @@ def test_one_flipped_bit_of_a_safe_torque_is_found(stopped, rewritten, part):
 
 
 @pytest.mark.parametrize(
-    ('name', 'value', 'departure'),
+    ('name', 'value', 'field'),
     [
         ('safety.state_timeout', 1.0, 'stop: stamp jump'),
         ('safety.error_ratio', 0.001, r"used by the law (joint 'joint1' is"),
     ],
 )
-def test_a_stop_that_only_one_of_the_two_makes_is_a_difference(
-    stopped, rewritten, name, value, departure
+def test_stop_in_only_the_recording_or_the_replay_is_a_difference(
+    stopped, rewritten, name, value, field
 ):
     def configured(event):
         event.content['parameters'][name] = value
         return event
 
     bag = rewritten(stopped, altered(EventType.CONFIGURE, configured))
-    assert verify(bag).difference.field.startswith(departure)
+    assert verify(bag).difference.field.startswith(field)
 
 
-def test_a_stop_for_silence_replays_with_its_torques(tmp_path):
+def test_state_timeout_replays_with_its_torques(tmp_path):
     clock = FakeClock()
     run = Recording(tmp_path / 'bag', clock, safety__watchdog='on', **DAMPED)
     run.ros.until(lambda: clock.advance(0.01) or run.arm._offered)
@@ -282,7 +282,7 @@ def test_a_stop_for_silence_replays_with_its_torques(tmp_path):
     run.ros.until(lambda: clock.advance(0.01) or run.arm._offered)
     run.run(20)
     deactivate(run.ros, run.law)
-    activate(run.ros, run.law)  # after a stop with the estimates alone
+    activate(run.ros, run.law)  # after a stop, keeping only the estimates
     run.run(50)
     bag = run.end()
     result = verify(bag)

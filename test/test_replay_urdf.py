@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of an arm whose URDF is gone or has changed since: they hold its text."""
+"""Bags hold the text of the URDF: they replay after its file was deleted or changed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PARAMETERS = """
 
 @pytest.fixture
 def recorded(tmp_path):
-    """URDF, configurations and bag of a run of three joints."""
+    """URDF, configurations and bag of a run with three joints."""
     urdf, file = tmp_path / 'arm.urdf', tmp_path / 'arm.yaml'
     urdf.write_text(random_urdf(3, seed=5)[0])
     file.write_text(PARAMETERS.format(urdf=urdf))
@@ -34,7 +34,7 @@ def recorded(tmp_path):
     return urdf, loop, tmp_path / 'bag'
 
 
-def test_a_bag_is_replayed_bit_for_bit_without_the_urdf_it_was_recorded_with(recorded):
+def test_bag_replays_bit_for_bit_without_its_urdf_file(recorded):
     urdf, _, bag = recorded
     urdf.unlink()
     verified = verify(bag)
@@ -43,14 +43,14 @@ def test_a_bag_is_replayed_bit_for_bit_without_the_urdf_it_was_recorded_with(rec
     assert read_run(bag).arm is not None
 
 
-def test_a_urdf_that_has_changed_since_does_not_change_the_bag(recorded):
+def test_changing_the_urdf_file_does_not_affect_the_bag(recorded):
     urdf, loop, bag = recorded
     urdf.write_text(random_urdf(3, seed=6)[0])
     assert read_context(bag).controller_config() == loop.controller
     assert verify(bag).difference is None
 
 
-def test_the_written_configuration_needs_no_other_file(recorded, tmp_path):
+def test_dumped_configuration_needs_no_other_file(recorded, tmp_path):
     urdf, loop, _ = recorded
     dump(tmp_path / 'config.yaml', loop.by_node)
     urdf.unlink()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag replays into the very numbers it holds, and what does not is found and named."""
+"""A bag replays to exactly the numbers it holds; any difference is located and named."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def entries(bag):
 
 @pytest.fixture
 def rewritten(bag, entries, tmp_path):
-    """Writes the bag again with other messages, under its own configuration."""
+    """Writes a copy of the bag with other messages and the same configuration."""
     configuration = read_context(bag).configuration
 
     def write(changed=entries, **facts):
@@ -62,12 +62,12 @@ def rewritten(bag, entries, tmp_path):
 
 
 def test_decimated_telemetry_replays_bit_for_bit(bag, tmp_path):
-    """The tracking error of each sample stays: by it the replay knows the states of the law."""
+    """The tracking error is not decimated: it tells the replay which states the law used."""
     sparse = recorded_run.record(tmp_path / 'sparse', **{'telemetry.decimation': 7})
-    result, all_of_it = verify(sparse), verify(bag)
+    result, complete = verify(sparse), verify(bag)
     assert result.difference is None
     assert result.compared == 1.0
-    counts, full = compared(result), compared(all_of_it)
+    counts, full = compared(result), compared(complete)
     assert counts['learning'] < full['learning'] / 6.9
     assert counts['tracking_error'] == full['tracking_error']
     assert counts['commands'] == full['commands']
@@ -77,7 +77,7 @@ def test_decimated_telemetry_replays_bit_for_bit(bag, tmp_path):
     assert run.learning.stamp.size == -(-SAMPLES // 7)
 
 
-def test_every_number_is_the_same(bag):
+def test_every_number_is_reproduced(bag):
     result = verify(bag)
     assert result.difference is None
     assert result.remarks == ()
@@ -88,27 +88,27 @@ def test_every_number_is_the_same(bag):
         'learning': 10 * SAMPLES,  # three parameters, two biases, two disturbances, three more
         'monitor': 11 * 101,  # two ratios, two distances, five estimates, two more
     }
-    assert [one.left_out for one in result.comparisons if one.left_out] == ['compute_time']
+    assert [item.left_out for item in result.comparisons if item.left_out] == ['compute_time']
 
 
 @pytest.mark.parametrize('law', ['backstepping', 'slotine_li'])
-def test_every_law_and_a_compressed_bag_replay(tmp_path, law):
+def test_other_laws_replay_from_compressed_bags(tmp_path, law):
     path = recorded_run.record(tmp_path / law, 0.3, 'zstd', law=law)
     assert verify(path).difference is None
 
 
-def test_a_bound_that_narrows_replays_too(tmp_path):
+def test_narrowing_bound_replays(tmp_path):
     funnel = {'barrier.initial_bound': [0.02, 0.01], 'barrier.funnel_rate': 5.0}
     result = verify(recorded_run.record(tmp_path / 'bag', 0.3, **funnel))
     assert result.difference is None
-    assert ([one.type for one in result.events].count(EventType.PARAMETERS), result.remarks) == (
+    assert ([item.type for item in result.events].count(EventType.PARAMETERS), result.remarks) == (
         0,
         (),
     )
 
 
-def test_the_learning_has_begun_in_that_bag(bag):
-    # Else the replay above would not have seen the composite learning at all.
+def test_learning_has_started_in_the_bag(bag):
+    # Otherwise the replays above would not cover the composite learning.
     content = read_content(bag)
     latched = content.topics[LEARNING].joint_states(('latched',), ('position',))
     assert latched.values[-1, 0, 0] == 1.0
@@ -119,11 +119,11 @@ def test_the_learning_has_begun_in_that_bag(bag):
     [
         (COMMANDS, -8, 'effort of joint2'),
         (TRACKING_ERROR, -8, 'effort of joint2'),
-        (REFERENCE, -8 - 4, 'velocity of joint2'),  # behind it the empty effort
-        (LEARNING, -24, 'latched'),  # behind it model_changes, compute_time, velocity and effort
+        (REFERENCE, -8 - 4, 'velocity of joint2'),  # followed by the empty effort
+        (LEARNING, -24, 'latched'),  # before model_changes, compute_time, velocity and effort
     ],
 )
-def test_one_flipped_bit_is_found_and_named(entries, rewritten, topic, at, field):
+def test_flipped_bit_is_located_and_named(entries, rewritten, topic, at, field):
     changed = [list(entry) for entry in entries]
     raw = bytearray(of(changed, topic)[700][3])
     at = at if topic is not LEARNING else at - 8
@@ -139,7 +139,7 @@ def test_one_flipped_bit_is_found_and_named(entries, rewritten, topic, at, field
     assert f'recorded {difference.recorded!r}, replayed {difference.replayed!r}' in str(difference)
 
 
-def test_the_earliest_of_several_differences_is_reported(entries, rewritten):
+def test_earliest_of_several_differences_is_reported(entries, rewritten):
     changed = [list(entry) for entry in entries]
     for topic, k in ((COMMANDS, 500), (TRACKING_ERROR, 400), (LEARNING, 600)):
         of(changed, topic)[k][3] = of(entries, topic)[k - 100][3][:20] + bytes(
@@ -172,7 +172,7 @@ def test_repeated_and_unused_states_are_skipped(entries, rewritten):
     assert result.stamp.size == SAMPLES
 
 
-def test_a_lost_state_ends_the_replay_there_and_says_so(entries, rewritten):
+def test_lost_state_ends_the_replay_with_a_remark(entries, rewritten):
     lost = of(entries, JOINT_STATES)[500]
     result = verify(rewritten([entry for entry in entries if entry is not lost]))
     assert result.difference is None
@@ -180,31 +180,31 @@ def test_a_lost_state_ends_the_replay_there_and_says_so(entries, rewritten):
     assert any(f'stamp {START + 500 * MILLISECOND} ns' in remark for remark in result.remarks)
 
 
-def test_a_recording_that_began_late_is_recognised(entries, rewritten):
+def test_recording_that_started_late_is_rejected(entries, rewritten):
     late = [entry for entry in entries if entry[2] > START + 200 * MILLISECOND]
     journal = of(entries, JOURNAL)
     with pytest.raises(BlfDscError, match=f'with the stamp {START} ns, .* start the recorder'):
         verify(rewritten([*journal, *late]))
 
 
-def test_what_the_recorder_missed_is_remarked(entries, rewritten):
-    said = '800 written, 0 missed, 201 sent before the recorder connected'
-    result = verify(rewritten(entries, **{'messages /joint_states': said}))
+def test_messages_missed_by_the_recorder_are_remarked(entries, rewritten):
+    counts = '800 written, 0 missed, 201 sent before the recorder connected'
+    result = verify(rewritten(entries, **{'messages /joint_states': counts}))
     lost = '/joint_states: 0 missed, 201 sent before the recorder connected'
     assert result.remarks == (f'the recorder missed messages of {lost}',)
 
 
-def test_without_its_telemetry_the_torques_are_still_compared(entries, rewritten):
+def test_torques_are_compared_without_telemetry(entries, rewritten):
     kept = {COMMANDS.resolved, JOINT_STATES.resolved, JOURNAL.resolved}
     result = verify(rewritten([entry for entry in entries if entry[0] in kept]))
-    assert [one.topic for one in result.comparisons] == [COMMANDS.resolved]
+    assert [item.topic for item in result.comparisons] == [COMMANDS.resolved]
     assert result.difference is None
 
 
-def test_commands_of_unknown_number_are_left_out(entries, rewritten):
+def test_commands_that_cannot_be_matched_to_states_are_left_out(entries, rewritten):
     lost = of(entries, COMMANDS)[500]
     result = verify(rewritten([entry for entry in entries if entry is not lost]))
-    commands = next(one for one in result.comparisons if one.topic == COMMANDS.resolved)
+    commands = next(item for item in result.comparisons if item.topic == COMMANDS.resolved)
     assert commands.left_out.startswith('1000 commands for 1001 states')
     assert result.difference is None
 
@@ -214,7 +214,7 @@ def journal_of(bag):
 
 
 def retuned(bag):
-    """The bag as it would be, had feedback.gain and barrier.bound been changed at 0.5 s."""
+    """Messages of the bag as if feedback.gain and barrier.bound had been changed at 0.5 s."""
     config = recorded_run.loop_config().controller
     content = read_content(bag)
     states = content.topics[JOINT_STATES].joint_states(config.joints)
@@ -239,16 +239,16 @@ def retuned(bag):
             yield [topic.resolved, topic.type, now, raw]
 
 
-def test_parameters_changed_on_the_way_are_replayed_where_they_took_effect(bag, rewritten, capsys):
+def test_parameter_changes_replay_where_they_took_effect(bag, rewritten, capsys):
     path = rewritten(list(retuned(bag)))
     result = verify(path)
-    assert [one.type for one in result.events].count(EventType.PARAMETERS) == 2
+    assert [event.type for event in result.events].count(EventType.PARAMETERS) == 2
     assert result.difference is None
     assert main(['replay', str(path)]) == 0
     assert '2 parameter changes replayed' in capsys.readouterr().out
 
 
-def test_an_event_that_the_recorder_lost_ends_the_replay(bag, rewritten):
+def test_event_lost_by_the_recorder_ends_the_replay(bag, rewritten):
     messages = list(retuned(bag))
     lost = of(messages, JOURNAL)[3]
     result = verify(rewritten([entry for entry in messages if entry is not lost]))
@@ -256,13 +256,13 @@ def test_an_event_that_the_recorder_lost_ends_the_replay(bag, rewritten):
     assert result.remarks == ('an event of the journal is not in the bag: the replay ends there',)
 
 
-def test_another_configuration_runs_in_open_loop(bag):
+def test_other_gains_run_in_open_loop(bag):
     config = recorded_run.loop_config().controller
     same = what_if(bag, config)
     assert np.abs(same.difference).max() == 0.0
     stiffer = replace(config, feedback=replace(config.feedback, gain=(70.0, 20.0)))
     found = what_if(bag, stiffer)
-    # By (28) alone, as long as nothing is adapted: at the first sample the gain times xi2.
+    # Before anything is adapted, (28) alone: at the first sample, the gain change times xi2.
     recorded = read_content(bag).topics[TRACKING_ERROR]
     errors = recorded.joint_states(config.joints, ('velocity',))
     expected = -10.0 * errors.values[0, 1, 0]
@@ -271,18 +271,18 @@ def test_another_configuration_runs_in_open_loop(bag):
     assert found.error_ratio == pytest.approx(same.error_ratio)
 
 
-def test_a_replay_is_a_run_with_the_figures_of_its_bag(bag):
+def test_replayed_run_has_the_metrics_of_its_bag(bag):
     config = recorded_run.loop_config().controller
     replayed, recorded = what_if(bag, config).run, read_run(bag)
     for part in ('tracking', 'learning'):
         mine, theirs = (
-            summarize(one)[part] for one in (replace(replayed, truth=recorded.truth), recorded)
+            summarize(run)[part] for run in (replace(replayed, truth=recorded.truth), recorded)
         )
         assert mine == theirs
     assert set(replayed.learning.names) <= set(recorded.learning.names)
 
 
-def test_open_loop_learns_from_the_torques_that_acted(bag):
+def test_open_loop_learns_from_the_applied_torques(bag):
     config = recorded_run.loop_config().controller
     softer = replace(config, feedback=replace(config.feedback, gain=(6.0, 2.0)))
     estimate = what_if(bag, softer).run.learning.values
@@ -291,7 +291,7 @@ def test_open_loop_learns_from_the_torques_that_acted(bag):
     assert estimate[-1, :3] == pytest.approx(own[-1, :3], rel=0.05)
 
 
-def test_the_journal_holds_the_configuration(entries, tmp_path):
+def test_journal_holds_the_configuration(entries, tmp_path):
     path = recorded_run.write(tmp_path / 'bag', entries)
     assert verify(path).difference is None
     with pytest.raises(BagError, match='--config recommended'):
@@ -299,20 +299,20 @@ def test_the_journal_holds_the_configuration(entries, tmp_path):
 
 
 @pytest.mark.parametrize('topics', [[JOINT_STATES], [JOURNAL, JOINT_STATES]])
-def test_a_bag_without_the_controller_has_nothing_to_compare(entries, rewritten, topics):
+def test_bag_without_a_controller_has_nothing_to_compare(entries, rewritten, topics):
     kept = [entry for topic in topics for entry in of(entries, topic)]
     with pytest.raises(BlfDscError, match=r'/joint_states \(1001\)'):
         verify(rewritten(kept))
 
 
-def test_another_version_is_remarked(bag, monkeypatch):
+def test_recording_by_another_version_is_remarked(bag, monkeypatch):
     monkeypatch.setattr('blf_dsc_controller.replay.verify.__version__', '9.9.9')
     result = verify(bag)
     assert result.difference is None
-    assert any('recorded by version 0.1.0 and replayed by 9.9.9' in one for one in result.remarks)
+    assert any('recorded by version 0.1.0 and replayed by 9.9.9' in text for text in result.remarks)
 
 
-def test_a_configuration_of_another_version_is_rejected_as_such(entries, tmp_path, monkeypatch):
+def test_configuration_of_another_version_is_rejected(entries, tmp_path, monkeypatch):
     changed = [list(entry) for entry in entries]
     first = of(changed, JOURNAL)[0]
     event = decode(first[3])
@@ -326,7 +326,7 @@ def test_a_configuration_of_another_version_is_rejected_as_such(entries, tmp_pat
         verify(path)
 
 
-def test_the_bag_of_another_robot_is_recognised_by_its_joints(entries, rewritten):
+def test_bag_of_another_robot_is_rejected_by_its_joint_names(entries, rewritten):
     states = of(entries, JOINT_STATES)
     decoder = JointStateDecoder(('joint1', 'joint2'))
     other = JointStateEncoder(('wheel', 'arm'))

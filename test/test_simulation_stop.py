@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An offline run stops as the node does: at the same sample, for the same reason, same torques."""
+"""An offline run stops like the node: at the same sample, for the same reason, same torques."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CASES = {
     'error past the bound': WEAK | HELD,
     'torque saturated': WEAK | HELD | {'safety.error_ratio': 0.0, 'safety.saturation_time': 0.01},
     'velocity not plausible': {'safety.velocity_limit': 0.25},
-    GOES_ON: {'torque.limit': [10.5, 20.0]},  # saturated for some samples, and tracking goes on
+    GOES_ON: {'torque.limit': [10.5, 20.0]},  # saturated for some samples, but tracking continues
     f'{GOES_ON} with an estimated velocity': {'safety.velocity': 'estimated'},
 }
 
@@ -35,8 +35,8 @@ def run(given, simulation=simulate, duration=2.5):
     return simulation(build(ControllerConfig, given), plant)
 
 
-@pytest.mark.parametrize(('reason', 'given'), CASES.items(), ids=lambda one: str(one)[:30])
-def test_stop_and_torques_are_those_of_the_node_bit_for_bit(ros, reason, given):
+@pytest.mark.parametrize(('reason', 'given'), CASES.items(), ids=lambda value: str(value)[:30])
+def test_stop_and_torques_match_the_node_bit_for_bit(ros, reason, given):
     from ros_rig import torques
 
     from blf_dsc_controller.messages import topics
@@ -56,7 +56,7 @@ def test_stop_and_torques_are_those_of_the_node_bit_for_bit(ros, reason, given):
 
 
 @pytest.mark.parametrize('reason', ['error past the bound', 'velocity not plausible'])
-def test_the_bag_of_a_stopped_run_replays_and_says_so(tmp_path, reason):
+def test_bag_of_a_stopped_run_replays_with_its_stop(tmp_path, reason):
     given = CASES[reason]
     record = run(given)
     write_bag(tmp_path / 'bag', record, record.config, 'none')
@@ -70,13 +70,13 @@ def test_the_bag_of_a_stopped_run_replays_and_says_so(tmp_path, reason):
     assert simulated.timed_stops[0][0] == recorded.timed_stops[0][0]
     for field in ('position', 'torque', 'reference', 'error', 'bound'):
         np.testing.assert_array_equal(getattr(simulated, field), getattr(recorded, field))
-    told = [summarize(one)['tracking'] for one in (simulated, recorded)]
-    stamps = [one['stops'][0].pop('stamp_ns') for one in told]
-    assert told[0] == told[1]
+    tracking = [summarize(each)['tracking'] for each in (simulated, recorded)]
+    stamps = [metrics['stops'][0].pop('stamp_ns') for metrics in tracking]
+    assert tracking[0] == tracking[1]
     assert stamps[1] - stamps[0] == START
 
 
-def test_the_law_alone_goes_on_past_every_limit():
+def test_unguarded_law_continues_past_every_limit():
     stopped, alone = run(CASES['error past the bound']), run(WEAK, simulate_law)
     (row,) = np.flatnonzero(stopped.stamps == stopped.run().stops[0].stamp)
     assert 0 < row < 100
@@ -85,11 +85,11 @@ def test_the_law_alone_goes_on_past_every_limit():
     assert np.isnan(stopped.samples[row:, :6]).all()
 
 
-def test_nothing_is_lost_where_the_compiled_loop_hands_over():
-    """A run in chunks, of which the first is run by the guard, is the run of the law alone."""
+def test_switching_between_guard_and_compiled_loop_does_not_change_the_run():
+    """A run in chunks, the first of them run by the guard, equals the run of the law alone."""
     given = CASES[GOES_ON]
-    cut = run(given).run()
-    assert not cut.stops
-    np.testing.assert_array_equal(cut.torque, run(given, simulate_law).run().torque)
-    assert (np.abs(cut.torque[:1000]) == given['torque.limit']).any()
-    assert not (np.abs(cut.torque[1001:2000]) == given['torque.limit']).any()
+    chunked = run(given).run()
+    assert not chunked.stops
+    np.testing.assert_array_equal(chunked.torque, run(given, simulate_law).run().torque)
+    assert (np.abs(chunked.torque[:1000]) == given['torque.limit']).any()
+    assert not (np.abs(chunked.torque[1001:2000]) == given['torque.limit']).any()

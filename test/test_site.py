@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The site of the documentation: made without a warning, whole, and without a request elsewhere."""
+"""The documentation site: built without warnings, complete, and without external requests."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DOC = ROOT / 'doc'
 
 
 class Page(HTMLParser):
-    """Anchors, links and what a browser would load of a page of the site."""
+    """Anchors, links and loaded resources of a page of the site."""
 
     def __init__(self, text):
         super().__init__()
@@ -35,11 +35,11 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope='module')
 def site(tmp_path_factory):
-    """Every page of the site, made as by `make docs`."""
+    """Every page of the site, built as by `make docs`."""
     out = tmp_path_factory.mktemp('site')
     sphinx = [sys.executable, '-m', 'sphinx', '-q', '-W', '--keep-going', '-n', str(DOC), str(out)]
-    made = subprocess.run(sphinx, check=False, capture_output=True, text=True)
-    assert made.returncode == 0, made.stderr
+    built = subprocess.run(sphinx, check=False, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
     return {path: Page(path.read_text()) for path in out.rglob('*.html')}
 
 
@@ -57,7 +57,7 @@ def test_site_has_every_page_and_no_dead_link(site):
                 assert url.fragment in site[target].anchors, (path.name, link)
 
 
-def test_site_loads_nothing_from_elsewhere(site):
+def test_site_loads_no_external_resources(site):
     for path, page in site.items():
         for url in page.loaded:
             assert not urlsplit(url).netloc, (path.name, url)
@@ -70,9 +70,9 @@ def test_site_loads_nothing_from_elsewhere(site):
 @pytest.mark.parametrize(
     'name', ['README.md', 'CONTRIBUTING.md', 'examples/mujoco_plant/README.md']
 )
-def test_links_beside_the_site_are_alive(name, site):
+def test_links_outside_the_site_are_valid(name, site):
     page = ROOT / name
-    anchors = {path.stem: one.anchors for path, one in site.items()}
+    anchors = {path.stem: parsed.anchors for path, parsed in site.items()}
     for link in re.findall(r'\]\(([^)\s]+)\)', page.read_text()):
         url = urlsplit(link)
         if not url.scheme:
@@ -81,8 +81,8 @@ def test_links_beside_the_site_are_alive(name, site):
             assert not url.fragment or url.fragment in anchors[target.stem], link
 
 
-def test_every_picture_has_its_command():
-    told = (DOC / 'figures.md').read_text()
+def test_every_picture_has_a_make_command():
+    text = (DOC / 'figures.md').read_text()
     shown = {path.name for folder in ('doc', 'benchmark') for path in (ROOT / folder).glob('*.png')}
-    rows = re.findall(r'^\| \S*?([\w-]+\.png)\S* \| `make (\w+)', told, re.MULTILINE)
+    rows = re.findall(r'^\| \S*?([\w-]+\.png)\S* \| `make (\w+)', text, re.MULTILINE)
     assert {picture for picture, _ in rows} == shown

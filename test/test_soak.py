@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Some seconds of the soak, in a process of its own; `make soak` runs half an hour."""
+"""Some seconds of the soak test, in a separate process; `make soak` runs half an hour."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 
-def test_the_loop_overcomes_what_comes_for_a_while():
-    """It checks by itself: the bound outside of faults, memory and handles."""
+def test_loop_survives_a_short_soak():
+    """The script checks by itself: the bound outside of faults, memory and handles."""
     script = Path(__file__).with_name('soak.py')
     run = subprocess.run(
         [sys.executable, str(script), '--minutes', '0.3', '--seed', '2'],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Without a usable joint state no torque is commanded that depends on one."""
+"""Without usable joint states, no torque is commanded that depends on them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ UNUSABLE = FIRST | {'frozen': lambda state: state.raw(stamp=1_000_000_000)}
 
 
 def moving(given):
-    """Rig half a second on, where both joints move."""
+    """Rig after half a second, when both joints are moving."""
     rig = Rig(given)
     rig.step(500)
     assert (np.abs(rig.state().dq) > 0.1).all()
@@ -30,7 +30,7 @@ def moving(given):
 
 @pytest.mark.parametrize('safety', ['damping', 'hold_gravity'])
 @pytest.mark.parametrize('raw', FIRST.values(), ids=FIRST)
-def test_nothing_is_commanded_before_a_state_was_seen(safety, raw):
+def test_nothing_is_commanded_before_the_first_usable_state(safety, raw):
     rig = Rig({'safety.torque': safety})
     assert rig.deliver(raw(rig.state())) is None
     assert rig.deliver(raw(rig.state())) is None
@@ -38,7 +38,7 @@ def test_nothing_is_commanded_before_a_state_was_seen(safety, raw):
 
 
 @pytest.mark.parametrize('raw', UNUSABLE.values(), ids=UNUSABLE)
-def test_a_velocity_of_the_past_is_not_damped(raw):
+def test_outdated_velocity_is_not_damped(raw):
     rig = moving({'safety.torque': 'damping'})
     rig.sense = lambda state: [raw(state)]
     rig.step(10)
@@ -47,7 +47,7 @@ def test_a_velocity_of_the_past_is_not_damped(raw):
 
 
 @pytest.mark.parametrize('raw', UNUSABLE.values(), ids=UNUSABLE)
-def test_gravity_held_without_states_fades_out_and_comes_back_with_them(raw):
+def test_held_gravity_fades_out_without_states_and_returns_with_them(raw):
     rig = moving(HOLDING)
     good, rig.sense = rig.sense, lambda state: [raw(state)]
     rig.step(10)
@@ -63,28 +63,28 @@ def test_gravity_held_without_states_fades_out_and_comes_back_with_them(raw):
     assert (np.abs(rig.commands[-1]) > 0.1).all()
 
 
-def silent(rig):
+def torque_after_silence(rig):
     rig.wait(1000)
     return rig.commands[-1].tolist()
 
 
-def test_in_silence_gravity_is_held_for_the_fade_time_only():
+def test_gravity_is_held_in_silence_only_for_the_fade_time():
     rig = Rig(HOLDING | {'safety.fade_time': 0.2}, live=True)
     rig.step(20)
     rig.wait(60)
     assert (np.abs(rig.commands[-1]) > 1.0).all()
-    assert silent(rig) == [0.0, 0.0]
+    assert torque_after_silence(rig) == [0.0, 0.0]
 
 
 @pytest.mark.parametrize('again', [False, True])
-def test_the_torque_fades_when_silence_follows_a_deactivation(again):
-    """A driver would apply the last torque for ever."""
+def test_torque_fades_when_silence_follows_a_deactivation(again):
+    """A driver would apply the last torque forever."""
     rig = Rig(HOLDING, live=True)
     rig.step(20)
     rig.guard.deactivate()
     if again:
         rig.guard.activate()
-    assert silent(rig) == [0.0, 0.0]
+    assert torque_after_silence(rig) == [0.0, 0.0]
     assert rig.supervisor.phase is (Phase.STARTING if again else Phase.INACTIVE)
     rig.base += rig.steady - 5_000_000_000
     rig.step(1)

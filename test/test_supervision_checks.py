@@ -39,7 +39,7 @@ def test_estimates_of_a_valid_sample_are_kept(law):
     law.checks.ratio[:], law.checks.kept[:] = (0.9, 0.0), 0.0
     assert verdict(law) == 0
     np.testing.assert_array_equal(law.checks.kept, [*law.state.estimate, *law.state.disturbance])
-    # The largest ratio so far stays; a smaller one is overtaken.
+    # The largest ratio so far is kept; a smaller one is replaced.
     assert law.checks.ratio[0] == 0.9
     assert law.checks.ratio[1] == abs(law.sample.xi1[1]) / law.sample.bound[1]
 
@@ -49,27 +49,27 @@ def test_estimates_of_a_valid_sample_are_kept(law):
     ('part', 'name', 'i'),
     [('state', 'estimate', 4), ('state', 'disturbance', 1), ('signals', 'demand', 0)],
 )
-def test_values_that_are_not_finite_are_suspect_and_not_kept(law, part, name, i, bad):
+def test_non_finite_values_are_suspect_and_not_kept(law, part, name, i, bad):
     getattr(getattr(law, part), name)[i] = bad
     law.checks.kept[:] = 3.0
     assert verdict(law) & SUSPECT
     assert (law.checks.kept == 3.0).all()
 
 
-def test_a_demand_past_the_limit_is_suspect(law):
+def test_demand_past_the_limit_is_suspect(law):
     law.signals.demand[1] = -np.nextafter(20.0, 21.0)
     assert verdict(law) == SUSPECT
 
 
 @pytest.mark.parametrize('error', [0.002, -0.0021, nan])
-def test_an_error_past_the_bound_is_outside_and_suspect_if_it_is_to_stop(law, error):
+def test_error_past_the_bound_is_outside_and_suspect_if_it_must_stop(law, error):
     law.sample.xi1[0] = error
     assert verdict(law) == OUTSIDE | SUSPECT
     assert verdict(law, error_ratio=2.0) & SUSPECT == (SUSPECT if np.isnan(error) else 0)
     assert verdict(law, error_ratio=0.0) == OUTSIDE
 
 
-def test_the_nan_of_a_rejected_column_is_no_fault(law):
+def test_nan_of_a_rejected_column_is_not_a_fault(law):
     law.sample.estimate[4] = nan
     assert verdict(law) == 0
 
@@ -84,19 +84,19 @@ STATES = [
 ]
 
 
-@pytest.mark.parametrize(('place', 'value', 'reason'), STATES)
+@pytest.mark.parametrize(('index', 'value', 'reason'), STATES)
 @pytest.mark.parametrize('learns_from', [0, EFFORT])
-def test_a_state_is_used_if_finite_and_slow_and_the_reason_is_the_same(
-    place, value, reason, learns_from
+def test_only_finite_and_plausible_states_are_used_and_the_reasons_agree(
+    index, value, reason, learns_from
 ):
     """The efforts must be finite if learning uses them."""
     law = controller(recommended()._replace(torque_source=learns_from))
     law.checks.velocity_limit[0] = 50.0
     measurement = plant().measure()
-    measurement[place] = value
+    measurement[index] = value
     before = law.save()
     law.update(0.0, DT, measurement)
-    if place == 5 and learns_from == EFFORT:
+    if index == 5 and learns_from == EFFORT:
         reason = Reason.NOT_FINITE
     assert (law.flags == INVALID) == bool(reason)
     assert (law.save() == before).all() == bool(reason)
@@ -106,7 +106,7 @@ def test_a_state_is_used_if_finite_and_slow_and_the_reason_is_the_same(
 
 
 SAFETY = Safety()
-# Repeated, early, usual, jittering, missed and much too late; now and then backwards.
+# Repeated, early, regular, jittering, missed and far too late; occasionally backwards.
 STEPS = st.sampled_from([0, 1, 499_999, 500_001, 1_000_000, 1_000_001, 1_499_999, 1_500_001])
 RARE_STEPS = st.sampled_from([2_000_000, 3_000_000, 41_000_000, 50_000_000, -1_000_000])
 
@@ -119,11 +119,11 @@ class FullCheck(StateCheck):
 
 
 @given(steps=st.lists(STEPS | RARE_STEPS | st.just(1_000_000), max_size=60))
-def test_the_short_check_of_a_stamp_is_the_full_one(steps):
+def test_short_stamp_check_agrees_with_the_full_one(steps):
     short, full = (cls(['joint1', 'joint2'], DT) for cls in (StateCheck, FullCheck))
     stamp = 1_000_000_000
     for step in steps:
         stamp += step
-        faults = [one.check(SAFETY, stamp) for one in (short, full)]
+        faults = [states.check(SAFETY, stamp) for states in (short, full)]
         assert faults[0] == faults[1]
         assert vars(short) == vars(full)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Warnings before the start: none where all is well, and what they warn of does happen."""
+"""Configuration warnings: none for sound gains, and what they warn of does happen."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def warnings(changes, preset='recommended', q=None):
 
 
 @pytest.mark.parametrize('preset', ['recommended', 'paper', 'noisy', 'two_tone', 'model_based'])
-def test_presets_are_not_warned_of(preset):
+def test_presets_cause_no_warnings(preset):
     config = load_loop(preset)
     assert config_warnings(config.controller, np.array(config.plant.initial.position)) == []
 
@@ -53,7 +53,7 @@ def test_presets_are_not_warned_of(preset):
         ),
     ],
 )
-def test_gains_that_cannot_work_are_named(parameter, changes):
+def test_unworkable_gains_are_named(parameter, changes):
     (warning,) = warnings(changes)
     assert warning.startswith(parameter)
 
@@ -62,40 +62,40 @@ def test_gains_that_cannot_work_are_named(parameter, changes):
     ('gain', 'accepted'),
     [((60.0, 120.0), True), ((60.0, 110.0), True), ((60.0, 121.0), False), ((4000.0, 15.0), False)],
 )
-def test_a_change_must_not_make_worse_what_is_warned_of(gain, accepted):
-    """From gains that are warned of, chosen by their user, the way back is open."""
+def test_gain_change_must_not_worsen_an_existing_warning(gain, accepted):
+    """A user who chose gains with a warning can change them back."""
     before = configured('recommended', 1.0, {'feedback.gain': [60.0, 120.0]}).controller
     load = reference_load(before, settings_of_config(before))
     assert len(config_warnings(before, load=load)) == 1
     found = worsened(before, change(before, {'feedback.gain': gain}), load)
     assert (found == []) == accepted
-    assert all(one.startswith('feedback.gain: K_p over the inertia is ') for one in found)
+    assert all(text.startswith('feedback.gain: K_p over the inertia is ') for text in found)
 
 
-def test_a_start_close_to_the_bound_is_named_with_its_joint():
+def test_start_close_to_the_bound_is_named_with_its_joint():
     qr = np.array([2.2935, 1.6961])
     (warning,) = warnings({}, q=qr - np.array([0.0, 0.9 * BOUND]))
     assert warning.startswith('barrier.bound: joint2 starts -0.0018 rad')
     assert warnings({}, q=qr - np.array([0.0, 0.5 * BOUND])) == []
 
 
-def test_laws_are_not_warned_of_gains_they_do_not_have():
+def test_laws_cause_no_warnings_about_gains_they_do_not_have():
     changes = {'surface.time_constant': 0.05, 'learning.window': 5.0, 'law': 'backstepping'}
     assert warnings(changes) == []
 
 
-def test_load_needs_the_torque_that_the_run_needs():
-    """With the true parameters and no disturbance, within the filter's lag of the run's largest."""
-    silent = {'truth.constant': [0.0, 0.0], 'truth.amplitude': [0.0, 0.0]}
-    loop = configured('model_based', 7.0, silent, NO_DISTURBANCE)
+def test_reference_load_predicts_the_torque_of_the_run():
+    """True parameters, no disturbance: the run's largest torque, up to the filter's lag."""
+    undisturbed = {'truth.constant': [0.0, 0.0], 'truth.amplitude': [0.0, 0.0]}
+    loop = configured('model_based', 7.0, undisturbed, NO_DISTURBANCE)
     config, torque = loop.controller, np.abs(run(loop).torque[1000:])
     load = reference_load(config, settings_of_config(config))
     np.testing.assert_allclose(load.torque, torque.max(axis=0), rtol=2e-3)
 
 
 @pytest.mark.parametrize('preset', ['recommended', 'two_tone', 'excitation'])
-def test_excitation_is_that_of_the_controller_s_window(preset):
-    """With columns and filters; the loop's window is of the arm, within a milliradian of qr."""
+def test_predicted_excitation_matches_the_window_of_the_controller(preset):
+    """With columns and filters; the loop's window is along q, within a milliradian of qr."""
     loop = configured(preset, 14.0)
     windows = windows_along(loop.controller, settings_of_config(loop.controller))
     record = simulate_law(loop.controller, loop.plant)
@@ -103,29 +103,29 @@ def test_excitation_is_that_of_the_controller_s_window(preset):
     assert least == pytest.approx(record.sample(-1).lambda_min[0], rel=0.02)
 
 
-def test_a_column_that_will_be_rejected_is_announced():
-    """P alone is excited by 0.26, with the bias columns by 0.0056: between them one is rejected."""
+def test_rejection_of_a_column_is_predicted():
+    """lambda_min is 0.26 for P alone, 0.0056 with the bias columns: in between one is rejected."""
     for threshold, is_rejected in ((0.005, False), (0.05, True)):
         changes = {'learning.excitation_threshold': threshold}
-        found = [one for one in warnings(changes) if 'a column will be rejected' in one]
+        found = [text for text in warnings(changes) if 'a column will be rejected' in text]
         assert bool(found) == is_rejected
         estimate = run(configured('recommended', 8.0, changes)).estimate[-1]
         assert np.isnan(estimate).any() == is_rejected
 
 
-def test_too_large_a_gain_of_the_columns_overflows_as_it_is_warned():
+def test_too_large_column_gain_overflows_as_warned():
     changes = {'learning.adaptation_gain': [0.02] * 3, 'learning.weight': 2100.0}
     (warning,) = warnings(changes)
     assert warning.startswith('learning.weight: kappa Gamma T is 2.1')
     assert warnings(changes | {'learning.column_gain': 0.02}) == []
-    ends = []
+    in_bound = []
     for gain in (1.0, 0.02):
         loop = run(configured('recommended', 12.0, changes | {'learning.column_gain': gain}))
-        ends.append(np.abs(loop.xi1).max() < BOUND)
-    assert ends == [False, True]
+        in_bound.append(np.abs(loop.xi1).max() < BOUND)
+    assert in_bound == [False, True]
 
 
-def test_too_high_a_feedback_chatters_from_twice_the_inertia_s_rate_on():
+def test_feedback_gain_past_the_sampling_limit_chatters():
     """K_p T over the true inertia: below two the sampled loop is calm, above it saturates."""
     calm = {}
     for gain in (100.0, 160.0, 180.0, 250.0):
@@ -141,7 +141,7 @@ def test_too_high_a_feedback_chatters_from_twice_the_inertia_s_rate_on():
     assert set(calm.values()) == {True, False}
 
 
-def test_too_heavy_a_gradient_diverges_as_it_is_warned():
+def test_too_large_gradient_weight_diverges_as_warned():
     changes = {'learning.update': 'gradient', 'learning.weight': 30.0}
     assert warnings(changes)[0].startswith('learning.weight')
     loop = run(configured('recommended', 9.0, changes))
@@ -149,7 +149,7 @@ def test_too_heavy_a_gradient_diverges_as_it_is_warned():
     assert np.linalg.norm(P) > 0.0
 
 
-def test_a_window_of_no_whole_period_keeps_the_disturbance():
+def test_window_of_a_fractional_period_retains_the_disturbance():
     changes = {'learning.window': 5.0}
     assert warnings(changes)[0].startswith('learning.window')
     errors = [run(configured('recommended', 12.0, each)).error_at(12.0) for each in (changes, {})]
@@ -167,24 +167,24 @@ def panda(changes):
     return load(locate('panda'), 'blf_dsc_controller', ControllerConfig, changes)
 
 
-def test_a_bound_that_begins_far_wider_than_asked_for_is_named():
+def test_initial_bound_far_wider_than_requested_is_named():
     assert config_warnings(panda({})) == []
-    found = [one for one in config_warnings(panda({'robot.lag': 0.1})) if 'initial' in one]
+    found = [text for text in config_warnings(panda({'robot.lag': 0.1})) if 'initial' in text]
     assert found[0].startswith('barrier.initial_bound: panda_joint2 begins with a bound of ')
     assert 'robot.lag of 0.1 s' in found[0]
 
 
-def test_an_assumed_torque_limit_is_named():
+def test_assumed_torque_limit_is_named():
     urdf = read_urdf('panda.urdf').replace('effort="12"', 'effort="0"')
     found = config_warnings(panda({'robot.urdf': urdf}))
-    assert [one.split(' has no effort')[0] for one in found if 'effort' in one] == [
+    assert [text.split(' has no effort')[0] for text in found if 'effort' in text] == [
         f'torque.limit: panda_joint{k}' for k in (5, 6, 7)
     ]
     given = [20.0] * 7
     assert config_warnings(panda({'robot.urdf': urdf, 'torque.limit': given})) != found
 
 
-def test_inertias_that_cannot_be_meant_are_named():
+def test_implausible_inertias_are_named():
     urdf = read_urdf('panda.urdf')
     wrong = urdf.replace('ixx="0.037242"', 'ixx="3.0"')
     assert wrong != urdf

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is injected, when it is noticed, the commands from then on, and the reason."""
+"""Injected faults: when they are detected, what is commanded from then on, and the reason."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LIMIT = 20.0  # N m, the default torque limit
 
 
 @pytest.mark.parametrize('fault', FAULTS, ids=lambda fault: fault.name)
-def test_a_fault_is_detected_named_and_overcome(fault):
+def test_fault_is_detected_and_named_and_the_loop_recovers(fault):
     outcome = run(fault)
 
     assert outcome.reason is fault.reason, outcome.text
@@ -29,22 +29,22 @@ def test_a_fault_is_detected_named_and_overcome(fault):
     else:
         assert 1 <= outcome.noticed <= fault.within
         assert outcome.text
-        # The safe torque is the default one; above all it is not the last one over again.
+        # The default safe torque is zero; above all, the last torque is not repeated.
         assert not outcome.after.any()
         assert outcome.last.all()
     assert outcome.recovered
 
 
-def test_a_command_that_will_not_do_is_counted_and_does_no_harm():
-    wrong = [fault for fault in FAULTS if fault.name.startswith('one command')]
-    assert [run(fault).rejected for fault in wrong] == [1] * 4
+def test_invalid_command_is_counted_and_does_no_harm():
+    invalid = [fault for fault in FAULTS if fault.name.startswith('one command')]
+    assert [run(fault).rejected for fault in invalid] == [1] * 4
 
 
-def test_there_are_thirty_faults_that_differ():
+def test_at_least_thirty_distinct_faults_cover_the_reasons():
     assert len({fault.name for fault in FAULTS}) == len(FAULTS) >= 30
     assert {fault.reason for fault in FAULTS} == set(Reason) - {Reason.FAILED}
 
 
-def test_the_page_of_faults_is_current():
+def test_faults_page_is_up_to_date():
     path = Path(__file__).parents[1] / 'doc/faults.md'
     assert path.read_text() == page(), 'run: python test/fault_table.py doc/faults.md'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The guarded controller: safe torques and ramps, what is kept, and gains changed while it runs."""
+"""The guarded law: safe torques, ramps, what is kept over a stop, and gain changes at run time."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ P = np.array([1.0, 0.32, 0.4])
 
 
 def settings(**given):
-    from blf_dsc_controller.law import factory as assembly
+    from blf_dsc_controller.law import factory
 
-    return assembly.settings_of_config(change(ControllerConfig(), given))
+    return factory.settings_of_config(change(ControllerConfig(), given))
 
 
 def weight(q):
@@ -38,20 +38,20 @@ def safe(torque, q=Q, dq=DQ, estimate=P, **given):
     return safe_torque(Safety(torque=torque, damping=(2.0, 1.0)), settings(**given), last, estimate)
 
 
-def test_each_safe_torque_is_what_its_name_says():
+def test_each_safe_torque_does_what_its_name_says():
     np.testing.assert_array_equal(safe('zero'), [0.0, 0.0])
     np.testing.assert_allclose(safe('damping'), [-1.0, 2.0])
     np.testing.assert_allclose(safe('hold_gravity'), weight(Q) + np.array([-1.0, 2.0]))
 
 
-def test_a_safe_torque_keeps_the_limit_and_is_zero_if_not_finite():
+def test_safe_torque_is_limited_and_zero_if_not_finite():
     limited = safe('hold_gravity', **{'torque.limit': (3.0, 3.0)})
     np.testing.assert_array_equal(limited, [3.0, 3.0])
     np.testing.assert_array_equal(safe('hold_gravity', estimate=P * np.nan), [0.0, 0.0])
     np.testing.assert_array_equal(safe('damping', dq=np.array([1.7e308, 0.0])), [0.0, 0.0])
 
 
-def test_a_ramp_is_straight_and_ends_at_a_goal_that_moves():
+def test_ramp_is_linear_and_ends_at_a_moving_goal():
     ramp, safety = SafeTorque(2), Safety(torque='damping', damping=(1.0, 1.0))
 
     def advance(goal):
@@ -68,7 +68,7 @@ def test_a_ramp_is_straight_and_ends_at_a_goal_that_moves():
 
 
 def test_missed_states_are_averaged():
-    """Every second state missed is a fraction of a half, after a few windows."""
+    """With every second state missed, the fraction is one half after a few windows."""
     states = StateCheck(JOINTS, 1e-3)
     safety = Safety(overrun_window=0.1, overrun_fraction=1.0)
     for k in range(1001):
@@ -80,20 +80,20 @@ def test_missed_states_are_averaged():
     assert states.missed_fraction < 1e-4
 
 
-def test_silence_is_detected_by_a_check_in_time():
+def test_watchdog_detects_silence_if_it_checks_in_time():
     times = iter([0, 10, 41, 51, 200, 208])  # ms
     watchdog = Watchdog(lambda: next(times) * MILLISECOND, lambda: 0)
     assert watchdog.silence(0.04) == 0.0  # no state has come yet
     watchdog.restart()
     assert watchdog.silence(0.04) == 0.0
-    assert watchdog.next_check == pytest.approx(0.01)  # 1 ms after it could be silent
+    assert watchdog.next_check == pytest.approx(0.01)  # 1 ms after the earliest timeout
     assert watchdog.silence(0.04) == pytest.approx(0.041)
-    assert watchdog.silence(0.04) == 0.0  # it has slept itself
+    assert watchdog.silence(0.04) == 0.0  # the watchdog itself was asleep
     assert watchdog.silence(0.04) == pytest.approx(0.198)
 
 
 @pytest.mark.parametrize(('watchdog', 'live'), [('auto', True), ('on', False)])
-def test_silence_stops_where_the_stamps_are_of_today_or_it_is_asked_for(watchdog, live):
+def test_silence_stops_with_wall_time_stamps_or_the_watchdog_on(watchdog, live):
     rig = Rig({'safety.watchdog': watchdog}, live=live)
     rig.step(20)
     rig.wait(60)
@@ -102,7 +102,7 @@ def test_silence_stops_where_the_stamps_are_of_today_or_it_is_asked_for(watchdog
 
 
 @pytest.mark.parametrize(('watchdog', 'live'), [('auto', False), ('off', True)])
-def test_a_slow_lockstep_is_no_silence(watchdog, live):
+def test_slow_lockstep_is_not_silence(watchdog, live):
     rig = Rig({'safety.watchdog': watchdog}, live=live)
     rig.step(20)
     rig.wait(5000)
@@ -110,7 +110,7 @@ def test_a_slow_lockstep_is_no_silence(watchdog, live):
     assert rig.supervisor.phase is Phase.TRACKING
 
 
-def test_after_a_fault_the_torque_ramps_if_so_configured():
+def test_torque_ramps_after_a_fault_if_configured():
     rig = Rig({'safety.stop_ramp': 0.01})
     rig.step(20)
     last = rig.commands[-1]
@@ -121,7 +121,7 @@ def test_after_a_fault_the_torque_ramps_if_so_configured():
     assert not ramp[10:].any()
 
 
-def test_a_velocity_that_cannot_be_is_not_damped():
+def test_implausible_velocity_is_not_damped():
     rig = Rig({'safety.torque': 'damping'})
     rig.step(20)
     state = rig.state()
@@ -130,8 +130,8 @@ def test_a_velocity_that_cannot_be_is_not_damped():
     np.testing.assert_allclose(torque, [0.0, -0.1])  # D of joint2 is 1 N m s/rad
 
 
-def test_a_stopped_arm_is_held_by_the_gravity_that_was_learned():
-    """With parameters that are right, gravity is held and damping takes the rest of the motion."""
+def test_stopped_arm_is_held_by_the_learned_gravity():
+    """With the true parameters, gravity is held and damping stops the remaining motion."""
     learned = {'learning.initial_estimate': P.tolist(), 'safety.torque': 'hold_gravity'}
     rig = Rig(learned, plant={'disturbance.constant': [0.0, 0.0]})
     rig.step(20)
@@ -144,7 +144,7 @@ def test_a_stopped_arm_is_held_by_the_gravity_that_was_learned():
     assert np.abs(rig.state().q - start).max() < 0.05
 
 
-def test_activated_again_at_once_the_torque_goes_on_where_it_was():
+def test_torque_continues_after_immediate_reactivation():
     rig = Rig({'safety.deactivation_ramp': 10.0})
     rig.step(200)
     before = rig.commands[-1]
@@ -153,15 +153,15 @@ def test_activated_again_at_once_the_torque_goes_on_where_it_was():
     rig.guard.activate()
     rig.step(100)
     assert rig.supervisor.phase is Phase.TRACKING
-    # The surface filter starts anew: that costs K_p = 60 N m s/rad times the few mrad/s that it
-    # lagged behind, of a torque of 9 N m.
+    # The surface filter restarts: that changes the torque of 9 N m by K_p = 60 N m s/rad times
+    # the few mrad/s that it lagged behind.
     assert np.abs(rig.commands[201] - before).max() < 0.3
     assert rig.guard.samples.ratio.max() < 0.5
 
 
 @pytest.mark.parametrize('again', ['activate', 'reset'])
-def test_the_rate_limit_binds_from_the_torque_before_an_activation(again):
-    """The safe torque is zero, gravity takes 12 N m: it comes at the rate that is allowed."""
+def test_rate_limit_applies_from_the_torque_before_an_activation(again):
+    """The safe torque is zero and gravity takes 12 N m: it is approached at the rate limit."""
     rate = np.array([1000.0, 300.0])
     rig = Rig({'torque.rate_limit': rate.tolist(), 'safety.deactivation_ramp': 0.0})
     rig.step(200)
@@ -179,18 +179,18 @@ def test_the_rate_limit_binds_from_the_torque_before_an_activation(again):
 
 
 @pytest.mark.parametrize(
-    ('watchdog', 'late', 'told'),
+    ('watchdog', 'late', 'reported'),
     [('auto', 61.0, True), ('auto', 59.0, False), ('auto', -61.0, True), ('on', 61.0, False)],
 )
-def test_stamps_that_switch_the_watchdog_off_are_told(watchdog, late, told):
+def test_stamps_that_switch_off_the_watchdog_are_reported(watchdog, late, reported):
     rig = Rig({'safety.watchdog': watchdog}, live=True)
     rig.base -= int(late * 1e9)
     rig.step(2)
     assert rig.supervisor.phase is Phase.TRACKING
-    said = rig.guard.watchdog.why_off
-    assert (f'{late:.4g} s behind' in said if late > 0 else 'ahead of' in said) == told
+    why = rig.guard.watchdog.why_off
+    assert (f'{late:.4g} s behind' in why if late > 0 else 'ahead of' in why) == reported
     rig.wait(100)
-    assert (rig.supervisor.reason is Reason.STATE_TIMEOUT) == (not told)
+    assert (rig.supervisor.reason is Reason.STATE_TIMEOUT) == (not reported)
 
 
 @pytest.mark.parametrize('keep', [True, False])
@@ -208,8 +208,8 @@ def test_estimates_are_kept_or_forgotten_as_configured(keep):
     assert not np.array_equal(learned, start)
 
 
-def test_after_a_fault_estimates_are_kept_from_before_it_and_the_window_is_not():
-    rig = Rig({'safety.error_ratio': 0.2})  # passed on the way, while nothing is saturated
+def test_estimates_before_a_fault_are_kept_but_not_the_window():
+    rig = Rig({'safety.error_ratio': 0.2})  # exceeded during the motion, without saturation
     while rig.supervisor.reason is Reason.NONE:
         learned = rig.guard.controller.state.estimate.copy()
         rig.step()
@@ -221,7 +221,7 @@ def test_after_a_fault_estimates_are_kept_from_before_it_and_the_window_is_not()
     assert rig.guard.controller.state.rows[0] == 0.0
 
 
-def test_after_a_fault_only_the_estimates_from_before_it_are_kept():
+def test_only_the_estimates_before_a_fault_are_kept():
     """The window may hold what led to the fault: nothing else of the state survives."""
     rig = Rig({'learning.window': 0.1, 'learning.settling_time': 0.0})
     rig.step(200)
@@ -238,8 +238,8 @@ def test_after_a_fault_only_the_estimates_from_before_it_are_kept():
     np.testing.assert_array_equal(kept, controller.state_vector)
 
 
-def test_activated_again_the_surface_filter_starts_where_the_arm_is():
-    """On the law's first sample alpha2 = beta2: not the one of a motion long past."""
+def test_reactivation_restarts_the_surface_filter_at_the_current_state():
+    """On the law's first sample alpha2 = beta2, not the value from an earlier motion."""
     rig = Rig()
     rig.step(1500)
     rig.guard.deactivate()
@@ -250,7 +250,7 @@ def test_activated_again_the_surface_filter_starts_where_the_arm_is():
     assert np.abs(rig.guard.controller.sample.xi2).max() < 1e-3  # rad/s; it was at 0.3 rad/s
 
 
-def test_a_reset_forgets():
+def test_reset_clears_the_estimates():
     rig = Rig()
     rig.step(200)
     rig.guard.reset()
@@ -259,7 +259,7 @@ def test_a_reset_forgets():
     assert not state.disturbance.any()
 
 
-def test_after_a_reset_on_the_way_learning_waits_for_a_full_window():
+def test_learning_waits_for_a_full_window_after_a_reset_in_motion():
     rig = Rig({'learning.window': 0.5, 'learning.excitation_threshold': 1e-9})
     rig.step(1200)
     state = rig.guard.controller.state
@@ -272,7 +272,7 @@ def test_after_a_reset_on_the_way_learning_waits_for_a_full_window():
     assert state.latched[0] == 1.0
 
 
-def test_a_rejected_column_is_no_fault():
+def test_rejected_column_is_not_a_fault():
     """Its estimate is NaN."""
     rig = Rig()
     rig.step(20)
@@ -282,7 +282,7 @@ def test_a_rejected_column_is_no_fault():
     assert rig.supervisor.phase is Phase.TRACKING
 
 
-def test_an_unexpected_error_stops_too():
+def test_unexpected_error_causes_a_safe_stop():
     rig = Rig()
     rig.step(20)
     torque = rig.guard.fail('ZeroDivisionError: x')
@@ -301,7 +301,7 @@ NEW_GAINS = [
 
 
 def jump(given, *, bumpless, samples=1):
-    """Largest way of a torque after a change of gains, at the largest error of the start."""
+    """Largest change of a torque after a gain change, at the largest error of the start."""
     rig = Rig()
     rig.step(60)
     candidate = change(rig.guard.config, given)
@@ -317,34 +317,34 @@ def jump(given, *, bumpless, samples=1):
 
 
 @pytest.mark.parametrize('given', NEW_GAINS, ids=lambda given: next(iter(given)))
-def test_new_gains_are_taken_without_a_bump(given):
-    """The torque moves by no more than it does from sample to sample without a change."""
+def test_gain_change_is_bumpless(given):
+    """The torque changes about as little as from sample to sample without new gains."""
     usual = jump({}, bumpless=True)
     assert jump(given, bumpless=False) > 4.0 * usual
     assert jump(given, bumpless=True) < 2.0 * usual
 
 
 @pytest.mark.parametrize('given', NEW_GAINS[1:3], ids=lambda given: next(iter(given)))
-def test_nor_does_the_bump_come_later(given):
-    """Ten time constants of the surface filter on, what it took up must not come back."""
+def test_gain_change_causes_no_delayed_bump(given):
+    """Ten time constants of the surface filter later, what it absorbed must not come back."""
     usual = jump({}, bumpless=True, samples=20)
     assert jump(given, bumpless=False, samples=20) > 4.0 * usual
     assert jump(given, bumpless=True, samples=20) < 1.2 * usual
 
 
 @pytest.mark.parametrize(
-    ('given', 'said'),
+    ('given', 'message'),
     [
         ({'barrier.bound': (1e-6, 0.002)}, 'barrier.bound: joint1 is'),
         ({'torque.limit': (20.0, 1.0)}, 'torque.limit: joint2 is held with'),
         ({'learning.radius': 0.58}, 'learning.radius: the norm of the estimate is'),
     ],
 )
-def test_gains_that_a_running_law_cannot_take_are_rejected(given, said):
+def test_gains_that_a_running_law_cannot_adopt_are_rejected(given, message):
     rig = Rig()
     rig.step(200)
     (problem,) = rig.guard.problems(change(rig.guard.config, given))
-    assert problem.startswith(said)
+    assert problem.startswith(message)
     rig.guard.deactivate()
     assert rig.guard.problems(change(rig.guard.config, given)) == []
 
@@ -358,8 +358,8 @@ def test_gains_can_change_while_the_projection_holds_the_estimate():
     assert rig.guard.problems(change(rig.guard.config, {'feedback.gain': (60.0, 25.0)})) == []
 
 
-def test_an_update_that_would_diverge_is_rejected():
-    """Gradient: kappa Gamma lambda_max T >= 2; here kappa is 100 and lambda_max some 100."""
+def test_update_that_would_diverge_is_rejected():
+    """Gradient: kappa Gamma lambda_max T >= 2; here kappa is 100 and lambda_max about 100."""
     rig = Rig(
         {
             'learning.window': 0.2,
@@ -379,7 +379,7 @@ def to(goal, seconds):
     return Trajectory(('joint1', 'joint2'), (TrajectoryPoint(seconds, goal),))
 
 
-def test_a_plan_is_followed_from_its_time_on():
+def test_plan_is_followed_from_its_start_time():
     rig = Rig()
     rig.step(100)
     plan = rig.guard.plan(to((2.1, 1.5), 1.0), rig.guard.time + 0.03)
@@ -392,7 +392,7 @@ def test_a_plan_is_followed_from_its_time_on():
     assert rig.supervisor.phase is Phase.TRACKING
 
 
-def test_a_plan_that_comes_too_late_is_not_followed():
+def test_late_plan_is_rejected():
     rig = Rig()
     rig.step(100)
     plan = rig.guard.plan(to((2.1, 1.5), 1.0), rig.guard.time + 0.03)
@@ -401,7 +401,7 @@ def test_a_plan_that_comes_too_late_is_not_followed():
         rig.guard.adopt(plan)
 
 
-def test_a_plan_from_another_reference_is_not_followed():
+def test_plan_from_a_replaced_reference_is_rejected():
     rig = Rig()
     rig.step(100)
     plan = rig.guard.plan(to((2.1, 1.5), 1.0), rig.guard.time + 0.03)

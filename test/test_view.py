@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page without a browser: what is drawn of a moment, and what a bag or a mistake does."""
+"""The live view without a browser: what is drawn, how a bag is played, and wrong usage."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def player(tmp_path_factory):
     page.close()
 
 
-def test_a_bag_is_played_and_stops_at_its_end(player):
+def test_bag_plays_and_stops_at_its_end(player):
     player.slider.value = 0.5
     player.update(0.2)
     assert player.slider.value == 0.5  # paused
@@ -53,7 +53,7 @@ def test_a_bag_is_played_and_stops_at_its_end(player):
     player.update(0.5)
     assert player.slider.value == 1.0
     shown = player._page._table.content
-    now = max(one.time for one in player.moments if one.time <= 1.0)
+    now = max(moment.time for moment in player.moments if moment.time <= 1.0)
     assert f't = {now:.2f} s' in shown
     player.speed.value = '10'
     player.update(0.05)
@@ -61,17 +61,17 @@ def test_a_bag_is_played_and_stops_at_its_end(player):
     player.update(0.5)
     assert player.slider.value == player.moments[-1].time == pytest.approx(2.0, abs=1e-3)
     view_rig.click(player.button)
-    assert player.slider.value == 0.0  # from the start again
+    assert player.slider.value == 0.0  # back to the start
 
 
-def test_the_moments_of_a_bag_are_its_values(player):
+def test_moments_hold_the_values_of_the_bag(player):
     assert len(player.moments) == 60
     last = player.moments[-1]
     assert np.abs(last.error).max() < 0.002
     assert last.bound == pytest.approx([0.002, 0.002])
     assert last.truth[:3] == pytest.approx([1.0, 0.32, 0.4])
-    assert np.isnan(last.truth[3:]).all()  # nobody knows a true bias
-    assert last.estimate[:3] == pytest.approx(last.truth[:3], rel=0.3)  # half at the start
+    assert np.isnan(last.truth[3:]).all()  # the true bias is unknown
+    assert last.estimate[:3] == pytest.approx(last.truth[:3], rel=0.3)  # starts at half of it
     assert player.moments[0].estimate[:3] == pytest.approx([0.5, 0.16, 0.2], rel=0.1)
 
 
@@ -88,13 +88,13 @@ def test_arm_ghost_bound_and_path_are_drawn(player):
     assert (plot[3] == 100.0).all()
 
 
-def test_the_server_connects_to_nobody(player):
+def test_server_opens_no_external_connections(player):
     player.slider.value = 1.0
     player.update(0.0)
-    assert [at for at in CONNECTIONS if isinstance(at, tuple) and at[0] != HOST] == []
+    assert [peer for peer in CONNECTIONS if isinstance(peer, tuple) and peer[0] != HOST] == []
 
 
-def test_a_bag_without_configuration_is_rejected_in_one_line(tmp_path, capsys):
+def test_bag_without_configuration_is_rejected_in_one_line(tmp_path, capsys):
     bare = recorded_run.write(
         tmp_path / 'bare', recorded_run.messages(recorded_run.record(tmp_path / 'whole', 0.05))
     )
@@ -105,7 +105,7 @@ def test_a_bag_without_configuration_is_rejected_in_one_line(tmp_path, capsys):
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_links_without_shapes_become_cylinders_where_the_links_are(seed):
+def test_links_without_shapes_become_cylinders_in_place(seed):
     text = random_urdf(4, seed)[0]
     chain = chain_of(text, '', 'tip', ('j1', 'j2', 'j3', 'j4'))
     model = Arm(text, chain).model()
@@ -118,7 +118,7 @@ def test_links_without_shapes_become_cylinders_where_the_links_are(seed):
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_cylinders_begin_at_a_joint_and_end_at_the_next(seed):
+def test_cylinders_reach_from_joint_to_joint(seed):
     robot = ET.fromstring(with_cylinders(random_urdf(4, seed)[0], 2.0))  # noqa: S314 - our own
     joints = {}
     for joint in robot.findall('joint'):
@@ -142,7 +142,7 @@ def test_cylinders_begin_at_a_joint_and_end_at_the_next(seed):
 _ORIGIN = ('xyz', 'rpy')
 
 
-def test_a_chain_of_any_number_of_planar_links_is_drawn():
+def test_planar_chain_of_any_length_is_drawn():
     joints = ('a', 'b', 'c')
     chain = chain_of(planar_urdf(joints, (1.0, 0.8, 0.5)), '', 'tip', joints)
     for q, tip in (([0.0, 0.0, 0.0], [2.3, 0.0, 0.0]), ([np.pi / 2, 0.0, 0.0], [0.0, 0.0, 2.3])):
@@ -151,14 +151,11 @@ def test_a_chain_of_any_number_of_planar_links_is_drawn():
 
 def moments_of(motion):
     times = np.arange(0.0, 7.0, 1 / 30)
-    nothing, unknown = np.zeros(2), np.full(5, np.nan)
-    return [
-        Moment(t, motion(t), nothing, nothing, nothing, nothing, unknown, unknown, 0.0)
-        for t in times
-    ]
+    zero, unknown = np.zeros(2), np.full(5, np.nan)
+    return [Moment(t, motion(t), zero, zero, zero, zero, unknown, unknown, 0.0) for t in times]
 
 
-def test_only_what_moves_is_identified():
+def test_only_a_moving_arm_is_identified():
     confidence = Confidence(ControllerConfig())
     moving = confidence.deviations(moments_of(lambda t: 2.0 + 0.3 * np.cos([t, t])))
     still = confidence.deviations(moments_of(lambda _: np.array([2.0, 1.4])))
@@ -168,7 +165,7 @@ def test_only_what_moves_is_identified():
     assert (moving[parameters] < still[parameters]).all()
 
 
-def test_a_port_that_is_taken_is_left_to_its_owner(player):
+def test_port_in_use_is_skipped(player):
     own = player._page.server.get_port()
     assert free_port(HOST, own) > own
     with pytest.raises(BlfDscError, match=r"cannot be served at '192\.0\.2\.1'.*of this computer"):
@@ -177,13 +174,13 @@ def test_a_port_that_is_taken_is_left_to_its_owner(player):
         free_port('nowhere.invalid', PORT)
 
 
-def test_without_viser_the_remedy_is_named(monkeypatch):
+def test_missing_viser_is_reported_with_the_pip_command(monkeypatch):
     monkeypatch.setattr(address.importlib.util, 'find_spec', lambda _: None)
     with pytest.raises(MissingExtraError, match=r"pip install 'blf_dsc_controller\[view\]'"):
         Page(HOST, PORT)
 
 
-def test_a_view_of_an_offline_run_is_rejected_before_it_begins(tmp_path):
+def test_view_of_an_offline_run_is_rejected_before_the_run(tmp_path):
     out = tmp_path / 'run'
     assert main(['run', '--offline', '--view', '--out', str(out)]) == 1
     assert not out.exists()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a running loop: its buttons and sliders reach the real nodes, in lock-step."""
+"""The live view of a running loop: its buttons and sliders reach the real nodes, in lock-step."""
 
 from __future__ import annotations
 
@@ -52,11 +52,11 @@ def events(loop):
     return loop[2].page._events
 
 
-def told(view, word):
-    return [one for one in view.page._events if word in f'{one}']
+def events_with(view, word):
+    return [event for event in view.page._events if word in f'{event}']
 
 
-def test_the_page_shows_the_loop(rig, loop):
+def test_page_shows_the_loop(rig, loop):
     _arm, _law, view = loop
     rig.until(lambda: view.past[-1].time > 2.0)
     now = view.past[-1]
@@ -66,19 +66,19 @@ def test_the_page_shows_the_loop(rig, loop):
     assert now.truth[:3] == pytest.approx([1.0, 0.32, 0.4])
     assert np.isfinite(now.estimate[:3]).all()
     assert view.page._state == ('OK', 'tracking')
-    assert [t for t, *_ in told(view, 'payload of 0.25 kg begins')] == [1.0]
-    assert [t for t, *_ in told(view, 'payload of 0.25 kg ends')] == [1.5]
+    assert [t for t, *_ in events_with(view, 'payload of 0.25 kg begins')] == [1.0]
+    assert [t for t, *_ in events_with(view, 'payload of 0.25 kg ends')] == [1.5]
 
 
-def test_a_push_reaches_the_plant_and_ends(rig, loop):
+def test_push_reaches_the_plant_and_ends(rig, loop):
     arm, _, view = loop
     view_rig.click(view.controls.buttons['Push'])
     rig.until(lambda: arm.config.load.torque == (2.0, 0.0))
     rig.until(lambda: arm.config.load.torque == (0.0, 0.0))
-    rig.until(lambda: len(told(view, 'load.torque')) == 2)
+    rig.until(lambda: len(events_with(view, 'load.torque')) == 2)
 
 
-def test_a_payload_reaches_the_plant(rig, loop):
+def test_payload_reaches_the_plant(rig, loop):
     arm, _, view = loop
     view_rig.click(view.controls.buttons['Pick up'])
     rig.until(lambda: arm.config.load.payload == 0.5)
@@ -87,14 +87,14 @@ def test_a_payload_reaches_the_plant(rig, loop):
     rig.until(lambda: arm.config.load.payload == 0.0)
 
 
-def test_a_gain_reaches_the_controller_or_its_slider_returns(rig, loop):
+def test_gain_reaches_the_controller_or_its_slider_reverts(rig, loop):
     _, law, view = loop
     first, second = view.controls.sliders['feedback.gain']
     assert (first.value, second.value) == (60.0, 20.0)
     view_rig.drag(second, 25.0)
     rig.until(lambda: law.config.feedback.gain == (60.0, 25.0))
     rejected = view.controls.sliders['torque.limit'][0]
-    view_rig.drag(rejected, rejected.min)  # less than the arm weighs
+    view_rig.drag(rejected, rejected.min)  # less than gravity needs
     rig.until(lambda: rejected.value == 20.0)
     assert law.config.torque.limit == (20.0, 20.0)
 
@@ -103,7 +103,7 @@ def test_gains_changed_elsewhere_move_the_sliders(rig, loop):
     _, law, view = loop
     result = law.set_parameters_atomically([_parameter('surface.gain', [140.0, 150.0])])
     assert result.successful, result.reason
-    rig.until(lambda: told(view, 'surface.gain'))
+    rig.until(lambda: events_with(view, 'surface.gain'))
     rig.until(lambda: view.controls.sliders['surface.gain'][0].value == 140.0)
 
 
@@ -113,42 +113,42 @@ def _parameter(name, value):
     return Parameter(name, value=value)
 
 
-def test_a_reference_is_followed(rig, loop):
+def test_sent_reference_is_followed(rig, loop):
     _, _, view = loop
     view_rig.click(view.controls.buttons['Go there'])
-    rig.until(lambda: told(view, 'trajectory'))
+    rig.until(lambda: events_with(view, 'trajectory'))
     there = [1.9935, 1.3961]  # the middle of the configured reference
     rig.until(lambda: np.abs(view.past[-1].position - there).max() < 0.002)
 
 
-def test_reset_takes_the_arm_to_its_start(rig, loop):
+def test_reset_returns_the_arm_to_its_start(rig, loop):
     _arm, _law, view = loop
     view_rig.click(view.controls.buttons['Reset'])
-    rig.until(lambda: told(view, 'reset'))
+    rig.until(lambda: events_with(view, 'reset'))
     rig.until(lambda: 0.1 < view.past[-1].time < 1.0)  # counted from the new start
 
 
-def test_a_controller_that_died_is_missed(rig, loop):
+def test_killed_controller_is_reported_as_gone(rig, loop):
     _, law, view = loop
     rig.kill(law)
     rig.until(lambda: view.page._state[0] == 'ERROR' and 'gone' in view.page._state[1])
 
 
-def test_a_run_has_its_page_until_it_ends(tmp_path):
+def test_page_of_a_run_is_served_until_the_run_ends(tmp_path):
     out = tmp_path / 'run'
     command = (*COMMAND, '--view', '--mode', 'lockstep', '--duration', '100000', '--out', str(out))
     with subprocess.Popen(command, stdout=PIPE, stderr=STDOUT, text=True) as process:
-        said = ''
-        while not (found := re.search(r'the page: (http://localhost:\d+)', said)):
-            said += process.stdout.readline()
-            assert process.poll() is None, said
+        output = ''
+        while not (found := re.search(r'the page: (http://localhost:\d+)', output)):
+            output += process.stdout.readline()
+            assert process.poll() is None, output
         wait_for(lambda: 'open http' in (out / 'logs' / 'view.log').read_text())
         with urlopen(found[1]) as page:  # noqa: S310 - an address of our own
             assert b'<html' in page.read()
         process.send_signal(signal.SIGINT)
-        said += process.communicate()[0]
-    assert process.returncode == INTERRUPTED, said
+        output += process.communicate()[0]
+    assert process.returncode == INTERRUPTED, output
     run = read_run(out / 'bag')
-    assert np.isfinite(run.error[0]).all()  # the recorder was there before the page was
+    assert np.isfinite(run.error[0]).all()  # the recorder was running before the page
     with pytest.raises(URLError):
         urlopen(found[1])  # noqa: S310

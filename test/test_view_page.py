@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The live view in a browser: it draws in space, asks for nothing elsewhere, and its controls work.
+"""The live view in a browser: the 3-D scene, no external requests, and working controls.
 
 `make test-browser`. What is drawn is checked without a browser in test_view.py, what the controls
 do in test_view_live.py.
@@ -27,15 +27,15 @@ pytestmark = [
 
 SHOTS = Path(os.environ.get('BROWSER_SHOTS') or tempfile.gettempdir())
 TEXT = '(document.body?.innerText ?? "")'
-OF_LIBRARIES = ('THREE.Clock', 'GPU stall due to ReadPixels')  # remarks of what viser is made of
+HARMLESS = ('THREE.Clock', 'GPU stall due to ReadPixels')  # warnings of libraries that viser uses
 
 
 @pytest.fixture
 def browser(tmp_path):
     SHOTS.mkdir(exist_ok=True)
-    one = chromium.Browser(tmp_path / 'profile', *chromium.WEBGL, '--window-size=1000,700')
-    yield one
-    one.close()
+    chrome = chromium.Browser(tmp_path / 'profile', *chromium.WEBGL, '--window-size=1000,700')
+    yield chrome
+    chrome.close()
 
 
 def show(browser, page):
@@ -45,16 +45,16 @@ def show(browser, page):
 
 
 def complaints(browser):
-    return [one for one in browser.complaints if not any(w in f'{one}' for w in OF_LIBRARIES)]
+    return [line for line in browser.complaints if not any(w in f'{line}' for w in HARMLESS)]
 
 
 def assert_local(browser, page):
     own = (page.url, 'data:', 'blob:')
-    assert [one for one in browser.requests if not one.startswith(own)] == []
+    assert [url for url in browser.requests if not url.startswith(own)] == []
     assert browser.requests
 
 
-def test_a_bag_is_played_in_the_browser(browser, tmp_path):
+def test_bag_is_played_in_the_browser(browser, tmp_path):
     page = Page('127.0.0.1', 18280)
     try:
         player = BagPlayer(page, recorded_run.record(tmp_path / 'bag', 4.0))
@@ -82,7 +82,7 @@ def wait_until(browser, condition):
         browser.value('1')
 
 
-def test_a_running_loop_is_shown_and_pushed(browser):
+def test_running_loop_is_shown_and_pushed(browser):
     pytest.importorskip('rclpy', reason='needs ROS 2')
     from ros_rig import RosRig
 
