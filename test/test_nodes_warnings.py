@@ -14,7 +14,6 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from sim_plant.node import PlantNode
 
-OBSERVED = {'wait_for_subscribers': 0}
 COSINE = {'learning.frequencies': [1.0], 'learning.bias': False}
 
 

@@ -146,7 +146,7 @@ class TopicMessages:
         if stamps.size > 1 and (stamps == stamps[0]).all():
             raise BagError(
                 f'all {stamps.size} messages of {self.name} have the stamp {stamps[0]} ns: each '
-                'needs a stamp of its own, so the driver has to set header.stamp'
+                'needs a unique stamp, so the driver has to set header.stamp'
             )
         kept = [k for k in range(stamp.size) if k not in foreign]
         if len(kept) in (0, stamp.size):

@@ -128,19 +128,18 @@ def over_postures(
 
     Both are taken over random postures within the limits, with the rated payload [kg].
     """
-    from blf_dsc_controller.arms.prior import prior_factor  # slow: compiles
+    from blf_dsc_controller.arms.model import inertia_matrix  # slow: compiles
+    from blf_dsc_controller.arms.prior import prior_factor
 
     model = parameters.model
     n = model.n
     L = prior_factor(chain, parameters, payload, np.zeros(n))
     random = np.random.default_rng(0)
-    Yp, Yr, M = np.zeros((n, len(P))), np.zeros((n, len(P))), np.zeros((n, n))
+    Yp, Yr = np.zeros((2, n, len(P)))
     least, deviation = np.full(n, np.inf), np.zeros(n)
     for _ in range(_POSTURES):
         q = random.uniform(lower, upper)
-        for i, unit in enumerate(np.eye(n)):
-            model.momentum_regressor(q, unit, Yp, Yr)
-            M[:, i] = Yp @ P
+        M = inertia_matrix(model, np.array(P), q)
         least = np.minimum(least, 1.0 / np.diag(np.linalg.inv(M)))
         model.momentum_regressor(q, np.zeros(n), Yp, Yr)
         deviation = np.maximum(deviation, np.linalg.norm(Yr @ L, axis=1))

@@ -5,6 +5,7 @@ from math import exp, nan
 
 import numpy as np
 
+from blf_dsc_controller.arms.model import inertia_matrix
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.settings import LINEAR, NEWTON, Settings
@@ -80,17 +81,14 @@ def fill_energies(
 
 
 def largest_inertia(settings: Settings) -> float:
-    """Return the largest eigenvalue of M(q) [kg m^2] over all postures, for the true parameters."""
-    n, p = settings.n, settings.p
-    Yp, Yr = np.zeros((2, n, p))
-    largest = 0.0
-    for angle in np.linspace(-np.pi, np.pi, _POSTURES):
-        M = np.zeros((n, n))
-        for i, unit in enumerate(np.eye(n)):
-            settings.model.momentum_regressor(np.full(n, angle), unit, Yp, Yr)
-            M[:, i] = Yp @ settings.true_parameters
-        largest = max(largest, float(np.linalg.eigvalsh(M)[-1]))
-    return largest
+    """Return the largest eigenvalue of M(q) [kg m^2] for the true parameters.
+
+    Of postures with equal joint angles, one of which is the stretched planar arm.
+    """
+    angles = np.linspace(-np.pi, np.pi, _POSTURES)
+    postures = [np.full(settings.n, angle) for angle in angles]
+    M = [inertia_matrix(settings.model, settings.true_parameters, q) for q in postures]
+    return float(np.linalg.eigvalsh(M).max())
 
 
 def decay_rate(settings: Settings) -> float:

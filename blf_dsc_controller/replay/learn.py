@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.arms.model import ArmModel
+from blf_dsc_controller.arms.model import ArmModel, inertia_matrix
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
@@ -162,15 +162,10 @@ def _solve(X: Floats, u: Floats, rho: float) -> tuple[Floats, Floats, Floats]:
 
 def _least_inertia(model: ArmModel, estimate: Floats, q: Floats) -> float:
     """Return the smallest eigenvalue of M at some of q (N, n), by the estimate (m,) of P and d."""
-    n, p = model.n, len(model.parameter_names)
-    Yp, Yr, M = np.zeros((n, p)), np.zeros((n, p)), np.zeros((n, n))
-    least = np.inf
-    for position in q[:: max(1, q.shape[0] // _POSITIONS)]:
-        for i, unit in enumerate(np.eye(n)):
-            model.momentum_regressor(position, unit, Yp, Yr)
-            M[:, i] = Yp @ estimate[:p]
-        least = min(least, float(np.linalg.eigvalsh(M)[0]))
-    return least
+    P = estimate[: len(model.parameter_names)]
+    some = q[:: max(1, q.shape[0] // _POSITIONS)]
+    M = [inertia_matrix(model, P, position) for position in some]
+    return float(np.linalg.eigvalsh(M).min())
 
 
 def correlation_length(left: Floats) -> float:

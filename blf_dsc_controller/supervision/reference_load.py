@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.arms.model import inertia_matrix
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.prediction import rows_along
@@ -53,16 +54,13 @@ class ReferenceLoad(NamedTuple):
 def reference_load(config: ControllerConfig, settings: Settings) -> ReferenceLoad:
     """Evaluate the dynamics along the reference, over its slowest period."""
     P = settings.initial_estimate[: settings.p]
-    H, Yp, Yr = np.zeros((3, settings.n, settings.p))
+    H = np.zeros((settings.n, settings.p))
     torque, inertia = np.zeros(settings.n), []
     moments = np.linspace(0.0, _horizon(config), _POINTS, endpoint=False)
     for q, dq, ddq in sampled(reference_of(config), moments):
         settings.model.regressor(q, dq, dq, ddq, H)
         torque = np.maximum(torque, np.abs(H @ P))
-        M = np.zeros((settings.n, settings.n))
-        for i, unit in enumerate(np.eye(settings.n)):
-            settings.model.momentum_regressor(q, unit, Yp, Yr)
-            M[:, i] = Yp @ P
+        M = inertia_matrix(settings.model, P, q)
         if np.linalg.eigvalsh(M)[0] > 0.0:
             inertia.append(M)
     return ReferenceLoad(torque, np.reshape(inertia, (-1, settings.n, settings.n)))
