@@ -153,7 +153,7 @@ def acceleration(
 
     `ddq` may alias the joint `torque` (n,) [N m, or N].
     """
-    add_up(arm, now, payload)
+    combine_bodies(arm, now, payload)
     for j in range(arm.n):
         ddq[j] = torque[j] - along_joint(
             arm, now, j, vector(now.force[j + 1]), vector(now.torque[j + 1])
@@ -167,7 +167,7 @@ def acceleration(
 
 
 @inner
-def add_up(arm: RigidBodies, now: Motion, payload: float) -> None:
+def combine_bodies(arm: RigidBodies, now: Motion, payload: float) -> None:
     """Sum inertias, and forces and moments of the bias, from the tip to the base."""
     n = arm.n
     F = N = (0.0, 0.0, 0.0)

@@ -45,7 +45,7 @@ class Browser:
     """One page in a browser of its own.
 
     Attributes:
-        complaints: errors of the console and of scripts.
+        errors: errors of the console and of scripts.
         requests: URLs that the page requested.
     """
 
@@ -64,7 +64,7 @@ class Browser:
         self._number = 0
         self._pending = b''
         self._session = None
-        self.complaints = []
+        self.errors = []
         self.requests = []
         target = self.call('Target.createTarget', url='about:blank')['targetId']
         attached = self.call('Target.attachToTarget', targetId=target, flatten=True)
@@ -87,9 +87,9 @@ class Browser:
 
     def value(self, expression):
         """Return the value of an expression in the page."""
-        told = self.call('Runtime.evaluate', expression=expression, returnByValue=True)
-        assert 'exceptionDetails' not in told, told
-        return told['result'].get('value')
+        answer = self.call('Runtime.evaluate', expression=expression, returnByValue=True)
+        assert 'exceptionDetails' not in answer, answer
+        return answer['result'].get('value')
 
     def wait(self, expression):
         """Wait until an expression in the page is true, and return its value."""
@@ -128,8 +128,8 @@ class Browser:
 
     def screenshot(self, path, *, whole=False):
         """Write the visible part of the page, or the whole page, as PNG."""
-        told = self.call('Page.captureScreenshot', captureBeyondViewport=whole, format='png')
-        path.write_bytes(base64.b64decode(told['data']))
+        answer = self.call('Page.captureScreenshot', captureBeyondViewport=whole, format='png')
+        path.write_bytes(base64.b64decode(answer['data']))
 
     def close(self):
         """Kill the browser."""
@@ -142,24 +142,24 @@ class Browser:
         deadline = time.monotonic() + PATIENCE
         while b'\0' not in self._pending:
             ready, _, _ = select.select([self._from], [], [], 1.0)
-            assert time.monotonic() < deadline, 'the browser says nothing'
+            assert time.monotonic() < deadline, 'the browser does not respond'
             if ready:
-                came = os.read(self._from, 1 << 20)
-                assert came, 'the browser has ended'
-                self._pending += came
+                received = os.read(self._from, 1 << 20)
+                assert received, 'the browser has ended'
+                self._pending += received
         raw, self._pending = self._pending.split(b'\0', 1)
         message = json.loads(raw)
         self._note(message)
         return message
 
     def _note(self, message):
-        told = message.get('params', {})
+        params = message.get('params', {})
         if message.get('method') == 'Runtime.exceptionThrown':
-            self.complaints.append(told['exceptionDetails'])
+            self.errors.append(params['exceptionDetails'])
         elif message.get('method') == 'Runtime.consoleAPICalled':
-            if told['type'] in ('error', 'warning', 'assert'):
-                self.complaints.append(told['args'])
+            if params['type'] in ('error', 'warning', 'assert'):
+                self.errors.append(params['args'])
         elif message.get('method') == 'Network.requestWillBeSent':
-            self.requests.append(told['request']['url'])
-        elif message.get('method') == 'Log.entryAdded' and told['entry']['level'] == 'error':
-            self.complaints.append(told['entry'])
+            self.requests.append(params['request']['url'])
+        elif message.get('method') == 'Log.entryAdded' and params['entry']['level'] == 'error':
+            self.errors.append(params['entry'])

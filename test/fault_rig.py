@@ -41,8 +41,8 @@ class State(NamedTuple):
 
     def raw(self, encoder=PLAIN, **changes):
         """Return the state, with changes, as a message."""
-        told = self._replace(**changes)
-        return encoder.encode(told.stamp, told.q, told.dq, told.effort)
+        changed = self._replace(**changes)
+        return encoder.encode(changed.stamp, changed.q, changed.dq, changed.effort)
 
 
 class Rig:
@@ -119,7 +119,7 @@ class Rig:
                 self._command(self.guard.watch())
                 self.next_watch = self.steady + self.guard.watchdog.next_check * 1e9
 
-    def mend(self):
+    def clear_fault(self):
         """Remove the fault, and reset arm and controller as the nodes' services do."""
         self.sense = lambda state: [state.raw()]
         self.actuate = lambda raw: [raw]

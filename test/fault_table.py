@@ -68,7 +68,7 @@ def run(fault: Fault, rig: Rig | None = None) -> Outcome:
     error = float(rig.guard.samples.ratio.max())
     before, after = np.array(rig.commands[start:stop]), np.array(rig.commands[stop:])
     rejected = rig.input.rejected
-    rig.mend()
+    rig.clear_fault()
     rig.step(LEAD)
     recovered = rig.supervisor.phase is Phase.TRACKING and bool(rig.guard.samples.ratio.max() < 1.0)
     return Outcome(noticed, reason, text, before, after, last, error, recovered, rejected)

@@ -106,12 +106,12 @@ class RosRig:
 
     def listen(self, topic, *, raw=False):
         """Return a list that fills with all messages of a topic."""
-        heard = []
+        messages = []
         name = topic.relative if isinstance(topic, topics.Topic) else topic
         self.tester.create_subscription(
-            message_class(topic.type), name, heard.append, qos_profile(topic.offered), raw=raw
+            message_class(topic.type), name, messages.append, qos_profile(topic.offered), raw=raw
         )
-        return heard
+        return messages
 
     def publisher(self, topic):
         """Return a publisher of the test on a topic of another node."""
@@ -164,9 +164,9 @@ class Arm:
         return torques(self._commands)[-1]
 
 
-def torques(heard):
+def torques(messages):
     """Return the values of commands as an array."""
-    return np.array([message.data for message in heard])
+    return np.array([message.data for message in messages])
 
 
 def states(messages, names=JOINTS):

@@ -38,10 +38,10 @@ def granted(ros, names):
     ask = ros.tester
     found = {}
     for _, access, _, method in KINDS:
-        told = set()
+        shown = set()
         for name in names:
-            told |= {one for one, _ in getattr(ask, method)(name, '/')}
-        found[access] = sorted(told)
+            shown |= {one for one, _ in getattr(ask, method)(name, '/')}
+        found[access] = sorted(shown)
     return found
 
 

@@ -68,7 +68,7 @@ def test_every_panel_is_drawn_without_errors(browser, pages, name):
     assert lines > drawn
     browser.screenshot(SHOTS / f'report_{name}.png')
     browser.screenshot(SHOTS / f'report_{name}_whole.png', whole=True)
-    assert browser.complaints == []
+    assert browser.errors == []
 
 
 @pytest.mark.parametrize('name', ['one', 'both'])
@@ -113,7 +113,7 @@ def test_dragging_zooms_all_time_panels(browser, pages):
         assert low == pytest.approx(1.0, abs=0.05)
         assert high == pytest.approx(2.0, abs=0.05)
     browser.screenshot(SHOTS / 'report_zoomed.png')
-    assert browser.complaints == []
+    assert browser.errors == []
 
 
 def test_arm_is_animated(browser, pages):
@@ -125,4 +125,4 @@ def test_arm_is_animated(browser, pages):
     browser.wait(f'{picture} != {first!r}')
     browser.value("document.getElementById('arm').scrollIntoView()")
     browser.screenshot(SHOTS / 'report_arm.png')
-    assert browser.complaints == []
+    assert browser.errors == []

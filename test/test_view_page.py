@@ -44,8 +44,8 @@ def show(browser, page):
     browser.wait("document.querySelector('canvas') !== null")
 
 
-def complaints(browser):
-    return [line for line in browser.complaints if not any(w in f'{line}' for w in HARMLESS)]
+def errors(browser):
+    return [line for line in browser.errors if not any(w in f'{line}' for w in HARMLESS)]
 
 
 def assert_local(browser, page):
@@ -71,7 +71,7 @@ def test_bag_is_played_in_the_browser(browser, tmp_path):
             browser.click(tab)
             browser.wait(f'{TEXT}.includes({word!r})')
             browser.screenshot(SHOTS / f'view_{tab.lower()}.png')
-        assert complaints(browser) == []
+        assert errors(browser) == []
         assert_local(browser, page)
     finally:
         page.close()
@@ -108,7 +108,7 @@ def test_running_loop_is_shown_and_pushed(browser):
         rig.kill(law)
         rig.until(lambda: view.page._state[0] == 'ERROR')
         browser.wait(f"{TEXT}.includes('the controller is gone')")
-        assert complaints(browser) == []
+        assert errors(browser) == []
         assert_local(browser, view.page)
     finally:
         rig.close()

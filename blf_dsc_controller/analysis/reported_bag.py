@@ -128,13 +128,13 @@ def _events(run: Run) -> Iterator[Event]:
     for t, stop in run.timed_stops:
         yield Event(t, 'stop', f'{stop.reason}: {stop.text}')
     if violated is not None:
-        yield from _spells(run, violated, 'violation', 'outside its bound')
+        yield from _intervals(run, violated, 'violation', 'outside its bound')
     if run.torque_limit is not None:
         limited = np.abs(run.torque) >= _AT_LIMIT * run.torque_limit
-        yield from _spells(run, limited, 'saturation', 'at its torque limit')
+        yield from _intervals(run, limited, 'saturation', 'at its torque limit')
 
 
-def _spells(run: Run, holds: np.ndarray, kind: str, what: str) -> Iterator[Event]:
+def _intervals(run: Run, holds: np.ndarray, kind: str, what: str) -> Iterator[Event]:
     for i, joint in enumerate(run.joints):
         edges = np.diff(np.concatenate([[0], holds[:, i].astype(np.int8), [0]]))
         begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)

@@ -43,9 +43,9 @@ def prior_factor(
     blocks: list[tuple[int, np.ndarray]] = []  # body, directions (11, k) of its entries
     for i, joint in enumerate(chain.joints):
         J = pseudo_inertia(joint.inertia)
-        blocks.append((i, _of_ten(deviations(J, LINKS, CENTRE))))
+        blocks.append((i, _blocks_of_ten(deviations(J, LINKS, CENTRE))))
     J = chain.tip_placement @ payload_inertia(payload) @ chain.tip_placement.T
-    blocks.append((n - 1, _of_ten(deviations(J, 1.0, PAYLOAD_SIZE))))
+    blocks.append((n - 1, _blocks_of_ten(deviations(J, 1.0, PAYLOAD_SIZE))))
     blocks += [(i, rotors[i] * np.eye(ROTOR + 1)[:, ROTOR:]) for i in range(n)]
     K = parameters.K.reshape(-1, n, ROTOR + 1)
     L = np.column_stack([K[:, i] @ block for i, block in blocks])
@@ -58,7 +58,7 @@ def payload_inertia(payload: float) -> np.ndarray:
     return payload * np.diag((*(PAYLOAD_SIZE**2,) * 3, 1.0))
 
 
-def _of_ten(directions: np.ndarray) -> np.ndarray:
+def _blocks_of_ten(directions: np.ndarray) -> np.ndarray:
     """Append a rotor entry of zero to directions (10, k) of the ten, giving (11, k)."""
     return np.vstack((directions, np.zeros((1, directions.shape[1]))))
 

@@ -31,10 +31,10 @@ def identify(options: Namespace) -> None:
         payload=options.payload,
     )
     found = identify_bag(options.bag, robot, options.namespace, NameMap.parse(options.map))
-    told = [f'{found.source}, {found.duration:.1f} s of {len(found.chain.joints)} joints']
+    header = [f'{found.source}, {found.duration:.1f} s of {len(found.chain.joints)} joints']
     kept = [*_joints(found), *_errors(found)]
-    print('\n'.join([*told, *_links(found), *_base(found), *kept]))
-    note = '\n'.join(['Inertias and friction by blf_dsc identify:', *told, *kept])
+    print('\n'.join([*header, *_links(found), *_base(found), *kept]))
+    note = '\n'.join(['Inertias and friction by blf_dsc identify:', *header, *kept])
     _, viscous, coulomb, _ = found.joint_terms
     corrected = corrected_urdf(robot.text, found.chain, found.inertias, viscous, coulomb, note)
     options.out.write_text(corrected, encoding='utf-8')

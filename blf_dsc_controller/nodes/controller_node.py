@@ -279,7 +279,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         before, self._phase = self._phase, guard.supervisor.phase
         if self._phase is Phase.SAFE_STOP:
             stop = f'{self.config.safety.torque} torque: {guard.supervisor.text}'
-            self.get_logger().fatal(f'{stop}; {self._way_back()}')
+            self.get_logger().fatal(f'{stop}; {self._restart_hint()}')
         elif self._phase is before:
             return
         elif self._phase is Phase.APPROACHING:
@@ -288,7 +288,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         elif self._phase is Phase.TRACKING:
             self.get_logger().info('tracking the reference')
 
-    def _way_back(self) -> str:
+    def _restart_hint(self) -> str:
         """Return how to start again after a stop."""
         plant = f'{self.get_namespace().rstrip("/")}/{topics.PLANT}/reset'
         if plant in dict(self.get_service_names_and_types()):

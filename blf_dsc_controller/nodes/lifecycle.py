@@ -191,10 +191,10 @@ class LoopNode(ManagedNode, Generic[Config]):
         """Publish diagnostics."""
 
     def _on_second(self) -> None:
-        self._look_for_rivals()
+        self._check_rivals()
         self._report()
 
-    def _look_for_rivals(self) -> None:
+    def _check_rivals(self) -> None:
         """Warn of other publishers of the output that only this node should publish."""
         if not self._outputs:
             return

@@ -125,7 +125,7 @@ class BagRecorderNode(PlainNode):
                 if topic in self._anonymous:
                     self._request_parameters(topic)
             elif topic not in self._skipped and self._wanted(topic):
-                self._consider(topic, types)
+                self._offer_topic(topic, types)
 
     def _request_parameters(self, topic: str) -> bool:
         """Request the parameters of a topic's publishers; return whether all have been read.
@@ -161,7 +161,7 @@ class BagRecorderNode(PlainNode):
             return topic in self._chosen
         return not any(part.startswith('_') for part in topic.split('/'))
 
-    def _consider(self, topic: str, types: list[str]) -> None:
+    def _offer_topic(self, topic: str, types: list[str]) -> None:
         publishers = self.get_publishers_info_by_topic(topic)
         if not publishers or self._waits(topic):
             return

@@ -92,7 +92,7 @@ def _of_abstract(results: Results) -> Iterator[Claim]:
         verdict(lag < 0.01),
         command=_CASES['model_based'].command,
     )
-    yield _superiority(results, 'Abstract', 'It is superior in tracking and in estimation.')
+    yield _superiority_claim(results, 'Abstract', 'It is superior in tracking and in estimation.')
 
 
 def _final_errors(results: Results, *names: str) -> list[float]:
@@ -105,7 +105,7 @@ def _lag(results: Results) -> float:
     return float(np.abs(_error(run)[run.time >= 1.0]).max())
 
 
-def _superiority(results: Results, where: str, says: str) -> Claim:
+def _superiority_claim(results: Results, where: str, says: str) -> Claim:
     names = ('paper_tuned', 'comparison', 'comparison_detuned')
     proposed, tuned, detuned = (
         float(np.linalg.norm(results.metrics[name].rms_error)) for name in names
@@ -255,7 +255,9 @@ def _of_conclusion(results: Results) -> Iterator[Claim]:
         verdict(*(fraction > _FITTED for fraction in explained)),
         'no disturbance remains',
     )
-    yield _superiority(results, 'IV, V', 'The proposed controller outperforms the comparison.')
+    yield _superiority_claim(
+        results, 'IV, V', 'The proposed controller outperforms the comparison.'
+    )
 
 
 def _exponential_fit(run: Run) -> float:

@@ -159,7 +159,7 @@ def check_takeover(
             raise VelocityMismatchError(joint, float(difference), float(limit))
 
 
-def _by_way_of_the_middle(
+def _via_centre(
     begin: Sequence[Term], target: Term, t: float, config: ControllerConfig
 ) -> Motion | None:
     """Plan an approach to fast sinusoids that rests at their centre first; None if impossible."""
@@ -212,7 +212,7 @@ def plan_start(
         try:
             return blend(begin, target, t, config)
         except MotionError:
-            motion = _by_way_of_the_middle(begin, target, t, config)
+            motion = _via_centre(begin, target, t, config)
             if motion is None:
                 raise
             return motion

@@ -162,7 +162,7 @@ class Rerun:
                 self._depart(f'used by the law ({guard.supervisor.text})', stamp)
         pending = guard.journal.pending
         if pending and _key(pending[0]) != _key(event):
-            self._depart_by(pending[0], event)
+            self._report_departure(pending[0], event)
 
     def _command(self, stamp: int, torque: Floats | None, *, is_exact: bool) -> None:
         if torque is not None:
@@ -178,7 +178,7 @@ class Rerun:
             and _reason(event) not in (Reason.STATE_TIMEOUT, Reason.FAILED)
         )
         if not is_own and pending:
-            self._depart_by(pending[0], event)
+            self._report_departure(pending[0], event)
             return
         try:
             self._act(event)
@@ -217,7 +217,7 @@ class Rerun:
             guard.journal.stamp = event.stamp
             self._command(event.stamp, guard.fail(content['text']), is_exact=True)
 
-    def _depart_by(self, own: Event, event: Event | None) -> None:
+    def _report_departure(self, own: Event, event: Event | None) -> None:
         """Note that the controller started or stopped differently from the recorded one."""
         text = own.content['text'] if own.type is EventType.STOP else own.type
         what = f'stop: {_reason(event)}' if _stops_at(event, own.stamp) else 'used by the law'
