@@ -13,7 +13,7 @@ contradict the latched solution (their mean square error over 0.1 s exceeds eigh
 that the arm has changed: window, filters and latch are cleared, and learning restarts.  Until the
 new window is full, it does not average out disturbances, so its solution is pulled to the estimate
 before the change, most strongly in weakly excited directions; likewise, a full window with an
-unusually large residual is pulled to the solution of one window ago.
+unusually large residual is pulled to an earlier solution, kept once per window.
 """
 
 import numpy as np

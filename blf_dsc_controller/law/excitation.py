@@ -30,7 +30,7 @@ def reject_columns(settings: Settings, state: State, signals: Signals) -> None:
 
     The window must excite the parameters without any column; then the column with the largest entry
     in the minimum eigenvector is rejected, repeatedly, until the rest is excited.  This happens at
-    the first full window that is excited enough, and once per window while a column is rejected.
+    the first settled window that is excited enough, and once per window while a column is rejected.
     """
     for j in range(settings.p, settings.m):
         state.active[j] = 0.0

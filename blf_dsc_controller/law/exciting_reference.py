@@ -37,7 +37,7 @@ ITERATIONS = 150
 
 _SAMPLES_PER_HARMONIC = 64
 _COARSE = 4  # samples per filtered row
-_MARGIN = 1e-3  # fraction of each limit, for peaks between samples
+_MARGIN = 1e-3  # fraction of each limit, and m of room, for peaks between samples
 _PENALTY = 1e4  # on the mean square excess: limits are exceeded by a few percent
 _SHRINKS = 30  # most reductions of the amplitudes, by 1 % each, to keep the limits
 _SPREAD = 0.2  # standard deviation of a search's initial amplitudes
@@ -50,7 +50,7 @@ class Excitation(NamedTuple):
     gain: float  # objective of the search
     ratios: np.ndarray  # (4, n) largest position, velocity, acceleration, torque, over the limit
     room: np.ndarray  # (k,) least room between pairs of links and to the floor; negative: too close
-    excess: float  # mean square violation of the limits, relative to them
+    excess: float  # mean square violation of the limits, relative, and of the room, in m
 
     @property
     def is_allowed(self) -> bool:

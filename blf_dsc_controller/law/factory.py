@@ -4,7 +4,7 @@
 All laws share one kernel; they differ in the surface and in which gains are zero:
 
     blf_dsc       (28): filtered surface, barrier, composite learning, d^3
-    model_based   (16): the same with P^ = P and the disturbance known, nothing adapted
+    model_based   (16): P^ = P and the disturbance known, no robust term, nothing adapted
     backstepping  (35): linear surface, position gain, leaky adaptation by the tracking error
     slotine_li    tau = H P^ - K_p s, P^' = -Gamma H^T s: (35) without its extra terms,
                   optionally with the integral of s, by (30)

@@ -92,7 +92,7 @@ def largest_inertia(settings: Settings) -> float:
 
 
 def decay_rate(settings: Settings) -> float:
-    """Return kappa_e of (32) [1/s]; 0 if eta, gamma or kappa is zero, when (32) is void.
+    """Return kappa_e of (32) [1/s]; 0 if (32) is void: eta, gamma or kappa 0, or unknown truth.
 
     A Newton step replaces sigma, the smallest eigenvalue of Phi_e, by sigma / (sigma + rho).
     """

@@ -22,7 +22,7 @@ class State(NamedTuple):
     latch_time: Cell  # T_e, s
     lambda_min: Cell  # of Phi at the last check
     latched_lambda: Cell  # lambda_min of the latched window
-    best_lambda: Cell  # largest of a full window since the last change
+    best_lambda: Cell  # largest of a full window since the last change, with decay
     columns_checked: Cell  # 1 once the disturbance columns are accepted or rejected
     residual: Cell  # mean square torque residual of the latched window, (N m)^2
     least_residual: Cell  # smallest residual of any full window, (N m)^2
@@ -49,7 +49,7 @@ class State(NamedTuple):
     factor: Annotated[Array, 'm', 'm']  # Cholesky factor of Phi_e + rho R
     solution: Annotated[Array, 'm']  # of the latched window, (Phi_e + rho R)^-1 b_e
     anchor: Annotated[Array, 'm']  # theta^ to which windows with little information are pulled
-    min_eigenvector: Annotated[Array, 'm']  # of Phi, a unit vector
+    min_eigenvector: Annotated[Array, 'm']  # x of Phi x = lambda R x, x^T R x = 1
     active: Annotated[Array, 'm']  # 0 where a disturbance column has been rejected
     ring: Annotated[Array, 'window', 'n', 'm + 1']  # the window's rows
 
