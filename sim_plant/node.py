@@ -277,6 +277,8 @@ class PlantNode(LoopNode[PlantConfig]):
         level, message = OK, 'running'
         if self.state_label != 'active':
             level, message = STALE, self.state_label
+        elif self.rivals:
+            level, message = ERROR, 'another node publishes joint states, too'
         elif not self._running:
             level, message = WARN, 'braked: waiting for the first torque'
         elif self.plant.is_broken:

@@ -12,7 +12,7 @@ from changes import BOUND, CHANGED, LIGHTER, OFF, ROWS, WINDOW, allowed, begin_o
 from paper_case import NO_DISTURBANCE, configured
 
 from blf_dsc_controller.analysis.metrics import estimates_of
-from blf_dsc_controller.law import excitation
+from blf_dsc_controller.law import consistency, excitation, window
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.messages.topics import MODEL_CHANGES
@@ -146,6 +146,18 @@ def test_columns_are_checked_again_after_a_window_without_excitation():
     state.cursor[0] = 0.0
     excitation.readmit_columns(settings, state, signals)
     assert state.columns_checked[0] == 0.0
+
+
+def test_rejected_column_stays_zero_in_a_window_that_is_pulled_to_the_anchor():
+    controller = run(8.0, law={'learning.frequencies': [1.0]}).controller
+    settings, state, signals = controller.settings, controller.state, controller.signals
+    rejected = state.active == 0.0
+    state.anchor[rejected] = 0.1
+    state.rows[0] *= 0.5  # the window seems not to be full
+    window.excitation(settings, state, signals, 60)
+    assert consistency.accept_window(settings, state, signals, np.array([2.293, 1.696]))
+    assert np.all(state.solution[rejected] == 0.0)
+    assert np.all(state.solution[~rejected] != 0.0)
 
 
 def test_window_after_a_change_may_be_partial_and_stays_near_the_estimate_before():

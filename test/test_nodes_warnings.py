@@ -81,18 +81,19 @@ def test_second_publisher_on_the_same_topic_is_reported(ros, kind):
     first = ros.add(kind, namespace=space)
     second = ros.add(kind, namespace=space)
     ros.until(lambda: first.rivals == second.rivals == 1)
-    name = 'joint_states' if kind is PlantNode else 'blf_dsc_controller/commands'
+    is_plant = kind is PlantNode
+    name = 'joint_states' if is_plant else 'blf_dsc_controller/commands'
+    does = 'publishes joint states' if is_plant else 'commands torques'
     ros.until(
         lambda: any(f'another node publishes on /{space}/{name}, too' in line.msg for line in log)
     )
-    if kind is ControllerNode:
-        ros.until(
-            lambda: any(
-                status.message == 'another node commands torques, too'
-                for array in diagnostics
-                for status in array.status
-            )
+    ros.until(
+        lambda: any(
+            status.message == f'another node {does}, too'
+            for array in diagnostics
+            for status in array.status
         )
+    )
     ros.kill(second)
     ros.until(lambda: first.rivals == 0)
 

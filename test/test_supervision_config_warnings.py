@@ -44,6 +44,7 @@ def test_presets_cause_no_warnings(preset):
         ('learning.weight', {'learning.weight': 2500.0}),
         ('learning.weight', {'learning.update': 'gradient'}),
         ('disturbance.leakage', {'disturbance.leakage': 11.0}),
+        ('disturbance.leakage', {'disturbance.leakage': 11.0, 'learning.weight': 0.0}),
         ('learning.excitation_threshold', {'learning.excitation_threshold': 0.5}),
         ('learning.window', {'learning.window': 5.0}),
         ('learning.settling_time', {'learning.settling_time': 0.1}),

@@ -8,8 +8,7 @@ import textwrap
 from math import inf
 from pathlib import Path
 
-_BAG = 'folder of the bag, or its .mcap or .db3 file'
-_BAG_OF_ANY_KIND = 'folder of the bag, or its .mcap, .db3 or .bag'
+_BAG = 'folder of the bag, or its .mcap, .db3 or .bag file'
 _WIDTH = 88
 
 
@@ -117,7 +116,7 @@ def make_parser() -> argparse.ArgumentParser:
         'plot',
         'bags',
         'plot and summarise a bag',
-        'Draw tracking.png and parameters.png of a bag and write summary.json.',
+        'Draw tracking.png, parameters.png and monitors.png of a bag and write summary.json.',
         'run1/bag --out pictures',
     )
     plot.add_argument('bag', type=Path, help=_BAG)
@@ -233,7 +232,7 @@ def _run_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _replay_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('bag', type=Path, help=_BAG_OF_ANY_KIND)
+    parser.add_argument('bag', type=Path, help=_BAG)
     parser.add_argument(
         '--config', help='parameter file or preset: show what it would have commanded (open loop)'
     )
@@ -292,7 +291,7 @@ def _excite_options(parser: argparse.ArgumentParser) -> None:
 
 def _identify_options(parser: argparse.ArgumentParser) -> None:
     option = parser.add_argument
-    option('bag', type=Path, help=_BAG_OF_ANY_KIND)
+    option('bag', type=Path, help=_BAG)
     option('--urdf', required=True, help='URDF: a file, package://name/path, or a file in config/')
     option('--out', type=Path, required=True, help='URDF to write')
     _force(parser)

@@ -32,7 +32,7 @@ OUTCOMES = {
     KEPT: 'inside the bound to the end',
     VIOLATED: 'outside at some sample',
     DIVERGED: 'a number became infinite or NaN',
-    REJECTED: 'measured outside the bound at the start, where the controller refuses to start',
+    REJECTED: 'the controller refuses to start there',
 }
 """Possible outcomes of a run."""
 

@@ -58,6 +58,11 @@ def config_warnings(
     load = load or reference_load(config, settings)
     found = [*_of_start(config, q), *_of_urdf(config, load)]
     found += [one.text for one in _of_gains(config, load)]
+    if settings.eta * float(settings.gamma.max()) * config.sample_time > 1.0:
+        found.append(
+            'disturbance.leakage: eta gamma T is above 1: the leakage makes the disturbance '
+            'estimate oscillate'
+        )
     if settings.surface != LINEAR and settings.kappa > 0.0 and settings.Gamma.any():
         windows = windows_along(config, settings)
         found += _of_update(config, settings, windows)
@@ -199,11 +204,6 @@ def _of_update(config: ControllerConfig, settings: Settings, windows: Floats) ->
             f'learning.weight: {what} is {step:.2g}: the estimate overshoots above 1 and '
             f'diverges above 2: lower learning.weight, or learning.adaptation_gain and '
             f'learning.column_gain'
-        )
-    if settings.eta * float(settings.gamma.max()) * T > 1.0:
-        yield (
-            'disturbance.leakage: eta gamma T is above 1: the leakage makes the disturbance '
-            'estimate oscillate'
         )
 
 
