@@ -16,7 +16,7 @@ COLUMNS = {'learning.viscous': True, 'learning.coulomb': True}
 
 
 def test_tracking_error_stays_small_over_the_first_latch():
-    """The estimate steps by half of P; without the handover the error reaches 0.43 mrad."""
+    """The estimate steps by half of P; without the handover the error reaches 0.42 mrad."""
     bumpless = run(12.0)
     paper = run(12.0, law={'learning.bumpless': False})
 

@@ -55,7 +55,8 @@ class ArmModel(Protocol):
 def arm_model(name: str, n: int, l1: float, gravity: float) -> ArmModel:
     """Return the named model for n joints, with known l1 [m] and gravity [m/s^2]."""
     r = gravity / l1
-    return {'two_link': TwoLink(r), 'planar_chain': PlanarChain(n, r)}[name]
+    models: dict[str, ArmModel] = {'two_link': TwoLink(r), 'planar_chain': PlanarChain(n, r)}
+    return models[name]
 
 
 def inertia_matrix(model: ArmModel, P: Array, q: Array) -> Array:

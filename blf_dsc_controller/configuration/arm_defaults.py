@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Default gains and limits of the controller, derived from the URDF of the arm.
 
-The delay of the loop, 1.5 T + robot.lag, gives the rate omega_v = 0.5 / delay, at which the loop
+The delay of the loop, 1.5 T + robot.lag, gives the rate omega_b = 0.5 / delay, at which the loop
 loses half a radian of phase. Gains are multiples of this rate and of the inertia of each joint with
 the others free, m_i = 1 / (M^-1)_ii, minimised over several postures (doc/arms.md: margins).
 
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 UNKNOWN_EFFORT = 100.0
 """Torque limit [N m] of a joint without one in the URDF."""
-_SAG = 1.5  # sag over (standard deviation of gravity / m omega_v^2); measured: at most 1
-_PHASE = 0.5  # rad, phase lost to the delay at omega_v
+_SAG = 1.5  # sag over (standard deviation of gravity / m omega_b^2); measured: at most 1
+_PHASE = 0.5  # rad, phase lost to the delay at omega_b
 _BOUND = 0.002  # rad
 _UNMODELLED = 0.01  # rms, fraction of the rated torque: ripple, noise, Stribeck
 _WINDOW = {'base': 5.0, 'payload': 2.0, 'scale': 5.0}  # s

@@ -66,7 +66,7 @@ class Surface:
         (150.0, 150.0), 'gain of the virtual control on the tracking error', '1/s', 'K'
     )
     mu: PerJoint = non_negative(
-        (20.0, 20.0), 'part of surface.gain that remains at the bound', '1/s', 'mu'
+        (20.0, 20.0), 'gain of the virtual control that remains at the bound', '1/s', 'mu'
     )
     time_constant: float = positive(0.002, 'time constant of the surface filter', 's', 'lambda')
 
