@@ -73,6 +73,13 @@ def test_gain_change_must_not_worsen_an_existing_warning(gain, accepted):
     assert all(text.startswith('feedback.gain: K_p over the inertia is ') for text in found)
 
 
+def test_leakage_that_makes_the_estimate_oscillate_is_new_after_a_change():
+    before = configured('recommended', 1.0).controller
+    load = reference_load(before, settings_of_config(before))
+    (text,) = worsened(before, change(before, {'disturbance.leakage': 11.0}), load)
+    assert text.startswith('disturbance.leakage: eta gamma T')
+
+
 def test_start_close_to_the_bound_is_named_with_its_joint():
     qr = np.array([2.2935, 1.6961])
     (warning,) = warnings({}, q=qr - np.array([0.0, 0.9 * BOUND]))

@@ -136,8 +136,14 @@ def accept_window(settings: Settings, state: State, signals: Signals, q: np.ndar
     pull = settings.anchor_weight * missing + doubt
     if pull > 0.0:
         window.pull_to(state.anchor, pull, settings.information, signals.Phi, signals.b)
-        window.remove_rejected(state.active, signals.Phi, signals.b)
-        window.regularized_factor(signals.Phi, settings.rho, settings.information, signals.factor)
+        window.regularized_factor(
+            state.active,
+            settings.rho,
+            settings.information,
+            signals.Phi,
+            signals.b,
+            signals.factor,
+        )
         for j in range(m):
             solution[j] = signals.b[j]
         cholesky.solve(signals.factor, solution)

@@ -85,10 +85,28 @@ def pull_to(
 
 
 @inner
+def remove_rejected(active: np.ndarray, Phi: np.ndarray, b: np.ndarray) -> None:
+    """Remove the rejected columns from Phi theta = b, setting theta_j = 0."""
+    for i in range(active.size):
+        if active[i] == 0.0:
+            for j in range(active.size):
+                Phi[i, j] = 0.0
+                Phi[j, i] = 0.0
+            Phi[i, i] = 1.0
+            b[i] = 0.0
+
+
+@inner
 def regularized_factor(
-    Phi: np.ndarray, rho: float, information: np.ndarray, factor: np.ndarray
+    active: np.ndarray,
+    rho: float,
+    information: np.ndarray,
+    Phi: np.ndarray,
+    b: np.ndarray,
+    factor: np.ndarray,
 ) -> None:
-    """Fill `factor` with the Cholesky factor of Phi + rho R."""
+    """Remove the rejected columns; fill `factor` with the Cholesky factor of Phi + rho R."""
+    remove_rejected(active, Phi, b)
     for i in range(Phi.shape[0]):
         for j in range(i + 1):
             factor[i, j] = Phi[i, j] + rho * information[i, j]
@@ -140,18 +158,6 @@ def min_eigenvector(
     return weigh(Phi, direction, work)
 
 
-@inner
-def remove_rejected(active: np.ndarray, Phi: np.ndarray, b: np.ndarray) -> None:
-    """Remove the rejected columns from Phi theta = b, setting theta_j = 0."""
-    for i in range(active.size):
-        if active[i] == 0.0:
-            for j in range(active.size):
-                Phi[i, j] = 0.0
-                Phi[j, i] = 0.0
-            Phi[i, i] = 1.0
-            b[i] = 0.0
-
-
 @called
 def min_eigenvalue(
     running: np.ndarray,
@@ -172,8 +178,7 @@ def min_eigenvalue(
     average_window(running, samples, Phi, b)
     if prior_weight > 0.0:
         pull_to(prior, prior_weight, information, Phi, b)
-    remove_rejected(active, Phi, b)
-    regularized_factor(Phi, rho, information, factor)
+    regularized_factor(active, rho, information, Phi, b, factor)
     return min_eigenvector(Phi, information, factor, direction, work, iterations)
 
 

@@ -58,11 +58,6 @@ def config_warnings(
     load = load or reference_load(config, settings)
     found = [*_of_start(config, q), *_of_urdf(config, load)]
     found += [one.text for one in _of_gains(config, load)]
-    if settings.eta * float(settings.gamma.max()) * config.sample_time > 1.0:
-        found.append(
-            'disturbance.leakage: eta gamma T is above 1: the leakage makes the disturbance '
-            'estimate oscillate'
-        )
     if settings.surface != LINEAR and settings.kappa > 0.0 and settings.Gamma.any():
         windows = windows_along(config, settings)
         found += _of_update(config, settings, windows)
@@ -162,6 +157,12 @@ def _of_feedback(
         2.0 * fraction,
         f'disturbance.gain: in each sample the disturbance estimate absorbs {fraction:.2g} of '
         f'the velocity feedback, more than half: it will oscillate against feedback.gain',
+    )
+    yield Finding(
+        'leakage',
+        settings.eta * float(settings.gamma.max()) * config.sample_time,
+        'disturbance.leakage: eta gamma T is above 1: the leakage makes the disturbance estimate '
+        'oscillate',
     )
 
 
