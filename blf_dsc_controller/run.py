@@ -53,8 +53,8 @@ class Stop(NamedTuple):
     """ns, of the last joint state before the next start; None: the end of the run"""
 
 
-Regressor = Callable[[Floats, Floats, Floats, Floats, Floats], None]
-"""Writes H (n, p) for (q, dq, v, a), (n,) each: H P = M(q) a + C(q, dq) v + G(q) [N m]."""
+Regressor = Callable[[Floats, Floats, Floats, Floats], Floats]
+"""Returns H (k, n, p) for (q, dq, v, a), (k, n) each: H P = M(q) a + C(q, dq) v + G(q) [N m]."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -77,7 +77,7 @@ def estimates_of(run: Run) -> Estimates | None:
     names, at = _parameters(run.learning.names), run.time_of(run.learning.stamp)
     estimate, truth, arm = run.learning.select(names), run.truth, run.arm
     is_known = arm is not None and _parameters(arm.units) == names
-    torques = _torques(run, arm.regressor, len(names)) if arm and is_known else None
+    torques = _torques(run, arm.regressor) if arm and is_known else None
     theirs = () if truth is None else _parameters(truth.names)
 
     def true_of(names: Sequence[str]) -> Floats | None:
@@ -90,12 +90,12 @@ def estimates_of(run: Run) -> Estimates | None:
         base = true, torques
     elif arm and arm.base and torques is not None:
         P = true_of(arm.base[0])
-        base = None if P is None else (P, _torques(run, arm.base[1], len(arm.base[0])))
+        base = None if P is None else (P, _torques(run, arm.base[1]))
     unlike = theirs if true is None and base is None else ()
     return Estimates(names, at, estimate, true, unlike, torques, base)
 
 
-def _torques(run: Run, regressor: Regressor, p: int) -> Floats:
+def _torques(run: Run, regressor: Regressor) -> Floats:
     """Return rows of H(q, dq, dq, ddq) (k n, p) along the reference, else along the motion.
 
     The derivatives are three-point differences.
@@ -108,10 +108,8 @@ def _torques(run: Run, regressor: Regressor, p: int) -> Floats:
     forward, backward = (q[rows + 1] - q[rows]) / after, (q[rows] - q[rows - 1]) / before
     dq = (after * backward + before * forward) / (after + before)
     ddq = 2.0 * (forward - backward) / (after + before)
-    H = np.zeros((rows.size, len(run.joints), p))
-    for k in range(rows.size):
-        regressor(q[rows[k]], dq[k], dq[k], ddq[k], H[k])
-    return H.reshape(-1, p)
+    H = regressor(q[rows], dq, dq, ddq)
+    return H.reshape(-1, H.shape[-1])
 
 
 def _parameters(names: Iterable[str]) -> tuple[str, ...]:

@@ -60,9 +60,11 @@ class Picture:
         with rc_context(_SETTINGS):
             self._figure = Figure(
                 figsize=(panel[0] * columns, panel[1] * rows + 0.5),
+                dpi=_DPI,
+                facecolor='white',
                 layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08, hspace=0.04),
             )
-            FigureCanvasAgg(self._figure)
+            self._canvas = FigureCanvasAgg(self._figure)
             self._figure.suptitle(title, x=0.01, ha='left', fontsize=14, fontweight='bold')
             self.axes = self._figure.subplots(rows, columns, sharex=share_time, squeeze=False)
             for axes in self.axes.flat:
@@ -78,7 +80,8 @@ class Picture:
                 lowest = [axes for axes in column if axes.get_visible()][-1]
                 lowest.set_xlabel('time [s]')
                 lowest.tick_params(labelbottom=True)
-            self._figure.savefig(path, dpi=_DPI, facecolor='white')
+            # Figure.savefig would draw twice, the first time for the layout only.
+            self._canvas.print_png(path)  # type: ignore[no-untyped-call]
 
 
 def head(axes: Axes, title: str) -> None:

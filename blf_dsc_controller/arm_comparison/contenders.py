@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.arm_comparison.baselines import simulate_baseline
+from blf_dsc_controller.arms.batch import regressors_at
 from blf_dsc_controller.configuration.arm_defaults import over_postures
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig
@@ -182,7 +183,5 @@ def torque_rows(config: ControllerConfig) -> np.ndarray:
     """Return the rows of H(q, q', q', q'') (k, p) along the configured reference."""
     model = model_of(config)
     times = np.linspace(0.0, PICK_UP, _ROWS)
-    H = np.zeros((_ROWS, model.n, len(config.learning.initial_estimate)))
-    for rows, (q, dq, ddq) in zip(H, terms.sampled(reference_of(config), times), strict=True):
-        model.regressor(q, dq, dq, ddq, rows)
-    return H.reshape(_ROWS * model.n, -1)
+    q, dq, ddq = np.moveaxis(terms.sampled(reference_of(config), times), 1, 0)
+    return regressors_at(model, q, dq, dq, ddq).reshape(_ROWS * model.n, -1)

@@ -12,8 +12,6 @@ from __future__ import annotations
 
 from typing import Protocol
 
-import numpy as np
-
 from blf_dsc_controller.arms.combined_chain import CombinedChain
 from blf_dsc_controller.arms.planar_chain import PlanarChain
 from blf_dsc_controller.arms.serial_chain import SerialChain
@@ -57,16 +55,6 @@ def arm_model(name: str, n: int, l1: float, gravity: float) -> ArmModel:
     r = gravity / l1
     models: dict[str, ArmModel] = {'two_link': TwoLink(r), 'planar_chain': PlanarChain(n, r)}
     return models[name]
-
-
-def inertia_matrix(model: ArmModel, P: Array, q: Array) -> Array:
-    """Return M(q) (n, n) of an arm with the parameters P (p,), column by column from Yp P."""
-    M = np.zeros((model.n, model.n))
-    Yp, Yr = np.zeros((2, model.n, P.size))
-    for i, unit in enumerate(np.eye(model.n)):
-        model.momentum_regressor(q, unit, Yp, Yr)
-        M[:, i] = Yp @ P
-    return M
 
 
 compile_methods(

@@ -128,22 +128,17 @@ def over_postures(
 
     Both are taken over random postures within the limits, with the rated payload [kg].
     """
-    from blf_dsc_controller.arms.model import inertia_matrix  # slow: compiles
+    from blf_dsc_controller.arms.batch import inertia_matrices, regressors_at  # slow: compiles
     from blf_dsc_controller.arms.prior import prior_factor
 
     model = parameters.model
     n = model.n
     L = prior_factor(chain, parameters, payload, np.zeros(n))
-    random = np.random.default_rng(0)
-    Yp, Yr = np.zeros((2, n, len(P)))
-    least, deviation = np.full(n, np.inf), np.zeros(n)
-    for _ in range(_POSTURES):
-        q = random.uniform(lower, upper)
-        M = inertia_matrix(model, np.array(P), q)
-        least = np.minimum(least, 1.0 / np.diag(np.linalg.inv(M)))
-        model.momentum_regressor(q, np.zeros(n), Yp, Yr)
-        deviation = np.maximum(deviation, np.linalg.norm(Yr @ L, axis=1))
-    return least, deviation
+    q = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, n))
+    free = 1.0 / np.diagonal(np.linalg.inv(inertia_matrices(model, np.array(P), q)), 0, 1, 2)
+    rest = np.zeros_like(q)
+    deviation = np.linalg.norm(regressors_at(model, q, rest, rest, rest) @ L, axis=2)
+    return free.min(axis=0), deviation.max(axis=0)
 
 
 def _bound_of(given: Mapping[str, Any], n: int) -> np.ndarray:

@@ -5,7 +5,7 @@ from math import exp, nan
 
 import numpy as np
 
-from blf_dsc_controller.arms.model import inertia_matrix
+from blf_dsc_controller.arms.batch import inertia_matrices
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.settings import LINEAR, NEWTON, Settings
@@ -85,9 +85,8 @@ def largest_inertia(settings: Settings) -> float:
 
     Of postures with equal joint angles, one of which is the stretched planar arm.
     """
-    angles = np.linspace(-np.pi, np.pi, _POSTURES)
-    postures = [np.full(settings.n, angle) for angle in angles]
-    M = [inertia_matrix(settings.model, settings.true_parameters, q) for q in postures]
+    postures = np.linspace(-np.pi, np.pi, _POSTURES)[:, np.newaxis] * np.ones(settings.n)
+    M = inertia_matrices(settings.model, settings.true_parameters, postures)
     return float(np.linalg.eigvalsh(M).max())
 
 

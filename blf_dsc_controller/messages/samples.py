@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
+from blf_dsc_controller.arms.batch import regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import column_names, estimate_names, model_of, prior_covariance
@@ -41,11 +43,11 @@ def learned_arm(config: ControllerConfig) -> LearnedArm | None:
     base = None
     if config.robot.learn != 'base':
         all_shown = model_of(replace(config, robot=replace(config.robot, learn='base')))
-        base = all_shown.parameter_names, all_shown.regressor
+        base = all_shown.parameter_names, partial(regressors_at, all_shown)
     return LearnedArm(
         dict(zip(names, (*model.parameter_units, *friction), strict=True)),
         dict(zip(names, deviations, strict=True)),
-        model.regressor,
+        partial(regressors_at, model),
         base,
     )
 

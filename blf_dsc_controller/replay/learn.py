@@ -18,7 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.arms.model import ArmModel, inertia_matrix
+from blf_dsc_controller.arms.batch import inertia_matrices
+from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
@@ -164,8 +165,7 @@ def _least_inertia(model: ArmModel, estimate: Floats, q: Floats) -> float:
     """Return the smallest eigenvalue of M at some of q (N, n), by the estimate (m,) of P and d."""
     P = estimate[: len(model.parameter_names)]
     some = q[:: max(1, q.shape[0] // _POSITIONS)]
-    M = [inertia_matrix(model, P, position) for position in some]
-    return float(np.linalg.eigvalsh(M).min())
+    return float(np.linalg.eigvalsh(inertia_matrices(model, P, some)).min())
 
 
 def correlation_length(left: Floats) -> float:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms.model import inertia_matrix
+from blf_dsc_controller.arms.batch import inertia_matrices, regressors_at
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.prediction import rows_along
@@ -53,17 +53,12 @@ class ReferenceLoad(NamedTuple):
 
 def reference_load(config: ControllerConfig, settings: Settings) -> ReferenceLoad:
     """Evaluate the dynamics along the reference, over its slowest period."""
-    P = settings.initial_estimate[: settings.p]
-    H = np.zeros((settings.n, settings.p))
-    torque, inertia = np.zeros(settings.n), []
+    model, P = settings.model, settings.initial_estimate[: settings.p]
     moments = np.linspace(0.0, _horizon(config), _POINTS, endpoint=False)
-    for q, dq, ddq in sampled(reference_of(config), moments):
-        settings.model.regressor(q, dq, dq, ddq, H)
-        torque = np.maximum(torque, np.abs(H @ P))
-        M = inertia_matrix(settings.model, P, q)
-        if np.linalg.eigvalsh(M)[0] > 0.0:
-            inertia.append(M)
-    return ReferenceLoad(torque, np.reshape(inertia, (-1, settings.n, settings.n)))
+    q, dq, ddq = np.moveaxis(sampled(reference_of(config), moments), 1, 0)
+    torque = np.abs(regressors_at(model, q, dq, dq, ddq) @ P).max(axis=0)
+    M = inertia_matrices(model, P, q)
+    return ReferenceLoad(torque, M[np.linalg.eigvalsh(M)[:, 0] > 0.0])
 
 
 def windows_along(config: ControllerConfig, settings: Settings) -> Floats:

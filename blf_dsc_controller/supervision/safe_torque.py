@@ -8,6 +8,7 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.arms.batch import regressors_at
 from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.saturation import RATE_CUT
@@ -73,9 +74,8 @@ def safe_torque(safety: Safety, settings: Settings, last: LastState, estimate: V
         if safety.torque != 'zero':
             torque -= np.array(safety.damping) * last.dq
         if safety.torque == 'hold_gravity':
-            rest = np.zeros(settings.n)
-            H = np.zeros((settings.n, settings.p))
-            settings.model.regressor(last.q, rest, rest, rest, H)
+            rest = np.zeros((1, settings.n))
+            (H,) = regressors_at(settings.model, last.q[np.newaxis], rest, rest, rest)
             torque += H @ estimate[: settings.p]
     if not np.isfinite(torque).all():
         return np.zeros(settings.n)
