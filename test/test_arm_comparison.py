@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from blf_dsc_controller.arm_comparison import study
 from blf_dsc_controller.arm_comparison.baselines import simulate_baseline
 from blf_dsc_controller.arm_comparison.contenders import (
     BASELINES,
@@ -204,10 +205,12 @@ def test_best_law_is_the_one_with_the_smallest_worst_error():
 
 @pytest.fixture(scope='module')
 def page(tmp_path_factory):
-    """The smallest run of the command: one arm, one truth, only the first population."""
+    """The smallest run of the command: one arm, one truth, a first population of five."""
     out = tmp_path_factory.mktemp('arms') / 'page'
     small = ['--config', 'ur5e', '--truths', '1', '--generations', '0']
-    assert main(['arms', *small, '--out', str(out)]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study, 'POPULATION', 5)
+        assert main(['arms', *small, '--out', str(out)]) == 0
     return out
 
 
