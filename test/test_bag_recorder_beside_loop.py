@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording beside a real-time loop, on the same processors, loses no message.
+"""A run in real time reports its timing, and the recorder beside it loses no message.
 
 Sequence numbers of the publishers reveal losses. `make test-long` records and prints a minute.
 """
 
 from __future__ import annotations
 
+import json
 import os
 from collections import defaultdict
 
@@ -13,11 +14,10 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from command import closed_loop
+from command import PATIENT, closed_loop
 from mcap.reader import make_reader
 
 from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.cli.run import STOPPED
 from blf_dsc_controller.messages import topics
 
 DURATION = 60 if os.environ.get('LONG_TESTS') else 3  # s
@@ -41,19 +41,46 @@ def sequence_numbers(bag):
     return found
 
 
-def test_every_message_of_a_real_time_loop_is_in_the_bag(tmp_path):
-    run = closed_loop('--mode', 'realtime', '--duration', DURATION, '--out', tmp_path / 'out')
-    # On a busy machine the controller may stop: everything is still recorded.
-    assert run.returncode in (0, STOPPED), run.stderr
-    recorded = sequence_numbers(tmp_path / 'out' / 'bag')
-    facts = read_context(tmp_path / 'out' / 'bag').facts
+@pytest.fixture(scope='module')
+def out(tmp_path_factory):
+    """Results of a run in real time."""
+    folder = tmp_path_factory.mktemp('run')
+    config = folder / 'fifo.yaml'
+    # Only one node, which cannot keep the others from both processors.
+    fifo = 'sim_plant:\n  ros__parameters:\n    realtime: {priority: 10, lock_memory: true}\n'
+    config.write_text(fifo + PATIENT)
+    arguments = ('--config', config, '--mode', 'realtime', '--duration', DURATION)
+    run = closed_loop(*arguments, '--out', folder / 'out')
+    assert run.returncode == 0, run.stderr
+    (folder / 'out' / 'output.txt').write_text(run.stdout)
+    return folder / 'out'
+
+
+def test_timing_and_permissions_are_reported(out):
+    timing = json.loads((out / 'summary.json').read_text())['timing']
+    assert set(timing) == {'rate_hz', 'latency_us', 'late_steps'}
+    assert timing['rate_hz'] > 0.0
+    assert list(timing['latency_us']) == ['p50', 'p99', 'p99.9', 'max']
+    assert timing['late_steps'] >= 0
+    output = (out / 'output.txt').read_text()
+    assert 'real time' in output
+    assert 'late steps' in output
+    log = (out / 'logs' / f'{topics.PLANT}.log').read_text()
+    # Granted or denied, as this machine permits, but always logged.
+    assert 'SCHED_FIFO priority 10' in log
+    assert 'memory' in log
+
+
+def test_every_message_of_a_real_time_loop_is_in_the_bag(out):
+    recorded = sequence_numbers(out / 'bag')
+    facts = read_context(out / 'bag').facts
     for topic in EACH_SAMPLE:
         counts = facts[f'messages {topic.resolved}']
         print(f'{topic.resolved}: {counts}')  # noqa: T201 - shown by make test-long
         count = len(recorded[topic.resolved])
         assert recorded[topic.resolved] == list(range(1, count + 1))
         assert counts == f'{count} written, 0 missed'
-    logs = tmp_path / 'out' / 'logs'
+    logs = out / 'logs'
     # On a busy machine the first torque may take seconds, and the plant sends its state again.
     again = (logs / f'{topics.PLANT}.log').read_text().count('sending the state again')
     assert len(recorded[topics.JOINT_STATES.resolved]) == SAMPLES + again

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 
 import numpy as np
 import pytest
@@ -65,7 +66,9 @@ def test_papers_preset_over_ros_matches_its_offline_run_bit_for_bit(tmp_path):
     """Lambda prediction, gradient, no columns and a known truth: paths the defaults do not take."""
     assert offline('paper', tmp_path / 'offline', 1.0) == 0
     over_ros = ['--config', 'paper', '--mode', 'lockstep', '--duration', '1.0']
+    before = dict(os.environ)
     assert main(['run', *over_ros, '--out', str(tmp_path / 'ros')]) == 0
+    assert dict(os.environ) == before  # the ROS domain of the run is not left behind
 
     runs = [read_run(tmp_path / name / 'bag') for name in ('offline', 'ros')]
     np.testing.assert_array_equal(runs[0].error, runs[1].error)
