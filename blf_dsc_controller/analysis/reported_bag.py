@@ -81,7 +81,7 @@ def _read(path: Path, name: str, namespace: str, names: NameMap) -> ReportedBag:
     try:
         sections = parse(context.configuration)
     except ConfigurationError:  # missing or unreadable
-        sections = []
+        sections = ()
     entries = {name: entry.value for section in sections for name, entry in section.entries.items()}
     lost = (Event(0.0, 'lost', f'{topic}: {text}') for topic, text in context.losses.items())
     arm, problem = _drawn(context, entries, len(run.joints))

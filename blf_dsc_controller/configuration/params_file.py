@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -47,7 +47,7 @@ def locate(given: str | Path) -> Path:
     raise ConfigurationError([f'{name} {what}: {guess}{remedy}'])
 
 
-def read(path: str | Path) -> list[Section]:
+def read(path: str | Path) -> Sequence[Section]:
     """Read the sections of a parameter file; ConfigurationError names the file and the line."""
     try:
         return parse(read_text(Path(path)))
@@ -136,7 +136,7 @@ def format_value(value: Value) -> str:
 
 
 def _load(
-    sections: list[Section], node: str, cls: type[Config], overrides: Mapping[str, object]
+    sections: Sequence[Section], node: str, cls: type[Config], overrides: Mapping[str, object]
 ) -> Config:
     """Build the configuration; names of other nodes in wildcard sections are left out."""
     known = {one.name for one in parameters(cls)}
@@ -161,7 +161,7 @@ def _load(
         raise ConfigurationError(problems) from None
 
 
-def _unknown_names(sections: list[Section]) -> Iterator[str]:
+def _unknown_names(sections: Sequence[Section]) -> Iterator[str]:
     known = known_names()
     for section in sections:
         for name, entry in section.entries.items():
@@ -169,7 +169,7 @@ def _unknown_names(sections: list[Section]) -> Iterator[str]:
                 yield f'line {entry.line}: {unknown(name, known)}'
 
 
-def unmatched_sections(sections: list[Section], nodes: Iterable[str]) -> Iterator[str]:
+def unmatched_sections(sections: Sequence[Section], nodes: Iterable[str]) -> Iterator[str]:
     """Yield a problem for each section that is meant for one of these nodes but would be ignored.
 
     Either its name is misspelt, or its namespace differs from the node's and no other section of

@@ -10,10 +10,11 @@ the other way round for PyYAML; `yes` is a bool, `010` is eight, `null` a string
 from __future__ import annotations
 
 import difflib
+import functools
 import math
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, cast
 
 import yaml
@@ -46,7 +47,7 @@ class Section(NamedTuple):
 
     pattern: str
     line: int
-    entries: dict[str, Entry]
+    entries: Mapping[str, Entry]
 
     @property
     def is_wildcard(self) -> bool:
@@ -59,7 +60,8 @@ class Section(NamedTuple):
         return re.fullmatch(expression.replace('#', '*'), node) is not None
 
 
-def parse(text: str) -> list[Section]:
+@functools.lru_cache(maxsize=16)  # a study loads the same presets hundreds of times
+def parse(text: str) -> tuple[Section, ...]:
     """Read the sections of a parameter file, in order.
 
     Raises ConfigurationError, with the line, if the text is not YAML or not a parameter file.
@@ -76,7 +78,7 @@ def parse(text: str) -> list[Section]:
         raise ConfigurationError([f'not valid YAML: {error}']) from error
     if root is None:
         raise _error(1, f'the file is empty: expected node names with {_PARAMETERS}')
-    return list(_sections(root, ''))
+    return tuple(_sections(root, ''))
 
 
 def parse_scalar(word: str) -> bool | int | float | str:
