@@ -8,7 +8,7 @@
 PYTHON ?= python3
 CONFIG ?= recommended
 DURATION ?= 60
-WORKERS ?= 2
+WORKERS ?= 3  # of tests on two cores: many wait for other processes
 MINUTES ?= 30
 
 .DEFAULT_GOAL := help

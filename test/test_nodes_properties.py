@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arbitrary input in arbitrary order: no callback raises, and every torque is valid.
 
-`make test-nightly` runs ten thousand examples of each, `make test` a few hundred in all.
+`make test-nightly` runs ten thousand examples of each, `make test` sixty.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointSt
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from sim_plant.node import PlantNode
 
-EXAMPLES = int(os.environ.get('BLF_DSC_EXAMPLES', '150'))
+EXAMPLES = int(os.environ.get('BLF_DSC_EXAMPLES', '60'))
 SETTINGS = settings(
     max_examples=EXAMPLES,
     deadline=None,
