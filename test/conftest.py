@@ -52,6 +52,14 @@ def ros():
     rig.close()
 
 
+@pytest.fixture
+def blank_pictures(monkeypatch):
+    """Write empty pictures where no test looks at them: drawing takes a second for each run."""
+    from blf_dsc_controller.analysis.style import Picture
+
+    monkeypatch.setattr(Picture, 'save', lambda _picture, path: path.touch())
+
+
 def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: not item.path.stem.startswith(_FIRST))
 

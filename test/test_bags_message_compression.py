@@ -12,6 +12,8 @@ from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.types import typestore
 
+pytestmark = pytest.mark.usefixtures('blank_pictures')
+
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 
 

@@ -19,6 +19,8 @@ from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE, JOINT_STATES
 from blf_dsc_controller.messages.types import definition
 
+pytestmark = pytest.mark.usefixtures('blank_pictures')
+
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 
 ODD = 'my_msgs/msg/Odd'  # of a package that does not exist

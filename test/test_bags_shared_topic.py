@@ -22,6 +22,8 @@ from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE, JOINT_STAT
 from blf_dsc_controller.replay.learn import learn
 from blf_dsc_controller.replay.what_if import what_if
 
+pytestmark = pytest.mark.usefixtures('blank_pictures')
+
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 
 CONFIG = recorded_run.loop_config().controller

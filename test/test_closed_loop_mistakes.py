@@ -12,6 +12,8 @@ from command import closed_loop, finished
 
 from blf_dsc_controller.cli.main import main
 
+pytestmark = pytest.mark.usefixtures('blank_pictures')
+
 WITHOUT_ROS = """
 import sys
 from importlib.machinery import PathFinder

@@ -24,6 +24,8 @@ from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.configuration.share import share_folder
 from blf_dsc_controller.errors import BlfDscError
 
+pytestmark = pytest.mark.usefixtures('blank_pictures')
+
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 
 MAGIC = b'\x89MCAP0\r\n'

@@ -87,6 +87,7 @@ def test_report_is_written(store):
         assert matplotlib.image.imread(store.folder / picture).shape[1] > 1200
 
 
+@pytest.mark.usefixtures('blank_pictures')
 def test_commands_in_the_report_reproduce_the_worst_runs(store, tmp_path, monkeypatch):
     write_report(store)
     page = html.unescape((store.folder / 'report.html').read_text())
@@ -113,6 +114,7 @@ def test_commands_in_the_report_reproduce_the_worst_runs(store, tmp_path, monkey
     assert main(arguments) == 1
 
 
+@pytest.mark.usefixtures('blank_pictures')
 def test_run_that_differs_from_its_stored_results_is_reported(store, tmp_path):
     folder = tmp_path / 'tampered'
     other = Store.create_or_open(folder, store.study)

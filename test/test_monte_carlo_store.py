@@ -21,6 +21,8 @@ from blf_dsc_controller.monte_carlo import store as stores
 from blf_dsc_controller.monte_carlo.runs import run_chunk
 from blf_dsc_controller.monte_carlo.store import Span, Store
 
+pytestmark = pytest.mark.usefixtures('blank_pictures')
+
 TIMEOUT = 300.0  # s; the machine may be busy, and kernels may have to be compiled
 
 

@@ -20,8 +20,8 @@ LAW = {'comparison': 'backstepping', 'comparison_detuned': 'backstepping'} | {
     name: name for name in ('model_based', 'slotine_li')
 }
 
-# Figures are drawn once for each law, and for the paper's set; the others have the same panels.
-DRAWN = {'recommended', 'paper', 'comparison', 'model_based', 'slotine_li', 'panda'}
+# Figures are drawn once for each law and each kind of arm; the others have the same panels.
+DRAWN = {'recommended', 'comparison', 'model_based', 'slotine_li', 'panda'}
 
 
 def offline(preset, out, duration):
@@ -30,9 +30,9 @@ def offline(preset, out, duration):
 
 
 @pytest.mark.parametrize('preset', PRESETS)
-def test_preset_runs_by_name_and_saves_its_configuration(preset, tmp_path, capsys, monkeypatch):
+def test_preset_runs_by_name_and_saves_its_configuration(preset, tmp_path, capsys, request):
     if preset not in DRAWN:
-        monkeypatch.setattr('blf_dsc_controller.cli.run.draw', lambda *_: [])
+        request.getfixturevalue('blank_pictures')
     assert offline(preset, tmp_path / 'out', 0.5) == 0
     printed = capsys.readouterr().out
     summary = json.loads((tmp_path / 'out' / 'summary.json').read_text(encoding='utf-8'))
@@ -47,6 +47,7 @@ def test_preset_runs_by_name_and_saves_its_configuration(preset, tmp_path, capsy
     assert ('final_torque_error' in summary['learning']) is from_urdf
 
 
+@pytest.mark.usefixtures('blank_pictures')
 def test_offline_run_warns_about_a_rejected_column_with_the_reason(tmp_path, capsys):
     path = tmp_path / 'cosine.yaml'
     path.write_text(
@@ -62,6 +63,7 @@ def test_offline_run_warns_about_a_rejected_column_with_the_reason(tmp_path, cap
 
 
 @pytest.mark.skipif(importlib.util.find_spec('rclpy') is None, reason='needs ROS 2')
+@pytest.mark.usefixtures('blank_pictures')
 def test_papers_preset_over_ros_matches_its_offline_run_bit_for_bit(tmp_path):
     """Lambda prediction, gradient, no columns and a known truth: paths the defaults do not take."""
     assert offline('paper', tmp_path / 'offline', 1.0) == 0

@@ -205,6 +205,7 @@ def test_implausible_inertias_are_named():
     assert 'at its torque limit panda_joint7 accelerates at only ' in ' '.join(found)
 
 
+@pytest.mark.usefixtures('blank_pictures')
 def test_closed_loop_warns_before_it_runs(tmp_path, capsys):
     path = tmp_path / 'short.yaml'
     path.write_text(
