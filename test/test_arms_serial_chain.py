@@ -9,7 +9,7 @@ import pytest
 from numba import njit
 from random_arm import CONFIG, PANDA, UR5E, configuration, pinocchio_model, random_urdf
 
-import blf_dsc_controller.arms.model  # noqa: F401 - lets kernels call the methods
+from blf_dsc_controller.arms.batch import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.chain_kernels import ROTOR
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import read_chain
@@ -156,3 +156,17 @@ def test_chosen_columns_keep_their_values_names_and_units():
     rotor = 'kg' if whole.chain.joints[0].kind == 'prismatic' else 'kg m^2'
     assert part.parameter_units == (rotor, 'kg', 'kg m', 'kg m^2')
     assert {joint.kind for joint in whole.chain.joints} > {'prismatic'}
+
+
+def test_many_states_at_once_give_the_regressors_of_each():
+    case = Case('six')
+    states = case.random.normal(size=(5, 4, case.n))
+    H = regressors_at(case.arm, *np.moveaxis(states, 1, 0))
+    np.testing.assert_array_equal(H, [case.H(*state) for state in states])
+
+
+def test_inertia_matrices_match_pinocchio():
+    case = Case('six')
+    q = np.stack((case.q + 0.5, case.q))
+    M = inertia_matrices(case.arm, case.phi, q)[1]
+    np.testing.assert_allclose(M, case.matrices()[0], atol=1e-11)
