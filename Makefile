@@ -8,7 +8,8 @@
 PYTHON ?= python3
 CONFIG ?= recommended
 DURATION ?= 60
-WORKERS ?= 3  # of tests on two cores: many wait for other processes
+# Of tests on two cores: many wait for other processes.
+WORKERS ?= 3
 MINUTES ?= 30
 
 .DEFAULT_GOAL := help

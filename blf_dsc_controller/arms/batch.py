@@ -12,7 +12,7 @@ from blf_dsc_controller.compiled.layout import Array
 
 def regressors_at(model: ArmModel, q: Array, dq: Array, v: Array, a: Array) -> Array:
     """Return H (k, n, p) of the states (k, n): H P = M(q) a + C(q, dq) v + G(q)   [N m]."""
-    H = np.zeros((*q.shape, len(model.parameter_names)))
+    H = np.zeros((*q.shape, model.p))
     q, dq, v, a = (np.ascontiguousarray(each) for each in (q, dq, v, a))
     _fill_regressors(model, q, dq, v, a, H)
     return H
@@ -25,6 +25,11 @@ def inertia_matrices(model: ArmModel, P: Array, q: Array) -> Array:
     units = np.tile(np.eye(n), (k, 1))
     _fill_momentum_regressors(model, np.repeat(q, n, axis=0), units, Yp, Yr)
     return np.swapaxes((Yp @ P).reshape(k, n, n), 1, 2)
+
+
+def free_inertias(M: Array) -> Array:
+    """Return the inertia (k, n) of each joint with the others free, of matrices M (k, n, n)."""
+    return 1.0 / np.diagonal(np.linalg.inv(M), axis1=1, axis2=2)
 
 
 @kernel

@@ -28,6 +28,10 @@ class ArmModel(Protocol):
         """Number of joints."""
 
     @property
+    def p(self) -> int:
+        """Number of parameters."""
+
+    @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the p entries of P, in order."""
 

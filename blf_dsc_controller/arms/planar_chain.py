@@ -28,6 +28,11 @@ class PlanarChain(NamedTuple):
     r: float  # g / l1, 1/s^2
 
     @property
+    def p(self) -> int:
+        """Number of parameters."""
+        return self.n * (self.n + 1) // 2
+
+    @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the P_ij, in the order of the regressor's columns."""
         if self.n == 2:
@@ -38,7 +43,7 @@ class PlanarChain(NamedTuple):
     @property
     def parameter_units(self) -> tuple[str, ...]:
         """Units of the P_ij."""
-        return ('kg m^2',) * (self.n * (self.n + 1) // 2)
+        return ('kg m^2',) * self.p
 
     def regressor(self, q: Array, dq: Array, v: Array, a: Array, H: Array) -> None:
         """Fill H (n, p) so that H P = M(q) a + C(q, dq) v + G(q)   [N m], Property III."""

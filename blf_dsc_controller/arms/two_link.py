@@ -33,6 +33,11 @@ class TwoLink(NamedTuple):
         return 2
 
     @property
+    def p(self) -> int:
+        """Number of parameters."""
+        return 3
+
+    @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the entries of P."""
         return PARAMETER_NAMES

@@ -128,14 +128,18 @@ def over_postures(
 
     Both are taken over random postures within the limits, with the rated payload [kg].
     """
-    from blf_dsc_controller.arms.batch import inertia_matrices, regressors_at  # slow: compiles
+    from blf_dsc_controller.arms.batch import (  # slow: compiles
+        free_inertias,
+        inertia_matrices,
+        regressors_at,
+    )
     from blf_dsc_controller.arms.prior import prior_factor
 
     model = parameters.model
     n = model.n
     L = prior_factor(chain, parameters, payload, np.zeros(n))
     q = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, n))
-    free = 1.0 / np.diagonal(np.linalg.inv(inertia_matrices(model, np.array(P), q)), 0, 1, 2)
+    free = free_inertias(inertia_matrices(model, np.array(P), q))
     rest = np.zeros_like(q)
     deviation = np.linalg.norm(regressors_at(model, q, rest, rest, rest) @ L, axis=2)
     return free.min(axis=0), deviation.max(axis=0)

@@ -74,7 +74,7 @@ def prior_covariance(config: ControllerConfig) -> np.ndarray:
     """
     columns = column_names(config)
     if config.model != 'urdf':
-        return np.eye(len(model_of(config).parameter_names) + len(columns))
+        return np.eye(model_of(config).p + len(columns))
     L = learned_of(config.robot, config.robot.chain(config.joints)).L
     covariance = np.zeros((len(L) + len(columns),) * 2)
     covariance[: len(L), : len(L)] = L @ L.T
@@ -97,7 +97,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     """Return the settings of a configuration, in the paper's symbols."""
     model = model_of(config)
     learning = config.learning
-    p, columns = len(model.parameter_names), len(column_names(config))
+    p, columns = model.p, len(column_names(config))
     truth = config.truth
     per_joint = zip(
         config.barrier.bound, config.barrier.weight, config.barrier.slope_limit, strict=True

@@ -163,7 +163,7 @@ def _solve(X: Floats, u: Floats, rho: float) -> tuple[Floats, Floats, Floats]:
 
 def _least_inertia(model: ArmModel, estimate: Floats, q: Floats) -> float:
     """Return the smallest eigenvalue of M at some of q (N, n), by the estimate (m,) of P and d."""
-    P = estimate[: len(model.parameter_names)]
+    P = estimate[: model.p]
     some = q[:: max(1, q.shape[0] // _POSITIONS)]
     return float(np.linalg.eigvalsh(inertia_matrices(model, P, some)).min())
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms.batch import inertia_matrices, regressors_at
+from blf_dsc_controller.arms.batch import free_inertias, inertia_matrices, regressors_at
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.prediction import rows_along
@@ -40,8 +40,7 @@ class ReferenceLoad(NamedTuple):
     @property
     def free_inertia(self) -> Floats:
         """Smallest inertia (n,) of each joint with the others free, kg m^2."""
-        free = 1.0 / np.diagonal(np.linalg.inv(self.inertia), axis1=1, axis2=2)
-        least: Floats = free.min(axis=0, initial=np.inf)
+        least: Floats = free_inertias(self.inertia).min(axis=0, initial=np.inf)
         return least
 
     def damping(self, settings: Settings) -> Floats:
