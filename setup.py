@@ -111,7 +111,6 @@ setup(
             'pytest>=7',
             'pytest-xdist',
             'hypothesis',
-            'coverage',
             'mujoco',
             'pin',  # pinocchio, the oracle of the arm models: 400 MB
             'setuptools>=70.1',

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node's process ends cleanly, even if its shutdown fails."""
+"""A node's process ends cleanly, and so does the middleware in it, even if a shutdown fails."""
 
 from __future__ import annotations
 
@@ -28,6 +28,31 @@ class Broken(PlainNode):
 
 print(run(lambda: Broken('broken')), rclpy.ok())
 """
+
+
+ENDED = """
+from pathlib import Path
+from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.process import run
+from sim_plant.node import PlantNode
+
+class Ended({node}):
+    def _on_poll(self):
+        self.finished = True
+
+print(run(Ended))
+# The watchdog of Fast DDS's shared memory belongs to the process.
+names = [(task / 'comm').read_text().strip() for task in Path('/proc/self/task').iterdir()]
+print(sorted(name for name in names if name.startswith('dds.') and name != 'dds.shm.wdog'))
+"""
+
+
+@pytest.mark.parametrize('node', ['ControllerNode', 'PlantNode'])
+def test_middleware_ends_with_the_node_and_not_only_with_the_process(node):
+    process = subprocess.run(
+        [sys.executable, '-c', ENDED.format(node=node)], capture_output=True, text=True, check=False
+    )
+    assert process.stdout == '0\n[]\n', process.stderr
 
 
 @pytest.mark.parametrize('error', ['RCLError', 'OSError', 'BlfDscError'])

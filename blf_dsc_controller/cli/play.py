@@ -87,19 +87,19 @@ def _announce(node: PlayerNode, options: Namespace) -> None:
 
 
 def _run(node: PlayerNode, options: Namespace) -> None:
-    executor = EventsExecutor()
-    executor.add_node(node)
-    begin = time.monotonic()
-    while time.monotonic() - begin < options.delay:
-        executor.spin_once(timeout_sec=_LONGEST_WAIT)
-    if not options.start_paused:
-        node.resume()
-    progress = Progress('played', (node.end - node.begin) * 1e-9)
-    try:
-        while not node.is_over:
-            wait = node.play()
-            progress.show(node.elapsed, 'paused' if node.timeline.paused else '')
-            executor.spin_once(timeout_sec=min(wait, _LONGEST_WAIT))
-        drain(node.outputs)
-    finally:
-        progress.close()
+    with EventsExecutor() as executor:
+        executor.add_node(node)
+        begin = time.monotonic()
+        while time.monotonic() - begin < options.delay:
+            executor.spin_once(timeout_sec=_LONGEST_WAIT)
+        if not options.start_paused:
+            node.resume()
+        progress = Progress('played', (node.end - node.begin) * 1e-9)
+        try:
+            while not node.is_over:
+                wait = node.play()
+                progress.show(node.elapsed, 'paused' if node.timeline.paused else '')
+                executor.spin_once(timeout_sec=min(wait, _LONGEST_WAIT))
+            drain(node.outputs)
+        finally:
+            progress.close()

@@ -215,7 +215,7 @@ class Monitor:
         if kind is None:
             self._receive_last()
         self.progress.close()
-        self._executor.remove_node(self._node)
+        self._executor.shutdown()
         self._node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 

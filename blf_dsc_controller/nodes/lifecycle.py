@@ -28,6 +28,7 @@ from blf_dsc_controller.nodes.endpoints import (
 )
 from blf_dsc_controller.nodes.rclpy_internals import (
     RCLError,
+    destroy_state_machine,
     lifecycle_state,
     raw_publish,
     wrap_change_state,
@@ -51,6 +52,11 @@ class ManagedNode(LifecycleNode, process.PlainNode):
         self._transition_error: Exception | None = None
         super().__init__(name, **options)
         wrap_change_state(self, self._rejecting)
+
+    def destroy_node(self) -> None:
+        """Destroy the node with its state machine."""
+        super().destroy_node()
+        destroy_state_machine(self)
 
     def configure(self) -> None:
         """Create everything the node computes with."""

@@ -73,15 +73,14 @@ def run(make_node: Callable[[], PlainNode]) -> int:
     try:
         refuse_unknown(sys.argv)
         rclpy.init(args=sys.argv, signal_handler_options=rclpy.SignalHandlerOptions.NO)
-        executor = EventsExecutor()
-        node = make_node()
-        executor.add_node(node)
-        # What is loaded by now stays: scanning it again would stall the loop for 0.1 s.
-        gc.collect()
-        gc.freeze()
-        while not (interrupted() or node.finished):
-            spin_once(executor, node)
-        executor.remove_node(node)
+        with EventsExecutor() as executor:
+            node = make_node()
+            executor.add_node(node)
+            # What is loaded by now stays: scanning it again would stall the loop for 0.1 s.
+            gc.collect()
+            gc.freeze()
+            while not (interrupted() or node.finished):
+                spin_once(executor, node)
         if node.failure is not None:
             raise node.failure
     except UnknownROSArgsError as error:

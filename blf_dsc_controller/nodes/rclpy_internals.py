@@ -62,6 +62,14 @@ def lifecycle_state(node: LifecycleNode) -> str:
     return str(node._state_machine.current_state[1])  # noqa: SLF001
 
 
+def destroy_state_machine(node: LifecycleNode) -> None:
+    """Destroy the state machine, which rclpy forgets when it destroys the node.
+
+    It would keep the middleware's threads alive until the process exits, where they crash at times.
+    """
+    node._state_machine.destroy_when_not_in_use()  # noqa: SLF001
+
+
 def wrap_change_state(
     node: LifecycleNode, wrap: Callable[[Callable[[Any, Any], Any]], Callable[[Any, Any], Any]]
 ) -> None:
