@@ -3,15 +3,16 @@
 
 from __future__ import annotations
 
+from math import tanh
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from random_arm import CONFIG, PANDA
 
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.compiled.layout import size_of, view_of
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE
@@ -65,10 +66,10 @@ class Reference(NamedTuple):
     phase: np.ndarray  # (k, n) rad
 
     def at(self, t):
-        """Return position and velocity (2, n) at a time [s]."""
-        angle = self.frequency * t + self.phase
-        swing = self.frequency * self.amplitude * np.cos(angle)
-        return np.array([self.offset + (self.amplitude * np.sin(angle)).sum(0), swing.sum(0)])
+        """Return position and velocity (..., 2, n) at times (...) [s]."""
+        angle = self.frequency * np.asarray(t)[..., np.newaxis, np.newaxis] + self.phase
+        q = self.offset + (self.amplitude * np.sin(angle)).sum(-2)
+        return np.stack([q, (self.frequency * self.amplitude * np.cos(angle)).sum(-2)], -2)
 
 
 def reference_of(chain, seed, tones=3):
@@ -81,41 +82,48 @@ def reference_of(chain, seed, tones=3):
     return Reference(limits.mean(1), amplitude, frequency, random.uniform(0.0, 6.3, (tones, n)))
 
 
-@njit(error_model='numpy')
-def _shake(arm, vector, viscous, coulomb, motion, q, gains, states):
-    """Follow `motion` (N, 2, n) by PD from q, torques held for a period; fill states (N, 3, n)."""
+@kernel
+def _shake(arm, vector, viscous, coulomb, motion, gains, work, states):
+    """Follow `motion` (N, 2, n) by PD, torques held for a period; fill states (N, 3, n).
+
+    The rows of `work` (8, n) are zero at first.
+    """
     now = motion_of(vector, arm)
-    n = q.size
-    dq = motion[0, 1].copy()
-    k1, torque = np.zeros((4, 2, n)), np.zeros(n)
+    q, dq, torque = work[0], work[1], work[2]
+    qs, dqs, ddq, q_step, dq_step = work[3], work[4], work[5], work[6], work[7]  # Runge-Kutta
+    for i in range(q.size):
+        q[i], dq[i] = motion[0, 0, i], motion[0, 1, i]
     for k in range(motion.shape[0]):
-        states[k, 0], states[k, 1], states[k, 2] = q, dq, torque
-        for i in range(n):
-            torque[i] = gains[i] * (
-                30.0 * (motion[k, 0, i] - q[i]) + 3.0 * (motion[k, 1, i] - dq[i])
-            )
-        for stage in range(4):
-            size = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
-            before = k1[stage - 1]
-            qs, dqs = q + size * PERIOD * before[0], dq + size * PERIOD * before[1]
+        for i in range(q.size):
+            states[k, 0, i], states[k, 1, i], states[k, 2, i] = q[i], dq[i], torque[i]
+            q_error, dq_error = motion[k, 0, i] - q[i], motion[k, 1, i] - dq[i]
+            torque[i] = gains[i] * (30.0 * q_error + 3.0 * dq_error)
+            q_step[i] = dq_step[i] = 0.0
+        for share, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
+            for i in range(q.size):
+                qs[i] = q[i] + share * PERIOD * dqs[i]
+                dqs[i] = dq[i] + share * PERIOD * ddq[i]
+                ddq[i] = torque[i] - viscous[i] * dqs[i] - coulomb[i] * tanh(dqs[i] / 0.005)
             locate(arm, qs, dqs, now)
-            ddq = torque - viscous * dqs - coulomb * np.tanh(dqs / 0.005)
             acceleration(arm, now, 0.0, ddq, ddq)
-            k1[stage, 0], k1[stage, 1] = dqs, ddq
-        mean = (k1[0] + 2.0 * k1[1] + 2.0 * k1[2] + k1[3]) / 6.0
-        q, dq = q + PERIOD * mean[0], dq + PERIOD * mean[1]
+            for i in range(q.size):
+                q_step[i] += weight * PERIOD / 6.0 * dqs[i]
+                dq_step[i] += weight * PERIOD / 6.0 * ddq[i]
+        for i in range(q.size):
+            q[i] += q_step[i]
+            dq[i] += dq_step[i]
 
 
 def shake(chain, truth, reference, duration):
     """Return states (N, 3, n) of our own plant: position, velocity, previous torque."""
     arm = rigid_bodies(chain, GRAVITY, truth.inertias, truth.rotors)
     times = np.arange(round(duration / PERIOD)) * PERIOD
-    motion = np.array([reference.at(t) for t in times])
+    motion = reference.at(times)
     gains = np.array([min(joint.effort, 100.0) for joint in chain.joints]) / 4.0
-    states = np.zeros((times.size, 3, len(chain.joints)))
-    vector = np.zeros(motion_size(arm))
-    arguments = truth.viscous, truth.coulomb, motion, motion[0, 0].copy(), gains, states
-    _shake(arm, vector, *arguments)
+    n = len(chain.joints)
+    states, vector = np.zeros((times.size, 3, n)), np.zeros(motion_size(arm))
+    work = np.zeros((8, n))
+    _shake(arm, vector, truth.viscous, truth.coulomb, motion, gains, work, states)
     return states
 
 

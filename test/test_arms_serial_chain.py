@@ -6,13 +6,13 @@ from __future__ import annotations
 import numpy as np
 import pinocchio
 import pytest
-from numba import njit
 from random_arm import CONFIG, PANDA, UR5E, configuration, pinocchio_model, random_urdf
 
 from blf_dsc_controller.arms.batch import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.chain_kernels import ROTOR
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import read_chain
+from blf_dsc_controller.compiled.jit import kernel
 
 # The base stands on the floor, is mounted on a wall, or is tilted.
 ARMS = {
@@ -125,7 +125,7 @@ def test_torque_is_the_rate_of_momentum_plus_the_rest(case):
     np.testing.assert_allclose(ours, expected, atol=1e-7 * max(1.0, np.abs(expected).max()))
 
 
-@njit(error_model='numpy')
+@kernel
 def all_three(model, q, dq, v, a, separate, together):
     model.regressor(q, dq, v, a, separate[0])
     model.momentum_regressor(q, dq, separate[1], separate[2])

@@ -70,9 +70,10 @@ def last_progress(errors):
     return [line for line in errors.splitlines() if line.startswith('closed loop ')][-1]
 
 
-@pytest.mark.parametrize(('mode', 'duration'), [('lockstep', 8), ('realtime', 5)])
-def test_full_disk_stops_the_recording_but_not_the_loop(tmp_path, mode, duration):
+@pytest.mark.parametrize('mode', ['lockstep', 'realtime'])
+def test_full_disk_stops_the_recording_but_not_the_loop(tmp_path, mode):
     # Full after 2 s: a second takes over 1 MB, and half of the 4 MB is reserved to close the bag.
+    duration = 5
     config = tmp_path / 'patient.yaml'
     config.write_text(PATIENT)
     run = ('--config', config, '--mode', mode, '--duration', duration, '--out')

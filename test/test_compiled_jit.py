@@ -10,6 +10,7 @@ import numba
 import numpy as np
 import pytest
 from numba.core.errors import UnsupportedError
+from shaken_arm import _shake
 
 import blf_dsc_controller
 from blf_dsc_controller.compiled import jit
@@ -32,6 +33,12 @@ def test_kernel_depends_on_the_files_it_is_compiled_from():
     assert names(update) >= LAW | REFERENCE | ALWAYS
     assert names(run_loop) >= LAW | REFERENCE | PLANT | ALWAYS
     assert names(step_plant) >= PLANT | ALWAYS
+
+
+def test_kernel_outside_the_package_depends_on_what_it_uses_of_it():
+    files = jit.dependencies(_shake)[0]
+    assert {path.name for path in files} >= {'shaken_arm.py', 'rigid_body.py', 'cholesky.py'}
+    assert 'step.py' not in {path.name for path in files}
 
 
 def test_kernel_does_not_depend_on_other_files():

@@ -7,11 +7,11 @@ import mujoco
 import numpy as np
 import pinocchio
 import pytest
-from numba import njit
 from random_arm import CONFIG, PANDA, UR5E, configuration, pinocchio_model, random_urdf
 
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import read_chain
+from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.compiled.layout import size_of, view_of
 from sim_plant.rigid_body import Motion, acceleration, locate, rigid_bodies, tip
 
@@ -130,7 +130,7 @@ def test_mujoco_reads_the_same_arm_from_the_urdf(name):
     np.testing.assert_allclose(case.acceleration(), data.qacc[order], rtol=1e-9, atol=1e-9)
 
 
-@njit(error_model='numpy')
+@kernel
 def compiled(arm, vector, q, dq, torque, ddq):
     now = motion_of(vector, arm)
     locate(arm, q, dq, now)

@@ -154,12 +154,24 @@ class TopicMessages:
         received, raw = [self.received[k] for k in kept], [self.raw[k] for k in kept]
         return replace(self, received=received, raw=raw)
 
+    def name_lists(self) -> list[tuple[str, ...]]:
+        """Return each list of names in a message; UnreadableMessageError if the first has none.
+
+        Messages are decoded only if they do not begin like one before.
+        """
+        first = self.layout()
+        begin = slice(first.begin, first.arrays[0].size_offset)
+        found: dict[tuple[bytes, bytes], tuple[str, ...]] = {}
+        for raw in self.raw:
+            beginning = raw[:2], raw[begin]
+            if beginning not in found:
+                with suppress(MessageError):
+                    found[beginning] = joint_state_layout(raw).names
+        return list(found.values())
+
     def joint_names(self) -> tuple[str, ...]:
         """Return the longest list of names in a message; UnreadableMessageError if it is empty."""
-        names = self.layout().names
-        for raw in {len(raw): raw for raw in self.raw}.values():
-            with suppress(UnreadableMessageError):
-                names = max(names, replace(self, raw=[raw]).layout().names, key=len)
+        names = max(self.name_lists(), key=len)
         if not names:
             unnamed = MessageError('it names no joint, so its values cannot be assigned to joints')
             raise UnreadableMessageError(self.name, 0, unnamed)

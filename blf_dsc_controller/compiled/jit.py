@@ -47,17 +47,22 @@ _METHODS: dict[str, list[Callable[..., object]]] = {}  # by name, see `compile_m
 
 
 def dependencies(function: Callable[..., object]) -> tuple[set[Path], set[str]]:
-    """Return the source files of a kernel, and the constants in it as `name=value`."""
+    """Return the source files of a kernel, and the constants in it as `name=value`.
+
+    The kernel itself may be outside the package.
+    """
     files, constants = set(_IN_EVERY_KERNEL), set()
     pending: list[tuple[str, Any]] = [('', function)]
     seen: list[object] = []
+    function = getattr(function, 'py_func', function)
     while pending:
         name, value = pending.pop()
         value = getattr(value, 'py_func', value)
         if isinstance(value, (int, float, str, tuple)):
             constants.add(f'{name}={value!r}')
         module = getattr(value, '__module__', None) or ''
-        if not module.startswith(_PACKAGES) or any(value is other for other in seen):
+        ours = value is function or module.startswith(_PACKAGES)
+        if not ours or any(value is other for other in seen):
             continue
         seen.append(value)
         files.add(Path(inspect.getfile(sys.modules[module])).resolve())

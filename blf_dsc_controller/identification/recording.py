@@ -18,7 +18,6 @@ from blf_dsc_controller.arms.urdf import chain_joints, moving_joints
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap, read_content
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.torque import applied_torque
-from blf_dsc_controller.messages.cdr import joint_state_layout
 from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.run import Floats, Stamps
 
@@ -54,7 +53,7 @@ def read_recording(
             of no arm.
     """
     content = read_content(path, namespace, names)
-    named = [joint_state_layout(raw).names for raw in content.topics[JOINT_STATES].raw]
+    named = content.topics[JOINT_STATES].name_lists()
     joints = tuple(joints) or _arm_joints(text, set().union(*named), names)
     theirs = names.joints_of(joints)
     content = content.of_joints(theirs)
