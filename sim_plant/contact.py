@@ -14,7 +14,7 @@ from blf_dsc_controller.compiled.layout import Array
 from sim_plant.arm import Arm
 
 
-class Wall(NamedTuple):
+class WallSettings(NamedTuple):
     """A plane that pushes the tip along its unit normal."""
 
     point: Annotated[Array, '3']  # m
@@ -35,12 +35,12 @@ class Contact(NamedTuple):
     """Sources of the force at the tip."""
 
     push: np.ndarray  # (3,) N
-    wall: Wall
+    wall: WallSettings
     tip: TipState
 
 
 @inner
-def wall_force(wall: Wall, position: np.ndarray, velocity: np.ndarray) -> float:
+def wall_force(wall: WallSettings, position: np.ndarray, velocity: np.ndarray) -> float:
     """Return the normal force [N], >= 0, on a tip with position (3,) [m] and velocity (3,) [m/s].
 
     Kelvin-Voigt model: k depth + d d(depth)/dt inside the wall, 0 outside.

@@ -13,7 +13,7 @@ from blf_dsc_controller.compiled.layout import Array, Cell
 from sim_plant.disturbance import JointDisturbance
 
 
-class Load(NamedTuple):
+class LoadSettings(NamedTuple):
     """Load that acts all the time."""
 
     payload: float  # kg, point mass at the tip
@@ -22,7 +22,7 @@ class Load(NamedTuple):
     offset: Annotated[Array, 'n']  # rad, measured minus true position
 
 
-class Events(NamedTuple):
+class EventSettings(NamedTuple):
     """Contribution of each event to load and friction; times are in samples."""
 
     begin: Annotated[Array, 'events']
@@ -74,7 +74,11 @@ def put(target: np.ndarray, values: np.ndarray) -> None:
 
 @inner
 def update_acting(
-    disturbance: JointDisturbance, load: Load, events: Events, sample: float, acting: Acting
+    disturbance: JointDisturbance,
+    load: LoadSettings,
+    events: EventSettings,
+    sample: float,
+    acting: Acting,
 ) -> None:
     """Sum load and events of a sample, unless already done."""
     if acting.sample[0] == sample:

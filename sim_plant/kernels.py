@@ -15,9 +15,9 @@ from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
 from blf_dsc_controller.compiled.views import part, view
 from sim_plant.actuator import Drives, DriveState, actuate
 from sim_plant.arm import Arm
-from sim_plant.contact import Contact, TipState, Wall
+from sim_plant.contact import Contact, TipState, WallSettings
 from sim_plant.disturbance import JointDisturbance
-from sim_plant.events import Acting, Events, Load, update_acting
+from sim_plant.events import Acting, EventSettings, LoadSettings, update_acting
 from sim_plant.integrator import Stages, integrate
 from sim_plant.motion import Motion, disturbing_torque
 from sim_plant.sensors import EncoderReading, Encoders, draw, is_noisy, sense
@@ -38,9 +38,9 @@ class PlantSettings(NamedTuple):
     encoders: Encoders
     disturbance: JointDisturbance
     drives: Drives
-    load: Load
-    wall: Wall
-    schedule: Events
+    load: LoadSettings
+    wall: WallSettings
+    schedule: EventSettings
 
 
 class PlantState(NamedTuple):

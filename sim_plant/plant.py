@@ -13,9 +13,9 @@ from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.plant import PlantConfig
 from sim_plant.actuator import Drives, lag
 from sim_plant.arms import arm_of, parameter_names_of
-from sim_plant.contact import Wall
+from sim_plant.contact import WallSettings
 from sim_plant.disturbance import JointDisturbance
-from sim_plant.events import Events, Load
+from sim_plant.events import EventSettings, LoadSettings
 from sim_plant.integrator import INTEGRATORS
 from sim_plant.kernels import (
     PlantSettings,
@@ -190,8 +190,8 @@ def settings_of(config: PlantConfig) -> PlantSettings:
             *lag(actuator.time_constant, config.sample_time),
             actuator.torque_noise,
         ),
-        load=Load(load.payload, *map(np.array, (load.torque, load.force, sensor.offset))),
-        wall=Wall(
+        load=LoadSettings(load.payload, *map(np.array, (load.torque, load.force, sensor.offset))),
+        wall=WallSettings(
             np.array(wall.point),
             np.array(wall.normal) / np.linalg.norm(wall.normal),
             wall.stiffness,
@@ -218,7 +218,7 @@ def _disturbance_of(config: PlantConfig) -> JointDisturbance:
     )
 
 
-def _schedule_of(config: PlantConfig) -> Events:
+def _schedule_of(config: PlantConfig) -> EventSettings:
     """Return the events with times in samples, and zeros for what is not given."""
     events, count, n = config.events, len(config.events.begin), len(config.joints)
 
@@ -230,7 +230,7 @@ def _schedule_of(config: PlantConfig) -> Events:
         return np.rint(times / config.sample_time)
 
     begin, duration = values('begin'), values('duration')
-    return Events(
+    return EventSettings(
         begin=samples(begin),
         end=np.where(duration > 0.0, samples(begin + duration), np.inf),
         ramp=samples(values('ramp')),

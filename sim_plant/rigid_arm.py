@@ -12,12 +12,12 @@ from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.compiled.jit import called
 from blf_dsc_controller.compiled.layout import Array, pack, size_of, view_of
-from sim_plant.rigid_body import Motion, RigidBodies, acceleration, locate, rigid_bodies, tip
+from sim_plant.rigid_body import BodyMotion, RigidBodies, acceleration, locate, rigid_bodies, tip
 
-motion_of, motion_size = view_of(Motion), size_of(Motion)
+motion_of, motion_size = view_of(BodyMotion), size_of(BodyMotion)
 
 
-class Content(NamedTuple):
+class ArmContent(NamedTuple):
     """Constants of an arm."""
 
     n: int
@@ -28,7 +28,7 @@ class Content(NamedTuple):
     rest: Annotated[Array, 'n']  # zero velocities
 
 
-content_of = view_of(Content)
+content_of = view_of(ArmContent)
 
 
 class RigidArm(NamedTuple):
@@ -36,8 +36,8 @@ class RigidArm(NamedTuple):
 
     n: int
     p: int
-    content: Array  # Content
-    memory: Array  # Motion
+    content: Array  # ArmContent
+    memory: Array  # BodyMotion
 
     def fill_parameters(self, payload: float, P: Array) -> None:
         """Write the base parameters P (p,) with a payload [kg]."""
@@ -87,7 +87,7 @@ def rigid_arm(
     payload = np.zeros_like(inertias)
     payload[-1] = inertia_of(np.outer(point, point))
     P = parameters.of(inertias, rotors)
-    content = Content(
+    content = ArmContent(
         n=bodies.n,
         p=P.size,
         bodies=bodies,

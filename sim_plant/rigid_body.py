@@ -50,7 +50,7 @@ class RigidBodies(NamedTuple):
     tip: Annotated[Array, 3]  # m, in the last body
 
 
-class Motion(NamedTuple):
+class BodyMotion(NamedTuple):
     """Pose and motion of the bodies in the base frame; entry 0 of each field is the base."""
 
     rotation: Annotated[Array, 'n + 1', 3, 3]
@@ -90,7 +90,7 @@ def rigid_bodies(
 
 
 @inner
-def locate(arm: RigidBodies, q: np.ndarray, dq: np.ndarray, now: Motion) -> None:
+def locate(arm: RigidBodies, q: np.ndarray, dq: np.ndarray, now: BodyMotion) -> None:
     """Write pose and motion of the bodies at q (n,) and dq (n,)."""
     for r in range(3):
         for c in range(3):
@@ -132,7 +132,7 @@ def turn(R: np.ndarray, axis: Vector, angle: float) -> None:
 
 
 @inner
-def tip(arm: RigidBodies, now: Motion, position: np.ndarray, jacobian: np.ndarray) -> None:
+def tip(arm: RigidBodies, now: BodyMotion, position: np.ndarray, jacobian: np.ndarray) -> None:
     """Write the tip position (3,) [m] after `locate`, and its Jacobian (3, n) [m/rad, or 1]."""
     lever = product(now.rotation[arm.n], vector(arm.tip))
     end = plus(vector(now.origin[arm.n]), lever)
@@ -147,7 +147,7 @@ def tip(arm: RigidBodies, now: Motion, position: np.ndarray, jacobian: np.ndarra
 
 @inner
 def acceleration(
-    arm: RigidBodies, now: Motion, payload: float, torque: np.ndarray, ddq: np.ndarray
+    arm: RigidBodies, now: BodyMotion, payload: float, torque: np.ndarray, ddq: np.ndarray
 ) -> None:
     """Write ddq (n,) after `locate`, with a point mass `payload` [kg] at the tip.
 
@@ -167,7 +167,7 @@ def acceleration(
 
 
 @inner
-def combine_bodies(arm: RigidBodies, now: Motion, payload: float) -> None:
+def combine_bodies(arm: RigidBodies, now: BodyMotion, payload: float) -> None:
     """Sum inertias, and forces and moments of the bias, from the tip to the base."""
     n = arm.n
     F = N = (0.0, 0.0, 0.0)
@@ -230,7 +230,7 @@ def add_point(m: float, lever: Vector, out: np.ndarray) -> None:
 
 
 @inner
-def fill_inertia(arm: RigidBodies, now: Motion) -> None:
+def fill_inertia(arm: RigidBodies, now: BodyMotion) -> None:
     """Fill M (n, n), the inertia matrix of the joints, rotors included."""
     for j in range(arm.n):
         axis, h = vector(now.axis[j + 1]), vector(now.moment[j + 1])
@@ -246,7 +246,7 @@ def fill_inertia(arm: RigidBodies, now: Motion) -> None:
 
 
 @inner
-def along_joint(arm: RigidBodies, now: Motion, i: int, F: Vector, N: Vector) -> float:
+def along_joint(arm: RigidBodies, now: BodyMotion, i: int, F: Vector, N: Vector) -> float:
     """Return the torque [N m], or force [N], of joint i under F and a moment N about its origin."""
     axis = vector(now.axis[i + 1])
     return dot(axis, F) if arm.prismatic[i] == 1.0 else dot(axis, N)

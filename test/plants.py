@@ -4,10 +4,10 @@
 import numpy as np
 
 from sim_plant.actuator import Drives, lag
-from sim_plant.contact import Contact, TipState, Wall
+from sim_plant.contact import Contact, TipState, WallSettings
 from sim_plant.disturbance import JointDisturbance
 from sim_plant.dynamics import PointMassArm
-from sim_plant.events import Events, Load
+from sim_plant.events import EventSettings, LoadSettings
 from sim_plant.integrator import DOPRI5
 from sim_plant.kernels import PlantSettings
 from sim_plant.motion import Motion
@@ -59,9 +59,9 @@ def rough_disturbance():
     )
 
 
-NOWHERE = Wall(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0)
-UNLOADED = Load(0.0, *(np.zeros(size) for size in (2, 3, 2)))
-UNEVENTFUL = Events(*np.zeros((4, 0)), *(np.zeros((0, size)) for size in (2, 3, 2, 2, 2)))
+NOWHERE = WallSettings(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0)
+UNLOADED = LoadSettings(0.0, *(np.zeros(size) for size in (2, 3, 2)))
+UNEVENTFUL = EventSettings(*np.zeros((4, 0)), *(np.zeros((0, size)) for size in (2, 3, 2, 2, 2)))
 
 
 def motion(arm=ARM, load=None, force=(0.0, 0.0, 0.0), wall=NOWHERE):

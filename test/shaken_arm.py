@@ -16,14 +16,14 @@ from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.compiled.layout import size_of, view_of
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE
-from sim_plant.rigid_body import Motion, acceleration, locate, rigid_bodies
+from sim_plant.rigid_body import BodyMotion, acceleration, locate, rigid_bodies
 
 PANDA_TEXT = (CONFIG / 'panda.urdf').read_text()
 PANDA_CHAIN = read_chain(PANDA_TEXT, 'panda_link0', 'panda_hand_tcp', PANDA)
 GRAVITY = (0.0, 0.0, -9.81)
 PERIOD = 0.001  # s
 
-motion_of, motion_size = view_of(Motion), size_of(Motion)
+motion_of, motion_size = view_of(BodyMotion), size_of(BodyMotion)
 
 
 class Truth(NamedTuple):

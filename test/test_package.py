@@ -10,6 +10,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ET
 import zipfile
+from collections import Counter
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -164,6 +165,17 @@ def test_every_folder_of_modules_is_a_package():
     assert {path.parent for path in sources()} == {
         path.parent for path in sources() if path.name == '__init__.py'
     }
+
+
+def test_no_two_classes_have_the_same_name():
+    classes = Counter(
+        node.name
+        for package in PACKAGES
+        for path in (ROOT / package).rglob('*.py')
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ClassDef)
+    )
+    assert [name for name, count in classes.items() if count > 1] == []
 
 
 def test_wheel_is_marked_as_typed(wheel):

@@ -22,7 +22,7 @@ from blf_dsc_controller.configuration.robot import chain_of
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.view import address
 from blf_dsc_controller.view.address import free_port
-from blf_dsc_controller.view.arm import Arm, planar_urdf, with_cylinders
+from blf_dsc_controller.view.arm import ShownArm, planar_urdf, with_cylinders
 from blf_dsc_controller.view.bag import BagPlayer
 from blf_dsc_controller.view.moment import Confidence, Moment
 from blf_dsc_controller.view.page import Page
@@ -108,7 +108,7 @@ def test_bag_without_configuration_is_rejected_in_one_line(tmp_path, capsys):
 def test_links_without_shapes_become_cylinders_in_place(seed):
     text = random_urdf(4, seed)[0]
     chain = chain_of(text, '', 'tip', ('j1', 'j2', 'j3', 'j4'))
-    model = Arm(text, chain).model()
+    model = ShownArm(text, chain).model()
     assert len(model.scene.geometry) > 4
     q = np.random.default_rng(seed).uniform(-1.0, 1.0, 4)
     model.update_cfg(dict(zip(('j1', 'j2', 'j3', 'j4'), q, strict=True)))

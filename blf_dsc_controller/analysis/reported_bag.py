@@ -30,7 +30,7 @@ _LONGEST = 1000  # characters of a parameter that is shown in full
 _AT_LIMIT = 1.0 - 1e-9
 
 
-class Event(NamedTuple):
+class ReportedEvent(NamedTuple):
     """An event of a run."""
 
     time: float  # s since the first sample
@@ -47,7 +47,7 @@ class ReportedBag:
     version: str  # that recorded it, empty for another recorder
     parameters: dict[str, str]  # `node name: parameter` to its value as text
     arm: DrawnArm
-    events: list[Event]  # by time
+    events: list[ReportedEvent]  # by time
 
 
 def read_bags(
@@ -83,9 +83,11 @@ def _read(path: Path, name: str, namespace: str, names: NameMap) -> ReportedBag:
     except ConfigurationError:  # missing or unreadable
         sections = ()
     entries = {name: entry.value for section in sections for name, entry in section.entries.items()}
-    lost = (Event(0.0, 'lost', f'{topic}: {text}') for topic, text in context.losses.items())
+    lost = (
+        ReportedEvent(0.0, 'lost', f'{topic}: {text}') for topic, text in context.losses.items()
+    )
     arm, problem = _drawn(context, entries, len(run.joints))
-    unread = [Event(0.0, 'arm', problem)] if problem else []
+    unread = [ReportedEvent(0.0, 'arm', problem)] if problem else []
     changed = _changed(path, run, namespace)
     events = (*unread, *_events(run), *_diagnosed(path, run), *changed, *lost)
     return ReportedBag(
@@ -116,17 +118,17 @@ def _drawn(context: Context, entries: Mapping[str, Any], n: int) -> tuple[DrawnA
     return planar_arm([float(f'{length}') for length in lengths]), problem
 
 
-def _events(run: Run) -> Iterator[Event]:
+def _events(run: Run) -> Iterator[ReportedEvent]:
     latched, violated = latch_time(run), outside(run)
     if latched is not None:
-        yield Event(latched, 'learning', 'first excited window: learning began')
+        yield ReportedEvent(latched, 'learning', 'first excited window: learning began')
     for t in change_times(run):
-        yield Event(t, 'learning', 'the arm has changed: learning restarted')
+        yield ReportedEvent(t, 'learning', 'the arm has changed: learning restarted')
     for column, reason in run.rejected.items():
         text = reason or f'{column} is not estimated: its column was rejected'
-        yield Event(run.duration, 'learning', text)
+        yield ReportedEvent(run.duration, 'learning', text)
     for t, stop in run.timed_stops:
-        yield Event(t, 'stop', f'{stop.reason}: {stop.text}')
+        yield ReportedEvent(t, 'stop', f'{stop.reason}: {stop.text}')
     if violated is not None:
         yield from _intervals(run, violated, 'violation', 'outside its bound')
     if run.torque_limit is not None:
@@ -134,20 +136,20 @@ def _events(run: Run) -> Iterator[Event]:
         yield from _intervals(run, limited, 'saturation', 'at its torque limit')
 
 
-def _intervals(run: Run, holds: np.ndarray, kind: str, what: str) -> Iterator[Event]:
+def _intervals(run: Run, holds: np.ndarray, kind: str, what: str) -> Iterator[ReportedEvent]:
     for i, joint in enumerate(run.joints):
         edges = np.diff(np.concatenate([[0], holds[:, i].astype(np.int8), [0]]))
         begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
         for begin, end in list(zip(begins, ends, strict=True))[:_MOST_OF_A_KIND]:
             text = f'{joint} {what} for {end - begin} samples'
-            yield Event(float(run.time[begin]), kind, text)
+            yield ReportedEvent(float(run.time[begin]), kind, text)
         if begins.size > _MOST_OF_A_KIND:
             more = begins.size - _MOST_OF_A_KIND
             at = float(run.time[begins[_MOST_OF_A_KIND]])
-            yield Event(at, kind, f'{joint}: {more} more intervals, not listed')
+            yield ReportedEvent(at, kind, f'{joint}: {more} more intervals, not listed')
 
 
-def _diagnosed(path: Path, run: Run) -> Iterator[Event]:
+def _diagnosed(path: Path, run: Run) -> Iterator[ReportedEvent]:
     """Yield each change of a level or message, at the time of the last sample received."""
     shown: dict[str, tuple[int, str]] = {}
     with open_bag(path) as bag:
@@ -162,10 +164,10 @@ def _diagnosed(path: Path, run: Run) -> Iterator[Event]:
                 if shown.get(status.name) != now:
                     shown[status.name] = now
                     level = _LEVELS[min(now[0], len(_LEVELS) - 1)]
-                    yield Event(time, level, f'{status.name}: {now[1]}')
+                    yield ReportedEvent(time, level, f'{status.name}: {now[1]}')
 
 
-def _changed(path: Path, run: Run, namespace: str) -> Iterator[Event]:
+def _changed(path: Path, run: Run, namespace: str) -> Iterator[ReportedEvent]:
     """Yield each change of the simulated plant's parameters during the run."""
     name = f'/{namespace.strip("/")}'.rstrip('/') + CHANGES.resolved
     with open_bag(path) as bag:
@@ -176,7 +178,7 @@ def _changed(path: Path, run: Run, namespace: str) -> Iterator[Event]:
             content = json.loads(message.data)
             time = (content['stamp'] - int(run.stamp[0])) * 1e-9
             for parameter, value in content['parameters'].items():
-                yield Event(time, 'plant', f'{parameter}: {_shown(value)}')
+                yield ReportedEvent(time, 'plant', f'{parameter}: {_shown(value)}')
 
 
 def _shown(value: object) -> str:

@@ -168,7 +168,7 @@ class NodeProcess:
             self._process.wait()
 
 
-class Monitor:
+class ProgressMonitor:
     """Progress display of the loop that runs in this process's ROS domain."""
 
     def __init__(self, config: LoopConfig, interrupts: Sequence[int]) -> None:
@@ -208,7 +208,7 @@ class Monitor:
         self.progress.show_loop(self._elapsed, ratio, [values[name] for name in self._parameters])
         return True
 
-    def __enter__(self) -> Monitor:
+    def __enter__(self) -> ProgressMonitor:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -283,7 +283,7 @@ def _monitor(
     """
     recorder, *loop = nodes
     ended, warned, announced = inf, False, False
-    with Monitor(config, interrupts) as monitor:
+    with ProgressMonitor(config, interrupts) as monitor:
         while loop[-1].is_running and not interrupts:
             for node in loop:
                 node.check()

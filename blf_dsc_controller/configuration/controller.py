@@ -18,7 +18,7 @@ from blf_dsc_controller.configuration.common import (
 )
 from blf_dsc_controller.configuration.gains import (
     Barrier,
-    Comparison,
+    ComparisonGains,
     DisturbanceEstimate,
     Feedback,
     KnownArm,
@@ -152,7 +152,7 @@ class ControllerConfig(Sampled):
     disturbance: DisturbanceEstimate = DisturbanceEstimate()
     torque: Torque = Torque()
     learning: Learning = Learning()
-    comparison: Comparison = Comparison()
+    comparison: ComparisonGains = ComparisonGains()
     truth: KnownArm = KnownArm()
     safety: Safety = Safety()
     telemetry: Telemetry = Telemetry()

@@ -113,7 +113,7 @@ class Torque:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ComparisonGains:
     """Gains of the laws `backstepping` (35) and `slotine_li`, besides feedback and learning."""
 
     surface_gain: PerJoint = positive(

@@ -65,7 +65,7 @@ class RecorderConfig:
 
 
 @dataclass(frozen=True)
-class DrawnArm:
+class MarkerArm:
     """Link lengths of the drawn arm."""
 
     l1: float = _of_markers(1.0, 'length of the first link', 'm', 'l1', above=0.0)
@@ -82,7 +82,7 @@ class MarkersConfig:
     frame: str = _of_markers('base_link', 'frame of the markers')
     period: float = _of_markers(0.1, 'time between two updates of the markers', 's', above=0.0)
     torque_scale: float = _of_markers(0.05, 'arrow length per torque', 'm/(N m)', above=0.0)
-    arm: DrawnArm = DrawnArm()
+    arm: MarkerArm = MarkerArm()
     robot: Robot = Robot()
 
     @classmethod

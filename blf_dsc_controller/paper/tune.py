@@ -44,7 +44,7 @@ PLANTS = ('recommended', 'noisy')
 """Presets whose plants a law is tuned on."""
 
 
-class Gain(NamedTuple):
+class TunedGain(NamedTuple):
     """One tuned number: the parameter it sets, its range, and its joint."""
 
     name: str
@@ -60,28 +60,28 @@ class Task(NamedTuple):
     title: str
     preset: str
     fixed: Mapping[str, object]
-    gains: tuple[Gain, ...]
+    gains: tuple[TunedGain, ...]
 
 
 _SHARED = (
-    Gain('feedback.gain', 5.0, 200.0, joint=0),
-    Gain('feedback.gain', 2.0, 100.0, joint=1),
-    Gain('learning.adaptation_gain', 0.01, 30.0, length=3),
+    TunedGain('feedback.gain', 5.0, 200.0, joint=0),
+    TunedGain('feedback.gain', 2.0, 100.0, joint=1),
+    TunedGain('learning.adaptation_gain', 0.01, 30.0, length=3),
 )
-_SURFACE_OF_35 = Gain('comparison.surface_gain', 10.0, 300.0)
+_SURFACE_OF_35 = TunedGain('comparison.surface_gain', 10.0, 300.0)
 _PROPOSED = (
     *_SHARED,
-    Gain('surface.gain', 10.0, 600.0),
-    Gain('surface.mu', 1.0, 100.0),
-    Gain('disturbance.gain', 0.1, 300.0),
-    Gain('learning.weight', 0.1, 100.0, length=0),
+    TunedGain('surface.gain', 10.0, 600.0),
+    TunedGain('surface.mu', 1.0, 100.0),
+    TunedGain('disturbance.gain', 0.1, 300.0),
+    TunedGain('learning.weight', 0.1, 100.0, length=0),
 )
 _COMPARISON = (
     *_SHARED,
     _SURFACE_OF_35,
-    Gain('comparison.position_gain', 0.1, 1e4),
-    Gain('comparison.robust_gain', 1e-3, 5.0),
-    Gain('comparison.leakage', 1e-5, 1.0, length=0),
+    TunedGain('comparison.position_gain', 0.1, 1e4),
+    TunedGain('comparison.robust_gain', 1e-3, 5.0),
+    TunedGain('comparison.leakage', 1e-5, 1.0, length=0),
 )
 TASKS = {
     'proposed': Task(

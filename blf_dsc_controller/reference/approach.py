@@ -35,7 +35,7 @@ _BRAKE = 3.0
 """Braking from v in the time h takes up to 1.5 v / h, so that h = 3 v / limit takes half of it."""
 
 
-class Motion(NamedTuple):
+class BlendedReference(NamedTuple):
     """A packed reference, and the time [s] at which its last blend ends."""
 
     vector: np.ndarray
@@ -56,7 +56,9 @@ def stop(t0: float, q: np.ndarray, dq: np.ndarray, config: ControllerConfig) -> 
     return hermite(np.array([t0, t0 + h]), points)
 
 
-def blend(before: Sequence[Term], target: Term, t0: float, config: ControllerConfig) -> Motion:
+def blend(
+    before: Sequence[Term], target: Term, t0: float, config: ControllerConfig
+) -> BlendedReference:
     """Blend from `before` to `target`, starting at t0 [s], as fast as the limits allow.
 
     Raises:
@@ -96,7 +98,7 @@ def blend(before: Sequence[Term], target: Term, t0: float, config: ControllerCon
             duration = middle
         else:
             too_short = middle
-    return Motion(attempt(duration), t0 + duration)
+    return BlendedReference(attempt(duration), t0 + duration)
 
 
 def reference_of(config: ControllerConfig) -> np.ndarray:
@@ -161,7 +163,7 @@ def check_takeover(
 
 def _via_centre(
     begin: Sequence[Term], target: Term, t: float, config: ControllerConfig
-) -> Motion | None:
+) -> BlendedReference | None:
     """Plan an approach to fast sinusoids that rests at their centre first; None if impossible."""
     if config.reference.type != 'sinusoids':
         return None
@@ -187,7 +189,7 @@ def _check_limits(config: ControllerConfig, q: np.ndarray) -> None:
 
 def plan_start(
     config: ControllerConfig, bound: np.ndarray, q: np.ndarray, dq: np.ndarray, t: float = 0.0
-) -> Motion:
+) -> BlendedReference:
     """Plan the configured reference, with an approach unless the law can take over at once.
 
     At time t [s], the arm is at q (n,) [rad] with dq (n,) [rad/s], and the bound is `bound` (n,)
@@ -216,4 +218,4 @@ def plan_start(
             if motion is None:
                 raise
             return motion
-    return Motion(vector, t)
+    return BlendedReference(vector, t)

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.reference.approach import Motion, blend
+from blf_dsc_controller.reference.approach import BlendedReference, blend
 from blf_dsc_controller.reference.limits import MotionError, check_times, worst_violation
 from blf_dsc_controller.reference.polynomials import (
     cubics,
@@ -70,7 +70,7 @@ class Trajectory(NamedTuple):
 
 def plan_trajectory(
     trajectory: Trajectory, vector: np.ndarray, now: float, config: ControllerConfig
-) -> Motion:
+) -> BlendedReference:
     """Return a packed reference that continues `vector` at `now` [s], then follows the trajectory.
 
     Raises:
@@ -89,7 +89,7 @@ def plan_trajectory(
             present = sampled(pack(n, before), np.array([t0]))[0]
             term = _from_state(present, t0, times, points)._replace(begin=t0)
             blended = max((one.settled for one in before if one.fade > 0.0), default=now)
-            motion = Motion(pack(n, [*before, term]), min(blended, t0))
+            motion = BlendedReference(pack(n, [*before, term]), min(blended, t0))
         else:
             motion = blend(before, _through_points(times, points), t0, config)
     except MotionError as error:

@@ -10,7 +10,7 @@ import numpy as np
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import differences
 from blf_dsc_controller.messages.journal import EventType
-from blf_dsc_controller.reference.approach import Motion
+from blf_dsc_controller.reference.approach import BlendedReference
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, plan_trajectory
 from blf_dsc_controller.supervision import retuning
 from blf_dsc_controller.supervision.guarded_law import GuardedLaw
@@ -30,7 +30,7 @@ class Plan(NamedTuple):
     trajectory: Trajectory
     at: float  # s since the start, when it takes effect
     before: np.ndarray  # packed reference that it continues
-    motion: Motion
+    motion: BlendedReference
 
 
 class Guard(GuardedLaw):

@@ -21,7 +21,7 @@ _THICKNESS = 0.025  # radius of a link relative to the length of all links
 _SHORTEST = 1e-3  # m, length below which a link is not drawn
 
 
-class Arm(NamedTuple):
+class ShownArm(NamedTuple):
     """The text of a URDF and the chain of its controlled joints."""
 
     text: str
@@ -40,13 +40,13 @@ class Arm(NamedTuple):
         return model if model.scene.geometry else _load(with_cylinders(self.text, self.reach))
 
 
-def arm_of(config: ControllerConfig, lengths: Sequence[float] = ()) -> Arm:
+def arm_of(config: ControllerConfig, lengths: Sequence[float] = ()) -> ShownArm:
     """Return the arm of a controller; planar links have these lengths [m], or all `arm.l1`."""
     robot = config.robot
     if config.model == 'urdf':
-        return Arm(robot.text, robot.chain(config.joints))
+        return ShownArm(robot.text, robot.chain(config.joints))
     text = planar_urdf(config.joints, lengths or (config.arm.l1,) * len(config.joints))
-    return Arm(text, chain_of(text, '', 'tip', config.joints))
+    return ShownArm(text, chain_of(text, '', 'tip', config.joints))
 
 
 def planar_urdf(joints: Sequence[str], lengths: Sequence[float]) -> str:

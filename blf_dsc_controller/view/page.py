@@ -19,7 +19,7 @@ from blf_dsc_controller.analysis.style import ALARM, COLOURS, GREEN, MUTED, ORAN
 from blf_dsc_controller.arms.chain_geometry import frames, tip_radius
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.address import free_port, require_viser, url_of
-from blf_dsc_controller.view.arm import Arm
+from blf_dsc_controller.view.arm import ShownArm
 from blf_dsc_controller.view.moment import Moment
 from blf_dsc_controller.view.tables import estimate_table, event_table, joint_table
 
@@ -69,7 +69,7 @@ class Page:
         self._header = gui.add_html('')
         self.state(*self._state)
 
-    def draw_arm(self, arm: Arm, estimates: Mapping[str, str]) -> Any:
+    def draw_arm(self, arm: ShownArm, estimates: Mapping[str, str]) -> Any:
         """Draw an arm, given the units of its estimates by name; return the page's tabs."""
         from trimesh import Trimesh
         from viser.extras import ViserUrdf
@@ -227,6 +227,6 @@ class Page:
 _NO_POINTS = {'show': False}
 
 
-def _hangs(arm: Arm) -> bool:
+def _hangs(arm: ShownArm) -> bool:
     """Return whether the links turn in a vertical plane, also below their base."""
     return not any(joint.placement[2, 3] for joint in arm.chain.joints)
