@@ -48,7 +48,7 @@ def test_signal_shuts_down_cleanly_with_bag_and_report(running, number):
 def test_killed_node_is_reported_and_ends_the_others(running):
     os.kill(running.child('controller_node'), signal.SIGKILL)
     code, _, errors = running.end()
-    assert code == 1
+    assert code == 1, errors
     assert 'blf_dsc run: blf_dsc_controller was terminated by SIGKILL' in errors
     assert f'the recording up to then is in {running.out / "bag"}' in errors
     assert 'Traceback' not in errors
