@@ -155,9 +155,12 @@ class TopicMessages:
         return replace(self, received=received, raw=raw)
 
     def name_lists(self) -> list[tuple[str, ...]]:
-        """Return each list of names in a message; UnreadableMessageError if the first has none.
+        """Return the different lists of names in the messages; those that are cut off are skipped.
 
-        Messages are decoded only if they do not begin like one before.
+        Only one of the messages that begin alike is decoded.
+
+        Raises:
+            UnreadableMessageError: the first message cannot be decoded.
         """
         first = self.layout()
         begin = slice(first.begin, first.arrays[0].size_offset)
