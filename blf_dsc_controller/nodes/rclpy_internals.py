@@ -65,7 +65,7 @@ def lifecycle_state(node: LifecycleNode) -> str:
 def destroy_state_machine(node: LifecycleNode) -> None:
     """Destroy the state machine, which rclpy forgets when it destroys the node.
 
-    It would keep the middleware's threads alive until the process exits, where they crash at times.
+    It would keep the middleware's threads alive until the process exits: a known cause of crashes.
     """
     node._state_machine.destroy_when_not_in_use()  # noqa: SLF001
 
