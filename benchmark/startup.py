@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 import tempfile
 import time
 from collections.abc import Iterator
@@ -15,7 +14,6 @@ import numpy as np
 from harness import Contestant, Ratio, own_graph, ratio, wait_for
 from node import StandIn
 
-from blf_dsc_controller.configuration.share import share_folder
 from blf_dsc_controller.messages.telemetry import PlantTelemetry
 
 _ROUNDS = 3
@@ -27,9 +25,6 @@ _POLL = 0.002  # s
 
 def measure() -> Iterator[Ratio]:
     """Measure the time to the first torque relative to the null node's."""
-    # As in `blf_dsc run`: with the defaults, discovery takes 0.1 s or 3 s, as chance will have it.
-    profiles = share_folder() / 'config' / 'fastdds.xml'
-    os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(profiles))
     seconds: dict[str, list[float]] = {name: [] for name in (_NULL, _WARM, _COLD)}
     with own_graph(), tempfile.TemporaryDirectory() as caches:
         _first_torque(_WARM, f'{caches}/warm')

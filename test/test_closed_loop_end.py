@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,6 +47,9 @@ def test_signal_shuts_down_cleanly_with_bag_and_report(running, number):
 
 
 def test_killed_node_is_reported_and_ends_the_others(running):
+    for process in (running.process.pid, *map(running.child, ('controller_node', 'sim_plant'))):
+        # A killed process would leave it broken, and crash the others.
+        assert 'shm/fastrtps' not in Path(f'/proc/{process}/maps').read_text()
     os.kill(running.child('controller_node'), signal.SIGKILL)
     code, _, errors = running.end()
     assert code == 1, errors

@@ -41,9 +41,8 @@ class Ended({node}):
         self.finished = True
 
 print(run(Ended))
-# The watchdog of Fast DDS's shared memory belongs to the process.
 names = [(task / 'comm').read_text().strip() for task in Path('/proc/self/task').iterdir()]
-print(sorted(name for name in names if name.startswith('dds.') and name != 'dds.shm.wdog'))
+print(sorted(name for name in names if name.startswith('dds.')))
 """
 
 

@@ -39,7 +39,8 @@ _MODULES = {
     PLANT: 'sim_plant.node',
     VIEW: 'blf_dsc_controller.view.node',  # only on request, once the loop runs
 }
-_MIDDLEWARE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+_RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 _DOMAINS = range(1, 101)  # 0 is the default; above 101, ports are ephemeral
 _FIRST_SIGN = 5.0  # s, at most, to the first message of a running loop, even on a busy machine
 _LAST = 1.0  # s without a message after which none is expected, even on a busy machine
@@ -64,9 +65,8 @@ def run_session(config: LoopConfig, out: Path, domain: int | None, view_host: st
     with own_domain() if domain is None else nullcontext(domain) as chosen:
         environment = {
             'ROS_DOMAIN_ID': str(chosen),
-            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
             'ROS_LOG_DIR': str(logs / 'ros'),
-            _MIDDLEWARE: os.environ.get(_MIDDLEWARE, str(share_folder() / 'config/fastdds.xml')),
+            **localhost_environment(),
         }
         try:
             with _environment(environment):
@@ -77,6 +77,19 @@ def run_session(config: LoopConfig, out: Path, domain: int | None, view_host: st
             if (out / 'bag' / 'metadata.yaml').exists():
                 print(f'the recording up to then is in {out / "bag"}', file=sys.stderr)
             raise
+
+
+def localhost_environment() -> dict[str, str]:
+    """Return the environment in which nodes find only those on this computer.
+
+    A profile that the user has chosen, and middleware other than Fast DDS, are left as they are.
+    """
+    profiles = str(share_folder() / 'config/fastdds.xml')
+    chosen = os.environ.get(_PROFILES, profiles)
+    if chosen != profiles or 'fastrtps' not in rclpy.get_rmw_implementation_identifier():
+        return {_RANGE: 'LOCALHOST'}
+    # With LOCALHOST, rmw_fastrtps would add shared memory to the transports of the profile.
+    return {_RANGE: 'SYSTEM_DEFAULT', 'ROS_LOCALHOST_ONLY': '', _PROFILES: profiles}
 
 
 @contextmanager
