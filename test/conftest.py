@@ -8,12 +8,11 @@ likely to share, discovery on this machine only, and a log folder that is remove
 import os
 import shutil
 import tempfile
+from importlib.util import find_spec
 
 import hypothesis
 import pytest
 from own_domain import own_domain
-
-from blf_dsc_controller.configuration.share import share_folder
 
 # The time that an example takes depends on the machine, not on the package.
 hypothesis.settings.register_profile('patient', deadline=None)
@@ -23,10 +22,11 @@ _LOG_FOLDER = tempfile.mkdtemp(prefix='blf_dsc_controller_test_log_')
 
 os.environ['ROS_DOMAIN_ID'] = str(own_domain())
 os.environ['ROS_LOG_DIR'] = _LOG_FOLDER
-# As in `blf_dsc run`, without importing rclpy.
-os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
-os.environ['ROS_LOCALHOST_ONLY'] = ''
-os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(share_folder() / 'config/fastdds.xml')
+os.environ.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
+if find_spec('rclpy'):  # some tests run without ROS
+    from blf_dsc_controller.cli.isolation import localhost_environment
+
+    os.environ.update(localhost_environment())
 
 # The longest tests start first, so that no worker is left with one of them at the end.
 _FIRST = (

@@ -13,17 +13,15 @@ from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.compiled.jit import kernel
-from blf_dsc_controller.compiled.layout import size_of, view_of
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE
-from sim_plant.rigid_body import BodyMotion, acceleration, locate, rigid_bodies
+from sim_plant.rigid_arm import motion_of, motion_size
+from sim_plant.rigid_body import acceleration, locate, rigid_bodies
 
 PANDA_TEXT = (CONFIG / 'panda.urdf').read_text()
 PANDA_CHAIN = read_chain(PANDA_TEXT, 'panda_link0', 'panda_hand_tcp', PANDA)
 GRAVITY = (0.0, 0.0, -9.81)
 PERIOD = 0.001  # s
-
-motion_of, motion_size = view_of(BodyMotion), size_of(BodyMotion)
 
 
 class Truth(NamedTuple):

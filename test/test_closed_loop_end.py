@@ -20,7 +20,9 @@ from blf_dsc_controller.bags.recover import recover
 
 
 @pytest.fixture
-def running(tmp_path):
+def running(tmp_path, monkeypatch):
+    monkeypatch.delenv('FASTRTPS_DEFAULT_PROFILES_FILE', raising=False)
+    monkeypatch.setenv('ROS_LOCALHOST_ONLY', '1')  # of a user; Fast DDS would share memory
     command = Running(tmp_path / 'out')
     yield command
     command.close()

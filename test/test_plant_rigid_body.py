@@ -12,8 +12,8 @@ from random_arm import CONFIG, PANDA, UR5E, configuration, pinocchio_model, rand
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.compiled.jit import kernel
-from blf_dsc_controller.compiled.layout import size_of, view_of
-from sim_plant.rigid_body import BodyMotion, acceleration, locate, rigid_bodies, tip
+from sim_plant.rigid_arm import motion_of, motion_size
+from sim_plant.rigid_body import acceleration, locate, rigid_bodies, tip
 
 TILTED_GRAVITY = (1.0, -3.0, 5.0)
 ARMS = {
@@ -24,7 +24,6 @@ ARMS = {
     'panda': ((CONFIG / 'panda.urdf').read_text(), PANDA, 'panda_link0', 'panda_hand_tcp'),
     'ur5e': ((CONFIG / 'ur5e.urdf').read_text(), UR5E, 'world', 'tool0'),
 }
-motion_of, motion_size = view_of(BodyMotion), size_of(BodyMotion)
 
 
 class Case:
