@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS environment of the test process and its child processes; hypothesis without deadlines.
+"""ROS environment of the test process and its child processes; profile of hypothesis.
 
-It is set here, before any test module imports rclpy: a domain that no other run on this machine is
-likely to share, discovery on this machine only, and a log folder that is removed at the end.
+Both are set here, before any test module imports rclpy. The environment has a domain that no other
+run on this machine is likely to share, discovery on this machine only, and a log folder that is
+removed at the end.
 """
 
 import os
@@ -14,9 +15,12 @@ import hypothesis
 import pytest
 from own_domain import own_domain
 
-# The time that an example takes depends on the machine, not on the package.
-hypothesis.settings.register_profile('patient', deadline=None)
-hypothesis.settings.load_profile('patient')
+# The time that an example takes depends on the machine, not on the package. Each run has the same
+# examples; `make test-nightly` draws others.
+hypothesis.settings.register_profile(
+    'suite', deadline=None, derandomize='BLF_DSC_EXAMPLES' not in os.environ
+)
+hypothesis.settings.load_profile('suite')
 
 _LOG_FOLDER = tempfile.mkdtemp(prefix='blf_dsc_controller_test_log_')
 

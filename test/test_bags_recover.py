@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from foreign_readers import read
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
@@ -26,6 +28,7 @@ from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointSt
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES
 from blf_dsc_controller.messages.types import typestore
 
+EXAMPLES = int(os.environ.get('BLF_DSC_EXAMPLES', '60'))
 START = 1_734_000_000_000_000_000
 MILLISECOND = 1_000_000
 CHUNKS = 6
@@ -33,8 +36,8 @@ PER_CHUNK = 5  # messages of each topic
 CONFIGURATION = '/blf_dsc_controller:\n  ros__parameters:\n    law: "blf_dsc"\n'
 
 
-def write(path, compression='none'):
-    """Write a bag of two topics with a chunk every five milliseconds, each of them flushed."""
+def write(path, compression='none', ends=range(PER_CHUNK - 1, CHUNKS * PER_CHUNK, PER_CHUNK)):
+    """Write a bag of two topics with chunks that end after the messages `ends`, each flushed."""
     states, torques = JointStateEncoder(['joint1']), Float64MultiArrayEncoder(1)
     with BagWriter(path, flush_interval=None, compression=compression) as bag:
         bag.configure(CONFIGURATION, 17)
@@ -44,7 +47,7 @@ def write(path, compression='none'):
             stamp = START + k * MILLISECOND
             bag.write(first, states.encode(stamp, [k], [0], [0]), stamp, stamp - 7, k + 1)
             bag.write(second, torques.encode([k]), stamp + 1, stamp, k + 1)
-            if k % PER_CHUNK == PER_CHUNK - 1:
+            if k in ends:
                 bag.flush()
     return path / f'{path.name}_0.mcap'
 
@@ -98,7 +101,7 @@ def test_every_intact_chunk_is_recovered_at_any_truncation(plain, tmp_path):
         assert recovery.is_whole == salvage.is_complete
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_flipped_bytes_lose_only_the_chunks_they_hit(whole, tmp_path_factory, data):
     # Flip some bytes anywhere: only what was written is recovered, and no other chunk is lost.
@@ -122,6 +125,33 @@ def test_flipped_bytes_lose_only_the_chunks_they_hit(whole, tmp_path_factory, da
     hit = sum(any(at <= place < end for place in places) for at, end, _ in chunks(original))
     outside = sum(not any(a <= place < e for a, e, _ in chunks(original)) for place in places)
     assert found >= 2 * PER_CHUNK * (CHUNKS - hit - outside)
+
+
+@pytest.mark.parametrize('at_last', [0, 1])
+@pytest.mark.parametrize('before', ['magic', 'metadata'])
+def test_index_names_the_topics_if_every_earlier_copy_is_lost(plain, tmp_path, before, at_last):
+    # What is hit: the magic or the metadata before the chunks, the first chunk, and the type or the
+    # length of the last one.
+    original = plain.read_bytes()
+    (first, *_, last) = chunks(original)
+    metadata = [piece.at for piece in scan(original) if piece.opcode == Opcode.METADATA]
+    places = [0] if before == 'magic' else [at + 1 for at in metadata if at < first[0]]
+    content = bytearray(original)
+    for place in (*places, first[0] + 900, last[0] + at_last):
+        content[place] ^= 1
+    recovery = recover(damaged(tmp_path / 'bag', content), tmp_path / 'clean')
+    assert list(recovery.messages.values()) == 2 * [PER_CHUNK * (CHUNKS - 2)]
+
+
+def test_lost_messages_are_not_counted_by_the_index_of_the_next_chunk(tmp_path):
+    original = write(tmp_path / 'whole', ends=(4, 7, 29)).read_bytes()
+    _, (second, _, _), (third, _, _) = chunks(original)
+    content = bytearray(original)
+    content[second + 500] ^= 1
+    content[third] ^= 1
+    recovery = recover(damaged(tmp_path / 'bag', content), tmp_path / 'clean')
+    counted, uncounted = (list(loss.messages.values()) for loss in recovery.losses)
+    assert (counted, uncounted) == ([3, 3], [])
 
 
 def test_damaged_chunk_header_loses_at_most_that_chunk(whole, tmp_path):

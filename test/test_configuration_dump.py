@@ -48,7 +48,7 @@ def test_node_in_a_namespace_is_written_under_its_full_name(tmp_path):
         load(path, '/right/sim_plant', PlantConfig)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     st.one_of(
         # ROS reads subnormal numbers as strings, and no parameter needs them.

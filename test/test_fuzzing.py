@@ -12,8 +12,6 @@ pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controll
 
 FEW = settings(
     max_examples=8,
-    deadline=None,
-    derandomize=True,
     phases=(Phase.generate,),
     suppress_health_check=list(HealthCheck),
 )

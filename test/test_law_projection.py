@@ -6,7 +6,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import settings as examples
 from hypothesis import strategies as st
 
 from blf_dsc_controller.law import projection
@@ -26,7 +25,6 @@ def on_sphere(random, size=3):
     return w * RADIUS / np.linalg.norm(w) * (1.0 + 1e-15)
 
 
-@examples(deadline=None)
 @given(
     st.integers(0, 2**32 - 1),
     st.integers(1, 9),

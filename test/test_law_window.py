@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import settings as examples
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from blf_dsc_controller.law import window
@@ -46,7 +45,7 @@ def terms(row):
     return np.triu(sum(np.outer(joint, joint) for joint in row))
 
 
-@examples(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     st.integers(1, 4), st.integers(1, 7), st.integers(1, 9), st.integers(1, 40), st.integers(0, 99)
 )

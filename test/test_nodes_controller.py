@@ -15,7 +15,7 @@ from ros_rig import JOINTS, START, Arm, torques
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import ConfigurationError, OutsideBarrierError
-from blf_dsc_controller.law import factory as assembly
+from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
@@ -26,7 +26,7 @@ VELOCITY = (0.01, -0.02)  # rad/s
 
 def law_torques(*measurements):
     """Torques of the law without a node, for states (q, dq) one sample apart."""
-    controller = assembly.controller_of(ControllerConfig())
+    controller = controller_of(ControllerConfig())
     return [
         controller.update(k * 1e-3, 1e-3, np.array([*q, *dq, 0.0, 0.0])).copy()
         for k, (q, dq) in enumerate(measurements)

@@ -26,12 +26,7 @@ from blf_dsc_controller.nodes.controller_node import ControllerNode
 from sim_plant.node import PlantNode
 
 EXAMPLES = int(os.environ.get('BLF_DSC_EXAMPLES', '60'))
-SETTINGS = settings(
-    max_examples=EXAMPLES,
-    deadline=None,
-    derandomize='BLF_DSC_EXAMPLES' not in os.environ,
-    suppress_health_check=list(HealthCheck),
-)
+SETTINGS = settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck))
 LIMIT = 20.0
 START = (2.293, 1.696)
 

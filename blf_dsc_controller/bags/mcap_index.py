@@ -11,14 +11,12 @@ from heapq import heappop, heappush
 from mmap import ACCESS_READ, MADV_DONTNEED, mmap
 from operator import attrgetter, itemgetter
 from pathlib import Path
-from struct import Struct
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Metadata, Schema
 
 from blf_dsc_controller.bags.folder import StoredTopic
 from blf_dsc_controller.bags.mcap_reader import (
-    MAGIC,
     MalformedRecordError,
     Piece,
     messages_in,
@@ -26,12 +24,12 @@ from blf_dsc_controller.bags.mcap_reader import (
     record_at,
     require_ends,
     scan,
+    summary_start,
     unpack,
 )
 from blf_dsc_controller.bags.metadata import strongest_quality
 from blf_dsc_controller.bags.unpacking import Unpacker
 
-_FOOTER = Struct('<BQQQI')
 _INDEXES = (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
 
 
@@ -171,9 +169,8 @@ def _mapped(path: Path) -> Iterator[mmap]:
 def _summary(data: mmap) -> list[Piece]:
     """Return the records of the index at the end, none if there is no valid index."""
     require_ends(data)
-    at = len(data) - len(MAGIC) - _FOOTER.size
-    opcode, length, start, _, _ = _FOOTER.unpack_from(data, at)
-    if opcode != Opcode.FOOTER or length != _FOOTER.size - 9 or start > at:
+    start = summary_start(data)
+    if start is None:
         raise MalformedRecordError('its last record is not the footer of an MCAP file')
     pieces = list(scan(data, start)) if start else []
     return [] if any(piece.reason for piece in pieces) else pieces

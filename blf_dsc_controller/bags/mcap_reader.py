@@ -2,15 +2,17 @@
 """Raw records of complete or damaged MCAP files.
 
 Neither lengths nor the index are trusted: a record that does not match its length starts a gap,
-which ends at the next chunk. Chunks are searched for byte by byte; a chunk holds its length three
-times, so false matches are rare. The reader of rosbags relies on the index: it silently misses
-messages in 3 % of small files with one flipped bit, and takes four times as long.
+which ends at the next chunk, or where another record is found before it. Chunks are searched for
+byte by byte; a chunk holds its length three times, so false matches are rare. The reader of rosbags
+relies on the index: it silently misses messages in 3 % of small files with one flipped bit, and
+takes four times as long.
 """
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from io import BytesIO
 from mmap import ACCESS_READ, MADV_DONTNEED, mmap
 from pathlib import Path
@@ -52,6 +54,7 @@ MAGIC = b'\x89MCAP0\r\n'
 _SMALLEST = 45  # bytes: the magic twice, and a footer
 _HEAD = Struct('<BQ')  # opcode and content length, at the start of each record
 _MESSAGE = Struct('<BQHIQQ')
+_FOOTER = Struct('<BQQQI')
 _CHUNK = Struct('<BQQQQII')  # up to the length of the compression's name
 _COMPRESSIONS = ('', 'zstd', 'lz4')
 _COMPRESSION_BYTES = tuple(name.encode() for name in _COMPRESSIONS)
@@ -185,14 +188,40 @@ def scan(data: Data, begin: int = 0) -> Iterator[Piece]:
         try:
             piece = record_at(data, at, is_chunked=is_chunked)
         except MalformedRecordError as error:
-            end = data.find(_CHUNK_BYTE, at + 1)
-            while end >= 0 and not _is_chunk(data, end):
-                end = data.find(_CHUNK_BYTE, end + 1)
-            end = len(data) if end < 0 else end
+            end = _end_of_gap(data, at, is_chunked=is_chunked)
             piece = Piece(at, end - at, 0, reason=str(error))
         is_chunked = is_chunked or piece.opcode == Opcode.CHUNK
         yield piece
         at += piece.size
+
+
+def _end_of_gap(data: Data, at: int, *, is_chunked: bool) -> int:
+    """Return where records continue after a malformed one.
+
+    That is the next chunk, unless a record begins before it where the malformed one should end (the
+    rest of that may be intact), or where the footer says that the index begins.
+    """
+    length = int.from_bytes(data[at + 1 : at + _HEAD.size], 'little')
+    stated = at + _HEAD.size + length if at else len(MAGIC)
+    limit = len(data)
+    for other in sorted({stated, summary_start(data) or 0}):
+        if at < other < limit:
+            with suppress(MalformedRecordError):
+                limit = record_at(data, other, is_chunked=is_chunked).at
+    end = data.find(_CHUNK_BYTE, at + 1, limit)
+    while end >= 0 and not _is_chunk(data, end):
+        end = data.find(_CHUNK_BYTE, end + 1, limit)
+    return limit if end < 0 else end
+
+
+def summary_start(data: Data) -> int | None:
+    """Return where the index at the end begins, 0 if there is none; None without a valid footer."""
+    at = len(data) - len(MAGIC) - _FOOTER.size
+    if at < 0:
+        return None
+    opcode, length, start, _, _ = _FOOTER.unpack_from(data, at)
+    is_footer = opcode == Opcode.FOOTER and length == _FOOTER.size - _HEAD.size
+    return int(start) if is_footer and start <= at else None
 
 
 def unpack(chunk: Chunk, unpacker: Unpacker) -> bytes:
