@@ -68,9 +68,10 @@ arms: $(READY) ## Compare laws on a Panda and a UR5e with wrong URDFs, into out/
 	$(RUN) -m blf_dsc_controller arms --out "$$out"
 
 # A file's tests stay together on one of the workers, for what they set up is shared; the files
-# come in the order of test/conftest.py.
+# come in the order of test/conftest.py. Bytecode is kept, also where the environment says not to,
+# as containers do: each of the many processes would compile the package's sources again.
 test: $(READY) ## Run the tests (TESTS=test/test_x.py for some, WORKERS=0 in one process)
-	@PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(RUN) -m pytest -p xdist -p _hypothesis_pytestplugin \
+	@PYTHONDONTWRITEBYTECODE= PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(RUN) -m pytest -p xdist -p _hypothesis_pytestplugin \
 	    -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(TESTS)
 
 test-long: $(READY) ## Run the long tests: recorder killed ten times, one-minute recording, changing arms
@@ -83,8 +84,9 @@ test-browser: $(READY) ## Test the pages of bag_report and view in a headless Ch
 pictures: $(READY) ## Make the README's animation, doc/view.webp, with a headless Chromium
 	@PYTHONPATH="$(CURDIR):$(CURDIR)/test" $(VENV)/bin/python test/view_pictures.py
 
-test-nightly: $(READY) ## Test each property of the nodes with ten thousand examples
-	@BLF_DSC_EXAMPLES=10000 $(RUN) -m pytest -q test/test_nodes_properties.py
+test-nightly: $(READY) ## Test nodes and recovery with ten thousand random examples of each property
+	@BLF_DSC_EXAMPLES=10000 $(RUN) -m pytest -q test/test_nodes_properties.py \
+	    test/test_bags_recover.py -k 'nodes_properties or flipped'
 
 changes: $(READY) ## Simulate ten thousand randomly changing arms, with and without learning, into out/changes
 	@$(RUN) benchmark/changing_arms.py
