@@ -19,8 +19,7 @@ from harness import Ratio, interleaved, ratio
 
 from blf_dsc_controller.configuration.params_file import locate
 from blf_dsc_controller.law.factory import controller_of
-from blf_dsc_controller.monte_carlo import executors as engines
-from blf_dsc_controller.monte_carlo.executors import compute
+from blf_dsc_controller.monte_carlo import executors
 from blf_dsc_controller.monte_carlo.runs import run_chunk, warm_up
 from blf_dsc_controller.monte_carlo.store import Span
 from blf_dsc_controller.monte_carlo.study import (
@@ -100,14 +99,14 @@ def _processes(study: Study) -> Iterator[Ratio]:
 
 def _pool(study: Study, stack: ExitStack, workers: int) -> Callable[[], int]:
     """Return the engine's work on this many workers, which stay alive between rounds."""
-    engine = engines.processes(workers)
+    engine = executors.processes(workers)
     executor: Executor = stack.enter_context(engine.open())
     engine = engine._replace(open=lambda: nullcontext(executor))
     spans = [Span(k * _CHUNK, _CHUNK) for k in range(_CHUNKS)]
 
     def work() -> int:
         done: list[Span] = []
-        compute(study, spans, engine, lambda span, _: done.append(span), print)
+        executors.compute(study, spans, engine, lambda span, _: done.append(span), print)
         return sum(span.runs for span in done)
 
     return work

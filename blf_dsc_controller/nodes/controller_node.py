@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.law import factory as assembly
+from blf_dsc_controller.law import factory
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.cdr import MessageError
@@ -54,14 +54,14 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self.guard: Guard | None = None
         self._load: ReferenceLoad | None = None
         joints = self.config.joints
-        self._estimates = assembly.estimate_names(self.config)
+        self._estimates = factory.estimate_names(self.config)
         self._telemetry = ControllerTelemetry(
             joints, self._estimates, self.config.telemetry.decimation
         )
         self._monitor: Monitor | None = None
         self._learning_events = (0.0, 0.0, 0.0)  # columns checked, columns in use, model changes
         self._published_bound = b''  # bytes of the array, to detect changes
-        self._decoder = JointStateDecoder(joints, assembly.required_fields(self.config))
+        self._decoder = JointStateDecoder(joints, factory.required_fields(self.config))
         self._pending: bytes | None = None
         self._warned_at = -1  # stamp of the start that the last warning was about
         self._listeners: list[Callable[[], int]] = []  # count the subscribers of STREAMS
