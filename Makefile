@@ -71,8 +71,8 @@ arms: $(READY) ## Compare laws on a Panda and a UR5e with wrong URDFs, into out/
 # come in the order of test/conftest.py. Bytecode is kept, also where the environment says not to,
 # as containers do: each of the many processes would compile the package's sources again.
 test: $(READY) ## Run the tests (TESTS=test/test_x.py for some, WORKERS=0 in one process)
-	@PYTHONDONTWRITEBYTECODE= PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(RUN) -m pytest -p xdist -p _hypothesis_pytestplugin \
-	    -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(TESTS)
+	@PYTHONDONTWRITEBYTECODE= PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(RUN) -m pytest -p xdist \
+	    -p _hypothesis_pytestplugin -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(TESTS)
 
 test-long: $(READY) ## Run the long tests: recorder killed ten times, one-minute recording, changing arms
 	@LONG_TESTS=1 $(RUN) -m pytest -rP test/test_bag_recorder_killed.py \
@@ -86,7 +86,7 @@ pictures: $(READY) ## Make the README's animation, doc/view.webp, with a headles
 
 test-nightly: $(READY) ## Test nodes and recovery with ten thousand random examples of each property
 	@BLF_DSC_EXAMPLES=10000 $(RUN) -m pytest -q test/test_nodes_properties.py \
-	    test/test_bags_recover.py -k 'nodes_properties or flipped'
+	    test/test_bags_recover.py::test_flipped_bytes_lose_only_the_chunks_they_hit
 
 changes: $(READY) ## Simulate ten thousand randomly changing arms, with and without learning, into out/changes
 	@$(RUN) benchmark/changing_arms.py

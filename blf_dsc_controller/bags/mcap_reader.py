@@ -207,7 +207,8 @@ def _end_of_gap(data: Data, at: int, *, is_chunked: bool) -> int:
     for other in sorted({stated, summary_start(data) or 0}):
         if at < other < limit:
             with suppress(MalformedRecordError):
-                limit = record_at(data, other, is_chunked=is_chunked).at
+                record_at(data, other, is_chunked=is_chunked)
+                limit = other
     end = data.find(_CHUNK_BYTE, at + 1, limit)
     while end >= 0 and not _is_chunk(data, end):
         end = data.find(_CHUNK_BYTE, end + 1, limit)

@@ -91,7 +91,7 @@ class Salvage:
             elif piece.opcode:
                 self._describe(piece)
             elif not self.is_complete:
-                lost_chunk = None  # an index may follow that of another chunk
+                lost_chunk = None  # the next index may be that of another chunk
                 self._lose(piece, piece.reason)
         for loss, number, count in counts:
             channel = self.channel(number)
