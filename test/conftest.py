@@ -13,7 +13,6 @@ from importlib.util import find_spec
 
 import hypothesis
 import pytest
-from own_domain import own_domain
 
 # The time that an example takes depends on the machine, not on the package. Each run has the same
 # examples; `make test-nightly` draws others.
@@ -24,13 +23,14 @@ hypothesis.settings.load_profile('suite')
 
 _LOG_FOLDER = tempfile.mkdtemp(prefix='blf_dsc_controller_test_log_')
 
-os.environ['ROS_DOMAIN_ID'] = str(own_domain())
 os.environ['ROS_LOG_DIR'] = _LOG_FOLDER
 os.environ.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
 if find_spec('rclpy'):  # some tests run without ROS
+    from own_domain import own_domain
+
     from blf_dsc_controller.cli.isolation import localhost_environment
 
-    os.environ.update(localhost_environment())
+    os.environ.update({'ROS_DOMAIN_ID': str(own_domain()), **localhost_environment()})
 
 # The longest tests start first, so that no worker is left with one of them at the end.
 _FIRST = (

@@ -7,31 +7,22 @@ Each context takes the next one, because nodes of the last test leave the graph 
 from __future__ import annotations
 
 import os
-import socket
+from contextlib import ExitStack
+
+from blf_dsc_controller.cli import isolation
+from blf_dsc_controller.errors import BlfDscError
 
 _WANTED = 8
-_DOMAINS = 100
-_CLAIMS = []
+_CLAIMS = ExitStack()  # released when this process exits
 _MINE = []
 
 
 def _claim():
-    """Claim a domain that no other process holds; return None if none is left.
-
-    The system releases it when this process exits.
-    """
-    first = os.getpid() % _DOMAINS
-    for k in range(_DOMAINS):
-        domain = 1 + (first + k) % _DOMAINS
-        claim = socket.socket(socket.AF_UNIX)
-        try:
-            claim.bind(f'\0blf_dsc_controller domain {domain}')
-        except OSError:
-            claim.close()
-            continue
-        _CLAIMS.append(claim)
-        return domain
-    return None
+    """Claim a domain that no other process holds; return None if none is left."""
+    try:
+        return _CLAIMS.enter_context(isolation.own_domain())
+    except BlfDscError:
+        return None
 
 
 def own_domain() -> int:
@@ -42,6 +33,6 @@ def own_domain() -> int:
             _MINE.append(claimed)
             return claimed
     if not _MINE:  # on a crowded machine, share one
-        _MINE.append(1 + os.getpid() % _DOMAINS)
+        _MINE.append(1 + os.getpid() % 100)
     _MINE.append(_MINE.pop(min(1, len(_MINE) - 1)))  # the first is the environment's
     return _MINE[-1]
