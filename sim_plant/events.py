@@ -29,6 +29,7 @@ class EventSettings(NamedTuple):
     end: Annotated[Array, 'events']  # infinite: permanent
     ramp: Annotated[Array, 'events']
     payload: Annotated[Array, 'events']
+    sloshing: Annotated[Array, 'events']
     torque: Annotated[Array, 'events', 'n']
     force: Annotated[Array, 'events', '3']
     viscous: Annotated[Array, 'events', 'n']
@@ -41,6 +42,7 @@ class Acting(NamedTuple):
 
     sample: Cell  # of the sum; -1: none yet
     payload: Cell  # kg
+    sloshing: Cell  # kg
     force: Annotated[Array, '3']  # N
     offset: Annotated[Array, 'n']  # rad
     constant: Annotated[Array, 'n']  # N m, of the disturbance, less torques that push the joints
@@ -85,6 +87,7 @@ def update_acting(
         return
     acting.sample[0] = sample
     acting.payload[0] = load.payload
+    acting.sloshing[0] = 0.0
     put(acting.force, load.force)
     put(acting.offset, load.offset)
     put(acting.constant, disturbance.constant)
@@ -96,6 +99,7 @@ def update_acting(
         fraction -= come(sample, events.end[e], events.ramp[e])
         if fraction != 0.0:
             acting.payload[0] += fraction * events.payload[e]
+            acting.sloshing[0] += fraction * events.sloshing[e]
             add(acting.force, fraction, events.force[e])
             add(acting.offset, fraction, events.offset[e])
             add(acting.constant, -fraction, events.torque[e])

@@ -39,8 +39,8 @@ _DOPRI5_B = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84]
 class Stages(NamedTuple):
     """Working memory of a step."""
 
-    point: Annotated[Array, '2 * n']
-    k: Annotated[Array, '6', '2 * n']
+    point: Annotated[Array, '2 * n + 6']
+    k: Annotated[Array, '6', '2 * n + 6']
 
 
 @inner
@@ -80,7 +80,10 @@ def integrate(
     x: np.ndarray,
     stages: Stages,
 ) -> None:
-    """Advance x = [q, dq] (2n,) in place from t to t + h [s] under a held torque (n,) [N m]."""
+    """Advance x in place from t to t + h [s] under a held torque (n,) [N m].
+
+    `x` is [q, dq] (2n,), or [q, dq, y, v] (2n + 6,) while a load sloshes.
+    """
     if method == RK4:
         _explicit_step(_RK4_A, _RK4_B, _RK4_C, motion, t, h, torque, x, stages)
     else:

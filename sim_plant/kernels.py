@@ -15,7 +15,7 @@ from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
 from blf_dsc_controller.compiled.views import part, view
 from sim_plant.actuator import Drives, DriveState, actuate
 from sim_plant.arm import Arm
-from sim_plant.contact import Contact, TipState, WallSettings
+from sim_plant.contact import Contact, SloshSettings, TipState, WallSettings, locate_tip
 from sim_plant.disturbance import JointDisturbance
 from sim_plant.events import Acting, EventSettings, LoadSettings, update_acting
 from sim_plant.integrator import Stages, integrate
@@ -40,6 +40,7 @@ class PlantSettings(NamedTuple):
     drives: Drives
     load: LoadSettings
     wall: WallSettings
+    slosh: SloshSettings
     schedule: EventSettings
 
 
@@ -47,7 +48,8 @@ class PlantState(NamedTuple):
     """Everything that changes from sample to sample except the random generator."""
 
     sample: Cell  # k
-    x: Annotated[Array, '2 * n']  # q [rad], dq [rad/s], noise-free
+    x: Annotated[Array, '2 * n + 6']  # q [rad], dq [rad/s], noise-free; load: y [m], v [m/s]
+    sloshes: Cell  # 1: y and v are those of a load
     reading: EncoderReading
     drives: DriveState
     stages: Stages
@@ -69,10 +71,23 @@ def plant_views(
 
 
 @inner
+def attach_load(plant: PlantSettings, now: PlantState) -> None:
+    """Place a sloshing load that begins at the tip, moving with it."""
+    n, sloshes = plant.n, now.acting.sloshing[0] > 0.0
+    if sloshes and now.sloshes[0] == 0.0:
+        locate_tip(plant.arm, part(now.x, 0, (n,)), part(now.x, n, (n,)), now.tip)
+        for i in range(3):
+            now.x[2 * n + i] = now.tip.position[i]
+            now.x[2 * n + 3 + i] = now.tip.velocity[i]
+    now.sloshes[0] = 1.0 if sloshes else 0.0
+
+
+@inner
 def update_motion(plant: PlantSettings, now: PlantState) -> Motion:
     """Return the equation of motion of this sample."""
     acting, disturbance = now.acting, plant.disturbance
     update_acting(disturbance, plant.load, plant.schedule, now.sample[0], acting)
+    attach_load(plant, now)
     return Motion(
         plant.arm,
         acting.payload[0],
@@ -89,7 +104,7 @@ def update_motion(plant: PlantSettings, now: PlantState) -> Motion:
             disturbance.ripple,
             disturbance.ripple_frequency,
         ),
-        Contact(acting.force, plant.wall, now.tip),
+        Contact(acting.force, plant.wall, plant.slosh, acting.sloshing[0], now.tip),
     )
 
 
@@ -127,13 +142,15 @@ def observe(plant: PlantSettings, now: PlantState, measurement: np.ndarray) -> N
 def step(plant: PlantSettings, now: PlantState, command: np.ndarray) -> None:
     """Apply the commanded torque (n,) [N m] of this sample and advance to the next one."""
     actuate(plant.drives, int(now.sample[0]), command, now.drives)
+    motion = update_motion(plant, now)
+    size = 2 * plant.n + 6 if motion.contact.mass > 0.0 else 2 * plant.n
     integrate(
         plant.integrator,
-        update_motion(plant, now),
+        motion,
         now.sample[0] * plant.period_ns * 1e-9,
         plant.period_ns * 1e-9,
         now.drives.applied,
-        now.x,
+        part(now.x, 0, (size,)),
         now.stages,
     )
     now.sample[0] += 1.0
@@ -152,8 +169,7 @@ def truth(plant: PlantSettings, now: PlantState, out: np.ndarray) -> None:
     n = plant.n
     t = now.sample[0] * plant.period_ns * 1e-9
     true_parameters(plant, now, out)
-    q, dq = part(now.x, 0, (n,)), part(now.x, n, (n,))
-    disturbing_torque(update_motion(plant, now), t, q, dq, part(out, plant.p, (n,)))
+    disturbing_torque(update_motion(plant, now), t, now.x, part(out, plant.p, (n,)))
     for i in range(2 * n):
         out[plant.p + n + i] = now.x[i]
 

@@ -13,7 +13,7 @@ from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.plant import PlantConfig
 from sim_plant.actuator import Drives, lag
 from sim_plant.arms import arm_of, parameter_names_of
-from sim_plant.contact import WallSettings
+from sim_plant.contact import SloshSettings, WallSettings
 from sim_plant.disturbance import JointDisturbance
 from sim_plant.events import EventSettings, LoadSettings
 from sim_plant.integrator import INTEGRATORS
@@ -57,8 +57,8 @@ class Plant:
         self._now = state_of(self.state, settings)
         self._noises = [self._now.reading.noise] if is_noisy(settings.encoders) else []
         self._noises += [self._now.drives.noise] if settings.drives.noise > 0.0 else []
-        self._now.x[:] = np.concatenate((position, velocity))
-        self._q, self._dq = self._now.x[: self.joints], self._now.x[self.joints :]
+        self._q, self._dq = self._now.x[: 2 * self.joints].reshape(2, -1)
+        self._q[:], self._dq[:] = position, velocity
         self._now.reading.sample[0] = self._now.acting.sample[0] = -1.0
         self._initial = self.state.copy()
         self._measurement = np.zeros(3 * self.joints)
@@ -197,6 +197,7 @@ def settings_of(config: PlantConfig) -> PlantSettings:
             wall.stiffness,
             wall.damping,
         ),
+        slosh=_slosh_of(config),
         schedule=_schedule_of(config),
     )
 
@@ -218,6 +219,12 @@ def _disturbance_of(config: PlantConfig) -> JointDisturbance:
     )
 
 
+def _slosh_of(config: PlantConfig) -> SloshSettings:
+    omega, zeta = config.events.sloshing_frequency, config.events.sloshing_damping
+    gravity = config.robot.gravity if config.robot.urdf else (0.0, 0.0, -config.arm.gravity)
+    return SloshSettings(omega**2, 2.0 * zeta * omega, np.array(gravity))
+
+
 def _schedule_of(config: PlantConfig) -> EventSettings:
     """Return the events with times in samples, and zeros for what is not given."""
     events, count, n = config.events, len(config.events.begin), len(config.joints)
@@ -235,6 +242,7 @@ def _schedule_of(config: PlantConfig) -> EventSettings:
         end=np.where(duration > 0.0, samples(begin + duration), np.inf),
         ramp=samples(values('ramp')),
         payload=values('payload'),
+        sloshing=values('sloshing'),
         force=values('force', 3),
         **{name: values(name, n) for name in ('torque', 'viscous', 'coulomb', 'offset')},
     )

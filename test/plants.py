@@ -4,7 +4,7 @@
 import numpy as np
 
 from sim_plant.actuator import Drives, lag
-from sim_plant.contact import Contact, TipState, WallSettings
+from sim_plant.contact import Contact, SloshSettings, TipState, WallSettings
 from sim_plant.disturbance import JointDisturbance
 from sim_plant.dynamics import PointMassArm
 from sim_plant.events import EventSettings, LoadSettings
@@ -61,13 +61,15 @@ def rough_disturbance():
 
 NOWHERE = WallSettings(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0)
 UNLOADED = LoadSettings(0.0, *(np.zeros(size) for size in (2, 3, 2)))
-UNEVENTFUL = EventSettings(*np.zeros((4, 0)), *(np.zeros((0, size)) for size in (2, 3, 2, 2, 2)))
+CALM = SloshSettings(0.0, 0.0, np.zeros(3))
+UNEVENTFUL = EventSettings(*np.zeros((5, 0)), *(np.zeros((0, size)) for size in (2, 3, 2, 2, 2)))
 
 
 def motion(arm=ARM, load=None, force=(0.0, 0.0, 0.0), wall=NOWHERE):
     """Return the equation of motion of an arm with a disturbance and a force at its tip."""
-    tip = TipState(np.zeros(3), np.zeros((3, 2)), np.zeros(3))
-    return Motion(arm, 0.0, load or disturbance(), Contact(np.array(force), wall, tip))
+    tip = TipState(np.zeros(3), np.zeros(3), np.zeros((3, 2)), np.zeros(3), np.zeros(3))
+    contact = Contact(np.array(force), wall, CALM, 0.0, tip)
+    return Motion(arm, 0.0, load or disturbance(), contact)
 
 
 def settings(
@@ -102,6 +104,7 @@ def settings(
         ),
         load=UNLOADED,
         wall=NOWHERE,
+        slosh=CALM,
         schedule=UNEVENTFUL,
     )
 

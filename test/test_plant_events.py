@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plants import ARM, NOWHERE, commands, motion, points
+from plants import ARM, NOWHERE, commands, energies, motion, points
 from plants import run as measurements
+from scipy.integrate import cumulative_simpson
 
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.errors import ConfigurationError
+from sim_plant.arms import urdf_of
 from sim_plant.contact import wall_force
 from sim_plant.dynamics import tip
 from sim_plant.motion import disturbing_torque
@@ -23,6 +25,7 @@ ALL_KINDS = {
     'events.duration': [0.02, 0.0],
     'events.ramp': [0.004, 0.003],
     'events.payload': [0.3, 0.2],
+    'events.sloshing': [0.0, 0.4],
     'events.force': [3.0, 0.0, -2.0, 0.0, 1.0, 4.0],
     'events.torque': [1.0, -2.0, 0.5, 0.0],
     'events.viscous': [0.1, 0.2, 0.0, 0.3],
@@ -120,13 +123,98 @@ def test_tip_force_does_the_same_work_as_its_joint_torques(q):
 
     gradient = [(work(q + d) - work(q - d)) / (2 * step) for d in step * np.eye(2)]
     load = np.empty(2)
-    disturbing_torque(motion(force=force), 0.0, q, np.zeros(2), load)
+    disturbing_torque(motion(force=force), 0.0, np.append(q, np.zeros(8)), load)
     np.testing.assert_allclose(-load, gradient, atol=1e-8)
 
     position, jacobian = np.empty(3), np.empty((3, 2))
     tip(ARM, q, position, jacobian)
     np.testing.assert_allclose(position, points(ARM.l1, ARM.l2, q)[2], rtol=1e-14)
     np.testing.assert_allclose(force @ jacobian, -load, rtol=1e-12)
+
+
+STILL = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
+OMEGA, MASS = 12.0, 0.4  # rad/s, kg
+
+
+def sloshing(samples, **events):
+    """State x (samples, 10) of an arm that falls, carrying a sloshing load from the start."""
+    given = {'begin': [0.0], 'sloshing': [MASS], 'sloshing_frequency': OMEGA} | events
+    config = build(PlantConfig, STILL | {f'events.{name}': given[name] for name in given})
+    arm = plant_of(config)
+    rows = np.empty((samples, 10))
+    for row in rows:
+        arm.measure()
+        row[:] = arm._now.x
+        arm.step(np.zeros(2))
+    return rows
+
+
+def spring_of(x):
+    """Stretch [m] and its rate [m/s] of the spring at the states x (samples, 10)."""
+    tips, rates = np.empty((2, len(x), 3))
+    jacobian = np.empty((3, 2))
+    for row, position, rate in zip(x, tips, rates, strict=True):
+        tip(ARM, row[:2], position, jacobian)
+        rate[:] = jacobian @ row[2:4]
+    return x[:, 4:7] - tips, x[:, 7:10] - rates
+
+
+@pytest.mark.parametrize('zeta', [0.0, 0.3])
+def test_energy_of_arm_and_sloshing_load_changes_by_what_its_damper_takes(zeta):
+    """d/dt [E_arm + m v^2 / 2 + m g z + m omega^2 |y - x|^2 / 2] = -2 m zeta omega |v - dx|^2."""
+    x = sloshing(2000, sloshing_damping=zeta)
+    stretch, rate = spring_of(x)
+    energy = np.array([sum(energies(ARM, row[:2], row[2:4])) for row in x])
+    energy += MASS * (0.5 * np.sum(x[:, 7:10] ** 2, axis=1) + ARM.g * x[:, 6])
+    energy += 0.5 * MASS * OMEGA**2 * np.sum(stretch**2, axis=1)
+    power = 2.0 * MASS * zeta * OMEGA * np.sum(rate**2, axis=1)
+    taken = cumulative_simpson(power, dx=1e-3, initial=0.0)
+    assert np.ptp(energies(ARM, x[0, :2], x[0, 2:4])) > 1.0
+    assert np.abs(stretch).max() > 0.05
+    assert taken[-1] > 0.1 or zeta == 0.0
+    np.testing.assert_allclose(energy + taken, energy[0], atol=1e-7)
+
+
+def test_load_on_a_stiff_spring_is_a_payload():
+    x = sloshing(1000, sloshing_frequency=600.0, sloshing_damping=1.0)
+    payload = sloshing(1000, sloshing=[0.0], payload=[MASS])
+    nothing = sloshing(1000, sloshing=[0.0])
+    assert np.abs(nothing[:, :2] - payload[:, :2]).max() > 0.1
+    np.testing.assert_allclose(x[:, :2], payload[:, :2], atol=1e-3)
+
+
+def test_sloshing_load_begins_at_rest_relative_to_the_tip_and_leaves_no_trace():
+    x = sloshing(60, begin=[0.02], duration=[0.02])
+    for k in (20, 21):
+        stretch, rate = spring_of(x[k : k + 1])
+        assert np.abs(stretch).max() <= (1e-15 if k == 20 else 1e-4)
+        assert np.abs(rate).max() <= (1e-15 if k == 20 else 2e-2)
+    np.testing.assert_array_equal(x[:20, :4], sloshing(20, sloshing=[0.0])[:, :4])
+    np.testing.assert_array_equal(x[41, 4:], x[59, 4:])  # frozen, and of no effect
+
+
+def test_sloshing_load_hangs_from_a_rigid_arm_as_it_does_from_point_masses():
+    """The same motion with the two-link arm's own URDF."""
+    begin = {'events.begin': [0.0], 'events.sloshing': [MASS], **STILL}
+    points_only = build(PlantConfig, begin)
+    rigid = build(
+        PlantConfig,
+        begin
+        | {
+            'robot.urdf': urdf_of(points_only),
+            'robot.tip': 'tip',
+            'robot.gravity': [0.0, 0.0, -ARM.g],
+        }
+        | {'robot.rotor_inertia': [0.0, 0.0], 'joints': list(points_only.joints)}
+        | {name: flatten(points_only)[name] for name in ('initial.position', 'initial.velocity')},
+    )
+    states = []
+    for config in (points_only, rigid):
+        arm = plant_of(config)
+        for torque in commands(SAMPLES):
+            arm.step(torque)
+        states.append(arm._now.x.copy())
+    np.testing.assert_allclose(*states, atol=1e-6)
 
 
 def test_wall_pushes_on_contact_and_never_pulls():

@@ -12,7 +12,7 @@ from functools import partial
 from typing import Annotated
 
 from blf_dsc_controller.configuration.common import PerJoint
-from blf_dsc_controller.configuration.schema import non_negative, parameter
+from blf_dsc_controller.configuration.schema import non_negative, parameter, positive
 
 Vector = Annotated[tuple[float, ...], '3']
 PerEvent = Annotated[tuple[float, ...], 'events.begin']
@@ -59,6 +59,11 @@ class Events:
     duration: PerEvent = _of_events('duration of each event; 0: permanent', unit='s', at_least=0.0)
     ramp: PerEvent = _of_events('time to fade in, and to fade out', unit='s', at_least=0.0)
     payload: PerEvent = _of_events('point mass at the tip', unit='kg', at_least=0.0)
+    sloshing: PerEvent = _of_events(
+        'point mass on a damped spring at the tip', unit='kg', at_least=0.0
+    )
+    sloshing_frequency: float = positive(15.0, 'undamped frequency of this spring', 'rad/s')
+    sloshing_damping: float = non_negative(0.05, 'damping ratio of this spring')
     force: Annotated[tuple[float, ...], 'events.begin', '3'] = _of_events(
         'external force on the tip', unit='N'
     )
