@@ -105,6 +105,8 @@ setup(
         'report': ['plotly>=6'],
         # Only for `view`, to serve its page: 130 MB, most of it for reading meshes.
         'view': ['viser>=1.1', 'yourdfpy>=0.0.57', 'trimesh'],
+        # Only to draw known arms, such as the Panda, with their meshes: 414 MB.
+        'meshes': ['example-robot-data', 'pycollada'],
         'parquet': ['pyarrow'],  # only for `bag_export` into Parquet
         # setuptools: test_package.py builds a wheel offline.
         'test': [

@@ -22,10 +22,15 @@ from blf_dsc_controller.configuration.robot import chain_of
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.view import address
 from blf_dsc_controller.view.address import free_port
-from blf_dsc_controller.view.arm import ShownArm, planar_urdf, with_cylinders
+from blf_dsc_controller.view.arm import (
+    ShownArm,
+    planar_urdf,
+    with_cylinders,
+    with_known_meshes,
+)
 from blf_dsc_controller.view.bag import BagPlayer
-from blf_dsc_controller.view.moment import Confidence, Moment
-from blf_dsc_controller.view.page import Page
+from blf_dsc_controller.view.moment import Confidence, Moment, plant_events
+from blf_dsc_controller.view.page import Page, bodies_of
 
 HOST = '127.0.0.1'
 PORT = 18080
@@ -84,8 +89,61 @@ def test_arm_ghost_bound_and_path_are_drawn(player):
         assert sum(name.startswith(root) for name in drawn) > 5
     plot = player._page._plots[0].data
     assert plot[0][-1] == pytest.approx(1.5, abs=0.04)  # s
-    assert np.abs(plot[1:3]).max() < 100.0  # % of the bound
+    assert 0.0 < np.abs(plot[1:3]).max() < 100.0  # % of the bound
     assert (plot[3] == 100.0).all()
+    assert not player._page._ghost.show_visual  # the errors are too small to be seen
+
+
+def test_events_are_lines_in_the_plots_and_named_at_the_arm(player):
+    page = player._page
+    player.slider.value = 1.5
+    player._events = [(1.0, 'plant', '2 kg picked up')]
+    player._drawn = -1
+    player.update(0.0)
+    for plot in page._plots:
+        (at,) = np.flatnonzero(plot.data[-1] == 1.0)
+        assert plot.data[0][at - 1 : at + 2] == pytest.approx([1.0, 1.0, 1.0])
+        assert np.all(np.diff(plot.data[0]) >= 0.0)
+        assert np.isfinite(plot.data).all()
+    assert '/event' in view_rig.nodes(page)
+    assert page.server.scene._handle_from_node_name['/event'].text == 'plant: 2 kg picked up'
+
+
+def test_payloads_and_other_events_of_a_plant_are_listed():
+    values = {'events.begin': [20.0, 3.0], 'events.duration': [25.0, 0.0]}
+    values['events.payload'] = [2.0, 0.0]
+    found = [(3.0, 'event 2 begins', 0.0), (20.0, '2 kg picked up', 2.0)]
+    assert plant_events(values) == [*found, (45.0, '2 kg put down', -2.0)]
+    assert plant_events({}) == []
+
+
+def test_estimates_are_grouped_by_link_and_friction():
+    names = (*(f'{kind}{link}' for link in (1, 2) for kind in ('m*cx', 'Izz', 'rotor')),)
+    names += ('viscous joint1', 'viscous joint2', 'coulomb joint1', 'coulomb joint2')
+    bodies = bodies_of(names)
+    assert {body: len(members) for body, members in bodies.items()} == {
+        '1': 3,
+        '2': 3,
+        'viscous': 2,
+        'coulomb': 2,
+    }
+    assert bodies_of(names[:3]) == {name: [k] for k, name in enumerate(names[:3])}
+
+
+def test_meshes_of_an_installed_description_are_drawn_only_for_the_same_arm(tmp_path, monkeypatch):
+    text = random_urdf(3, 0)[0]
+    chain = chain_of(text, '', 'tip', ('j1', 'j2', 'j3'))
+    folder = tmp_path / 'cmeel.prefix/share/example-robot-data/robots/any/urdf'
+    folder.mkdir(parents=True)
+    monkeypatch.setattr('sysconfig.get_path', lambda *_: str(tmp_path))
+    for seed, drawn in ((1, 0), (0, 3)):
+        other = ET.fromstring(random_urdf(3, seed)[0])  # noqa: S314 - our own
+        for link in other.findall('link'):
+            if link.get('name') in ('l1', 'l2', 'l3'):
+                geometry = ET.SubElement(ET.SubElement(link, 'visual'), 'geometry')
+                ET.SubElement(geometry, 'sphere', radius='0.1')
+        (folder / f'{seed}.urdf').write_text(ET.tostring(other, encoding='unicode'))
+        assert with_known_meshes(text, chain).count('<visual') == drawn
 
 
 def test_server_opens_no_external_connections(player):

@@ -66,8 +66,8 @@ def test_page_shows_the_loop(rig, loop):
     assert now.truth[:3] == pytest.approx([1.0, 0.32, 0.4])
     assert np.isfinite(now.estimate[:3]).all()
     assert view.page._state == ('OK', 'tracking')
-    assert [t for t, *_ in events_with(view, 'payload of 0.25 kg begins')] == [1.0]
-    assert [t for t, *_ in events_with(view, 'payload of 0.25 kg ends')] == [1.5]
+    assert [t for t, *_ in events_with(view, '0.25 kg picked up')] == [1.0]
+    assert [t for t, *_ in events_with(view, '0.25 kg put down')] == [1.5]
 
 
 def test_push_reaches_the_plant_and_ends(rig, loop):

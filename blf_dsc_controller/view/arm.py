@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arm as drawn on the page: the shapes of its URDF or, without any, cylinders."""
+"""The arm as drawn on the page: the shapes of its URDF, else known meshes, else cylinders."""
 
 from __future__ import annotations
 
+import copy
 import io
 import logging
+import sysconfig
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +23,7 @@ from blf_dsc_controller.errors import BlfDscError
 
 _THICKNESS = 0.025  # radius of a link relative to the length of all links
 _SHORTEST = 1e-3  # m, length below which a link is not drawn
+_SAME = 1e-3  # m and of rotation matrices, between two URDFs of the same arm
 
 
 class ShownArm(NamedTuple):
@@ -35,8 +40,9 @@ class ShownArm(NamedTuple):
         return float(np.linalg.norm(steps, axis=1).sum())
 
     def model(self) -> Any:
-        """Return the yourdfpy model, with the URDF's shapes if any are found, else cylinders."""
-        model = _load(self.text)
+        """Return the yourdfpy model with the first shapes found: meshes, others, cylinders."""
+        has_meshes = '<mesh' in self.text
+        model = _load(self.text if has_meshes else with_known_meshes(self.text, self.chain))
         return model if model.scene.geometry else _load(with_cylinders(self.text, self.reach))
 
 
@@ -67,6 +73,37 @@ def planar_urdf(joints: Sequence[str], lengths: Sequence[float]) -> str:
         ET.SubElement(joint, 'axis', xyz='0 -1 0')
         parent = child
     return ET.tostring(robot, encoding='unicode')
+
+
+def with_known_meshes(text: str, chain: Chain) -> str:
+    """Draw an arm as the wheel `example-robot-data` does, if it has one with these joints."""
+    names = tuple(joint.name for joint in chain.joints)
+    for path in sorted(_installed('example-robot-data').glob('robots/*/urdf/*.urdf')):
+        known = path.read_text(encoding='utf-8')
+        if not all(f'"{name}"' in known for name in names):
+            continue
+        with suppress(BlfDscError):
+            joints = chain_of(known, '', chain.joints[-1].link, names).joints
+            pairs = zip(joints, chain.joints, strict=True)
+            if all(np.allclose(a.placement, b.placement, atol=_SAME) for a, b in pairs):
+                return _with_visuals(text, known)
+    return text
+
+
+def _with_visuals(text: str, known: str) -> str:
+    robot, source = ET.fromstring(text), ET.fromstring(known)  # noqa: S314 - as trusted as the robot
+    visuals = {link.get('name'): link.findall('visual') for link in source.findall('link')}
+    for link in robot.findall('link'):
+        found = visuals.get(link.get('name'))
+        for own in link.findall('visual') if found else ():
+            link.remove(own)
+        link.extend(copy.deepcopy(found or []))
+    return ET.tostring(robot, encoding='unicode')
+
+
+def _installed(package: str) -> Path:
+    """Return the folder of a description that is installed as a wheel."""
+    return Path(sysconfig.get_path('purelib'), 'cmeel.prefix', 'share', package)
 
 
 def with_cylinders(text: str, reach: float) -> str:
@@ -110,7 +147,7 @@ def _load(text: str) -> Any:
 
 
 def _file(fname: str) -> str:  # yourdfpy prescribes the argument's name
-    try:
+    with suppress(BlfDscError, OSError):
         return str(resolve(fname.removeprefix('file://')))
-    except (BlfDscError, OSError):
-        return fname
+    package, _, rest = fname.removeprefix('package://').partition('/')
+    return str(_installed(package) / rest)

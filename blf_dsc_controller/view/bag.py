@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from pathlib import Path
 from typing import NoReturn
@@ -15,13 +16,14 @@ from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.messages.topics import LAMBDA_MIN
 from blf_dsc_controller.run import Floats, Run, Series, Stamps
 from blf_dsc_controller.view.arm import arm_of
-from blf_dsc_controller.view.moment import Confidence, Moment, estimates_of
+from blf_dsc_controller.view.moment import Confidence, Moment, estimates_of, plant_events
 from blf_dsc_controller.view.page import PAST, Page
 
 _RATE = 30.0  # moments per second
 _MOST = 20_000  # moments per bag
 _PERIOD = 1.0 / 30.0  # s
 _PLOTTED = 6  # frames between updates of the plots
+_PLANT = 'sim_plant: '  # before the names of its parameters
 _SPEEDS = ('0.1', '0.5', '1', '2', '5', '10')
 
 
@@ -42,10 +44,17 @@ class BagPlayer:
         estimates = estimates_of(config)
         self.moments = moments(run, tuple(estimates))
         self._page, self._times = page, np.array([one.time for one in self.moments])
+        plant = {
+            name.removeprefix(_PLANT): json.loads(value)
+            for name, value in bag.parameters.items()
+            if name.startswith(f'{_PLANT}events.')
+        }
         self._events = [(*event,) for event in bag.events]
+        self._events += [(at, 'plant', text) for at, text, _ in plant_events(plant)]
+        self._events.sort()
         self._confidence = Confidence(config)
         self._playing, self._drawn = False, -1
-        keys = ('sim_plant: arm.l1', 'sim_plant: arm.l2')
+        keys = (f'{_PLANT}arm.l1', f'{_PLANT}arm.l2')
         lengths = [float(bag.parameters[key]) for key in keys if key in bag.parameters]
         page.draw_arm(arm_of(config, lengths), estimates)
         gui = page.server.gui
@@ -76,11 +85,11 @@ class BagPlayer:
         longest = max(PAST, self._confidence.window)
         first = int(np.searchsorted(self._times, self._times[k] - longest))
         past = self.moments[first : k + 1]
+        self._page.events([event for event in self._events if event[0] <= self._times[k]])
         self._page.move(past)
         if plots:
             self._page.learned(self._confidence.prior, self._confidence.deviations(past))
             self._page.plot(past)
-            self._page.events([one for one in self._events if one[0] <= self._times[k]])
 
     def play(self) -> NoReturn:
         """Follow the buttons and the slider until Ctrl-C."""

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,6 +43,20 @@ def estimates_of(config: ControllerConfig) -> dict[str, str]:
     friction = {one: 'N m s/rad' if 'viscous' in one else 'N m' for one in column_names(config)}
     model = model_of(config)
     return dict(zip(model.parameter_names, model.parameter_units, strict=True)) | friction
+
+
+def plant_events(values: Mapping[str, Any]) -> list[tuple[float, str, float]]:
+    """Return time [s], text and change of payload [kg] of what a simulated arm undergoes."""
+    begin = values.get('events.begin', ())
+    nothing = (0.0,) * len(begin)
+    duration, masses = (values.get(f'events.{k}') or nothing for k in ('duration', 'payload'))
+    found = []
+    for k, (at, lasts, mass) in enumerate(zip(begin, duration, masses, strict=False), 1):
+        texts = (f'{mass:g} kg picked up', f'{mass:g} kg put down')
+        first, last = texts if mass else (f'event {k} begins', f'event {k} ends')
+        found.append((at, first, mass))
+        found += [(at + lasts, last, -mass)] if lasts else []
+    return sorted(found)
 
 
 class Confidence:

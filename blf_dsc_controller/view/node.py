@@ -35,7 +35,7 @@ from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.address import LOCAL, open_to_others
 from blf_dsc_controller.view.arm import arm_of
 from blf_dsc_controller.view.controls import Controls
-from blf_dsc_controller.view.moment import Confidence, Moment, estimates_of
+from blf_dsc_controller.view.moment import Confidence, Moment, estimates_of, plant_events
 from blf_dsc_controller.view.page import PAST, Page
 from blf_dsc_controller.view.requests import Requests
 
@@ -249,18 +249,11 @@ class ViewNode(PlainNode):
 
     def _payload(self, time: float) -> float:
         """Return the payload of the simulated arm [kg]; list events that have begun or ended."""
-        get = self._plant.get
-        begin = get('events.begin', ())
-        none = (0.0,) * len(begin)
-        duration, masses = (get(f'events.{one}', ()) or none for one in ('duration', 'payload'))
-        payload = float(get('load.payload', 0.0))
-        for k, (at, lasts, mass) in enumerate(zip(begin, duration, masses, strict=False)):
-            end = at + (lasts or np.inf)
-            what = f'payload of {mass:g} kg' if mass else f'event {k + 1}'
-            for moment, verb in ((at, 'begins'), (end, 'ends')):
-                if self._noted < moment <= time:
-                    self.page.event(moment, 'plant', f'{what} {verb}')
-            payload += mass if at <= time < end else 0.0
+        payload = float(self._plant.get('load.payload', 0.0))
+        for at, text, mass in plant_events(self._plant):
+            if self._noted < at <= time:
+                self.page.event(at, 'plant', text)
+            payload += mass if at <= time else 0.0
         self._noted = time
         return payload
 

@@ -8,15 +8,19 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
+import re
+import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from html import escape
+from math import inf
 from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.analysis.style import ALARM, COLOURS, GREEN, MUTED, ORANGE
-from blf_dsc_controller.arms.chain_geometry import frames, tip_radius
+from blf_dsc_controller.analysis.style import ALARM, COLOURS, GREEN, INK, MUTED, ORANGE
+from blf_dsc_controller.arms.chain_geometry import frames, skeleton, tip_radius
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.address import free_port, require_viser, url_of
 from blf_dsc_controller.view.arm import ShownArm
@@ -28,9 +32,26 @@ PAST = 20.0
 
 _TRAIL = 4.0  # s of the tip's path
 _EVENTS = 12
+_MESH = 5000  # faces of a shape from which on it is a mesh with colours of its own
+_SHOWN = 3.0  # s that an event is named beside the arm
 _PLAIN = (86, 110, 150)  # colour of an arm without any
 _GHOST = (0, 200, 120, 0.35)
-_HALO = 0.005  # thickness relative to the reach
+_APART = 0.01  # rad, error from which on the reference is drawn beside the arm
+_PEAK = 30  # moments, a second, of which the largest error is plotted
+_LEAST, _MOST = 0.1, 300.0  # % of the bound, the ends of its axis
+_FEW = 8  # estimates that are plotted one by one
+_HEIGHT = 130  # px of a plot: three fit below the state at 900 px
+_VIEW = np.array((0.42, -0.88, 0.22))  # direction from the arm to the camera
+_NO_POINTS = {'show': False}
+_AUTO: Mapping[str, Any] = {}
+_FROM_ZERO = {'range': {'min': {'hard': 0.0, 'soft': 0.0, 'mode': 1}, 'max': {'pad': 0.1}}}
+_SETTLED = 2.0  # s
+_NARROW = 576  # px, width up to which viser shows the panel below
+# viser's sheet for narrow windows is as wide as a panel and covers the arm on one side.
+_SHEET = (
+    '<style>@media (max-width:36em){[style*="width: 20em"]'
+    '{width:100%!important;max-height:50vh!important}}</style>'
+)
 _LEVELS = {'OK': GREEN, 'WARN': ORANGE, 'ERROR': ALARM, 'STALE': MUTED, 'BAG': MUTED}
 
 
@@ -55,6 +76,8 @@ class Page:
         self.url = url_of(host, self.server.get_port())
         self._events: deque[tuple[float, str, str]] = deque(maxlen=_EVENTS)
         self._state = 'STALE', ''
+        self._corners: Floats | None = None  # joints and tip when first drawn
+        self.server.on_client_connect(self._welcome)
         self.clear()
 
     def clear(self) -> None:
@@ -71,24 +94,22 @@ class Page:
 
     def draw_arm(self, arm: ShownArm, estimates: Mapping[str, str]) -> Any:
         """Draw an arm, given the units of its estimates by name; return the page's tabs."""
-        from trimesh import Trimesh
         from viser.extras import ViserUrdf
 
-        self._arm, self._units = arm, dict(estimates)
+        self._arm = arm
         self._joints = [joint.name for joint in arm.chain.joints]
+        prefix, names = _shortened(self._joints)
+        self._units = {name.replace(f' {prefix}', ' '): unit for name, unit in estimates.items()}
+        self._bodies = bodies_of(tuple(estimates))
         self._deviation = self._prior = np.full(len(estimates), np.nan)
         server, gui, reach = self.server, self.server.gui, arm.reach
         model = arm.model()
         self._held = dict.fromkeys(model.actuated_joint_names, 0.0)
-        colour = None if 'rgba' in arm.text or '<mesh' in arm.text else _PLAIN
+        shapes = model.scene.geometry.values()
+        colour = None if any(len(shape.faces) > _MESH for shape in shapes) else _PLAIN
         self._drawn = ViserUrdf(server, model, root_node_name='/arm', mesh_color_override=colour)
-        ghost = arm.model()
-        shapes = ghost.scene.geometry
-        for name, shape in list(shapes.items()):  # a shell around the arm where both coincide
-            corners = shape.vertices + _HALO * reach * shape.vertex_normals
-            shapes[name] = Trimesh(corners, shape.faces, process=False)
         self._ghost = ViserUrdf(
-            server, ghost, root_node_name='/reference', mesh_color_override=_GHOST
+            server, arm.model(), root_node_name='/reference', mesh_color_override=_GHOST
         )
         base = np.array(model.get_transform(arm.chain.base))
         self._base = base
@@ -96,15 +117,15 @@ class Page:
         server.scene.add_grid(
             '/floor', 4 * reach, 4 * reach, cell_size=0.25, position=(0, 0, floor)
         )
-        server.initial_camera.position = tuple(np.array((0.45, -1.05, 0.5)) * reach)
-        server.initial_camera.look_at = (0.15 * reach, 0.0, 0.28 * reach)
+        self._corners = None
         tabs = gui.add_tab_group()
         with tabs.add_tab('Plots'):
+            log = {'distr': 3, 'range': (_LEAST, _MOST)}
             self._plots = [
-                self._plot('tracking error [% of the bound]', self._joints, ('bound',), 110.0),
-                self._plot('torque [N m]', self._joints, ()),
-                self._plot('estimates minus truth [% of the prior]', tuple(estimates), (), 100.0),
-                self._plot('excitation: log10 of lambda_min', ('lambda_min',), ()),
+                self._plot(f'{prefix}: largest error in 1 s [% of bound]', names, log, 'bound'),
+                self._plot(f'{prefix}: torque [N m]', names),
+                self._plot('error of the estimates [% of prior]', tuple(self._bodies), _FROM_ZERO),
+                self._plot('excitation: log10 of lambda_min', ('lambda_min',)),
             ]
             self._table = gui.add_html('')
         with tabs.add_tab('Estimates'):
@@ -115,28 +136,34 @@ class Page:
         return tabs
 
     def _plot(
-        self, title: str, names: Sequence[str], limits: Sequence[str], span: float = 0.0
+        self, title: str, names: Sequence[str], y: Mapping[str, Any] = _AUTO, limit: str = ''
     ) -> Any:
         lines: list[Any] = [{'label': 's'}]
         lines += [
             {'label': name, 'stroke': COLOURS[k % len(COLOURS)], 'width': 1.5, 'points': _NO_POINTS}
             for k, name in enumerate(names)
         ]
-        edge = {'stroke': ALARM, 'width': 1.0, 'dash': [6, 4], 'points': _NO_POINTS}
-        lines += [{'label': sign + name, **edge} for name in limits for sign in '+-']
-        scales: Any = {'x': {'time': False}}
-        if span:
-            scales['y'] = {'range': (-span, span)}
+        edge = {'stroke': ALARM, 'width': 1.5, 'dash': [6, 4], 'points': _NO_POINTS}
+        lines += [{'label': limit, **edge}] if limit else []
+        lines += [
+            {'label': 'event', 'stroke': INK, 'width': 1.0, 'points': _NO_POINTS, 'scale': 'marks'}
+        ]
+        scales: Any = {'x': {'time': False}, 'y': y, 'marks': {'range': (0.0, 1.0)}}
         empty = (np.zeros(1),) * len(lines)
         return self.server.gui.add_uplot(
-            empty, tuple(lines), title=title, scales=scales, legend={'show': False}, height=150
+            empty,
+            tuple(lines),
+            title=title,
+            scales=scales,
+            legend={'show': True, 'live': False},
+            height=_HEIGHT,
         )
 
     def state(self, level: str, text: str) -> None:
         """Show the controller's state: level (OK, WARN, ERROR, STALE or BAG) and description."""
         self._state = level, text
         self._header.content = (
-            f'<div style="margin:4px 12px;padding:6px 10px;border-radius:6px;color:white;'
+            f'{_SHEET}<div style="margin:4px 12px;padding:6px 10px;border-radius:6px;color:white;'
             f'background:{_LEVELS[level]}"><b>{level}</b> {escape(text)}</div>'
         )
 
@@ -145,10 +172,10 @@ class Page:
         for client in self.server.get_clients().values():
             client.add_notification(title, text, color='red', auto_close_seconds=15.0)
 
-    def event(self, time: float, kind: str, text: str) -> None:
-        """Add an event at a time [s] to the list."""
+    def event(self, at: float, kind: str, text: str) -> None:
+        """Add an event at `at` [s] to the list."""
         if kind:
-            self._events.append((time, kind, text))
+            self._events.append((at, kind, text))
         if self._list is not None:
             self._list.content = event_table(reversed(self._events))
 
@@ -169,8 +196,12 @@ class Page:
         chain, reach, scene = self._arm.chain, self._arm.reach, self.server.scene
         with self.server.atomic():
             self._drawn.update_cfg(self._posture(now.position))
+            if self._corners is None:
+                self._corners = self._transformed(skeleton(chain, now.position)[0])
+                self._aim_all()
             tip = self._at(frames(chain, now.position)[-1])
             reference = now.position - now.error
+            self._ghost.show_visual = bool(np.abs(now.error).max() > _APART)  # NaN: not
             if np.isfinite(reference).all():
                 self._ghost.update_cfg(self._posture(reference))
                 if np.isfinite(now.bound).all():
@@ -182,6 +213,10 @@ class Page:
             scene.add_icosphere(
                 '/payload', 0.045 * reach, color=(213, 94, 0), position=tip, visible=now.loaded
             )
+            happened = [e for e in self._events if now.time - _SHOWN < e[0] <= now.time]
+            _, kind, text = happened[-1] if happened else (0.0, '', '')
+            above = tip + np.array((0.0, 0.0, 0.1 * reach))
+            scene.add_label('/event', f'{kind}: {text}', position=above, visible=bool(kind))
             recent = np.array([one.position for one in past if one.time > now.time - _TRAIL])
             if len(recent) > 1:
                 path = self._at(frames(chain, recent)[-1])
@@ -195,27 +230,70 @@ class Page:
         now = past[-1]
         shown = [one for one in past if one.time > now.time - PAST]
         t = np.array([one.time for one in shown])
-        edge = np.full(t.size, 100.0)
-        error = np.array([100.0 * one.error / one.bound for one in shown]).T
-        torque = np.array([one.torque for one in shown]).T
-        off = np.array([100.0 * (one.estimate - np.nan_to_num(one.truth)) for one in shown]).T
+        error = np.array([100.0 * moment.error / moment.bound for moment in shown]).T
+        torque = np.array([moment.torque for moment in shown]).T
+        excitation = np.array([[moment.lambda_min for moment in shown]])
         with np.errstate(divide='ignore', invalid='ignore'):
-            excitation = np.log10(np.array([[one.lambda_min for one in shown]]))
-            curves = error, torque, off / self._prior[:, np.newaxis], excitation
+            curves = (
+                np.vstack((_peaks(np.abs(error)), np.full(t.size, 100.0))),
+                torque,
+                self._off(shown),
+                np.log10(excitation),
+            )
+        marks = [e[0] for e in self._events if t[0] <= e[0] <= t[-1]]
         with self.server.atomic():
             for plot, values in zip(self._plots, curves, strict=True):
-                edges = (edge, -edge) if plot is self._plots[0] else ()
-                plot.data = (t, *(np.where(np.isfinite(v), v, np.nan) for v in values), *edges)
+                plot.data = with_marks(t, values, marks)
             self._table.content = joint_table(self._joints, now)
             deviations = self._prior, self._deviation
             self._estimates.content = estimate_table(self._units, now, *deviations)
+
+    def _off(self, shown: Sequence[Moment]) -> Floats:
+        """Return how far the estimates of each body (b, k) are off, rms [% of the prior].
+
+        Off the truth or, where none is known, off what they were at the left end of the plot.
+        """
+        estimate = np.array([moment.estimate for moment in shown])
+        truth = shown[-1].truth if np.isfinite(shown[-1].truth).any() else estimate[0]
+        truth = np.array([moment.truth for moment in shown]) if truth is not estimate[0] else truth
+        square = (100.0 * (estimate - truth) / self._prior) ** 2
+        rms = [
+            np.sqrt(np.nanmean(square[:, members], axis=1))
+            if np.isfinite(square[:, members]).any()
+            else np.full(len(shown), np.nan)
+            for members in self._bodies.values()
+        ]
+        return np.array(rms)
+
+    def _aim(self, camera: Any, width: float = inf) -> None:
+        """Point a camera at the arm, which then fills a picture of this width [px]."""
+        if self._corners is None:
+            return
+        low, high = self._corners.min(axis=0), self._corners.max(axis=0)
+        centre, size = 0.5 * (low + high), float(np.linalg.norm(high - low))
+        if width <= _NARROW:  # the lower half is covered
+            centre, size = centre - (0.0, 0.0, 0.4 * size), 1.7 * size
+        camera.position, camera.look_at = centre + 1.15 * size * _VIEW, centre
+
+    def _welcome(self, client: Any) -> None:
+        for pause in (0.0, _SETTLED):  # the browser begins with the common camera, at some time
+            time.sleep(pause)
+            self._aim(client.camera, client.camera.image_width)
+
+    def _aim_all(self) -> None:
+        self._aim(self.server.initial_camera)
+        for client in self.server.get_clients().values():
+            self._aim(client.camera, client.camera.image_width)
 
     def _posture(self, q: Floats) -> dict[str, float]:
         return self._held | dict(zip(self._joints, q.tolist(), strict=True))
 
     def _at(self, placement: Floats) -> Floats:
-        """Transform the origins (..., 3) of placements from the base to the root of the URDF."""
-        at: Floats = placement[..., :3, 3] @ self._base[:3, :3].T + self._base[:3, 3]
+        """Return the origins (..., 3) of placements in the frame of the URDF's root."""
+        return self._transformed(placement[..., :3, 3])
+
+    def _transformed(self, points: Floats) -> Floats:
+        at: Floats = points @ self._base[:3, :3].T + self._base[:3, 3]
         return at
 
     def close(self) -> None:
@@ -224,7 +302,42 @@ class Page:
             self.server.stop()
 
 
-_NO_POINTS = {'show': False}
+def bodies_of(estimates: Sequence[str]) -> dict[str, list[int]]:
+    """Return the indices of the estimates of each link and kind of friction; of few, each alone."""
+    if len(estimates) <= _FEW:
+        return {name: [k] for k, name in enumerate(estimates)}
+    bodies: dict[str, list[int]] = {}
+    for k, name in enumerate(estimates):
+        number = re.search(r'\d+$', name)
+        body = number[0] if number and ' ' not in name else name.split(' ')[0]
+        bodies.setdefault(body, []).append(k)
+    return bodies
+
+
+def _shortened(joints: Sequence[str]) -> tuple[str, Sequence[str]]:
+    """Return what all names begin with, and what is left of each, as a legend has little room."""
+    prefix = os.path.commonprefix(joints).rstrip('0123456789')  # noqa: RUF071 - of characters
+    rest = [name.removeprefix(prefix) for name in joints]
+    return (prefix, rest) if all(rest) and prefix else ('joints', joints)
+
+
+def _peaks(values: Floats) -> Floats:
+    """Return the largest of the last values (n, k) up to each."""
+    padded = np.pad(values, ((0, 0), (_PEAK - 1, 0)), mode='edge')
+    peaks: Floats = np.fmax.reduce([padded[:, j : j + values.shape[1]] for j in range(_PEAK)])
+    return peaks
+
+
+def with_marks(t: Floats, curves: Floats, marks: Sequence[float]) -> tuple[Floats, ...]:
+    """Return times (k,), curves (c, k) and a vertical line at each mark, as rows of a plot.
+
+    uPlot draws no line through NaN, and no axis: unknown values are put below the axis.
+    """
+    known = np.where(np.isfinite(curves), curves, -1.0)
+    at = np.repeat(np.searchsorted(t, marks), 3)
+    line = np.insert(np.full(t.size, -1.0), at, (-1.0, 1.0, -1.0) * len(marks))
+    held = known[:, np.maximum(at - 1, 0)]
+    return (np.insert(t, at, np.repeat(marks, 3)), *np.insert(known, at, held, axis=1), line)
 
 
 def _hangs(arm: ShownArm) -> bool:

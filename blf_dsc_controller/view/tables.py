@@ -13,7 +13,7 @@ from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.moment import Moment
 
 _NOT_SHOWN = 0.5  # share of the prior's deviation above which an estimate is not identified
-_CELL = 'padding:1px 6px;text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums'
+_CELL = 'padding:1px 4px;text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums'
 
 
 def joint_table(joints: Sequence[str], now: Moment) -> str:
@@ -26,15 +26,14 @@ def joint_table(joints: Sequence[str], now: Moment) -> str:
 
 def estimate_table(units: Mapping[str, str], now: Moment, prior: Floats, deviation: Floats) -> str:
     """Return the table of estimates; `prior` and `deviation` are standard deviations (m,)."""
-    rows = [_row('th', 'estimate', '', '±', 'truth', 'unit', 'identified')]
+    rows = [_row('th', 'estimate', '', '±', 'truth', 'known')]
     columns = now.estimate, deviation, now.truth, deviation / prior
     for name, unit, value, spread, truth, left in zip(units, units.values(), *columns, strict=True):
-        figures = map(_figure, (value, spread, truth))
+        figures = (f'{x:.3g}' if np.isfinite(x) else '-' for x in (value, spread, truth))
+        label = f'{escape(name)} <span style="opacity:0.6">{unit}</span>'
         rejected = not np.isfinite(value)
         bar = 'rejected' if rejected else _bar(1.0 - left)
-        rows.append(
-            _row('td', escape(name), *figures, unit, bar, pale=rejected or left > _NOT_SHOWN)
-        )
+        rows.append(_row('td', label, *figures, bar, pale=rejected or left > _NOT_SHOWN))
     return _in_table(rows)
 
 
@@ -59,8 +58,8 @@ def _bar(share: float) -> str:
     percent = 100.0 * min(max(float(np.nan_to_num(share)), 0.0), 1.0)
     colour = GREEN if share > 1.0 - _NOT_SHOWN else MUTED
     fill = f'linear-gradient(to right,{colour} {percent:.0f}%,transparent 0)'
-    return f'<div style="width:60px;border:1px solid #bbb;background:{fill}">&nbsp;</div>'
+    return f'<div style="width:40px;border:1px solid #bbb;background:{fill}">&nbsp;</div>'
 
 
 def _in_table(rows: Iterable[str]) -> str:
-    return f'<table style="font-size:12px;margin:4px 8px">{"".join(rows)}</table>'
+    return f'<table style="font-size:11px;margin:4px">{"".join(rows)}</table>'
