@@ -22,6 +22,8 @@ from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.analysis.style import COLOURS, formula
 from blf_dsc_controller.analysis.thinning import envelope
 from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.simulation.loop import simulate
 
 
 @pytest.fixture(scope='module')
@@ -43,6 +45,17 @@ def amount(image, colour):
 def lightened(colour, opacity=0.75):
     """Colour of a line with this opacity on white."""
     return to_hex(np.array(to_rgb(colour)) * opacity + 1.0 - opacity)
+
+
+def test_a_change_of_the_arm_is_drawn_from_close_by(tmp_path):
+    event = {'events.begin': (1.0,), 'events.duration': (0.0,), 'events.payload': (0.25,)}
+    loop = load_loop('recommended', {'sim_plant': {'duration': 4.0, **event}})
+    drawn = draw(simulate(loop.controller, loop.plant).run(), tmp_path)
+    assert [path.name for path in drawn[:2]] == ['tracking.png', 'change.png']
+    image = pixels(tmp_path / 'change.png')
+    assert amount(image, '#DCE9F5') > 20_000  # the bound
+    for colour in COLOURS[:2]:  # error and torque of two joints
+        assert amount(image, colour) > 500
 
 
 def test_draw_writes_both_figures(run, tmp_path):

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The panels of a run as PNG files: tracking.png, parameters.png and monitors.png."""
+"""The panels of a run as PNG files: tracking.png, change.png, parameters.png and monitors.png."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,11 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 
-from blf_dsc_controller.analysis.metrics import measure
+from blf_dsc_controller.analysis.metrics import change_times, measure, true_change_times
 from blf_dsc_controller.analysis.panels import Line, Mark, Panel, panels
 from blf_dsc_controller.analysis.style import (
     ALARM,
+    BLUE,
     COLOURS,
     GREEN,
     INK,
@@ -30,13 +31,15 @@ from blf_dsc_controller.analysis.thinning import thin
 from blf_dsc_controller.messages.topics import DISTURBANCE
 from blf_dsc_controller.run import Run
 
-NAMES = ('tracking.png', 'parameters.png', 'monitors.png')
+NAMES = ('tracking.png', 'change.png', 'parameters.png', 'monitors.png')
 """Names of the files that `draw` can write."""
 
 _SIZE = (6.2, 2.6)  # inches
 _LOW = (4.3, 1.75)
 _ABREAST = 3  # joints, at most, in columns; more are in rows
 _HIGH = (6.2, 3.2)
+_CLOSE_UP = (9.5, 2.6)
+_BEFORE, _AFTER = 1.0, 2.0  # s, shown of a change
 _ALONE = {'Torque': ORANGE, 'Excitation': GREEN}  # colour of one line
 _WIDE = {'Motion': (3.2, 0.55), 'Estimates': (2.4, 0.75)}  # width and opacity
 _FLAT, _DECADE = 2.0, 10.0
@@ -47,8 +50,8 @@ _WIDTHS_UPON_EACH_OTHER = (5.0, 2.4)
 def draw(run: Run, folder: Path) -> list[Path]:
     """Draw tracking.png and the other files that the run has data for, and return the paths.
 
-    These are parameters.png if parameters were learned, and monitors.png if the monitor was
-    recorded. The folder is created if necessary.
+    These are change.png if a simulated arm changed, parameters.png if parameters were learned, and
+    monitors.png if the monitor was recorded. The folder is created if necessary.
     """
     folder.mkdir(parents=True, exist_ok=True)
     found = panels([run])
@@ -72,6 +75,11 @@ def draw(run: Run, folder: Path) -> list[Path]:
     else:
         rows = [panel for i in range(n) for panel in motion[i::n]]
         draw_panels(paths[0], title, rows, len(motion) // n, _LOW, legend_above=True)
+    changes = true_change_times(run)
+    if changes and run.error is not None:
+        paths.append(folder / NAMES[1])
+        title = f'The first change of the arm, from {changes[0] - _BEFORE:g} s on'
+        draw_panels(paths[-1], title, list(_close_up(run, found, changes[0])), 1, _CLOSE_UP)
     if parameters:
         title, error = 'Learning', metrics.final_parameter_error
         if not math.isnan(error):
@@ -82,11 +90,11 @@ def draw(run: Run, folder: Path) -> list[Path]:
             shown = [_overlaid('estimates', [panel for panel in parameters if not panel.log])]
             shown += [panel for panel in parameters if panel.log]
         shown += [_overlaid('disturbance estimates', disturbances)] if disturbances else []
-        paths.append(folder / NAMES[1])
+        paths.append(folder / NAMES[2])
         draw_panels(paths[-1], title, [*shown, *excitation], 2, _HIGH)
     if monitors:
         shown = monitors if parameters else [*monitors, *excitation]
-        paths.append(folder / NAMES[2])
+        paths.append(folder / NAMES[3])
         draw_panels(paths[-1], 'Monitors', shown, 2, _HIGH)
     return paths
 
@@ -99,6 +107,34 @@ def _overlaid(title: str, shown: Sequence[Panel]) -> Panel:
         name = formula(name) if panel.group == 'Parameters' else name
         lines += [line if line.colour else line._replace(name=name) for line in panel.lines]
     return replace(shown[0], group='Estimates', title=title, lines=tuple(lines))
+
+
+def _close_up(run: Run, found: Sequence[Panel], change: float) -> Iterator[Panel]:
+    """Yield the errors of all joints, their torques and the model's error around a change."""
+    begin, end = change - _BEFORE, change + _AFTER
+    marks = [Mark(change, 'the arm changes', INK)]
+    marks += [Mark(t, 'learning restarts', BLUE) for t in change_times(run) if begin < t < end]
+    for group, kind in (('Tracking', 'error of '), ('Torque', 'torque of ')):
+        of_joints = [panel for panel in found if panel.title.startswith(kind)]
+        lines = []
+        for panel, joint in zip(of_joints, run.joints, strict=False):
+            lines.append(panel.lines[0]._replace(name=joint))
+            lines += [line for line in panel.lines[1:] if line.shaded and len(lines) == 1]
+        if lines:
+            title, unit = f'{kind}each joint', of_joints[0].unit
+            yield _cut(Panel(group, title, unit, tuple(lines), marks=tuple(marks)), begin, end)
+            marks = [mark._replace(text='') for mark in marks]  # named once
+    for panel in found:
+        if panel.group == 'Parameters' and panel.log:
+            yield _cut(replace(panel, marks=tuple(marks), note=''), begin, end)
+
+
+def _cut(panel: Panel, begin: float, end: float) -> Panel:
+    lines = []
+    for line in panel.lines:
+        shown = (line.time >= begin) & (line.time <= end)
+        lines.append(line._replace(time=line.time[shown], values=line.values[shown]))
+    return replace(panel, lines=tuple(lines))
 
 
 def draw_panels(

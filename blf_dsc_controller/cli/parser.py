@@ -116,7 +116,7 @@ def make_parser() -> argparse.ArgumentParser:
         'plot',
         'bags',
         'plot and summarise a bag',
-        'Draw tracking.png, parameters.png and monitors.png of a bag and write summary.json.',
+        'Draw the pictures of a bag (tracking.png, ...) and write summary.json.',
         'run1/bag --out pictures',
     )
     plot.add_argument('bag', type=Path, help=_BAG)
