@@ -8,8 +8,10 @@ from typing import Annotated, NamedTuple
 
 import numba
 import numpy as np
+import pytest
 
-from blf_dsc_controller.compiled.layout import Array, Cell, pack, size_of, view_of
+from blf_dsc_controller.compiled import jit
+from blf_dsc_controller.compiled.layout import Array, Cell, Fixed, pack, size_of, sizes_of, view_of
 
 
 class Motor(NamedTuple):
@@ -70,3 +72,42 @@ def test_kernels_and_python_agree():
     assert results[0][0] == 44.0
     assert results[0][1] == 0.5
     assert results[0][1 + 12] == 9.0
+
+
+class Sized(NamedTuple):
+    joints: Fixed
+    columns: Fixed
+    count: int
+    gains: Annotated[Array, 'joints', 'columns + 1']
+
+
+sized_of = view_of(Sized)
+
+
+@jit.kernel
+def lengths(vector, sizes, out):
+    sized = sized_of(vector, sizes)
+    out[0], out[1], out[2] = sized.joints, sized.columns, sized.count
+    out[3] = sized.gains[sized.joints - 1, sized.columns]
+
+
+@pytest.mark.parametrize(('joints', 'columns'), [(1, 0), (2, 3), (7, 300)])
+def test_fixed_numbers_reach_kernels_beside_the_vector(joints, columns):
+    gains = np.arange(float(joints * (columns + 1))).reshape(joints, columns + 1)
+    sized = Sized(joints, columns, 5, gains)
+    vector, out = pack(sized), np.zeros(4)
+    assert vector.size == 1 + gains.size
+    lengths(vector, sizes_of(sized), out)
+    assert out.tolist() == [joints, columns, 5, gains[-1, -1]]
+    view = sized_of(vector, sizes_of(sized))
+    assert view[:3] == (joints, columns, 5)
+    np.testing.assert_array_equal(view.gains, gains)
+
+
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
+def test_kernels_are_compiled_for_their_fixed_numbers():
+    before = len(lengths.signatures)
+    for joints, count in ((11, 1), (11, 2), (12, 1)):
+        sized = Sized(joints, 0, count, np.zeros((joints, 1)))
+        lengths(pack(sized), sizes_of(sized), np.zeros(4))
+    assert len(lengths.signatures) == before + 2

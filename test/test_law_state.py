@@ -24,7 +24,7 @@ from closed_loop_case import (
 )
 from numba.core.runtime import _nrt_python, rtsys
 
-from blf_dsc_controller.compiled.layout import pack
+from blf_dsc_controller.compiled.layout import pack, sizes_of
 from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.settings import Settings, settings_of
 from blf_dsc_controller.law.state import (
@@ -59,7 +59,7 @@ def distinct_settings(n, p):
 def test_settings_survive_packing_and_unpacking(n, p):
     settings = distinct_settings(n, p)
 
-    unpacked = settings_of(pack(settings), settings.model)
+    unpacked = settings_of(pack(settings), sizes_of(settings), settings.model)
 
     for name in Settings._fields:
         np.testing.assert_array_equal(
@@ -167,10 +167,12 @@ def test_restored_loop_continues_bit_for_bit():
 
 
 @numba.njit
-def many_updates(model, settings, law, state, signals, measurement, sample, checks, count):
+def many_updates(model, sizes, settings, law, state, signals, measurement, sample, checks, count):
     for k in range(count):
         t = k * 1e-3
-        update(model, settings, law, state, signals, t, 1e-3, measurement, sample, checks)
+        update(
+            model, sizes, settings, law, state, signals, t, 1e-3, measurement, sample, checks
+        )
 
 
 def test_updates_in_a_compiled_loop_allocate_nothing():
@@ -179,6 +181,7 @@ def test_updates_in_a_compiled_loop_allocate_nothing():
     measurement = np.array([*START, *np.zeros(4)])
     vectors = (
         law.settings.model,
+        law.sizes,
         law.settings_vector,
         REFERENCE,
         law.state_vector,

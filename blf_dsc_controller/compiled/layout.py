@@ -20,29 +20,56 @@ tuple in kernels).  Fields of type `int` and `float` are numbers, read when the 
 `int` field of the layout itself can also be a length; if the vector holds all lengths, the view
 takes the vector alone, and `pack` makes it from the tuple.  A field may itself be such a
 `NamedTuple`.  A field of any other type is not in the vector: the view takes it as an argument.
+
+Nor is a field of type `Fixed`, an integer that is compiled into kernels, such as the number of
+joints: loops of known length are unrolled.  The view takes all of them as its second argument,
+`sizes_of` the tuple; a kernel is compiled once for each combination of values that occurs.
 """
 
 from __future__ import annotations
 
-import ast
 import functools
+import re
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any, TypeVar, get_type_hints
 
 import numpy as np
+from numba.extending import overload
 
-from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.jit import INLINED, inner
 from blf_dsc_controller.compiled.views import part
 
 Array = np.ndarray
 Cell = Annotated[Array, '1']
 """One number of a vector, which kernels can write."""
+Fixed = Annotated[int, 'compiled into kernels']
+"""An integer that kernels are compiled for."""
 
 T = TypeVar('T')
 
 _hints: Callable[[Any], dict[str, Any]] = functools.cache(
     functools.partial(get_type_hints, include_extras=True)
 )
+
+
+def sizes_of(layout: Any) -> np.dtype[np.void]:
+    """Return the fixed numbers of a layout, as the second argument of its view in kernels.
+
+    They are the lengths of the arrays in a structured data type, which for numba is a type.
+    """
+    names = [name for name, hint in _hints(type(layout)).items() if hint is Fixed]
+    return np.dtype([(name, 'u1', (getattr(layout, name),)) for name in names])
+
+
+def fixed(sizes: Any, name: str) -> int:
+    """Return the named number of `sizes_of`."""
+    return int(sizes[name].shape[0])
+
+
+@overload(fixed, strict=False, jit_options=INLINED, prefer_literal=True)
+def _compiled_fixed(sizes: Any, name: Any) -> Any:
+    (number,) = sizes.dtype.typeof(name.literal_value).shape
+    return lambda sizes, name: number  # noqa: ARG005 - numba looks at the names
 
 
 def pack(layout: Any) -> np.ndarray:
@@ -69,13 +96,14 @@ def view_of(layout: type[T]) -> Callable[..., T]:
     Kernels may call it; its arrays are views that must not outlive the vector (`views.part`).
     """
     # No field's name starts with an underscore.
-    names: dict[str, Any] = {'_part': part, '__name__': layout.__module__}
+    names: dict[str, Any] = {'_part': part, '_fixed': fixed, '__name__': layout.__module__}
     hints = _hints(layout)
-    own = tuple(name for name, hint in hints.items() if hint is int)
+    own = tuple(name for name, hint in hints.items() if hint in (int, Fixed))
     lines = ['_at = 0']
     result = _view(layout, own, lines, names, '')
-    arguments = ['_vector', *(name for name, hint in hints.items() if not _is_part(hint))]
-    if any('_sizes.' in line for line in lines):
+    passed = (name for name, hint in hints.items() if not (_is_part(hint) or hint is Fixed))
+    arguments = ['_vector', *passed]
+    if any('_sizes' in line for line in lines):
         arguments.insert(1, '_sizes')
     body = '\n    '.join([*lines, f'return {result}'])
     view: Callable[..., T] = _defined(', '.join(arguments), body, names)
@@ -94,7 +122,9 @@ def _view(
             values.append(f'{name}={_view(hint, own, lines, names, f"{local}_")}')
             continue
         values.append(f'{name}={local}')
-        if hint in (int, float):
+        if hint is Fixed:
+            lines += [f'{local} = _fixed(_sizes, {name!r})']
+        elif hint in (int, float):
             lines += [f'{local} = {"int(_vector[_at])" if hint is int else "_vector[_at]"}']
             lines += ['_at += 1']
         elif _is_part(hint):
@@ -113,19 +143,17 @@ def _sizes(layout: type) -> Iterator[str]:
 
 
 def _is_part(hint: Any) -> bool:
-    return hint in (int, float) or hasattr(hint, '__metadata__') or hasattr(hint, '_fields')
+    is_array = hasattr(hint, '__metadata__') and hint is not Fixed
+    return hint in (int, float) or is_array or hasattr(hint, '_fields')
 
 
 def _length(expression: object, own: tuple[str, ...]) -> str:
     """Return the length with names read from `_sizes`, except for the layout's own."""
-
-    class FromSizes(ast.NodeTransformer):
-        def visit_Name(self, node: ast.Name) -> ast.expr:
-            if node.id in own:
-                return node
-            return ast.Attribute(ast.Name('_sizes', ast.Load()), node.id, ast.Load())
-
-    return ast.unparse(FromSizes().visit(ast.parse(str(expression), mode='eval')))
+    return re.sub(
+        r'[A-Za-z_][\w.]*',
+        lambda name: name[0] if name[0] in own else f'_sizes.{name[0]}',
+        str(expression),
+    )
 
 
 def _product(lengths: list[str]) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import kernel
-from blf_dsc_controller.compiled.layout import pack
+from blf_dsc_controller.compiled.layout import pack, sizes_of
 from blf_dsc_controller.compiled.views import part
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.checks import (
@@ -35,6 +35,7 @@ from blf_dsc_controller.reference.approach import check_start
 @kernel
 def update(
     model: ArmModel,
+    sizes: np.dtype[np.void],
     settings_vector: np.ndarray,
     reference_vector: np.ndarray,
     state_vector: np.ndarray,
@@ -49,7 +50,7 @@ def update(
 
     Returns the flags of its checks (see `checks`), or 0 while they are off.
     """
-    settings = settings_of(settings_vector, model)
+    settings = settings_of(settings_vector, sizes, model)
     state = state_of(state_vector, settings)
     signals = signals_of(signals_vector, settings)
     sample = sample_of(sample_vector, settings)
@@ -67,6 +68,7 @@ class Controller:
 
     Attributes:
         settings: settings of the law; views of `settings_vector`.
+        sizes: what the kernels are compiled for.
         state: views of `state_vector`, the whole state of the controller.
         signals: views of the values that the last update computed.
         sample: telemetry of the last update.
@@ -77,8 +79,9 @@ class Controller:
     def __init__(self, settings: Settings, reference_vector: np.ndarray) -> None:
         """Allocate the vectors for settings and a packed reference; compile the kernels."""
         self.settings_vector = pack(settings)
+        self.sizes = sizes_of(settings)
         self.reference_vector = reference_vector
-        self.settings = settings_of(self.settings_vector, settings.model)
+        self.settings = settings_of(self.settings_vector, self.sizes, settings.model)
         self.state_vector = np.zeros(state_size(self.settings))
         self.signals_vector = np.zeros(signals_size(self.settings))
         self.state = state_of(self.state_vector, self.settings)
@@ -129,6 +132,7 @@ class Controller:
         """
         self.flags = update(
             self.settings.model,
+            self.sizes,
             self.settings_vector,
             self.reference_vector,
             self.state_vector,

@@ -29,6 +29,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import inner, kernel
+from blf_dsc_controller.compiled.layout import sizes_of
 from blf_dsc_controller.law import surface
 from blf_dsc_controller.law.settings import FILTERED, LAMBDA, Settings, settings_of
 from blf_dsc_controller.law.state import Signals, State
@@ -195,20 +196,21 @@ def rows_along(
     """
     H = np.zeros((settings.n, settings.p))
     rows = np.zeros((times.size, settings.n, settings.m))
-    _fill_rows(settings.model, settings_vector, times, motion, H, rows)
+    _fill_rows(settings.model, sizes_of(settings), settings_vector, times, motion, H, rows)
     return rows
 
 
 @kernel
 def _fill_rows(
     model: ArmModel,
+    sizes: np.dtype[np.void],
     settings_vector: np.ndarray,
     times: np.ndarray,
     motion: np.ndarray,
     H: np.ndarray,
     rows: np.ndarray,
 ) -> None:
-    settings = settings_of(settings_vector, model)
+    settings = settings_of(settings_vector, sizes, model)
     for k in range(times.size):
         q = motion[k, 0]
         dq = motion[k, 1]

@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.arms.model import ArmModel
-from blf_dsc_controller.compiled.layout import Array, view_of
+from blf_dsc_controller.compiled.layout import Array, Fixed, view_of
 
 # The vector holds the index of each choice.
 SURFACES = ('filtered', 'linear')
@@ -30,9 +30,9 @@ class Settings(NamedTuple):
     """
 
     model: ArmModel
-    n: int
-    p: int
-    m: int
+    n: Fixed
+    p: Fixed
+    m: Fixed
     surface: int
     prediction: int
     latch: int

@@ -55,6 +55,7 @@ def run_loop(
     plant_state: np.ndarray,
     rng: np.random.Generator,
     model: ArmModel,
+    sizes: np.dtype[np.void],
     settings: np.ndarray,
     reference: np.ndarray,
     state: np.ndarray,
@@ -77,7 +78,7 @@ def run_loop(
     energies are computed, and a non-finite number ends the run; numba compiles this separately.
     Metrics are updated if their settings have joints.
     """
-    law = settings_of(settings, model)
+    law = settings_of(settings, sizes, model)
     law_state = state_of(state, law)
     law_signals = signals_of(signals, law)
     plant, now = plants.plant_views(arm, plant_settings, plant_state)
@@ -239,6 +240,7 @@ def _run_samples(
         plant.state,
         plant.rng,
         controller.settings.model,
+        controller.sizes,
         controller.settings_vector,
         controller.reference_vector,
         controller.state_vector,
