@@ -33,10 +33,8 @@ endif
 
 VENV := .venv
 READY := $(VENV)/.ready-$(FLAVOUR)-$(VERSION)
-LINT_READY := $(READY)-lint
-BENCH_READY := $(READY)-bench
-RELEASE_READY := $(READY)-release
-PIP := $(VENV)/bin/python -m pip --disable-pip-version-check -qq
+# Bytecode is left to the first import: most of what is installed is never imported.
+PIP_INSTALL := $(VENV)/bin/python -m pip --disable-pip-version-check install --no-compile
 # This checkout comes first, also before a workspace that has the package installed.
 RUN := PYTHONPATH="$(CURDIR)$${PYTHONPATH:+:$$PYTHONPATH}" $(VENV)/bin/python
 PIP_FAILED := { echo 'The installation failed: see above. It needs a package index: behind a proxy' \
@@ -48,7 +46,7 @@ PIP_FAILED := { echo 'The installation failed: see above. It needs a package ind
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' Makefile
 
-venv: $(READY) ## Install everything into .venv (other targets do it when needed)
+venv: $(READY)-test $(READY)-lint ## Install all for runs, tests and lint into .venv (others do it when needed)
 
 demo: $(READY) ## Run the closed loop over ROS 2 (CONFIG, DURATION in s) and plot it, into out/
 	@mkdir -p out; out=out/demo; n=1; \
@@ -70,21 +68,21 @@ arms: $(READY) ## Compare laws on a Panda and a UR5e with wrong URDFs, into out/
 # A file's tests stay together on one of the workers, for what they set up is shared; the files
 # come in the order of test/conftest.py. Bytecode is kept, also where the environment says not to,
 # as containers do: each of the many processes would compile the package's sources again.
-test: $(READY) ## Run the tests (TESTS=test/test_x.py for some, WORKERS=0 in one process)
+test: $(READY)-test ## Run the tests (TESTS=test/test_x.py for some, WORKERS=0 in one process)
 	@PYTHONDONTWRITEBYTECODE= PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(RUN) -m pytest -p xdist \
 	    -p _hypothesis_pytestplugin -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(TESTS)
 
-test-long: $(READY) ## Run the long tests: recorder killed ten times, one-minute recording, changing arms
+test-long: $(READY)-test ## Run the long tests: recorder killed ten times, one-minute recording, changing arms
 	@LONG_TESTS=1 $(RUN) -m pytest -rP test/test_bag_recorder_killed.py \
 	    test/test_bag_recorder_beside_loop.py test/test_changed_arm.py
 
-test-browser: $(READY) ## Test the pages of bag_report and view in a headless Chromium, if installed
+test-browser: $(READY)-test ## Test the pages of bag_report and view in a headless Chromium, if installed
 	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_analysis_report_page.py test/test_view_page.py
 
-pictures: $(READY) ## Make the README's animation, doc/view.webp, with a headless Chromium
+pictures: $(READY)-test ## Make the README's animation, doc/view.webp, with a headless Chromium
 	@PYTHONPATH="$(CURDIR):$(CURDIR)/test" $(VENV)/bin/python test/view_pictures.py
 
-test-nightly: $(READY) ## Test nodes and recovery with ten thousand random examples of each property
+test-nightly: $(READY)-test ## Test nodes and recovery with ten thousand random examples of each property
 	@BLF_DSC_EXAMPLES=10000 $(RUN) -m pytest -q test/test_nodes_properties.py \
 	    test/test_bags_recover.py::test_flipped_bytes_lose_only_the_chunks_they_hit
 
@@ -94,26 +92,26 @@ changes: $(READY) ## Simulate ten thousand randomly changing arms, with and with
 expect: $(READY) ## Recompute the figures of doc/arms.md for the presets panda and ur5e
 	@$(RUN) benchmark/what_to_expect.py
 
-bench: $(BENCH_READY) ## Run the benchmarks (GROUPS=offline for one group), into benchmark/RESULTS.md
+bench: $(READY)-bench ## Run the benchmarks (GROUPS=offline for one group), into benchmark/RESULTS.md
 	@$(RUN) benchmark/run.py $(GROUPS)
 
-soak: $(READY) ## Run half an hour of plant time (MINUTES) with a fault every few seconds
+soak: $(READY)-test ## Run half an hour of plant time (MINUTES) with a fault every few seconds
 	@$(RUN) test/soak.py --minutes "$(MINUTES)"
 
-docs: $(READY) ## Build the documentation site, into out/docs
+docs: $(READY)-docs ## Build the documentation site, into out/docs
 	@$(RUN) -m sphinx -q -W --keep-going -n doc out/docs && echo 'Open out/docs/index.html'
 
-release: $(RELEASE_READY) ## Check versions and metadata, and build sdist and wheel into out/dist
+release: $(READY)-release ## Check versions and metadata, and build sdist and wheel into out/dist
 	@$(MAKE) test TESTS=test/test_package.py
 	@rm -rf out/dist && $(VENV)/bin/python -m build --outdir out/dist . && \
 	$(VENV)/bin/python -m twine check --strict out/dist/*
 	@! grep -q '@.*[.]invalid' package.xml || echo 'package.xml has no maintainer that can be' \
 	    'reached, and so has what is in out/dist: see CONTRIBUTING.md before you publish it.'
 fuzz: MINUTES := 5
-fuzz: $(READY) ## Feed random files and names to everything that reads them (MINUTES)
+fuzz: $(READY)-test ## Feed random files and names to everything that reads them (MINUTES)
 	@$(RUN) test/fuzzing.py --minutes "$(MINUTES)"
 
-lint: $(LINT_READY) ## Check style, types and layers
+lint: $(READY)-lint ## Check style, types and layers
 	@good=1; for check in 'ruff check' 'ruff format --check' mypy; do \
 	    $(VENV)/bin/python -m $$check || good=0; done; \
 	PYTHONPATH="$(CURDIR)" $(VENV)/bin/lint-imports || good=0; test $$good = 1
@@ -129,22 +127,16 @@ $(READY): setup.py
 	    "$(BASE)" -m venv --clear $(venv_options_$(FLAVOUR)) $(VENV); } || { \
 	    echo 'python -m venv failed: see above. On Debian and Ubuntu: apt install python3-venv' >&2; \
 	    exit 1; }
-	@echo 'Installing into $(VENV), which takes a minute or two'
+	@echo 'Installing what runs and pictures need: about 150 MB to download, 800 MB unpacked'
 	@: > $(VENV)/constraints.txt; $(constrain_$(FLAVOUR))
-	@$(PIP) install 'pip>=22' && $(PIP) install -c $(VENV)/constraints.txt \
-	    -e '.[$(extras_$(FLAVOUR))]' || $(PIP_FAILED)
+	@{ $(PIP_INSTALL) 'pip>=22' 'setuptools>=70.1' && $(PIP_INSTALL) -c $(VENV)/constraints.txt \
+	    --no-build-isolation -e '.[$(extras_$(FLAVOUR))]'; } || $(PIP_FAILED)
 	@touch $@
 
-$(BENCH_READY): $(READY)
-	@$(PIP) install -c $(VENV)/constraints.txt -e '.[bench]' || $(PIP_FAILED)
-	@touch $@
-
-$(RELEASE_READY): $(READY)
-	@$(PIP) install -c $(VENV)/constraints.txt -e '.[release]' || $(PIP_FAILED)
-	@touch $@
-
-$(LINT_READY): $(READY)
-	@$(PIP) install -c $(VENV)/constraints.txt -e '.[lint]' || $(PIP_FAILED)
+# Further packages, named after the extra in setup.py.
+$(READY)-%: $(READY)
+	@echo 'Installing what make $* needs besides'
+	@$(PIP_INSTALL) -c $(VENV)/constraints.txt --no-build-isolation -e '.[$*]' || $(PIP_FAILED)
 	@touch $@
 
 define check_python
@@ -156,7 +148,7 @@ test -n '$(VERSION)' || { echo '$(PYTHON) does not run: install Python 3.10 or n
 endef
 
 about_wheels := ROS 2 Jazzy from wheels
-extras_wheels := ros,test
+extras_wheels := ros,report,view
 venv_options_wheels :=
 constrain_wheels := :
 define check_wheels
@@ -169,7 +161,7 @@ endef
 
 # numpy stays as it is, because the sourced ROS's messages were compiled against it.
 about_sourced := the ROS 2 Jazzy sourced in this shell
-extras_sourced := test
+extras_sourced := report,view
 venv_options_sourced := --system-site-packages
 constrain_sourced := "$(BASE)" -c 'import numpy; print("numpy==" + numpy.__version__)' \
     > $(VENV)/constraints.txt

@@ -1,13 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The middleware's settings for the nodes of a run."""
+"""The environment of the nodes of a run: the middleware's settings, and numpy's threads."""
+
+import os
+import sys
 
 import pytest
+from command import finished
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from blf_dsc_controller.cli import isolation
 from blf_dsc_controller.cli.isolation import localhost_environment
 
+MULTIPLY = """
+import os, sys
+from blf_dsc_controller.cli import main
+code = getattr(main, sys.argv.pop(1))()
+import numpy as np
+np.ones((500, 500)) @ np.ones((500, 500))
+print(code, len(os.listdir('/proc/self/task')))
+"""
 LOCALHOST = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
 
@@ -21,3 +33,19 @@ def test_other_middleware_is_limited_to_this_computer_as_well(monkeypatch):
         isolation.rclpy, 'get_rmw_implementation_identifier', lambda: 'rmw_cyclonedds_cpp'
     )
     assert localhost_environment() == LOCALHOST
+
+
+@pytest.mark.parametrize(
+    'command',
+    [('main', 'plot', '/none'), ('blf_dsc_controller', '--ros-args', '--params-file', '/none')],
+)
+def test_libraries_start_no_threads_unless_the_environment_asks_for_them(command):
+    """Such a thread would spin beside the nodes, and at the priority of a real-time node."""
+    outputs = []
+    for given in ({}, {'OPENBLAS_NUM_THREADS': '1'}, {'OPENBLAS_NUM_THREADS': '3'}):
+        kept = {name: value for name, value in os.environ.items() if 'NUM_THREADS' not in name}
+        run = finished(sys.executable, '-c', MULTIPLY, *command, env=kept | given)
+        outputs.append([int(number) for number in run.stdout.split()])
+    (code, threads), same, more = outputs
+    assert same == [code, threads]
+    assert more == [code, threads + 2]

@@ -3,11 +3,6 @@
 
 from __future__ import annotations
 
-import os
-
-# Set before numpy is imported: for matrices of this size, threads cost more than they gain.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 import textwrap
 from argparse import Namespace
 

@@ -23,11 +23,14 @@ from blf_dsc_controller.errors import BlfDscError
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 
+_THREADS = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a sub-command and return its exit code; errors print a message to stderr and return 1."""
     parser = make_parser()
     options = parser.parse_args(arguments)
+    _keep_to_one_thread()
     if options.command is None:
         parser.print_help(sys.stderr)
         return 2
@@ -57,6 +60,16 @@ def _handle(options: argparse.Namespace) -> int | None:
         importlib.import_module(f'blf_dsc_controller.cli.{module}'), function
     )(options)
     return code
+
+
+def _keep_to_one_thread() -> None:
+    """Let numpy's libraries, not loaded yet, start no threads, unless the environment says how many.
+
+    The matrices here are small. The threads would spin, beside nodes that run at the same time and,
+    in a real-time node, at its priority.
+    """
+    for name in _THREADS:
+        os.environ.setdefault(name, '1')
 
 
 def _interrupt(command: str, _number: int, _frame: object) -> None:
@@ -113,6 +126,7 @@ monte_carlo = partial(_alias, 'monte-carlo')
 
 
 def _node(module: str) -> int:
+    _keep_to_one_thread()
     for number in (signal.SIGINT, signal.SIGTERM):  # until the node installs its own handlers
         signal.signal(number, lambda *_: os._exit(0))
     try:
