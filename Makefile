@@ -127,7 +127,7 @@ $(READY): setup.py
 	    "$(BASE)" -m venv --clear $(venv_options_$(FLAVOUR)) $(VENV); } || { \
 	    echo 'python -m venv failed: see above. On Debian and Ubuntu: apt install python3-venv' >&2; \
 	    exit 1; }
-	@echo 'Installing what runs and pictures need: about 150 MB to download, 800 MB unpacked'
+	@echo 'Installing what runs and pictures need: 250 MB to download, 800 MB unpacked'
 	@: > $(VENV)/constraints.txt; $(constrain_$(FLAVOUR))
 	@{ $(PIP_INSTALL) 'pip>=22' 'setuptools>=70.1' && $(PIP_INSTALL) -c $(VENV)/constraints.txt \
 	    --no-build-isolation -e '.[$(extras_$(FLAVOUR))]'; } || $(PIP_FAILED)

@@ -170,9 +170,7 @@ def test_restored_loop_continues_bit_for_bit():
 def many_updates(model, sizes, settings, law, state, signals, measurement, sample, checks, count):
     for k in range(count):
         t = k * 1e-3
-        update(
-            model, sizes, settings, law, state, signals, t, 1e-3, measurement, sample, checks
-        )
+        update(model, sizes, settings, law, state, signals, t, 1e-3, measurement, sample, checks)
 
 
 def test_updates_in_a_compiled_loop_allocate_nothing():

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from functools import partial
 
@@ -20,7 +21,8 @@ from ros_rig import START, deactivate
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from blf_dsc_controller.compiled.notice import COMPILATION_NOTICE
+from blf_dsc_controller.compiled import jit
+from blf_dsc_controller.compiled.notice import COMPILING
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
@@ -91,16 +93,31 @@ def test_end_of_a_real_time_run_is_not_a_fault(ros, log):
     assert not log('blf_dsc_controller', '', FATAL)
 
 
-def test_compilation_is_announced_by_the_node_that_waits_for_it(ros, log):
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
+def test_each_compiled_kernel_is_announced_by_the_node_that_waits(ros, log, monkeypatch, tmp_path):
+    monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path))  # an empty cache
+
+    @jit.kernel
+    def first(x):
+        return x + 1.0
+
+    @jit.kernel
+    def second(x):
+        return x + 2.0
+
     class Compiling(PlantNode):
         def configure(self):
             super().configure()
+            first(1.0)
+            second(1.0)
             numba.njit(lambda x: x + 1)(1)
-            numba.njit(lambda x: x + 2)(1)
 
     ros.add(Compiling, namespace='compiles')
     ros.until(lambda: log('compiles', 'realtime, waiting for a controller'))
-    assert log('compiles', COMPILATION_NOTICE) == [COMPILATION_NOTICE]
+    parts = [re.split(r'\W+', line) for line in log('compiles', COMPILING)]
+    numbers = {part[-1]: int(part[2]) for part in parts}  # the plant's kernels come before
+    assert list(numbers)[-2:] == ['first', 'second']
+    assert sorted(numbers.values()) == list(range(1, len(parts) + 1))
 
 
 def test_repeatedly_stale_torques_do_not_flood_the_log(ros, log):

@@ -63,7 +63,7 @@ def _handle(options: argparse.Namespace) -> int | None:
 
 
 def _keep_to_one_thread() -> None:
-    """Let numpy's libraries, not loaded yet, start no threads, unless the environment says how many.
+    """Let numpy's libraries, not loaded yet, start no threads unless the environment says so.
 
     The matrices here are small. The threads would spin, beside nodes that run at the same time and,
     in a real-time node, at its priority.

@@ -42,7 +42,8 @@ _PARAMETERS_TIMEOUT = 60.0  # s; a bag without its configuration cannot be repla
 
 def run(options: Namespace) -> int:
     """Run the closed loop and write the results to a new folder."""
-    config = _configuration(options)
+    with announced_compilation(print_notice):
+        config = _configuration(options)
     if not options.offline:
         require_ros()
     if options.view:
@@ -160,9 +161,11 @@ def print_notice(notice: str) -> None:
 
 def _report(out: Path) -> bool:
     """Draw and summarise the bag of a run; return whether the controller stopped in it."""
+    print_notice('reading the bag')
     recorded = read_run(out / 'bag')
     summary = summarize(recorded)
     write_summary(summary, out / 'summary.json')
+    print_notice('drawing the pictures')
     pictures = draw(recorded, out)
     print(format_table(summary))
     for topic, text in read_context(out / 'bag').losses.items():

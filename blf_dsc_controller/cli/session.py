@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ctypes
+import itertools
 import os
 import shutil
 import signal
@@ -17,7 +18,7 @@ from pathlib import Path
 
 from blf_dsc_controller.cli.isolation import environment, localhost_environment, own_domain
 from blf_dsc_controller.cli.monitor import FIRST_SIGN, ProgressMonitor
-from blf_dsc_controller.compiled.notice import COMPILATION_NOTICE
+from blf_dsc_controller.compiled.notice import COMPILING
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, VIEW, LoopConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.view.address import free_port, url_of
@@ -72,6 +73,7 @@ class NodeProcess:
 
     def __init__(self, name: str, params_file: Path, logs: Path, *arguments: str) -> None:
         self.name = name
+        self._noticed = 0
         self._log = logs / f'{name}.log'
         command = [sys.executable, '-m', _MODULES[name], '--ros-args', '--params-file']
         with self._log.open('wb') as output:
@@ -91,10 +93,12 @@ class NodeProcess:
         """Whether the process is alive."""
         return self._process.poll() is None
 
-    @property
-    def is_compiling(self) -> bool:
-        """Whether the node has reported that it compiles the kernels."""
-        return COMPILATION_NOTICE in self._log.read_text(encoding='utf-8', errors='replace')
+    def new_notices(self) -> list[str]:
+        """Return what the node has newly reported about compiling its kernels."""
+        lines = self._log.read_text(encoding='utf-8', errors='replace').splitlines()
+        notices = [line[line.index(COMPILING) :] for line in lines if COMPILING in line]
+        new, self._noticed = notices[self._noticed :], len(notices)
+        return [f'{self.name}: {notice}' for notice in new]
 
     def check(self, remark: str = '') -> None:
         """Raise NodeFailedError, with the end of the log, if the node exited with an error."""
@@ -167,14 +171,14 @@ def _monitor(
     nodes wait for a subscriber, which must be the recorder.
     """
     recorder, *loop = nodes
-    ended, warned, announced = inf, False, False
+    ended, warned = inf, False
     with ProgressMonitor(config, interrupts) as monitor:
         while loop[-1].is_running and not interrupts:
             for node in loop:
                 node.check()
-            if not (announced or monitor.has_begun) and any(node.is_compiling for node in loop):
-                announced = True
-                monitor.progress.write(COMPILATION_NOTICE)
+            if not monitor.has_begun:
+                for notice in itertools.chain(*(node.new_notices() for node in loop)):
+                    monitor.progress.write(notice)
             if not recorder.is_running:
                 ended = min(ended, time.monotonic())
                 if monitor.has_begun and not warned:

@@ -39,6 +39,9 @@ INLINED = {
 }
 """Compiler options for functions that are compiled into kernels."""
 
+KERNELS: list[Any] = []
+"""All kernels that have been imported."""
+
 _PACKAGES = ('blf_dsc_controller.', 'sim_plant.')
 _ROOM = Path(__file__).resolve().parents[1]
 # Layouts and arm models reach a kernel through the types of its arguments.
@@ -162,6 +165,7 @@ def kernel(function: F) -> F:
             no_cfunc_wrapper=True,
             pipeline_class=KernelCompiler,
         )
+        KERNELS.append(compiled)
         return cast('F', compiled)
     finally:
         config.CACHE_DIR = before

@@ -34,10 +34,9 @@ from collections.abc import Callable, Iterator
 from typing import Annotated, Any, TypeVar, get_type_hints
 
 import numpy as np
-from numba.extending import overload
 
-from blf_dsc_controller.compiled.jit import INLINED, inner
-from blf_dsc_controller.compiled.views import part
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.views import fixed, part
 
 Array = np.ndarray
 Cell = Annotated[Array, '1']
@@ -59,17 +58,6 @@ def sizes_of(layout: Any) -> np.dtype[np.void]:
     """
     names = [name for name, hint in _hints(type(layout)).items() if hint is Fixed]
     return np.dtype([(name, 'u1', (getattr(layout, name),)) for name in names])
-
-
-def fixed(sizes: Any, name: str) -> int:
-    """Return the named number of `sizes_of`."""
-    return int(sizes[name].shape[0])
-
-
-@overload(fixed, strict=False, jit_options=INLINED, prefer_literal=True)
-def _compiled_fixed(sizes: Any, name: Any) -> Any:
-    (number,) = sizes.dtype.typeof(name.literal_value).shape
-    return lambda sizes, name: number  # noqa: ARG005 - numba looks at the names
 
 
 def pack(layout: Any) -> np.ndarray:

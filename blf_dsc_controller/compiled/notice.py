@@ -5,31 +5,41 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from typing import Any
 
 from numba.core import event
 
-COMPILATION_NOTICE = 'compiling the kernels, once for this version: this takes 10 to 60 s'
+from blf_dsc_controller.compiled.jit import KERNELS
+
+COMPILING = 'compiling kernel '
+"""How a notice begins."""
 
 
 class _Listener(event.Listener):  # type: ignore[misc]
     def __init__(self, say: Callable[[str], object]) -> None:
         self._say = say
-        self._announced = False
+        self._count = 0
 
-    def on_start(self, _event: object) -> None:
-        if not self._announced:
-            self._announced = True
-            self._say(COMPILATION_NOTICE)
+    def on_start(self, started: Any) -> None:
+        kernel = started.data['dispatcher']
+        if not any(kernel is other for other in KERNELS):
+            return
+        self._count += 1
+        total = max(self._count, len(KERNELS))
+        self._say(
+            f'{COMPILING}{self._count} of at most {total}, once for this version: '
+            f'{kernel.py_func.__name__}'
+        )
 
     def on_end(self, _event: object) -> None:
         pass
 
 
 def announced_compilation(say: Callable[[str], object]) -> AbstractContextManager[object]:
-    """Call `say` once with a notice if anything not in the cache is compiled in this context.
+    """Call `say` with a notice for each kernel not in the cache that is compiled in this context.
 
-    Only numba knows this: a kernel has a version for each type of arguments, and another install of
-    the same sources has its own entries in the same cache.
+    Only numba knows this: a kernel has a version for each type of arguments. Of those that are
+    loaded, some may not be called.
     """
     listener: AbstractContextManager[object] = event.install_listener(
         'numba:compile', _Listener(say)

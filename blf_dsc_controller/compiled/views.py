@@ -33,6 +33,11 @@ def part(vector: NDArray[np.float64], at: int, shape: tuple[int, ...]) -> NDArra
     return vector[at : at + prod(shape)].reshape(shape)
 
 
+def fixed(sizes: np.dtype[np.void], name: str) -> int:
+    """Return the named number of `layout.sizes_of`, a constant in compiled code."""
+    return int(sizes[name].shape[0])
+
+
 @intrinsic
 def _view(_typing: Any, vector: Any) -> Any:
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
@@ -77,3 +82,9 @@ def _compiled_view(vector: Any) -> Any:  # noqa: ARG001 - numba looks at the nam
 @overload(part, strict=False, jit_options=INLINED)
 def _compiled_part(vector: Any, at: Any, shape: Any) -> Any:  # noqa: ARG001
     return lambda vector, at, shape: _part(vector, at, shape)  # noqa: PLW0108
+
+
+@overload(fixed, strict=False, jit_options=INLINED, prefer_literal=True)
+def _compiled_fixed(sizes: Any, name: Any) -> Any:
+    (number,) = sizes.dtype.typeof(name.literal_value).shape
+    return lambda sizes, name: number  # noqa: ARG005 - numba looks at the names
