@@ -100,7 +100,6 @@ setup(
         # Only for `monte_carlo`, whose results are Parquet files: 50 MB that a robot does not need.
         'monte-carlo': ['pyarrow'],
         'dask': ['pyarrow', 'distributed'],
-        'mpi': ['pyarrow', 'mpi4py'],
         # Only for `bag_report`, to draw its pages: 40 MB.
         'report': ['plotly>=6'],
         # Only for `view`, to serve its page: 130 MB, most of it for reading meshes.

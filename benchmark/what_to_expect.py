@@ -16,13 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.arm_comparison.contenders import torque_rows
-from blf_dsc_controller.arm_comparison.study import trial
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.simulation.metrics import another_motion, torque_error, torque_rows
 from blf_dsc_controller.simulation.record import START, Record
 from blf_dsc_controller.supervision.guard import Guard
 
@@ -79,24 +78,23 @@ def in_mujoco(name: str, seed: int, changes: Mapping[str, Any]) -> np.ndarray:
     return errors
 
 
-def torque_error(record: Record, unseen: np.ndarray, row: int) -> float:
+def model_error(record: Record, unseen: np.ndarray, row: int) -> float:
     """Return the torque error [%] of the learned model at a sample, on rows of H (k, p)."""
     p = unseen.shape[1]
-    P, learned = record.truths[row, :p], record.sample(row).estimate[:p]
-    return float(100.0 * np.linalg.norm(unseen @ (learned - P)) / np.linalg.norm(unseen @ P))
+    return 100.0 * torque_error(unseen, record.sample(row).estimate[:p], record.truths[row, :p])
 
 
 def figures(name: str, seed: int) -> dict[str, float]:
     """Return the figures of one truth."""
-    unseen = torque_rows(trial(name, 1).controller)
+    unseen = torque_rows(another_motion(load_loop(name).controller, 1))
     record, errors = simulated(name, seed, 20.0, 2.0)
     _, ideal = simulated(name, seed, 13.0, 0.0, IDEAL)
     found = {
         'first 3 s [mrad]': errors[:3000].max(),
         'from 8 s on [mrad]': errors[8000:20_000].max(),
         '2 kg picked up at 20 s [mrad]': errors[20_000:].max(),
-        'another motion, after 10 s [%]': torque_error(record, unseen, 10_000),
-        'another motion, 1 s after the pick-up [%]': torque_error(record, unseen, 21_000),
+        'another motion, after 10 s [%]': model_error(record, unseen, 10_000),
+        'another motion, 1 s after the pick-up [%]': model_error(record, unseen, 21_000),
         'ideal sensors and drives, from 10 s on [mrad]': ideal[10_000:].max(),
         '3 kg from the start [mrad]': simulated(name, seed, 0.0, 3.0)[1].max(),
         '2 kg at any moment [mrad]': max(simulated(name, seed, t, 2.0)[1].max() for t in MOMENTS),

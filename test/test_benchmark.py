@@ -168,29 +168,23 @@ def test_waiting_for_a_silent_contestant_times_out():
         harness.wait_for(lambda: False, 'a torque', timeout=0.1)
 
 
-def test_changes_are_the_same_with_and_without_learning_and_differences_are_reported(tmp_path):
+@pytest.mark.usefixtures('blank_pictures')
+def test_changes_are_reported_in_one_table(tmp_path, monkeypatch):
+    """Of all studies, with what does not favour learning, and each exception's command."""
     changes = importlib.import_module('changing_arms')
-    config = tmp_path / 'short.yaml'
-    text = changes.PRESET.read_text()
-    config.write_text(text.replace('duration: 50.0', 'duration: 11.0').replace('9.9, 30.0', '9.9'))
-    changes.main(['--config', str(config), '--runs', '3', '--out', str(tmp_path / 'out')])
-    written = (tmp_path / 'out/changes.txt').read_text()
-    assert 'with learning: 3 of 3 runs kept the bound' in written
-    assert (tmp_path / 'out/changes.png').stat().st_size > 10_000
+    monkeypatch.setattr(changes, 'STUDIES', {'monte_carlo_events': 'two links'})
+    changes.main(['--runs', '3', '--workers', '1', '--out', str(tmp_path)])
+    written = (tmp_path / 'changes.md').read_text()
+    assert '| two links | 3 | ' in written
 
-    results = {
-        name: changes.Store(tmp_path / 'out' / name).results()
-        for name in (changes.WITH, changes.WITHOUT)
-    }
-    for name, values in results['with'].items():
-        if name.startswith('plant.'):
-            assert (values == results['without'][name]).all()
-    assert (
-        results['with']['parameter_error.end'] != results['without']['parameter_error.end']
-    ).all()
-
-    results['with']['outcome'][1] = 'violated'
-    study = changes.studies(config, {'runs': 3})['with']
-    written = changes.report(study, results, tmp_path)
-    assert 'kept only without learning: 1\n  run 1: begin.1 ' in written
-    assert f'--reproduce {tmp_path / "with"} 1\n' in written
+    study, results = (
+        getattr(changes.Store(tmp_path / 'monte_carlo_events'), name)
+        for name in ('study', 'results')
+    )
+    results = results()
+    results['outcome'][:] = results['without.outcome'][:] = 'kept'
+    results['outcome'][1] = 'violated'
+    written = changes.report({'monte_carlo_events': (study, results)}, tmp_path)
+    assert '| two links | 3 | 2 / 3 | 1 / 0 | ' in written
+    assert 'two links, run 1: breaks the bound only with learning\n' in written
+    assert f'--reproduce {tmp_path / "monte_carlo_events"} 1 --out ' in written

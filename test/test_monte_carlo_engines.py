@@ -53,11 +53,6 @@ def local_dask():
     return engines.dask(2)
 
 
-def mpi_ranks():
-    pytest.importorskip('mpi4py', reason='the extra mpi is not installed')
-    return engines.mpi(2)
-
-
 @pytest.mark.parametrize(
     ('make', 'size'),
     [
@@ -66,9 +61,8 @@ def mpi_ranks():
         (lambda: engines.processes(1), RUNS),
         (lambda: engines.processes(2), 4),
         (local_dask, 5),
-        (mpi_ranks, 5),
     ],
-    ids=['threads', 'thread', 'process', 'processes', 'dask', 'mpi'],
+    ids=['threads', 'thread', 'process', 'processes', 'dask'],
 )
 def test_every_engine_gives_the_same_results(a_study, undisturbed, make, size):
     assert same(results_of(a_study, make(), size), undisturbed)

@@ -11,6 +11,7 @@ from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.monte_carlo.report import plant_of_run
 from blf_dsc_controller.monte_carlo.runs import run_chunk
 from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.simulation.metrics import another_motion, torque_rows
 
 LIMITS = 'blf_dsc_controller:\n  ros__parameters:\n'
 WEAK = LOOP.replace(LIMITS, LIMITS + '    torque: {limit: [8.0, 20.0]}\n')
@@ -49,8 +50,12 @@ def metrics_of_record(a_study, run):
         'parameter_error.0.25_s': distance[250],
         'parameter_error.end': distance[300],
     }
+    rows = torque_rows(another_motion(a_study.controller, 1000))
+    wrong = np.linalg.norm(rows @ (estimate[300] - P[300]))
+    metrics['torque_error.end'] = wrong / np.linalg.norm(rows @ P[300])
     for i, joint in enumerate(('joint1', 'joint2')):
         metrics[f'max_error_ratio.{joint}'] = error[:, i].max() / 0.002
+        metrics[f'settled_error_ratio.{joint}'] = error[200:, i].max() / 0.002
         metrics[f'rms_error_rad.{joint}'] = np.sqrt(np.mean(error[200:, i] ** 2))
         metrics[f'peak_torque_nm.{joint}'] = np.abs(record.measurements[:, 4 + i]).max()
     return metrics
@@ -64,6 +69,21 @@ def test_metrics_match_the_full_record(tmp_path, loop):
         for name, value in metrics_of_record(a_study, run).items():
             # Sums are taken in another order.
             assert results[name][run] == pytest.approx(value, rel=1e-12, nan_ok=True), name
+
+
+def test_pairs_run_the_same_plant_with_and_without_learning(tmp_path):
+    """Until learning begins both are the same, bit for bit; each is a run of an unpaired study."""
+    pairs = STUDY.replace('seed: 7', 'seed: 7\n    pairs: true')
+    found = whole(study(tmp_path, LOOP + pairs, runs=6))
+    alone = whole(study(tmp_path, LOOP + STUDY, runs=6))
+    never = LOOP.replace('learning: {', 'learning: {weight: 0.0, ')
+    without = whole(study(tmp_path, never + STUDY, runs=6))
+    figures = [name for name in alone if not name.startswith('plant.')][2:]
+    for name in figures:
+        np.testing.assert_array_equal(found[name], alone[name], err_msg=name)
+        np.testing.assert_array_equal(found[f'without.{name}'], without[name], err_msg=name)
+    assert (found['parameter_error.0.1_s'] == found['without.parameter_error.0.1_s']).all()
+    assert (found['parameter_error.end'] != found['without.parameter_error.end']).any()
 
 
 def test_studies_used_here_cover_all_kinds_of_metrics(tmp_path):

@@ -12,10 +12,11 @@ import matplotlib.image
 import numpy as np
 import pyarrow.parquet
 import pytest
-from monte_carlo_case import RUNS, study, whole
+from monte_carlo_case import LOOP, RUNS, STUDY, study, whole
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.cli.run import make_folder
 from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.monte_carlo.report import plant_of_run, reproduce, write_report
@@ -124,6 +125,39 @@ def test_run_that_differs_from_its_stored_results_is_reported(store, tmp_path):
     (tmp_path / 'run').mkdir()
     with pytest.raises(BlfDscError, match=r'run 4 differs .*\n.*max_error_ratio.joint2'):
         reproduce(other, 4, tmp_path / 'run')
+
+
+@pytest.mark.usefixtures('blank_pictures')
+def test_pairs_are_compared_and_exceptions_are_reproduced(tmp_path, capsys):
+    text = STUDY.replace('seed: 7', 'seed: 7\n    pairs: true')
+    a_study = study(tmp_path, LOOP + text, runs=4)
+    results = whole(a_study)
+    truth = results | {name: results[name].copy() for name in results}
+    results['outcome'] = np.array(['kept', 'violated', 'kept', 'violated'])
+    results['without.outcome'] = np.array(['kept', 'kept', 'violated', 'violated'])
+    for joint in ('joint1', 'joint2'):
+        results[f'settled_error_ratio.{joint}'] = np.array([0.3, 1.2, 0.9, 9.0])
+        results[f'without.settled_error_ratio.{joint}'] = np.array([0.2, 0.4, 1.1, 1.0])
+    pairs = summarize(a_study, results)['pairs']
+    assert pairs['kept'] == {'with': 2, 'without': 2}
+    assert (pairs['broken_only_with'], pairs['broken_only_without']) == ([1], [2])
+    assert pairs['above'] == [1, 0]  # run 3 breaks the bound either way
+    assert pairs['factor']['max'] == pytest.approx(3.0)
+    results['outcome'][1] = 'diverged'
+    assert summarize(a_study, results)['pairs']['factor']['max'] is None
+
+    store = Store.create_or_open(tmp_path / 'pairs', a_study)
+    store.keep(Span(0, 4), truth)
+    reproduce(store, 2, make_folder(tmp_path / 'run'))
+    for folder in (tmp_path / 'run', tmp_path / 'run/without_learning'):
+        assert (folder / 'bag').is_dir()
+    assert load_loop(tmp_path / 'run/without_learning/config.yaml').controller.learning.weight == 0
+    store.keep(Span(0, 4), results)
+    assert main(['monte-carlo', '--report', str(tmp_path / 'pairs')]) == 0
+    assert '1 broke it only with learning, 1 only without' in capsys.readouterr().out
+    page = html.unescape((tmp_path / 'pairs/report.html').read_text())
+    assert 'breaks the bound only with learning' in page
+    assert 'largest error more than 1.3 times' in page
 
 
 def test_missing_run_is_reported(store, tmp_path, capsys):

@@ -53,6 +53,16 @@ def test_integers_are_equally_frequent(text):
     assert [values.count(i) for i in range(-1, 4)] == [200] * 5
 
 
+def test_maybe_is_zero_as_often_as_it_says():
+    distribution = parse('maybe(0.3, 1, 2)', Kind.DOUBLE)
+    values = np.array([distribution.at(u) for u in np.arange(1000) / 1000])
+    assert (values == 0.0).sum() == 700
+    assert values[values > 0.0].min() >= 1.0
+    assert values.max() < 2.0
+    assert values[values > 0.0].mean() == pytest.approx(1.5, abs=0.01)
+    assert 0.0 in distribution.extremes
+
+
 def test_distribution_of_a_single_value_is_allowed():
     assert parse('uniform(0.5, 0.5)', Kind.DOUBLE).at(0.9) == 0.5
     assert parse('choice(brake)', Kind.STRING).at(0.9) == 'brake'
@@ -84,6 +94,14 @@ def test_preset_is_a_study_of_ten_thousand_runs():
         ('uniform(0.3, 0.7)', 'uniform(nan, 0.7)', r'but a number is expected between commas'),
         ('uniform(0.3, 0.7)', 'uniform(0.7, 0.3)', r'must not be above the second'),
         ('uniform(0.3, 0.7)', 'normal(0.3, -0.1)', r'a deviation cannot be below 0'),
+        ('uniform(0.3, 0.7)', 'maybe(1.3, 0.3, 0.7)', r'but a probability is from 0 to 1'),
+        ('uniform(0.3, 0.7)', 'maybe(0.3, 0.4, 0.7)', r'not allowed: got 0.0, .* above 0'),
+        (
+            'uniform(0.3, 0.7)',
+            'maybe(0.3, 0.7)',
+            r'but maybe\(probability, low, high\) is expected',
+        ),
+        ('runs: 24', 'base: nothing', r'nothing does not exist: give a parameter file'),
         ('loguniform(1.0e-6', 'loguniform(0.0', r'loguniform distribution begins above 0'),
         # Four standard deviations below the mean, the mass would be zero.
         (
@@ -180,6 +198,37 @@ def test_events_are_drawn_entry_by_entry(tmp_path):
     assert events.torque[0] == values['plant.events.torque.1.joint1'] != 0.0
     assert events.torque[2] == values['plant.events.torque.2.joint1'] != events.torque[0]
     assert (events.torque[1], events.torque[3]) == (0.0, 0.0)
+
+
+def test_events_may_follow_each_other_by_gaps(tmp_path):
+    text = STUDY.replace('events.begin: ["uniform(0.05, 0.1)", "choice(0.2)"]', 'events.gap: GAP')
+    a_study = study(tmp_path, LOOP + text.replace('GAP', '["uniform(0.0, 0.1)", "choice(0.15)"]'))
+    first = drawn_values(a_study, 3)['plant.events.gap.1']
+    origin = origin_of(controller_of(a_study.controller))
+    begin = plant_of_draw(a_study, draw(a_study, 3), origin).events.begin
+    assert begin == (first, first + 0.15)
+
+
+def test_one_row_of_joints_serves_all_events(tmp_path):
+    rows = '["uniform(-0.5, 0.5)", "choice(0.0)", "uniform(-0.5, 0.5)", "choice(0.0)"]'
+    assert rows in STUDY
+    text = STUDY.replace(rows, '["uniform(-0.5, 0.5)", "choice(0.0)"]')
+    assert study(tmp_path, LOOP + text) == study(tmp_path)
+
+
+def test_study_may_be_based_on_a_preset(tmp_path):
+    """Each file takes precedence over its base, value by value."""
+    write(tmp_path)
+    base = (tmp_path / 'study.yaml').rename(tmp_path / 'base.yaml')
+    text = f'monte_carlo:\n  ros__parameters:\n    base: {base}\n    runs: 3\n    seed: 1\n'
+    derived = study(tmp_path, text + '    vary: {arm.m2: "choice(0.5)"}\n')
+    original = study(tmp_path)
+    assert (derived.settings.runs, derived.settings.seed) == (3, 1)
+    assert derived.settings.moments == original.settings.moments
+    assert derived.varied() == original.varied() | {'arm.m2': 'choice(0.5)'}
+    assert derived.plant == original.plant
+    with pytest.raises(ConfigurationError, match=r'base: .*study.yaml. leads back to a file'):
+        study(tmp_path, text.replace(str(base), str(tmp_path / 'study.yaml')))
 
 
 def test_events_do_not_change_the_other_draws(tmp_path):

@@ -242,7 +242,7 @@ def test_every_import_is_a_declared_dependency(metadata):
     used |= set(imports(ROOT / 'launch/closed_loop.launch.py'))
     foreign = used - set(sys.stdlib_module_names) - set(PACKAGES) - {'llvmlite'}  # a part of numba
     distributions = {'pyyaml' if name == 'yaml' else name for name in foreign}
-    extras = ('monte-carlo', 'dask', 'mpi', 'report', 'view')
+    extras = ('monte-carlo', 'dask', 'report', 'view')
     optional = set().union(*(requirements(metadata, extra) for extra in extras))
     assert distributions <= requirements(metadata) | optional | depends('exec_depend')
 

@@ -174,8 +174,6 @@ def check_parameters(rest):
 def check_python(rest):
     if '-m' in rest:
         module, *arguments = rest[rest.index('-m') + 1 :]
-        if module == 'mpi4py.futures':
-            module, *arguments = arguments[1:]
         assert importlib.util.find_spec(module), rest
         if module == 'blf_dsc_controller':
             parse(arguments)

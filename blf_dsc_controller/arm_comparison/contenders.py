@@ -9,17 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.arm_comparison.baselines import simulate_baseline
-from blf_dsc_controller.arms.batch import regressors_at
 from blf_dsc_controller.configuration.arm_defaults import over_postures
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.factory import model_of
 from blf_dsc_controller.law.state import sample_of
-from blf_dsc_controller.reference import terms
-from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.simulation.metrics import torque_error
 
 PICK_UP = 15.0  # s
 DURATION = 30.0  # s
@@ -30,7 +27,6 @@ INTERVALS = {
     'from 20 s': (20.0, DURATION),
 }
 _BEFORE = PICK_UP - 0.01  # s, when the model is evaluated for the first time
-_ROWS = 200
 _STIFFEST = 4.0  # least slope limit of the barrier, as a multiple of its weight
 
 
@@ -173,15 +169,7 @@ def _simulate_law(
     rows = [round(_BEFORE / config.sample_time), -1]
     estimates = record.samples[rows][:, columns.estimate[:p]]
     model = tuple(
-        float(np.linalg.norm(unseen @ (estimate - P)) / np.linalg.norm(unseen @ P))
+        torque_error(unseen, estimate, P)
         for estimate, P in zip(estimates, record.truths[rows, :p], strict=True)
     )
     return errors, record.samples[:, columns.torque], model
-
-
-def torque_rows(config: ControllerConfig) -> np.ndarray:
-    """Return the rows of H(q, q', q', q'') (k, p) along the configured reference."""
-    model = model_of(config)
-    times = np.linspace(0.0, PICK_UP, _ROWS)
-    q, dq, ddq = np.moveaxis(terms.sampled(reference_of(config), times), 1, 0)
-    return regressors_at(model, q, dq, dq, ddq).reshape(_ROWS * model.n, -1)

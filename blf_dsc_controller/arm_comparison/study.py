@@ -21,7 +21,6 @@ from blf_dsc_controller.arm_comparison.contenders import (
     PICK_UP,
     Figures,
     run,
-    torque_rows,
 )
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.params_file import load_loop
@@ -29,6 +28,7 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.paper.tune import HOPELESS, search
 from blf_dsc_controller.run import Floats
+from blf_dsc_controller.simulation.metrics import another_motion, torque_rows
 
 POPULATION = 16
 ROUGHEST = 0.05
@@ -78,15 +78,9 @@ def trial(name: str, seed: int) -> LoopConfig:
         'events.payload': [max(events.payload, default=0.0)],
     }
     # No funnel, since the other laws have none: all approach the motion from rest.
-    motion: dict[str, object] = {'barrier.initial_bound': [0.0] * len(loop.plant.joints)}
-    if seed > 0:
-        random = np.random.default_rng(seed)
-        signs = random.choice((-1.0, 1.0), len(reference.amplitude))
-        motion['reference.amplitude'] = (signs * reference.amplitude).tolist()
-        motion['reference.phase'] = random.uniform(0.0, 2.0 * np.pi, len(reference.phase)).tolist()
-    return loop._replace(
-        controller=change(loop.controller, motion), plant=change(loop.plant, plant)
-    )
+    law = change(loop.controller, {'barrier.initial_bound': [0.0] * len(loop.plant.joints)})
+    law = another_motion(law, seed) if seed > 0 else law
+    return loop._replace(controller=law, plant=change(loop.plant, plant))
 
 
 def values_of(name: str, exponents: Floats) -> dict[str, float]:

@@ -323,7 +323,7 @@ def _monte_carlo_options(parser: argparse.ArgumentParser) -> None:
     option('--seed', type=int, help='seed of the study (as configured)')
     option(
         '--engine',
-        choices=('processes', 'threads', 'dask', 'mpi'),
+        choices=('processes', 'threads', 'dask'),
         default='processes',
         help='engine that computes the runs (processes)',
     )

@@ -4,7 +4,6 @@
     processes   processes of this machine (default)
     threads     threads of this process: the kernels release the GIL
     dask        a dask.distributed cluster: a running one, by its address, or a local one
-    mpi         the ranks of an MPI job (mpi4py.futures)
 
 All of them give the same results.  Chunks of runs are submitted one after the other, a few ahead of
 the workers, so the memory needed does not grow with the number of runs.
@@ -93,20 +92,6 @@ def dask(workers: int, address: str = '') -> Engine:
         with client() as connected:
             workers = max(1, sum(connected.nthreads().values()))
     return Engine(start, workers)
-
-
-def mpi(workers: int) -> Engine:
-    """Use all ranks but one of an MPI job, `mpiexec -n 9 python -m mpi4py.futures -m ...`.
-
-    Started as a single rank, it requests `workers` more.
-    """
-    try:
-        from mpi4py import MPI
-        from mpi4py.futures import MPIPoolExecutor
-    except ImportError:
-        raise MissingExtraError('mpi4py', 'mpi', 'the engine mpi') from None
-    workers = MPI.COMM_WORLD.Get_size() - 1 or workers
-    return Engine(lambda: MPIPoolExecutor(workers), workers)
 
 
 def chunk_size(runs: int, workers: int) -> int:

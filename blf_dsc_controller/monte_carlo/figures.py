@@ -9,10 +9,25 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 
-from blf_dsc_controller.analysis.style import ALARM, BLUE, COLOURS, INK, MUTED, Picture, head
+from blf_dsc_controller.analysis.style import (
+    ALARM,
+    BLUE,
+    COLOURS,
+    INK,
+    MUTED,
+    ORANGE,
+    Picture,
+    head,
+)
 from blf_dsc_controller.monte_carlo.runs import KEPT, Columns, error_columns
-from blf_dsc_controller.monte_carlo.statistics import influence, worst_ratio
-from blf_dsc_controller.monte_carlo.study import Study
+from blf_dsc_controller.monte_carlo.statistics import (
+    ALLOWED,
+    LAWS,
+    influence,
+    worst_of,
+    worst_ratio,
+)
+from blf_dsc_controller.monte_carlo.study import WITHOUT, Study
 from blf_dsc_controller.run import Floats
 
 _PANEL = (6.2, 3.4)  # inches
@@ -22,6 +37,7 @@ _MOST_DOTS = 20_000
 _FEW_DOTS = 1000
 _LEAST_ERROR = 1e-6
 _FAR = 1.25  # |xi1| / k_c of the last bar, which includes all larger ones
+_LEAST_RATIO = 0.03  # smallest |xi1| / k_c drawn beside each other
 _FARTHEST = 2.0  # largest |xi1| / k_c drawn; larger ones are clipped
 _FEW_DECADES = 50.0
 _RATIO = r'max $|\xi_1| \; / \; k_c$'
@@ -29,13 +45,16 @@ _PERCENT = FuncFormatter(lambda value, _: f'{100 * value:g} %')
 
 
 def draw_study(study: Study, results: Columns, folder: Path) -> list[Path]:
-    """Draw distributions.png, and influence.png if anything varies, and return their paths."""
+    """Draw distributions.png, pairs.png of pairs, influence.png if anything varies."""
     paths = [folder / 'distributions.png']
     _draw_distributions(study, results, paths[0])
+    if study.settings.pairs:
+        paths.append(folder / 'pairs.png')
+        draw_pairs({'': (study, results)}, paths[-1])
     strongest = influence(study, results)
     if strongest:
         paths.append(folder / 'influence.png')
-        _draw_influence(study, results, strongest, paths[1])
+        _draw_influence(study, results, strongest, paths[-1])
     return paths
 
 
@@ -80,6 +99,59 @@ def _draw_distributions(study: Study, results: Columns, path: Path) -> None:
     error.set_xlabel(r'$\|\hat P - P\| \;/\; \|P\|$')
     head(error, 'relative parameter error')
     picture.save(path)
+
+
+def draw_pairs(studies: dict[str, tuple[Study, Columns]], path: Path) -> None:
+    """Compare studies of pairs, by their titles: errors and learned models, with and without."""
+    picture = Picture(
+        1, 3, 'The same random runs with learning and without it', (5.2, 4.2), share_time=False
+    )
+    largest, rms, model = picture.axes[0]
+    for (title, (study, results)), colour in zip(studies.items(), COLOURS, strict=False):
+        x, y = (worst_of(study, results, 'settled_error_ratio', law) for law in (WITHOUT, ''))
+        lost = (results['outcome'] != KEPT) & (results[f'{WITHOUT}outcome'] == KEPT)
+        x, y = (np.clip(values, _LEAST_RATIO, _FARTHEST) for values in (x, y))
+        chosen = np.flatnonzero(~lost)[:_MOST_DOTS]
+        largest.plot(x[chosen], y[chosen], '.', ms=3, color=colour, alpha=0.4, mew=0, label=title)
+        largest.plot(x[lost], y[lost], 'o', ms=5, color=ALARM, mew=0)
+    ends = np.array([_LEAST_RATIO, _FARTHEST])
+    largest.loglog(ends, ends, color=MUTED, lw=1.0, label='equal')
+    largest.loglog(ends, ALLOWED * ends, color=MUTED, lw=1.0, ls=':', label=f'{ALLOWED:g} times')
+    largest.axhline(1.0, color=INK, ls='--', lw=1.0, label='bound')
+    largest.axvline(1.0, color=INK, ls='--', lw=1.0)
+    largest.set_xlabel(f'{_RATIO} without learning')
+    largest.set_ylabel('with learning')
+    _plain(largest)
+    head(largest, 'largest error of each run')
+    figures = {
+        'rms_error_rad': (rms, 1e3, r'rms $\xi_1$ of the worst joint [mrad]', 'rms error'),
+        'torque_error.end': (model, 1e2, 'of the torque [%]', 'model error on the next motion'),
+    }
+    for name, (axes, unit, label, title) in figures.items():
+        _boxes(axes, name, unit, studies)
+        axes.set_xlabel(label)
+        head(axes, title)
+    picture.save(path)
+
+
+def _boxes(axes: Axes, name: str, unit: float, studies: dict[str, tuple[Study, Columns]]) -> None:
+    """Draw the quartiles, and the 1 % and 99 % quantiles, of a figure with and without learning."""
+    labels: list[str] = []
+    for title, (study, results) in studies.items():
+        for (law, label), colour in zip(LAWS.items(), (BLUE, ORANGE), strict=True):
+            column = f'{law}{name}'
+            values = results[column] if column in results else worst_of(study, results, name, law)
+            known = unit * values[np.isfinite(values)]
+            y = 2 * [-len(labels)]
+            if known.size:
+                least, *quartiles, most = np.quantile(known, (0.01, 0.25, 0.5, 0.75, 0.99))
+                axes.plot([least, most], y, color=colour, lw=1.2)
+                axes.plot([quartiles[0], quartiles[2]], y, color=colour, lw=7, alpha=0.6)
+                axes.plot(quartiles[1:2], y[:1], 'o', color=INK, ms=4)
+            labels.append(f'{title} {label}'.strip())
+    axes.set_yticks(-np.arange(len(labels)), labels)
+    axes.set_xscale('log')
+    _plain(axes)
 
 
 def _plain(axes: Axes) -> None:

@@ -18,8 +18,14 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.monte_carlo.figures import draw_study
-from blf_dsc_controller.monte_carlo.runs import OUTCOMES, metrics_row, metrics_settings
-from blf_dsc_controller.monte_carlo.statistics import Summary, summarize
+from blf_dsc_controller.monte_carlo.runs import (
+    OUTCOMES,
+    metrics_row,
+    metrics_settings,
+    model_error,
+    rows_of_another_motion,
+)
+from blf_dsc_controller.monte_carlo.statistics import ALLOWED, Summary, summarize
 from blf_dsc_controller.monte_carlo.store import Store, differences
 from blf_dsc_controller.monte_carlo.study import Study, draw, origin_of, plant_of_draw
 from blf_dsc_controller.simulation.bag import write_bag
@@ -44,12 +50,22 @@ def write_report(store: Store) -> tuple[Summary, list[Path]]:
 
 
 def headline(summary: Summary) -> str:
-    """Return the result in one sentence."""
-    kept = summary['kept']
-    return (
+    """Return the result in one sentence; of pairs, in three."""
+    kept, pairs = summary['kept'], summary['pairs']
+    text = (
         f'{_percent(kept["fraction"])} of the runs kept the bound '
         f'({summary["outcomes"]["kept"]} of {summary["runs"]}; {100 * kept["confidence"]:g} % '
         f'confidence: {_percent(kept["low"])} to {_percent(kept["high"])})'
+    )
+    if pairs is None:
+        return text
+    without, factor = pairs['kept']['without'], pairs['factor']
+    return (
+        f'{text}, {without} without learning. {len(pairs["broken_only_with"])} broke it only with '
+        f'learning, {len(pairs["broken_only_without"])} only without. Of the {without}, the '
+        f'largest error was at most {ALLOWED:g} times that without learning in '
+        f'{_percent(1.0 - len(pairs["above"]) / max(1, without))} (99.9 %: '
+        f'{_number(factor["p99.9"])} times, largest: {_number(factor["max"])})'
     )
 
 
@@ -67,6 +83,8 @@ def plant_of_run(study: Study, run: int) -> PlantConfig:
 def reproduce(store: Store, run: int, out: Path) -> Summary:
     """Repeat a run of the study and write config.yaml, bag, figures and summary to `out`.
 
+    The one without learning, of a study of pairs, goes to `out/without_learning`.
+
     Raises BlfDscError if the run has no results, or if they are not reproduced bit for bit;
     StartError if the controller rejects its start.
     """
@@ -75,24 +93,29 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
         raise BlfDscError(f'{store.folder} has no run {run}: it has {results["run"].size} runs')
     study = store.study
     plant = plant_of_run(study, run)
-    dump(out / 'config.yaml', {PLANT: plant, CONTROLLER: study.controller})
-    settings = metrics_settings(study, plant)
-    metrics = new_metrics(settings)
-    record = simulate_law(study.controller, plant, metrics=(pack(settings), metrics))
-    write_bag(out / 'bag', record, study.controller, 'none')
-    recorded = read_run(out / 'bag')
-    summary = summarize_run(recorded)
-    write_summary(summary, out / 'summary.json')
-    draw_run(recorded, out)
-    here = metrics_row(study, metrics_of(metrics, settings))
+    settings, unseen = metrics_settings(study, plant), rows_of_another_motion(study)
     row = int((results['run'] == run).argmax())
-    different = differences({name: results[name][row] for name in here}, here)
-    if different:
-        raise BlfDscError(
-            f'run {run} differs from the stored one: was it computed on another kind of machine, '
-            f'or by another version?{different}'
-        )
-    return summary
+    summaries = []
+    for prefix, law in study.laws().items():
+        folder = out / 'without_learning' if prefix else out
+        folder.mkdir(exist_ok=True)
+        dump(folder / 'config.yaml', {PLANT: plant, CONTROLLER: law})
+        metrics = new_metrics(settings)
+        record = simulate_law(law, plant, metrics=(pack(settings), metrics))
+        write_bag(folder / 'bag', record, law, 'none')
+        recorded = read_run(folder / 'bag')
+        summaries.append(summarize_run(recorded))
+        write_summary(summaries[-1], folder / 'summary.json')
+        draw_run(recorded, folder)
+        error = model_error(unseen, settings, record.sample(-1).estimate, record.truths[-1])
+        here = metrics_row(study, metrics_of(metrics, settings), error)
+        different = differences({name: results[f'{prefix}{name}'][row] for name in here}, here)
+        if different:
+            raise BlfDscError(
+                f'run {run} differs from the stored one: was it computed on another kind of '
+                f'machine, or by another version?{different}'
+            )
+    return summaries[0]
 
 
 def _write_page(path: Path, study: Study, summary: Summary, figures: list[Path]) -> None:
@@ -121,6 +144,10 @@ def _write_page(path: Path, study: Study, summary: Summary, figures: list[Path])
             ),
         ],
         worst=[_worst_row(one, path.parent) for one in summary['worst']],
+        exceptions=[
+            (run, what, Cell(command, 'code'))
+            for run, what, command in exceptions(summary['pairs'], path.parent)
+        ],
         varied=varied,
     )
 
@@ -134,6 +161,20 @@ def _worst_row(one: Summary, folder: Path) -> tuple[str | Cell, ...]:
         '-' if first is None else f'{first:.3f} s',
         Cell(reproduce_command(folder, one['run']), 'code'),
     )
+
+
+def exceptions(pairs: Summary | None, folder: Path) -> list[tuple[str, str, str]]:
+    """Return the run, what is wrong with it and its command for each exception of a comparison."""
+    if pairs is None:
+        return []
+    broken = pairs['broken_only_with']
+    above = [run for run in pairs['above'] if run not in broken]
+    what = f'largest error more than {ALLOWED:g} times that without learning'
+    return [
+        (f'{run}', words, reproduce_command(folder, run))
+        for runs, words in ((broken, 'breaks the bound only with learning'), (above, what))
+        for run in runs
+    ]
 
 
 def _explained(fraction: float | None) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from math import nan
 
 import numpy as np
 
@@ -18,11 +19,16 @@ from blf_dsc_controller.simulation.loop import run_metrics
 from blf_dsc_controller.simulation.metrics import (
     LoopMetrics,
     MetricsSettings,
+    another_motion,
     metrics_of,
     new_metrics,
+    torque_error,
+    torque_rows,
 )
 from sim_plant.arms import parameter_names_of
-from sim_plant.plant import parameter_order, plant_of, steps_of
+from sim_plant.plant import Plant, parameter_order, plant_of, steps_of
+
+_UNSEEN = 1000  # seed of the motion on which the torque of the learned model is judged
 
 KEPT = 'kept'
 VIOLATED = 'violated'
@@ -44,13 +50,22 @@ Columns = dict[str, np.ndarray]
 def run_chunk(study: Study, first: int, count: int) -> Columns:
     """Compute runs `first` to `first + count - 1`.
 
-    All runs share one controller, which takes nearly all of the memory. The result depends on the
-    arguments alone, and no file is written.
+    All runs share one controller of each law, which take nearly all of the memory. The result
+    depends on the arguments alone, and no file is written.
     """
-    controller = controller_of(study.controller)
-    origin = origin_of(controller)
-    rows = [_run(study, index, controller, origin) for index in range(first, first + count)]
+    laws = {prefix: controller_of(config) for prefix, config in study.laws().items()}
+    origin = origin_of(laws[''])
+    unseen = rows_of_another_motion(study)
+    rows = [_run(study, index, laws, origin, unseen) for index in range(first, first + count)]
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+def rows_of_another_motion(study: Study) -> np.ndarray | None:
+    """Return rows of H (k, p) of a motion that is never run; None without sinusoids."""
+    law = study.controller
+    if law.reference.type != 'sinusoids':
+        return None
+    return torque_rows(another_motion(law, _UNSEEN))
 
 
 def warm_up(study: Study) -> None:
@@ -78,7 +93,7 @@ def metrics_settings(study: Study, plant: PlantConfig) -> MetricsSettings:
     )
 
 
-def metrics_row(study: Study, metrics: LoopMetrics) -> Row:
+def metrics_row(study: Study, metrics: LoopMetrics, model_error: float = nan) -> Row:
     """Return the columns of a run from its metrics; NaN for events that did not happen."""
     settled = metrics.settled[0]
     outcome = KEPT if np.isnan(metrics.violation[0]) else VIOLATED
@@ -91,11 +106,22 @@ def metrics_row(study: Study, metrics: LoopMetrics) -> Row:
     rms = np.sqrt(metrics.squares / settled) if settled else np.full_like(metrics.squares, np.nan)
     for i, joint in enumerate(study.plant.joints):
         row[f'max_error_ratio.{joint}'] = float(metrics.ratio[i])
+        row[f'settled_error_ratio.{joint}'] = float(metrics.late[i]) if settled else np.nan
         row[f'rms_error_rad.{joint}'] = float(rms[i])
         row[f'peak_torque_nm.{joint}'] = float(metrics.peak[i])
     for name, error in zip(error_columns(study), metrics.error.tolist(), strict=True):
         row[name] = error
+    row['torque_error.end'] = model_error
     return row
+
+
+def model_error(
+    unseen: np.ndarray | None, settings: MetricsSettings, estimate: np.ndarray, P: np.ndarray
+) -> float:
+    """Return the torque error of an estimate on another motion; NaN if it is not of the plant's."""
+    if unseen is None or settings.order.min() < 0:
+        return nan
+    return torque_error(unseen, estimate[: settings.p], P[settings.order])
 
 
 def error_columns(study: Study) -> Iterator[str]:
@@ -105,21 +131,44 @@ def error_columns(study: Study) -> Iterator[str]:
     yield 'parameter_error.end'
 
 
-def _run(study: Study, index: int, controller: Controller, origin: Origin) -> Row:
+def _run(
+    study: Study,
+    index: int,
+    laws: dict[str, Controller],
+    origin: Origin,
+    unseen: np.ndarray | None,
+) -> Row:
     drawn = draw(study, index)
     row: Row = {'run': drawn.run, 'seed': drawn.seed}
-    for one, value in zip(study.variations, drawn.values, strict=True):
-        row[one.column] = value
+    for variation, value in zip(study.variations, drawn.values, strict=True):
+        row[variation.column] = value
     config = plant_of_draw(study, drawn, origin)
-    plant = plant_of(config)
+    settings, plant = metrics_settings(study, config), plant_of(config)
+    for prefix, controller in laws.items():
+        found = _run_law(study, controller, plant, settings, unseen)
+        row |= {f'{prefix}{name}': value for name, value in found.items()}
+    return row
+
+
+def _run_law(
+    study: Study,
+    controller: Controller,
+    plant: Plant,
+    settings: MetricsSettings,
+    unseen: np.ndarray | None,
+) -> Row:
+    """Run a plant, from its beginning, with a controller; return the columns of its metrics."""
+    plant.reset()
     q, dq, _ = plant.measure().reshape(3, -1)
     controller.reset()
     try:
         begin(controller, study.controller, q, dq)
     except (StartError, MotionError):
-        return row | _rejected_row(study, np.abs(q - origin.qr) / origin.bound)
-    settings = metrics_settings(study, config)
-    return row | metrics_row(study, run_metrics(controller, plant, steps_of(config) + 1, settings))
+        origin = origin_of(controller)
+        return _rejected_row(study, np.abs(q - origin.qr) / origin.bound)
+    metrics = run_metrics(controller, plant, steps_of(study.plant) + 1, settings)
+    error = model_error(unseen, settings, controller.state.estimate, plant.truth())
+    return metrics_row(study, metrics, error)
 
 
 def _rejected_row(study: Study, ratios: np.ndarray) -> Row:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import binomtest, rankdata
 
 from blf_dsc_controller.monte_carlo.runs import DIVERGED, KEPT, OUTCOMES, Columns
-from blf_dsc_controller.monte_carlo.study import Study
+from blf_dsc_controller.monte_carlo.study import WITHOUT, Study
 from blf_dsc_controller.run import Floats
 
 Summary = dict[str, Any]
@@ -19,7 +19,13 @@ _CONFIDENCE = 0.95
 _WORST = 10
 _GROUPS = 10
 _QUANTILES = {'min': 0.0, 'p5': 0.05, 'median': 0.5, 'p95': 0.95, 'p99': 0.99, 'max': 1.0}
+_FACTORS = {'median': 0.5, 'p99': 0.99, 'p99.9': 0.999, 'max': 1.0}
 _DRAWN = 'plant.'
+
+ALLOWED = 1.3
+"""Largest error with learning that is called no larger than that without, as a factor."""
+LAWS = {'': 'with', WITHOUT: 'without'}
+"""The laws of a study of pairs: what they are called, by the prefix of their columns."""
 
 
 def summarize(study: Study, results: Columns) -> Summary:
@@ -32,7 +38,7 @@ def summarize(study: Study, results: Columns) -> Summary:
     runs = outcomes.size
     kept = int((outcomes == KEPT).sum())
     interval = binomtest(kept, runs).proportion_ci(_CONFIDENCE, method='wilson')
-    others = ('run', 'seed', 'outcome')
+    others = ('run', 'seed', 'outcome', f'{WITHOUT}outcome')
     figures = [one for one in results if one not in others and not one.startswith(_DRAWN)]
     return {
         'runs': runs,
@@ -47,16 +53,60 @@ def summarize(study: Study, results: Columns) -> Summary:
             'confidence': _CONFIDENCE,
             'interval': 'Wilson',
         },
+        'pairs': compare(study, results) if study.settings.pairs else None,
         'figures': {name: _quantiles(results[name]) for name in figures},
         'influence': influence(study, results),
         'worst': [_one_run(study, results, row) for row in worst_first(study, results)[:_WORST]],
     }
 
 
+def compare(study: Study, results: Columns) -> Summary:
+    """Compare the runs of a study of pairs, with learning and without it.
+
+    `factor` is the largest settled error with learning over that without, in the runs that keep the
+    bound without; None: infinite.
+    """
+    kept, without = (results[f'{law}outcome'] == KEPT for law in LAWS)
+    factors = error_factor(study, results)[without]
+    above = np.flatnonzero(~(factors <= ALLOWED))
+    quantiles = np.quantile(factors, list(_FACTORS.values()), method='higher')
+    return {
+        'kept': {'with': int(kept.sum()), 'without': int(without.sum())},
+        'broken_only_with': results['run'][without & ~kept].tolist(),
+        'broken_only_without': results['run'][kept & ~without].tolist(),
+        'factor': {
+            name: factor if math.isfinite(factor) else None
+            for name, factor in zip(_FACTORS, quantiles.tolist(), strict=True)
+        },
+        'allowed': ALLOWED,
+        'above': results['run'][without][above[np.argsort(-factors[above])]].tolist(),
+        'median': {
+            'rms_error_rad': {
+                label: _median(worst_of(study, results, 'rms_error_rad', law))
+                for law, label in LAWS.items()
+            },
+            'torque_error': {
+                label: _median(results[f'{law}torque_error.end']) for law, label in LAWS.items()
+            },
+        },
+    }
+
+
+def error_factor(study: Study, results: Columns) -> Floats:
+    """Return the largest settled error of each run with learning over that without."""
+    name = 'settled_error_ratio'
+    return worst_of(study, results, name) / worst_of(study, results, name, WITHOUT)
+
+
+def worst_of(study: Study, results: Columns, name: str, law: str = '') -> Floats:
+    """Return a figure of the worst joint in each run; infinite if the run diverged."""
+    each = [results[f'{law}{name}.{joint}'] for joint in study.plant.joints]
+    return np.where(results[f'{law}outcome'] == DIVERGED, np.inf, np.max(each, axis=0))
+
+
 def worst_ratio(study: Study, results: Columns) -> Floats:
     """Return the largest |xi1| / k_c of any joint in each run; infinite if the run diverged."""
-    each = [results[f'max_error_ratio.{joint}'] for joint in study.plant.joints]
-    return np.where(results['outcome'] == DIVERGED, np.inf, np.max(each, axis=0))
+    return worst_of(study, results, 'max_error_ratio')
 
 
 def worst_first(study: Study, results: Columns) -> np.ndarray:
@@ -92,6 +142,11 @@ def _explained(values: np.ndarray, ranks: Floats) -> float:
     if freedom <= 0 or ranks.var() == 0.0:
         return 0.0
     return max(0.0, float(1.0 - (within / freedom) / ranks.var(ddof=1)))
+
+
+def _median(values: np.ndarray) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else None
 
 
 def _quantiles(values: np.ndarray) -> Summary | None:

@@ -5,6 +5,7 @@ Its file is a parameter file of the loop with one additional section:
 
     monte_carlo:
       ros__parameters:
+        base: payload  # a preset or file that this one changes; none: the defaults
         runs: 10000
         vary:
           arm.m2: uniform(0.4, 0.6)
@@ -15,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,10 +26,13 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
 from blf_dsc_controller.configuration.params_file import dump, format_value, load_loop, read
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import build, flatten, parameter
+from blf_dsc_controller.configuration.schema import build, change, flatten, parameter
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.monte_carlo.variations import Value, Variation, read_variations, slots
+from blf_dsc_controller.monte_carlo.variations import Value, Variation, read_variations
+
+WITHOUT = 'without.'
+"""Prefix of the columns of a run without learning."""
 
 _NODE = 'monte_carlo'
 _VARY = 'vary.'
@@ -44,9 +49,14 @@ class MonteCarloConfig:
     seed: int = parameter(
         0, 'run i is determined by this seed and i alone', at_least=0, read_only=_ONE_STUDY
     )
+    pairs: bool = parameter(
+        default=False,
+        description='run each plant with learning and without it (learning.weight: 0)',
+        read_only=_ONE_STUDY,
+    )
     settled_after: float = parameter(
         0.0,
-        'time from which the rms error is computed; allow for the learning window',
+        'time from which the rms and the largest settled error are computed, and pairs compared',
         unit='s',
         at_least=0.0,
         read_only=_ONE_STUDY,
@@ -85,6 +95,12 @@ class Study:
     plant: PlantConfig
     settings: MonteCarloConfig
     variations: tuple[Variation, ...]
+
+    def laws(self) -> dict[str, ControllerConfig]:
+        """Return each law of a run by the prefix of its columns."""
+        if not self.settings.pairs:
+            return {'': self.controller}
+        return {'': self.controller, WITHOUT: change(self.controller, {'learning.weight': 0.0})}
 
     def by_node(self) -> dict[str, Any]:
         """Return the configurations by node name."""
@@ -191,15 +207,16 @@ class Draw(NamedTuple):
 def draw(study: Study, index: int) -> Draw:
     """Draw run `index` from the seed of the study and the index alone.
 
-    Each variation has its own random number, regardless of what else varies: two studies with the
-    same seed that differ in one distribution have otherwise the same arms.
+    Each variation has its own random number, by its name and regardless of what else varies: two
+    studies with the same seed that differ in one distribution have otherwise the same arms.
     """
-    sequence = np.random.SeedSequence(study.settings.seed, spawn_key=(index,))
-    rng = np.random.Generator(np.random.PCG64(sequence))
-    seed = int(rng.integers(2**62))
-    numbers = rng.random(slots(study.plant)).tolist()
-    values = tuple(one.distribution.at(numbers[one.slot]) for one in study.variations)
-    return Draw(index, seed, values)
+
+    def bits(name: str) -> int:
+        text = f'{study.settings.seed} {index} {name}'
+        return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), 'big') >> 11
+
+    values = tuple(one.distribution.at(bits(one.column) / 2**53) for one in study.variations)
+    return Draw(index, bits('seed'), values)
 
 
 def origin_of(controller: Controller) -> Origin:
@@ -221,6 +238,8 @@ def plant_of_draw(study: Study, drawn: Draw, origin: Origin) -> PlantConfig:
         start['position'] = tuple((origin.qr + origin.bound * relative['error']).tolist())
     if 'velocity_error' in relative:
         start['velocity'] = tuple((origin.dqr + relative['velocity_error']).tolist())
+    if 'gap' in changes.get('events', {}):
+        changes['events']['begin'] = tuple(np.cumsum(changes['events'].pop('gap')).tolist())
     groups = {
         group: dataclasses.replace(getattr(study.plant, group), **section)
         for group, section in (changes | {'initial': start}).items()

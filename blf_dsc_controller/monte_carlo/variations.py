@@ -5,19 +5,19 @@ A value is the inverse of the distribution function at a number u in [0, 1), so 
 random number. The inverses are written out because `ppf` of scipy.stats takes 0.1 ms a call.
 
 The start is relative to the reference: `initial.error` is the tracking error xi1(0) as a fraction
-of the bound, `initial.velocity_error` is dq(0) - dqr(0).
+of the bound, `initial.velocity_error` is dq(0) - dqr(0). So may be the events: `events.gap` is the
+time from the beginning of the event before, or from the start.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import itertools
 import math
 import operator
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import Annotated, cast
 
@@ -37,6 +37,7 @@ FORMS = {
         'uniform(low, high)',
         'loguniform(low, high)',
         'normal(mean, deviation)',
+        'maybe(probability, low, high)',
         'choice(a, b, ...)',
     ),
     Kind.INTEGER: ('integers(low, high)', 'choice(a, b, ...)'),
@@ -50,18 +51,15 @@ TAIL = 4.0
 _CALL = re.compile(r'\s*(\w+)\s*\((.*)\)\s*')
 _NAMES = {Kind.DOUBLE: 'a number', Kind.INTEGER: 'an integer', Kind.STRING: 'a word'}
 _NORMAL = NormalDist()
-_GROUPS = ('arm.', 'disturbance.', 'sensor.', 'actuator.')
-# Added later, in this order, so that the draws of the others do not change.
-_LATER = (
-    ('sensor.offset', 'load.', 'wall.', 'events.'),
-    (
-        'disturbance.stribeck',
-        'sensor.velocity_pole',
-        'actuator.time_constant',
-        'actuator.torque_noise',
-        'actuator.ripple',
-        'truth.',
-    ),
+_GROUPS = (
+    'arm.',
+    'truth.',
+    'disturbance.',
+    'sensor.',
+    'actuator.',
+    'load.',
+    'wall.',
+    'events.',
 )
 _REALTIME = ('actuator.command_timeout', 'actuator.without_command')
 
@@ -77,6 +75,9 @@ class Distribution:
         """Return the value below which the fraction `u`, in [0, 1), of all draws lies."""
         if self.name == 'choice':
             return self.arguments[int(u * len(self.arguments))]
+        if self.name == 'maybe':
+            probability, low, high = cast('tuple[float, float, float]', self.arguments)
+            return low + u / probability * (high - low) if u < probability else 0.0
         low, high = cast('tuple[float, float]', self.arguments)
         if self.name == 'uniform':
             return low + u * (high - low)
@@ -90,6 +91,8 @@ class Distribution:
     @property
     def extremes(self) -> tuple[Value, ...]:
         """Lowest and highest value, or all values of a choice."""
+        if self.name == 'maybe':
+            return (0.0, *self.arguments[1:])
         if self.name != 'normal':
             return self.arguments
         mean, deviation = cast('tuple[float, float]', self.arguments)
@@ -112,10 +115,12 @@ def parse(text: object, kind: Kind) -> Distribution:
         raise ValueError(f'got {text!r}, but {_NAMES[kind]} is expected between commas') from None
     if name == 'choice':
         return Distribution(name, arguments)
-    if len(arguments) != 2:
-        form = next(form for form in forms if form.startswith(f'{name}('))
+    form = next(form for form in forms if form.startswith(f'{name}('))
+    if len(arguments) != form.count(',') + 1:
         raise ValueError(f'got {text!r} with {len(arguments)} values, but {form} is expected')
-    first, second = cast('tuple[float, float]', arguments)
+    first, second = cast('tuple[float, float]', arguments[-2:])
+    if name == 'maybe' and not 0.0 <= cast('float', arguments[0]) <= 1.0:
+        raise ValueError(f'got {text!r}, but a probability is from 0 to 1')
     if name == 'normal' and second < 0.0:
         raise ValueError(f'got {text!r}, but a deviation cannot be below 0')
     if name != 'normal' and first > second:
@@ -147,25 +152,30 @@ class RelativeStart:
 
 
 @dataclass(frozen=True)
+class RelativeEvents:
+    """Events of a run, one after the other."""
+
+    gap: Annotated[tuple[float, ...], 'events.begin'] = parameter(
+        (), 'time since the event before began', unit='s', at_least=0.0
+    )
+
+
+@dataclass(frozen=True)
 class Variation:
     """One number drawn for each run."""
 
     name: str  # of the parameter
     entry: int  # index in the list; -1: not a list
     column: str  # name in the results
-    slot: int  # index of its random number among those of a run
     distribution: Distribution
 
 
 @functools.cache
 def variable_parameters() -> Mapping[str, Parameter]:
     """Return every parameter that may vary, by name."""
-    start = parameters(RelativeStart)
-    plant = parameters(PlantConfig)
-    later = [one for names in _LATER for one in plant if one.name.startswith(names)]
-    found = [one for one in plant if one.name.startswith(_GROUPS) and one not in later]
-    found += [dataclasses.replace(one, name=f'initial.{one.name}') for one in start]
-    found += later
+    found = [one for one in parameters(PlantConfig) if one.name.startswith(_GROUPS)]
+    for group, relative in (('initial', RelativeStart), ('events', RelativeEvents)):
+        found += [replace(one, name=f'{group}.{one.name}') for one in parameters(relative)]
     return {
         one.name: one for one in found if one.name not in _REALTIME and one.kind.element in FORMS
     }
@@ -191,15 +201,6 @@ def _numbers(count: int) -> tuple[str, ...]:
     return tuple(f'{number}' for number in range(1, count + 1))
 
 
-def slots(plant: PlantConfig) -> int:
-    """Return how many random numbers a run draws: one per entry that may vary, varied or not."""
-    return sum(_slots(one, plant) for one in variable_parameters().values())
-
-
-def _slots(one: Parameter, plant: PlantConfig) -> int:
-    return len(entries(one, plant)) if one.kind.is_array else 1
-
-
 def read_variations(
     given: Mapping[str, object], plant: PlantConfig
 ) -> tuple[tuple[Variation, ...], list[str]]:
@@ -210,39 +211,37 @@ def read_variations(
     known = variable_parameters()
     problems = [unknown(name, known) for name in given if name not in known]
     found: list[Variation] = []
-    slot = 0
     for name, one in known.items():
         if name in given:
             try:
-                found += _variations_of(one, given[name], entries(one, plant), slot)
+                found += _variations_of(one, given[name], entries(one, plant))
             except ValueError as error:
                 problems.append(f'{name}: {error}')
-        slot += _slots(one, plant)
     return tuple(found), problems
 
 
-def _variations_of(
-    one: Parameter, given: object, names: tuple[str, ...], slot: int
-) -> list[Variation]:
+def _variations_of(one: Parameter, given: object, names: tuple[str, ...]) -> list[Variation]:
     if not one.kind.is_array:
-        return [Variation(one.name, -1, f'plant.{one.name}', slot, _distribution(one, given))]
+        return [Variation(one.name, -1, f'plant.{one.name}', _distribution(one, given))]
     if not names:
         raise ValueError('got a distribution, but there are no events: give events.begin')
     each = list(given) if isinstance(given, (list, tuple)) else [given] * len(names)
+    if len(each) == len({name.rpartition('.')[2] for name in names}):
+        each *= len(names) // len(each)  # the same row for each event
     if len(each) != len(names):
         raise ValueError(
             f'got {len(each)} distributions, but there are {len(names)} entries '
             f'({", ".join(names)}): give one for each, or a single one for all'
         )
     return [
-        Variation(one.name, i, f'plant.{one.name}.{name}', slot + i, _distribution(one, text))
+        Variation(one.name, i, f'plant.{one.name}.{name}', _distribution(one, text))
         for i, (name, text) in enumerate(zip(names, each, strict=True))
     ]
 
 
 def _distribution(one: Parameter, text: object) -> Distribution:
     """Parse a distribution and check that the parameter allows all of its values."""
-    scalar = dataclasses.replace(one, kind=one.kind.element)
+    scalar = replace(one, kind=one.kind.element)
     distribution = parse(text, scalar.kind)
     for value in distribution.extremes:
         for problem in scalar.problems(value):

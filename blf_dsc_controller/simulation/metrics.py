@@ -8,9 +8,18 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.arms.batch import regressors_at
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.law.factory import model_of
 from blf_dsc_controller.law.state import Sample
+from blf_dsc_controller.reference import terms
+from blf_dsc_controller.reference.approach import reference_of
+
+_ROWS = 200
+_ROWS_FOR = 15.0  # s
 
 
 class MetricsSettings(NamedTuple):
@@ -20,7 +29,7 @@ class MetricsSettings(NamedTuple):
     p: int  # parameters of the model
     true: int  # parameters of the plant
     moments: int
-    settled: int  # first sample of the rms error
+    settled: int  # first settled sample, of the rms error
     limit: Annotated[Array, 'n']  # N m, torque at which a joint is saturated; 0: none
     order: Annotated[Array, 'p']  # index of each in those of the plant; -1: it has others
     samples: Annotated[Array, 'moments']  # at which the parameter error is stored
@@ -34,8 +43,9 @@ class LoopMetrics(NamedTuple):
     violation: Cell  # s, first time of |xi1| >= k(t), or NaN
     latch: Cell  # s, first time with a latched window, or NaN
     saturated: Cell  # samples in which a joint was saturated
-    settled: Cell  # samples in the rms error
+    settled: Cell  # settled samples
     ratio: Annotated[Array, 'n']  # max |xi1| / k(t)
+    late: Annotated[Array, 'n']  # max |xi1| / k(t) of the settled samples
     squares: Annotated[Array, 'n']  # rad^2, sum of xi1^2 of the settled samples
     peak: Annotated[Array, 'n']  # N m, max |applied torque|
     error: Annotated[Array, 'moments']  # |P^ - P| / |P|, or NaN
@@ -89,6 +99,7 @@ def update_joint(
     metrics.peak[i] = max(metrics.peak[i], abs(applied))
     if metrics.samples[0] >= settings.settled:
         metrics.squares[i] += error * error
+        metrics.late[i] = max(metrics.late[i], error / s.bound[i])
     return bool(settings.limit[i] > 0.0 and abs(s.torque[i]) >= settings.limit[i])
 
 
@@ -124,3 +135,27 @@ def update_metrics(
         if settings.samples[j] == metrics.samples[0]:
             metrics.error[j] = relative_error(sample.estimate, metrics.P, settings.order)
     metrics.samples[0] += 1.0
+
+
+def another_motion(config: ControllerConfig, seed: int) -> ControllerConfig:
+    """Return a configuration with other signs and phases of the reference's sinusoids."""
+    random, reference = np.random.default_rng(seed), config.reference
+    signs = random.choice((-1.0, 1.0), len(reference.amplitude))
+    motion = {
+        'reference.amplitude': (signs * reference.amplitude).tolist(),
+        'reference.phase': random.uniform(0.0, 2.0 * np.pi, len(reference.phase)).tolist(),
+    }
+    return change(config, motion)
+
+
+def torque_rows(config: ControllerConfig) -> np.ndarray:
+    """Return the rows of H(q, q', q', q'') (k, p) along the configured reference."""
+    model = model_of(config)
+    times = np.linspace(0.0, _ROWS_FOR, _ROWS)
+    q, dq, ddq = np.moveaxis(terms.sampled(reference_of(config), times), 1, 0)
+    return regressors_at(model, q, dq, dq, ddq).reshape(_ROWS * model.n, -1)
+
+
+def torque_error(rows: np.ndarray, estimate: np.ndarray, P: np.ndarray) -> float:
+    """Return the torque error of a learned model on such rows, relative to their torque."""
+    return float(np.linalg.norm(rows @ (estimate - P)) / np.linalg.norm(rows @ P))
