@@ -9,13 +9,15 @@ from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
 from blf_dsc_controller.arms.two_link_geometry import urdf
 from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of
-from blf_dsc_controller.configuration.truth import Truth
+from blf_dsc_controller.configuration.truth import Deviation
 from sim_plant.arm import Arm
 from sim_plant.dynamics import PointMassArm
 from sim_plant.rigid_arm import rigid_arm
+from sim_plant.rigid_body import rigid_bodies
 
 
 def arm_of(config: PlantConfig) -> Arm:
@@ -29,7 +31,17 @@ def arm_of(config: PlantConfig) -> Arm:
     return rigid_arm(chain, robot.gravity, inertias, rotors, parameters)
 
 
-def true_inertias(chain: Chain, truth: Truth) -> np.ndarray:
+def drive_bodies(config: PlantConfig) -> np.ndarray:
+    """Return the packed `RigidBodies` by which the drives compensate gravity; empty without."""
+    robot = config.robot
+    if robot.drive_compensates == 'none':
+        return np.zeros(0)
+    chain = robot.chain(config.joints)
+    inertias = robot.drive_inertias(chain, true_inertias(chain, config.drive))
+    return pack(rigid_bodies(chain, robot.gravity, inertias, np.zeros(len(chain.joints))))
+
+
+def true_inertias(chain: Chain, truth: Deviation) -> np.ndarray:
     """Return the inertias (n, 10) of the URDF with each mass distribution scaled and shifted."""
     moved = np.eye(4)
     inertias = np.empty((len(chain.joints), 10))

@@ -15,6 +15,7 @@ from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
 from blf_dsc_controller.compiled.views import part, view
 from sim_plant.actuator import Drives, DriveState, actuate
 from sim_plant.arm import Arm
+from sim_plant.compensation import Compensation, CompensationState, compensate, jumps
 from sim_plant.contact import Contact, SloshSettings, TipState, WallSettings, locate_tip
 from sim_plant.disturbance import JointDisturbance
 from sim_plant.events import Acting, EventSettings, LoadSettings, update_acting
@@ -38,6 +39,10 @@ class PlantSettings(NamedTuple):
     encoders: Encoders
     disturbance: JointDisturbance
     drives: Drives
+    compensation: Compensation
+    drive_size: int  # of drive_bodies; 0: the drives add nothing
+    drive_memory: int
+    drive_bodies: Annotated[Array, 'drive_size']  # RigidBodies, as the drives know them
     load: LoadSettings
     wall: WallSettings
     slosh: SloshSettings
@@ -52,6 +57,7 @@ class PlantState(NamedTuple):
     sloshes: Cell  # 1: y and v are those of a load
     reading: EncoderReading
     drives: DriveState
+    compensation: CompensationState
     stages: Stages
     acting: Acting
     tip: TipState
@@ -109,9 +115,26 @@ def update_motion(plant: PlantSettings, now: PlantState) -> Motion:
 
 
 @inner
+def add_compensation(plant: PlantSettings, now: PlantState) -> None:
+    """Compute what the drives add in this sample, by the true state."""
+    n = plant.n
+    friction = update_motion(plant, now).disturbance
+    q, dq = part(now.x, 0, (n,)), part(now.x, n, (n,))
+    compensate(plant.compensation, plant.drive_bodies, friction, q, dq, now.compensation)
+
+
+@inner
+def is_due(plant: PlantSettings, now: PlantState) -> bool:
+    """Return whether the encoders read this sample, which they have not done yet."""
+    sample, every = int(now.sample[0]), plant.encoders.repeat_every
+    is_repeat = every > 0 and sample > 0 and sample % every == 0
+    return now.reading.sample[0] != now.sample[0] and not is_repeat
+
+
+@inner
 def draw_noise(plant: PlantSettings, now: PlantState, rng: np.random.Generator) -> None:
     """Draw encoder and drive noise for this sample, unless it has been read already."""
-    if now.reading.sample[0] != now.sample[0]:
+    if is_due(plant, now):
         if is_noisy(plant.encoders):
             draw(rng, now.reading.noise)
         if plant.drives.noise > 0.0:
@@ -122,11 +145,13 @@ def draw_noise(plant: PlantSettings, now: PlantState, rng: np.random.Generator) 
 def observe(plant: PlantSettings, now: PlantState, measurement: np.ndarray) -> None:
     """Write [q, dq, effort] (3n,) of this sample, with the noise already drawn.
 
-    `effort` is the torque applied over the last interval [N m].  Reading a sample again gives the
-    same numbers.
+    `effort` is the torque applied over the last interval [N m], before the first one that with
+    which the drives hold the arm.  Reading a sample again gives the same numbers.
     """
     n = plant.n
-    if now.reading.sample[0] != now.sample[0]:
+    if now.sample[0] == 0.0:
+        add_compensation(plant, now)
+    if is_due(plant, now):
         update_motion(plant, now)
         q, dq = part(now.x, 0, (n,)), part(now.x, n, (n,))
         offset = now.acting.offset
@@ -136,20 +161,31 @@ def observe(plant: PlantSettings, now: PlantState, measurement: np.ndarray) -> N
         measurement[i] = now.reading.position[i]
         measurement[n + i] = now.reading.velocity[i]
         measurement[2 * n + i] = now.drives.applied[i]
+        if plant.compensation.effort_is_whole == 1:
+            measurement[2 * n + i] += now.compensation.added[i]
 
 
 @inner
 def step(plant: PlantSettings, now: PlantState, command: np.ndarray) -> None:
     """Apply the commanded torque (n,) [N m] of this sample and advance to the next one."""
+    own = now.compensation
+    if jumps(plant.compensation, command, own):
+        for i in range(plant.n):
+            now.x[plant.n + i] = now.drives.applied[i] = now.drives.motor[i] = 0.0
+        now.sample[0] += 1.0
+        return
     actuate(plant.drives, int(now.sample[0]), command, now.drives)
     motion = update_motion(plant, now)
+    add_compensation(plant, now)
+    for i in range(plant.n):
+        own.whole[i] = now.drives.applied[i] + own.added[i]
     size = 2 * plant.n + 6 if motion.contact.mass > 0.0 else 2 * plant.n
     integrate(
         plant.integrator,
         motion,
         now.sample[0] * plant.period_ns * 1e-9,
         plant.period_ns * 1e-9,
-        now.drives.applied,
+        own.whole,
         part(now.x, 0, (size,)),
         now.stages,
     )

@@ -42,6 +42,7 @@ from sim_plant.plant import FASTEST, Plant, plant_of, settings_of, steps_of
 LOCKSTEP_START = 1_000_000_000
 """First stamp in lock-step [ns]: a zero stamp means 'not set' in ROS."""
 
+_STALE = {'zero': ': not applied', 'brake': ': the brakes hold', 'hold': ', and still applied'}
 _REPEAT_PERIOD = 3.0  # s, until a state without a torque is sent again
 _EARLY = 0.05  # fraction of a sample by which a timer may fire early
 _BETWEEN_RUNS = 1_000_000_000  # ns from the last stamp before a reset to the first after it
@@ -60,7 +61,8 @@ class PlantNode(LoopNode[PlantConfig]):
         joints = self.config.joints
         self._steps = steps_of(self.config)
         self._lockstep = self.config.mode == 'lockstep'
-        self._telemetry = PlantTelemetry(joints, parameter_names_of(self.config))
+        published = self.config.sensor.published_joints
+        self._telemetry = PlantTelemetry(joints, parameter_names_of(self.config), published)
         self._decoder = Float64MultiArrayDecoder(len(joints))
         self.input = TorqueInput(joints)
         self._reported_stale = self._reported_rejected = 0
@@ -146,6 +148,7 @@ class PlantNode(LoopNode[PlantConfig]):
         if not self._lockstep:
             self._start_stamp = self._wall() - self.plant.elapsed_ns
         self._offered = True
+        self._publish_incomplete_states()
         if self._lockstep and self._torque_waits:
             self._running = True
             self._advance()
@@ -203,23 +206,31 @@ class PlantNode(LoopNode[PlantConfig]):
         if self._is_over():
             return
         was_stale, self._stale = self._stale, self._is_stale()
-        if self._stale and self.config.actuator.without_command == 'brake':
+        without = self.config.actuator.without_command
+        if self._stale and without == 'brake':
             self.plant.hold()
         else:
-            if self._stale:
+            if self._stale and without == 'zero':
                 self.input.torque[:] = 0.0
             self._step()
         self._apply_changes()
         self._publish_state()
         if self._stale and not was_stale:
             self.get_logger().error(
-                'the torque is too old and is no longer applied', throttle_duration_sec=1.0
+                'the torque is too old' + _STALE[self.config.actuator.without_command],
+                throttle_duration_sec=1.0,
             )
             self._report()
 
     def _step(self) -> None:
-        was_broken = self.plant.is_broken
+        was_broken, was_stopped = self.plant.is_broken, self.plant.is_stopped
         self.plant.step(self.input.torque)
+        if self.plant.is_stopped and not was_stopped:
+            self.get_logger().error(
+                f'reflex: the commands jumped to {self.input.torque} N m, faster than '
+                f'{self.config.actuator.reflex_rate:g} N m/s: the drives brake until a reset'
+            )
+            self._report()
         if self.plant.is_broken and not was_broken:
             self.get_logger().error(
                 f'the torque {self.input.torque} N m drove the arm beyond {FASTEST:g} rad/s: '
@@ -252,6 +263,12 @@ class PlantNode(LoopNode[PlantConfig]):
         if self.config.publish_clock:
             self._publish(self._telemetry.clock(stamp))
 
+    def _publish_incomplete_states(self) -> None:
+        sensor, measurement = self.config.sensor, self.plant.measure()
+        for ahead in range(sensor.incomplete_states, 0, -1):
+            stamp = self.stamp - ahead * self.config.sample_time_ns
+            self._publish(self._telemetry.incomplete_states(stamp, measurement, sensor.incomplete))
+
     def _reconfigure(self, config: PlantConfig) -> None:
         self._changed |= differences(self.config, config)
         self.config = config
@@ -283,9 +300,12 @@ class PlantNode(LoopNode[PlantConfig]):
             level, message = WARN, 'braked: waiting for the first torque'
         elif self.plant.is_broken:
             level, message = ERROR, f'the arm was faster than {FASTEST:g} rad/s: reset it'
+        elif self.plant.is_stopped:
+            level, message = ERROR, 'reflex stop after a jump of the commands: reset the arm'
         elif stale > self._reported_stale:
             level = ERROR
-            message = 'the last torque is too old (actuator.command_timeout): not applied'
+            message = 'the last torque is too old (actuator.command_timeout)'
+            message += _STALE[self.config.actuator.without_command]
         elif rejected > self._reported_rejected:
             level, message = WARN, self.input.problem
         self._reported_stale, self._reported_rejected = stale, rejected

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.plant import PlantConfig
 from sim_plant.actuator import Drives, lag
-from sim_plant.arms import arm_of, parameter_names_of
+from sim_plant.arms import arm_of, drive_bodies, parameter_names_of
+from sim_plant.compensation import Compensation, memory_size
 from sim_plant.contact import SloshSettings, WallSettings
 from sim_plant.disturbance import JointDisturbance
 from sim_plant.events import EventSettings, LoadSettings
@@ -72,6 +73,11 @@ class Plant:
     def sample(self) -> int:
         """Samples stepped since the start, k."""
         return int(self.state[0])
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether the drives have made a reflex stop, which lasts until a reset."""
+        return bool(self._now.compensation.stopped[0])
 
     @property
     def elapsed_ns(self) -> int:
@@ -169,6 +175,7 @@ def settings_of(config: PlantConfig) -> PlantSettings:
     """Return the settings of a configured plant."""
     arm, n = arm_of(config), len(config.joints)
     sensor, actuator, load, wall = config.sensor, config.actuator, config.load, config.wall
+    robot, drive, bodies = config.robot, config.drive, drive_bodies(config)
     return PlantSettings(
         arm=arm,
         n=n,
@@ -182,6 +189,7 @@ def settings_of(config: PlantConfig) -> PlantSettings:
             sensor.resolution,
             VELOCITY_SOURCES[sensor.velocity],
             sensor.velocity_pole,
+            sensor.repeat_every,
         ),
         disturbance=_disturbance_of(config),
         drives=Drives(
@@ -190,6 +198,14 @@ def settings_of(config: PlantConfig) -> PlantSettings:
             *lag(actuator.time_constant, config.sample_time),
             actuator.torque_noise,
         ),
+        compensation=Compensation(
+            drive.friction if robot.drive_compensates == 'gravity_and_friction' else 0.0,
+            int(robot.effort == 'whole'),
+            actuator.reflex_rate * config.sample_time,
+        ),
+        drive_size=bodies.size,
+        drive_memory=memory_size(arm) if bodies.size else 0,
+        drive_bodies=bodies,
         load=LoadSettings(load.payload, *map(np.array, (load.torque, load.force, sensor.offset))),
         wall=WallSettings(
             np.array(wall.point),

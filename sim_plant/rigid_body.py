@@ -146,6 +146,14 @@ def tip(arm: RigidBodies, now: BodyMotion, position: np.ndarray, jacobian: np.nd
 
 
 @inner
+def gravity_torque(arm: RigidBodies, now: BodyMotion, out: np.ndarray) -> None:
+    """Write G (n,) [N m, or N] after `locate` at rest, without a payload."""
+    combine_bodies(arm, now, 0.0)
+    for j in range(arm.n):
+        out[j] = along_joint(arm, now, j, vector(now.force[j + 1]), vector(now.torque[j + 1]))
+
+
+@inner
 def acceleration(
     arm: RigidBodies, now: BodyMotion, payload: float, torque: np.ndarray, ddq: np.ndarray
 ) -> None:

@@ -27,6 +27,7 @@ class Encoders(NamedTuple):
     resolution: float  # rad, 0 = none
     velocity_source: int  # MEASURED or DIFFERENCED
     velocity_pole: float  # rad/s, 0 = no filter
+    repeat_every: int  # samples after which the last reading is sent once more; 0: never
 
 
 class EncoderReading(NamedTuple):

@@ -4,6 +4,7 @@
 import numpy as np
 
 from sim_plant.actuator import Drives, lag
+from sim_plant.compensation import Compensation
 from sim_plant.contact import Contact, SloshSettings, TipState, WallSettings
 from sim_plant.disturbance import JointDisturbance
 from sim_plant.dynamics import PointMassArm
@@ -96,12 +97,16 @@ def settings(
         integrator=integrator,
         events=0,
         encoders=Encoders(
-            position_noise, velocity_noise, resolution, velocity_source, velocity_pole
+            position_noise, velocity_noise, resolution, velocity_source, velocity_pole, 0
         ),
         disturbance=disturbance() if load is None else load,
         drives=Drives(
             np.array(torque_limit), delay, *lag(time_constant, period_ns * 1e-9), torque_noise
         ),
+        compensation=Compensation(0.0, 1, 0.0),
+        drive_size=0,
+        drive_memory=0,
+        drive_bodies=np.zeros(0),
         load=UNLOADED,
         wall=NOWHERE,
         slosh=CALM,

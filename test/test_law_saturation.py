@@ -13,12 +13,13 @@ from blf_dsc_controller.law.saturation import LEVEL_CUT, RATE_CUT, saturate
 DT = 2e-3  # s: with 500 N m/s, 1 N m from sample to sample
 
 
-def cut(demand, last, *, level=10.0, rate=500.0, samples=7.0):
+def cut(demand, last, *, level=10.0, rate=500.0, samples=7.0, added=0.0):
     case = arbitrary(0, n=1, torque_limit=np.array([level]), rate_limit=np.array([rate]))
     case.state.samples[0] = samples
     case.state.torque[0] = last
     case.state.level_cuts[0] = case.state.rate_cuts[0] = 0.0
     case.signals.demand[0] = demand
+    case.signals.added[0] = added
     saturated = saturate(case.settings, case.state, case.signals, DT)
     return case.signals.torque[0], case.signals.cuts[0], saturated, case.state
 
@@ -42,6 +43,21 @@ def test_torque_saturates_at_its_level_and_at_its_rate(demand, last, torque, cut
     assert bool(saturated) is (cuts > 0.0)
     assert state.level_cuts[0] == (cuts in {LEVEL_CUT, LEVEL_CUT + RATE_CUT})
     assert state.rate_cuts[0] == (cuts in {RATE_CUT, LEVEL_CUT + RATE_CUT})
+
+
+@pytest.mark.parametrize(
+    ('demand', 'command', 'cuts'),
+    [
+        (12.0, 6.0, LEVEL_CUT),  # the whole torque is at its limit
+        (-7.0, -10.0, LEVEL_CUT),  # the command is: with the 4 N m of the drive, -6 N m
+        (9.0, 5.0, 0.0),
+        (7.5, 4.0, RATE_CUT),  # the rate is that of the command
+    ],
+)
+def test_limits_hold_for_the_command_and_for_the_whole_torque(demand, command, cuts):
+    last = {RATE_CUT: 5.0}.get(cuts, command)
+    got = cut(demand, last, rate=1000.0 if cuts != RATE_CUT else 500.0, added=4.0)
+    assert got[:2] == (command, cuts)
 
 
 def test_any_change_is_allowed_without_a_rate_limit():

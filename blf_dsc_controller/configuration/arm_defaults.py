@@ -77,6 +77,7 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
         'disturbance.gain': _listed(0.4 * m * rate**2),
         'torque.limit': _listed(effort),
         'torque.rate_limit': zeros,
+        'torque.first_step': zeros,
         'reference.type': 'hold',
         'reference.offset': _listed((lower + upper) / 2.0),
         'reference.amplitude': zeros,

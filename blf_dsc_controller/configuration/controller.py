@@ -85,6 +85,9 @@ class Safety:
         0.4, 'largest fraction of missed states, averaged over overrun_window', at_most=1.0
     )
     overrun_window: float = positive(1.0, 'time over which missed states are averaged', 's')
+    first_torque: Literal['check', 'send'] = parameter(
+        'check', 'refuse a first torque that an arm at rest contradicts, or send it unchecked'
+    )
     torque: Literal['zero', 'damping', 'hold_gravity'] = parameter(
         'zero', 'safe torque: zero, damping -D dq, or the learned gravity with damping'
     )
@@ -175,6 +178,7 @@ class ControllerConfig(Sampled):
             return [f'robot.learn: got {self.robot.learn}, but model {self.model} learns base only']
         return [
             *joint_problems(self.joints, f'model {self.model}', needed),
+            *(f'robot.{problem}' for problem in self.robot.problems()),
             *self.sample_time_problems(),
             *self.reference.problems(),
             *self.limits.problems(self.joints),

@@ -105,10 +105,18 @@ class Torque:
     """Saturation of the commanded torque."""
 
     limit: PerJoint = positive(
-        (20.0, 20.0), 'largest commanded torque; learning uses the limited torque', 'N m'
+        (20.0, 20.0),
+        'largest torque, both as commanded and with what the drives add; learning uses the limited '
+        'torque',
+        'N m',
     )
     rate_limit: PerJoint = non_negative(
         (0.0, 0.0), 'largest rate of the commanded torque; 0: no limit', 'N m/s'
+    )
+    first_step: PerJoint = non_negative(
+        (0.0, 0.0),
+        'largest first torque, a step from none, that the drives tolerate; 0: any',
+        'N m',
     )
 
 

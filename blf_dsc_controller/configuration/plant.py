@@ -25,7 +25,7 @@ from blf_dsc_controller.configuration.schema import (
     parameters,
     positive,
 )
-from blf_dsc_controller.configuration.truth import Truth
+from blf_dsc_controller.configuration.truth import Deviation, Truth
 
 _fixed = partial(parameter, read_only='the plant is built once, when the node starts')
 
@@ -91,6 +91,26 @@ class Sensor:
         0.0, 'pole of the low-pass filter on the velocity; 0: none', 'rad/s', at_least=0.0
     )
     offset: PerJoint = parameter((0.0, 0.0), 'measured minus true position', 'rad')
+    repeat_every: int = _fixed(
+        0,
+        'after so many samples, the last reading is repeated with a new stamp; 0: never',
+        at_least=0,
+    )
+    published_joints: tuple[str, ...] = _fixed(
+        (),
+        'names in the joint states, in order; others than `joints` stay at 0; empty: `joints`',
+        may_be_empty=True,
+    )
+    incomplete: Literal['invalid', 'absent'] = _fixed(
+        'invalid',
+        'velocities and efforts of the first `incomplete_states` joint states: NaN, or none',
+    )
+    incomplete_states: int = _fixed(
+        0,
+        'joint states without velocities and efforts, before the first one',
+        at_least=0,
+        at_most=100,
+    )
 
 
 @dataclass(frozen=True)
@@ -116,8 +136,30 @@ class Actuator:
     command_timeout: float = positive(
         0.05, 'age above which a commanded torque is not applied, in real time only', 's'
     )
-    without_command: Literal['zero', 'brake'] = parameter(
-        'zero', 'without a command: zero torque, or the brakes hold the joints'
+    without_command: Literal['zero', 'brake', 'hold'] = parameter(
+        'zero',
+        'without a command: zero torque, the brakes hold the joints, or the last command goes on',
+    )
+    reflex_rate: float = _fixed(
+        0.0,
+        'rate of the commanded torque above which the drives brake until a reset; 0: never',
+        'N m/s',
+        at_least=0.0,
+    )
+
+
+@dataclass(frozen=True)
+class Drive(Deviation):
+    """Model by which the drives compensate `robot.drive_compensates`.
+
+    With the deviations of `truth` it is the true arm, without any it is the URDF.
+    """
+
+    friction: float = _fixed(
+        0.8,
+        'share of viscous and Coulomb friction that gravity_and_friction compensates',
+        at_least=0.0,
+        at_most=1.0,
     )
 
 
@@ -158,6 +200,7 @@ class PlantConfig(Sampled):
     arm: PlantArm = PlantArm()
     robot: Robot = Robot()
     truth: Truth = Truth()
+    drive: Drive = Drive()
     initial: Initial = Initial()
     disturbance: PlantDisturbance = PlantDisturbance()
     sensor: Sensor = Sensor()
@@ -194,6 +237,14 @@ class PlantConfig(Sampled):
         problems += self.sample_time_problems() + self.wall.problems()
         if self.truth != Truth() and not self.robot.urdf:
             problems.append('truth: it applies only to a URDF: give robot.urdf, or change arm')
+        if self.drive != Drive() and self.robot.drive_compensates == 'none':
+            problems.append('drive: without robot.drive_compensates the drives need no model')
+        problems += [f'robot.{problem}' for problem in self.robot.problems()]
+        published = self.sensor.published_joints
+        if published and (lacking := [name for name in self.joints if name not in published]):
+            problems.append(f'sensor.published_joints: {", ".join(lacking)} of `joints` is missing')
+        if len(set(published)) < len(published):
+            problems.append('sensor.published_joints: a name is repeated')
         if self.actuator.ripple > 0.0 and not all(self.actuator.torque_limit):
             problems.append(
                 'actuator.ripple: it is a fraction of the rated torque: give actuator.torque_limit'

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
+from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.arms.urdf import Chain, UrdfError, chain_joints, moving_joints, read_chain
 from blf_dsc_controller.configuration.schema import build, counted, parameter
 from blf_dsc_controller.configuration.share import read_text, resolve
@@ -27,6 +28,7 @@ _fixed = partial(parameter, read_only='the arm is built once, when the node star
 TOPIC = 'topic://'
 """Prefix of a `robot.urdf` that is published; the node waits for it when it starts."""
 
+_MOMENTS = 4  # inertial parameters that gravity shows: mass and first moments
 _DRIVE_ACCELERATION = 400.0  # rad/s^2, of an unloaded drive at its rated torque
 
 
@@ -65,26 +67,47 @@ class Robot:
         omittable=True,
     )
 
+    drive_compensates: Literal['none', 'gravity', 'gravity_and_friction'] = _fixed(
+        'none', 'what the drives add to a commanded torque by themselves'
+    )
+    drive_payload: float = _fixed(
+        0.0,
+        'payload that the drives have been told of, as far as the URDF lacks it',
+        'kg',
+        at_least=0.0,
+    )
+    drive_payload_centre: Annotated[tuple[float, ...], '3'] = _fixed(
+        (0.0, 0.0, 0.0), 'centre of mass of that payload, in the frame of the tip', 'm'
+    )
+    effort: Literal['whole', 'commanded'] = _fixed(
+        'whole', 'what `effort` in joint states contains: all torques, or without what drives add'
+    )
     viscous: Annotated[tuple[float, ...], 'joints'] = _fixed(
         (),
-        'initial viscous friction; empty: damping of the URDF',
+        'initial viscous friction; empty: damping of the URDF, or 0 if the drives compensate it',
         'N m s/rad',
         at_least=0.0,
         omittable=True,
     )
     coulomb: Annotated[tuple[float, ...], 'joints'] = _fixed(
         (),
-        'initial Coulomb friction; empty: friction of the URDF',
+        'initial Coulomb friction; empty: friction of the URDF, or 0 if the drives compensate it',
         'N m',
         at_least=0.0,
         omittable=True,
     )
 
     def problems(self) -> list[str]:
-        """Check that there is something to learn."""
+        """Check that there is something to learn, and a model of what the drives add."""
+        found = []
         if self.learn == 'payload' and self.payload == 0.0:
-            return ['payload: got 0 kg, but learn: payload needs the mass that the arm may carry']
-        return []
+            found += ['payload: got 0 kg, but learn: payload needs the mass that the arm may carry']
+        if self.drive_compensates != 'none' and not self.urdf:
+            found += [f'drive_compensates: got {self.drive_compensates}, which needs robot.urdf']
+        if self.drive_compensates == 'none' and self.drive_payload:
+            known = f'drive_payload: got {self.drive_payload:g} kg, but drive_compensates is none: '
+            found += [known + 'the drives reckon with no payload']
+        return found
 
     @property
     def text(self) -> str:
@@ -97,10 +120,18 @@ class Robot:
 
     def friction(self, chain: Chain) -> dict[str, tuple[float, ...]]:
         """Return the initial friction of each joint, by the name of its column."""
+        left = 0.0 if self.drive_compensates == 'gravity_and_friction' else 1.0
         return {
-            'viscous': self.viscous or tuple(joint.damping for joint in chain.joints),
-            'coulomb': self.coulomb or tuple(joint.friction for joint in chain.joints),
+            'viscous': self.viscous or tuple(left * joint.damping for joint in chain.joints),
+            'coulomb': self.coulomb or tuple(left * joint.friction for joint in chain.joints),
         }
+
+    def drive_inertias(self, chain: Chain, links: np.ndarray) -> np.ndarray:
+        """Return the inertias (n, 10) of `links` with the payload that the drives know."""
+        inertias: np.ndarray = links.copy()
+        point = np.asarray(chain.tip_placement @ np.append(self.drive_payload_centre, 1.0))
+        inertias[-1] += self.drive_payload * inertia_of(np.outer(point, point))
+        return inertias
 
     def rotors(self, chain: Chain) -> np.ndarray:
         """Return drive inertias (n,) [kg m^2]: as given, or rated torque / 400 rad/s^2."""
@@ -174,6 +205,22 @@ def _learned_of(
     from blf_dsc_controller.arms.forms import learned_parameters  # slow: compiles
 
     return learned_parameters(chain, base, form, payload, np.array(rotors))
+
+
+def drive_model(robot: Robot, joints: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gravity that the drives add: a packed chain, and what its columns multiply.
+
+    The columns are mass and first moments of each body, payload included; empty if they add none.
+    """
+    if robot.drive_compensates == 'none':
+        return np.zeros(0), np.zeros(0)
+    from blf_dsc_controller.arms.serial_chain import serial_chain  # slow: compiles
+
+    chain = robot.chain(joints)
+    columns = [(i, entry) for i in range(len(chain.joints)) for entry in range(_MOMENTS)]
+    inertias = robot.drive_inertias(chain, chain.inertias)
+    gravity = (robot.gravity[0], robot.gravity[1], robot.gravity[2])
+    return serial_chain(chain, gravity, columns).vector, inertias[:, :_MOMENTS].ravel()
 
 
 def given_robot(given: Mapping[str, Any], joints: object) -> tuple[Robot, Chain]:

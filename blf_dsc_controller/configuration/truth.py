@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Deviations of the simulated arm from its URDF, unknown to the controller."""
+"""Deviations of the simulated arm and its drives from the URDF, unknown to the controller."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ _fixed = partial(parameter, read_only='the plant is built once, when the node st
 
 
 @dataclass(frozen=True)
-class Truth:
-    """Deviations of the true masses from those of the URDF.
+class Deviation:
+    """Deviations of masses from those of the URDF.
 
     A changed body stays physically consistent: its mass distribution is only scaled and shifted.
     """
 
     mass_factor: float = _fixed(1.0, 'factor on all masses and inertias', above=0.0)
-    rotor_factor: float = _fixed(1.0, 'factor on the inertias of the drives', at_least=0.0)
     mass_deviation: float = _fixed(
         0.0, 'largest random deviation of each mass, as a fraction', at_least=0.0, below=1.0
     )
@@ -36,3 +35,10 @@ class Truth:
         drawn = random.uniform(-1.0, 1.0, (n, 4))
         factors = self.mass_factor * (1.0 + self.mass_deviation * drawn[:, 0])
         return factors, self.centre_deviation * drawn[:, 1:]
+
+
+@dataclass(frozen=True)
+class Truth(Deviation):
+    """Deviations of the true arm from its URDF."""
+
+    rotor_factor: float = _fixed(1.0, 'factor on the inertias of the drives', at_least=0.0)

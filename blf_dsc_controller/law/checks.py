@@ -76,7 +76,9 @@ def check_sample(
     """
     flags = check_error(settings, checks, sample.xi1, sample.bound)
     for i in range(settings.n):
-        within = abs(signals.demand[i]) <= settings.torque_limit[i]
+        demand = signals.demand[i]
+        largest = max(abs(demand), abs(demand - signals.added[i]))
+        within = largest <= settings.torque_limit[i]
         if not (within and isfinite(sample.torque[i]) and isfinite(state.disturbance[i])):
             flags |= SUSPECT
     for j in range(settings.m):

@@ -19,7 +19,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel, arm_model
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.robot import learned_of
+from blf_dsc_controller.configuration.robot import drive_model, learned_of
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import (
@@ -105,6 +105,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     floor = np.array(learning.residual_floor)
     least = float(floor.min())
     covariance = prior_covariance(config)
+    drive_chain, drive_inertias = drive_model(config.robot, config.joints)
     settings = Settings(
         model=model,
         n=model.n,
@@ -115,6 +116,9 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         latch=LATCHES.index(learning.latch),
         update=UPDATES.index(learning.update),
         torque_source=TORQUE_SOURCES.index(learning.torque_source),
+        effort_is_whole=int(config.robot.effort == 'whole'),
+        drive=drive_inertias.size,
+        drive_size=drive_chain.size,
         window=round(learning.window / (config.sample_time * learning.row_interval)),
         row_interval=learning.row_interval,
         interval=learning.interval,
@@ -166,6 +170,8 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         variance=np.diag(covariance).copy(),
         true_parameters=np.array(truth.parameters or (0.0,) * p),
         frequencies=np.array(learning.frequencies),
+        drive_chain=drive_chain,
+        drive_inertias=drive_inertias,
     )
     return settings._replace(**_of_law(config, settings))
 

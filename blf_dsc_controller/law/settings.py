@@ -38,6 +38,9 @@ class Settings(NamedTuple):
     latch: int
     update: int
     torque_source: int
+    effort_is_whole: int  # 1: measured efforts contain what the drive adds, 0: they do not
+    drive: int  # columns of the gravity that the drive adds; 0: it adds none
+    drive_size: int  # of drive_chain
     window: int  # N, rows in tau_d
     row_interval: int  # samples between two rows of the window
     interval: int  # samples between two checks of the excitation
@@ -88,6 +91,8 @@ class Settings(NamedTuple):
     variance: Annotated[Array, 'm']  # diagonal of R^-1
     true_parameters: Annotated[Array, 'p']
     frequencies: Annotated[Array, 'tones']  # of the sine and cosine columns, rad/s
+    drive_chain: Annotated[Array, 'drive_size']  # `Bodies` of the drive's model, with its memory
+    drive_inertias: Annotated[Array, 'drive']  # masses [kg] and moments [kg m] of the drive's model
 
 
 settings_of = view_of(Settings)

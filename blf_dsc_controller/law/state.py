@@ -32,6 +32,7 @@ class State(NamedTuple):
     contradiction: Cell  # `recent_residual` at the last change, (N m)^2
     alpha2: Annotated[Array, 'n']  # rad/s
     torque: Annotated[Array, 'n']  # last commanded torque, N m
+    added: Annotated[Array, 'n']  # what the drive added to it then, N m
     disturbance: Annotated[Array, 'n']  # d^3, N m
     observed: Annotated[Array, 'n']  # xi2 filtered by (8), rad/s
     observed_rate: Annotated[Array, 'n']  # its derivative, rad/s^2
@@ -66,7 +67,9 @@ class Signals(NamedTuple):
     xi2: Annotated[Array, 'n']  # rad/s
     known: Annotated[Array, 'n']  # disturbance known to the law, N m
     acceleration: Annotated[Array, 'n']  # estimated ddq, rad/s^2
-    demand: Annotated[Array, 'n']  # torque (28) before saturation, N m
+    added: Annotated[Array, 'n']  # torque that the drive adds to the command, N m
+    applied: Annotated[Array, 'n']  # mean whole torque of the last interval, N m
+    demand: Annotated[Array, 'n']  # whole torque (28) before saturation, N m
     torque: Annotated[Array, 'n']  # commanded torque, N m
     cuts: Annotated[Array, 'n']  # how the torque was cut: 0, LEVEL_CUT, RATE_CUT, or their sum
     bound: Annotated[Array, 'n']  # k(t), rad
@@ -81,6 +84,8 @@ class Signals(NamedTuple):
     factor: Annotated[Array, 'm', 'm']
     inertia: Annotated[Array, 'n', 'n']  # M^(q) minus its least admissible value, or its factor
     unit: Annotated[Array, 'n']  # scratch
+    still: Annotated[Array, 'n']  # zeros
+    drive: Annotated[Array, 'n', 'drive']  # columns of the gravity that the drive adds
     rate: Annotated[Array, 'm']  # theta^' [1/s]
     work: Annotated[Array, 'm']  # scratch
 

@@ -16,6 +16,7 @@ from blf_dsc_controller.law import (
     adaptation,
     barrier,
     consistency,
+    drive,
     excitation,
     prediction,
     saturation,
@@ -23,7 +24,7 @@ from blf_dsc_controller.law import (
     torque,
     window,
 )
-from blf_dsc_controller.law.settings import EFFORT, FILTERED, Settings
+from blf_dsc_controller.law.settings import FILTERED, Settings
 from blf_dsc_controller.law.state import Sample, Signals, State
 from blf_dsc_controller.reference import terms as reference
 
@@ -104,22 +105,21 @@ def step(
 ) -> None:
     """Run one sample, from the measurement to the torque; `lyapunov.fill_energies` is separate.
 
-    The measurement is [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m],
+    The measurement is [q (n,) rad, dq (n,) rad/s, effort of the last interval (n,) N m],
     t [s] the time since the start, dt [s] since the last sample (at the first: until the next).
     """
     n = settings.n
     q = part(measurement, 0, (n,))
     dq = part(measurement, n, (n,))
-    applied = state.torque
-    if settings.torque_source == EFFORT:
-        applied = part(measurement, 2 * n, (n,))
+    drive.find_added(settings, signals, q)
+    drive.find_applied(settings, state, signals, measurement)
     reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
     torque.known_disturbance(settings, signals, t)
     barrier.update_bound(settings, signals, t)
     surface.compute_errors(settings, state, signals, dt, q, dq)
     compute_regressors(settings, state, signals, q, dq)
     prediction.fill_compensation(settings, signals)
-    update_window(settings, state, signals, t, dt, q, dq, applied)
+    update_window(settings, state, signals, t, dt, q, dq, signals.applied)
     torque.compute_demand(settings, state, signals, q)
     saturated = saturation.saturate(settings, state, signals, dt)
     adaptation.adapt(settings, state, signals, dt, saturated)

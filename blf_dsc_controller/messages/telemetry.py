@@ -84,14 +84,23 @@ class ControllerTelemetry:
 
 
 class PlantTelemetry:
-    """Messages of the plant of n joints and p true parameters."""
+    """Messages of the plant of n joints and p true parameters.
 
-    def __init__(self, joints: Sequence[str], parameters: Sequence[str]) -> None:
+    Joint states have the names `published`, by default the joints; other joints stay at 0.
+    """
+
+    def __init__(
+        self, joints: Sequence[str], parameters: Sequence[str], published: Sequence[str] = ()
+    ) -> None:
+        names = tuple(published) or tuple(joints)
         true_state = [
             what + joint for what in (topics.POSITION, topics.VELOCITY) for joint in joints
         ]
         self._joints = len(joints)
-        self._joint_states = JointStateEncoder(joints)
+        self._joint_states = JointStateEncoder(names)
+        self._positions_only = JointStateEncoder(names, ('position',))
+        self._places = [names.index(joint) for joint in joints]
+        self._published = np.zeros((3, len(names)))
         self._truth = JointStateEncoder(
             (*parameters, *disturbance_names(joints), *true_state), ('position',)
         )
@@ -101,8 +110,17 @@ class PlantTelemetry:
 
     def joint_states(self, stamp: int, measurement: np.ndarray) -> Message:
         """Encode measured [q, dq, applied torque of the last interval] (3 n,)."""
-        fields = measurement.reshape(3, self._joints)
-        return topics.JOINT_STATES, self._joint_states.encode(stamp, *fields)
+        self._published[:, self._places] = measurement.reshape(3, self._joints)
+        return topics.JOINT_STATES, self._joint_states.encode(stamp, *self._published)
+
+    def incomplete_states(self, stamp: int, measurement: np.ndarray, missing: str) -> Message:
+        """Encode a joint state whose velocities and efforts are `missing`: invalid or absent."""
+        self._published[:, self._places] = measurement.reshape(3, self._joints)
+        position = self._published[0]
+        if missing == 'absent':
+            return topics.JOINT_STATES, self._positions_only.encode(stamp, position)
+        unknown = np.full(position.size, np.nan)
+        return topics.JOINT_STATES, self._joint_states.encode(stamp, position, unknown, unknown)
 
     def truth(self, stamp: int, truth: np.ndarray) -> Message:
         """Encode the true [P, tau_dist, q, dq] (p + 3 n,)."""

@@ -19,6 +19,7 @@ from blf_dsc_controller.bags.torque import applied_torque
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.messages.samples import columns_of, run_of
+from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.replay.states import law_states
 from blf_dsc_controller.run import Floats, Run
 from blf_dsc_controller.supervision.velocity import Velocity
@@ -50,6 +51,7 @@ class RecordedStates(NamedTuple):
     applied: Floats  # torque from each state to the next (N, n), N m; NaN for the last if unknown
     source: str  # topic of the applied torque
     left_out: int  # number of states that are not finite or follow an unknown torque
+    is_measured: bool  # the torques are measured efforts, not commands
 
 
 def read_states(
@@ -74,7 +76,8 @@ def read_states(
     if not states.stamp.size:
         raise BagError(f'{path} holds no joint state that is finite and has a known torque')
     left_out = every.stamp.size - states.stamp.size
-    return RecordedStates(states, applied[known], source, left_out)
+    is_measured = source == f'effort of {content.topics[JOINT_STATES].name}'
+    return RecordedStates(states, applied[known], source, left_out, is_measured)
 
 
 def what_if(
@@ -91,8 +94,10 @@ def what_if(
 
 def run_over(recorded_states: RecordedStates, config: ControllerConfig) -> WhatIf:
     """Run a configuration over recorded states; errors as for `what_if`."""
-    states, applied, source, left_out = recorded_states
+    states, applied, source, left_out, is_measured = recorded_states
     config = replace(config, learning=replace(config.learning, torque_source='effort'))
+    if not is_measured:
+        config = replace(config, robot=replace(config.robot, effort='commanded'))
     controller = controller_of(config)
     n, m = len(states.names), controller.settings.m
     stamps = states.stamp.tolist()

@@ -24,6 +24,7 @@ from blf_dsc_controller.messages import cdr
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.reference.approach import check_takeover
 from blf_dsc_controller.reference.limits import MotionError
+from blf_dsc_controller.supervision.first_torque import check_first_torque
 from blf_dsc_controller.supervision.safe_torque import SafeTorque, limit_first_torque
 from blf_dsc_controller.supervision.sample_check import SampleCheck
 from blf_dsc_controller.supervision.state_check import SKIP, StateCheck
@@ -164,6 +165,8 @@ class GuardedLaw:
         if not resumed:
             try:
                 self.settled = begin(self.controller, self.config, q, dq)
+                if not self.commanding:
+                    check_first_torque(self.controller, self.config, measurement)
             except (StartError, MotionError) as error:
                 self.start_error = error
                 self._stop(Reason.START_REJECTED, str(error))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.arms.batch import regressors_at
 from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.drive import added_torque
 from blf_dsc_controller.law.saturation import RATE_CUT
 from blf_dsc_controller.law.settings import Settings
 
@@ -64,8 +65,8 @@ class LastState:
 def safe_torque(safety: Safety, settings: Settings, last: LastState, estimate: Vector) -> Vector:
     """Return the safe torque (n,) [N m], within the torque limit and always finite.
 
-    It is zero, damping -D dq, or damping plus gravity H(q, 0, 0, 0) P^, and fades to zero while no
-    usable state arrives.
+    It is zero, damping -D dq, or damping plus gravity H(q, 0, 0, 0) P^ as far as the drive does not
+    add it, and fades to zero while no usable state arrives.
     """
     torque = np.zeros(settings.n)
     if last.age >= safety.fade_time:
@@ -76,7 +77,7 @@ def safe_torque(safety: Safety, settings: Settings, last: LastState, estimate: V
         if safety.torque == 'hold_gravity':
             rest = np.zeros((1, settings.n))
             (H,) = regressors_at(settings.model, last.q[np.newaxis], rest, rest, rest)
-            torque += H @ estimate[: settings.p]
+            torque += H @ estimate[: settings.p] - added_torque(settings, last.q)
     if not np.isfinite(torque).all():
         return np.zeros(settings.n)
     limited = np.clip(torque, -settings.torque_limit, settings.torque_limit)

@@ -107,7 +107,9 @@ class SampleCheck:
         return Fault(Reason.OUTSIDE_BOUND, text)
 
     def _saturated(self, dt: float) -> Fault | None:
-        demand, limit = self._controller.signals.demand, self._controller.settings.torque_limit
+        signals, limit = self._controller.signals, self._controller.settings.torque_limit
+        command = signals.demand - signals.added
+        demand = np.where(np.abs(command) > np.abs(signals.demand), command, signals.demand)
         worst = int(np.argmax(np.abs(demand) - limit))
         is_saturated = bool(np.abs(demand[worst]) > limit[worst])
         self.saturated += is_saturated

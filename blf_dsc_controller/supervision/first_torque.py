@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The check of the first torque, before it is sent to an arm that nobody has commanded yet.
+
+Whether drives compensate gravity cannot be told from positions, but from the effort with which they
+hold a resting arm: gravity if they do, nothing if the brakes hold it.  Only its direction and order
+of magnitude are used, so it may also be a current.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.arms.batch import regressors_at
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.errors import StartError
+from blf_dsc_controller.law.controller import Controller
+
+Vector = NDArray[np.float64]
+
+_AT_REST = 0.01  # rad/s
+_NOTICED = 0.02  # of the torque of gravity; a few amperes for some fifty N m
+_MATTERS = 0.05  # of the torque limit
+_ALIKE = 0.9  # cosine of the angle between two torques
+_SEND = 'safety.first_torque: send'
+
+
+def check_first_torque(
+    controller: Controller, config: ControllerConfig, measurement: Vector
+) -> None:
+    """Raise StartError if the first torque must not be sent; the controller has begun.
+
+    `measurement` is [q (n,) rad, dq (n,) rad/s, effort (n,) N m].
+    """
+    if config.safety.first_torque == 'send':
+        return
+    saved = controller.save()
+    torque = controller.update(0.0, config.sample_time, measurement).copy()
+    controller.restore(saved)
+    if config.robot.urdf:
+        _check_gravity(controller, config, measurement, torque)
+    step = np.array(config.torque.first_step)
+    excess = np.where(step > 0.0, np.abs(torque) - step, 0.0)
+    worst = int(np.argmax(excess))
+    if excess[worst] > 0.0:
+        raise StartError(
+            f'the first torque would step to {torque[worst]:.4g} N m on joint '
+            f'{config.joints[worst]!r}, more than the {step[worst]:g} N m that its drive tolerates '
+            f'(torque.first_step){_gravity_of(controller, config, measurement, torque)}'
+        )
+
+
+def _gravity(controller: Controller, q: Vector) -> Vector:
+    """Return the torque (n,) of gravity by the present estimate [N m]."""
+    settings, rest = controller.settings, np.zeros((1, q.size))
+    (H,) = regressors_at(settings.model, q[np.newaxis], rest, rest, rest)
+    G: Vector = H @ controller.state.estimate[: settings.p]
+    return G
+
+
+def _is_like(torque: Vector, gravity: Vector) -> bool:
+    sizes = float(np.linalg.norm(torque)), float(np.linalg.norm(gravity))
+    return sizes[0] > _NOTICED * sizes[1] and float(torque @ gravity) > _ALIKE * sizes[0] * sizes[1]
+
+
+def _check_gravity(
+    controller: Controller, config: ControllerConfig, measurement: Vector, torque: Vector
+) -> None:
+    """Raise StartError if the arm would get gravity twice, or not at all."""
+    q, dq, effort = measurement.reshape(3, -1)
+    gravity = _gravity(controller, q)
+    worst = int(np.argmax(np.abs(gravity)))
+    matters = np.abs(gravity[worst]) > _MATTERS * config.torque.limit[worst]
+    if not (matters and np.abs(dq).max() <= _AT_REST and np.isfinite(effort).all()):
+        return
+    robot, joint = config.robot, config.joints[worst]
+    holds = _is_like(effort, gravity)
+    if robot.drive_compensates == 'none' and holds:
+        raise StartError(
+            f'gravity twice: the first torque would be {torque[worst]:.4g} N m on joint {joint!r}, '
+            f'but it rests with an effort of {effort[worst]:.4g} N m before any command: '
+            'the drives compensate gravity (set robot.drive_compensates to gravity), or a torque '
+            f'of another controller holds the arm (set {_SEND})'
+        )
+    is_unloaded = np.linalg.norm(effort) <= _NOTICED * np.linalg.norm(gravity)
+    fits = not is_unloaded if robot.effort == 'whole' else not holds
+    if robot.drive_compensates == 'none' or fits:
+        return
+    drives = f'robot.drive_compensates is {robot.drive_compensates}'
+    if robot.effort == 'commanded':
+        raise StartError(
+            f'no gravity: {drives}, but joint {joint!r} rests with a commanded effort of '
+            f'{effort[worst]:.4g} N m where none should be needed: set it to none, or '
+            'robot.effort to whole if the effort contains what the drives add, or, if a torque of '
+            f'another controller holds the arm, {_SEND}'
+        )
+    raise StartError(
+        f'no gravity: {drives}, but joint {joint!r} rests with an effort of {effort[worst]:.4g} '
+        f'N m where the drives should hold {gravity[worst]:.4g} N m: the first torque, '
+        f'{torque[worst]:.4g} N m, would drop the arm. Release the brakes if they hold it, or set '
+        'robot.drive_compensates to none, or robot.effort to commanded if the effort does not '
+        f'contain what the drives add, or {_SEND}'
+    )
+
+
+def _gravity_of(
+    controller: Controller, config: ControllerConfig, measurement: Vector, torque: Vector
+) -> str:
+    """Return what a first torque is that resembles gravity, else an empty text."""
+    if not (
+        config.robot.urdf and _is_like(torque, _gravity(controller, measurement.reshape(3, -1)[0]))
+    ):
+        return ''
+    return (
+        ': it is the gravity of the URDF; if the drives compensate it themselves, set '
+        'robot.drive_compensates to gravity, or to gravity_and_friction'
+    )

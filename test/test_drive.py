@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drives that compensate gravity and friction: in the law, in the safe torque, and at the start."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pinocchio
+import pytest
+from random_arm import CONFIG
+
+from blf_dsc_controller import load_loop, simulate
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.errors import ConfigurationError, StartError
+from blf_dsc_controller.law.drive import added_torque
+from blf_dsc_controller.law.factory import controller_of, estimate_names
+from blf_dsc_controller.replay.verify import verify
+from blf_dsc_controller.simulation.bag import write_bag
+from blf_dsc_controller.supervision.safe_torque import LastState, safe_torque
+
+PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
+HELD = {'robot.drive_compensates': 'gravity'}
+TOLD = {'robot.drive_payload': 1.5, 'robot.drive_payload_centre': [0.02, -0.03, 0.05]}
+OWN = {'drive.mass_deviation': 0.3, 'drive.centre_deviation': 0.01}  # those of `truth`: the arm's
+POSITION = np.array([0.3, -0.4, 0.5, -1.8, 0.2, 1.9, 0.7])
+
+
+@cache
+def loop_of(preset):
+    return load_loop(CONFIG / f'{preset}.yaml')
+
+
+def run(preset, duration, both=None, law=None, plant=None):
+    loop = loop_of(preset)
+    return simulate(
+        change(loop.controller, {**(both or {}), **(law or {})}),
+        change(loop.plant, {**(both or {}), **(plant or {}), 'duration': duration}),
+    )
+
+
+def ratios(record, begin=0.0):
+    """Largest |xi1| / k_c of each joint from a time [s] on."""
+    rows = range(round(begin * 1e3), record.stamps.size)
+    samples = [record.sample(row) for row in rows]
+    return np.max([np.abs(sample.xi1) / sample.bound for sample in samples], axis=0)
+
+
+def panda(**given):
+    return build(ControllerConfig, PANDA | {k.replace('__', '.'): v for k, v in given.items()})
+
+
+def test_added_torque_is_the_gravity_of_the_urdf_and_of_the_payload_told():
+    model = pinocchio.buildModelFromXML((CONFIG / 'panda.urdf').read_text())
+    config = build(ControllerConfig, PANDA | HELD | TOLD)
+    tip = model.getFrameId('panda_hand_tcp')
+    frame = model.frames[tip]
+    point = frame.placement.act(np.array(TOLD['robot.drive_payload_centre']))
+    model.appendBodyToJoint(
+        frame.parentJoint, pinocchio.Inertia(1.5, point, np.zeros((3, 3))), pinocchio.SE3.Identity()
+    )
+    q = np.append(POSITION, np.zeros(model.nq - 7))
+    expected = pinocchio.computeGeneralizedGravity(model, model.createData(), q)[:7]
+
+    settings = controller_of(config).settings
+    np.testing.assert_allclose(added_torque(settings, POSITION), expected, atol=1e-9)
+
+
+def test_command_is_the_whole_torque_without_what_the_drive_adds():
+    laws = [controller_of(panda()), controller_of(build(ControllerConfig, PANDA | HELD | TOLD))]
+    added = added_torque(laws[1].settings, POSITION)
+    measurement = np.concatenate((POSITION, 0.01 * POSITION, np.zeros(7)))
+    for law in laws:
+        law.reference_vector = law.reference_vector.copy()
+    whole, command = (law.update(0.0, 1e-3, measurement).copy() for law in laws)
+    unlimited = laws[0].signals.demand
+    np.testing.assert_allclose(laws[1].signals.demand, unlimited, rtol=1e-12)
+    inside = np.abs(unlimited) < laws[0].settings.torque_limit
+    np.testing.assert_allclose(command[inside], (whole - added)[inside], atol=1e-9)
+
+
+@pytest.mark.parametrize('effort', ['whole', 'commanded'])
+def test_learning_sees_the_whole_torque(effort):
+    """From the last command, or from efforts with or without what the drive adds."""
+    config = build(
+        ControllerConfig,
+        PANDA | HELD | {'robot.effort': effort, 'learning.torque_source': 'effort'},
+    )
+    by_command = controller_of(build(ControllerConfig, PANDA | HELD))
+    by_effort = controller_of(config)
+    added = added_torque(by_effort.settings, POSITION)
+    measurement = np.concatenate((POSITION, np.zeros(14)))
+    command = by_command.update(0.0, 1e-3, measurement).copy()
+    by_command.update(1e-3, 1e-3, measurement)
+    by_effort.update(0.0, 1e-3, measurement)
+    measurement[14:] = command + (added if effort == 'whole' else 0.0)
+    by_effort.update(1e-3, 1e-3, measurement)
+    np.testing.assert_allclose(by_effort.signals.applied, command + added, atol=1e-12)
+    np.testing.assert_allclose(by_command.signals.applied, command + added, atol=1e-12)
+
+
+def test_neither_the_command_nor_the_whole_torque_exceeds_the_limit():
+    limit = [30.0, 5.0, 30.0, 30.0, 12.0, 12.0, 12.0]
+    config = build(ControllerConfig, PANDA | HELD | {'torque.limit': limit})
+    law = controller_of(config)
+    added = added_torque(law.settings, POSITION)
+    assert np.any(np.abs(added) > limit)  # so that the two limits contradict each other there
+    random = np.random.default_rng(0)
+    feasible = np.abs(added) < limit
+    for _ in range(50):
+        measurement = np.concatenate((POSITION, random.normal(0.0, 1.0, 7), np.zeros(7)))
+        command = law.update(0.0, 1e-3, measurement)
+        whole = command + added
+        assert np.all(np.abs(command)[feasible] <= np.array(limit)[feasible] + 1e-9)
+        assert np.all(np.abs(whole)[feasible] <= np.array(limit)[feasible] + 1e-9)
+        law.reset()
+
+
+def test_hold_gravity_commands_only_what_was_learned_beyond_the_model_of_the_drive():
+    config = build(ControllerConfig, PANDA | HELD)
+    settings = controller_of(config).settings
+    last = LastState(7)
+    last.take(1, np.concatenate((POSITION, np.zeros(14))))
+    estimate = settings.initial_estimate.copy()
+    at_rest = safe_torque(config.safety, settings, last, estimate)
+    np.testing.assert_allclose(at_rest, 0.0, atol=0.01)  # the estimate has four digits
+    last.dq[:] = 0.1
+    damped = safe_torque(config.safety, settings, last, estimate)
+    np.testing.assert_allclose(damped, -0.1 * np.array(config.safety.damping), atol=0.01)
+    last.dq[:] = 0.0
+    mass = estimate_names(config).index('m*cx7')
+    estimate[mass] += 0.3
+    assert np.abs(safe_torque(config.safety, settings, last, estimate)).max() > 1.0
+
+
+@pytest.mark.parametrize('preset', ['panda', 'ur5e'])
+@pytest.mark.parametrize(
+    ('drive', 'parameter', 'refusal'),
+    [
+        ('none', 'none', ''),
+        ('gravity', 'gravity', ''),
+        ('gravity', 'none', '^gravity twice: the first torque would be -(32.4|18.12) N m'),
+        ('none', 'gravity', '^no gravity: .* an effort of 0 N m where the drives should hold -'),
+    ],
+)
+def test_first_torque_must_fit_the_drive(preset, drive, parameter, refusal):
+    """Issue 28: 59.8 N m were sent to a UR5e whose drives held it already."""
+    name = 'robot.drive_compensates'
+    arguments = (preset, 0.1, None, {name: parameter}, {name: drive})
+    if refusal:
+        with pytest.raises(StartError, match=refusal):
+            run(*arguments)
+        return
+    record = run(*arguments)
+    assert record.run().stops == ()
+    first = np.abs(record.sample(0).torque).max()
+    assert (first > 15.0) if parameter == 'none' else (first < 0.01)
+
+
+def test_first_torque_beyond_what_the_drive_tolerates_is_refused():
+    """Whatever the effort shows: here it is without what the drives add, so 0."""
+    relative = {'robot.effort': 'commanded'}
+    steps = {'torque.first_step': [1.0] * 7}
+    with pytest.raises(
+        StartError, match=r"'panda_joint2', more than the 1 N m .* it is the gravit"
+    ):
+        run('panda', 0.1, relative, steps, HELD)
+    assert run('panda', 0.1, relative | HELD, steps).run().stops == ()
+    unchecked = {'safety.first_torque': 'send'}
+    assert np.abs(run('panda', 0.01, relative, steps | unchecked, HELD).sample(0).torque[1]) > 30.0
+
+
+def test_torque_of_another_controller_is_not_taken_for_a_missing_gravity_twice():
+    """An effort that only contains commands, but holds the arm: its drives do not."""
+    with pytest.raises(StartError, match=r'no gravity: .* rests with a commanded effort of'):
+        run('panda', 0.1, None, HELD | {'robot.effort': 'commanded'}, HELD)
+
+
+@pytest.mark.parametrize('own_model', [{}, OWN], ids=['of the URDF', 'of the arm'])
+def test_payload_is_learned_on_a_drive_that_compensates_gravity(own_model):
+    """The drive knows nothing of the 2 kg picked up at 10 s, the URDF nothing of the true arm."""
+    pick_up = {'events.begin': [10.0], 'events.duration': [0.0]}
+    record = run('panda', 17.0, HELD, None, own_model | pick_up)
+    assert record.run().stops == ()
+    assert ratios(record).max() < 0.7
+    assert ratios(record, 15.0).max() < 0.08
+    shifts = record.sample(-1).torque - record.sample(9900).torque
+    assert np.abs(shifts).max() > 5.0  # the load is held by the commands
+
+
+def test_run_with_such_a_drive_replays_bit_for_bit_with_its_stop(tmp_path):
+    record = run('ur5e', 1.5, HELD, {'safety.error_ratio': 0.2}, OWN)
+    (stop,) = record.run().stops
+    assert stop.reason == 'error past the bound'
+    write_bag(tmp_path / 'bag', record, record.config, 'none')
+    assert verify(tmp_path / 'bag').difference is None
+
+
+def test_stop_in_motion_comes_to_rest():
+    """A UR5e at 0.5 rad/s, whose drives and URDF have different gravity (30 %, 1 cm)."""
+    record = run('ur5e', 3.5, HELD, {'safety.error_ratio': 0.2}, OWN)
+    k = round(record.run().timed_stops[0][0] / 1e-3)
+    q, dq = record.truths[k:, -12:-6], record.truths[k:, -6:]
+    assert np.abs(dq[0]).max() > 0.4
+    assert np.abs(q - q[0]).max() < 0.05
+    assert np.abs(dq[-1]).max() < 0.005
+
+
+def test_friction_that_the_drive_compensates_is_not_fed_forward_a_second_time():
+    """80 % are compensated; what is left is learned, and fits the bound better than all of it."""
+    none = {'robot.viscous': [], 'robot.coulomb': [], 'robot.drive_compensates': 'gravity'}
+    compensated = none | {'robot.drive_compensates': 'gravity_and_friction'}
+    told = {'robot.drive_compensates': 'gravity_and_friction'}  # and robot.coulomb of 6 N m
+    names = estimate_names(loop_of('ur5e').controller)
+    coulomb = [names.index(f'coulomb {joint}') for joint in loop_of('ur5e').controller.joints]
+    errors, learned = {}, {}
+    for name, both in {'all': none, 'rest': compensated, 'twice': told}.items():
+        record = run('ur5e', 12.0, both, None, OWN | {'events.begin': [50.0]})
+        assert record.run().stops == ()
+        errors[name] = ratios(record).max(), ratios(record, 8.0).max()
+        learned[name] = record.sample(-1).estimate[coulomb]
+    assert errors['rest'][0] < 0.8 * errors['twice'][0]  # 0.29, 0.39
+    assert errors['rest'][0] < 0.5 * errors['all'][0]  # 0.29, 0.66
+    assert errors['rest'][1] < errors['all'][1]
+    left = 0.2 * np.array([6.0, 6.0, 6.0, 1.1, 1.1, 1.1])
+    assert np.all(np.abs(learned['rest'][:3] - left[:3]) < 1.2)
+
+
+@pytest.mark.parametrize(
+    ('given', 'problem'),
+    [
+        ({'robot.drive_compensates': 'friction'}, "got 'friction', but it must be one of none, "),
+        ({'robot.drive_payload': -1.0} | HELD, 'drive_payload: got -1.0, but it must be at least'),
+        (TOLD, 'robot.drive_payload: got 1.5 kg, but drive_compensates is none'),
+        ({'robot.drive_payload_centre': [0.0]} | HELD, 'got 1 entry, but 3 are needed'),
+        ({'robot.effort': 'current'}, "robot.effort: got 'current', but it must be one of whole"),
+        ({'torque.first_step': [-1.0] + 6 * [0.0]}, 'torque.first_step: got -1.0 at entry 1'),
+        ({'safety.first_torque': 'ask'}, "got 'ask', but it must be one of check, send"),
+    ],
+)
+def test_mistakes_give_one_line(given, problem):
+    with pytest.raises(ConfigurationError, match=problem) as raised:
+        build(ControllerConfig, PANDA | given)
+    assert len(raised.value.problems) == 1
+
+
+def test_arm_without_urdf_has_no_model_of_its_drives():
+    with pytest.raises(ConfigurationError, match=r'drive_compensates: got gravity, which needs ro'):
+        build(ControllerConfig, HELD)
