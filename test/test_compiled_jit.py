@@ -3,16 +3,21 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import sys
 from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
+from command import finished
 from numba.core.errors import UnsupportedError
 from shaken_arm import _shake
 
 import blf_dsc_controller
+from blf_dsc_controller.arms import batch
+from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.compiled import jit
 from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.simulation.loop import run_loop
@@ -58,6 +63,64 @@ def test_kernel_depends_on_its_constants():
 def test_cache_folder_of_a_kernel_follows_from_its_dependencies(kernel):
     """A kernel must be defined after what it calls, or edits would run stale machine code."""
     assert str(jit.cache_folder(kernel)) in kernel._cache.cache_path
+
+
+COMPILE = """
+import numpy as np
+from blf_dsc_controller.arms import batch
+from blf_dsc_controller.arms.two_link import TwoLink
+
+H = batch.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
+print(float(H[0, 0, 0]), *(sum(batch._fill_regressors.stats[k].values()) for k in (1, 2)))
+"""
+
+
+def compiled_in(checkout, cache):
+    """Return an entry of a regressor, and how often its kernel was found and was compiled."""
+    environment = {**os.environ, 'PYTHONPATH': str(checkout), 'NUMBA_CACHE_DIR': str(cache)}
+    run = finished(sys.executable, '-c', COMPILE, cwd=checkout, env=environment)
+    entry, found, compiled = map(float, run.stdout.split())
+    return entry, found, compiled
+
+
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
+def test_second_checkout_finds_the_kernels_of_the_first_and_never_those_of_other_sources(tmp_path):
+    first, second, cache = (tmp_path / name for name in ('first', 'second', 'cache'))
+    for checkout in (first, second):
+        for package in (PACKAGE, PACKAGE.parent / 'sim_plant'):
+            unwanted = shutil.ignore_patterns('__pycache__')
+            shutil.copytree(package, checkout / package.name, ignore=unwanted)
+    entry, *counts = compiled_in(first, cache)
+    assert counts == [0, 1]
+    assert compiled_in(second, cache) == (entry, 1, 0)
+
+    called = second / PACKAGE.name / 'arms/two_link.py'  # in another file than the kernel
+    called.write_text(called.read_text().replace('H[0, 0] = a[0] +', 'H[0, 0] = 1.0 + a[0] +'))
+    assert compiled_in(second, cache) == (pytest.approx(entry + 1.0), 0, 1)
+    assert compiled_in(first, cache) == (entry, 1, 0)
+
+
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
+def test_kernels_compile_without_the_private_parts_of_numba(tmp_path):
+    """What other releases lack is done without: less quickly, with the same numbers."""
+    without = """
+import sys
+import numba.core.caching, numba.core.codegen
+del numba.core.codegen.JITCodeLibrary
+if sys.argv[1] == 'cache':
+    del numba.core.caching.CompileResultCacheImpl
+"""
+    environment = {**os.environ, 'NUMBA_CACHE_DIR': str(tmp_path)}
+    for lacking in ('linking', 'cache'):
+        runs = [
+            finished(sys.executable, '-c', without + COMPILE, lacking, env=environment)
+            for _ in range(2)
+        ]
+        outputs = [[float(word) for word in run.stdout.split()] for run in runs]
+        assert [counts for _, *counts in outputs] == [[0, 1], [1, 0]], runs
+        entry, *_ = outputs[0]
+        H = batch.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
+        assert entry == H[0, 0, 0]
 
 
 @jit.inner

@@ -2,9 +2,10 @@
 """Compilation of the numerical kernels, with a cache that tracks their dependencies.
 
 Numba keys a cached function by the contents of its own file, not by those of the functions it
-calls in other files, so an edit there would leave stale machine code behind.  Here the cache folder
-of a kernel is named after a digest of every source file it is compiled from and of the constants it
-uses: an edit recompiles what depends on it, and a reinstall finds the existing cache.
+calls in other files, so an edit there would leave stale machine code behind, and by the place of
+that file.  Here the cache folder of a kernel is named after a digest of every source file it is
+compiled from and of the constants it uses, and of nothing else: an edit recompiles what depends on
+it, and a reinstall or a second checkout finds the existing cache.
 
 If the user's cache folder is not writable, the cache is in the folder for temporary files.
 """
@@ -23,11 +24,18 @@ from types import FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.core import config
+from numba.core import caching, config
 from numba.core.types.containers import BaseNamedTuple
 from numba.extending import overload_method, register_jitable
 
-from blf_dsc_controller.compiled.linked import KernelCompiler, LinkedCompiler
+try:
+    from blf_dsc_controller.compiled.linked import KernelCompiler, LinkedCompiler
+except ImportError:  # it uses parts of numba that other releases may lack: see there
+    _INNER_COMPILER: dict[str, Any] = {}
+    _KERNEL_COMPILER: dict[str, Any] = {}
+else:
+    _INNER_COMPILER = {'pipeline_class': LinkedCompiler}
+    _KERNEL_COMPILER = {'pipeline_class': KernelCompiler}
 
 F = TypeVar('F', bound=Callable[..., object])
 
@@ -35,7 +43,7 @@ INLINED = {
     'error_model': 'numpy',
     'forceinline': True,
     'no_cfunc_wrapper': True,
-    'pipeline_class': LinkedCompiler,
+    **_INNER_COMPILER,
 }
 """Compiler options for functions that are compiled into kernels."""
 
@@ -90,10 +98,27 @@ def cache_folder(function: Callable[..., object]) -> Path:
     """Return the folder of a kernel's machine code, in NUMBA_CACHE_DIR or else the user's cache."""
     files, constants = dependencies(function)
     digest = hashlib.sha256(' '.join([numba.__version__, *sorted(constants)]).encode())
-    for source in sorted(files):
-        digest.update(_contents(source))
+    for name, source in sorted((_name(source), source) for source in files):
+        digest.update(name.encode() + b'\0' + _contents(source))
     chosen = os.environ.get('NUMBA_CACHE_DIR')
-    return (Path(chosen) if chosen else _base()) / digest.hexdigest()[:16]
+    base = Path(chosen) if chosen and _is_writable(Path(chosen)) else _base()
+    return base / digest.hexdigest()[:16]
+
+
+@functools.cache
+def _is_writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+def _name(source: Path) -> str:
+    """Return the place of a file in the packages, which cached types refer to."""
+    inside = source.is_relative_to(_ROOM.parent)
+    return str(source.relative_to(_ROOM.parent)) if inside else source.name
 
 
 @functools.cache
@@ -154,18 +179,54 @@ def _compile_method(name: str, signature: inspect.Signature) -> None:
 
 def kernel(function: F) -> F:
     """Compile `function` for calls from Python: IEEE arithmetic (no fast-math), cached."""
-    before = config.CACHE_DIR
-    config.CACHE_DIR = str(cache_folder(function))
+    compiled = numba.njit(
+        function, error_model='numpy', nogil=True, no_cfunc_wrapper=True, **_KERNEL_COMPILER
+    )
+    KERNELS.append(compiled)
+    if not config.DISABLE_JIT:
+        _keep(compiled, cache_folder(function))
+    return cast('F', compiled)
+
+
+def _keep(kernel: Any, folder: Path) -> None:
+    """Cache the machine code of a kernel in a folder that no other source shares.
+
+    Within it, numba tells signatures, processors and Python versions apart.  Releases of numba that
+    lack what is used here make a further folder in it, for the place of the source.
+    """
     try:
-        compiled = numba.njit(
-            function,
-            cache=True,
-            error_model='numpy',
-            nogil=True,
-            no_cfunc_wrapper=True,
-            pipeline_class=KernelCompiler,
-        )
-        KERNELS.append(compiled)
-        return cast('F', compiled)
-    finally:
-        config.CACHE_DIR = before
+        kernel._cache = _cache(folder)(kernel.py_func)  # noqa: SLF001 - as numba's enable_caching
+    except (AttributeError, TypeError):
+        before = config.CACHE_DIR
+        config.CACHE_DIR = str(folder)
+        try:
+            kernel.enable_caching()
+        finally:
+            config.CACHE_DIR = before
+
+
+def _cache(folder: Path) -> Any:
+    class Place(caching._CacheLocator):  # type: ignore[misc]  # noqa: SLF001
+        def __init__(self, function: Any) -> None:
+            self._line = function.__code__.co_firstlineno
+
+        def get_cache_path(self) -> str:
+            return str(folder)
+
+        def get_source_stamp(self) -> str:
+            return folder.name
+
+        def get_disambiguator(self) -> str:
+            return str(self._line)
+
+        @classmethod
+        def from_function(cls, function: Any, _file: str) -> Place:
+            return cls(function)
+
+    class Content(caching.CompileResultCacheImpl):  # type: ignore[misc]
+        _locator_classes = (Place,)
+
+    class Cache(caching.FunctionCache):  # type: ignore[misc]
+        _impl_class = Content
+
+    return Cache
