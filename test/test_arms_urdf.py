@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from math import inf
 
 import numpy as np
@@ -152,8 +153,17 @@ WRONG = {
         {
             'text': WEIGHTLESS.replace('<mass value="0.015" />', '<mass value="0" />'),
         },
-        "link 'panda_link7', moved by joint 'panda_joint7', has no mass",
+        'nor has anything fixed to them: panda_link7 (moved by panda_joint7): add',
     ),
+    'no <inertial> at all': (
+        {'text': re.sub('<inertial>.*?</inertial>', '', PANDA_TEXT, flags=re.DOTALL)},
+        'panda_link1 (moved by panda_joint1), panda_link2 (moved by panda_joint2), ',
+    ),
+    'a negative effort': (
+        {'text': changed('effort="87"', 'effort="-87"')},
+        '\'panda_joint1\' has <limit effort="-87">: it is a magnitude, so give 87',
+    ),
+    'a negative velocity': ({'text': changed('velocity="2.175"', 'velocity="-2"')}, 'so give 2'),
     'a negative mass': (
         {'text': changed('<mass value="0.73" />', '<mass value="-0.73" />')},
         "link 'panda_hand' has a mass of -0.73 kg",
@@ -198,6 +208,17 @@ def test_unusable_urdf_is_rejected_with_a_remedy(case):
     with pytest.raises(UrdfError) as caught:
         read_chain(**{**arguments, 'joints': PANDA, **changes})
     assert message in str(caught.value)
+
+
+def test_moments_below_zero_by_rounding_are_accepted():
+    text = changed('ixx="0.001" iyy="0.0025" izz="0.0017"', 'ixx="0" iyy="0" izz="-2e-35"')
+    assert read_chain(text, 'panda_link0', 'panda_hand_tcp', PANDA).pointlike == ()
+
+
+def test_links_with_an_all_zero_tensor_are_listed():
+    text = changed('ixx="0.001" iyy="0.0025" izz="0.0017"', 'ixx="0" iyy="0" izz="0"')
+    chain = read_chain(text, 'panda_link0', 'panda_hand_tcp', PANDA)
+    assert chain.pointlike == ('panda_hand',)
 
 
 def test_expanded_file_may_still_declare_the_xacro_namespace():

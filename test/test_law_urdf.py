@@ -47,6 +47,14 @@ def test_given_parameters_override_the_derived_ones():
     assert change(config, {'feedback.damping_rate': 5.0}).feedback.damping_rate == 5.0
 
 
+def test_an_empty_urdf_is_an_error(tmp_path):
+    """A failed xacro leaves an empty file, which must not select the two-link arm."""
+    path = tmp_path / 'arm.urdf'
+    path.write_text('\n')
+    with pytest.raises(ConfigurationError, match=r'arm.urdf.* is empty: did the xacro'):
+        panda(robot__urdf=str(path))
+
+
 def test_urdf_may_be_given_as_text_or_file():
     file = CONFIG / 'panda.urdf'
     assert panda(robot__urdf=file.read_text()).learning == panda(robot__urdf=str(file)).learning
@@ -137,7 +145,9 @@ def test_drives_with_unknown_effort_limit_get_a_finite_prior(learn):
     config = panda(robot__urdf=text, robot__learn=learn)
     assert np.all(np.isfinite(settings_of_config(config).information))
     deviation = np.sqrt(np.diag(prior_covariance(config)))
-    assert deviation[estimate_names(config).index('rotor7')] >= 0.01
+    rotor = config.robot.rotors(config.robot.chain(config.joints))[6]  # from the weight carried
+    assert deviation[estimate_names(config).index('rotor7')] == pytest.approx(0.5 * rotor)
+    assert 0.005 < rotor < 0.03
 
 
 def test_random_arm_with_prismatic_joints_needs_only_its_urdf():

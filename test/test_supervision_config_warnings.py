@@ -205,6 +205,35 @@ def test_implausible_inertias_are_named():
     assert 'at its torque limit panda_joint7 accelerates at only ' in ' '.join(found)
 
 
+def test_masses_without_moments_of_inertia_are_named():
+    tensor = 'ixx="0.001" iyy="0.0025" izz="0.0017"'
+    urdf = read_urdf('panda.urdf').replace(tensor, '')
+    (warning,) = config_warnings(panda({'robot.urdf': urdf}))
+    assert warning.startswith('robot.urdf: panda_hand: a mass without moments of inertia')
+
+
+def test_placeholder_efforts_are_named_and_neither_gains_nor_the_residual_floor_rest_on_them():
+    urdf = re.sub('effort="[0-9.]+"', 'effort="2000"', read_urdf('panda.urdf'))
+    config = panda({'robot.urdf': urdf})
+    found = [text for text in config_warnings(config) if 'effort' in text]
+    (warning,) = (text.split(' for')[0] for text in found)
+    assert warning == 'torque.limit: an effort of up to 2000 N m'
+    assert max(config.learning.residual_floor) < 1.0  # N m
+    rotors = config.robot.rotors(config.robot.chain(config.joints))
+    assert max(rotors) < 0.2  # kg m^2, instead of 5
+    assert panda({}).learning.residual_floor == (0.87,) * 4 + (0.12,) * 3
+
+
+def test_placeholder_friction_is_named_and_not_compensated_before_it_is_learned():
+    dynamics = '<dynamics damping="1" friction="4" /><limit'
+    changes = {'robot.urdf': read_urdf('panda.urdf').replace('<limit', dynamics)}
+    bare = changes | {'robot.viscous': [], 'robot.coulomb': []}
+    (warning,) = config_warnings(panda(bare))
+    assert 'a quarter of the effort of panda_joint5, panda_joint6, panda_joint7' in warning
+    assert not settings_of_config(panda(bare)).initial_estimate[-14:].any()
+    assert config_warnings(panda(changes)) == []  # the preset gives both
+
+
 @pytest.mark.usefixtures('blank_pictures')
 def test_closed_loop_warns_before_it_runs(tmp_path, capsys):
     path = tmp_path / 'short.yaml'

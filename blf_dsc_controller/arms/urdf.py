@@ -29,6 +29,7 @@ from blf_dsc_controller.errors import BlfDscError
 MOVING = ('revolute', 'continuous', 'prismatic')
 _MOST = 500  # at most, of links and of joints
 _LIMITS = ('lower', 'upper', 'velocity', 'effort')
+_ROUNDED = 1e-12  # kg m^2, of moments of inertia
 _LARGEST = 1e6  # m, kg, kg m^2 and so on; limits may be larger
 
 
@@ -70,13 +71,18 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Joints from `base` to `tip`, and placement of the tip (4, 4) in the last joint's frame."""
+    """Joints from `base` to `tip`, and placement of the tip (4, 4) in the last joint's frame.
+
+    `held` names the moving joints beside them, `pointlike` the links that they move whose mass has
+    no moments of inertia.
+    """
 
     base: str
     tip: str
     joints: tuple[Joint, ...]
     tip_placement: np.ndarray
     held: tuple[str, ...]
+    pointlike: tuple[str, ...]
 
     @property
     def inertias(self) -> np.ndarray:
@@ -93,15 +99,25 @@ def read_chain(text: str, base: str, tip: str, joints: Sequence[str]) -> Chain:
     path = _path(links, elements, base, tip)
     _check_joints(path, elements, joints)
     held: list[str] = []
+    pointlike: list[str] = []
+    massless: list[str] = []
     chain: list[Joint] = []
     frame = np.eye(4)
     for element in path:
         frame = frame @ _origin(element)
         if element.get('type') != 'fixed':
-            J = _body(links, elements, _link(element, 'child'), joints, held)
+            link = _link(element, 'child')
+            J = _body(links, elements, link, joints, (held, pointlike))
+            if J[3, 3] <= 0.0:
+                massless.append(f'{link} (moved by {element.get("name")})')
             chain.append(_joint(element, frame, J))
             frame = np.eye(4)
-    return Chain(base, tip, tuple(chain), frame, tuple(held))
+    if massless:
+        raise UrdfError(
+            f'these links have no mass, nor has anything fixed to them: {_listed(massless)}: add '
+            'an <inertial> to each, even a rough one'
+        )
+    return Chain(base, tip, tuple(chain), frame, tuple(held), tuple(pointlike))
 
 
 def chain_joints(
@@ -171,10 +187,21 @@ def _path(links: Elements, elements: Elements, base: str, tip: str) -> list[ET.E
 
 
 def _body(
-    links: Elements, elements: Elements, link: str, joints: Sequence[str], held: list[str]
+    links: Elements,
+    elements: Elements,
+    link: str,
+    joints: Sequence[str],
+    found: tuple[list[str], list[str]],
 ) -> np.ndarray:
-    """Return the pseudo-inertia (4, 4) of a link and all fixed to it; add held joints to `held`."""
+    """Return the pseudo-inertia (4, 4) of a link and all fixed to it.
+
+    Adds the held joints and the links without moments of inertia to the lists `found`.
+    """
+    held, pointlike = found
     J = _link_inertia(links[link])
+    tensor = links[link].find('inertial/inertia')
+    if J[3, 3] > 0.0 and not any(_number(tensor, f'i{axis}{axis}') for axis in 'xyz'):
+        pointlike.append(link)
     for name, element in elements.items():
         if _link(element, 'parent') != link or name in joints:
             continue
@@ -184,7 +211,7 @@ def _body(
         elif kind != 'fixed':
             raise UrdfError(f'joint {name!r} on {link!r} is {kind}: remove it from the URDF')
         frame = _origin(element)
-        J = J + frame @ _body(links, elements, _link(element, 'child'), joints, held) @ frame.T
+        J = J + frame @ _body(links, elements, _link(element, 'child'), joints, found) @ frame.T
     return J
 
 
@@ -263,13 +290,13 @@ def _joint(element: ET.Element, placement: np.ndarray, J: np.ndarray) -> Joint:
             raise UrdfError(
                 f'joint {name!r} has an empty range, {lower:g} to {upper:g}: correct its <limit>'
             )
+    for key in ('velocity', 'effort'):
+        if (value := _number(limit, key)) < 0.0:
+            raise UrdfError(
+                f'joint {name!r} has <limit {key}="{value:g}">: it is a magnitude, so give '
+                f'{-value:g}, or 0 if it is unknown'
+            )
     dynamics = element.find('dynamics')
-    link = _link(element, 'child')
-    if J[3, 3] <= 0.0:
-        raise UrdfError(
-            f'link {link!r}, moved by joint {name!r}, has no mass, nor has anything fixed to it: '
-            'add its <inertial>, even a rough one'
-        )
     return Joint(
         name=name,
         kind=kind,
@@ -281,7 +308,7 @@ def _joint(element: ET.Element, placement: np.ndarray, J: np.ndarray) -> Joint:
         effort=_number(limit, 'effort') or inf,
         damping=_number(dynamics, 'damping'),
         friction=_number(dynamics, 'friction'),
-        link=link,
+        link=_link(element, 'child'),
         inertia=inertia_of(J),
     )
 
@@ -296,7 +323,7 @@ def _link_inertia(link: ET.Element) -> np.ndarray:
     mass = _number(inertial.find('mass'), 'value')
     J = pseudo_inertia(np.array([mass, 0.0, 0.0, 0.0, *entries]))
     moments = np.linalg.eigvalsh(rotational_inertia(J))
-    if mass < 0.0 or moments[0] < -1e-9 * moments[-1]:
+    if mass < 0.0 or moments[0] < -max(1e-9 * moments[-1], _ROUNDED):
         figures = _listed(f'{moment:.3g}' for moment in moments)
         raise UrdfError(
             f'link {link.get("name")!r} has a mass of {mass:g} kg and principal moments of inertia '

@@ -60,7 +60,7 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
     limits = tuple(lower), tuple(upper)
     m, gravity = over_postures(chain, parameters, robot.payload, tuple(P), *limits)
     sag = _SAG * gravity / (m * rate**2) if rate else np.zeros(n)
-    floor = _UNMODELLED * effort
+    floor = _UNMODELLED * robot.efforts(chain)
     zeros = (0.0,) * n
     return {
         'joints': tuple(joint.name for joint in chain.joints),

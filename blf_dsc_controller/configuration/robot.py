@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 
 from blf_dsc_controller.arms.inertia import inertia_of
+from blf_dsc_controller.arms.prior import PAYLOAD_SIZE
 from blf_dsc_controller.arms.urdf import Chain, UrdfError, chain_joints, moving_joints, read_chain
 from blf_dsc_controller.configuration.schema import build, counted, parameter
 from blf_dsc_controller.configuration.share import read_text, resolve
@@ -29,7 +30,11 @@ TOPIC = 'topic://'
 """Prefix of a `robot.urdf` that is published; the node waits for it when it starts."""
 
 _MOMENTS = 4  # inertial parameters that gravity shows: mass and first moments
+_GRAVITY = 9.81  # m/s^2, where robot.gravity is zero
 _DRIVE_ACCELERATION = 400.0  # rad/s^2, of an unloaded drive at its rated torque
+_PLACEHOLDER = 4.0  # times the weight of the arm at its full reach: the strongest drives have 1
+_NEEDED = 0.5  # of that torque, where efforts are placeholders: no arm stretches every link
+_MOST_FRICTION = 0.25  # of the effort
 
 
 @dataclass(frozen=True)
@@ -120,10 +125,11 @@ class Robot:
 
     def friction(self, chain: Chain) -> dict[str, tuple[float, ...]]:
         """Return the initial friction of each joint, by the name of its column."""
-        left = 0.0 if self.drive_compensates == 'gravity_and_friction' else 1.0
+        compensated = self.drive_compensates == 'gravity_and_friction'
+        share = 0.0 if compensated or implausible_friction(chain) else 1.0
         return {
-            'viscous': self.viscous or tuple(left * joint.damping for joint in chain.joints),
-            'coulomb': self.coulomb or tuple(left * joint.friction for joint in chain.joints),
+            'viscous': self.viscous or tuple(share * joint.damping for joint in chain.joints),
+            'coulomb': self.coulomb or tuple(share * joint.friction for joint in chain.joints),
         }
 
     def drive_inertias(self, chain: Chain, links: np.ndarray) -> np.ndarray:
@@ -133,12 +139,50 @@ class Robot:
         inertias[-1] += self.drive_payload * inertia_of(np.outer(point, point))
         return inertias
 
+    def efforts(self, chain: Chain) -> np.ndarray:
+        """Return the rated torques (n,) [N m], from the weight where the URDF has placeholders."""
+        efforts = np.array([joint.effort for joint in chain.joints])
+        needed = _NEEDED * self._weight_at_reach(chain)
+        known = efforts if not self.placeholder_efforts(chain) else np.minimum(efforts, needed)
+        return np.asarray(np.where(np.isfinite(known), known, needed))
+
+    def placeholder_efforts(self, chain: Chain) -> tuple[str, ...]:
+        """Return the joints whose effort no drive of such an arm has."""
+        most = _PLACEHOLDER * float(self._weight_at_reach(chain).max())
+        return tuple(joint.name for joint in chain.joints if most < joint.effort < math.inf)
+
+    def _weight_at_reach(self, chain: Chain) -> np.ndarray:
+        """Return the torque (n,) [N m] of the weight beyond each joint, if stretched out flat."""
+        weight = float(np.linalg.norm(self.gravity)) or _GRAVITY
+        force = self.payload * weight
+        torque = force * (PAYLOAD_SIZE + float(np.linalg.norm(chain.tip_placement[:3, 3])))
+        needed = []
+        for joint in reversed(chain.joints):
+            m, *first = joint.inertia[:4] * weight
+            torque, force = torque + float(np.linalg.norm(first)), force + m
+            needed.append(torque)
+            torque += force * float(np.linalg.norm(joint.placement[:3, 3]))
+        return np.array(needed[::-1])
+
     def rotors(self, chain: Chain) -> np.ndarray:
         """Return drive inertias (n,) [kg m^2]: as given, or rated torque / 400 rad/s^2."""
         if self.rotor_inertia:
             return np.array(self.rotor_inertia)
-        efforts = [joint.effort for joint in chain.joints]
-        return np.array([e / _DRIVE_ACCELERATION if math.isfinite(e) else 0.0 for e in efforts])
+        rotors: np.ndarray = self.efforts(chain) / _DRIVE_ACCELERATION
+        return rotors
+
+
+def implausible_friction(chain: Chain) -> tuple[str, ...]:
+    """Return the joints whose friction in the URDF takes a quarter of their effort or more.
+
+    One is enough: then the friction of the URDF is a placeholder, and not known for any joint.
+    """
+    return tuple(
+        joint.name
+        for joint in chain.joints
+        if joint.friction > _MOST_FRICTION * joint.effort
+        or (math.isfinite(joint.velocity) and joint.damping * joint.velocity > joint.effort)
+    )
 
 
 def read_urdf(given: str) -> str:
@@ -152,10 +196,13 @@ def read_urdf(given: str) -> str:
             'robot.urdf`) and give that file'
         )
     try:
-        return read_text(resolve(given))
+        text = read_text(resolve(given))
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, 'strerror', None) or error
         raise BlfDscError(f'{given!r} cannot be read: {reason}') from error
+    if not text.strip():
+        raise BlfDscError(f'{given!r} is empty: did the xacro that wrote it fail?')
+    return text
 
 
 @functools.lru_cache(maxsize=16)

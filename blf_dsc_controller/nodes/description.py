@@ -44,6 +44,8 @@ def wait_for_description(node: Node, name: str) -> str:
     finally:
         hidden.close()
     text: str = deserialize_message(messages[-1].raw, String).data
+    if not text.strip():
+        raise ConfigurationError([f'robot.urdf: the URDF on {topic} is empty: did xacro fail?'])
     return text
 
 

@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.inertia import pseudo_inertia
+from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.arm_defaults import UNKNOWN_EFFORT
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.robot import Robot, implausible_friction
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.settings import FILTERED, LINEAR, NEWTON, Settings
 from blf_dsc_controller.reference.approach import reference_of
@@ -88,7 +90,9 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
     if config.model != 'urdf':
         return
     robot, barrier = config.robot, config.barrier
-    for joint, limit in zip(robot.chain(config.joints).joints, config.torque.limit, strict=True):
+    chain = robot.chain(config.joints)
+    yield from _of_placeholders(robot, chain)
+    for joint, limit in zip(chain.joints, config.torque.limit, strict=True):
         moments = np.linalg.eigvalsh(pseudo_inertia(joint.inertia))
         if moments[0] < -_IMPOSSIBLE * moments[-1]:
             yield (
@@ -116,6 +120,28 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
                 f'narrows to {bound:g}: with gains for robot.lag of {robot.lag:g} s it would sag '
                 f'that far under an undeclared load of {robot.payload:g} kg (robot.payload)'
             )
+
+
+def _of_placeholders(robot: Robot, chain: Chain) -> Iterator[str]:
+    """Check for figures of the URDF that nobody can have measured."""
+    if chain.pointlike:
+        yield (
+            f'robot.urdf: {", ".join(chain.pointlike)}: a mass without moments of inertia (all '
+            'zero): the gains of these joints rest on the drives alone; give rough ones'
+        )
+    if (joints := robot.placeholder_efforts(chain)) and not robot.rotor_inertia:
+        largest = max(joint.effort for joint in chain.joints)
+        yield (
+            f'torque.limit: an effort of up to {largest:g} N m for {", ".join(joints)} is not that '
+            f'of an arm of this weight: it limits nothing; the inertia of the drives and '
+            f'learning.residual_floor follow from the weight instead. Give the rated torques'
+        )
+    if (joints := implausible_friction(chain)) and not (robot.viscous and robot.coulomb):
+        yield (
+            f'robot.coulomb: the friction in <dynamics> takes a quarter of the effort of '
+            f'{", ".join(joints)} or more: it is hardly real, so none of it is compensated before '
+            f'it is learned; give robot.viscous and robot.coulomb'
+        )
 
 
 def _of_gains(config: ControllerConfig, load: ReferenceLoad) -> list[Finding]:
