@@ -193,31 +193,40 @@ static void adapt(const settings *s, loop *x, double H[N][P], const double xi2[N
             for (int j = 0; j < P; j++) x->d3[i] -= H[i][j] * (x->theta[j] - by_tracking[j]);
 }
 
+static void regressor(const settings *s, const double q[N], const double dq[N], const double v[N],
+                      const double a[N], double H[N][P])
+{
+    double r = s->g / s->l1, c2 = cos(q[1]), s2 = sin(q[1]), c12 = cos(q[0] + q[1]);
+    H[0][0] = a[0] + r * cos(q[0]);
+    H[0][1] = H[1][1] = a[0] + a[1];
+    H[0][2] = c2 * (2.0 * a[0] + a[1]) - s2 * (dq[1] * v[0] + (dq[0] + dq[1]) * v[1]) + r * c12;
+    H[1][0] = 0.0;
+    H[1][2] = c2 * a[0] + s2 * dq[0] * v[0] + r * c12;
+}
+
 static void control(const settings *s, loop *x, double t, double xi1[N])
 {
-    double r = s->g / s->l1, a[N], v[N], xi2[N], beta2[N], H[N][P], Yp[N][P], Yr[N][M];
+    double qr[N], dqr[N], ddqr[N], a[N], v[N], xi2[N], beta2[N];
+    double H[N][P], Hr[N][P], Yp[N][P], Yr[N][M];
     double share = 1.0 - exp(-s->T / s->lambda);
     int saturated = 0;
     for (int i = 0; i < N; i++) {
         double angle = s->tone * t, rate = s->tone * s->swing[i];
         double ratio;
-        xi1[i] = x->q[i] - (s->offset[i] + s->swing[i] * cos(angle));
+        qr[i] = s->offset[i] + s->swing[i] * cos(angle);
+        dqr[i] = -rate * sin(angle);
+        ddqr[i] = -s->tone * rate * cos(angle);
+        xi1[i] = x->q[i] - qr[i];
         ratio = xi1[i] / s->bound[i];
-        beta2[i] = -rate * sin(angle) - s->mu[i] * xi1[i];
+        beta2[i] = dqr[i] - s->mu[i] * xi1[i];
         if (fabs(ratio) < 1.0) beta2[i] -= 0.5 * s->K[i] * xi1[i] * sinc(M_PI * ratio * ratio);
         if (x->samples == 0) x->alpha2[i] = beta2[i];
         v[i] = x->alpha2[i];
         a[i] = share * (beta2[i] - v[i]) / s->T;
         xi2[i] = x->dq[i] - v[i];
     }
-    double c2 = cos(x->q[1]), s2 = sin(x->q[1]), c12 = cos(x->q[0] + x->q[1]);
-    H[0][0] = a[0] + r * cos(x->q[0]);
-    H[0][1] = H[1][1] = a[0] + a[1];
-    H[0][2] = c2 * (2.0 * a[0] + a[1]) - s2 * (x->dq[1] * v[0] + (x->dq[0] + x->dq[1]) * v[1])
-              + r * c12;
-    H[1][0] = 0.0;
-    H[1][2] = c2 * a[0] + s2 * x->dq[0] * v[0] + r * c12;
-
+    regressor(s, x->q, x->dq, v, a, H);
+    regressor(s, qr, dqr, dqr, ddqr, Hr);
     regressors(s, x->q, x->dq, Yp, Yr);
     if (x->samples > 0) {
         filter_and_push(s, x, Yp, Yr);
@@ -228,11 +237,12 @@ static void control(const settings *s, loop *x, double t, double xi1[N])
 
     for (int i = 0; i < N; i++) {
         double torque = x->d3[i] - s->Kp[i] * xi2[i] - barrier(s, i, xi1[i]);
-        for (int j = 0; j < P; j++) torque += H[i][j] * x->theta[j];
+        for (int j = 0; j < P; j++)
+            torque += H[i][j] * s->P0[j] + Hr[i][j] * (x->theta[j] - s->P0[j]);
         x->torque[i] = fmin(s->limit[i], fmax(-s->limit[i], torque));
         saturated |= x->torque[i] != torque;
     }
-    adapt(s, x, H, xi2, saturated);
+    adapt(s, x, Hr, xi2, saturated);
     for (int i = 0; i < N; i++) x->alpha2[i] += share * (beta2[i] - x->alpha2[i]);
     x->samples++;
 }

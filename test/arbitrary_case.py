@@ -51,6 +51,8 @@ def arbitrary_settings(random: np.random.Generator, n: int, p: int, **changes) -
         'bumpless': 0,
         'information': np.eye(p + n),
         'variance': np.ones(p + n),
+        'least': np.full(p + n, -np.inf),
+        'most': np.full(p + n, np.inf),
         'damping_rate': 0.0,
         'row_weight': np.ones(n),
         'radius': 1e3,

@@ -27,6 +27,7 @@ class PlainLaw:
         self.gains = settings
         self.newton = settings.update == 1
         self.effort = settings.torque_source == 1
+        self.at_state = settings.compensation == 1
         self.theta = settings.initial_estimate.copy()
         self.d3 = np.zeros(2)
         self.tau = np.zeros(2)
@@ -135,8 +136,11 @@ class PlainLaw:
         if g.bumpless and self.latched is not None:
             self.d3 = self.d3 - H @ (self.theta - by_tracking)[:3]
 
-    def update(self, t, dt, qr, dqr, measurement):
-        """Return the torque (28) for a measurement; the caller sets `tau`, the last one sent."""
+    def update(self, t, dt, qr, dqr, ddqr, measurement):
+        """Return the torque (28) for a measurement; the caller sets `tau`, the last one sent.
+
+        What is learned acts along the reference, or at the measured state as in the paper.
+        """
         g = self.gains
         q, dq, effort = np.reshape(measurement, (3, 2)).copy()
         xi1 = q - qr
@@ -148,18 +152,21 @@ class PlainLaw:
         xi2 = dq - self.alpha2
         self.learn(t, dt, q, dq, effort if self.effort else self.tau)
         H = self.regressor(q, dq, self.alpha2, dalpha2)
+        P0 = g.initial_estimate[:3]
+        H_r = H if self.at_state else self.regressor(qr, dqr, dqr, ddqr)
         demand = (
             self.barrier_torque(xi1, t)
             - g.d2 * np.abs(xi1) * np.clip(xi2 / g.boundary_layer, -1.0, 1.0)
             - g.Kp * xi2
-            + H @ self.theta[:3]
+            + H @ P0
+            + H_r @ (self.theta[:3] - P0)
             + self.d3
         )
         torque = np.clip(demand, -g.torque_limit, g.torque_limit)
         if self.samples:
             step = np.where(g.rate_limit > 0.0, g.rate_limit * dt, np.inf)
             torque = np.clip(torque, self.tau - step, self.tau + step)
-        self.adapt(dt, H, xi2, saturated=np.any(torque != demand))
+        self.adapt(dt, H_r, xi2, saturated=np.any(torque != demand))
         self.alpha2 = following
         self.samples += 1
         return torque

@@ -85,10 +85,13 @@ def test_only_the_prediction_error_adapts_at_a_torque_limit(n, p):
     np.testing.assert_array_equal(disturbance, d3)
 
 
+@pytest.mark.parametrize('most', [np.inf, 1e-3])
 @pytest.mark.parametrize('saturated', [False, True])
-def test_learning_does_not_change_the_torque(saturated):
-    """Only the tracking error changes H theta^ + d^3 (`bumpless`)."""
-    settings, state, signals = random_case = case(5, 3, 4, bumpless=1, eta=0.0)
+def test_learning_does_not_change_the_torque(saturated, most):
+    """Only the tracking error changes H theta^ + d^3 (`bumpless`), also where a column is cut."""
+    limits = {'least': np.full(7, -np.inf), 'most': np.append(np.full(6, np.inf), most)}
+    settings, state, signals = random_case = case(5, 3, 4, bumpless=1, eta=0.0, **limits)
+    state.estimate[-1] = 0.0
     change = signals.H @ tracking_part(settings, signals) - settings.gamma * signals.xi2
     expected = signals.H @ state.estimate + state.disturbance + DT * change * (not saturated)
     learned = signals.H @ prediction_part(settings, state)
@@ -97,6 +100,7 @@ def test_learning_does_not_change_the_torque(saturated):
 
     assert np.abs(learned).min() > 0.1
     np.testing.assert_allclose(signals.H @ estimate + disturbance, expected, atol=1e-12)
+    assert (estimate[-1] == most) == np.isfinite(most)
 
 
 def test_newton_converges_at_the_same_rate_in_all_directions_unlike_gradient():

@@ -24,8 +24,9 @@ TIMES = np.linspace(0.0, END, 11)
 
 
 def reference(t):
-    """qr of Section IV and its derivative."""
-    return np.array([np.array([1.9935, 1.3961]) + 0.3 * np.cos(t), [-0.3 * np.sin(t)] * 2])
+    """qr of Section IV and its derivatives."""
+    qr = np.array([1.9935, 1.3961]) + 0.3 * np.cos(t)
+    return np.array([qr, [-0.3 * np.sin(t)] * 2, [-0.3 * np.cos(t)] * 2])
 
 
 def surface(xi1, dqr):
@@ -34,29 +35,35 @@ def surface(xi1, dqr):
     return -K * KC**2 / (np.pi * xi1) * np.sin(s) * np.cos(s) - MU * xi1 + dqr
 
 
+def regressor(q, dq, v, a):
+    """H(q, dq, v, a)."""
+    parts = [dynamics(e, R, q, dq) for e in np.eye(3)]
+    return np.column_stack([M @ a + C @ v + G for M, C, G in parts])
+
+
 def derivative(t, y):
     """The whole loop: arm (1), filter (13), law (28), learning (20) from a latched window, (30)."""
     q, dq, alpha2, estimate, d3 = np.split(y, [2, 4, 6, 9])
-    qr, dqr = reference(t)
+    qr, dqr, ddqr = reference(t)
     xi1, xi2 = q - qr, dq - alpha2
     dalpha2 = (surface(xi1, dqr) - alpha2) / LAMBDA
-    parts = [dynamics(e, R, q, dq) for e in np.eye(3)]
-    H = np.column_stack([M @ dalpha2 + C @ alpha2 + G for M, C, G in parts])
+    H, H_r = regressor(q, dq, alpha2, dalpha2), regressor(qr, dqr, dqr, ddqr)
     barrier = W * xi1 / np.cos(np.pi * xi1**2 / (2.0 * KC**2)) ** 2
-    torque = H @ estimate + d3 - KP * xi2 - barrier
+    P0 = 0.5 * TRUE
+    torque = H @ P0 + H_r @ (estimate - P0) + d3 - KP * xi2 - barrier
     M, C, G = dynamics(TRUE, R, q, dq)
     ddq = np.linalg.solve(M, torque - C @ dq - G - 0.1 - 0.1 * np.sin(t))
     eps = np.linalg.solve(PHI + RHO * np.eye(3), PHI @ (TRUE - estimate))
     learned = GAMMA * KAPPA * eps
-    update = learned - GAMMA * H.T @ xi2
-    return np.concatenate([dq, ddq, dalpha2, update, -GAMMA3 * xi2 - H @ learned])
+    update = learned - GAMMA * H_r.T @ xi2
+    return np.concatenate([dq, ddq, dalpha2, update, -GAMMA3 * xi2 - H_r @ learned])
 
 
 @cache
 def continuous():
     """Positions and P^ at TIMES, to a tolerance far below the sampling error."""
     start = np.array([2.293, 1.696])
-    qr, dqr = reference(0.0)
+    qr, dqr, _ = reference(0.0)
     alpha2 = surface(start - qr, dqr)
     y = np.concatenate([start, np.zeros(2), alpha2, 0.5 * TRUE, np.zeros(2)])
     solution = solve_ivp(

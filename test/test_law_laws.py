@@ -129,7 +129,8 @@ def test_model_based_law_follows_equation_16_in_a_closed_loop():
         controller.update(t, 1e-3, measurement)
         plain.theta[:3], plain.d3 = P, np.full(2, 0.1 + 0.1 * np.sin(t))
         signals = controller.signals
-        torque = plain.update(t, 1e-3, signals.qr, signals.dqr, measurement)
+        reference = signals.qr, signals.dqr, signals.ddqr
+        torque = plain.update(t, 1e-3, *reference, measurement)
         np.testing.assert_allclose(signals.torque, torque, atol=ROUNDING)
         plain.tau = signals.torque.copy()
         arm.step(signals.torque)

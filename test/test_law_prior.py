@@ -11,7 +11,8 @@ from arbitrary_case import arbitrary
 from closed_loop_case import closed_loop, controller, plant, quick, recommended, record
 from scipy.linalg import eigh
 
-from blf_dsc_controller.law import adaptation, consistency, torque, window
+from blf_dsc_controller.law import adaptation, consistency, window
+from blf_dsc_controller.law.settings import COMPENSATIONS
 
 SCALE = np.array([1e-3, 5.0, 0.2, 30.0, 1.0, 1e-2, 4.0])  # of theta: p = 4 and 3 columns
 
@@ -59,9 +60,11 @@ def test_tracking_error_adapts_each_parameter_in_its_scale():
     np.testing.assert_allclose((state.estimate - before)[:4], expected, rtol=1e-9, atol=1e-15)
 
 
-def test_damping_by_the_initial_inertia_is_omega_v_M_xi2():
+@pytest.mark.parametrize('compensation', range(len(COMPENSATIONS)))
+def test_damping_by_the_initial_inertia_is_omega_v_M_xi2(compensation):
     plain, damped = (
-        controller(recommended(Kp=np.zeros(2), damping_rate=rate)) for rate in (0.0, 30.0)
+        controller(recommended(Kp=np.zeros(2), damping_rate=rate, compensation=compensation))
+        for rate in (0.0, 30.0)
     )
     measurement = np.array([2.2935, 1.6961, 0.3, -0.2, 0.0, 0.0])
     for law in (plain, damped):
@@ -103,11 +106,3 @@ def test_only_estimates_with_a_positive_inertia_are_physical(P2, physical):
     if P2 == 0.02:  # positive definite, but below a tenth of the initial estimate
         law.settings.initial_estimate[:3] = [1.0, 0.32, 0.0]
     assert consistency.is_physical(law.settings, law.signals, q, theta) == physical
-
-
-def test_momentum_regressor_is_not_evaluated_without_damping():
-    law = controller(recommended())
-    law.update(0.0, 1e-3, np.array([2.2935, 1.6961, 0.3, -0.2, 0.0, 0.0]))
-    Yp = law.signals.momentum.copy()
-    torque.compute_demand(law.settings, law.state, law.signals, np.zeros(2))
-    np.testing.assert_array_equal(law.signals.momentum, Yp)

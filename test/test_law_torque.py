@@ -8,18 +8,20 @@ import pytest
 from closed_loop_case import closed_loop, controller, plant, quick, record
 from plain_law import PlainLaw
 
-from blf_dsc_controller.law.settings import EFFORT, UPDATES
+from blf_dsc_controller.law.settings import COMPENSATIONS, EFFORT, UPDATES
 
 # The window is not a multiple of the interval, and learning lasts nearly a second. For so short
 # a window the condition number of Phi is 1e7; rho = 10 keeps the amplified rounding below 1e-12,
 # but would spoil the inverse iteration, so every window counts as excited.
 SHORT = {'window': 497, 'interval': 7, 'learning_start': 0.6, 'rho': 10.0, 'sigma': -1.0}
 ROUNDING = 1e-12
+AT_STATE = COMPENSATIONS.index('state')
 GRADIENT = UPDATES.index('gradient')
 
 CASES = {
     'newton': ({}, {}),
     'gradient': ({'update': GRADIENT, 'kappa': 2.0}, {}),
+    "the paper's compensation": ({'compensation': AT_STATE}, {}),
     'no bias columns': ({'bias': False}, {}),
     'damping and leakage': ({'d2': np.array([300.0, 200.0]), 'eta': 0.5}, {}),
     'effort': ({'torque_source': EFFORT}, {'delay': 2, 'noise': 1e-6}),
@@ -45,7 +47,8 @@ def differences(settings, arm, duration=1.5):
     law, plain = controller(settings), PlainLaw(settings)
     worst, dt = np.zeros(3), arm.period_ns * 1e-9
     for sample in closed_loop(law, arm, duration):
-        torque = plain.update(sample.t, dt, law.signals.qr, law.signals.dqr, sample.measurement)
+        reference = law.signals.qr, law.signals.dqr, law.signals.ddqr
+        torque = plain.update(sample.t, dt, *reference, sample.measurement)
         plain.tau = law.signals.torque.copy()
         pairs = (
             (law.signals.torque, torque),

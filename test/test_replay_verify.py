@@ -312,6 +312,16 @@ def test_recording_by_another_version_is_remarked(bag, monkeypatch):
     assert any('recorded by version 0.1.0 and replayed by 9.9.9' in text for text in result.remarks)
 
 
+def test_bag_that_is_older_than_a_parameter_is_remarked(entries, rewritten):
+    changed = [list(entry) for entry in entries]
+    first = of(changed, JOURNAL)[0]
+    event = decode(first[3])
+    del event.content['parameters']['learning.compensation']
+    first[3] = event.encode()
+    remarks = verify(rewritten(changed)).remarks
+    assert any('before the law had learning.compensation' in text for text in remarks)
+
+
 def test_configuration_of_another_version_is_rejected(entries, tmp_path, monkeypatch):
     changed = [list(entry) for entry in entries]
     first = of(changed, JOURNAL)[0]

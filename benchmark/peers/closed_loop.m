@@ -44,12 +44,12 @@ slope = @(x) w * (1 + 2 * pi * (x / kc) ^ 2 * tan(pi / 2 * (x / kc) ^ 2)) ...
         / cos(pi / 2 * (x / kc) ^ 2) ^ 2 - Slim;
 knee = fzero(slope, [0, 0.999 * kc]);
 share = 1 - exp(-T / lambda); gain = 1 - exp(-pole * T);
-x = [2.293; 1.696; 0; 0]; theta = [0.5; 0.16; 0.2; 0; 0]; d3 = [0; 0]; tau = [0; 0];
+x = [2.293; 1.696; 0; 0]; P0 = [0.5; 0.16; 0.2]; theta = [P0; 0; 0]; d3 = [0; 0]; tau = [0; 0];
 pole1 = zeros(2, 6); pole2 = zeros(2, 6); ring = zeros(2, 6, N); total = zeros(6);
 latched = false; samples = round(duration / T);
 for k = 0:samples - 1
   t = k * T; q = x(1:2); dq = x(3:4);
-  qr = [1.9935; 1.3961] + 0.3 * cos(t); dqr = -0.3 * sin(t) * [1; 1];
+  qr = [1.9935; 1.3961] + 0.3 * cos(t); dqr = -0.3 * sin(t) * [1; 1]; ddqr = -0.3 * cos(t) * [1; 1];
   xi1 = q - qr; ratio = xi1 / kc; s = pi * ratio .^ 2; part = sin(s) ./ s; part(s == 0) = 1;
   beta2 = dqr - (abs(ratio) < 1) .* (K / 2 * xi1 .* part) - mu * xi1;
   if k == 0, alpha2 = beta2; end
@@ -68,15 +68,15 @@ for k = 0:samples - 1
     end
   end
   Yp0 = Yp; Yr0 = Yr;
-  H = regressor(r, q, dq, alpha2, dalpha2);
+  H = regressor(r, q, dq, alpha2, dalpha2); Hr = regressor(r, qr, dqr, dqr, ddqr);
   edge = min(abs(xi1), knee);
   barrier = sign(xi1) .* (w * edge ./ cos(pi / 2 * (edge / kc) .^ 2) .^ 2 + Slim * (abs(xi1) - edge));
-  demand = H * theta(1:3) + d3 - Kp .* xi2 - barrier;
+  demand = H * P0 + Hr * (theta(1:3) - P0) + d3 - Kp .* xi2 - barrier;
   tau = max(-limit, min(limit, demand));
   rate = zeros(5, 1);
   if latched, rate = kappa * ((Phi + rho * eye(5)) \ (b - Phi * theta)); end
   if all(tau == demand)
-    rate(1:3) = rate(1:3) - H' * xi2; d3 = d3 - T * gamma * xi2;
+    rate(1:3) = rate(1:3) - Hr' * xi2; d3 = d3 - T * gamma * xi2;
   end
   theta = theta + T * Gamma .* rate;
   alpha2 = alpha2 + share * (beta2 - alpha2);

@@ -49,7 +49,8 @@ def run(duration: float, state: State, step: Step) -> np.ndarray:
         q, dq = state()
         qr = offset + swing * np.cos(w * t)
         dqr = -w * swing * np.sin(w * t)
-        law.tau = law.update(t, T, qr, dqr, np.concatenate((q, dq, law.tau)))
+        ddqr = -w * w * swing * np.cos(w * t)
+        law.tau = law.update(t, T, qr, dqr, ddqr, np.concatenate((q, dq, law.tau)))
         errors[k] = q - qr
         step(t, law.tau)
     return errors

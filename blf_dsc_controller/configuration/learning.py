@@ -78,6 +78,10 @@ class Learning:
     radius: float = positive(
         3.0, 'radius of the projection ball of the estimate', 'kg m^2', 'omega_a'
     )
+    compensation: Literal['reference', 'state'] = parameter(
+        'reference',
+        'where what is learned acts: along the reference only, or at the measured state (paper)',
+    )
     bumpless: bool = parameter(
         True, 'let the disturbance estimate offset the torque that the prediction error adds'
     )

@@ -19,7 +19,7 @@ and d^3 is left to estimate the disturbance alone.
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.views import part
-from blf_dsc_controller.law import cholesky, projection
+from blf_dsc_controller.law import cholesky, projection, saturation
 from blf_dsc_controller.law.settings import NEWTON, Settings
 from blf_dsc_controller.law.state import Signals, State
 
@@ -74,7 +74,8 @@ def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturat
     gain = part(settings.Gamma, 0, (p,))
     projection.project(parameters, part(signals.rate, 0, (p,)), gain, settings.radius)
     for j in range(settings.m):
-        state.estimate[j] += dt * signals.rate[j]
+        estimate = state.estimate[j] + dt * signals.rate[j]
+        state.estimate[j] = saturation.clip(estimate, settings.least[j], settings.most[j])
     projection.retract(parameters, gain, settings.radius)
     if not saturated:
         for i in range(settings.n):

@@ -23,6 +23,7 @@ from blf_dsc_controller.configuration.robot import drive_model, learned_of
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import (
+    COMPENSATIONS,
     LATCHES,
     PREDICTIONS,
     SURFACES,
@@ -33,6 +34,7 @@ from blf_dsc_controller.law.settings import (
 from blf_dsc_controller.reference.approach import plan_start, reference_of
 
 _FRICTION = 0.05  # standard deviation of friction, over the rated torque
+_MOST_FRICTION = 3.0  # times its initial estimate
 
 
 def model_of(config: ControllerConfig) -> ArmModel:
@@ -78,12 +80,32 @@ def prior_covariance(config: ControllerConfig) -> np.ndarray:
     L = learned_of(config.robot, config.robot.chain(config.joints)).L
     covariance = np.zeros((len(L) + len(columns),) * 2)
     covariance[: len(L), : len(L)] = L @ L.T
-    limits = zip(config.torque.limit, config.limits.velocity, strict=True)
-    friction = np.array([(_FRICTION * t, _FRICTION * t / v) for t, v in limits])
-    for k, name in enumerate(columns, len(L)):
-        joint = config.joints.index(name.rsplit(' ', 1)[-1])
-        covariance[k, k] = friction[joint, int(name.startswith('viscous'))] ** 2
+    for k, name in enumerate(columns):
+        covariance[len(L) + k, len(L) + k] = _usual_friction(config, name) ** 2
     return covariance
+
+
+def _usual_friction(config: ControllerConfig, column: str) -> float:
+    """Return 5 % of the rated torque, for `viscous` at the largest velocity of the reference."""
+    block, _, joint = column.rpartition(' ')
+    i = config.joints.index(joint)
+    velocity = config.limits.velocity[i] if block == 'viscous' else 1.0
+    return _FRICTION * config.torque.limit[i] / velocity
+
+
+def column_limits(config: ControllerConfig) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the least and the most that each disturbance column can be estimated at.
+
+    Friction is between 0 and three times its initial estimate, or 5 % of the rated torque where
+    that is zero: a push that is learned as negative friction turns over where the joint does.
+    """
+    least, most = [], []
+    for name, initial in zip(column_names(config), initial_columns(config), strict=True):
+        is_friction = name.startswith(('viscous ', 'coulomb '))
+        least.append(0.0 if is_friction else -np.inf)
+        limit = _MOST_FRICTION * initial or _usual_friction(config, name)
+        most.append(limit if is_friction else np.inf)
+    return tuple(least), tuple(most)
 
 
 def required_fields(config: ControllerConfig) -> tuple[str, ...]:
@@ -106,6 +128,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     least = float(floor.min())
     covariance = prior_covariance(config)
     drive_chain, drive_inertias = drive_model(config.robot, config.joints)
+    friction = column_limits(config)
     settings = Settings(
         model=model,
         n=model.n,
@@ -119,6 +142,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         effort_is_whole=int(config.robot.effort == 'whole'),
         drive=drive_inertias.size,
         drive_size=drive_chain.size,
+        compensation=COMPENSATIONS.index(learning.compensation),
         window=round(learning.window / (config.sample_time * learning.row_interval)),
         row_interval=learning.row_interval,
         interval=learning.interval,
@@ -168,6 +192,8 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         initial_estimate=np.array(learning.initial_estimate + initial_columns(config)),
         information=np.linalg.inv(covariance),
         variance=np.diag(covariance).copy(),
+        least=np.array((-np.inf,) * p + friction[0]),
+        most=np.array((np.inf,) * p + friction[1]),
         true_parameters=np.array(truth.parameters or (0.0,) * p),
         frequencies=np.array(learning.frequencies),
         drive_chain=drive_chain,
@@ -185,6 +211,7 @@ def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
         'd2': nothing,
         'gamma': nothing,
         'kappa': 0.0,
+        'compensation': COMPENSATIONS.index('state'),
         'bumpless': 0,
         'change_detection': 0,
     }

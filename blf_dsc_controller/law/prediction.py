@@ -155,11 +155,11 @@ def accelerated_row(
 ) -> None:
     """Write the row `acceleration` or `lambda` to `signals.row`, from ddq^ of `differentiate`."""
     scale = 1.0
-    X = signals.H
+    X = signals.momentum
     if settings.prediction == LAMBDA:
         scale = heuristic_factor(settings, state, signals, dq)
+        settings.model.regressor(q, dq, state.alpha2, signals.dalpha2, X)
     else:
-        X = signals.momentum
         settings.model.regressor(q, dq, dq, signals.acceleration, X)
     for i in range(settings.n):
         for j in range(settings.m):

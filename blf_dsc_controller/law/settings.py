@@ -14,6 +14,7 @@ PREDICTIONS = ('filtered', 'acceleration', 'lambda')
 LATCHES = ('last', 'max')
 UPDATES = ('gradient', 'newton')
 TORQUE_SOURCES = ('command', 'effort')
+COMPENSATIONS = ('reference', 'state')
 
 LINEAR = SURFACES.index('linear')
 FILTERED = PREDICTIONS.index('filtered')
@@ -21,6 +22,7 @@ LAMBDA = PREDICTIONS.index('lambda')
 BEST = LATCHES.index('max')
 NEWTON = UPDATES.index('newton')
 EFFORT = TORQUE_SOURCES.index('effort')
+REFERENCE = COMPENSATIONS.index('reference')
 
 
 class Settings(NamedTuple):
@@ -41,6 +43,7 @@ class Settings(NamedTuple):
     effort_is_whole: int  # 1: measured efforts contain what the drive adds, 0: they do not
     drive: int  # columns of the gravity that the drive adds; 0: it adds none
     drive_size: int  # of drive_chain
+    compensation: int
     window: int  # N, rows in tau_d
     row_interval: int  # samples between two rows of the window
     interval: int  # samples between two checks of the excitation
@@ -89,6 +92,8 @@ class Settings(NamedTuple):
     initial_estimate: Annotated[Array, 'm']  # P^(0), then that of the columns
     information: Annotated[Array, 'm', 'm']  # R, inverse covariance of the prior of theta
     variance: Annotated[Array, 'm']  # diagonal of R^-1
+    least: Annotated[Array, 'm']  # value that theta^ can have: friction is not negative
+    most: Annotated[Array, 'm']  # value that theta^ can have
     true_parameters: Annotated[Array, 'p']
     frequencies: Annotated[Array, 'tones']  # of the sine and cosine columns, rad/s
     drive_chain: Annotated[Array, 'drive_size']  # `Bodies` of the drive's model, with its memory

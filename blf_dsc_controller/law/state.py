@@ -65,6 +65,8 @@ class Signals(NamedTuple):
     beta2: Annotated[Array, 'n']  # rad/s
     dalpha2: Annotated[Array, 'n']  # rad/s^2
     xi2: Annotated[Array, 'n']  # rad/s
+    damped: Annotated[Array, 'n']  # alpha2' - omega_v xi2, rad/s^2
+    model_torque: Annotated[Array, 'n']  # H(q, dq, alpha2, damped) P^(0), N m
     known: Annotated[Array, 'n']  # disturbance known to the law, N m
     acceleration: Annotated[Array, 'n']  # estimated ddq, rad/s^2
     added: Annotated[Array, 'n']  # torque that the drive adds to the command, N m
@@ -75,7 +77,7 @@ class Signals(NamedTuple):
     bound: Annotated[Array, 'n']  # k(t), rad
     knee: Annotated[Array, 'n']  # knee of the barrier for that bound, rad
     narrowing: Annotated[Array, 'n']  # k'/k, 1/s
-    H: Annotated[Array, 'n', 'm']  # [H | compensated columns]
+    H: Annotated[Array, 'n', 'm']  # of what is learned: [H | compensated columns]
     momentum: Annotated[Array, 'n', 'p']  # Yp
     rest: Annotated[Array, 'n', 'm']  # [Yr | columns]
     row: Annotated[Array, 'n', 'm + 1']  # filtered [X | u]

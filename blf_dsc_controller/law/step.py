@@ -24,7 +24,7 @@ from blf_dsc_controller.law import (
     torque,
     window,
 )
-from blf_dsc_controller.law.settings import FILTERED, Settings
+from blf_dsc_controller.law.settings import FILTERED, REFERENCE, Settings
 from blf_dsc_controller.law.state import Sample, Signals, State
 from blf_dsc_controller.reference import terms as reference
 
@@ -33,13 +33,23 @@ from blf_dsc_controller.reference import terms as reference
 def compute_regressors(
     settings: Settings, state: State, signals: Signals, q: np.ndarray, dq: np.ndarray
 ) -> None:
-    """Compute H(q, dq, alpha2, alpha2') and, for the filtered prediction, Yp and Yr."""
+    """Compute H P^(0) of the feedback, H of what is learned; if the row needs them, Yp and Yr."""
     model, H = settings.model, signals.H
-    if settings.prediction != FILTERED:
+    for i in range(settings.n):
+        signals.damped[i] = signals.dalpha2[i] - settings.damping_rate * signals.xi2[i]
+    if settings.prediction == FILTERED:
+        Yp, Yr = signals.momentum, signals.rest
+        model.regressors(q, dq, state.alpha2, signals.damped, H, Yp, Yr)
+    else:
+        model.regressor(q, dq, state.alpha2, signals.damped, H)
+    for i in range(settings.n):
+        signals.model_torque[i] = 0.0
+        for j in range(settings.p):
+            signals.model_torque[i] += H[i, j] * settings.initial_estimate[j]
+    if settings.compensation == REFERENCE:
+        model.regressor(signals.qr, signals.dqr, signals.dqr, signals.ddqr, H)
+    elif settings.damping_rate > 0.0:
         model.regressor(q, dq, state.alpha2, signals.dalpha2, H)
-        return
-    Yp, Yr = signals.momentum, signals.rest
-    model.regressors(q, dq, state.alpha2, signals.dalpha2, H, Yp, Yr)
 
 
 @inner
@@ -120,7 +130,7 @@ def step(
     compute_regressors(settings, state, signals, q, dq)
     prediction.fill_compensation(settings, signals)
     update_window(settings, state, signals, t, dt, q, dq, signals.applied)
-    torque.compute_demand(settings, state, signals, q)
+    torque.compute_demand(settings, state, signals)
     saturated = saturation.saturate(settings, state, signals, dt)
     adaptation.adapt(settings, state, signals, dt, saturated)
     surface.filter_step(settings, state, signals, dt)

@@ -1,17 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Torque demand before saturation: (28) of the proposed law and (35) of the comparison law.
 
-    tau = -dV/dxi1 - d2 |xi1| sat(xi2/b) - K_p xi2 + H(q, dq, alpha2, alpha2') P^ + d^3        (28)
+    tau = -dV/dxi1 - d2 |xi1| sat(xi2/b) - K_p xi2 + tau_m + d^3                                (28)
     tau = -w z1 - mu_bar sat(z2/b) - K_p z2 + H P^                                             (35)
 
-(28) prints the robust term with sgn; sat is its smooth replacement.  Where the inertias are roughly
-known, the damping can scale with them: - omega_v M(q, P^(0)) xi2, added to - K_p xi2, damps every
-direction at the same rate.
+(28) prints the robust term with sgn; sat is its smooth replacement.  The paper's compensation is
+tau_m = H(q, dq, alpha2, alpha2') P^ (`compensation: state`).  alpha2' contains the feedback, which
+is thus multiplied by the learned inertia: an estimate of 2.65 times the inertia makes a loop at
+1 kHz unstable.  So what is learned acts along the reference only, and the feedback keeps the model
+from before the start, as in the desired compensation law of Sadegh and Horowitz (1990):
+
+    tau_m = H(q, dq, alpha2, alpha2' - omega_v xi2) P^(0) + H(qr, dqr, dqr, ddqr) (P^ - P^(0))
+
+A wrong estimate is then a bounded disturbance, never a gain.  Where the inertias are roughly known,
+the damping can scale with them: - omega_v M(q, P^(0)) xi2, part of the first term, is added to
+- K_p xi2 and damps every direction at the same rate.
 """
 
 from math import sin
-
-import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law import barrier
@@ -53,22 +59,15 @@ def feedback(settings: Settings, signals: Signals, i: int) -> float:
 
 
 @inner
-def compute_demand(settings: Settings, state: State, signals: Signals, q: np.ndarray) -> None:
-    """Compute the torque (28) or (35) before saturation, `signals.demand` (n,) [N m].
-
-    Overwrites Yp and Yr of `signals` if it damps by the initial estimate's inertia.
-    """
-    damped = settings.damping_rate > 0.0
-    if damped:
-        settings.model.momentum_regressor(q, signals.xi2, signals.momentum, signals.rest)
+def compute_demand(settings: Settings, state: State, signals: Signals) -> None:
+    """Compute the torque (28) or (35) before saturation, `signals.demand` (n,) [N m]."""
     for i in range(settings.n):
-        torque = feedback(settings, signals, i) + state.disturbance[i]
-        if damped:
-            for j in range(settings.p):
-                inertia = signals.momentum[i, j] * settings.initial_estimate[j]
-                torque -= settings.damping_rate * inertia
+        torque = feedback(settings, signals, i) + signals.model_torque[i] + state.disturbance[i]
         if settings.feed_forward == 1:
             torque += signals.known[i]
         for j in range(settings.m):
-            torque += signals.H[i, j] * state.estimate[j]
+            learned = state.estimate[j]
+            if j < settings.p:
+                learned -= settings.initial_estimate[j]
+            torque += signals.H[i, j] * learned
         signals.demand[i] = torque

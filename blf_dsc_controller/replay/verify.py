@@ -14,6 +14,7 @@ from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_con
 from blf_dsc_controller.bags.context import Context, read_context
 from blf_dsc_controller.bags.topic_messages import JointStates, UnreadableMessageError
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import required_fields
 from blf_dsc_controller.messages.cdr import MessageError
@@ -67,7 +68,9 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
     """
     context, content = read_context(path), read_content(path, namespace, names)
     events, content, end = _events(content)
-    config = context.build_config(events[0].content['parameters'], JOURNAL.resolved)
+    recorded = events[0].content['parameters']
+    config = context.build_config(recorded, JOURNAL.resolved)
+    newer = sorted(flatten(config).keys() - recorded.keys())
     states, errors = _states(content, config, names.joints_of(config.joints))
     start = next((one.stamp for one in events if one.type is EventType.START), None)
     if start is not None and start not in states.stamp:
@@ -89,7 +92,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
         comparisons,
         tuple(run.events),
         int(np.count_nonzero(~run.outputs.commands.of_law)),
-        tuple(_remarks(context, run.end or end)),
+        tuple(_remarks(context, run.end or end, newer)),
         min((one for one in found if one), key=lambda one: one.stamp, default=None),
     )
 
@@ -138,7 +141,7 @@ def _nothing_to_compare(content: Content) -> BlfDscError:
     )
 
 
-def _remarks(context: Context, end: str) -> Iterator[str]:
+def _remarks(context: Context, end: str, newer: Sequence[str]) -> Iterator[str]:
     if end:
         yield f'{end}: the replay ends there'
     for topic, what in context.losses.items():
@@ -147,4 +150,9 @@ def _remarks(context: Context, end: str) -> Iterator[str]:
         yield (
             f'recorded by version {context.version or "unknown"} and replayed by {__version__}: '
             'differences may come from the software'
+        )
+    if newer:
+        yield (
+            f'recorded before the law had {", ".join(newer)}: replayed with the present law and '
+            'its defaults, so differences come from the software'
         )

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is learned acts along the reference: a wrong estimate cannot destabilise the loop.
+
+Each row changes the arm in its first window, which nothing can tell from a good one, or disturbs it
+at a frequency of the reference.  Without learning the bound is held; with it, it must be too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from changes import OFF
+from paper_case import configured
+
+from blf_dsc_controller.law.factory import controller_of, estimate_names
+from blf_dsc_controller.law.state import sample_of
+from blf_dsc_controller.simulation.loop import simulate
+
+AT_STATE = {'learning.compensation': 'state'}
+TONE = 1.2566370614359172  # rad/s, first of the presets panda and ur5e
+
+
+def event(begin, payload, duration=0.0, ramp=0.0):
+    """Return parameters of a plant that picks up a payload [kg]."""
+    row = {'begin': begin, 'duration': duration, 'ramp': ramp, 'payload': payload}
+    return {f'events.{name}': [value] for name, value in row.items()}
+
+
+ROWS = {
+    'panda, 2 kg': ('panda', 9.0, event(2.0, 2.0)),
+    'panda, 0.76 kg in 0.5 s': ('panda', 9.0, event(3.4, 0.76, ramp=0.5)),
+    'ur5e, 1.26 kg put down again': ('ur5e', 12.0, event(4.14, 1.26, 3.92)),
+    'panda, sine on joint7': (
+        'panda',
+        12.0,
+        {'disturbance.amplitude': [0.0] * 6 + [1.2], 'disturbance.frequency': [TONE] * 7},
+    ),
+    'noisy, cosines': (
+        'noisy',
+        20.0,
+        {'disturbance.amplitude': [1.5, 1.5], 'disturbance.phase': [-np.pi / 2.0] * 2},
+    ),
+}
+BROKEN = ('panda, 2 kg', 'panda, 0.76 kg in 0.5 s', 'ur5e, 1.26 kg put down again')
+"""Rows in which the paper's compensation leaves the bound."""
+
+
+def run(name, law):
+    preset, duration, plant = ROWS[name]
+    config = configured(preset, duration, law, plant)
+    return simulate(config.controller, config.plant).run(), config.controller.barrier.bound
+
+
+@pytest.mark.parametrize('name', ROWS)
+def test_learning_breaks_no_bound_that_is_kept_without_it(name):
+    (learning, bound), (without, _) = run(name, {}), run(name, OFF)
+    assert learning.stops == without.stops == ()
+    most = np.abs(without.error).max()
+    assert most < bound[0]
+    assert np.abs(learning.error).max() <= 1.3 * most
+
+
+@pytest.mark.parametrize('name', BROKEN)
+def test_compensation_of_the_paper_breaks_them(name):
+    found, _ = run(name, AT_STATE)
+    assert [stop.reason for stop in found.stops] == ['error past the bound']
+
+
+def test_sine_of_the_frequency_of_the_reference_is_compensated_like_a_model():
+    """Mistaken for parameters, it is still cancelled along the reference."""
+    rms = []
+    for law in ({}, OFF, AT_STATE):
+        found, _ = run('noisy, cosines', law)
+        rms.append(np.sqrt(np.mean(found.error[found.time > 10.0] ** 2, axis=0)).max())
+    assert rms[0] < 0.5 * rms[1]  # 0.012, 0.096 mrad
+    assert rms[2] > 3.0 * rms[1]  # 0.50 mrad
+
+
+def test_learned_friction_stays_friction():
+    """Between 0 and three times its initial estimate, or 5 % of the rated torque if that is 0.
+
+    The first windows of the UR5e see a payload come and go, and take parts of it for friction.
+    """
+    preset, duration, plant = ROWS['ur5e, 1.26 kg put down again']
+    config = configured(preset, duration, {}, plant)
+    names = np.array(estimate_names(config.controller))
+    friction = np.flatnonzero([name.startswith(('viscous ', 'coulomb ')) for name in names])
+    record = simulate(config.controller, config.plant)
+    settings = record.controller.settings
+    columns = sample_of(np.arange(record.samples.shape[1]), settings).estimate[friction]
+    learned, limit = record.samples[:, columns], 3.0 * settings.initial_estimate[friction]
+    assert limit.min() > 0.0
+    assert np.all((learned >= 0.0) & (learned <= limit))
+    assert np.any(learned == 0.0)
+
+    planar = configured('recommended', 1.0, {'learning.coulomb': True, 'learning.viscous': True})
+    most = controller_of(planar.controller).settings.most
+    np.testing.assert_allclose(most[-4:], [0.05 * 20.0 / 1.5] * 2 + [0.05 * 20.0] * 2)
