@@ -15,7 +15,7 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.params_file import format_value, load, locate
 from blf_dsc_controller.configuration.robot import learned_of, parameters_of
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law import exciting_reference
+from blf_dsc_controller.identification import exciting_reference
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.reference.clearance import Clearance
 

@@ -3,6 +3,11 @@
 
 from __future__ import annotations
 
+import os
+
+# Set before numpy is imported: for matrices of this size, threads cost more than they gain.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
 from argparse import Namespace
 from collections.abc import Iterator
 
@@ -10,7 +15,9 @@ import numpy as np
 
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.cli.output import make_room
+from blf_dsc_controller.cli.parser import PICK_UP
 from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.identify import Identified, identify_bag
 from blf_dsc_controller.identification.prior import JOINT_TERMS, columns_of
@@ -18,27 +25,64 @@ from blf_dsc_controller.identification.prior import JOINT_TERMS, columns_of
 _TWO_SIDED = 1.96  # standard deviations of a 95 % interval
 _UNSEEN = 0.5  # of the prior's variance; parameters that keep more are not shown
 _POOR = 0.2  # of the torque, largest accepted error on the part held back
+_LEAST_GRAVITY, _MOST_GRAVITY = 0.4, 1.6  # of the URDF's; beyond, it is missing or double
 
 
 def identify(options: Namespace) -> None:
-    """Identify the arm, print what changed and write the corrected URDF."""
-    make_room(options.out, force=options.force)
+    """Identify the arm, print what changed, and write the corrected URDF and the page."""
+    if not (options.out or options.report or options.payload):
+        raise BlfDscError('nothing to write: give --out, --report or --payload')
+    for path in (options.out, options.report):
+        if path:
+            make_room(path, force=options.force)
     robot = Robot(
         urdf=options.urdf,
         base=options.base,
         tip=options.tip,
         gravity=tuple(options.gravity),
-        payload=options.payload,
+        payload=options.rated_payload,
     )
-    found = identify_bag(options.bag, robot, options.namespace, NameMap.parse(options.map))
+    pick_up = options.payload == PICK_UP
+    found = identify_bag(
+        options.bag,
+        robot,
+        options.namespace,
+        NameMap.parse(options.map),
+        options.effort,
+        options.gains,
+        None if pick_up else options.payload,
+        pick_up=pick_up,
+    )
     header = [f'{found.source}, {found.duration:.1f} s of {len(found.chain.joints)} joints']
-    kept = [*_joints(found), *_errors(found)]
+    kept = [*_load(found), *_joints(found), *_errors(found), *doubts(found, options.effort)]
     print('\n'.join([*header, *_links(found), *_base(found), *kept]))
-    note = '\n'.join(['Inertias and friction by blf_dsc identify:', *header, *kept])
-    _, viscous, coulomb, _ = found.joint_terms
-    corrected = corrected_urdf(robot.text, found.chain, found.inertias, viscous, coulomb, note)
-    options.out.write_text(corrected, encoding='utf-8')
-    print(f'wrote {options.out}')
+    if options.out:
+        note = '\n'.join(['Inertias and friction by blf_dsc identify:', *header, *kept])
+        viscous, coulomb = found.dynamics
+        corrected = corrected_urdf(robot.text, found.chain, found.inertias, viscous, coulomb, note)
+        options.out.write_text(corrected, encoding='utf-8')
+        print(f'wrote {options.out}')
+    if options.report:
+        from blf_dsc_controller.analysis.identified_arm import write_identified
+
+        tables = (_load(found), _links(found), _joints(found), _errors(found), _base(found))
+        lines = [*header, *doubts(found, options.effort)]
+        write_identified(found, options.report, lines, [[*table] for table in tables])
+        print(f'wrote {options.report}')
+
+
+def _load(found: Identified) -> Iterator[str]:
+    if found.picked_up is None:
+        return
+    (m, *centre), (m_spread, *spread) = found.load
+    at = ', '.join(
+        f'{1e3 * c:.1f} +- {1e3 * _TWO_SIDED * s:.2g}' for c, s in zip(centre, spread, strict=True)
+    )
+    yield ''
+    yield (
+        f'load from {found.picked_up:.1f} s on: {m:.3f} +- {_TWO_SIDED * m_spread:.2g} kg, its '
+        f'centre at {at} mm in {found.chain.tip}'
+    )
 
 
 def _links(found: Identified) -> Iterator[str]:
@@ -67,16 +111,27 @@ def _joints(found: Identified) -> Iterator[str]:
     n = len(found.chain.joints)
     names = [joint.name for joint in found.chain.joints]
     width = max(map(len, names))
-    spread = _TWO_SIDED * np.sqrt(np.diag(found.covariance)[10 * n : -1].reshape(-1, n))
+    spread = _TWO_SIDED * np.sqrt(np.diag(found.covariance))
+    terms = spread[10 * n : 17 * n].reshape(-1, n)
+    shown = [k for k in range(len(JOINT_TERMS)) if found.joint_terms[k].any()]
     yield ''
-    yield f'{"joint":{width}}' + ''.join(f'  {term:24}' for term in JOINT_TERMS).rstrip()
+    yield f'{"joint":{width}}' + ''.join(f'  {JOINT_TERMS[k]:22}' for k in shown).rstrip()
     for i, name in enumerate(names):
-        terms = (
-            f'{value:.4g} +- {s:.2g}'
-            for value, s in zip(found.joint_terms[:, i], spread[:, i], strict=True)
+        values = (
+            f'{found.joint_terms[k, i]:.4g} +- {terms[k, i]:.2g}' if found.joint_terms[k, i] else ''
+            for k in shown
         )
-        yield f'{name:{width}}' + ''.join(f'  {term:24}' for term in terms).rstrip()
-    delay, s = found.values[-1], _TWO_SIDED * np.sqrt(found.covariance[-1, -1])
+        yield f'{name:{width}}' + ''.join(f'  {value:22}' for value in values).rstrip()
+    if found.coupling.any():
+        inertia, viscous, coulomb = (
+            f'{value:.4g} +- {s:.2g}'
+            for value, s in zip(found.coupling, spread[17 * n :], strict=False)
+        )
+        yield (
+            f'one motor drives {names[-2]} and {names[-1]}: inertia {inertia} kg m^2, viscous '
+            f'friction {viscous} and Coulomb friction {coulomb} act on both'
+        )
+    delay, s = found.values[-1], spread[-1]
     yield f'delay of the torques relative to the positions: {1e3 * delay:.2f} +- {1e3 * s:.2g} ms'
 
 
@@ -102,17 +157,43 @@ def _errors(found: Identified) -> Iterator[str]:
     yield ''
     yield f'torque error from {begin:.1f} to {end:.1f} s, which was held back [% of rms torque]:'
     share = 100.0 * found.errors / found.torque
-    total = 100.0 * np.sqrt(np.sum(found.errors**2, axis=1) / np.sum(found.torque**2))
+    total = total_errors(found)
     width = max(len(joint.name) for joint in found.chain.joints)
-    yield f'{"joint":{width}}      URDF  corrected  with rotors and offsets'
+    yield f'{"joint":{width}}      URDF  corrected  with all terms'
     for joint, (before, after, full) in zip(found.chain.joints, share.T, strict=True):
         yield f'{joint.name:{width}}  {before:8.2f}  {after:9.2f}  {full:8.2f}'
     yield f'{"all":{width}}  {total[0]:8.2f}  {total[1]:9.2f}  {total[2]:8.2f}'
+    if found.rest:
+        yield f'{found.rest:.1f} s in which no joint moves were left out'
     for name in found.still:
         yield f'{name} did not move: its rotor and friction are guesses'
+
+
+def total_errors(found: Identified) -> np.ndarray:
+    """Return the torque errors (3,) of URDF, corrected URDF and all terms [% of rms torque]."""
+    total = np.sum(found.errors**2, axis=1) / np.sum(found.torque**2)
+    return np.asarray(100.0 * np.sqrt(total))
+
+
+def doubts(found: Identified, effort: str) -> Iterator[str]:
+    """Yield why the result should not be used."""
+    if found.gravity < _LEAST_GRAVITY:
+        yield (
+            f"GRAVITY IS MISSING: the efforts contain {found.gravity:.2f} of the URDF's. If the "
+            'drives compensate it, give --effort without-gravity; if the arm is not mounted '
+            'upright, --gravity'
+        )
+    elif found.gravity > _MOST_GRAVITY:
+        cause = (
+            'The efforts are the whole torque: give --effort torque'
+            if effort == 'without-gravity'
+            else 'Are the masses of the URDF far too small, or is it without its tool?'
+        )
+        yield f"GRAVITY IS DOUBLE: the efforts contain {found.gravity:.2f} of the URDF's. {cause}"
+    total = total_errors(found)
     if total[2] > min(100.0 * _POOR, total[0]):
         yield (
             'DO NOT USE this URDF: it does not explain the torques held back. Are the efforts in '
-            'N m (not currents) and do they include gravity, is --gravity given in the base '
-            'frame, and was the load the same throughout?'
+            'N m (currents need --gains), is --gravity given in the base frame, and was the load '
+            'the same throughout?'
         )

@@ -148,8 +148,9 @@ def make_parser() -> argparse.ArgumentParser:
             'Identify an arm from the positions and efforts of any bag: write its URDF with '
             'physical inertias that reproduce the torques and are closest to the original ones, '
             'and print what changed, with 95 % intervals, and the torque error on the last fifth '
-            'of the bag, which was held back.',
-            'run1/bag --urdf robot.urdf --out corrected.urdf',
+            'of the motion, which was held back. With --payload, weigh what the arm holds.',
+            'run1/bag --urdf robot.urdf --out corrected.urdf --report page.html\n'
+            '  blf_dsc identify empty/bag --urdf robot.urdf --payload loaded/bag',
         )
     )
     paper = command(
@@ -289,12 +290,38 @@ def _excite_options(parser: argparse.ArgumentParser) -> None:
     option('--floor', type=float, default=0.0, help='height of the floor in the base frame [m] (0)')
 
 
+PICK_UP = Path()
+"""Value of `identify --payload` without a bag."""
+
+
 def _identify_options(parser: argparse.ArgumentParser) -> None:
     option = parser.add_argument
     option('bag', type=Path, help=_BAG)
     option('--urdf', required=True, help='URDF: a file, package://name/path, or a file in config/')
-    option('--out', type=Path, required=True, help='URDF to write')
+    option('--out', type=Path, help='URDF to write')
+    option('--report', type=Path, help='page with pictures and tables to write')
     _force(parser)
+    option(
+        '--payload',
+        type=Path,
+        nargs='?',
+        const=PICK_UP,
+        metavar='BAG',
+        help='identify a load: carried in this other bag, or without one, picked up in the first',
+    )
+    option(
+        '--effort',
+        choices=('torque', 'without-gravity', 'command'),
+        default='torque',
+        help='what efforts are: whole torque, or without that of gravity; or use commands (torque)',
+    )
+    option(
+        '--gains',
+        type=float,
+        nargs='+',
+        default=(),
+        help='torque per effort of each joint, for currents [N m/A]',
+    )
     option('--base', default='', help='fixed link (the root)')
     option('--tip', default='', help='last link (that of the last joint in the bag)')
     option(
@@ -306,7 +333,7 @@ def _identify_options(parser: argparse.ArgumentParser) -> None:
         help='gravity in the base frame [m/s^2] (0 0 -9.81)',
     )
     option(
-        '--payload',
+        '--rated-payload',
         type=float,
         default=3.0,
         help='largest mass on the last link that is not in the URDF [kg] (3)',

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prior of the identified values, in standard deviations from the URDF.
 
-The values (14 n + 1,) of n bodies and joints are the ten inertial parameters of each body, then
-each of the four JOINT_TERMS for all joints, and last the delay of the torques.
+The values (17 n + 14,) of n bodies and joints are the ten inertial parameters of each body, then
+each of the JOINT_TERMS for all joints, the coupling of the last two joints (see `rows`), the
+ten of a load that is picked up, and last the delay of the torques.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,18 +16,35 @@ import numpy as np
 from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.chain_kernels import ROTOR
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
-from blf_dsc_controller.arms.prior import CENTRE, LINKS, PAYLOAD_SIZE, deviations
+from blf_dsc_controller.arms.prior import (
+    CENTRE,
+    LINKS,
+    PAYLOAD_SIZE,
+    deviations,
+    payload_inertia,
+)
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.physical import Cone
+from blf_dsc_controller.identification.rows import COUPLING, LOAD
 from blf_dsc_controller.run import Floats
 
-JOINT_TERMS = ('rotor inertia', 'viscous friction', 'Coulomb friction', 'offset')
-_POSITIVE = 3  # the first three of them cannot be negative
+JOINT_TERMS = (
+    'rotor inertia',
+    'viscous friction',
+    'Coulomb friction',
+    'load friction',
+    'offset',
+    'Stribeck friction',
+    'quadratic friction',
+)
+_POSITIVE = 4  # the first four of them cannot be negative
+_OPTIONAL = (3, 5, 6)  # in the model only of joints whose recording shows them
 
 _DELAY = 0.005  # s
 _FRICTION = 0.3  # of a joint's largest torque; viscous friction: at its largest speed
 _OFFSET = 0.05  # of the largest torque
+_LOAD = 0.1  # of the torque of gravity
 _ROTOR = 100.0  # rad/s^2 or m/s^2, acceleration of the rotor alone by the largest torque
 _NEAREST = 0.01  # of a body's mass and extent: least value at which the search begins
 
@@ -34,19 +52,38 @@ _NEAREST = 0.01  # of a body's mass and extent: least value at which the search 
 class Prior(NamedTuple):
     """Values  mean + D z  with z of zero mean and unit covariance; physical inside all cones."""
 
-    mean: Floats  # (14 n + 1,)
-    D: Floats  # (14 n + 1, 14 n + 1)
+    mean: Floats  # (k,), k = 17 n + 14
+    D: Floats  # (k, k)
     cones: list[Cone]
-    start: Floats  # (14 n + 1,) z inside all cones
+    start: Floats  # (k,) z inside all cones
+
+    @property
+    def optional(self) -> list[tuple[int, ...]]:
+        """Entries of z that are in the model together or not at all: friction, the coupling."""
+        n = (self.mean.size - COUPLING - LOAD - 1) // (10 + len(JOINT_TERMS))
+        terms = [(10 * n + k * n + i,) for k in _OPTIONAL for i in range(n)]
+        return [*terms, tuple(range(17 * n, 17 * n + COUPLING))]
+
+    def only(self, kept: Collection[tuple[int, ...]]) -> Prior:
+        """Return the prior in which optional entries that are not kept are zero."""
+        D, out = self.D.copy(), [k for entry in self.optional if entry not in kept for k in entry]
+        D[:, out] = 0.0
+        return self._replace(D=D, cones=[cone for cone in self.cones if cone.at not in out])
 
 
 def prior_of(
-    robot: Robot, chain: Chain, held: Sequence[Floats], torque: Floats, speed: Floats
+    robot: Robot,
+    chain: Chain,
+    held: Sequence[Floats],
+    torque: Floats,
+    speed: Floats,
+    *,
+    load: bool,
 ) -> Prior:
     """Return the prior of a chain: inertias as for learning, joint terms scaled by the recording.
 
     `held` are lower bounds (4, 4) of the pseudo-inertias of the bodies; `torque` and `speed` (n,)
-    are the largest of each joint.
+    are the largest of each joint; `load` says whether one is picked up.
     """
     from scipy.linalg import block_diag
 
@@ -55,8 +92,7 @@ def prior_of(
     for i, joint in enumerate(chain.joints):
         D = deviations(pseudo_inertia(joint.inertia), LINKS, CENTRE)
         if i == n - 1:
-            load = robot.payload * np.diag((*(PAYLOAD_SIZE**2,) * 3, 1.0))
-            J = chain.tip_placement @ load @ chain.tip_placement.T
+            J = chain.tip_placement @ payload_inertia(robot.payload) @ chain.tip_placement.T
             both = np.column_stack((D, deviations(J, 1.0, PAYLOAD_SIZE)))
             D = np.transpose(np.linalg.qr(both.T, mode='r'))
         own = pseudo_inertia(joint.inertia) - held[i]
@@ -66,23 +102,35 @@ def prior_of(
         cones.append(Cone(10 * i, own, np.array([pseudo_inertia(d) for d in D.T])))
     rotors = robot.rotors(chain)
     damping, friction = np.transpose([(joint.damping, joint.friction) for joint in chain.joints])
-    means = np.concatenate((rotors, damping, friction, np.zeros(n)))
-    spread = np.concatenate(
-        (
-            np.maximum(rotors, torque / _ROTOR),
-            _FRICTION * torque / speed,
-            _FRICTION * torque,
-            _OFFSET * torque,
-        )
+    means = np.concatenate((rotors, damping, friction, np.zeros(4 * n + COUPLING)))
+    rotor, coulomb = np.maximum(rotors, torque / _ROTOR), _FRICTION * torque
+    viscous = coulomb / speed
+    joint_terms = (
+        *(rotor, viscous, coulomb, np.full(n, _LOAD)),
+        *(_OFFSET * torque, coulomb, viscous / speed),
     )
+    if load:
+        J = payload_inertia(max(robot.payload, 1.0))
+        of_load = deviations(chain.tip_placement @ J @ chain.tip_placement.T, 1.0, 2 * PAYLOAD_SIZE)
+        cones.append(
+            Cone(
+                17 * n + COUPLING,
+                np.zeros((4, 4)),
+                np.array([pseudo_inertia(d) for d in of_load.T]),
+            )
+        )
+    else:
+        of_load = np.zeros((LOAD, LOAD))
+    coupling = [each[-1] for each in (rotor, viscous, coulomb)]
+    spread = np.concatenate((*joint_terms, coupling))
     for k in range(_POSITIVE * n):
         cones.append(Cone(10 * n + k, means[[[k]]], spread[[[[k]]]]))
         start.append(np.full(1, 0.1))
     return Prior(
-        mean=np.concatenate((chain.inertias.ravel(), means, [0.0])),
-        D=block_diag(*blocks, np.diag(spread), _DELAY),
+        mean=np.concatenate((chain.inertias.ravel(), means, np.zeros(LOAD + 1))),
+        D=block_diag(*blocks, np.diag(spread), of_load, _DELAY),
         cones=cones,
-        start=np.concatenate((*start, np.zeros(n + 1))),
+        start=np.concatenate((*start, np.zeros(3 * n + COUPLING), 0.1 * np.eye(LOAD + 1)[0])),
     )
 
 
@@ -95,11 +143,12 @@ def _inside(J: Floats, mass: float) -> Floats:
 
 
 def columns_of(parameters: BaseParameters, n: int) -> Floats:
-    """Return the matrix (p + 3 n + 1, 14 n + 1) to [P; viscous; Coulomb; offset; delay]."""
+    """Return the matrix (p + 6 n + 14, 17 n + 14) to [P; COLUMNS; COUPLING; LOAD; delay]."""
     K = parameters.K.reshape(-1, n, ROTOR + 1)
     p = K.shape[0]
-    G = np.zeros((p + 3 * n + 1, 14 * n + 1))
+    others = 6 * n + COUPLING + LOAD + 1
+    G = np.zeros((p + others, 11 * n + others))
     G[:p, : 10 * n] = K[:, :, :ROTOR].reshape(p, -1)
     G[:p, 10 * n : 11 * n] = K[:, :, ROTOR]
-    G[p:, 11 * n :] = np.eye(3 * n + 1)
+    G[p:, 11 * n :] = np.eye(others)
     return G

@@ -42,8 +42,9 @@ def read_recording(
     joints: Sequence[str] = (),
     namespace: str = '',
     names: NameMap = NO_NAMES,
+    commanded: bool = False,  # noqa: FBT001, FBT002 - the last of a list
 ) -> Recording:
-    """Read joint states with efforts, or else with the commanded torques, from any bag.
+    """Read joint states with efforts, or else (or if `commanded`) commanded torques, from any bag.
 
     `text` is the URDF; `joints` are the arm's, from its base to its tip, by default all in the bag
     up to where the arm branches; `namespace` and `names` are as for `what_if`.
@@ -60,7 +61,7 @@ def read_recording(
     messages = content.topics[JOINT_STATES]
     states = messages.joint_states(theirs, ('position',))
     torque, source = states.values[:, 2], f'effort of {messages.name}'
-    if not np.nan_to_num(torque).any():
+    if commanded or not np.nan_to_num(torque).any():
         torque, source = applied_torque(content, states)
         if not np.nan_to_num(torque).any():
             raise BagError(f'{path}: all torques in the {source} are zero: record measured efforts')
@@ -122,3 +123,22 @@ def _resampled(
         for values in (q, torque)
     ]
     return Recording(joints, period, at_grid[0], at_grid[1], gap, source)
+
+
+def joined(first: Recording, second: Recording) -> tuple[Recording, float]:
+    """Return two recordings with a gap between them as one, and the time [s] of the second."""
+    times = np.arange(second.q.shape[0]) * second.period
+    grid = np.arange(0.0, times[-1], first.period)
+    q, torque = (
+        np.transpose([np.interp(grid, times, column) for column in values.T])
+        for values in (second.q, second.torque)
+    )
+    gap = np.interp(grid, times, second.gap) > 0.0
+    gap[0] = True
+    together = first._replace(
+        q=np.vstack((first.q, q)),
+        torque=np.vstack((first.torque, torque)),
+        gap=np.append(first.gap, gap),
+        source=f'{first.source}, {second.source}',
+    )
+    return together, first.q.shape[0] * first.period

@@ -7,6 +7,12 @@ With a smooth g that vanishes at both ends of a window, d/dt(Yp P) + Yr P + fric
 
 exactly, by parts (modulating functions: Shinbrot, On the analysis of linear and nonlinear systems,
 1957).  Both sides pass the same low-pass filter; windows with gaps are left out.
+
+Friction of a joint with speed v and s(v) = tanh(v / v_c):  viscous v,  Coulomb s(v),  load |G| s(v)
+with the torque G of gravity (gears lose what they carry),  Stribeck s(v) exp(-(v / v_s)^2),
+quadratic v |v|.  A motor that drives the last two joints, which are then coupled, adds to each of
+them the same Coulomb friction s(v_1 + v_2), and viscous friction and inertia times the speed and
+acceleration of the other.
 """
 
 from __future__ import annotations
@@ -16,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from blf_dsc_controller.arms.batch import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.identification.recording import Recording
@@ -28,12 +35,25 @@ HOP = WINDOW / 4
 """Time from one window to the next [s]."""
 
 _SMOOTHING = 0.03  # s, over which positions are smoothed
-_COULOMB = 0.01  # rad/s or m/s, scale of the tanh that replaces the sign
+_COULOMB = 0.01  # rad/s or m/s, scale v_c of the tanh that replaces the sign
+_STRIBECK = 0.1  # rad/s or m/s, scale v_s
+_GRAVITY = 0.01  # s between positions at which the torque of gravity is computed
 _REST = 0.05  # rad/s or m/s, below which a joint may stick and its rows count less
 
 
+COLUMNS = ('viscous', 'Coulomb', 'load', 'offset', 'Stribeck', 'quadratic')
+"""Columns of each joint, after those of P."""
+
+COUPLING = 3
+"""Columns of a coupling of the last two joints: inertia, viscous and Coulomb friction."""
+
+
+LOAD = 10
+"""Columns of a load that is picked up."""
+
+
 class Rows(NamedTuple):
-    """R windows of n joints and m unknowns [P; viscous; Coulomb; offset]."""
+    """R windows of n joints and m unknowns [P; COLUMNS of all joints; COUPLING; LOAD]."""
 
     time: Floats  # (R,) of their centres, s
     X: Floats  # (R, n, m)
@@ -44,6 +64,26 @@ class Rows(NamedTuple):
     slope: Floats  # (L,) g' in 1/s, scaled likewise
     starts: np.ndarray  # (R,) first sample of each window
     period: float  # s
+    sliding: Floats  # (N, n) s(v)
+    gravity: Floats  # (N / every, n, p) regressor of the torque of gravity
+    every: int  # samples between its positions
+
+    def gravity_torque(self, P: Floats) -> Floats:
+        """Return the torque of gravity (N, n) of the base parameters P (p,)."""
+        samples = np.arange(len(self.sliding))
+        columns = (self.gravity @ P).T
+        return np.transpose([np.interp(samples, samples[:: self.every], each) for each in columns])
+
+    def set_load(self, P: Floats) -> None:
+        """Compute the columns of the load friction in X for the gravity of P (p,)."""
+        self.set_column('load', P.size, np.abs(self.gravity_torque(P)) * self.sliding)
+
+    def set_column(self, name: str, p: int, values: Floats) -> None:
+        """Set a column of each joint in X to the values (N, n), filtered."""
+        n = values.shape[1]
+        joints = np.arange(n)
+        columns = p + COLUMNS.index(name) * n + joints
+        self.X[:, joints, columns] = self.over_windows(values, self.g)
 
     def u(self, delay: float) -> Floats:
         """Return the right-hand side (R, n) of torques recorded `delay` [s] late."""
@@ -79,9 +119,13 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
     g, slope = np.cos(phase) ** 4, -4.0 * np.cos(phase) ** 3 * np.sin(phase) * turn / h
     g, slope = g / g.sum(), slope / g.sum()
     q, dq = (savgol_filter(recording.q, width, 3, k, h, axis=0) for k in (0, 1))
-    X = np.zeros((starts.size, n, model.p + 3 * n))
+    X = np.zeros((starts.size, n, model.p + len(COLUMNS) * n + COUPLING + LOAD))
     regressors = np.zeros((2, n, model.p))
     add_windows(model, q, dq, g, slope, starts, regressors, X[:, :, : model.p])
+    sliding = np.tanh(dq / _COULOMB)
+    every = max(1, round(_GRAVITY / h))
+    at = q[::every]
+    still = np.zeros_like(at)
     rows = Rows(
         time=(starts + 0.5 * (length - 1)) * h,
         X=X,
@@ -92,12 +136,21 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
         slope=slope,
         starts=starts,
         period=h,
+        sliding=sliding,
+        gravity=regressors_at(model, at, still, still, still),
+        every=every,
     )
-    columns = dq, np.tanh(dq / _COULOMB), np.ones_like(dq)
-    for k, column in enumerate(columns):
-        filtered = rows.over_windows(column, g)
-        for i in range(n):
-            X[:, i, model.p + k * n + i] = filtered[:, i]
+    rows.set_column('viscous', model.p, dq)
+    rows.set_column('Coulomb', model.p, sliding)
+    rows.set_column('offset', model.p, np.ones_like(dq))
+    rows.set_column('Stribeck', model.p, sliding * np.exp(-((dq / _STRIBECK) ** 2)))
+    rows.set_column('quadratic', model.p, dq * np.abs(dq))
+    if n > 1:
+        at = model.p + len(COLUMNS) * n
+        others, both = dq[:, [-1, -2]], np.tanh(dq[:, -2:].sum(axis=1, keepdims=True) / _COULOMB)
+        X[:, -2:, at] = -rows.over_windows(others, slope)
+        X[:, -2:, at + 1] = rows.over_windows(others, g)
+        X[:, -2:, at + 2] = rows.over_windows(both, g)
     moving = dq**2 / (dq**2 + _REST**2)
     return rows._replace(weight=rows.over_windows(moving, g) ** 2)
 

@@ -16,7 +16,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.configuration.reference import MotionLimits
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.law.exciting_reference import ExcitationProblem, search
+from blf_dsc_controller.identification.exciting_reference import ExcitationProblem, search
 from blf_dsc_controller.law.factory import estimate_names, settings_of_config
 from blf_dsc_controller.reference.clearance import Clearance
 from blf_dsc_controller.reference.limits import MotionError

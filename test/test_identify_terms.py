@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What identification makes of friction, rest, other efforts and loads, on exact torques."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio
+import pytest
+from random_arm import PANDA, pinocchio_model
+from shaken_arm import (
+    PANDA_CHAIN,
+    PANDA_TEXT,
+    PERIOD,
+    measured,
+    reference_of,
+    truth_of,
+    write_states,
+)
+
+from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
+from blf_dsc_controller.cli.identify import doubts
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
+from blf_dsc_controller.identification.identify import identify_arm, identify_bag
+from blf_dsc_controller.identification.recording import Recording, joined
+
+ROBOT = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp')
+TRUTH = truth_of(PANDA_CHAIN, 1)
+LOAD = 2.0  # kg, a ball ...
+RADIUS = 0.03  # m
+CENTRE = (0.02, -0.03, 0.05)  # m, ... in the tip
+
+
+def model_of(loaded):
+    bodies = TRUTH.inertias.copy()
+    if loaded:
+        T = PANDA_CHAIN.tip_placement.copy()
+        T[:3, 3] += T[:3, :3] @ CENTRE
+        ball = LOAD * np.diag((*(0.2 * RADIUS**2,) * 3, 1.0))
+        bodies[-1] += inertia_of(T @ ball @ T.T)
+    none = np.zeros(7)
+    model = pinocchio_model(
+        corrected_urdf(PANDA_TEXT, PANDA_CHAIN, bodies, none, none, 'true'), PANDA
+    )
+    model.armature[:] = TRUTH.rotors
+    return model
+
+
+def moved(duration, seed=2, *, loaded=False):
+    """States (N, 3, n) of an exact motion with viscous and Coulomb friction, and its gravity."""
+    model, reference, h = model_of(loaded), reference_of(PANDA_CHAIN, seed), 1e-5
+    data = model.createData()
+    t = np.arange(0.0, duration, PERIOD)
+    q, dq = np.moveaxis(reference.at(t), -2, 0)
+    ddq = (reference.at(t + h)[:, 1] - reference.at(t - h)[:, 1]) / (2.0 * h)
+    torque = np.array([pinocchio.rnea(model, data, *row) for row in zip(q, dq, ddq, strict=True)])
+    gravity = np.array([pinocchio.computeGeneralizedGravity(model, data, row) for row in q])
+    torque += TRUTH.viscous * dq + TRUTH.coulomb * np.sign(dq)
+    return np.stack((q, dq, torque), axis=1), gravity
+
+
+def recording_of(states, seed=3):
+    seen, gap = measured(states, seed), np.zeros(len(states), dtype=bool)
+    return Recording(PANDA, PERIOD, seen[:, 0], seen[:, 2], gap, 'made up')
+
+
+@pytest.fixture(scope='module')
+def plain():
+    return moved(30.0)
+
+
+@pytest.fixture(scope='module')
+def found(plain):
+    return identify_arm(recording_of(plain[0]), ROBOT)
+
+
+def total(found):
+    return np.linalg.norm(found.errors[2]) / np.linalg.norm(found.torque)
+
+
+def test_terms_that_the_data_do_not_show_are_left_out(found):
+    load, stribeck, quadratic = found.joint_terms[[3, 5, 6]]
+    assert not load.any()
+    assert not found.coupling.any()
+    assert np.count_nonzero(stribeck) + np.count_nonzero(quadratic) <= 1  # of 14, by chance
+
+
+def test_joint_that_fits_badly_keeps_its_weight(plain):
+    """A slow torque that no column explains must not make the rest of its joint fit worse.
+
+    Weighted by the correlation length too, the estimate of joint 6 gets worse with every pass.
+    """
+    states = plain[0].copy()
+    t = np.arange(len(states)) * PERIOD
+    states[:, 2, 5] += 0.5 * np.sin(0.9 * t)
+    found = identify_arm(recording_of(states), ROBOT)
+    held = (found.time >= found.held_back[0]) & (found.time <= found.held_back[1])
+    unknown = 0.5 * np.sin(0.9 * found.time[held])
+    rest = found.measured[held, 5] - unknown - found.predicted[2, held, 5]
+    assert np.sqrt(np.mean(rest**2)) < 0.1 * found.torque[5]
+
+
+def test_load_friction_and_stribeck_friction_are_recognised(plain):
+    states, gravity = plain[0].copy(), plain[1]
+    v = states[:, 1]
+    states[:, 2] += 0.06 * np.abs(gravity) * np.sign(v)
+    states[:, 2, 3] += 3.0 * np.sign(v[:, 3]) * np.exp(-((v[:, 3] / 0.1) ** 2))
+    found = identify_arm(recording_of(states), ROBOT)
+    assert total(found) < 0.005
+    np.testing.assert_allclose(found.joint_terms[3, [1, 3]], 0.06, rtol=0.1)
+    assert found.joint_terms[5, 3] == pytest.approx(3.0, rel=0.1)
+    # The URDF has viscous and Coulomb friction only: they take over what they can.
+    assert np.linalg.norm(found.errors[1]) < 0.3 * np.linalg.norm(found.errors[0])
+
+
+def test_coupled_wrist_is_recognised_and_named(plain, tmp_path, capsys):
+    states = plain[0].copy()
+    h = PERIOD
+    others = states[:, 1, [6, 5]]
+    both = np.sign(states[:, 1, 5:].sum(axis=1, keepdims=True))
+    states[:, 2, 5:] += 0.02 * np.gradient(others, h, axis=0) + 0.3 * others + 0.8 * both
+    found = identify_arm(recording_of(states), ROBOT)
+    np.testing.assert_allclose(found.coupling, (0.02, 0.3, 0.8), rtol=0.05)
+    bag = write_states(tmp_path / 'bag', PANDA, states)
+    urdf, page = tmp_path / 'robot.urdf', tmp_path / 'page.html'
+    urdf.write_text(PANDA_TEXT)
+    assert main(['identify', str(bag), '--urdf', str(urdf), '--report', str(page)]) == 0
+    assert 'one motor drives panda_joint6 and panda_joint7' in capsys.readouterr().out
+    text = page.read_text()
+    assert 'data:image/png' in text
+    assert 'panda_link7' in text
+
+
+def test_rest_at_the_end_is_left_out(plain, found):
+    states = plain[0]
+    resting = np.vstack((states, np.repeat(states[-1:], 10_000, axis=0)))
+    resting[len(states) :, 1] = 0.0
+    resting[len(states) :, 2] += 5.0  # stiction, which is no fault of the model
+    recording = recording_of(resting)
+    recording.gap[len(states)] = True  # it stops between two samples
+    other = identify_arm(recording, ROBOT)
+    assert other.rest == pytest.approx(10.0, abs=0.5)
+    assert other.held_back[1] < 30.5
+    assert total(other) == pytest.approx(total(found), rel=0.2)
+    assert not list(doubts(other, 'torque'))
+
+
+def test_efforts_without_gravity_are_named_and_used(plain, found):
+    states, gravity = plain[0].copy(), plain[1]
+    states[:, 2] -= gravity
+    assert 'GRAVITY IS MISSING' in next(doubts(identify_arm(recording_of(states), ROBOT), 'torque'))
+    whole = identify_arm(recording_of(plain[0]), ROBOT, 'without-gravity')
+    assert 'GRAVITY IS DOUBLE' in next(doubts(whole, 'without-gravity'))
+    # The drive compensates the gravity of the URDF exactly: then this is the whole torque.
+    model = pinocchio_model(PANDA_TEXT, PANDA)
+    data = model.createData()
+    states = plain[0].copy()
+    states[:, 2] -= [pinocchio.computeGeneralizedGravity(model, data, q) for q in states[:, 0]]
+    right = identify_arm(recording_of(states), ROBOT, 'without-gravity')
+    assert total(right) < 2.0 * total(found)
+    assert not list(doubts(right, 'without-gravity'))
+
+
+def is_the_load(found):
+    value, deviation = found.load
+    off = np.abs(value - (LOAD, *CENTRE))
+    assert off[0] < 0.05 * LOAD
+    assert (off[1:] < 0.005).all()
+    assert (off < 4.0 * deviation).all()
+    ball = pseudo_inertia(found.values[-11:-1])
+    assert np.linalg.eigvalsh(ball)[0] > 0.0
+
+
+@pytest.fixture(scope='module')
+def loaded():
+    return moved(20.0, 5, loaded=True)[0]
+
+
+def test_load_is_weighed_with_a_recording_without_and_one_with_it(plain, loaded):
+    together, boundary = joined(recording_of(plain[0]), recording_of(loaded, 4))
+    is_the_load(identify_arm(together, ROBOT, picked_up=boundary))
+
+
+def test_load_that_is_picked_up_is_found_and_weighed(plain, loaded, tmp_path, capsys):
+    """The change is found; the jump from one motion to the other is a gap of the recording."""
+    bag = tmp_path / 'bag'
+    jump = np.full((10, 3, 7), np.nan)
+    write_states(bag, PANDA, np.vstack((plain[0], jump, loaded)))
+    found = identify_bag(bag, ROBOT, pick_up=True)
+    assert found.picked_up == pytest.approx(30.0, abs=1.0)
+    is_the_load(found)
+    urdf = tmp_path / 'robot.urdf'
+    urdf.write_text(PANDA_TEXT)
+    assert main(['identify', str(bag), '--urdf', str(urdf), '--payload']) == 0
+    assert 'load from' in capsys.readouterr().out
+
+
+def test_gains_turn_currents_into_torques(plain, found, tmp_path):
+    states, gains = plain[0].copy(), np.linspace(5.0, 11.0, 7)
+    states[:, 2] /= gains
+    bag = write_states(tmp_path / 'bag', PANDA, states)
+    other = identify_bag(bag, ROBOT, gains=gains)
+    np.testing.assert_allclose(other.torque, found.torque, rtol=0.01)
+    with pytest.raises(BlfDscError, match='got 2 gains for 7 joints'):
+        identify_bag(bag, ROBOT, gains=(1.0, 2.0))
