@@ -42,7 +42,7 @@ def test_given_parameters_override_the_derived_ones():
     config = panda(barrier__bound=[0.01] * 7, robot__lag=0.002)
     assert config.barrier.bound == (0.01,) * 7
     assert config.feedback.damping_rate == pytest.approx(
-        panda().feedback.damping_rate * 6.5e-3 / 3.5e-3
+        panda().feedback.damping_rate * 8e-3 / 5e-3
     )
     assert change(config, {'feedback.damping_rate': 5.0}).feedback.damping_rate == 5.0
 

@@ -192,6 +192,22 @@ def test_assumed_torque_limit_is_named():
     assert config_warnings(panda({'robot.urdf': urdf, 'torque.limit': given})) != found
 
 
+def test_pick_up_past_the_bound_is_named_with_what_would_hold():
+    (warning,) = config_warnings(panda({'sample_time': 0.002}))
+    assert warning.startswith('barrier.bound: when 2 kg (robot.payload) are picked up in motion, ')
+    bound, payload = (
+        float(re.search(pattern, warning)[1])
+        for pattern in ('a bound of ([0-9.]+) rad would', 'hold, or ([0-9.]+) kg')
+    )
+    for changes in ({'barrier.bound': [bound] * 7}, {'robot.payload': 0.95 * payload}):
+        assert config_warnings(panda({'sample_time': 0.002, **changes})) == []
+
+
+def test_friction_past_the_bound_is_named():
+    found = config_warnings(panda({'barrier.bound': [0.0002] * 7}))
+    assert any(text.startswith('barrier.bound: friction and unmodelled torque') for text in found)
+
+
 def test_implausible_inertias_are_named():
     urdf = read_urdf('panda.urdf')
     wrong = urdf.replace('ixx="0.037242"', 'ixx="3.0"')

@@ -28,7 +28,7 @@ from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.simulation.record import Record
-from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.supervision.config_warnings import config_warnings, expectation
 from blf_dsc_controller.supervision.supervisor import Reason
 from blf_dsc_controller.view.address import LOCAL, free_port, open_to_others, require_viser
 
@@ -113,6 +113,8 @@ def _configuration(options: Namespace) -> LoopConfig:
     plan_start(controller, np.array(controller.barrier.widest), q, dq)
     for warning in config_warnings(controller, q):
         print(f'warning: {warning}', file=sys.stderr)
+    if controller.model == 'urdf':
+        print(f'errors to expect: {expectation(controller)}')
     return config
 
 

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Default gains and limits of the controller, derived from the URDF of the arm.
 
-The delay of the loop, 1.5 T + robot.lag, gives the rate omega_b = 0.5 / delay, at which the loop
-loses half a radian of phase. Gains are multiples of this rate and of the inertia of each joint with
-the others free, m_i = 1 / (M^-1)_ii, minimised over several postures (doc/arms.md: margins).
+The delay of the loop, 3 T + robot.lag, gives the rate omega_b = 0.625 / delay. Gains are multiples
+of this rate and of the inertia of each joint with the others free, m_i = 1 / (M^-1)_ii, minimised
+over several postures. Three samples: half a sample for which torques are held, one until they are
+applied, half a sample of differenced velocities, and one for the surface filter and alpha2', so
+that gain margins are alike at 1 kHz and 250 Hz (doc/arms.md: margins).
 
 Errors of the modelled gravity, including the rated payload, make a joint sag at the start until the
 disturbance estimate compensates them. If it sags by more than the bound, the bound is a funnel.
@@ -18,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from blf_dsc_controller.configuration.gains import Surface
 from blf_dsc_controller.configuration.robot import given_robot, learned_of, parameters_of
 
 if TYPE_CHECKING:
@@ -27,8 +30,10 @@ if TYPE_CHECKING:
 
 UNKNOWN_EFFORT = 100.0
 """Torque limit [N m] of a joint without one in the URDF."""
+SAMPLES = 3.0
+"""Delay of the loop by its sampling alone, in samples."""
 _SAG = 1.5  # sag over (standard deviation of gravity / m omega_b^2); measured: at most 1
-_PHASE = 0.5  # rad, phase lost to the delay at omega_b
+_PHASE = 0.625  # rad, phase lost to the delay at omega_b
 _BOUND = 0.002  # rad
 _UNMODELLED = 0.01  # rms, fraction of the rated torque: ripple, noise, Stribeck
 _WINDOW = {'base': 5.0, 'payload': 2.0, 'scale': 5.0}  # s
@@ -37,8 +42,30 @@ _PRIOR = {'base': 0.01, 'payload': 0.1, 'scale': 0.1}
 _REGULARISATION = {'base': 1e-5, 'payload': 1e-9, 'scale': 1e-9}  # pulls P (about 1) to 0
 _ANCHOR = 5.0  # times the mean square of the unmodelled torque
 _POSTURES = 20
+_ROWS, _CHECKS = 0.01, 0.05  # s, between rows of the window and between its checks
+_SURFACE = 0.0015  # s, least time constant of the surface filter: noise of alpha2'
 _FREE = 2.0 * math.pi  # rad, position limit of a joint without one
 _SLOW = 0.5  # fraction of the rated velocity
+
+
+def loop_delay(sample_time: float, lag: float) -> float:
+    """Return the delay of the loop [s] that its gains allow for."""
+    return SAMPLES * sample_time + lag
+
+
+def sample_time_of(given: Mapping[str, Any]) -> float:
+    """Return the given sample time [s], which is validated later, or the default."""
+    period = given.get('sample_time')
+    return period if isinstance(period, float) and 0.0 < period < math.inf else 0.001
+
+
+def planar_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
+    """Return what follows the sample time for the planar arms, whose gains do not."""
+    period = sample_time_of(given)
+    return {
+        'surface.time_constant': max(period, Surface().time_constant),
+        'learning.interval': max(1, round(0.01 / period)),
+    }
 
 
 def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
@@ -55,11 +82,11 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
     parameters = parameters_of(robot, chain)
     P = parameters.of(chain.inertias, robot.rotors(chain))
     P0 = learned_of(robot, chain).initial
-    period = given.get('sample_time', 0.001)
-    rate = _PHASE / (1.5 * period + robot.lag) if isinstance(period, float) else 0.0
+    period = sample_time_of(given)
+    rate = _PHASE / loop_delay(period, robot.lag)
     limits = tuple(lower), tuple(upper)
     m, gravity = over_postures(chain, parameters, robot.payload, tuple(P), *limits)
-    sag = _SAG * gravity / (m * rate**2) if rate else np.zeros(n)
+    sag = _SAG * gravity / (m * rate**2)
     floor = _UNMODELLED * robot.efforts(chain)
     zeros = (0.0,) * n
     return {
@@ -71,6 +98,7 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
         'barrier.slope_limit': _listed(m * rate**2),
         'surface.gain': (2.0 * rate,) * n,
         'surface.mu': (0.5 * rate,) * n,
+        'surface.time_constant': max(period, _SURFACE),
         'feedback.gain': zeros,
         'feedback.damping': zeros,
         'feedback.damping_rate': 0.6 * rate,
@@ -92,8 +120,8 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
         'learning.regularization': _REGULARISATION[robot.learn],
         'learning.settling_time': 0.3,
         'learning.filter_pole': 20.0,
-        'learning.row_interval': 10,
-        'learning.interval': 50,
+        'learning.row_interval': max(1, round(_ROWS / period)),
+        'learning.interval': max(1, round(_CHECKS / period)),
         'learning.excitation_threshold': 1e-9,
         'learning.prior_weight': _PRIOR[robot.learn],
         'learning.anchor_weight': _ANCHOR * float(floor.min()) ** 2,

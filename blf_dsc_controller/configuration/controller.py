@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
-from blf_dsc_controller.configuration.arm_defaults import controller_defaults
+from blf_dsc_controller.configuration.arm_defaults import controller_defaults, planar_defaults
 from blf_dsc_controller.configuration.common import (
     PerJoint,
     Realtime,
@@ -165,7 +165,7 @@ class ControllerConfig(Sampled):
     def defaults(cls, given: Mapping[str, Any]) -> Mapping[str, Value]:
         """Return gains and limits for the arm of a URDF; the defaults suit the two-link arm."""
         if given.get('model', 'urdf' if given.get('robot.urdf') else '') != 'urdf':
-            return {}
+            return planar_defaults(given)
         return {'model': 'urdf', **controller_defaults(given)}
 
     def problems(self) -> list[str]:

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.inertia import pseudo_inertia
 from blf_dsc_controller.arms.urdf import Chain
-from blf_dsc_controller.configuration.arm_defaults import UNKNOWN_EFFORT
+from blf_dsc_controller.configuration.arm_defaults import SAMPLES, UNKNOWN_EFFORT, loop_delay
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import Robot, implausible_friction
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.settings import FILTERED, LINEAR, NEWTON, Settings
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
+from blf_dsc_controller.supervision.linear_loop import ExpectedErrors, expected_errors
 from blf_dsc_controller.supervision.reference_load import (
     ReferenceLoad,
     reference_load,
@@ -60,6 +61,8 @@ def config_warnings(
     load = load or reference_load(config, settings)
     found = [*_of_start(config, q), *_of_urdf(config, load)]
     found += [one.text for one in _of_gains(config, load)]
+    if config.model == 'urdf' and config.law == 'blf_dsc':
+        found += _of_errors(config, expected_errors(config, settings))
     if settings.surface != LINEAR and settings.kappa > 0.0 and settings.Gamma.any():
         windows = windows_along(config, settings)
         found += _of_update(config, settings, windows)
@@ -141,6 +144,43 @@ def _of_placeholders(robot: Robot, chain: Chain) -> Iterator[str]:
             f'robot.coulomb: the friction in <dynamics> takes a quarter of the effort of '
             f'{", ".join(joints)} or more: it is hardly real, so none of it is compensated before '
             f'it is learned; give robot.viscous and robot.coulomb'
+        )
+
+
+def expectation(config: ControllerConfig) -> str:
+    """Return the largest errors to expect of an arm of a URDF, in a sentence."""
+    errors = expected_errors(config, settings_of_config(config))
+    usual, most = (1e3 * float(each.max()) for each in errors)
+    joint = config.joints[int(errors.pick_up.argmax())]
+    return (
+        f'{usual:.2g} mrad by friction and unmodelled torque; {most:.2g} mrad of {joint} when '
+        f'{config.robot.payload:g} kg are picked up in motion'
+    )
+
+
+def _of_errors(config: ControllerConfig, errors: ExpectedErrors) -> Iterator[str]:
+    """Check that the errors to expect are within the bound."""
+    bound, T, robot = np.array(config.barrier.bound), config.sample_time, config.robot
+    worst = int(np.argmax(errors.unmodelled / bound))
+    if errors.unmodelled[worst] > bound[worst]:
+        yield (
+            f'barrier.bound: friction and unmodelled torque (learning.residual_floor) alone push '
+            f'{config.joints[worst]} about {errors.unmodelled[worst]:.2g} rad from its reference, '
+            f'past its bound of {bound[worst]:g} rad: give a wider bound'
+        )
+    worst = int(np.argmax(errors.pick_up / bound))
+    peak = errors.pick_up[worst]
+    if peak > bound[worst]:
+        share = bound[worst] / peak
+        faster = loop_delay(T, robot.lag) * math.sqrt(share) - robot.lag
+        remedy = f'a lower robot.lag than {robot.lag:g} s'
+        if faster > 0.0:
+            remedy = f'a sample time of {faster / SAMPLES:.2g} s'
+        yield (
+            f'barrier.bound: when {robot.payload:g} kg (robot.payload) are picked up in motion, '
+            f'{config.joints[worst]} is expected to be {peak:.2g} rad from its reference, past its '
+            f'bound of {bound[worst]:g} rad: a bound of {1.1 * peak:.2g} rad would hold, or '
+            f'{share * robot.payload:.2g} kg, or {remedy}'
         )
 
 

@@ -53,7 +53,7 @@ class ReferenceLoad(NamedTuple):
 def reference_load(config: ControllerConfig, settings: Settings) -> ReferenceLoad:
     """Evaluate the dynamics along the reference, over its slowest period."""
     model, P = settings.model, settings.initial_estimate[: settings.p]
-    moments = np.linspace(0.0, _horizon(config), _POINTS, endpoint=False)
+    moments = np.linspace(0.0, horizon(config), _POINTS, endpoint=False)
     q, dq, ddq = np.moveaxis(sampled(reference_of(config), moments), 1, 0)
     torque = np.abs(regressors_at(model, q, dq, dq, ddq) @ P).max(axis=0)
     M = inertia_matrices(model, P, q)
@@ -69,7 +69,7 @@ def windows_along(config: ControllerConfig, settings: Settings) -> Floats:
     step = learning.window / max(_WINDOW_POINTS, learning.window * learning.filter_pole / _FINE)
     step = max(step, config.sample_time)
     window, start = round(learning.window / step), round(settings.learning_start / step)
-    times = np.arange(start + round(_horizon(config) / step) + 1) * step
+    times = np.arange(start + round(horizon(config) / step) + 1) * step
     motion = sampled(reference_of(config), times)
     rows = rows_along(settings, pack(settings), times, motion)
     if settings.prediction == FILTERED:
@@ -86,7 +86,7 @@ def windows_along(config: ControllerConfig, settings: Settings) -> Floats:
     return np.array(found)
 
 
-def _horizon(config: ControllerConfig) -> float:
+def horizon(config: ControllerConfig) -> float:
     """Return the time [s] that covers the whole reference, at most `_LONGEST`."""
     if config.reference.type == 'waypoints':
         return min(max(config.reference.times), _LONGEST)

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sampled loop at small errors: its margins, and the errors to expect from it.
+
+About a motion that the law follows, learning aside, the law is linear in the errors, and so is the
+arm with its inertia M of that posture.  From one sample to the next the errors of n joints follow
+x+ = A x + B d with, for each joint,
+
+    x = [q, dq, drive torque, torque of the last sample, q of the last sample, filtered dq,
+         alpha2, d^3]
+
+where d [N m] is the torque that the model lacks.  Torques arrive a sample late and pass the drives,
+velocities are differences of positions behind a filter; each of both lags is half of `robot.lag`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.arms.batch import inertia_matrices, regressors_at
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.robot import learned_of
+from blf_dsc_controller.law.settings import Settings
+from blf_dsc_controller.law.surface import filter_gain
+from blf_dsc_controller.reference.approach import reference_of
+from blf_dsc_controller.reference.terms import sampled
+from blf_dsc_controller.supervision.reference_load import horizon
+
+Floats = NDArray[np.float64]
+
+_SETTLED = 20.0  # time constants of the damping, for which the response is followed
+_BISECTIONS = 16
+_MOMENTS = 40  # of the reference
+_REVERSAL = 0.75  # of Coulomb friction: half of it too much at breakaway, with either sign
+
+
+class Loop(NamedTuple):
+    """What the loop at small errors depends on besides the gains."""
+
+    sample_time: float  # s
+    lag: float  # s, of velocity filter and drives together
+    delay: float = 1.0  # samples from a state to its torque: 0 to 1
+
+
+def transition(
+    settings: Settings, loop: Loop, M: Floats, M0: Floats, stiffness: Floats
+) -> tuple[Floats, Floats]:
+    """Return A (k, 8 n, 8 n) and B (k, 8 n, n) for the inertias M and M0 of the model (k, n, n).
+
+    `stiffness` (n,) [N m/rad] is the slope of the barrier.
+    """
+    T, n = loop.sample_time, settings.n
+    decay = np.exp(-T / max(0.5 * loop.lag, 1e-9))  # of the drives
+    mean = (1.0 - decay) * 0.5 * loop.lag / T  # of the drives' transient over the sample
+    rate = settings.K / 2.0 + settings.mu
+    g = filter_gain(settings.time_constant, T)
+    unit, zero = np.eye(n), np.zeros((n, n))
+    # Rows of what the law computes, in terms of x: alpha2', xi2 and the torque.
+    q, dq, drive, last, before, speed, alpha2, d3 = (
+        np.concatenate([unit if i == k else zero for i in range(8)], axis=1) for k in range(8)
+    )
+    measured = speed + (1.0 - decay) * ((q - before) / T - speed)
+    beta2 = -rate[:, None] * q
+    dalpha2 = g * (beta2 - alpha2) / T
+    xi2 = measured - alpha2
+    torque = (
+        M0 @ (dalpha2 - settings.damping_rate * xi2)
+        - settings.Kp[:, None] * xi2
+        - stiffness[:, None] * q
+        + d3
+    )
+    held = loop.delay * last + (1.0 - loop.delay) * torque
+    applied = mean * drive + (1.0 - mean) * held  # mean over the sample
+    free = np.linalg.inv(M)
+    push = free @ applied
+    rows = [
+        q + T * dq + 0.5 * T**2 * push,
+        dq + T * push,
+        decay * drive + (1.0 - decay) * held,
+        torque,
+        np.broadcast_to(q, torque.shape),
+        np.broadcast_to(measured, torque.shape),
+        np.broadcast_to(alpha2 + T * dalpha2, torque.shape),
+        np.broadcast_to(d3 - T * settings.gamma[:, None] * xi2, torque.shape),
+    ]
+    A = np.concatenate(np.broadcast_arrays(*rows), axis=1)
+    B = np.zeros((*A.shape[:-1], n))
+    B[:, :n], B[:, n : 2 * n] = 0.5 * T**2 * free, T * free
+    return A, B
+
+
+def growth(settings: Settings, loop: Loop, M: Floats, M0: Floats, stiffness: Floats) -> float:
+    """Return the largest factor by which errors grow from sample to sample; stable below 1."""
+    A, _ = transition(settings, loop, M, M0, stiffness)
+    return float(np.abs(np.linalg.eigvals(A)).max())
+
+
+def margins(settings: Settings, loop: Loop, M0: Floats, stiffness: Floats) -> tuple[float, float]:
+    """Return how many times lighter the arm, and how many seconds later the loop, may be."""
+
+    def largest(reach: float, *, lighter: bool) -> float:
+        low, high = 0.0, reach
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            M = M0 / (1.0 + middle) if lighter else M0
+            slower = loop if lighter else loop._replace(lag=loop.lag + middle)
+            if growth(settings, slower, M, M0, stiffness) < 1.0:
+                low = middle
+            else:
+                high = middle
+        return low
+
+    return 1.0 + largest(9.0, lighter=True), largest(0.05, lighter=False)
+
+
+def peak_errors(settings: Settings, loop: Loop, M: Floats, M0: Floats, torque: Floats) -> Floats:
+    """Return the largest errors (k, n) [rad] after a step of the torque d (k, n) [N m]."""
+    A, B = transition(settings, loop, M, M0, settings.weight)
+    push = (B @ torque[..., None])[..., 0]
+    x, largest = np.zeros_like(push), np.zeros_like(torque)
+    rate = max(settings.damping_rate, 1.0)
+    for _ in range(round(_SETTLED / rate / loop.sample_time)):
+        x = (A @ x[..., None])[..., 0] + push
+        largest = np.maximum(largest, np.abs(x[:, : settings.n]))
+    return largest
+
+
+class ExpectedErrors(NamedTuple):
+    """Largest errors (n,) [rad] along the reference, before anything is learned of their cause."""
+
+    unmodelled: Floats  # of learning.residual_floor and friction at a reversal
+    pick_up: Floats  # when robot.payload is picked up in motion
+
+
+def expected_errors(config: ControllerConfig, settings: Settings) -> ExpectedErrors:
+    """Return the errors to expect from an arm of a URDF, by the linear loop without the barrier."""
+    model, robot = settings.model, config.robot
+    chain = robot.chain(config.joints)
+    q, dq, ddq = _motion(config)
+    P0 = settings.initial_estimate[: settings.p]
+    load = robot.payload * learned_of(robot, chain).load
+    M0, M = (inertia_matrices(model, P, q) for P in (P0, P0 + load))
+    loop = Loop(config.sample_time, robot.lag)
+    floor = np.array(config.learning.residual_floor)
+    floor += _REVERSAL * np.array(robot.friction(chain)['coulomb'])
+    unmodelled = peak_errors(settings, loop, M0, M0, np.broadcast_to(floor, q.shape))
+    pick_up = peak_errors(settings, loop, M, M0, regressors_at(model, q, dq, dq, ddq) @ load)
+    return ExpectedErrors(unmodelled.max(axis=0), pick_up.max(axis=0))
+
+
+def _motion(config: ControllerConfig) -> Floats:
+    """Return q, dq, ddq (3, k, n) along the reference; of one that holds, postures at rest."""
+    if config.reference.type == 'hold':
+        limits = config.limits.position_lower, config.limits.position_upper
+        q = np.random.default_rng(0).uniform(*limits, (_MOMENTS, len(config.joints)))
+        return np.stack((q, np.zeros_like(q), np.zeros_like(q)))
+    times = np.linspace(0.0, horizon(config), _MOMENTS, endpoint=False)
+    return np.moveaxis(sampled(reference_of(config), times), 1, 0)
