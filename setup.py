@@ -144,6 +144,7 @@ setup(
             'blf_dsc_controller = blf_dsc_controller.cli.main:blf_dsc_controller',
             'bag_recorder = blf_dsc_controller.cli.main:bag_recorder',
             'arm_markers = blf_dsc_controller.cli.main:arm_markers',
+            'torque_watchdog = blf_dsc_controller.cli.main:torque_watchdog',
             'view = blf_dsc_controller.cli.main:view',
             # Aliases of sub-commands: run, replay, report, ...
             'closed_loop = blf_dsc_controller.cli.main:closed_loop',

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start the simulated arm, the controller and, with `bag`, the recorder.
+"""Start the simulated arm, the controller, its watchdog and, with `bag`, the recorder.
 
 For instance: ros2 launch blf_dsc_controller closed_loop.launch.py mode:=lockstep bag:=run1
 """
@@ -93,6 +93,7 @@ def nodes(context: LaunchContext) -> list[Node]:
         started.append(node('arm_markers', {}, required=False))
     if bag:
         started.append(node('bag_recorder', {'output': bag}))
+    started.append(node('torque_watchdog', {}, required=False))
     return [*started, node('blf_dsc_controller', of_loop), node('sim_plant', of_plant)]
 
 

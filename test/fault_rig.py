@@ -64,12 +64,8 @@ class Rig:
 
     def controller(self):
         """Start a controller process: activated, with nothing learned."""
-        config = self.config
-        measured = config.safety.velocity == 'measured'
-        fields = ('position', 'velocity') if measured else ('position',)
-        fields += ('effort',) * (config.learning.torque_source == 'effort')
-        self._decoder = JointStateDecoder(JOINTS, fields)
-        guard = Guard(config, lambda: self.steady, lambda: self.wall)
+        self._decoder = JointStateDecoder(JOINTS, required=('position',))
+        guard = Guard(self.config, lambda: self.steady, lambda: self.wall)
         guard.activate()
         return guard
 

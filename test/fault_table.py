@@ -368,7 +368,7 @@ FAULTS = (
     ),
     Fault('only states of another robot', every(renamed('a', 'b')), R.STATE_TIMEOUT, 60, live=True),
     Fault('no positions', once(unmeasured('position')), R.FIELD_MISSING),
-    Fault('no velocities', once(unmeasured('velocity')), R.FIELD_MISSING),
+    Fault('no velocities', once(unmeasured('velocity')), R.NOT_FINITE),
     Fault(
         'no velocities, estimated from positions',
         every(unmeasured('velocity', 'effort')),
@@ -464,7 +464,7 @@ def rows() -> Iterator[str]:
         outcome = run(fault)
         stopped = outcome.noticed >= 0
         noticed = f'{outcome.noticed}' if stopped else 'tolerated'
-        largest = f'{np.abs(outcome.after).max():.3g}'
+        largest = f'{np.abs(outcome.after).max():.3g}' if len(outcome.after) else 'none'
         recovered = 'yes' if outcome.recovered else 'NO'
         yield f'| {fault.name} | {noticed} | {outcome.reason} | {largest} | {recovered} |\n'
 

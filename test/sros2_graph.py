@@ -16,6 +16,7 @@ from ros_rig import RosRig
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.markers_node import MarkersNode
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
+from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 from blf_dsc_controller.view.node import ViewNode
 from sim_plant.node import PlantNode
 
@@ -64,15 +65,17 @@ def live():
             ros.add(ControllerNode, sample_time=0.02)
             ros.add(MarkersNode)
             ros.add(ViewNode)
+            watchdog = ros.add(WatchdogNode)
             recorder = ros.add(BagRecorderNode, output=bag)
             recorder._parameter_client.request = lambda *_: (
                 None
             )  # no short-lived clients in one process
-            ros.until(lambda: is_recording_all(ros))
+            ros.until(lambda: is_recording_all(ros) and watchdog.line)
             nodes = {
                 'sim_plant': ['sim_plant'],
                 'blf_dsc_controller': ['blf_dsc_controller'],
                 'arm_markers': ['arm_markers', '_arm_markers_subscriptions'],
+                'torque_watchdog': ['torque_watchdog', '_torque_watchdog_subscriptions'],
                 'view': ['view', '_view_subscriptions'],
                 'bag_recorder': ['bag_recorder', '_bag_recorder_subscriptions'],
             }
@@ -84,12 +87,14 @@ def live():
             ros.executor.remove_node(recorder)
             ros.spin(0.1)
             recorder.close()
-            # It requests the parameters of each node once, by short-lived clients.
+            # Both request the parameters of nodes once, by short-lived clients.
+            services = 'get_parameters', 'list_parameters'
             found['bag_recorder']['request'] = sorted(
-                f'/{name}/{service}'
-                for name in nodes
-                for service in ('get_parameters', 'list_parameters')
+                f'/{name}/{service}' for name in nodes for service in services
             )
+            found['torque_watchdog']['request'] = [
+                f'/blf_dsc_controller/{service}' for service in services
+            ]
             return found
     finally:
         ros.close()

@@ -27,6 +27,7 @@ from blf_dsc_controller.nodes.arguments import assigned
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.markers_node import MarkersNode
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
+from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 from sim_plant.node import PlantNode
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -35,6 +36,7 @@ NODES = {
     'blf_dsc_controller': ControllerNode,
     'bag_recorder': BagRecorderNode,
     'arm_markers': MarkersNode,
+    'torque_watchdog': WatchdogNode,
 }
 
 

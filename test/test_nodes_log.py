@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections import deque
 from functools import partial
 
 import numba
@@ -15,21 +16,25 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from command import finished
 from fake_clock import FakeClock
+from plain_law import dynamics
 from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from ros_rig import START, deactivate
+from ros_rig import START, deactivate, shutdown, torques
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.compiled import jit
 from blf_dsc_controller.compiled.notice import COMPILING
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.supervision.supervisor import Phase
 from sim_plant.node import PlantNode
 
 KEPT = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+PLAIN = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
+ZERO = (0.0, 0.0)
 FATAL = int.from_bytes(Log.FATAL, 'little') if isinstance(Log.FATAL, bytes) else Log.FATAL
 
 
@@ -75,9 +80,57 @@ def test_log_suggests_resetting_the_controller_without_a_simulated_arm(ros, log)
     states = ros.tester.create_publisher(JointState, '/real/joint_states', 1)
     ros.until(states.get_subscription_count)
     states.publish(b'')
+    ros.until(lambda: log('real', 'not started, waiting for a usable joint state: '))
+    states.publish(JointStateEncoder(('joint1', 'joint2')).encode(10**9, START, ZERO, ZERO))
+    ros.until(lambda: log('real', 'tracking'))
+    states.publish(b'')
     ros.until(lambda: log('real', '', FATAL))
     (stop,) = log('real', '', FATAL)
     assert stop.endswith('/real/blf_dsc_controller/reset starts again from where the arm is')
+
+
+def test_a_stop_is_logged_once(ros, log):
+    node = ros.add(ControllerNode, {'safety.torque': 'hold_gravity'}, namespace='once')
+    driver = (Float64MultiArray, '/once/blf_dsc_controller/commands', lambda _: None, 1)
+    ros.tester.create_subscription(*driver)
+    states = ros.tester.create_publisher(JointState, '/once/joint_states', 50)
+    ros.until(states.get_subscription_count)
+    encoder = JointStateEncoder(('joint1', 'joint2'))
+    for k in (0, 1, 2, 60, 61, 62):
+        states.publish(encoder.encode(10**9 + k * 10**6, START, ZERO, ZERO))
+        ros.until(lambda k=k: node.guard.journal.stamp == 10**9 + k * 10**6)
+        node._report_if_changed(node.guard)
+    node.guard._note(EventType.SILENCE, torques=1)
+    node._report_if_changed(node.guard)
+    ros.until(lambda: log('once', '', FATAL))
+    ros.spin(0.2)
+    assert len(log('once', '', FATAL)) == 1
+
+
+def test_leaving_node_commands_the_safe_torque_last(ros):
+    """A driver holds it: zero would drop the arm. In motion, the arm is brought to rest first."""
+    commands = ros.listen(topics.COMMANDS)
+    given = {'safety.torque': 'hold_gravity', 'learning.initial_estimate': [1.0, 0.32, 0.4]}
+    arm, law = ros.loop(PLAIN, given)
+    ros.run(arm, 500)
+    assert np.abs(arm.plant.measure()[2:4]).min() > 0.1
+    ros.until(law.ready_to_end)
+    assert np.abs(arm.plant.measure()[2:4]).max() < 0.05
+    law.close()
+    ros.until(lambda: not ros.spin(0.1))
+    gravity = dynamics((1.0, 0.32, 0.4), 9.8, arm.plant.measure()[:2], ZERO)[2]
+    np.testing.assert_allclose(torques(commands)[-1], gravity, atol=0.1)
+    assert law.guard.journal.pending == deque()
+
+
+@pytest.mark.parametrize('way', [deactivate, shutdown])
+def test_every_lifecycle_way_out_leaves_the_safe_torque(ros, way):
+    commands = ros.listen(topics.COMMANDS)
+    arm, law = ros.loop(controller={'safety.torque': 'hold_gravity'})
+    ros.run(arm, 50)
+    assert way(ros, law)
+    ros.spin(0.3)
+    assert (np.abs(torques(commands)[-1]) > 1.0).all()
 
 
 def test_end_of_a_real_time_run_is_not_a_fault(ros, log):

@@ -29,6 +29,7 @@ EXECUTABLES = {
     'blf_dsc_controller',
     'bag_recorder',
     'arm_markers',
+    'torque_watchdog',
     'view',
     'closed_loop',
     'excite',

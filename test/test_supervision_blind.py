@@ -7,34 +7,74 @@ import numpy as np
 import pytest
 from fault_rig import Rig
 from fault_table import named
+from plain_law import dynamics
 
-from blf_dsc_controller.supervision.supervisor import Phase
+from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
 HOLDING = {'safety.torque': 'hold_gravity'}
+LEARNED = HOLDING | {'learning.initial_estimate': [1.0, 0.32, 0.4]}
 NAN = np.full(2, np.nan)
 FIRST = {
     'unreadable': lambda _: b'',
     'not finite': lambda state: state.raw(q=NAN, dq=NAN),
     'of other joints': lambda state: state.raw(named('joint1', 'joint3')),
 }
+NEVER = FIRST | {
+    'too fast': lambda state: state.raw(dq=np.array([0.0, 60.0])),
+    'without velocities': lambda state: state.raw(
+        named('joint1', 'joint2', fields=('position', 'effort')), dq=[]
+    ),
+    'without a stamp': lambda state: state.raw(stamp=0),
+}
 UNUSABLE = FIRST | {'frozen': lambda state: state.raw(stamp=1_000_000_000)}
 
 
 def moving(given):
-    """Rig after half a second, when both joints are moving."""
-    rig = Rig(given)
+    """Rig after half a second, when both joints are moving, without a disturbance."""
+    rig = Rig(
+        given, plant={'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
+    )
     rig.step(500)
     assert (np.abs(rig.state().dq) > 0.1).all()
     return rig
 
 
 @pytest.mark.parametrize('safety', ['damping', 'hold_gravity'])
-@pytest.mark.parametrize('raw', FIRST.values(), ids=FIRST)
-def test_nothing_is_commanded_before_the_first_usable_state(safety, raw):
+@pytest.mark.parametrize('raw', NEVER.values(), ids=NEVER)
+def test_controller_waits_silently_for_the_first_usable_state(safety, raw):
     rig = Rig({'safety.torque': safety})
-    assert rig.deliver(raw(rig.state())) is None
-    assert rig.deliver(raw(rig.state())) is None
-    assert rig.supervisor.phase is Phase.SAFE_STOP
+    for _ in range(3):
+        assert rig.deliver(raw(rig.state())) is None
+        assert rig.guard.waiting_for
+    assert (rig.supervisor.phase, rig.supervisor.stops) == (Phase.STARTING, 0)
+    rig.step(2)
+    assert rig.supervisor.phase is Phase.TRACKING
+    assert not rig.guard.waiting_for
+    assert len(rig.commands) == 2
+
+
+def test_missing_velocities_at_the_start_are_reported_with_their_remedy():
+    rig = Rig()
+    rig.deliver(rig.state().raw(dq=NAN))
+    assert 'set safety.velocity to estimated' in rig.guard.waiting_for
+
+
+def test_controller_that_was_refused_its_start_stays_silent():
+    rig = Rig({'approach.enabled': False})
+    rig.plant.state[1] += 0.1
+    rig.step(20)
+    assert rig.supervisor.reason is Reason.START_REJECTED
+    assert not rig.commands
+
+
+def test_unusable_states_after_a_reset_leave_the_safe_torque_in_force():
+    """A driver that holds the last torque of the law for ever must get another."""
+    rig = Rig(HOLDING)
+    rig.step(20)
+    rig.guard.reset()
+    torque = rig.deliver(rig.state().raw(dq=NAN))
+    assert rig.supervisor.phase is Phase.STARTING
+    assert (np.abs(torque) > 1.0).all()
 
 
 @pytest.mark.parametrize('raw', UNUSABLE.values(), ids=UNUSABLE)
@@ -89,3 +129,73 @@ def test_torque_fades_when_silence_follows_a_deactivation(again):
     rig.base += rig.steady - 5_000_000_000
     rig.step(1)
     assert rig.supervisor.phase is (Phase.TRACKING if again else Phase.INACTIVE)
+
+
+def test_after_a_long_silence_nothing_is_commanded_until_a_reset():
+    """By then the torque has faded: whoever restarted the driver may not expect another."""
+    rig = Rig(HOLDING, live=True)
+    rig.step(20)
+    rig.wait(3000)
+    commands = len(rig.commands)
+    rig.base += 3_000_000_000
+    rig.step(50)
+    assert len(rig.commands) == commands
+    assert 'joint states are back after 3 s' in rig.supervisor.text
+    assert rig.guard.release() is None
+    rig.guard.reset()
+    rig.step(5)
+    assert rig.supervisor.running
+    assert len(rig.commands) == commands + 5
+
+
+def test_after_a_short_silence_the_safe_torque_returns():
+    rig = Rig(HOLDING, live=True)
+    rig.step(20)
+    rig.wait(1000)
+    rig.base += 1_000_000_000
+    rig.step(1)
+    assert (np.abs(rig.commands[-1]) > 1.0).all()
+
+
+@pytest.mark.parametrize('dq', [NAN, np.array([60.0, np.inf])], ids=['missing', 'too fast'])
+def test_missing_and_implausible_velocities_are_differenced_from_the_positions(dq):
+    """Also without a velocity, gravity is held and the motion damped."""
+    rig = moving(LEARNED)
+    true = rig.state().dq
+    rig.sense = lambda state: [state.raw(dq=dq)]
+    rig.step(2)
+    assert rig.supervisor.phase is Phase.SAFE_STOP
+    np.testing.assert_allclose(rig.guard._safe_torque.last.dq, true, atol=0.05)
+    rig.step(1000)
+    assert np.abs(rig.state().dq).max() < 0.1  # a falling arm has several rad/s by then
+
+
+def test_joint_that_is_really_too_fast_is_damped_most():
+    rig = Rig({'safety.torque': 'damping', 'safety.velocity_limit': 1.0})
+    rig.step(20)
+    state, torque = rig.state(), None
+    for k in range(1, 3):
+        later = state.q + k * 1e-3 * np.array([3.0, 0.1])
+        torque = rig.deliver(state.raw(stamp=state.stamp + k * 10**6, q=later, dq=[3.0, 0.1]))
+    np.testing.assert_allclose(torque, [-2.0, -0.1])  # D is 2 and 1 N m s/rad
+
+
+@pytest.mark.parametrize('safety', ['hold_gravity', 'damping', 'zero'])
+def test_last_torque_is_the_safe_torque_of_an_arm_at_rest(safety):
+    """A driver may hold it for ever: it is not damped, and there is no ramp any more."""
+    rig = moving({'safety.torque': safety})
+    torque = rig.guard.release()
+    P = rig.guard.samples.estimate[:3]
+    gravity = dynamics(P, 9.8, rig.guard._safe_torque.last.q, (0.0, 0.0))[2]
+    np.testing.assert_allclose(torque, gravity if safety == 'hold_gravity' else [0.0, 0.0])
+
+
+def test_arm_settles_after_a_deactivation():
+    """Then the last torque holds it."""
+    rig = moving(LEARNED)
+    assert not rig.guard.is_settled
+    rig.guard.deactivate()
+    rig.step(400)
+    assert not rig.guard.is_settled  # on the ramp
+    rig.step(3000)
+    assert rig.guard.is_settled

@@ -21,6 +21,7 @@ CONTROLLER = 'blf_dsc_controller'
 RECORDER = 'bag_recorder'
 MARKERS = 'arm_markers'
 VIEW = 'view'
+WATCHDOG = 'torque_watchdog'
 
 _of_bag = partial(parameter, read_only='a bag is opened once, when the recorder starts')
 _of_view = partial(parameter, read_only='the page is served once, when the node starts')
@@ -109,6 +110,20 @@ class MarkersConfig:
 
 
 @dataclass(frozen=True)
+class WatchdogConfig:
+    """Parameters of the node `torque_watchdog`."""
+
+    timeout: float = parameter(
+        0.05,
+        'silence of the controller, while joint states go on, after which it commands',
+        's',
+        at_least=0.005,
+        at_most=10.0,
+        read_only='it is read once, when the node starts',
+    )
+
+
+@dataclass(frozen=True)
 class ViewConfig:
     """Parameters of the node `view`."""
 
@@ -119,13 +134,22 @@ class ViewConfig:
 
 
 NODES: Mapping[
-    str, type[PlantConfig | ControllerConfig | RecorderConfig | MarkersConfig | ViewConfig]
+    str,
+    type[
+        PlantConfig
+        | ControllerConfig
+        | RecorderConfig
+        | MarkersConfig
+        | ViewConfig
+        | WatchdogConfig
+    ],
 ] = {
     PLANT: PlantConfig,
     CONTROLLER: ControllerConfig,
     RECORDER: RecorderConfig,
     MARKERS: MarkersConfig,
     VIEW: ViewConfig,
+    WATCHDOG: WatchdogConfig,
 }
 
 

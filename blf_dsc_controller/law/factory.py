@@ -108,13 +108,6 @@ def column_limits(config: ControllerConfig) -> tuple[tuple[float, ...], tuple[fl
     return tuple(least), tuple(most)
 
 
-def required_fields(config: ControllerConfig) -> tuple[str, ...]:
-    """Return the fields of a joint state that the controller needs."""
-    velocity = ('velocity',) if config.safety.velocity == 'measured' else ()
-    effort = ('effort',) if config.learning.torque_source == 'effort' else ()
-    return ('position', *velocity, *effort)
-
-
 def settings_of_config(config: ControllerConfig) -> Settings:
     """Return the settings of a configuration, in the paper's symbols."""
     model = model_of(config)

@@ -160,12 +160,6 @@ class Decoder(ABC):
         self.values[self._known] = grid[self._places]
 
 
-_WITHOUT = {
-    'velocity': ', or set safety.velocity to estimated',
-    'effort': ', or set learning.torque_source to command',
-}
-
-
 class JointStateDecoder(Decoder):
     """Decoder of sensor_msgs/JointState into arrays in the order of the n `joints`, by name.
 
@@ -217,7 +211,7 @@ class JointStateDecoder(Decoder):
             if array.size != len(layout.names):
                 raise ShortArrayError(
                     f'`{field}` of the message holds {array.size} values for {len(layout.names)} '
-                    f'names: publish one value for each name{_WITHOUT.get(field, "")}'
+                    f'names: publish one value for each name'
                 )
             row[:] = columns + array.place
         return places.ravel()

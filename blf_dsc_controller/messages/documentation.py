@@ -86,7 +86,7 @@ _ABOUT = {
         'reference as a ghost, bound around its tip, torques: for RViz and Foxglove',
     ),
     topics.CLOCK: ('each sample, if `publish_clock`', "the plant's time"),
-    topics.DIAGNOSTICS: ('every second, on change', 'health of controller and plant'),
+    topics.DIAGNOSTICS: ('every second, on change', 'health of controller, plant and watchdog'),
 }
 
 

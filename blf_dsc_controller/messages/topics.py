@@ -12,6 +12,7 @@ from dataclasses import dataclass
 CONTROLLER = 'blf_dsc_controller'
 PLANT = 'sim_plant'
 MARKERS_NODE = 'arm_markers'
+WATCHDOG_NODE = 'torque_watchdog'
 
 FOREVER = 2**63 - 1  # ns
 
@@ -68,6 +69,7 @@ FLOAT64_MULTI_ARRAY = 'std_msgs/msg/Float64MultiArray'
 # arm must never receive an old torque. A recorder that starts late reports it, and closed_loop
 # waits until the recorder has subscribed.
 LATEST = Quality(depth=1)
+UNRELIABLE = Quality(depth=1, reliability='best_effort')
 STREAM = Quality(depth=5000)
 HISTORY = Quality(depth=5000, durability='transient_local')
 LATCHED_QUALITY = Quality(depth=1, durability='transient_local')

@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import sys
+import time
 import traceback
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,6 +42,17 @@ STREAMS = topics.REFERENCE, topics.TRACKING_ERROR, topics.LEARNING
 
 _RATE_SAMPLES = 1001  # samples before the rate is checked
 _FAST = 0.9  # fraction of the sample time
+_WAITING_PERIOD = 5.0  # s between two warnings
+_LONGEST_END = 3.0  # s from a signal to the end; ros2 launch sends the next signal after 5 s
+_SILENT = 0.1  # s without joint states, after which nothing is left to bring to rest
+
+
+class _Ending(NamedTuple):
+    """The end of the process after a signal."""
+
+    since: float  # s, steady
+    messages: int  # joint states processed so far
+    seen_at: float  # s, when the last of them was
 
 
 class ControllerNode(LoopNode[ControllerConfig]):
@@ -61,13 +73,14 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._monitor: Monitor | None = None
         self._learning_events = (0.0, 0.0, 0.0)  # columns checked, columns in use, model changes
         self._published_bound = b''  # bytes of the array, to detect changes
-        self._decoder = JointStateDecoder(joints, factory.required_fields(self.config))
+        self._decoder = JointStateDecoder(joints, required=('position',))
         self._pending: bytes | None = None
         self._warned_at = -1  # stamp of the start that the last warning was about
         self._listeners: list[Callable[[], int]] = []  # count the subscribers of STREAMS
         self._heard = False  # whether there were any at the last count
         self._observed = self._started = False
-        self._phase = Phase.INACTIVE  # the last one logged
+        self._logged = Phase.INACTIVE, 0, False  # phase, stops, silenced
+        self._ending: _Ending | None = None  # since a signal
         self._status = ControllerStatus(self, joints)
         parameters.on_change(self, ControllerConfig, self._retune, self._problems)
         self.start()
@@ -104,23 +117,38 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._report()
 
     def release(self) -> None:
-        """Command zero torque and release the law."""
-        self._command_zero()
+        """Command the torque to leave behind and release the law."""
+        self._leave()
         self.guard = None
         self._report()
 
     def close(self) -> None:
-        """Command zero torque and wait until all subscribers have received the last messages."""
-        self._command_zero()
+        """Command the torque to leave behind, and wait until all subscribers have received it."""
+        self._leave()
         process.drain([*self._outputs.values(), self._status.journal])
 
-    def _command_zero(self) -> None:
-        """Command zero torque, since drivers hold the last command, and release the guard."""
+    def ready_to_end(self) -> bool:
+        """Bring the arm to rest first, unless the safe torque is zero."""
+        guard = self.guard
+        if guard is None or not guard.commanding or self.config.safety.torque == 'zero':
+            return True
+        now, seen = time.monotonic(), guard.journal.messages
+        if self._ending is None:
+            self._ending = _Ending(now, seen, now)
+            if guard.supervisor.running:
+                self.deactivate()
+        if seen > self._ending.messages:
+            self._ending = _Ending(self._ending.since, seen, now)
+        is_silent = now > self._ending.seen_at + _SILENT
+        return guard.is_settled or is_silent or now > self._ending.since + _LONGEST_END
+
+    def _leave(self) -> None:
+        """Command the torque that drivers may hold from now on, and release the guard."""
         guard, states = self.guard, self.resolve_topic_name(topics.JOINT_STATES.relative)
         if guard is not None:
-            if guard.commanding and self.count_publishers(states):
-                self._command(np.zeros(len(self.config.joints)))
-            guard.release()
+            torque = guard.release()
+            if self.count_publishers(states):
+                self._command(torque)
             self._status.publish_events(guard)
 
     def reset(self) -> str:
@@ -152,6 +180,11 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._command(torque)
         if guard.has_sample:
             self._publish_telemetry(guard)
+        if guard.waiting_for:
+            self.get_logger().warning(
+                f'not started, waiting for a usable joint state: {guard.waiting_for}',
+                throttle_duration_sec=_WAITING_PERIOD,
+            )
         self._report_if_changed(guard)
 
     def survive(self, error: Exception) -> bool:
@@ -276,16 +309,20 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._report()
 
     def _log_phase(self, guard: Guard) -> None:
-        before, self._phase = self._phase, guard.supervisor.phase
-        if self._phase is Phase.SAFE_STOP:
-            stop = f'{self.config.safety.torque} torque: {guard.supervisor.text}'
-            self.get_logger().fatal(f'{stop}; {self._restart_hint()}')
-        elif self._phase is before:
+        supervisor = guard.supervisor
+        now = supervisor.phase, supervisor.stops, guard.silenced
+        if now == self._logged:
             return
-        elif self._phase is Phase.APPROACHING:
+        self._logged = now
+        if guard.silenced:
+            self.get_logger().warning(supervisor.text)
+        elif supervisor.phase is Phase.SAFE_STOP:
+            stop = f'{self.config.safety.torque} torque: {supervisor.text}'
+            self.get_logger().fatal(f'{stop}; {self._restart_hint()}')
+        elif supervisor.phase is Phase.APPROACHING:
             left = guard.settled - guard.time
             self.get_logger().info(f'approaching the reference, for {left:.3g} s')
-        elif self._phase is Phase.TRACKING:
+        elif supervisor.phase is Phase.TRACKING:
             self.get_logger().info('tracking the reference')
 
     def _restart_hint(self) -> str:

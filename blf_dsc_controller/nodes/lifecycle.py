@@ -19,7 +19,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.telemetry import Message
-from blf_dsc_controller.messages.topics import Topic
+from blf_dsc_controller.messages.topics import WATCHDOG_NODE, Topic
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.endpoints import (
     create_publisher,
@@ -205,7 +205,12 @@ class LoopNode(ManagedNode, Generic[Config]):
         if not self._outputs:
             return
         publisher = next(iter(self._outputs.values()))
-        before, self.rivals = self.rivals, self.count_publishers(publisher.topic_name) - 1
+        others = [
+            one.node_name
+            for one in self.get_publishers_info_by_topic(publisher.topic_name)
+            if one.node_name != WATCHDOG_NODE
+        ]
+        before, self.rivals = self.rivals, len(others) - 1
         if self.rivals > before:
             self.get_logger().warning(
                 f'another node publishes on {publisher.topic_name}, too: stop one of the two '
@@ -226,6 +231,12 @@ class LoopNode(ManagedNode, Generic[Config]):
         """Whether each output has its subscribers, and the first one also the other node."""
         observers = self.config.wait_for_subscribers
         return all(
-            publisher.get_subscription_count() >= observers + (number == 0)
+            publisher.get_subscription_count() - self._watchdogs(publisher.topic_name)
+            >= observers + (number == 0)
             for number, publisher in enumerate(self._outputs.values())
         )
+
+    def _watchdogs(self, topic: str) -> int:
+        """Count the subscriptions of watchdogs, which neither record nor move the arm."""
+        found = self.get_subscriptions_info_by_topic(topic)
+        return sum(WATCHDOG_NODE in one.node_name for one in found)

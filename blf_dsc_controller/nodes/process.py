@@ -55,6 +55,10 @@ class PlainNode(Node):
     def close(self) -> None:
         """Save data and release resources while ROS is still up."""
 
+    def ready_to_end(self) -> bool:
+        """Return whether the process may end after a signal; called again and again until then."""
+        return True
+
     def survive(self, error: Exception) -> bool:  # noqa: ARG002
         """Return whether the node continues after an error that escaped from a callback."""
         return False
@@ -79,7 +83,7 @@ def run(make_node: Callable[[], PlainNode]) -> int:
             # What is loaded by now stays: scanning it again would stall the loop for 0.1 s.
             gc.collect()
             gc.freeze()
-            while not (interrupted() or node.finished):
+            while not (node.finished or (interrupted() and node.ready_to_end())):
                 spin_once(executor, node)
         if node.failure is not None:
             raise node.failure

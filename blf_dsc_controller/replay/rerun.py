@@ -83,7 +83,7 @@ class Rerun:
             self._feed(event, end, is_exact=is_exact)
             if self._is_over:
                 return
-            self._repeat(event)
+            self._repeat(event, is_exact=is_exact)
             self.events.append(event)
             if self._is_over or event.type is EventType.RELEASE:
                 return
@@ -170,7 +170,7 @@ class Rerun:
 
     # Events.
 
-    def _repeat(self, event: Event) -> None:
+    def _repeat(self, event: Event, *, is_exact: bool) -> None:
         """Repeat an event, or check that the controller has produced it itself."""
         pending = self._guard.journal.pending
         is_own = event.type is EventType.START or (
@@ -181,7 +181,7 @@ class Rerun:
             self._report_departure(pending[0], event)
             return
         try:
-            self._act(event)
+            self._act(event, is_exact=is_exact)
         except TrajectoryError as error:
             self._depart(f'trajectory accepted ({error})', event.stamp)
             return
@@ -191,7 +191,7 @@ class Rerun:
             return
         self.outputs.count_from(pending.popleft().commands, event.commands)
 
-    def _act(self, event: Event) -> None:
+    def _act(self, event: Event, *, is_exact: bool) -> None:
         guard, content = self._guard, event.content
         if event.type in (EventType.ACTIVATE, EventType.RESET):
             self._failed = False
@@ -199,7 +199,7 @@ class Rerun:
         elif event.type is EventType.DEACTIVATE:
             guard.deactivate()
         elif event.type is EventType.RELEASE:
-            guard.release()
+            self._command(event.stamp, guard.release(), is_exact=is_exact)
         elif event.type is EventType.TRAJECTORY:
             points = tuple(TrajectoryPoint(**point) for point in content['points'])
             trajectory = Trajectory(tuple(content['joints']), points, content['begin'])

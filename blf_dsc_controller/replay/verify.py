@@ -13,10 +13,8 @@ from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.context import Context, read_context
 from blf_dsc_controller.bags.topic_messages import JointStates, UnreadableMessageError
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.factory import required_fields
 from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.journal import Event, EventType, decode
 from blf_dsc_controller.messages.topics import JOINT_STATES, JOURNAL
@@ -71,7 +69,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
     recorded = events[0].content['parameters']
     config = context.build_config(recorded, JOURNAL.resolved)
     newer = sorted(flatten(config).keys() - recorded.keys())
-    states, errors = _states(content, config, names.joints_of(config.joints))
+    states, errors = _states(content, names.joints_of(config.joints))
     start = next((one.stamp for one in events if one.type is EventType.START), None)
     if start is not None and start not in states.stamp:
         reason = (
@@ -116,9 +114,7 @@ def _events(content: Content) -> tuple[list[Event], Content, str]:
     return events, content, ''
 
 
-def _states(
-    content: Content, config: ControllerConfig, joints: Sequence[str]
-) -> tuple[JointStates, dict[int, MessageError]]:
+def _states(content: Content, joints: Sequence[str]) -> tuple[JointStates, dict[int, MessageError]]:
     """Return all joint states, and the errors of the unreadable ones by number.
 
     Raises:
@@ -126,7 +122,7 @@ def _states(
     """
     recorded = content.topics[JOINT_STATES]
     errors: dict[int, MessageError] = {}
-    states = recorded.joint_states(joints, required_fields(config), errors)
+    states = recorded.joint_states(joints, ('position',), errors)
     if len(errors) == len(recorded.received):
         raise UnreadableMessageError(recorded.name, 0, errors[0])
     return states, errors

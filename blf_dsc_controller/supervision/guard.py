@@ -13,7 +13,7 @@ from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.reference.approach import BlendedReference
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, plan_trajectory
 from blf_dsc_controller.supervision import retuning
-from blf_dsc_controller.supervision.guarded_law import GuardedLaw
+from blf_dsc_controller.supervision.guarded_law import GuardedLaw, Vector
 from blf_dsc_controller.supervision.supervisor import Phase
 
 
@@ -57,7 +57,8 @@ class Guard(GuardedLaw):
         self.samples.saturated_time = 0.0
         self.watchdog.restart()
         if self._resumable:
-            self._safe_torque.begin_ramp(self.config.safety.deactivation_ramp)
+            ramp = self.config.safety.deactivation_ramp
+            self._safe_torque.begin_ramp(ramp, self.samples.disturbance)
 
     def reset(self) -> None:
         """Discard all estimates and faults, and restart with the next state."""
@@ -116,9 +117,19 @@ class Guard(GuardedLaw):
             return []
         return list(retuning.problems(self.controller, config, self.time))
 
-    def release(self) -> None:
-        """Record the controller's release in the journal."""
+    @property
+    def is_settled(self) -> bool:
+        """Whether the arm rests under the safe torque."""
+        return not self.supervisor.running and self._safe_torque.is_settled
+
+    def release(self) -> Vector | None:
+        """Return the last torque, if any was commanded: the safe torque of an arm at rest."""
         self._note(EventType.RELEASE)
+        if not self.commanding or self.silenced:
+            return None
+        return self._safe_torque.leave(
+            self.config.safety, self.controller.settings, self.samples.estimate
+        )
 
     def _note(self, event: EventType, **content: Any) -> None:
         self.end_silence()
@@ -129,6 +140,7 @@ class Guard(GuardedLaw):
         self.states.restart()
         self.samples.restart()
         self.start_error = None
+        self.silenced = False
         self.has_sample = False
         self._clean = True
         self.watchdog.wait()

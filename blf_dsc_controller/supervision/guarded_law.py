@@ -34,6 +34,7 @@ from blf_dsc_controller.supervision.watchdog import PERIOD, Watchdog
 
 Vector = NDArray[np.float64]
 _NANO = 1e-9
+_LONG_SILENCE = 2.0  # s
 
 _REASONS: dict[type[cdr.MessageError], Reason] = {
     cdr.MissingJointError: Reason.JOINT_MISSING,
@@ -56,6 +57,8 @@ class GuardedLaw:
         journal: events, and counts of what has been processed so far.
         has_sample: whether the law used the last message, so that there is new telemetry.
         start_error: why the law could not start; None if it could.
+        waiting_for: what is wrong with the last state that the law could not start from; or empty.
+        silenced: whether nothing is commanded until the next reset or activation.
         foreign: messages ignored because they name none of the joints.
         start_stamp: stamp of t = 0 [ns]; -1 before the first start.
         last_stamp: stamp of the law's last sample [ns].
@@ -80,6 +83,8 @@ class GuardedLaw:
         self.journal = Journal()
         self.has_sample = False
         self.start_error: BlfDscError | None = None
+        self.waiting_for = ''
+        self.silenced = False
         self.foreign = 0
         self.start_stamp = self.last_stamp = -1
         self.settled = self.compute_time = 0.0
@@ -105,7 +110,7 @@ class GuardedLaw:
         `measurement` is [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
         """
         self._begin_message()
-        self.journal.stamp = stamp
+        gap, self.journal.stamp = (stamp - self.journal.stamp) * _NANO, stamp
         self.watchdog.restart()
         if self._velocity is not None:
             self._velocity.replace(stamp, measurement)
@@ -115,8 +120,28 @@ class GuardedLaw:
                 return None
             if fault is None:
                 return self._use(stamp, measurement)
-            self._stop(*fault)
+            if self.supervisor.phase is Phase.STARTING:
+                self._wait(fault.text)
+            else:
+                self._stop(*fault)
+        elif self._is_silenced(gap):
+            return None
         return self._safe_at(stamp, measurement)
+
+    def _is_silenced(self, gap: float) -> bool:
+        """Whether to stay silent out of command: once the states are back after a long silence.
+
+        By then the safe torque has faded to zero, and whoever restarted the driver may not expect
+        another. `gap` [s] is the time since the state before.
+        """
+        faded = self._safe_torque.last.age >= self.config.safety.fade_time
+        if not self.silenced and faded and self.commanding and gap > _LONG_SILENCE:
+            self.silenced = True
+            self.supervisor.add(
+                f'joint states are back after {gap:.3g} s, and no torque is commanded until the '
+                'next reset or activation'
+            )
+        return self.silenced
 
     def _use(self, stamp: int, measurement: Vector) -> Vector | None:
         """Pass a state to the law, or stop if the law finds it invalid."""
@@ -124,10 +149,11 @@ class GuardedLaw:
         is_first = self.supervisor.phase is Phase.STARTING
         if is_first:
             if not is_valid_state(law.settings, law.checks, measurement):
-                return self._reject(stamp, measurement)
+                self._wait(self.states.invalid(self.config.safety, measurement).text)
+                return self._safe_at(stamp, measurement)
             last.take(stamp, measurement)
             if not self._start(stamp, measurement):
-                return self._safe(self.config.sample_time) if self.commanding else None
+                return self._safe(self.config.sample_time)
         dt = (stamp - self.last_stamp) * _NANO
         before = perf_counter()
         torque = law.update(self._time_of(stamp), dt, measurement)
@@ -146,6 +172,11 @@ class GuardedLaw:
         self.has_sample = True
         self.journal.commands += 1
         return torque
+
+    def _wait(self, problem: str) -> None:
+        """Go on waiting for a state to start from."""
+        self.waiting_for = problem
+        self.states.restart()
 
     def _reject(self, stamp: int, measurement: Vector) -> Vector | None:
         """Stop because of an invalid state."""
@@ -216,7 +247,10 @@ class GuardedLaw:
             self.foreign += 1
             return None
         self.watchdog.restart()
-        self._stop(_REASONS.get(type(error), Reason.BAD_MESSAGE), str(error))
+        if self.supervisor.phase is Phase.STARTING:
+            self._wait(str(error))
+        else:
+            self._stop(_REASONS.get(type(error), Reason.BAD_MESSAGE), str(error))
         return self._safe_without_state(self.config.sample_time)
 
     def watch(self) -> Vector | None:
@@ -247,6 +281,7 @@ class GuardedLaw:
 
     def _begin_message(self) -> None:
         self.end_silence()
+        self.waiting_for = ''
         self.has_sample = False
         self.journal.messages += 1
 
@@ -257,7 +292,7 @@ class GuardedLaw:
         if self.supervisor.stop(reason, text):
             self.journal.note(EventType.STOP, reason=reason, text=text)
             self._clean = self._resumable = False
-            self._safe_torque.begin_ramp(self.config.safety.stop_ramp)
+            self._safe_torque.begin_ramp(self.config.safety.stop_ramp, self.samples.disturbance)
 
     def _safe_without_state(self, dt: float) -> Vector | None:
         self.has_sample = False
@@ -267,9 +302,9 @@ class GuardedLaw:
     def _safe(self, dt: float) -> Vector | None:
         """Return the safe torque, `dt` [s] further along the ramp.
 
-        None before the first usable state, and while inactive before any torque was commanded.
+        None before the law has commanded any: a controller that never started stays silent.
         """
-        if self.supervisor.phase is Phase.INACTIVE and not self.commanding:
+        if not self.commanding:
             return None
         torque = self._safe_torque.advance(
             self.config.safety, self.controller.settings, self.samples.estimate, dt

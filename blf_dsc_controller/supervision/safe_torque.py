@@ -17,6 +17,10 @@ from blf_dsc_controller.law.settings import Settings
 
 Vector = NDArray[np.float64]
 
+_AT_REST = 0.01  # rad/s
+_OBSERVER = 30.0  # rad/s, L: slow against the lag of velocities and torques
+_LARGEST_LOAD = 0.5  # of the torque limit
+
 
 class LastState:
     """The last usable joint state.
@@ -24,6 +28,7 @@ class LastState:
     Attributes:
         measurement: [q, dq, applied torque] (3 n,) [rad, rad/s, N m].
         q, dq: views of it; a velocity that is currently unknown is zero.
+        ddq: acceleration since the state before (n,) [rad/s^2], None if it is unknown.
         age: time without a usable state [s]; infinite before the first.
     """
 
@@ -31,12 +36,14 @@ class LastState:
         self.measurement = np.zeros(3 * n)
         self.q = self.measurement[:n]
         self.dq = self.measurement[n : 2 * n]
+        self.ddq: Vector | None = None
         self.age = inf
         self._stamp = -1
 
     def take(self, stamp: int, measurement: Vector) -> None:
         """Store a valid state with its stamp [ns]."""
         self.measurement[:] = measurement
+        self.ddq = None
         self.age = 0.0
         self._stamp = stamp
 
@@ -45,28 +52,47 @@ class LastState:
     ) -> None:
         """Store the usable part of any other state, `period` [s] after the last.
 
-        Positions that are not finite or have a repeated stamp do not show where the arm is now.
+        Positions that are not finite or have a repeated stamp do not show where the arm is now. A
+        velocity that is missing, not finite or beyond the limit is replaced with the one
+        differenced from the positions, within the limit.
         """
         q, dq, _ = measurement.reshape(3, -1)
         if stamp == self._stamp or not np.isfinite(q).all():
             self.miss(period)
             return
+        elapsed = (stamp - self._stamp) * 1e-9
+        is_next = self.age == 0.0 and elapsed > 0.0
+        differenced = np.zeros_like(q)
+        if is_next:
+            differenced = np.clip((q - self.q) / elapsed, -velocity_limit, velocity_limit)
+        usable = np.where(np.abs(dq) <= velocity_limit, dq, differenced)
+        self.ddq = (usable - self.dq) / elapsed if is_next else None
         self.q[:] = q
-        self.dq[:] = np.where(np.abs(dq) <= velocity_limit, dq, 0.0)
+        self.dq[:] = usable
         self.age = 0.0
         self._stamp = stamp
 
     def miss(self, period: float) -> None:
         """Account for `period` [s] without a usable state."""
         self.dq[:] = 0.0
+        self.ddq = None
         self.age += period
 
 
-def safe_torque(safety: Safety, settings: Settings, last: LastState, estimate: Vector) -> Vector:
+def model_torque(settings: Settings, estimate: Vector, *motion: Vector) -> Vector:
+    """Return H(q, dq, dq, ddq) P^ (n,) [N m] of a motion q, dq, ddq (n,); at rest of q alone."""
+    q, dq, ddq = motion if len(motion) > 1 else (*motion, *np.zeros((2, settings.n)))
+    (H,) = regressors_at(settings.model, *(one[np.newaxis] for one in (q, dq, dq, ddq)))
+    return np.asarray(H @ estimate[: settings.p])
+
+
+def safe_torque(
+    safety: Safety, settings: Settings, last: LastState, estimate: Vector, load: Vector
+) -> Vector:
     """Return the safe torque (n,) [N m], within the torque limit and always finite.
 
-    It is zero, damping -D dq, or damping plus gravity H(q, 0, 0, 0) P^ as far as the drive does not
-    add it, and fades to zero while no usable state arrives.
+    It is zero, damping -D dq, or damping plus gravity H(q, 0, 0, 0) P^ and `load` (n,) [N m] as far
+    as the drive does not add them, and fades to zero while no usable state arrives.
     """
     torque = np.zeros(settings.n)
     if last.age >= safety.fade_time:
@@ -75,9 +101,8 @@ def safe_torque(safety: Safety, settings: Settings, last: LastState, estimate: V
         if safety.torque != 'zero':
             torque -= np.array(safety.damping) * last.dq
         if safety.torque == 'hold_gravity':
-            rest = np.zeros((1, settings.n))
-            (H,) = regressors_at(settings.model, last.q[np.newaxis], rest, rest, rest)
-            torque += H @ estimate[: settings.p] - added_torque(settings, last.q)
+            torque += model_torque(settings, estimate, last.q) + load
+            torque -= added_torque(settings, last.q)
     if not np.isfinite(torque).all():
         return np.zeros(settings.n)
     limited = np.clip(torque, -settings.torque_limit, settings.torque_limit)
@@ -87,21 +112,46 @@ def safe_torque(safety: Safety, settings: Settings, last: LastState, estimate: V
 class SafeTorque:
     """The torque without the law: a ramp from the last torque to the safe torque.
 
+    What holds the arm besides the model's gravity is observed from its motion, in the stop, too:
+
+        load' = L (tau - H(q, dq, dq, ddq) P^ - load),   |load| <= half of the torque limit
+
+    So an arm comes to rest with a payload, or with a model, that the law had not learned yet. An
+    arm that does not move at all (brakes) leaves the load as it is.
+
     Attributes:
+        load: torque (n,) [N m] that the model lacks; initially the disturbance estimate of the law.
         commanded: the last torque (n,) [N m], from the law or this ramp.
         last: the last usable joint state.
     """
 
     def __init__(self, n: int) -> None:
         self.commanded = np.zeros(n)
+        self.load = np.zeros(n)
         self.last = LastState(n)
         self._start = np.zeros(n)
         self._duration = self._elapsed = 0.0
 
-    def begin_ramp(self, duration: float) -> None:
-        """Start a linear ramp of `duration` [s] at the last torque."""
+    def begin_ramp(self, duration: float, load: Vector) -> None:
+        """Start a linear ramp of `duration` [s] at the last torque, with the `load` as known."""
+        self.load[:] = load
         self._start[:] = self.commanded
         self._duration, self._elapsed = duration, 0.0
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the ramp is over and the arm at rest, as far as its states show."""
+        is_over = self._elapsed >= self._duration
+        return is_over and self.last.age == 0.0 and float(np.abs(self.last.dq).max()) < _AT_REST
+
+    def leave(self, safety: Safety, settings: Settings, estimate: Vector) -> Vector | None:
+        """Return the last torque (n,) [N m]; None before the first usable state.
+
+        It is not damped: a driver may hold it for ever, and a constant torque damps nothing.
+        """
+        self._duration = 0.0
+        self.last.dq[:] = 0.0
+        return self.advance(safety, settings, estimate, 0.0)
 
     def advance(
         self, safety: Safety, settings: Settings, estimate: Vector, dt: float
@@ -109,13 +159,26 @@ class SafeTorque:
         """Return the torque (n,) [N m] `dt` [s] later; None before the first usable state."""
         if self.last.age == inf:
             return None
-        goal = safe_torque(safety, settings, self.last, estimate)
+        if safety.torque == 'hold_gravity':
+            self.observe(settings, estimate, dt)
+        goal = safe_torque(safety, settings, self.last, estimate, self.load)
         self._elapsed += dt
         if self._elapsed < self._duration:
             goal = self._start + self._elapsed / self._duration * (goal - self._start)
         limit = settings.torque_limit
         self.commanded[:] = np.clip(goal, -limit, limit)
         return self.commanded
+
+    def observe(self, settings: Settings, estimate: Vector, dt: float) -> None:
+        """Update the load by the motion of the last `dt` [s] under the torque commanded before."""
+        last, limit = self.last, settings.torque_limit
+        if last.ddq is not None:
+            with np.errstate(over='ignore', invalid='ignore'):
+                explained = model_torque(settings, estimate, last.q, last.dq, last.ddq)
+            whole = self.commanded + added_torque(settings, last.q)
+            residual = np.clip(whole - explained - self.load, -limit, limit)
+            self.load += min(1.0, _OBSERVER * dt) * np.nan_to_num(residual)
+        np.clip(self.load, -_LARGEST_LOAD * limit, _LARGEST_LOAD * limit, out=self.load)
 
 
 def limit_first_torque(controller: Controller, last: Vector, dt: float) -> None:

@@ -53,6 +53,11 @@ class SampleCheck:
         """The kept estimate (m,)."""
         return self._kept[: self._controller.settings.m]
 
+    @property
+    def disturbance(self) -> Vector:
+        """The kept disturbance estimate d^3 (n,) [N m]."""
+        return self._kept[self._controller.settings.m :]
+
     def keep(self) -> None:
         """Keep the current estimates."""
         state = self._controller.state

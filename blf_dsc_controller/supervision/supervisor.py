@@ -82,6 +82,10 @@ class Supervisor:
         self.stops += 1
         return True
 
+    def add(self, text: str) -> None:
+        """Add to the text, without changing phase or reason."""
+        self._set(self.phase, self.reason, '; '.join(filter(None, (self.text, text))))
+
     def _set(self, phase: Phase, reason: Reason, text: str) -> None:
         self.phase, self.reason, self.text = phase, reason, text
         self.running = phase in (Phase.TRACKING, Phase.APPROACHING)

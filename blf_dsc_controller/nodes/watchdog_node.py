@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `torque_watchdog`: the safe torque when the controller's process is dead or stopped.
+
+Effort controllers hold the last torque for ever. When commands stop while joint states go on, this
+node commands the safe torque of the controller's configuration until the controller is back. It
+reads that configuration from the running controller, so it needs no parameters of the arm.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import deque
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import WatchdogConfig
+from blf_dsc_controller.configuration.schema import build, parameters
+from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.cdr import MessageError
+from blf_dsc_controller.messages.codecs import (
+    Float64MultiArrayDecoder,
+    Float64MultiArrayEncoder,
+    JointStateDecoder,
+)
+from blf_dsc_controller.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher
+from blf_dsc_controller.nodes.endpoints import create_steady_timer, message_class, qos_profile
+from blf_dsc_controller.nodes.parameter_client import ParameterClient, Values
+from blf_dsc_controller.nodes.parameters import declare
+from blf_dsc_controller.nodes.process import PlainNode, drain, run
+from blf_dsc_controller.nodes.raw_subscriptions import RawMessage, RawSubscriptions
+from blf_dsc_controller.supervision.second_line import SecondLine
+
+_PERIOD = 0.004  # s, of the checks and of the torques
+_REPORT_PERIOD = 1.0  # s
+_DEPTH = 20  # messages of a topic in a period
+_STATES, _COMMANDS = range(2)
+
+
+class WatchdogNode(PlainNode):
+    """Publishes the safe torque on the controller's `~/commands` while the controller cannot.
+
+    `line` decides when; None until the controller's parameters have been read.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(topics.WATCHDOG_NODE, **options)
+        self._config = declare(self, WatchdogConfig)
+        self.line: SecondLine | None = None
+        self._states: JointStateDecoder
+        self._commands: Float64MultiArrayDecoder
+        self._encoder: Float64MultiArrayEncoder
+        self._was_active = False
+        self._sent: deque[tuple[int, bytes]] = deque(maxlen=10 * _DEPTH)
+        self._sequence = 0
+        self._raw_subscriptions = RawSubscriptions(self, _DEPTH)
+        for handle, topic in ((_STATES, topics.JOINT_STATES), (_COMMANDS, topics.COMMANDS)):
+            name = self.resolve_topic_name(topic.relative)
+            self._raw_subscriptions.subscribe(name, topic.type, [topics.UNRELIABLE], handle)
+        topic = topics.COMMANDS
+        quality = qos_profile(topic.offered)
+        self._output = self.create_publisher(message_class(topic.type), topic.relative, quality)
+        self._diagnostics = DiagnosticsPublisher(self, ())
+        self._client = ParameterClient(self._on_parameters)
+        self._controller = f'{self.get_namespace().rstrip("/")}/{topics.CONTROLLER}'
+        self._client.request(self._raw_subscriptions.node, self._controller)
+        create_steady_timer(self, _PERIOD, self._poll)
+        create_steady_timer(self, _REPORT_PERIOD, self._report)
+        self.get_logger().info(f'waiting for {self._controller}')
+
+    def close(self) -> None:
+        """Leave the torque that a driver may hold, if this node was the one to command it."""
+        if self.line is not None:
+            self._publish(self.line.leave())
+            drain([self._output])
+        self._raw_subscriptions.close()
+
+    def _on_parameters(self, node: str, values: Values) -> None:
+        known = {one.name for one in parameters(ControllerConfig)}
+        given = {name: value for name, value in values.items() if name in known}
+        try:
+            config = build(ControllerConfig, given, node)
+        except ConfigurationError as error:
+            self.failure, self.finished = error, True
+            return
+        count = len(config.joints)
+        self._states = JointStateDecoder(config.joints, required=('position',))
+        self._commands = Float64MultiArrayDecoder(count)
+        self._encoder = Float64MultiArrayEncoder(count)
+        self.line = SecondLine(config, self._config.timeout)
+        self.get_logger().info(
+            f'ready: {config.safety.torque} torque once {node} is silent for '
+            f'{self._config.timeout:g} s'
+        )
+
+    def _poll(self) -> None:
+        messages, now = self._raw_subscriptions.take(), time.monotonic()
+        if self.line is None:
+            self._client.poll()
+            return
+        for message in messages:
+            self._take(self.line, message, now)
+        self._publish(self.line.poll(now))
+        if self.line.active != self._was_active:
+            self._was_active = self.line.active
+            self._log(self.line)
+            self._report()
+
+    def _take(self, line: SecondLine, message: RawMessage, now: float) -> None:
+        try:
+            if message.handle == _STATES:
+                stamp = self._states.decode(message.raw)
+                line.state(stamp, self._states.values, now)
+            elif (message.sequence, message.raw) not in self._sent:
+                self._commands.decode(message.raw)
+                line.torque_of_controller(self._commands.values, now)
+        except MessageError as error:
+            self.get_logger().warning(f'ignored: {error}', throttle_duration_sec=10.0)
+
+    def _log(self, line: SecondLine) -> None:
+        if line.active:
+            self.get_logger().fatal(
+                f'no command for {line.silence:.3g} s while joint states go on: '
+                f'{line.config.safety.torque} torque until {self._controller} is back'
+            )
+        else:
+            self.get_logger().warning('this node no longer commands a torque')
+
+    def _publish(self, torque: np.ndarray | None) -> None:
+        if torque is not None:
+            raw = self._encoder.encode(torque)
+            self._sequence += 1
+            self._sent.append((self._sequence, raw))
+            self._output.publish(raw)
+
+    def _report(self) -> None:
+        level, message, takeovers = WARN, f'waiting for {self._controller}', 0
+        if self.line is not None:
+            level, message, takeovers = OK, 'watching', self.line.takeovers
+            if self.line.active:
+                level, message = ERROR, 'commands the safe torque: the controller is silent'
+        status = self._diagnostics.status('torque', level, message, {'takeovers': takeovers})
+        self._diagnostics.publish([status])
+
+
+main = partial(run, WatchdogNode)
+
+if __name__ == '__main__':
+    sys.exit(main())

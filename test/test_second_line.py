@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The second line: a dead or stopped controller, against a drive that holds the last torque."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fault_rig import MILLISECOND, Rig
+
+from blf_dsc_controller.supervision.second_line import SecondLine
+
+TIMEOUT = 0.05  # s
+HOLDING = {'safety.torque': 'hold_gravity'}
+AT_REST = HOLDING | {'reference.type': 'hold'}
+ARM = {'disturbance.amplitude': [0.0, 0.0]}
+
+
+class Watched(Rig):
+    """A loop whose controller can die; its drive holds the last torque for ever."""
+
+    def __init__(self, given, period=4):
+        super().__init__(given, plant=ARM)
+        self.line = SecondLine(self.config, TIMEOUT)
+        self.period = period  # ms, of the second line
+        self.dead = False
+        self.taken = []  # torques of the second line
+
+    def step(self, count=1):
+        for _ in range(count):
+            state, now = self.state(), self.plant.sample * 1e-3
+            if not self.dead:
+                self.deliver(state.raw())
+                self.line.torque_of_controller(self.commands[-1], now)
+            values = np.concatenate((state.q, state.dq, state.effort))
+            self.line.state(state.stamp, values, now)
+            if self.plant.sample % self.period == 0:
+                torque = self.line.poll(now)
+                if torque is not None:
+                    self.taken.append(torque.copy())
+                    self.input.torque[:] = torque
+            self.plant.step(self.input.torque)
+
+
+@pytest.mark.parametrize('period', [1, 4])
+@pytest.mark.parametrize(
+    ('given', 'angle'), [(AT_REST, 0.01), (HOLDING, 0.15)], ids=['at rest', 'in motion']
+)
+def test_arm_of_a_dead_controller_comes_to_rest(given, angle, period):
+    """The initial estimate is half the truth. Without a second line, the arm in motion goes on."""
+    rig = Watched(given, period)
+    rig.step(800)
+    assert not rig.taken
+    assert (np.abs(rig.state().dq).max() > 0.1) == (given is HOLDING)
+    rig.dead = True
+    start = rig.state().q
+    rig.step(3000)
+    assert rig.line.active
+    assert rig.line.silence == pytest.approx(TIMEOUT, abs=0.005)
+    assert np.abs(rig.state().q - start).max() < angle
+    assert np.abs(rig.state().dq).max() < 0.01
+
+
+def test_drive_that_holds_the_last_torque_moves_the_arm_far():
+    """What the second line is for."""
+    rig = Watched(HOLDING)
+    rig.step(800)
+    rig.dead, start = True, rig.state().q
+    rig.line.poll = lambda _: None
+    rig.step(1000)
+    assert np.abs(rig.state().q - start).max() > 0.5
+
+
+def test_controller_that_is_back_takes_over_at_once():
+    rig = Watched(HOLDING)
+    rig.step(100)
+    rig.dead = True
+    rig.step(200)
+    assert rig.line.active
+    rig.dead = False
+    count = len(rig.taken)
+    rig.step(100)
+    assert not rig.line.active
+    assert len(rig.taken) == count
+    rig.dead = True
+    rig.step(100)
+    assert rig.line.takeovers == 2
+
+
+def test_nothing_is_commanded_before_the_controller_or_while_states_stand_still():
+    """Such as a plant in lock-step, which waits for a torque and repeats its state."""
+    rig = Watched(HOLDING)
+    state = rig.state()
+    values = np.concatenate((state.q, state.dq, state.effort))
+    for k in range(500):
+        rig.line.state(state.stamp + k * MILLISECOND, values, k * 1e-3)
+        assert rig.line.poll(k * 1e-3) is None
+    rig.line.torque_of_controller(np.ones(2), 0.5)
+    for k in range(500, 1000):
+        rig.line.state(state.stamp + 499 * MILLISECOND, values, k * 1e-3)
+        assert rig.line.poll(k * 1e-3) is None
+    assert rig.line.leave() is None
+
+
+def test_torque_fades_when_the_states_stop_too_and_a_new_controller_is_waited_for():
+    rig = Watched(HOLDING)
+    rig.step(100)
+    rig.dead = True
+    rig.step(100)
+    assert rig.line.leave().all()
+    now = rig.plant.sample * 1e-3
+    faded = [rig.line.poll(now + k * 1e-3) for k in range(1000)]
+    last = [torque.copy() for torque in faded if torque is not None][-1]
+    assert not last.any()
+    assert not rig.line.active
+    rig.step(200)
+    assert not rig.line.active
