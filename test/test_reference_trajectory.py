@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.reference import MotionLimits
 from blf_dsc_controller.reference.limits import MotionError
-from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term, unpack
+from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term, spline_term, unpack
 from blf_dsc_controller.reference.trajectory import (
     Trajectory,
     TrajectoryError,
@@ -245,3 +247,48 @@ def test_trajectory_that_takes_too_long_to_plan_is_rejected(times, message):
     with pytest.raises(TrajectoryError, match='send it in pieces') as rejection:
         plan_trajectory(Trajectory(JOINTS, points), PAPER, NOW, LIMITS)
     assert message in str(rejection.value)
+
+
+def moving(velocity, acceleration=(0.0, 0.0)):
+    """A reference at zero with these derivatives at t = 0."""
+    terms = np.zeros((1, 2, 6))
+    terms[0, :, 1], terms[0, :, 2] = velocity, 0.5 * np.asarray(acceleration)
+    return pack(2, [spline_term(np.zeros(1), terms)])
+
+
+speeds = st.floats(-1.4, 1.4)
+
+
+@given(
+    velocity=st.tuples(speeds, speeds),
+    acceleration=st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
+    goal=st.tuples(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0)),
+    time=st.floats(8.0, 600.0),
+    count=st.integers(1, 3),
+)
+def test_goal_with_much_time_is_not_overshot_by_more_than_the_braking_distance(
+    velocity, acceleration, goal, time, count
+):
+    """Without braking first, the reference swings by 0.2 v T: 56 m for a joint with 1.4 rad/s."""
+    fields = np.array([goal, np.zeros(2), np.zeros(2)])[:count, np.newaxis]
+    sent = trajectory(fields, times=(time,))
+    motion = plan_trajectory(sent, moving(velocity, acceleration), 0.0, LIMITS)
+    times = np.linspace(0.0, time + 1.0, 20_001)
+    qr, dqr, _ = sampled(motion.vector, times).transpose(1, 0, 2)
+    # All joints brake together, at no more than half of 6 rad/s^2, ddqr aside.
+    h = max(0.2, 3.0 * max(map(abs, velocity)) / 6.0)
+    for i in range(2):
+        room = 0.5 * h * abs(velocity[i]) + h**2 * abs(acceleration[i]) / 6.0 + 1e-9
+        low, high = min(0.0, goal[i]), max(0.0, goal[i])
+        assert qr[:, i].min() >= low - room
+        assert qr[:, i].max() <= high + room
+    np.testing.assert_allclose(qr[-1], goal, atol=1e-9)
+    np.testing.assert_array_equal(dqr[-1], (0.0, 0.0))
+
+
+def test_point_that_needs_all_its_time_for_braking_is_still_reached():
+    """The gentle braking of 0.7 s does not fit, but braking all the way does."""
+    motion = plan_trajectory(
+        trajectory((np.array([[0.3, 0.0]]),), times=(0.45,)), moving((1.4, 0.0)), 0.0, LIMITS
+    )
+    np.testing.assert_allclose(at(motion.vector, 0.45), [(0.3, 0.0), (0, 0), (0, 0)], atol=1e-9)

@@ -47,9 +47,14 @@ def hold(position: np.ndarray) -> Term:
     return spline_term(np.zeros(1), at_rest(position))
 
 
+def braking_time(dq: np.ndarray, config: ControllerConfig) -> float:
+    """Return the time [s] to come to rest from dq (n,) [rad/s], within half of the limits."""
+    return max(_SHORTEST, float(np.max(_BRAKE * np.abs(dq) / config.limits.acceleration)))
+
+
 def stop(t0: float, q: np.ndarray, dq: np.ndarray, config: ControllerConfig) -> Term:
     """Return the term that comes to rest from q (n,) [rad] and dq (n,) [rad/s] at t0 [s]."""
-    h = max(_SHORTEST, float(np.max(_BRAKE * np.abs(dq) / config.limits.acceleration)))
+    h = braking_time(dq, config)
     points = np.zeros((3, 2, q.size))
     points[0] = q, q + 0.5 * h * dq
     points[1, 0] = dq

@@ -69,6 +69,13 @@ def spline_term(knots: np.ndarray, coefficients: np.ndarray) -> Term:
     return Term(SPLINE, np.concatenate(content))
 
 
+def pieces_of(term: Term, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return knots (pieces,) [s] and coefficients (pieces, n, 6) of a spline."""
+    count = int(term.content[0])
+    knots, coefficients = np.split(term.content[1:], [count])
+    return knots, coefficients.reshape(count, n, 6)
+
+
 def pack(n: int, terms: Sequence[Term]) -> np.ndarray:
     """Return the vector of a reference for n joints; `unpack` is the inverse."""
     packed = [

@@ -9,8 +9,9 @@ It is interpolated as by joint_trajectory_controller, except where that would ju
 
 (That controller joins bare positions by straight lines, so the velocity jumps at each point.)  The
 motion to the first point starts from the position, velocity and acceleration of the reference when
-the trajectory begins; if the first point is at that very time, the trajectory is blended into the
-present reference as fast as the limits allow.  Points in the past are skipped.  The last point is
+the trajectory begins, and brakes while it sets out from where the braking ends, so that a long time
+to that point does not make the arm swing away; if the first point is at that very time, the
+trajectory is blended into the present reference as fast as the limits allow.  Points in the past are skipped.  The last point is
 held.  To keep planning below a second, a trajectory longer than `LONGEST` or with more than
 `MOST_POINTS` is rejected.
 """
@@ -24,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.reference.approach import BlendedReference, blend
+from blf_dsc_controller.reference.approach import BlendedReference, blend, braking_time
 from blf_dsc_controller.reference.limits import MotionError, check_times, worst_violation
 from blf_dsc_controller.reference.polynomials import (
     cubics,
@@ -33,12 +34,21 @@ from blf_dsc_controller.reference.polynomials import (
     minimum_jerk,
     quintics,
 )
-from blf_dsc_controller.reference.terms import Term, pack, sampled, unpack
+from blf_dsc_controller.reference.terms import (
+    Term,
+    pack,
+    pieces_of,
+    sampled,
+    spline_term,
+    unpack,
+)
 
 MOST_POINTS = 1000
 LONGEST = 3600.0
 """Longest time [s] from the beginning of a trajectory to its last point."""
 
+_SMOOTH = 0.2  # s of braking at least, since the acceleration ends, too
+_ATTEMPTS = 5  # at braking, from the gentle time to all the time there is
 _FIELDS = ('positions', 'velocities', 'accelerations')
 
 
@@ -87,7 +97,7 @@ def plan_trajectory(
     try:
         if times[0] > t0:
             present = sampled(pack(n, before), np.array([t0]))[0]
-            term = _from_state(present, t0, times, points)._replace(begin=t0)
+            term = _from_state(present, t0, times, points, config)
             blended = max((one.settled for one in before if one.fade > 0.0), default=now)
             motion = BlendedReference(pack(n, [*before, term]), min(blended, t0))
         else:
@@ -133,19 +143,68 @@ def _through_points(times: np.ndarray, points: np.ndarray) -> Term:
     return ending_at_rest(times, pieces, points[0, -1])
 
 
-def _from_state(present: np.ndarray, t0: float, times: np.ndarray, points: np.ndarray) -> Term:
-    """Return a term from the present qr, dqr, ddqr (3, n) at t0 [s] through the points."""
+def _from_state(
+    present: np.ndarray,
+    t0: float,
+    times: np.ndarray,
+    points: np.ndarray,
+    config: ControllerConfig,
+) -> Term:
+    """Return a term from the present qr, dqr, ddqr (3, n) at t0 [s] through the points.
+
+    It brakes gently (`braking_time`), but within the time to the first point; as gently as possible
+    if the limits cannot be kept otherwise.
+    """
+    longest = float(times[0]) - t0
+    shortest = min(max(_SMOOTH, braking_time(present[1], config)), longest)
+    span = check_times(t0, float(times[-1]))
+    for h in np.geomspace(shortest, longest, _ATTEMPTS):
+        term = _braking(present, t0, times, points, min(float(h), longest))
+        if worst_violation(pack(present.shape[1], [term]), span, config) is None:
+            break
+    return term
+
+
+def _braking(
+    present: np.ndarray, t0: float, times: np.ndarray, points: np.ndarray, h: float
+) -> Term:
+    """Return a term through the points that brakes within h [s], the sum of two motions.
+
+    One leaves from rest at the position where the braking ends, the other brakes to there: its
+    velocity is the cubic from dqr to 0 with the slopes ddqr and 0.
+    """
+    n = present.shape[1]
+    rest = np.zeros((3, n))
+    rest[0] = present[0] + h * present[1] / 2.0 + h**2 * present[2] / 12.0
+    path = _from_rest(rest, t0, times, points)
+    at = np.array([t0 + h, times[0]])
+    if at[0] >= at[1]:
+        at = at[1:]
+    through = sampled(pack(n, [path]), at).transpose(1, 0, 2)
+    if len(points) > 1:
+        through[: len(points), -1] = points[:, 0]
+    both = np.concatenate((present[:, np.newaxis], through), axis=1)
+    knots = np.concatenate(([t0], at))
+    lead = quintics(np.diff(knots), both[:, :-1], both[:, 1:])
+    after, coefficients = pieces_of(path, n)
+    return spline_term(
+        np.concatenate((knots[:-1], after[1:])), np.concatenate((lead, coefficients[1:]))
+    )._replace(begin=t0)
+
+
+def _from_rest(rest: np.ndarray, t0: float, times: np.ndarray, points: np.ndarray) -> Term:
+    """Return a term from rest (3, n) at t0 [s] through the points."""
     knots = np.concatenate(([t0], times))
     if len(points) == 1:
-        return minimum_jerk(knots, np.vstack((present[:1], points[0])), present[1:])
+        return minimum_jerk(knots, np.vstack((rest[:1], points[0])))
     if len(points) == 3:
-        return hermite(knots, np.concatenate((present[:, np.newaxis], points), axis=1))
+        return hermite(knots, np.concatenate((rest[:, np.newaxis], points), axis=1))
     pieces = cubics(np.diff(times), points[:, :-1], points[:, 1:])
     arrival = np.zeros((3, 1, points.shape[2]))
     arrival[:2] = points[:, :1]
     if len(pieces):
         arrival[2, 0] = 2.0 * pieces[0, :, 2]
-    first = quintics(knots[1:2] - t0, present[:, np.newaxis], arrival)
+    first = quintics(knots[1:2] - t0, rest[:, np.newaxis], arrival)
     return ending_at_rest(knots, np.concatenate((first, pieces)), points[0, -1])
 
 
