@@ -193,7 +193,7 @@ def test_all_parameters_of_a_node_can_be_requested_at_once(ros, tmp_path, name):
     node = ros.add(NODES[name], parameters)
     listed = ros.call(ListParameters, f'/{name}/list_parameters', ListParameters.Request())
     names = listed.result.names
-    assert len(names) > 3
+    assert len(names) >= 3
     request = GetParameters.Request(names=names)
     values = ros.call(GetParameters, f'/{name}/get_parameters', request).values
     assert len(values) == len(names)

@@ -86,6 +86,20 @@ def model_torque(settings: Settings, estimate: Vector, *motion: Vector) -> Vecto
     return np.asarray(H @ estimate[: settings.p])
 
 
+def friction_torque(settings: Settings, estimate: Vector, dq: Vector) -> Vector:
+    """Return the friction (n,) [N m] of the estimate at dq (n,) [rad/s], zero without columns."""
+    n, at = settings.n, settings.p + settings.n * settings.bias
+    torque = np.zeros(n)
+    for is_on, effect in (
+        (settings.viscous, dq),
+        (settings.coulomb, np.tanh(dq / settings.coulomb_velocity)),
+    ):
+        if is_on:
+            torque += estimate[at : at + n] * effect
+            at += n
+    return torque
+
+
 def safe_torque(
     safety: Safety, settings: Settings, last: LastState, estimate: Vector, load: Vector
 ) -> Vector:
@@ -114,9 +128,9 @@ class SafeTorque:
 
     What holds the arm besides the model's gravity is observed from its motion, in the stop, too:
 
-        load' = L (tau - H(q, dq, dq, ddq) P^ - load),   |load| <= half of the torque limit
+        load' = L (tau - H(q, dq, dq, ddq) P^ - friction - load),   |load| <= half the torque limit
 
-    So an arm comes to rest with a payload, or with a model, that the law had not learned yet. An
+    Estimated friction is not part of it, since it helps to brake.  So an arm comes to rest with a payload, or with a model, that the law had not learned yet. An
     arm that does not move at all (brakes) leaves the load as it is.
 
     Attributes:
@@ -175,6 +189,7 @@ class SafeTorque:
         if last.ddq is not None:
             with np.errstate(over='ignore', invalid='ignore'):
                 explained = model_torque(settings, estimate, last.q, last.dq, last.ddq)
+                explained += friction_torque(settings, estimate, last.dq)
             whole = self.commanded + added_torque(settings, last.q)
             residual = np.clip(whole - explained - self.load, -limit, limit)
             self.load += min(1.0, _OBSERVER * dt) * np.nan_to_num(residual)
