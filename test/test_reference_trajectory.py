@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
+import hypothesis
 import numpy as np
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -259,7 +259,7 @@ def moving(velocity, acceleration=(0.0, 0.0)):
 speeds = st.floats(-1.4, 1.4)
 
 
-@given(
+@hypothesis.given(
     velocity=st.tuples(speeds, speeds),
     acceleration=st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
     goal=st.tuples(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0)),

@@ -11,9 +11,9 @@ It is interpolated as by joint_trajectory_controller, except where that would ju
 motion to the first point starts from the position, velocity and acceleration of the reference when
 the trajectory begins, and brakes while it sets out from where the braking ends, so that a long time
 to that point does not make the arm swing away; if the first point is at that very time, the
-trajectory is blended into the present reference as fast as the limits allow.  Points in the past are skipped.  The last point is
-held.  To keep planning below a second, a trajectory longer than `LONGEST` or with more than
-`MOST_POINTS` is rejected.
+trajectory is blended into the present reference as fast as the limits allow.  Points in the past
+are skipped.  The last point is held.  To keep planning below a second, a trajectory longer than
+`LONGEST` or with more than `MOST_POINTS` is rejected.
 """
 
 from __future__ import annotations

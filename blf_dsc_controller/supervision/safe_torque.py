@@ -130,8 +130,9 @@ class SafeTorque:
 
         load' = L (tau - H(q, dq, dq, ddq) P^ - friction - load),   |load| <= half the torque limit
 
-    Estimated friction is not part of it, since it helps to brake.  So an arm comes to rest with a payload, or with a model, that the law had not learned yet. An
-    arm that does not move at all (brakes) leaves the load as it is.
+    Estimated friction is not part of it, since it helps to brake.  So an arm comes to rest with a
+    payload, or with a model, that the law had not learned yet.  An arm that does not move at all
+    (brakes) leaves the load as it is.
 
     Attributes:
         load: torque (n,) [N m] that the model lacks; initially the disturbance estimate of the law.
