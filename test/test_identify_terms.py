@@ -3,6 +3,10 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
+from pathlib import Path
+
 import numpy as np
 import pinocchio
 import pytest
@@ -205,3 +209,30 @@ def test_gains_turn_currents_into_torques(plain, found, tmp_path):
     np.testing.assert_allclose(other.torque, found.torque, rtol=0.01)
     with pytest.raises(BlfDscError, match='got 2 gains for 7 joints'):
         identify_bag(bag, ROBOT, gains=(1.0, 2.0))
+
+
+def test_coupling_and_load_friction_that_would_drive_are_not_identified(plain):
+    """Negative ones reduce the error, too, but friction does not drive."""
+    states, gravity = plain[0].copy(), plain[1]
+    states[:, 2, :2] -= 0.05 * (np.abs(gravity) * np.sign(states[:, 1]))[:, :2]
+    states[:, 2, 5:] -= 0.3 * states[:, 1, [6, 5]]
+    found = identify_arm(recording_of(states), ROBOT)
+    assert not found.joint_terms[3, :2].any()
+    assert not found.coupling.any()
+
+
+def test_table_of_recordings_has_a_row_for_a_folder_with_a_bag(
+    plain, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / 'benchmark'))
+    recordings = importlib.import_module('recordings')
+    write_states(tmp_path / 'bag', PANDA, measured(plain[0], 3))
+    (tmp_path / 'panda.urdf').write_text(PANDA_TEXT)
+    monkeypatch.setattr(sys, 'argv', ['recordings.py', str(tmp_path)])
+    recordings.main()
+    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith('| bag '))
+    cells = [cell.strip() for cell in row.split('|')[1:-1]]
+    urdf, least_squares, bounded, ours = (float(cells[k]) for k in (1, 3, 4, 5))
+    assert urdf > 10.0
+    assert max(least_squares, bounded, ours) < 1.0
+    assert cells[7] == 'yes'

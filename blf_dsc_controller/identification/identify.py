@@ -153,7 +153,7 @@ def identify_arm(
     if duration < _SHORTEST:
         raise BlfDscError(f'the bag holds {duration:.3g} s; record at least {_SHORTEST:g} s')
     rows = rows_of(recording, parameters.model)
-    moving, fit, test = _windows(rows, n)
+    moving, fit, test = windows_of(rows, n)
     P = parameters.of(chain.inertias, robot.rotors(chain))
     if effort == 'without-gravity':
         rows = rows._replace(torque=recording.torque + rows.gravity_torque(P))
@@ -169,8 +169,8 @@ def identify_arm(
         if np.isnan(picked_up):
             picked_up = _pick_up(rows, fit, G, full)
         rows.X[rows.time < picked_up, :, -LOAD:] = 0.0
-    prior = full.only(_worthwhile(_regression(rows, fit, G, full), full))
-    found = _regression(rows, fit, G, prior)
+    prior = full.only(_worthwhile(regression(rows, fit, G, full), full))
+    found = regression(rows, fit, G, prior)
     z_best = solve(found.A, found.b, prior.cones, prior.start)
     values = prior.mean + prior.D @ z_best
     rows.set_load((G @ values)[: parameters.model.p])
@@ -211,7 +211,7 @@ def identify_arm(
     )
 
 
-def _windows(rows: Rows, n: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+def windows_of(rows: Rows, n: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """Return the windows in which the arm moves: all, those to fit, and those held back.
 
     Raises:
@@ -234,7 +234,7 @@ def _windows(rows: Rows, n: int) -> tuple[NDArray[np.intp], NDArray[np.intp], ND
     return moving, fit, test
 
 
-class _Regression(NamedTuple):
+class Regression(NamedTuple):
     """The problem |A z - b|^2 + |z|^2 of k unknowns z, normalised by deviations of the joints."""
 
     A: Floats  # (., k)
@@ -243,9 +243,9 @@ class _Regression(NamedTuple):
     scatter: Floats  # (k, k) covariance of A^T b
 
 
-def _regression(
+def regression(
     rows: Rows, fit: NDArray[np.intp], G: Floats, prior: Prior, parts: int = _FOLDS
-) -> _Regression:
+) -> Regression:
     """Return the problem of the prior's z, with deviations and gravity of its own solution.
 
     The delay is linearised about its last estimate.
@@ -278,13 +278,18 @@ def _regression(
         all_rows = part.reshape(-1, theta.size + 1)
         Ab = np.column_stack((all_rows[:, :-1] @ B, all_rows[:, -1] - all_rows[:, :-1] @ mean))
         folds.append(Ab.T @ Ab)
-    return _Regression(A, b, np.array(folds), scatter)
+    return Regression(A, b, np.array(folds), scatter)
 
 
-def _worthwhile(found: _Regression, prior: Prior) -> list[tuple[int, ...]]:
-    """Return the optional entries of z that predict the folds better, each fold by the others."""
+def _worthwhile(found: Regression, prior: Prior) -> list[tuple[int, ...]]:
+    """Return the optional entries of z that predict the folds better, each fold by the others.
+
+    Entries that cannot be negative must be positive in all of them.
+    """
     kept: list[tuple[int, ...]] = []
     optional = prior.optional
+    positive = np.zeros(prior.mean.size, dtype=bool)
+    positive[[cone.at for cone in prior.cones if cone.at in sum(optional, ())]] = True
     always = np.ones(prior.mean.size, dtype=bool)
     for entry in optional:
         always[list(entry)] = False
@@ -298,6 +303,8 @@ def _worthwhile(found: _Regression, prior: Prior) -> list[tuple[int, ...]]:
         for own, others in zip(found.folds, rest, strict=True):
             A = others[np.ix_(at, at)] + np.eye(int(used.sum()))
             z = np.append(np.linalg.solve(A, others[at, -1]), -1.0)
+            if (z[:-1][positive[used]] <= 0.0).any():
+                return np.inf
             at_b = np.append(used, True)
             total += float(z @ own[np.ix_(at_b, at_b)] @ z)
         return total
@@ -314,7 +321,7 @@ def _worthwhile(found: _Regression, prior: Prior) -> list[tuple[int, ...]]:
 
 def _pick_up(rows: Rows, fit: NDArray[np.intp], G: Floats, prior: Prior) -> float:
     """Return the time [s] from which a load explains the torques best."""
-    found = _regression(rows, fit, G, prior, len(fit) // _PER_STEP)
+    found = regression(rows, fit, G, prior, len(fit) // _PER_STEP)
     load = np.zeros(prior.mean.size + 1, dtype=bool)
     load[-LOAD - 2 : -2] = True
     without = found.folds.copy()

@@ -123,14 +123,15 @@ def prior_of(
         of_load = np.zeros((LOAD, LOAD))
     coupling = [each[-1] for each in (rotor, viscous, coulomb)]
     spread = np.concatenate((*joint_terms, coupling))
-    for k in range(_POSITIVE * n):
-        cones.append(Cone(10 * n + k, means[[[k]]], spread[[[[k]]]]))
-        start.append(np.full(1, 0.1))
+    positive = [*range(_POSITIVE * n), *range(7 * n, 7 * n + COUPLING)]
+    cones += [Cone(10 * n + k, means[[[k]]], spread[[[[k]]]]) for k in positive]
+    first = np.zeros(spread.size)
+    first[positive] = 0.1
     return Prior(
         mean=np.concatenate((chain.inertias.ravel(), means, np.zeros(LOAD + 1))),
         D=block_diag(*blocks, np.diag(spread), of_load, _DELAY),
         cones=cones,
-        start=np.concatenate((*start, np.zeros(3 * n + COUPLING), 0.1 * np.eye(LOAD + 1)[0])),
+        start=np.concatenate((*start, first, 0.1 * np.eye(LOAD + 1)[0])),
     )
 
 
