@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start the simulated arm, the controller, its watchdog and, with `bag`, the recorder.
+"""Start the controller with its watchdog, the simulated arm, and, with `bag`, the recorder.
 
 For instance: ros2 launch blf_dsc_controller closed_loop.launch.py mode:=lockstep bag:=run1
+and for the driver of an arm: ros2 launch blf_dsc_controller closed_loop.launch.py driver:=fr3
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
@@ -20,14 +21,52 @@ from sim_plant.arms import urdf_of
 PACKAGE = 'blf_dsc_controller'
 
 
+class Driver(NamedTuple):
+    """Topics of a driver, and the parameter file for it."""
+
+    config: str
+    joint_states: str
+    commands: str
+
+    @property
+    def remappings(self) -> list[tuple[str, str]]:
+        """Return the names of the controller's topics, and those of the driver."""
+        own = f'{PACKAGE}/commands'  # of the simulated arm
+        return [
+            ('joint_states', self.joint_states),
+            ('~/commands', self.commands),
+            (own, self.commands),
+        ]
+
+
+DRIVERS = {
+    # joint_state_broadcaster at update_rate; joint_states is joint_state_publisher's, at 30 Hz
+    'fr3': Driver('fr3', 'franka/joint_states', 'fr3_effort_controller/commands'),
+    'ur5e': Driver('ur5e_driver', 'joint_states', 'forward_effort_controller/commands'),
+}
+
+
 def generate_launch_description() -> LaunchDescription:
     """Declare the arguments; `--show-args` lists them."""
     return LaunchDescription(
         [
             DeclareLaunchArgument(
                 'config',
-                default_value='recommended',
-                description='parameter file for all nodes, or the name of a preset',
+                default_value='',
+                description='parameter file for all nodes, or the name of a preset; empty: that of '
+                'the driver, or recommended',
+            ),
+            DeclareLaunchArgument(
+                'driver',
+                default_value='',
+                choices=['', *DRIVERS],
+                description='driver of an arm, whose topics are used; empty: the simulated arm',
+            ),
+            DeclareLaunchArgument(
+                'simulated',
+                default_value='false',
+                choices=['false', 'true'],
+                description='start the simulated arm with the topics of the driver',
             ),
             DeclareLaunchArgument(
                 'mode',
@@ -65,11 +104,15 @@ def generate_launch_description() -> LaunchDescription:
 
 def nodes(context: LaunchContext) -> list[Node]:
     """Create the nodes once the arguments are known."""
-    config, mode, namespace, bag, markers, rviz = (
+    config, mode, namespace, bag, markers, rviz, robot, simulated = (
         LaunchConfiguration(name).perform(context)
-        for name in ('config', 'mode', 'namespace', 'bag', 'markers', 'rviz')
+        for name in (
+            *('config', 'mode', 'namespace', 'bag', 'markers', 'rviz'),
+            *('driver', 'simulated'),
+        )
     )
-    file = str(locate(config))
+    driver = DRIVERS.get(robot)
+    file = str(locate(config or (driver.config if driver else 'recommended')))
     # The first sample must be recorded too, so the loop starts after the recorder subscribes.
     of_loop = {'wait_for_subscribers': 1} if bag else {}
     of_plant = of_loop | ({'mode': mode} if mode else {})
@@ -83,6 +126,7 @@ def nodes(context: LaunchContext) -> list[Node]:
             name=executable,
             namespace=namespace,
             parameters=[file, given] if given else [file],
+            remappings=driver.remappings if driver else [],
             output='screen',
             on_exit=Shutdown(reason=f'{executable} has ended') if required else None,
         )
@@ -93,8 +137,15 @@ def nodes(context: LaunchContext) -> list[Node]:
         started.append(node('arm_markers', {}, required=False))
     if bag:
         started.append(node('bag_recorder', {'output': bag}))
+<<<<<<< HEAD
     started.append(node('torque_watchdog', {}, required=False))
     return [*started, node('blf_dsc_controller', of_loop), node('sim_plant', of_plant)]
+=======
+    started.append(node('blf_dsc_controller', of_loop))
+    if driver is None or simulated == 'true':
+        started.append(node('sim_plant', of_plant))
+    return started
+>>>>>>> 84e8c40 (Add files for the drivers of an FR3 and a UR5e, and launch with their topics)
 
 
 def view(namespace: str, config: str) -> list[Node]:

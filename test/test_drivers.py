@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The files for named robots fit their drivers, and run on simulated ones."""
+
+from __future__ import annotations
+
+import json
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio
+import pytest
+import yaml
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+
+from random_arm import CONFIG
+from rclpy.qos import (
+    DurabilityPolicy,
+    LivelinessPolicy,
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
+from test_launch import NODES, arguments_of, launched, start  # noqa: F401 - fixtures
+
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.replay.verify import verify
+
+
+class Facts(NamedTuple):
+    """What the sources of a driver say; each is named beside it."""
+
+    preset: str
+    joint_states: str
+    commands: str
+    rate: float  # Hz
+    joints: tuple[str, ...]
+
+
+FACTS = {
+    # franka_ros2 jazzy 29cb85a (3.4.0)
+    'fr3': Facts(
+        preset='fr3',
+        # franka_bringup/launch/franka.launch.py: the broadcaster's remapping
+        joint_states='/franka/joint_states',
+        commands='/fr3_effort_controller/commands',  # config/fr3_effort_controller.yml
+        rate=1000.0,  # franka_bringup/config/controllers.yaml: update_rate
+        # franka_description 566ba44, robots/common/franka_arm.xacro with the prefix fr3_
+        joints=tuple(f'fr3_joint{i}' for i in range(1, 8)),
+    ),
+    # Universal_Robots_ROS2_Driver jazzy a16a268 (3.8.0)
+    'ur5e': Facts(
+        preset='ur5e_driver',
+        joint_states='/joint_states',  # ur_robot_driver/launch/ur_control.launch.py
+        # ur_robot_driver/config/ur_controllers.yaml: a forward_command_controller
+        commands='/forward_effort_controller/commands',
+        rate=500.0,  # ur_robot_driver/config/ur5e_update_rate.yaml
+        # the same file: forward_effort_controller.joints, in this order, without a tf_prefix
+        joints=(
+            'shoulder_pan_joint',
+            'shoulder_lift_joint',
+            'elbow_joint',
+            'wrist_1_joint',
+            'wrist_2_joint',
+            'wrist_3_joint',
+        ),
+    ),
+}
+# ros2_controllers 4, tried with its real parts: joint_state_broadcaster publishes with the
+# first, the effort controllers subscribe with the second (SystemDefaultsQoS).
+OFFERED = {'depth': 1, 'reliability': 'RELIABLE', 'durability': 'TRANSIENT_LOCAL'}
+REQUESTED = {'depth': 1, 'reliability': 'BEST_EFFORT', 'durability': 'VOLATILE'}
+ROBOTS = pytest.mark.parametrize('robot', FACTS)
+
+
+@ROBOTS
+def test_file_has_the_joints_and_the_rate_of_the_driver(robot):
+    facts = FACTS[robot]
+    loop = load_loop(facts.preset)
+    for config in (loop.controller, loop.plant):
+        assert config.joints == facts.joints
+        assert config.sample_time == 1.0 / facts.rate
+        assert config.robot.drive_compensates == 'gravity_and_friction'
+    assert loop.plant.actuator.without_command == 'hold'
+
+
+def test_effort_controller_of_the_fr3_has_its_joints_in_the_order_of_the_commands():
+    (section,) = yaml.safe_load((CONFIG / 'fr3_effort_controller.yml').read_text()).items()
+    assert f'/{section[0]}/commands' == FACTS['fr3'].commands
+    assert tuple(section[1]['ros__parameters']['joints']) == FACTS['fr3'].joints
+
+
+def test_urdf_of_the_fr3_has_its_mass_and_its_reach():
+    """franka_description: 2.3966 kg of base and 15.4948 kg of links; the flange at q = 0."""
+    model = pinocchio.buildModelFromXML((CONFIG / 'fr3.urdf').read_text())
+    assert sum(inertia.mass for inertia in model.inertias) == pytest.approx(
+        2.3966 + 15.4948, abs=1e-3
+    )
+    data = model.createData()
+    q = np.zeros(7)
+    pinocchio.framesForwardKinematics(model, data, q)
+    flange = data.oMf[model.getFrameId('fr3_link8')].translation
+    np.testing.assert_allclose(flange, [0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.107], atol=1e-6)
+
+
+def described(endpoint):
+    """Return what matters of an endpoint; deadlines that are not set are reported as infinite."""
+    found = endpoint.qos_profile
+    return {
+        'depth': 1,
+        'reliability': found.reliability.name,
+        'durability': found.durability.name,
+    }
+
+
+def quality(given):
+    return QoSProfile(
+        depth=given['depth'],
+        reliability=ReliabilityPolicy[given['reliability']],
+        durability=DurabilityPolicy[given['durability']],
+        liveliness=LivelinessPolicy.AUTOMATIC,
+    )
+
+
+@ROBOTS
+@pytest.mark.parametrize('simulated', ['false', 'true'])
+def test_launched_nodes_use_the_topics_of_the_driver(launched, start, tmp_path, robot, simulated):  # noqa: F811
+    facts = FACTS[robot]
+    nodes = {node.name: node for node in launched(driver=robot, simulated=simulated)}
+    assert ('sim_plant' in nodes) == (simulated == 'true')
+    started = {}
+    for name, node in nodes.items():
+        if name in NODES:
+            remaps = [f'{a}:={b}' for a, b in node.remappings]
+            argv = arguments_of(node, tmp_path)
+            started[name] = start(*argv, *(word for each in remaps for word in ('-r', each)))
+    controller = started['blf_dsc_controller']
+    types = dict(controller.get_topic_names_and_types())
+    assert types[facts.joint_states] == ['sensor_msgs/msg/JointState']
+    assert types[facts.commands] == ['std_msgs/msg/Float64MultiArray']
+    (states,) = controller.get_subscriptions_info_by_topic(facts.joint_states)
+    (commands,) = controller.get_publishers_info_by_topic(facts.commands)
+    for offered, requested in (
+        (OFFERED, described(states)),
+        (described(commands), REQUESTED),
+    ):
+        verdict, reason = qos_check_compatible(quality(offered), quality(requested))
+        assert verdict == QoSCompatibility.OK, reason
+    assert controller.config.sample_time == 1.0 / facts.rate
+    if simulated == 'true':
+        plant = started['sim_plant']
+        (states,) = plant.get_publishers_info_by_topic(facts.joint_states)
+        assert states.qos_profile.durability.name == 'TRANSIENT_LOCAL'
+        assert plant.count_subscribers(facts.commands) == 1
+
+
+@ROBOTS
+@pytest.mark.usefixtures('blank_pictures')
+def test_one_command_runs_the_simulated_driver_over_ros_and_replays_bit_for_bit(robot, tmp_path):
+    """With a pick-up at 6 s; 60 s with pick-up and put-down are run by hand before a release."""
+    preset = FACTS[robot].preset
+    file = tmp_path / 'early.yaml'
+    text = (CONFIG / f'{preset}.yaml').read_text()
+    file.write_text(text.replace('begin: [20.0]', 'begin: [6.0]'))
+    run = ['run', '--config', str(file), '--mode', 'lockstep', '--duration', '8']
+    assert main([*run, '--out', str(tmp_path / 'out')]) == 0
+    summary = json.loads((tmp_path / 'out' / 'summary.json').read_text(encoding='utf-8'))
+    assert summary['tracking']['held']
+    recorded = read_run(tmp_path / 'out' / 'bag')
+    assert recorded.stops == ()
+    assert verify(tmp_path / 'out' / 'bag').difference is None
