@@ -192,16 +192,17 @@ def test_payload_is_learned_on_a_drive_that_compensates_gravity(own_model):
 @pytest.mark.parametrize(
     ('preset', 'model', 'worst', 'learned'),
     [
-        ('panda', {'drive.mass_deviation': 0.5, 'drive.centre_deviation': 0.015}, 0.65, 0.07),
-        ('panda', {'drive.mass_factor': 1.5}, 0.65, 0.25),
+        ('panda', {'drive.mass_deviation': 0.8, 'drive.centre_deviation': 0.02}, 0.6, 0.07),
+        ('panda', {'drive.mass_factor': 0.5}, 0.6, 0.07),
+        ('panda', {'drive.mass_factor': 2.0}, 0.6, 0.07),
         ('ur5e', {'drive.mass_factor': 0.5}, 0.4, 0.3),
         ('ur5e', {'drive.mass_factor': 2.0}, 0.35, 0.3),
     ],
 )
 def test_bound_holds_with_a_wrong_model_of_the_drive(preset, model, worst, learned):
-    """Each body up to 50 % off, or all of them half or twice as heavy, and 2 kg at 10 s.
+    """Each body up to 80 % off, or all of them half or twice as heavy, and 2 kg at 10 s.
 
-    Where the drives hold the true arm the Panda reaches 0.48 and 0.05, the UR5e 0.30 and 0.26; with
+    Where the drives hold the true arm the Panda reaches 0.50 and 0.06, the UR5e 0.30 and 0.26; with
     half the weight missing the UR5e reaches 0.350 (0.300 with `compensation: state`).
     """
     pick_up = {'events.begin': [10.0], 'events.duration': [0.0], 'drive.seed': 3}
