@@ -137,15 +137,11 @@ def nodes(context: LaunchContext) -> list[Node]:
         started.append(node('arm_markers', {}, required=False))
     if bag:
         started.append(node('bag_recorder', {'output': bag}))
-<<<<<<< HEAD
     started.append(node('torque_watchdog', {}, required=False))
-    return [*started, node('blf_dsc_controller', of_loop), node('sim_plant', of_plant)]
-=======
     started.append(node('blf_dsc_controller', of_loop))
     if driver is None or simulated == 'true':
         started.append(node('sim_plant', of_plant))
     return started
->>>>>>> 84e8c40 (Add files for the drivers of an FR3 and a UR5e, and launch with their topics)
 
 
 def view(namespace: str, config: str) -> list[Node]:
