@@ -90,6 +90,8 @@ def test_prior_covers_the_deviations_of_links_drives_and_friction():
     assert np.linalg.eigvalsh(covariance)[0] > 0.0
     assert deviation['rotor7'] >= 0.5 * 12.0 / 400.0
     assert deviation['coulomb panda_joint1'] == pytest.approx(0.05 * 87.0)
+    known = prior_covariance(panda(robot__coulomb=[0.7] * 7))
+    assert known[-7, -7] == pytest.approx(0.35**2)
     np.testing.assert_allclose(
         settings_of_config(config).information @ covariance, np.eye(62), atol=1e-5
     )

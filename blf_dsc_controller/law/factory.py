@@ -72,7 +72,8 @@ def initial_columns(config: ControllerConfig) -> tuple[float, ...]:
 def prior_covariance(config: ControllerConfig) -> np.ndarray:
     """Return the prior covariance (m, m) of theta: identity for planar arms, else of the URDF.
 
-    Standard deviations: half its value for a drive, 5 % of the rated torque for friction columns.
+    Standard deviations: half its value for a drive and for known friction, else 5 % of the rated
+    torque for friction columns.
     """
     columns = column_names(config)
     if config.model != 'urdf':
@@ -80,8 +81,8 @@ def prior_covariance(config: ControllerConfig) -> np.ndarray:
     L = learned_of(config.robot, config.robot.chain(config.joints)).L
     covariance = np.zeros((len(L) + len(columns),) * 2)
     covariance[: len(L), : len(L)] = L @ L.T
-    for k, name in enumerate(columns):
-        covariance[len(L) + k, len(L) + k] = _usual_friction(config, name) ** 2
+    for k, (name, known) in enumerate(zip(columns, initial_columns(config), strict=True)):
+        covariance[len(L) + k, len(L) + k] = (0.5 * known or _usual_friction(config, name)) ** 2
     return covariance
 
 
@@ -96,13 +97,14 @@ def _usual_friction(config: ControllerConfig, column: str) -> float:
 def column_limits(config: ControllerConfig) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return the least and the most that each disturbance column can be estimated at.
 
-    Friction is between 0 and three times its initial estimate, or 5 % of the rated torque where
-    that is zero: a push that is learned as negative friction turns over where the joint does.
+    Friction is between a third of its initial estimate and three times that, or where that is zero
+    between 0 and 5 % of the rated torque: a push that is learned as friction, negative or none,
+    turns over where the joint does.
     """
     least, most = [], []
     for name, initial in zip(column_names(config), initial_columns(config), strict=True):
         is_friction = name.startswith(('viscous ', 'coulomb '))
-        least.append(0.0 if is_friction else -np.inf)
+        least.append(initial / _MOST_FRICTION if is_friction else -np.inf)
         limit = _MOST_FRICTION * initial or _usual_friction(config, name)
         most.append(limit if is_friction else np.inf)
     return tuple(least), tuple(most)
