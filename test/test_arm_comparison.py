@@ -20,7 +20,6 @@ from blf_dsc_controller.arm_comparison.contenders import (
     joint_inertia,
     law_changes,
     run,
-    torque_rows,
 )
 from blf_dsc_controller.arm_comparison.study import (
     ROUGHEST,
@@ -38,6 +37,7 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.reference import terms
 from blf_dsc_controller.reference.approach import reference_of
+from blf_dsc_controller.simulation.metrics import torque_rows
 
 IDEAL = {
     'truth.mass_deviation': 0.0,
