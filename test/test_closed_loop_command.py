@@ -145,4 +145,4 @@ def test_redirected_output_has_plain_progress_lines(out):
     assert len(progress) >= 1
     assert 'max|xi1|/bound' in progress[-1]
     assert 'parameter error 41.49 %' in progress[-1]  # as with the model two_link
-    assert 'parameters  error end 41.3 %' in output
+    assert 'parameters  error end 41.5 %' in output

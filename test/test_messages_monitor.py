@@ -11,8 +11,10 @@ from paper_case import EXACT, configured
 from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.factory import controller_of, estimate_names, settings_of_config
 from blf_dsc_controller.law.lyapunov import ExponentialBound, decay_rate, largest_inertia
+from blf_dsc_controller.law.surface import virtual_control
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.messages.telemetry import Monitor
@@ -20,7 +22,8 @@ from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 
 LARGEST = np.linalg.eigvalsh([[2.12, 0.72], [0.72, 0.32]])[-1]  # kg m^2, of M stretched
-LEAKY = EXACT | {'disturbance.leakage': 0.02, 'disturbance.gain': [50.0, 80.0]}
+PAPER = {'learning.compensation': 'state', 'learning.bumpless': False}  # (32) is for this form
+LEAKY = EXACT | PAPER | {'disturbance.leakage': 0.02, 'disturbance.gain': [50.0, 80.0]}
 
 
 def settings(law):
@@ -39,6 +42,8 @@ def test_largest_inertia_is_that_of_the_stretched_arm():
         ({'learning.weight': 0.0}, 0.0),
         ({'law': 'backstepping'}, 0.0),
         ({'truth.parameters': []}, 0.0),
+        ({'learning.compensation': 'reference'}, 0.0),
+        ({'learning.bumpless': True}, 0.0),
         ({}, 0.02 * 50.0),
         ({'surface.gain': [0.3, 9.0]}, 0.3),
         ({'learning.weight': 0.1}, 2.0 * 0.1 * 0.5 * 0.003 / (0.003 + 1e-5)),
@@ -55,11 +60,32 @@ def test_bound_starts_at_the_latch_and_decays_to_theta_over_kappa_e():
     bound = ExponentialBound(settings(LEAKY))
     floor = 0.5 * 0.02 * 2.0 * 0.2**2 / bound.rate
     assert bound.floor == pytest.approx(floor)
-    assert np.isnan(bound.at(1.0, 3.0, latched=False))
-    assert bound.at(2.0, 0.7, latched=True) == pytest.approx(0.7)
+    k = np.array([2e-3, 2e-3])
+    assert np.isnan(bound.at(1.0, 3.0, False, 0.1 * k, k))
+    assert bound.at(2.0, 0.7, True, 0.1 * k, k) == pytest.approx(0.7)
     later = floor + (0.7 - floor) * np.exp(-bound.rate * 1.5)
-    assert bound.at(3.5, 0.1, latched=True) == pytest.approx(later)
-    assert bound.at(1e3, 0.0, latched=True) == pytest.approx(floor)
+    assert bound.at(3.5, 0.1, True, 0.7 * k, k) == pytest.approx(later)
+    assert bound.at(1e3, 0.0, True, 0.1 * k, k) == pytest.approx(floor)
+
+
+def test_bound_ends_past_the_knee_where_the_virtual_control_loses_its_gain():
+    """K counts for 7 of its 150 1/s at 0.99 of the bound; the knee is at 0.78."""
+    law = settings(LEAKY)
+    ratios = np.array([0.5, law.knee[0] / law.bound[0], 0.99])
+    shares = [gain_on_potential(law, ratio * law.bound[0]) for ratio in ratios]
+    assert shares == pytest.approx([150.0, 150.0, 7.1], rel=0.01)
+
+    bound, k = ExponentialBound(law), law.bound
+    bound.at(0.0, 0.7, True, 0.1 * k, k)
+    assert np.isnan(bound.at(1.0, 0.9, True, np.array([0.0, -0.8]) * k, k))
+    assert bound.at(2.0, 0.5, True, 0.1 * k, k) == pytest.approx(0.5)
+
+
+def gain_on_potential(law, xi1):
+    """Rate [1/s] at which the part of beta2 with the gain K reduces V1 of joint1 at xi1 [rad]."""
+    joint = [part[0] for part in (law.bound, law.weight, law.slope_limit, law.knee)]
+    part = virtual_control(xi1, law.bound[0], law.K[0], 0.0, 0.0)
+    return -part * barrier.gradient(xi1, *joint) / barrier.potential(xi1, *joint)
 
 
 def decoded(monitor, names, *arguments):

@@ -8,7 +8,7 @@ import numpy as np
 from blf_dsc_controller.arms.batch import inertia_matrices
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.settings import LINEAR, NEWTON, Settings
+from blf_dsc_controller.law.settings import LINEAR, NEWTON, REFERENCE, Settings
 from blf_dsc_controller.law.state import Sample, Signals, State
 
 _POSTURES = 181
@@ -93,9 +93,12 @@ def largest_inertia(settings: Settings) -> float:
 def decay_rate(settings: Settings) -> float:
     """Return kappa_e of (32) [1/s]; 0 if (32) is void: eta, gamma or kappa 0, or unknown truth.
 
-    A Newton step replaces sigma, the smallest eigenvalue of Phi_e, by sigma / (sigma + rho).
+    It is void for other forms than the paper's, too: with compensation along the reference, or with
+    the handover to d^3, V of (29) need not fall (doc/theory.md: stability).  A Newton step replaces sigma, the smallest eigenvalue of Phi_e, by sigma / (sigma + rho).
     """
     if settings.surface == LINEAR or settings.truth_known == 0:
+        return 0.0
+    if settings.compensation == REFERENCE or settings.bumpless == 1:
         return 0.0
     sigma = settings.sigma
     if settings.update == NEWTON:
@@ -126,11 +129,17 @@ class ExponentialBound:
         constant, amplitude = np.abs(settings.true_disturbance[:2])
         theta = 0.5 * settings.eta * float(np.sum((constant + amplitude) ** 2))
         self.floor = theta / self.rate if self.rate > 0.0 else nan
+        self._knee = settings.knee / settings.bound
         self._begin: tuple[float, float] | None = None
 
-    def at(self, t: float, V: float, latched: bool) -> float:
-        """Return the bound at time t [s], given V(t) [J]; NaN before the latch or at rate 0."""
-        if self.rate == 0.0 or not latched:
+    def at(self, t: float, V: float, latched: bool, xi1: np.ndarray, bound: np.ndarray) -> float:
+        """Return the bound at time t [s], given V(t) [J]; NaN before the latch or at rate 0.
+
+        It ends where an error (n,) [rad] passes the knee for k(t) (n,) [rad]: K V1 is lost there.
+        It begins anew when the error returns.
+        """
+        if self.rate == 0.0 or not latched or np.any(np.abs(xi1) > self._knee * bound):
+            self._begin = None
             return nan
         if self._begin is None:
             self._begin = t, V

@@ -168,7 +168,8 @@ class Monitor:
             self._start = stamp if self._start is None else self._start
             V = float(sample.lyapunov.sum())
             t = (stamp - self._start) * 1e-9
-            values += [*sample.lyapunov, self._ceiling.at(t, V, bool(sample.latched[0]))]
+            latched = bool(sample.latched[0])
+            values += [*sample.lyapunov, self._ceiling.at(t, V, latched, sample.xi1, bound)]
         return values
 
     def message(self, stamp: int, sample: Sample, ratio: np.ndarray, bound: np.ndarray) -> Message:

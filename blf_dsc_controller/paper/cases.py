@@ -16,6 +16,8 @@ DURATION = 60.0  # s
 NO_DISTURBANCE = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
 LEAKY = {
     'disturbance.leakage': 0.02,
+    'learning.compensation': 'state',
+    'learning.bumpless': False,
     'truth.parameters': [1.0, 0.32, 0.4],
     'truth.constant': [0.1, 0.1],
 }
@@ -67,13 +69,13 @@ VARIATIONS = (
     Case('paper_from_zero', 'paper, P^(0) = 0', 'paper', {'learning.initial_estimate': [0.0] * 3}),
     Case(
         'leaky',
-        'recommended, eta = 0.02, sinusoidal disturbance',
+        "recommended in the paper's form, eta = 0.02, sinusoidal disturbance",
         'recommended',
         {**LEAKY, 'truth.amplitude': [0.1, 0.1]},
     ),
     Case(
         'leaky_constant',
-        'recommended, eta = 0.02, constant disturbance',
+        "recommended in the paper's form, eta = 0.02, constant disturbance",
         'recommended',
         LEAKY,
         {'disturbance.amplitude': [0.0, 0.0]},
