@@ -113,11 +113,22 @@ def test_compensation_of_the_paper_breaks_them(name):
 def test_sine_of_the_frequency_of_the_reference_is_compensated_like_a_model():
     """Mistaken for parameters, it is still cancelled along the reference."""
     rms = []
-    for law in ({}, OFF, AT_STATE):
+    for law in ({}, OFF):
         found, _ = run('noisy, cosines', law)
         rms.append(np.sqrt(np.mean(found.error[found.time > 10.0] ** 2, axis=0)).max())
     assert rms[0] < 0.5 * rms[1]  # 0.012, 0.096 mrad
-    assert rms[2] > 3.0 * rms[1]  # 0.50 mrad
+
+
+def test_torques_that_bang_between_their_limits_stop_the_arm():
+    """In the paper's form the same sine makes the loop unstable: 47 % of the torques are cut.
+
+    None stays at its limit for 0.5 s, but more than a fifth of the samples adds up.
+    """
+    found, _ = run('noisy, cosines', AT_STATE)
+    (stop,) = found.stops
+    assert stop.reason == 'torque saturated'
+    begin = np.flatnonzero(np.any(np.abs(found.torque) >= found.torque_limit, axis=1))[0] * 1e-3
+    assert begin + 0.6 < stop.stamp * 1e-9 < begin + 3.0
 
 
 def test_learned_friction_stays_friction():

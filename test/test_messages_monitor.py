@@ -61,11 +61,11 @@ def test_bound_starts_at_the_latch_and_decays_to_theta_over_kappa_e():
     floor = 0.5 * 0.02 * 2.0 * 0.2**2 / bound.rate
     assert bound.floor == pytest.approx(floor)
     k = np.array([2e-3, 2e-3])
-    assert np.isnan(bound.at(1.0, 3.0, False, 0.1 * k, k))
-    assert bound.at(2.0, 0.7, True, 0.1 * k, k) == pytest.approx(0.7)
+    assert np.isnan(bound.at(1.0, 3.0, 0.1 * k, k, latched=False))
+    assert bound.at(2.0, 0.7, 0.1 * k, k, latched=True) == pytest.approx(0.7)
     later = floor + (0.7 - floor) * np.exp(-bound.rate * 1.5)
-    assert bound.at(3.5, 0.1, True, 0.7 * k, k) == pytest.approx(later)
-    assert bound.at(1e3, 0.0, True, 0.1 * k, k) == pytest.approx(floor)
+    assert bound.at(3.5, 0.1, 0.7 * k, k, latched=True) == pytest.approx(later)
+    assert bound.at(1e3, 0.0, 0.1 * k, k, latched=True) == pytest.approx(floor)
 
 
 def test_bound_ends_past_the_knee_where_the_virtual_control_loses_its_gain():
@@ -76,9 +76,9 @@ def test_bound_ends_past_the_knee_where_the_virtual_control_loses_its_gain():
     assert shares == pytest.approx([150.0, 150.0, 7.1], rel=0.01)
 
     bound, k = ExponentialBound(law), law.bound
-    bound.at(0.0, 0.7, True, 0.1 * k, k)
-    assert np.isnan(bound.at(1.0, 0.9, True, np.array([0.0, -0.8]) * k, k))
-    assert bound.at(2.0, 0.5, True, 0.1 * k, k) == pytest.approx(0.5)
+    bound.at(0.0, 0.7, 0.1 * k, k, latched=True)
+    assert np.isnan(bound.at(1.0, 0.9, np.array([0.0, -0.8]) * k, k, latched=True))
+    assert bound.at(2.0, 0.5, 0.1 * k, k, latched=True) == pytest.approx(0.5)
 
 
 def gain_on_potential(law, xi1):

@@ -80,7 +80,11 @@ class Safety:
         1.0,
         'tracking error to stop at, as a multiple of the bound, for laws with a barrier; 0: never',
     )
-    saturation_time: float = positive(0.5, 'longest time that a torque may stay at its limit', 's')
+    saturation_time: float = positive(
+        0.5,
+        'longest time of torques at their limit; a quarter of the time without is deducted',
+        's',
+    )
     overrun_fraction: float = positive(
         0.4, 'largest fraction of missed states, averaged over overrun_window', at_most=1.0
     )

@@ -94,7 +94,8 @@ def decay_rate(settings: Settings) -> float:
     """Return kappa_e of (32) [1/s]; 0 if (32) is void: eta, gamma or kappa 0, or unknown truth.
 
     It is void for other forms than the paper's, too: with compensation along the reference, or with
-    the handover to d^3, V of (29) need not fall (doc/theory.md: stability).  A Newton step replaces sigma, the smallest eigenvalue of Phi_e, by sigma / (sigma + rho).
+    the handover to d^3, V of (29) need not fall (doc/theory.md: stability).  A Newton step
+    replaces sigma, the smallest eigenvalue of Phi_e, by sigma / (sigma + rho).
     """
     if settings.surface == LINEAR or settings.truth_known == 0:
         return 0.0
@@ -132,7 +133,7 @@ class ExponentialBound:
         self._knee = settings.knee / settings.bound
         self._begin: tuple[float, float] | None = None
 
-    def at(self, t: float, V: float, latched: bool, xi1: np.ndarray, bound: np.ndarray) -> float:
+    def at(self, t: float, V: float, xi1: np.ndarray, bound: np.ndarray, *, latched: bool) -> float:
         """Return the bound at time t [s], given V(t) [J]; NaN before the latch or at rate 0.
 
         It ends where an error (n,) [rad] passes the knee for k(t) (n,) [rad]: K V1 is lost there.

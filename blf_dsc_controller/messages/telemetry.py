@@ -169,7 +169,7 @@ class Monitor:
             V = float(sample.lyapunov.sum())
             t = (stamp - self._start) * 1e-9
             latched = bool(sample.latched[0])
-            values += [*sample.lyapunov, self._ceiling.at(t, V, latched, sample.xi1, bound)]
+            values += [*sample.lyapunov, self._ceiling.at(t, V, sample.xi1, bound, latched=latched)]
         return values
 
     def message(self, stamp: int, sample: Sample, ratio: np.ndarray, bound: np.ndarray) -> Message:

@@ -167,8 +167,10 @@ def _fraction_met(results: Results, name: str) -> float:
     run, bound = results.runs[name], ExponentialBound(_settings(name))
     V, latched = _energy(run), _learned(run, LATCHED) > 0.5
     bounds = np.broadcast_to(_CASES[name].loop().controller.barrier.bound, _error(run).shape)
-    samples = zip(run.time.tolist(), V.tolist(), latched, _error(run), bounds, strict=True)
-    values = np.array([bound.at(*sample) for sample in samples])
+    samples = zip(run.time.tolist(), V.tolist(), _error(run), bounds, strict=True)
+    values = np.array(
+        [bound.at(*sample, latched=on) for sample, on in zip(samples, latched, strict=True)]
+    )
     known = np.isfinite(values)
     return float(np.mean(V[known] <= values[known]))
 

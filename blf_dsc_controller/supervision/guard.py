@@ -54,7 +54,7 @@ class Guard(GuardedLaw):
         self._note(EventType.DEACTIVATE)
         self._resumable = self.supervisor.running
         self.supervisor.enter(Phase.INACTIVE)
-        self.samples.saturated_time = 0.0
+        self.samples.relax()
         self.watchdog.restart()
         if self._resumable:
             ramp = self.config.safety.deactivation_ramp

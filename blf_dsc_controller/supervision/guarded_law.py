@@ -237,7 +237,7 @@ class GuardedLaw:
         self._safe_torque.last.take(stamp, measurement)
         self._safe_torque.commanded[:] = self.controller.state.torque
         self.states.advance(stamp)
-        self.samples.saturated_time = 0.0
+        self.samples.relax((stamp - self.last_stamp) * _NANO)
         self._advance_to(stamp)
 
     def reject(self, error: cdr.MessageError) -> Vector | None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from blf_dsc_controller.law.settings import LINEAR
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
+_RELIEF = 4  # s without saturation that make up for one with it: more than a fifth adds up
 
 
 class SampleCheck:
@@ -24,7 +26,6 @@ class SampleCheck:
         ratio: largest |xi1| / k_c of each joint since the start (n,).
         outside: samples past the bound since the start.
         saturated: samples with a torque at its limit since the start.
-        saturated_time: duration of the current saturation [s].
     """
 
     def __init__(self, safety: Safety, joints: Sequence[str], controller: Controller) -> None:
@@ -33,6 +34,7 @@ class SampleCheck:
         self._controller = controller
         self.ratio = controller.checks.ratio
         self._kept = controller.checks.kept
+        self._saturation = 0  # ns, times _RELIEF
         self.set_limits(safety)
         self.keep()
         self.restart()
@@ -46,7 +48,18 @@ class SampleCheck:
         """Reset the counts, starting with the next sample."""
         self.ratio[:] = 0.0
         self.outside = self.saturated = 0
-        self.saturated_time = 0.0
+        self.relax()
+
+    @property
+    def saturated_time(self) -> float:
+        """Time at a torque limit [s], less a quarter of the time without since then."""
+        return self._saturation * 1e-9 / _RELIEF
+
+    def relax(self, duration: float = inf) -> None:
+        """Account for some time without saturation [s]."""
+        # Whole nanoseconds: many samples at once leave what they leave one by one.
+        left = self._saturation - round(duration * 1e9) if duration < inf else 0
+        self._saturation = max(0, left)
 
     @property
     def estimate(self) -> Vector:
@@ -75,7 +88,7 @@ class SampleCheck:
         if flags & OUTSIDE:
             self.outside += 1
         if not flags & SUSPECT:
-            self.saturated_time = 0.0
+            self.relax(dt)
             return None
         fault = self._not_finite()
         if fault is None:
@@ -118,11 +131,15 @@ class SampleCheck:
         worst = int(np.argmax(np.abs(demand) - limit))
         is_saturated = bool(np.abs(demand[worst]) > limit[worst])
         self.saturated += is_saturated
-        self.saturated_time = self.saturated_time + dt if is_saturated else 0.0
+        if is_saturated:
+            self._saturation += _RELIEF * round(dt * 1e9)
+        else:
+            self.relax(dt)
         if self.saturated_time <= self._safety.saturation_time:
             return None
         text = (
             f'joint {self._joints[worst]!r} needs {demand[worst]:+.4g} N m and has been at '
-            f'its limit of {limit[worst]:g} N m for {self.saturated_time:.4g} s'
+            f'its limit of {limit[worst]:g} N m for {self.saturated_time:.4g} s (less a quarter '
+            'of the time in between)'
         )
         return Fault(Reason.SATURATED, text)
