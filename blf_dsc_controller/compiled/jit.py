@@ -223,10 +223,10 @@ def _cache(folder: Path) -> Any:
         def from_function(cls, function: Any, _file: str) -> Place:
             return cls(function)
 
-    class Content(caching.CompileResultCacheImpl):  # type: ignore[misc]
+    class CachedCode(caching.CompileResultCacheImpl):  # type: ignore[misc]
         _locator_classes = (Place,)
 
     class Cache(caching.FunctionCache):  # type: ignore[misc]
-        _impl_class = Content
+        _impl_class = CachedCode
 
     return Cache
