@@ -149,3 +149,16 @@ def test_latched_window_has_no_effect_without_weight():
     assert never.state.latched[0] == 0.0
     np.testing.assert_array_equal(with_latch.torque, without.torque)
     np.testing.assert_array_equal(with_latch.estimate, without.estimate)
+
+
+def test_disturbance_estimate_takes_nothing_over_before_the_latch():
+    """The ball may move P^ then; (30) alone moves d^3."""
+    settings, state, signals = random_case = case(6, 2, 3, latched=False, radius=1.0, bumpless=1)
+    state.estimate[:3] *= 3.0 / np.linalg.norm(state.estimate[:3])
+    d3_rate = -settings.gamma * (signals.xi2 + settings.eta * state.disturbance)
+    d3 = state.disturbance + DT * d3_rate
+
+    estimate, disturbance = estimates_after(*random_case)
+
+    assert np.linalg.norm(estimate[:3]) < 1.1
+    np.testing.assert_allclose(disturbance, d3, rtol=0.0, atol=1e-15)

@@ -176,3 +176,65 @@ def test_change_detection_is_off_for_laws_without_composite_learning():
     config = configured('comparison', 1.0)
     assert controller_of(config.controller).settings.change_detection == 0
     assert controller_of(replace(config.controller, law='blf_dsc')).settings.change_detection == 1
+
+
+Q = np.array([2.293, 1.696])
+
+
+@pytest.fixture(scope='module')
+def learned():
+    """Controller with a full latched window of unmodelled friction, and its residual."""
+    controller = run(8.0, {'disturbance.viscous': [0.1, 0.1]}).controller
+    controller.settings = controller.settings._replace(residual_floor=0.0)
+    window.excitation(controller.settings, controller.state, controller.signals, 60)
+    state = controller.state
+    assert consistency.accept_window(controller.settings, state, controller.signals, Q)
+    return controller, float(state.residual[0])
+
+
+@pytest.mark.parametrize(('ratio', 'accepted'), [(3.9, True), (4.1, False)])
+def test_window_is_latched_up_to_four_times_the_least_residual(learned, ratio, accepted):
+    controller, residual = learned
+    settings, state, signals = controller.settings, controller.state, controller.signals
+    window.excitation(settings, state, signals, 60)
+    state.least_residual[0] = residual / ratio
+    assert consistency.accept_window(settings, state, signals, Q) == accepted
+
+
+@pytest.mark.parametrize(('ratio', 'pull'), [(1.2, 0.0), (3.0, 1.75)])
+def test_window_with_an_unusual_residual_is_pulled_to_the_anchor(learned, ratio, pull):
+    """By 3 (r^2 - 1.25 r^2_least) R."""
+    controller, residual = learned
+    settings, state, signals = controller.settings, controller.state, controller.signals
+    window.excitation(settings, state, signals, 60)
+    before = np.diag(signals.Phi).copy()
+    state.least_residual[0] = residual / ratio
+    consistency.accept_window(settings, state, signals, Q)
+    expected = 3.0 * pull * residual / 3.0 * np.diag(settings.information)
+    np.testing.assert_allclose(np.diag(signals.Phi) - before, expected, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize(('ratio', 'changes'), [(7.9, 0.0), (8.1, 1.0)])
+def test_change_is_detected_from_eight_times_the_residual_on(learned, ratio, changes):
+    controller, residual = learned
+    saved = controller.save()
+    state, signals = controller.state, controller.signals
+    signals.row[:] = 0.0
+    signals.row[0, -1] = np.sqrt(ratio * residual)
+    state.residual[0], state.latched[0] = residual, 1.0
+    consistency.detect_change(controller.settings, state, signals, 8.0, 0.1)
+    assert state.changes[0] == changes
+    controller.restore(saved)
+
+
+@pytest.mark.parametrize(
+    ('latched', 'cursor', 'kept'), [(0.0, 100.0, True), (1.0, 100.0, False), (1.0, 0.0, True)]
+)
+def test_anchor_is_kept_at_the_first_latch_and_once_per_window(learned, latched, cursor, kept):
+    controller, residual = learned
+    settings, state, signals = controller.settings, controller.state, controller.signals
+    window.excitation(settings, state, signals, 60)
+    state.least_residual[0], state.anchor[:] = residual, 0.0
+    state.latched[0], state.cursor[0] = latched, cursor
+    assert consistency.accept_window(settings, state, signals, Q)
+    assert np.array_equal(state.anchor, state.solution) == kept

@@ -292,3 +292,12 @@ def test_point_that_needs_all_its_time_for_braking_is_still_reached():
         trajectory((np.array([[0.3, 0.0]]),), times=(0.45,)), moving((1.4, 0.0)), 0.0, LIMITS
     )
     np.testing.assert_allclose(at(motion.vector, 0.45), [(0.3, 0.0), (0, 0), (0, 0)], atol=1e-9)
+
+
+def test_trajectory_that_begins_after_a_blend_is_settled_with_that_blend():
+    """The blend to the first trajectory is still under way when the second is planned."""
+    first = plan_trajectory(trajectory(times=(0.0, 4.0, 8.0)), PAPER, NOW, LIMITS)
+    assert first.settled > NOW + 0.1
+    later = trajectory(begin=first.settled + 0.5)
+    motion = plan_trajectory(later, first.vector, NOW + 0.05, LIMITS)
+    assert motion.settled == first.settled

@@ -10,8 +10,10 @@ from plain_law import dynamics
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
 from blf_dsc_controller.supervision.guard import LatePlanError
+from blf_dsc_controller.supervision.retuning import apply_bumpless
 from blf_dsc_controller.supervision.safe_torque import LastState, SafeTorque, safe_torque
 from blf_dsc_controller.supervision.state_check import StateCheck
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
@@ -439,3 +441,16 @@ def test_plan_from_a_replaced_reference_is_rejected():
     rig.guard.adopt(rig.guard.plan(to((2.0, 1.4), 1.0)))
     with pytest.raises(TrajectoryError, match='replaced while it was planned'):
         rig.guard.adopt(plan)
+
+
+def test_retuning_leaves_the_estimate_of_a_joint_without_integrator():
+    """A gain of 0 says that its disturbance is not estimated: the torque of that joint steps."""
+    config = change(ControllerConfig(), {'disturbance.gain': [0.0, 100.0]})
+    law, measurement = controller_of(config), np.array([2.2935, 1.6961, 0.1, 0.1, 0.0, 0.0])
+    for k in range(2):
+        law.update(k * 1e-3, 1e-3, measurement)
+    before = law.state.disturbance.copy()
+    gains = {'feedback.gain': [30.0, 10.0]}
+    apply_bumpless(law, change(config, gains), 1e-3, measurement)
+    moved = law.state.disturbance != before
+    assert moved.tolist() == [False, True]
