@@ -411,7 +411,7 @@ FAULTS = (
         120,
         given={'reference.amplitude': [1.0, 1.0], 'reference.offset': [1.2935, 0.6961]},
     ),
-    Fault('arm jammed', jammed, R.OUTSIDE_BOUND, 120),
+    Fault('arm jammed', jammed, R.NO_EFFECT, 120),
     Fault('arm pushed with 40 N m', pushed, R.OUTSIDE_BOUND, 40),
     Fault('motors reversed', reversed_motor, R.OUTSIDE_BOUND, 40),
     Fault(

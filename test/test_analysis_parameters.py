@@ -80,6 +80,6 @@ def test_unknown_parameter_names_give_a_reason_instead_of_an_error(tmp_path):
     assert learning['true'] is None
     assert list(learning['final_estimate']) == ['mass 1', 'mass 2', 'm2*l1*l2']
     table = format_table(summarize(run))
-    assert 'parameters  not comparable: the model has mass 1, mass 2, m2*l1*l2, ' in table
+    assert 'parameters  not comparable: the model has mass 1, mass 2, m2*l1*l2, the plant ' in table
     assert 'the plant (m1+m2)*l1^2, m2*l2^2, m2*l1*l2' in table
     draw(run, tmp_path)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
@@ -85,6 +87,36 @@ def test_safe_torque_is_repeated_when_the_arm_falls_silent(ros):
     before = len(commands)
     ros.until(lambda: clock.advance(0.01) or len(commands) >= before + 20)
     np.testing.assert_array_equal(torques(commands)[-1], ZERO)
+
+
+@pytest.mark.parametrize(('period', 'starts'), [(10, False), (1, True)])
+def test_rate_of_live_states_is_measured_before_the_start(ros, period, starts):
+    """controller_manager has 100 Hz by default."""
+    node = ros.add(ControllerNode)
+    states, commands = ros.publisher(topics.JOINT_STATES), ros.listen(topics.COMMANDS)
+    ros.until(lambda: states.get_subscription_count() > 0)
+    encoder, begin = JointStateEncoder(JOINTS), time.time_ns()
+    for k in range(12):
+        stamp = begin + k * period * 10**6
+        states.publish(encoder.encode(stamp, START, ZERO, ZERO))
+        ros.until(lambda k=k: node.finished or node._arrivals is None or len(node._arrivals) > k)
+        assert bool(commands) <= (k > 9 and starts)
+    if starts:
+        ros.until(lambda: commands)
+        return
+    ros.until(lambda: node.finished)
+    assert str(node.failure).startswith('joint states come every 0.01 s, but sample_time is 0.001')
+    assert 'set update_rate of controller_manager (100 Hz by default) to 1000' in str(node.failure)
+    ros.spin(0.1)
+    assert not commands
+
+
+def test_single_live_state_is_started_from_as_its_sender_waits_for_a_torque(ros):
+    ros.add(ControllerNode)
+    states, commands = ros.publisher(topics.JOINT_STATES), ros.listen(topics.COMMANDS)
+    ros.until(lambda: states.get_subscription_count() > 0)
+    states.publish(JointStateEncoder(JOINTS).encode(time.time_ns(), START, ZERO, ZERO))
+    ros.until(lambda: commands)
 
 
 def test_start_outside_the_bound_is_reported_with_joint_error_and_bound(ros):

@@ -10,7 +10,11 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from ros_rig import JOINTS, START
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
 
+from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from sim_plant.node import PlantNode
 
@@ -61,16 +65,24 @@ def test_configuration_warnings_are_logged_before_the_first_state(ros):
     ros.until(lambda: any('learning.window: 5 s' in line.msg for line in log))
 
 
-def test_stamps_that_disable_the_watchdog_cause_one_warning(ros):
+@pytest.mark.parametrize('simulated', [True, False])
+def test_stamps_that_disable_the_watchdog_cause_one_warning_except_in_lockstep(ros, simulated):
     log = listen(ros, Log, '/rosout', LATCHED)
-    ros.add(ControllerNode, namespace='unwatched')
-    arm = ros.add(PlantNode, {'mode': 'lockstep', 'duration': 0.1}, namespace='unwatched')
+    space = f'unwatched_{simulated}'
+    law = ros.add(ControllerNode, namespace=space)
+    if simulated:
+        ros.add(PlantNode, {'mode': 'lockstep'}, namespace=space)
+    else:
+        commands = f'/{space}/blf_dsc_controller/commands'
+        ros.tester.create_subscription(Float64MultiArray, commands, lambda _: None, 1)
+        states = ros.tester.create_publisher(JointState, f'/{space}/joint_states', 1)
+        ros.until(states.get_subscription_count)
+        states.publish(JointStateEncoder(JOINTS).encode(10**9, START, (0.0, 0.0), (0.0, 0.0)))
 
-    def warnings():
-        return [line.msg for line in log if 'a silence is not detected' in line.msg]
-
-    ros.until(lambda: arm.finished and warnings())
-    assert len(warnings()) == 1
+    ros.until(lambda: law.guard.start_stamp > 0 and law._warned_at == law.guard.start_stamp)
+    ros.spin(0.3)
+    warnings = [line.msg for line in log if 'a silence is not detected' in line.msg]
+    assert len(warnings) == (not simulated)
 
 
 @pytest.mark.parametrize('kind', [ControllerNode, PlantNode])

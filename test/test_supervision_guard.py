@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fault_rig import JOINTS, MILLISECOND, Rig
+from fault_table import jammed
 from plain_law import dynamics
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
@@ -454,3 +455,30 @@ def test_retuning_leaves_the_estimate_of_a_joint_without_integrator():
     apply_bumpless(law, change(config, gains), 1e-3, measurement)
     moved = law.state.disturbance != before
     assert moved.tolist() == [False, True]
+
+
+def test_commands_without_effect_stop_the_arm_with_the_model_from_before():
+    """Brakes, or an inactive effort controller: the law would learn its own commands."""
+    learned = {'learning.initial_estimate': P.tolist(), 'safety.torque': 'hold_gravity'}
+    rig = Rig(learned, plant={'disturbance.amplitude': [0.0, 0.0]})
+    rig.step(40)
+    before = rig.guard.samples.estimate.copy()
+    jammed(rig)
+    rig.step(500)
+    assert rig.supervisor.reason is Reason.NO_EFFECT
+    assert 'release the brakes, and activate the effort controller' in rig.supervisor.text
+    np.testing.assert_allclose(rig.guard.samples.estimate, before, rtol=1e-3)
+    state = rig.state()
+    rig.sense = lambda state: [state.raw()]  # the brakes open
+    rig.step(1000)
+    assert np.abs(rig.state().q - state.q).max() < 0.02
+
+
+def test_arm_that_stands_still_under_noise_is_not_taken_for_braked():
+    """Coarse encoders make the torque chatter although nothing moves."""
+    rig = Rig({'reference.type': 'hold', 'learning.initial_estimate': P.tolist()})
+    rng = np.random.default_rng(0)
+    rig.sense = lambda state: [state.raw(dq=state.dq + 0.02 * rng.normal(size=2))]
+    rig.step(2000)
+    assert np.abs(np.diff(rig.commands, axis=0)).max() > 2.0  # a tenth of the limit
+    assert rig.supervisor.phase is Phase.TRACKING, rig.supervisor.text

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ _JOINT = {  # entry of the summary: metric; title, unit, factor and decimals in 
 
 _OFTEN = 0.01  # of the samples
 _WIDEST = 'widest_bound_rad'
+_NAMED = 3  # parameters, where the names of model and plant differ
 _MEASURED = {  # comparison with the truth: entry of the summary, its line of the table
     'relative_error': 'parameters  error',
     'torque_error': 'model       torque error of the learned model',
@@ -185,6 +186,13 @@ def _sentences(summary: Summary) -> Iterator[str]:
         yield f'law         {_microseconds(summary["compute_time_us"])}'
 
 
+def _first(names: Iterable[str]) -> str:
+    """List the first three names."""
+    chosen = list(names)
+    more = f', ... ({len(chosen)} in all)' if len(chosen) > _NAMED else ''
+    return ', '.join(chosen[:_NAMED]) + more
+
+
 def _learning_lines(learning: Summary) -> Iterator[str]:
     latched = learning['latch_time_s']
     begun = 'never began' if latched is None else f'began at {latched:.3f} s'
@@ -196,8 +204,11 @@ def _learning_lines(learning: Summary) -> Iterator[str]:
         yield f'rejected    {reason or f"{column}: see the log for the reason"}'
     unlike = learning['true_parameters_of_other_names']
     if unlike:
-        names, true = ', '.join(learning['final_estimate']), ', '.join(unlike)
-        yield f'parameters  not comparable: the model has {names}, the plant {true}'
+        names, true = _first(learning['final_estimate']), _first(unlike)
+        yield (
+            f'parameters  not comparable: the model has {names}, the plant {true}; do gravity and '
+            'joints agree?'
+        )
     settled = learning['time_to_1_percent_s']
     ending = 'not below 1 %' if settled is None else f'below 1 % from {settled:.3f} s on'
     for measured, title in _MEASURED.items():

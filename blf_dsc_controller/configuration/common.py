@@ -22,7 +22,11 @@ class Realtime:
     """What the process requests from the operating system."""
 
     priority: int = _at_start(
-        0, 'SCHED_FIFO priority to request; 0: leave scheduling as it is', at_least=0, at_most=99
+        0,
+        'SCHED_FIFO priority to request, below 50, which is that of controller_manager; 0: leave '
+        'scheduling as it is',
+        at_least=0,
+        at_most=99,
     )
     lock_memory: bool = _at_start(False, 'lock the memory of the process, to prevent swapping')
 

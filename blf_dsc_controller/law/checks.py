@@ -22,6 +22,9 @@ SUSPECT = 1
 OUTSIDE = 2
 """An error outside its bound."""
 
+NO_EFFECT = 8
+"""Commands that have changed without any joint moving: they do not reach the arm, or it is held."""
+
 INVALID = 4
 """A joint state that is not finite or too fast; the law did not use it."""
 
@@ -33,7 +36,17 @@ class Checks(NamedTuple):
     error_ratio: Cell  # |xi1| / k from which an error is suspect; 0: never
     ratio: Annotated[Array, 'n']  # largest |xi1| / k so far
     kept: Annotated[Array, 'm + n']  # estimates and d^3 of the last sample that was not suspect
+    sample_time: Cell  # s, for the check of the effect of commands; 0: none
+    q: Annotated[Array, 'n']  # rad, where a joint has last moved
+    moved: Annotated[Array, 'm + n']  # estimates and d^3 of then
+    recent: Annotated[Array, 'n']  # N m, average of the commands over _RECENT
+    before: Annotated[Array, 'n']  # N m, average of them over _BEFORE
 
+
+_STILL = 0.02  # of the bound: a joint that stays within has not moved
+_CHANGED = 0.1  # of the torque limit: a command that differs by more should have moved something
+_RECENT = 0.05  # s, past the noise of the velocities
+_BEFORE = 1.0  # s
 
 checks_of, checks_size = view_of(Checks), size_of(Checks)
 
@@ -67,6 +80,36 @@ def check_error(settings: Settings, checks: Checks, xi1: np.ndarray, bound: np.n
 
 
 @inner
+def check_effect(settings: Settings, checks: Checks, state: State, sample: Sample) -> int:
+    """Return the flags for commands without effect; call it once the sample's values are kept.
+
+    While no joint moves, gravity does not change: the commands should not either, except by what
+    overcomes stiction. Otherwise brakes hold the arm, or its effort controller is not active, and
+    the law learns what its own commands say.
+    """
+    moves = state.samples[0] <= 1.0
+    for i in range(settings.n):
+        moved = abs(sample.qr[i] + sample.xi1[i] - checks.q[i])
+        moves = moves or not moved < _STILL * sample.bound[i]
+    if moves:
+        for i in range(settings.n):
+            checks.q[i] = sample.qr[i] + sample.xi1[i]
+            checks.recent[i] = checks.before[i] = sample.torque[i]
+        for j in range(settings.m + settings.n):
+            checks.moved[j] = checks.kept[j]
+        return 0
+    flags = 0
+    T = checks.sample_time[0]
+    for i in range(settings.n):
+        checks.recent[i] += min(1.0, T / _RECENT) * (sample.torque[i] - checks.recent[i])
+        checks.before[i] += min(1.0, T / _BEFORE) * (sample.torque[i] - checks.before[i])
+        change = abs(checks.recent[i] - checks.before[i])
+        if change > _CHANGED * settings.torque_limit[i]:
+            flags |= NO_EFFECT | SUSPECT
+    return flags
+
+
+@inner
 def check_sample(
     settings: Settings, checks: Checks, state: State, signals: Signals, sample: Sample
 ) -> int:
@@ -89,4 +132,6 @@ def check_sample(
             checks.kept[j] = state.estimate[j]
         for i in range(settings.n):
             checks.kept[settings.m + i] = state.disturbance[i]
+        if checks.sample_time[0] > 0.0:
+            flags |= check_effect(settings, checks, state, sample)
     return flags

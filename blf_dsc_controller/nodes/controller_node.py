@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law import factory
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
@@ -28,6 +29,7 @@ from blf_dsc_controller.supervision.config_warnings import config_warnings, wors
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
 from blf_dsc_controller.supervision.supervisor import Phase
+from blf_dsc_controller.supervision.watchdog import SAME_CLOCK
 
 OUTPUTS = (
     topics.COMMANDS,
@@ -42,6 +44,9 @@ STREAMS = topics.REFERENCE, topics.TRACKING_ERROR, topics.LEARNING
 
 _RATE_SAMPLES = 1001  # samples before the rate is checked
 _FAST = 0.9  # fraction of the sample time
+_MEASURED = 10  # intervals between live states, measured before the start ...
+_ALIKE = 1.5  # ... which may differ from the sample time by this factor
+_PATIENCE = 5  # checks without a newer state: a simulated arm waits for its first torque
 _WAITING_PERIOD = 5.0  # s between two warnings
 _LONGEST_END = 3.0  # s from a signal to the end; ros2 launch sends the next signal after 5 s
 _SILENT = 0.1  # s without joint states, after which nothing is left to bring to rest
@@ -75,6 +80,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._published_bound = b''  # bytes of the array, to detect changes
         self._decoder = JointStateDecoder(joints, required=('position',))
         self._pending: bytes | None = None
+        self._arrivals: list[int] | None = []  # stamps before the start [ns]; None: measured
+        self._checks = 0  # of the timer since the last of them
         self._warned_at = -1  # stamp of the start that the last warning was about
         self._listeners: list[Callable[[], int]] = []  # count the subscribers of STREAMS
         self._heard = False  # whether there were any at the last count
@@ -104,6 +111,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def activate(self) -> None:
         """Take command with the next joint state."""
+        self._arrivals = []
         if self.guard is not None:
             self.guard.activate()
         self.get_logger().info(f'ready for joint states of {", ".join(self.config.joints)}')
@@ -170,6 +178,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
             if not self._observed:
                 self._pending = raw
                 return
+        if self._arrivals is not None and self._measures_rate(guard, raw):
+            return
         if self._status.trajectories is not None:
             self._status.trajectories.poll(guard)
         try:
@@ -186,6 +196,38 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 throttle_duration_sec=_WAITING_PERIOD,
             )
         self._report_if_changed(guard)
+
+    def _measures_rate(self, guard: Guard, raw: bytes) -> bool:
+        """Measure the rate of live states before the start; return whether to wait for more.
+
+        At another rate than that of `sample_time` the gains are wrong, up to instability.
+        """
+        try:
+            stamp = self._decoder.decode(raw)
+        except MessageError:
+            return False
+        if guard.supervisor.phase is not Phase.STARTING or self._arrivals is None:
+            return False
+        if abs(self._wall() - stamp) * 1e-9 >= SAME_CLOCK:  # a plant in lock-step waits
+            self._arrivals = None
+            return False
+        self._arrivals.append(stamp)
+        self._pending, self._checks = raw, 0
+        if len(self._arrivals) <= _MEASURED:
+            return True
+        period = float(np.median(np.diff(self._arrivals))) * 1e-9
+        self._arrivals, self._pending = None, None
+        T = self.config.sample_time
+        if not T / _ALIKE < period < T * _ALIKE:
+            guard.refuse(
+                StartError(
+                    f'joint states come every {period:.3g} s, but sample_time is {T:g} s: set '
+                    f'update_rate of controller_manager (100 Hz by default) to {1.0 / T:.6g}, or '
+                    'sample_time to the period of the topic'
+                )
+            )
+            self._report_if_changed(guard)
+        return guard.start_error is not None
 
     def survive(self, error: Exception) -> bool:
         """Make a safe stop after an unexpected error, instead of leaving the arm without torque."""
@@ -268,8 +310,11 @@ class ControllerNode(LoopNode[ControllerConfig]):
         """Check for missing states, and set the timer to the next check, as waking up is costly."""
         wait, guard = POLL_PERIOD, self.guard
         if guard is not None:
-            if self._pending is not None and self._is_observed():
+            self._checks += 1
+            measures = self._arrivals and self._checks < _PATIENCE
+            if self._pending is not None and not measures and self._is_observed():
                 raw, self._pending = self._pending, None
+                self._arrivals = None if self._arrivals else self._arrivals
                 self._on_joint_state(raw)
             self._command(guard.watch())
             self._report_if_changed(guard)
@@ -300,13 +345,19 @@ class ControllerNode(LoopNode[ControllerConfig]):
             return
         supervisor = guard.supervisor
         self._log_phase(guard)
-        if guard.watchdog.why_off and guard.start_stamp != self._warned_at:
-            self._warned_at = guard.start_stamp
-            self.get_logger().warning(guard.watchdog.why_off)
         self._started = self._started or supervisor.running
         if guard.start_error is not None and self.config.autostart and not self._started:
             self.failure, self.finished = guard.start_error, True
         self._report()
+
+    def _on_second(self) -> None:
+        super()._on_second()
+        guard = self.guard
+        if guard is not None and guard.watchdog.why_off and guard.start_stamp != self._warned_at:
+            self._warned_at = guard.start_stamp
+            found = self.get_publishers_info_by_topic(topics.JOINT_STATES.relative)
+            if any(one.node_name != topics.PLANT for one in found):  # the plant waits in lock-step
+                self.get_logger().warning(guard.watchdog.why_off)
 
     def _log_phase(self, guard: Guard) -> None:
         supervisor = guard.supervisor

@@ -78,7 +78,9 @@ class GuardedLaw:
         self.controller = controller_of(config)
         self.supervisor = Supervisor()
         self.states = StateCheck(config.joints, config.sample_time)
-        self.samples = SampleCheck(config.safety, config.joints, self.controller)
+        self.samples = SampleCheck(
+            config.safety, config.joints, self.controller, config.sample_time
+        )
         self.watchdog = Watchdog(steady, wall)
         self.journal = Journal()
         self.has_sample = False
@@ -199,8 +201,7 @@ class GuardedLaw:
                 if not self.commanding:
                     check_first_torque(self.controller, self.config, measurement)
             except (StartError, MotionError) as error:
-                self.start_error = error
-                self._stop(Reason.START_REJECTED, str(error))
+                self.refuse(error)
                 return False
             self.start_stamp = stamp
         self.journal.note(EventType.START, resumed=resumed)
@@ -208,6 +209,11 @@ class GuardedLaw:
         self.watchdog.switch(self.config.safety.watchdog, stamp)
         self.supervisor.enter(Phase.APPROACHING)
         return True
+
+    def refuse(self, error: StartError | MotionError) -> None:
+        """Stop before the start, for a reason."""
+        self.start_error = error
+        self._stop(Reason.START_REJECTED, str(error))
 
     def _resumes(self, stamp: int, q: Vector, dq: Vector) -> bool:
         controller, t = self.controller, self._time_of(stamp)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import Safety
-from blf_dsc_controller.law.checks import OUTSIDE, SUSPECT
+from blf_dsc_controller.law.checks import NO_EFFECT, OUTSIDE, SUSPECT
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import LINEAR
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
@@ -28,8 +28,11 @@ class SampleCheck:
         saturated: samples with a torque at its limit since the start.
     """
 
-    def __init__(self, safety: Safety, joints: Sequence[str], controller: Controller) -> None:
-        """Enable the checks of the controller."""
+    def __init__(
+        self, safety: Safety, joints: Sequence[str], controller: Controller, sample_time: float
+    ) -> None:
+        """Enable the checks of the controller, with a sample every `sample_time` [s]."""
+        controller.checks.sample_time[0] = sample_time
         self._joints = tuple(joints)
         self._controller = controller
         self.ratio = controller.checks.ratio
@@ -90,7 +93,7 @@ class SampleCheck:
         if not flags & SUSPECT:
             self.relax(dt)
             return None
-        fault = self._not_finite()
+        fault = self._without_effect() if flags & NO_EFFECT else self._not_finite()
         if fault is None:
             saturated = self._saturated(dt)
             fault = self._outside() or saturated
@@ -107,6 +110,18 @@ class SampleCheck:
         if not (np.isfinite(demand).all() and np.isfinite(self._controller.sample.torque).all()):
             return Fault(Reason.TORQUE, f'the demanded torque is not finite: {demand}')
         return None
+
+    def _without_effect(self) -> Fault:
+        """Return to the estimates from before the arm stood still."""
+        checks = self._controller.checks
+        self._kept[:] = checks.moved
+        change = checks.recent - checks.before
+        worst = int(np.argmax(np.abs(change) / self._controller.settings.torque_limit))
+        text = (
+            f'the torque of joint {self._joints[worst]!r} has changed by {change[worst]:+.4g} N m, '
+            'but no joint has moved: release the brakes, and activate the effort controller'
+        )
+        return Fault(Reason.NO_EFFECT, text)
 
     def _outside(self) -> Fault | None:
         safety = self._safety

@@ -40,6 +40,7 @@ class Reason(str, Enum):
     VELOCITY = 'velocity not plausible'
     START_REJECTED = 'start rejected'
     OUTSIDE_BOUND = OUTSIDE_BOUND
+    NO_EFFECT = 'commands without effect'
     SATURATED = 'torque saturated'
     OVERRUN = 'loop overrun'
     ESTIMATE = 'estimate not finite'

@@ -8,7 +8,9 @@ from collections.abc import Callable
 PERIOD = 0.008
 """Time [s] between two checks of the steady clock during a silence."""
 
-_SAME_CLOCK = 60.0  # s that a live stamp may differ from this computer's time
+SAME_CLOCK = 60.0
+"""Time [s] that a live stamp may differ from this computer's clock."""
+
 _MARGIN = 0.001  # s past the limit, for a state in transit
 _NANO = 1e-9
 
@@ -40,7 +42,7 @@ class Watchdog:
         """Switch on or off; `auto`: on if the stamps [ns] are close to the `wall` clock."""
         self.why_off = ''
         behind = (self._wall() - stamp) * _NANO
-        if mode == 'auto' and abs(behind) >= _SAME_CLOCK:
+        if mode == 'auto' and abs(behind) >= SAME_CLOCK:
             where = f'{abs(behind):.4g} s {"behind" if behind > 0.0 else "ahead of"}'
             self.why_off = (
                 f"the stamps of the joint states are {where} this computer's clock: a silence is "
