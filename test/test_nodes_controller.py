@@ -112,9 +112,10 @@ def test_rate_of_live_states_is_measured_before_the_start(ros, period, starts):
 
 
 def test_single_live_state_is_started_from_as_its_sender_waits_for_a_torque(ros):
-    ros.add(ControllerNode)
+    ros.add(ControllerNode, {'safety.state_timeout': 600.0})
     states, commands = ros.publisher(topics.JOINT_STATES), ros.listen(topics.COMMANDS)
     ros.until(lambda: states.get_subscription_count() > 0)
+    ros.spin(0.2)
     states.publish(JointStateEncoder(JOINTS).encode(time.time_ns(), START, ZERO, ZERO))
     ros.until(lambda: commands)
 

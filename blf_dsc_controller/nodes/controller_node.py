@@ -211,8 +211,11 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if abs(self._wall() - stamp) * 1e-9 >= SAME_CLOCK:  # a plant in lock-step waits
             self._arrivals = None
             return False
+        if self._arrivals and stamp <= self._arrivals[-1]:
+            return True
         self._arrivals.append(stamp)
         self._pending, self._checks = raw, 0
+        self._poll_in(POLL_PERIOD)
         if len(self._arrivals) <= _MEASURED:
             return True
         period = float(np.median(np.diff(self._arrivals))) * 1e-9
@@ -306,6 +309,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
         limit = guard.controller.settings.torque_limit
         self._publish(self._telemetry.bound(stamp, bound, limit))
 
+    def _poll_in(self, wait: float) -> None:
+        self._poll_timer.timer_period_ns = int(1e9 * wait)
+        self._poll_timer.reset()
+
     def _on_poll(self) -> None:
         """Check for missing states, and set the timer to the next check, as waking up is costly."""
         wait, guard = POLL_PERIOD, self.guard
@@ -320,8 +327,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self._report_if_changed(guard)
             if self._pending is None:
                 wait = guard.watchdog.next_check
-        self._poll_timer.timer_period_ns = int(1e9 * wait)
-        self._poll_timer.reset()
+        self._poll_in(wait)
 
     # Changes of the configuration, and reports.
 
