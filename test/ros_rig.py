@@ -26,7 +26,7 @@ from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.simulation.loop import simulate
 from sim_plant.node import PlantNode
 
-PATIENCE = 40.0  # s, until a test gives up waiting
+PATIENCE = 300.0  # s, until a test gives up waiting
 JOINTS = ('joint1', 'joint2')
 START = (2.293, 1.696)  # rad, inside the bound at the reference's start
 
