@@ -138,8 +138,10 @@ def nodes(context: LaunchContext) -> list[Node]:
     if bag:
         started.append(node('bag_recorder', {'output': bag}))
     started.append(node('torque_watchdog', {}, required=False))
-    started.append(node('blf_dsc_controller', of_loop))
-    if driver is None or simulated == 'true':
+    is_simulated = driver is None or simulated == 'true'
+    # On an arm, the watchdog outlives a controller that crashes: it holds the arm.
+    started.append(node('blf_dsc_controller', of_loop, required=is_simulated))
+    if is_simulated:
         started.append(node('sim_plant', of_plant))
     return started
 

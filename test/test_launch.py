@@ -131,6 +131,17 @@ def test_loop_shuts_down_with_any_of_its_nodes_but_not_with_a_viewer(launched):
     assert all(f"'{name} = " in script for name in NODES)
 
 
+@pytest.mark.parametrize(('simulated', 'ends'), [('false', False), ('true', True)])
+def test_watchdog_of_an_arm_outlives_the_controller(launched, simulated, ends):
+    """A launch that ended with it would leave the last torque of the law."""
+    nodes = {node.executable: node for node in launched(driver='ur5e', simulated=simulated)}
+    assert bool(nodes['blf_dsc_controller'].on_exit) == ends
+    assert 'torque_watchdog' in nodes
+    assert ('blf_dsc_controller/commands', 'forward_effort_controller/commands') in nodes[
+        'torque_watchdog'
+    ].remappings
+
+
 def test_packages_that_may_be_missing_are_launched_first(launched):
     """`launch_ros` looks a package up at its turn, and leaves earlier nodes running if it fails."""
     packages = [node.package for node in launched(bag='run1', rviz='true')]
