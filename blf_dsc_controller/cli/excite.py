@@ -38,10 +38,10 @@ def _preset(options: Namespace) -> str:
     config = load(locate(options.config), CONTROLLER, ControllerConfig)
     problem = exciting_reference.ExcitationProblem(
         config,
-        _guess(config, options.guess),
+        guess_of(config, options.guess),
         options.torque_fraction,
         options.harmonics,
-        _clearance(config, options.radius, options.floor),
+        clearance_of(config, options.radius, options.floor),
         options.speed_fraction,
     )
     parameters = problem.parameters(_search(problem, options.seed, options.starts))
@@ -94,7 +94,7 @@ def _preset(options: Namespace) -> str:
 {entries}"""
 
 
-def _guess(config: ControllerConfig, given: list[float] | None) -> np.ndarray:
+def guess_of(config: ControllerConfig, given: list[float] | None) -> np.ndarray:
     """Return parameters P (k, p) to compute the torque with: as given, or the initial estimate.
 
     A URDF arm must also be able to carry its payload, which a second row includes.
@@ -111,7 +111,8 @@ def _guess(config: ControllerConfig, given: list[float] | None) -> np.ndarray:
     return np.array((start, start + robot.payload * learned_of(robot, chain).load))
 
 
-def _clearance(config: ControllerConfig, radius: float, floor: float) -> Clearance | None:
+def clearance_of(config: ControllerConfig, radius: float, floor: float) -> Clearance | None:
+    """Return the clearance of the links of a URDF's arm; radius and height of the floor in m."""
     if config.model != 'urdf':
         return None
     return Clearance(config.robot.chain(config.joints), radius, floor)
