@@ -135,20 +135,24 @@ def draw_pairs(studies: dict[str, tuple[Study, Columns]], path: Path) -> None:
 
 
 def _boxes(axes: Axes, name: str, unit: float, studies: dict[str, tuple[Study, Columns]]) -> None:
-    """Draw the quartiles, and the 1 % and 99 % quantiles, of a figure with and without learning."""
+    """Draw the quartiles, and the 1 % and 99 % quantiles, of a figure with and without learning.
+
+    Of the runs that keep the bound without.
+    """
     labels: list[str] = []
     for title, (study, results) in studies.items():
         for (law, label), colour in zip(LAWS.items(), (BLUE, ORANGE), strict=True):
             column = f'{law}{name}'
             values = results[column] if column in results else worst_of(study, results, name, law)
-            known = unit * values[np.isfinite(values)]
+            kept = results[f'{WITHOUT}outcome'] == KEPT
+            known = unit * values[kept & np.isfinite(values)]
             y = 2 * [-len(labels)]
             if known.size:
                 least, *quartiles, most = np.quantile(known, (0.01, 0.25, 0.5, 0.75, 0.99))
                 axes.plot([least, most], y, color=colour, lw=1.2)
                 axes.plot([quartiles[0], quartiles[2]], y, color=colour, lw=7, alpha=0.6)
                 axes.plot(quartiles[1:2], y[:1], 'o', color=INK, ms=4)
-            labels.append(f'{title} {label}'.strip())
+            labels.append(f'{title}, {label}'.removeprefix(', '))
     axes.set_yticks(-np.arange(len(labels)), labels)
     axes.set_xscale('log')
     _plain(axes)

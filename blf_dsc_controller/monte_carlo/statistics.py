@@ -63,8 +63,8 @@ def summarize(study: Study, results: Columns) -> Summary:
 def compare(study: Study, results: Columns) -> Summary:
     """Compare the runs of a study of pairs, with learning and without it.
 
-    `factor` is the largest settled error with learning over that without, in the runs that keep the
-    bound without; None: infinite.
+    `factor` is the largest settled error with learning over that without; None: infinite. It and
+    the medians are of the runs that keep the bound without.
     """
     kept, without = (results[f'{law}outcome'] == KEPT for law in LAWS)
     factors = error_factor(study, results)[without]
@@ -82,11 +82,12 @@ def compare(study: Study, results: Columns) -> Summary:
         'above': results['run'][without][above[np.argsort(-factors[above])]].tolist(),
         'median': {
             'rms_error_rad': {
-                label: _median(worst_of(study, results, 'rms_error_rad', law))
+                label: _median(worst_of(study, results, 'rms_error_rad', law)[without])
                 for law, label in LAWS.items()
             },
             'torque_error': {
-                label: _median(results[f'{law}torque_error.end']) for law, label in LAWS.items()
+                label: _median(results[f'{law}torque_error.end'][without])
+                for law, label in LAWS.items()
             },
         },
     }
