@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.law.checks import INVALID, OUTSIDE, SUSPECT, check_sample
 from blf_dsc_controller.law.settings import EFFORT
-from blf_dsc_controller.supervision.state_check import StateCheck
+from blf_dsc_controller.supervision.checks import StateCheck
 from blf_dsc_controller.supervision.supervisor import Reason
 
 DT = 1e-3

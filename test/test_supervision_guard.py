@@ -13,10 +13,10 @@ from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
+from blf_dsc_controller.supervision.checks import StateCheck
 from blf_dsc_controller.supervision.guard import LatePlanError
 from blf_dsc_controller.supervision.retuning import apply_bumpless
 from blf_dsc_controller.supervision.safe_torque import LastState, SafeTorque, safe_torque
-from blf_dsc_controller.supervision.state_check import StateCheck
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from blf_dsc_controller.supervision.watchdog import Watchdog
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from blf_dsc_controller.supervision.velocity import Velocity
+from blf_dsc_controller.supervision.checks import Velocity
 
 MILLISECOND = 1_000_000  # ns
 

@@ -22,7 +22,7 @@ from blf_dsc_controller.messages.samples import columns_of, run_of
 from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.replay.states import law_states
 from blf_dsc_controller.run import Floats, Run
-from blf_dsc_controller.supervision.velocity import Velocity
+from blf_dsc_controller.supervision.checks import Velocity
 
 _NANO = 1e-9
 

@@ -24,12 +24,10 @@ from blf_dsc_controller.messages import cdr
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.reference.approach import check_takeover
 from blf_dsc_controller.reference.limits import MotionError
+from blf_dsc_controller.supervision.checks import SKIP, SampleCheck, StateCheck, Velocity
 from blf_dsc_controller.supervision.first_torque import check_first_torque
 from blf_dsc_controller.supervision.safe_torque import SafeTorque, limit_first_torque
-from blf_dsc_controller.supervision.sample_check import SampleCheck
-from blf_dsc_controller.supervision.state_check import SKIP, StateCheck
 from blf_dsc_controller.supervision.supervisor import Phase, Reason, Supervisor
-from blf_dsc_controller.supervision.velocity import Velocity
 from blf_dsc_controller.supervision.watchdog import PERIOD, Watchdog
 
 Vector = NDArray[np.float64]
