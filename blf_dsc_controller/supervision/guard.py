@@ -125,6 +125,7 @@ class Guard(GuardedLaw):
     def release(self) -> Vector | None:
         """Return the last torque, if any was commanded: the safe torque of an arm at rest."""
         self._note(EventType.RELEASE)
+        self.has_sample = False  # the last torque is not the law's
         if not self.commanding or self.silenced:
             return None
         return self._safe_torque.leave(
