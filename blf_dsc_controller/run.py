@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
+Rows = slice | NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -22,23 +23,27 @@ class Series:
     stamp: Stamps  #: (m,) ns, increasing
     values: Floats  #: (m, number of names)
 
+    def at(self, rows: Rows, columns: Rows = slice(None)) -> Floats:
+        """Return the values in some rows and columns."""
+        return self.values[rows][:, columns]
+
     def select(self, names: Sequence[str]) -> Floats:
         """Return the columns of these names, (m, number of `names`)."""
-        return self.values[:, [self.names.index(name) for name in names]]
+        return self.at(slice(None), np.array([self.names.index(name) for name in names], np.intp))
 
     def column(self, name: str) -> Floats:
         """Return the values of one name, (m,)."""
-        return self.values[:, self.names.index(name)]
+        return self.select([name])[:, 0]
 
     def held(self, stamp: Stamps) -> Floats:
         """Return the last values at or before each stamp; the first values for earlier stamps."""
         index = np.searchsorted(self.stamp, stamp, side='right') - 1
-        return self.values[np.maximum(index, 0)]
+        return self.at(np.maximum(index, 0))
 
     def exact(self, stamp: Stamps) -> Floats:
         """Return the values at exactly these stamps, NaN where there are none."""
         index = np.minimum(np.searchsorted(self.stamp, stamp), self.stamp.size - 1)
-        values = self.values[index]
+        values = self.at(index)
         values[self.stamp[index] != stamp] = np.nan
         return values
 
@@ -94,6 +99,7 @@ class Run:
     effort: Floats | None = None  #: (N, n) N m, as measured
     reference_velocity: Floats | None = None  #: (N, n) rad/s
     xi2: Floats | None = None  #: (N, n) rad/s
+    notes: tuple[str, ...] = ()  #: samples of a bag that are left out, and why
 
     @property
     def time(self) -> Floats:

@@ -16,7 +16,6 @@ end of its duration.
 
 from __future__ import annotations
 
-import json
 import sys
 from functools import partial
 from typing import Any
@@ -25,10 +24,11 @@ from rclpy.timer import Timer
 from std_msgs.msg import String
 
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import Value, differences
+from blf_dsc_controller.configuration.schema import Value, differences, flatten
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder
+from blf_dsc_controller.messages.journal import encode_change
 from blf_dsc_controller.messages.telemetry import DECIMATION, PlantTelemetry
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher
@@ -71,6 +71,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self._start_stamp = LOCKSTEP_START
         self._changed: dict[str, Value] = {}
         self._changes = create_publisher(self, topics.CHANGES)
+        self._tell_parameters()
         self._handshake = Handshake(self, self._now)
         self.plant: Plant
         self.deactivate()
@@ -84,6 +85,8 @@ class PlantNode(LoopNode[PlantConfig]):
     def configure(self) -> None:
         """Put the arm at its start; create the topics on the first call."""
         self.plant = plant_of(self.config)
+        if self._changed:
+            self._tell_parameters()
         self._changed.clear()
         self.plant.compile()
         self.deactivate()
@@ -269,6 +272,11 @@ class PlantNode(LoopNode[PlantConfig]):
             stamp = self.stamp - ahead * self.config.sample_time_ns
             self._publish(self._telemetry.incomplete_states(stamp, measurement, sensor.incomplete))
 
+    def _tell_parameters(self) -> None:
+        """Publish all parameters, in force from the start."""
+        given = flatten(self.config)
+        self._changes.publish(encode_change(self._start_stamp, given, configured=True))
+
     def _reconfigure(self, config: PlantConfig) -> None:
         self._changed |= differences(self.config, config)
         self.config = config
@@ -278,8 +286,7 @@ class PlantNode(LoopNode[PlantConfig]):
         if not self._changed:
             return
         self.plant.change(settings_of(self.config))
-        content = {'stamp': self.stamp, 'parameters': self._changed}
-        self._changes.publish(String(data=json.dumps(content)))
+        self._changes.publish(encode_change(self.stamp, self._changed))
         self._changed = {}
 
     def _report(self) -> None:

@@ -13,6 +13,15 @@ def read(path):
         return [(c.topic, at, bytes(raw)) for c, at, raw in reader.messages()]
 
 
+def raw_records(data):
+    """Yield the records of an intact MCAP file as bytes, with their offsets."""
+    at = 8
+    while at < len(data) - 8:
+        end = at + 9 + int.from_bytes(data[at + 1 : at + 9], 'little')
+        yield at, data[at:end]
+        at = end
+
+
 def messages_on_disk(path):
     """Return the number of messages in a file that was not closed."""
     count = 0

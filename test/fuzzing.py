@@ -28,14 +28,13 @@ from xml.etree import ElementTree as ET
 import hypothesis
 import recorded_run
 import yaml
+from foreign_readers import raw_records
 from hypothesis import HealthCheck, Phase, given
 from hypothesis import strategies as st
 from mcap.data_stream import RecordBuilder
 from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 
-from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.mcap_reader import scan
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.share import share_folder
@@ -156,7 +155,7 @@ def entries():
 def pieces():
     """Return the records of its file."""
     (file,) = base().glob('*.mcap')
-    return [piece.raw for piece in scan(file.read_bytes())]
+    return [raw for _, raw in raw_records(file.read_bytes())]
 
 
 @_once
@@ -168,7 +167,7 @@ def secret():
     return folder
 
 
-READ = ('export', 'replay', 'replay --config', 'replay --learn', 'recover', 'in order', 'context')
+READ = ('export', 'replay', 'replay --config', 'replay --learn', 'recover', 'part')
 DRAW = ('report', 'plot')
 WAYS = st.sampled_from((*READ * 5, *DRAW))
 
@@ -177,12 +176,9 @@ def read(bag, way):
     """Read a bag in one of several ways."""
     out = bag.parent / f'out_{len(tried)}'
     name, _, option = way.partition(' ')
-    if way == 'in order':
+    if way == 'part':
         with contextlib.suppress(BlfDscError), open_bag(bag) as opened:
-            list(opened.in_order(opened.counts))
-    elif way == 'context':
-        with contextlib.suppress(BlfDscError):
-            read_context(bag)
+            list(opened.messages(opened.counts, 1_050_000_000))
     elif name == 'replay':
         words = {'': (), '--config': (option, 'recommended'), '--learn': (option,)}[option]
         command('replay', bag, *words)
@@ -350,10 +346,9 @@ def messages(data, way):
         changed[k][3] = bytes(raw)
         if data.draw(st.integers(0, 4)) == 0:
             changed[k][2] = data.draw(st.integers(0, 2**63 - 1))
-    configuration = read_context(base()).configuration
     with folder() as bag:
         bag.rmdir()
-        recorded_run.write(bag, changed, configuration)
+        recorded_run.write(bag, changed)
         with bounded('messages'):
             read(bag, way)
 

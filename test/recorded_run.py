@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
@@ -36,21 +38,21 @@ def messages(path):
     """Return every message as [topic, type, time, bytes]."""
     with open_bag(path) as bag:
         types = dict(bag.held)
-        return [[topic, types[topic], at, raw] for topic, at, raw in bag.messages(types)]
+        return [[m.topic, types[m.topic], m.received, m.raw] for m in bag.messages(types)]
 
 
-def write(path, entries, configuration='', **facts):
-    """Write messages into a new bag."""
-    handles = {}
+def write(path, entries, *, numbered=False, **facts):
+    """Write messages into a new bag, numbered by their topics' publishers or not."""
+    handles, numbers = {}, Counter()
     with BagWriter(path, flush_interval=None) as bag:
-        if configuration:
-            bag.configure(configuration, 0)
         if facts:
             bag.note(facts)
         for topic, type_name, at, raw in entries:
             if topic not in handles:
                 handles[topic] = bag.add_topic(topic, type_name, [])
-            bag.write(handles[topic], raw, at)
+            numbers[topic] += numbered
+            if raw is not None:  # else lost by the recorder
+                bag.write(handles[topic], raw, at, sequence=numbers[topic])
     return path
 
 
@@ -61,4 +63,4 @@ def of(entries, topic):
 
 def compared(result):
     """Return the number of values that a verification compared, by last part of the topic."""
-    return {one.topic.rsplit('/', 1)[-1]: one.values for one in result.comparisons}
+    return {each.topic.rsplit('/', 1)[-1]: each.values for each in result.comparisons}

@@ -43,7 +43,7 @@ class RosRig:
         )
         self.executor = EventsExecutor(context=self.context)
         self.nodes = []
-        self.tester = self._keep(rclpy.create_node('tester', context=self.context))
+        self.tester = self._keep(rclpy.create_node('record_tester', context=self.context))
         self._clients = {}
 
     def _keep(self, node):

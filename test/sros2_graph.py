@@ -67,9 +67,6 @@ def live():
             ros.add(ViewNode)
             watchdog = ros.add(WatchdogNode)
             recorder = ros.add(BagRecorderNode, output=bag)
-            recorder._parameter_client.request = lambda *_: (
-                None
-            )  # no short-lived clients in one process
             ros.until(lambda: is_recording_all(ros) and watchdog.line)
             nodes = {
                 'sim_plant': ['sim_plant'],
@@ -87,13 +84,10 @@ def live():
             ros.executor.remove_node(recorder)
             ros.spin(0.1)
             recorder.close()
-            # Both request the parameters of nodes once, by short-lived clients.
-            services = 'get_parameters', 'list_parameters'
-            found['bag_recorder']['request'] = sorted(
-                f'/{name}/{service}' for name in nodes for service in services
-            )
+            # It requests the parameters of the controller once, by short-lived clients.
             found['torque_watchdog']['request'] = [
-                f'/blf_dsc_controller/{service}' for service in services
+                f'/blf_dsc_controller/{service}'
+                for service in ('get_parameters', 'list_parameters')
             ]
             return found
     finally:

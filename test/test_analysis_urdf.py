@@ -19,9 +19,10 @@ from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.configuration.params_file import dumps
+from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.messages.samples import learned_arm
-from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED
+from blf_dsc_controller.messages.topics import JOURNAL, LAMBDA_MIN, LATCHED
 from blf_dsc_controller.run import LearnedArm, Run, Series
 
 PERIOD = 10_000_000  # ns
@@ -139,11 +140,18 @@ def test_seven_joints_and_sixty_parameters_fit_into_the_figures(tmp_path):
     assert sorted(drawn) == sorted([*names[:48], *joints, *joints])
 
 
+def configured(messages, values):
+    """Messages of a bag whose journal has another configuration."""
+    first = recorded_run.of(messages, JOURNAL)[0]
+    event = decode(first[3])
+    first[3] = event._replace(content={'parameters': values}).encode()
+    return messages
+
+
 def test_arm_of_a_bag_comes_from_its_recorded_configuration(tmp_path):
     config = panda()
-    text = dumps({'blf_dsc_controller': config})
     messages = recorded_run.messages(recorded_run.record(tmp_path / 'two_links', 0.1))
-    bag = recorded_run.write(tmp_path / 'bag', messages, text, model='urdf')
+    bag = recorded_run.write(tmp_path / 'bag', configured(messages, flatten(config)))
     run = read_run(bag)
     (reported,) = read_bags([bag])
     assert reported.arm == arm_of_chain(config.robot.chain(config.joints))
@@ -170,8 +178,9 @@ def test_page_draws_the_arm_in_space():
 
 def test_page_reports_that_it_cannot_draw_the_recorded_arm(tmp_path):
     messages = recorded_run.messages(recorded_run.record(tmp_path / 'two_links', 0.1))
-    text = dumps({'blf_dsc_controller': panda()}).replace('<robot', '<gone')
-    (reported,) = read_bags([recorded_run.write(tmp_path / 'bag', messages, text, model='urdf')])
+    values = flatten(panda())
+    values['robot.urdf'] = values['robot.urdf'].replace('<robot', '<gone')
+    (reported,) = read_bags([recorded_run.write(tmp_path / 'bag', configured(messages, values))])
     (problem,) = [event.text for event in reported.events if event.kind == 'arm']
     assert 'drawn as links in a plane' in problem
     assert 'robot.urdf: not a URDF' in problem

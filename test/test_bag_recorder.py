@@ -22,8 +22,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.analysis.reported_bag import read_bags
-from blf_dsc_controller.bags.context import Losses, read_context
+from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.sources import BagError
+from blf_dsc_controller.bags.writer import Losses
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import FOREVER, JOINT_STATES, Quality
@@ -64,7 +65,7 @@ class Loop:
         """Spin both nodes until the recorder has at least these numbers of messages by topic."""
         self.spin_until(
             lambda: all(
-                self.recorder._sink.message_counts.get(f'/{topic}', 0) >= count
+                self.recorder._bag.message_counts.get(f'/{topic}', 0) >= count
                 for topic, count in counts.items()
             )
         )
@@ -178,7 +179,7 @@ def test_quality_and_type_are_taken_from_the_graph(loop):
     run = loop()
     quality = QoSProfile(depth=7, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     run.source.create_publisher(Float64MultiArray, 'commands', quality)
-    run.spin_until(lambda: '/commands' in run.recorder._sink.message_counts)
+    run.spin_until(lambda: '/commands' in run.recorder._bag.message_counts)
     (seen,) = run.recorder.get_publishers_info_by_topic('/commands')
     run.close()
     with Reader(run.bag) as reader:
@@ -291,7 +292,7 @@ def test_messages_sent_before_the_recorder_connected_are_reported_as_lost(loop, 
     run.close()
     lost = '0 missed, 7 sent before the recorder connected'
     assert f'/joint_states: 3 messages, {lost}' in capfd.readouterr().err
-    assert read_context(run.bag).losses == {'/joint_states': lost}
+    assert read_content(run.bag).losses == {'/joint_states': lost}
     (bag,) = read_bags([run.bag])
     assert [(event.kind, event.text) for event in bag.events] == [
         ('lost', f'/joint_states: {lost}')

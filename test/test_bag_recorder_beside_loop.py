@@ -17,7 +17,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from command import PATIENT, closed_loop
 from mcap.reader import make_reader
 
-from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.messages import topics
 
 DURATION = 60 if os.environ.get('LONG_TESTS') else 3  # s
@@ -73,7 +73,7 @@ def test_timing_and_permissions_are_reported(out):
 
 def test_every_message_of_a_real_time_loop_is_in_the_bag(out):
     recorded = sequence_numbers(out / 'bag')
-    facts = read_context(out / 'bag').facts
+    facts = read_content(out / 'bag').facts
     for topic in EACH_SAMPLE:
         counts = facts[f'messages {topic.resolved}']
         print(f'{topic.resolved}: {counts}')  # noqa: T201 - shown by make test-long

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder in its own process: full disk, ring buffer, parameters of nodes, odd types."""
+"""The recorder in its own process: full disk, odd types."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from foreign_readers import read
 from recorder_rig import ENCODER, PATIENCE, Rig
 from small_disk import small_disk
-from std_srvs.srv import Trigger
 
-from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.bags.recover import recover
 
 ENCODED = ENCODER.encode(1, [1, 2], [3, 4], [5, 6])[12:]  # after the stamp
@@ -43,50 +41,6 @@ def test_full_disk_stops_the_recorder_with_one_error_and_a_whole_bag(rig, tmp_pa
         assert 'Traceback' not in output
         assert len(read(disk / 'bag')) > 1000
         assert recover(disk / 'bag', tmp_path / 'clean').is_whole
-
-
-def test_ring_is_written_on_a_trigger(rig, tmp_path):
-    rig.record(tmp_path / 'bag', ring=0.5)
-    client = rig.node.create_client(Trigger, '/bag_recorder/trigger')
-    rig.wait_for(client.service_is_ready)
-    rig.publish_for(1.5)
-    future = client.call_async(Trigger.Request())
-    rig.wait_for(future.done)
-    assert future.result().success, future.result().message
-    assert future.result().message.endswith(f'messages into {tmp_path / "bag"}')
-    stamps = [stamp for topic, stamp, _ in read(tmp_path / 'bag') if topic == '/a']
-    assert stamps[-1] - stamps[1] <= 0.5e9  # the first is older, as the topic is latched
-    again = client.call_async(Trigger.Request())
-    rig.wait_for(again.done)
-    assert (tmp_path / 'bag-2' / 'metadata.yaml').exists()
-
-
-def test_parameters_of_publishing_nodes_are_in_the_bag(rig, tmp_path):
-    process = rig.record(tmp_path / 'bag')
-    file = tmp_path / 'bag' / 'bag_0.mcap'
-    rig.wait_for(lambda: b'gain: [1.0, 2.0]' in file.read_bytes())
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=PATIENCE)
-    context = read_context(tmp_path / 'bag')
-    assert '/source:\n  ros__parameters:\n    gain: [1.0, 2.0]\n' in context.configuration
-    assert context.facts['messages /a'].startswith('0 written, 0 missed')
-
-
-def test_parameters_are_read_before_the_first_message_if_waited_for(rig, tmp_path):
-    process = rig.record(tmp_path / 'bag', wait_for_parameters=PATIENCE)
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=PATIENCE)
-    assert 'gain: [1.0, 2.0]' in read_context(tmp_path / 'bag').configuration
-
-
-def test_unresponsive_node_is_recorded_after_the_wait(rig, tmp_path):
-    process = rig.start(tmp_path / 'bag', wait_for_parameters=0.3)
-    while not rig.publishers[0].get_subscription_count():  # nobody serves its parameters
-        assert process.poll() is None
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    _, output = process.communicate(timeout=PATIENCE)
-    assert '/source: its parameters could not be read' in output
 
 
 def test_unknown_message_packages_are_not_imported_and_do_not_stop_the_recorder(rig, tmp_path):

@@ -41,7 +41,7 @@ def packed(bag, request, tmp_path_factory):
 
 def test_compressed_bag_replays_bit_for_bit(packed, capsys):
     assert main(['replay', str(packed)]) == 0
-    assert 'bit-equal: all outputs' in capsys.readouterr().out
+    assert 'bit-equal: all numbers' in capsys.readouterr().out
 
 
 def test_compressed_bag_works_with_every_command(bag, packed, tmp_path, capsys):

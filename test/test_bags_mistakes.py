@@ -13,7 +13,6 @@ import recorded_run
 from mcap.writer import Writer
 from rosbags.rosbag2 import Reader
 
-from blf_dsc_controller.bags.context import ATTACHMENT, read_context
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE, JOINT_STATES
@@ -45,10 +44,9 @@ def copy(bag, tmp_path):
 
 
 @pytest.fixture
-def rewritten(bag, tmp_path):
-    """Writes a bag of other messages with the configuration of the recorded one."""
-    configuration = read_context(bag).configuration
-    return lambda entries: recorded_run.write(tmp_path / 'changed', entries, configuration)
+def rewritten(tmp_path):
+    """Writes a bag of other messages."""
+    return lambda entries: recorded_run.write(tmp_path / 'changed', entries)
 
 
 @pytest.fixture
@@ -80,13 +78,12 @@ def all_say(readers, capsys):
     return check
 
 
-def write_mcap(folder, entries, schema, configuration=''):
+def write_mcap(folder, entries, schema):
     """Write one MCAP file; `schema` returns encoding and text of a type, or None for no schema."""
     folder.mkdir()
     with (folder / 'bag_0.mcap').open('wb') as stream:
         writer = Writer(stream)
         writer.start('ros2', 'another')
-        writer.add_attachment(0, 0, ATTACHMENT, 'application/yaml', configuration.encode())
         channels = {}
         for topic, type_name, at, raw in entries:
             if topic not in channels:
@@ -143,9 +140,8 @@ def test_types_of_this_package_need_no_definition(entries, readers, tmp_path, ca
     assert 'float64[] position' in text[JOINT_STATE]
 
 
-def test_topics_of_unknown_type(bag, entries, tmp_path, all_say, capsys):
-    configuration = read_context(bag).configuration
-    file = write_mcap(tmp_path / 'bag', entries, lambda _: None, configuration)
+def test_topics_of_unknown_type(entries, tmp_path, all_say, capsys):
+    file = write_mcap(tmp_path / 'bag', entries, lambda _: None)
     all_say(file, '/joint_states (of unknown type)')
     assert main(['recover', str(file), '--out', str(tmp_path / 'clean')]) == 1
     assert f'LOST {len(entries)} messages of topics whose' in capsys.readouterr().out
@@ -160,9 +156,9 @@ def test_empty_bag(rewritten, all_say, tmp_path, capsys):
 
 def test_metadata_that_lists_missing_messages(copy, entries, all_say, tmp_path):
     others = [entry for entry in entries if entry[0] != JOINT_STATES.resolved]
-    other = recorded_run.write(tmp_path / 'bag', others, read_context(copy).configuration)
+    other = recorded_run.write(tmp_path / 'bag', others)
     shutil.copy(other / 'bag_0.mcap', copy)
-    all_say(copy, 'is empty: it holds no message of /joint_states')
+    all_say(copy, 'counts 301 messages of /joint_states, its files 0')
 
 
 def test_bag_folder_without_its_mcap_file(copy, all_say, tmp_path, capsys):
@@ -216,18 +212,6 @@ def test_bag_of_another_format(copy, all_say, original, replacement, words, tmp_
     all_say(copy, words, f'to save the undamaged part: bag_recover {copy}')
     assert main(['recover', str(copy), '--out', str(tmp_path / 'clean')]) == 0
     assert 'none of the recorded messages was lost' in capsys.readouterr().out
-
-
-def test_damaged_configuration(entries, readers, tmp_path, capsys):
-    path = recorded_run.write(tmp_path / 'bag', entries, '{{{')
-    assert readers['replay --learn'](path) == 1
-    error = capsys.readouterr().err
-    assert 'holds a configuration that cannot be read' in error
-    assert '--config recommended' in error
-    # The replay takes the configuration from the journal.
-    for name in ('replay', 'report', 'export', 'plot', 'replay --config'):
-        assert readers[name](path) == 0, name
-    assert '<p>not recorded in the bag</p>' in (tmp_path / 'page.html').read_text()
 
 
 def test_folder_of_a_run_suggests_the_bag_in_it(copy, capsys):

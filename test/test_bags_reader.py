@@ -10,12 +10,16 @@ import numpy as np
 import pytest
 import recorded_run
 import synthetic_bag
+from foreign_readers import raw_records
+from mcap.opcode import Opcode
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from synthetic_bag import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 
+from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import UnreadableMessageError
+from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import JointStateDecoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import (
@@ -29,6 +33,7 @@ from blf_dsc_controller.messages.topics import (
 from blf_dsc_controller.messages.types import typestore
 
 SAMPLES = 200
+JOINT_NAMES = {joint: joint for joint in JOINTS}
 
 
 @pytest.fixture(scope='module')
@@ -146,12 +151,64 @@ def test_lost_sample_leaves_a_gap_and_shifts_no_other(made, lost):
     np.testing.assert_array_equal(reference[6:], made.reference[6:])
 
 
-def test_messages_are_sorted_and_deduplicated(tmp_path, made, messages):
-    shuffled = without(messages, COMMANDS)  # commands have no stamp to sort by
-    shuffled = shuffled[::-1] + shuffled[:40]
-    run = read_run(synthetic_bag.write(tmp_path / 'bag', shuffled))
+def test_stamps_that_fall_once_begin_another_run(tmp_path, made, messages):
+    """A simulator was reset: the longer run is read, and what is left out is counted."""
+    later = without(messages, COMMANDS)
+    begun = [entry for entry in later if entry[1] < made.stamp[50]]
+    shifted = [(topic, at + 10**9, raw) for topic, at, raw in later]
+    run = read_run(synthetic_bag.write(tmp_path / 'bag', begun + shifted))
     np.testing.assert_array_equal(run.stamp, made.stamp)
-    np.testing.assert_array_equal(run.torque, made.torque)
+    np.testing.assert_array_equal(run.error, made.error)
+    assert run.notes == (
+        (
+            '50 of 250 joint states left out: their stamps fall 1 times, so that 2 runs are in the '
+            'bag; run 2, the longest, is shown'
+        ),
+    )
+
+
+@pytest.mark.parametrize('kind', ['backwards', 'interleaved', 'numbered'])
+def test_states_of_several_publishers_are_refused(tmp_path, messages, kind):
+    states = without(messages, *{entry[0] for entry in messages} - {JOINT_STATES})
+    encoder = JointStateEncoder(JOINTS)
+    other = [
+        (JOINT_STATES, at + 400_000, encoder.encode(at + 400_000, [9, 9], [0, 0], [0, 0]))
+        for _, at, _ in states
+    ]
+    both = [entry for pair in zip(states, other, strict=True) for entry in pair]
+    with BagWriter(tmp_path / 'bag') as bag:
+        handle = bag.add_topic('/joint_states', JOINT_STATES.type, [])
+        for k, (_, at, raw) in enumerate(states[::-1] if kind == 'backwards' else both):
+            bag.write(handle, raw, at, sequence=1 + k // 2 if kind == 'numbered' else 0)
+    with pytest.raises(BagError, match='several publishers share /joint_states'):
+        read_run(tmp_path / 'bag')
+
+
+def test_repeated_states_and_those_of_other_joints_are_counted(tmp_path, messages):
+    gripper = JointStateEncoder(['finger']).encode(5, [0], [0], [0])
+    states = without(messages, *{entry[0] for entry in messages} - {JOINT_STATES})
+    kept = [states[0], states[0], (JOINT_STATES, states[0][1], gripper), *states[1:]]
+    run = read_run(synthetic_bag.write(tmp_path / 'bag', kept), names=NameMap({}, JOINT_NAMES))
+    assert run.stamp.size == SAMPLES
+    assert run.notes == (
+        '1 of 202 joint states left out: they name other joints',
+        '1 joint states left out: they repeat the stamp before',
+    )
+
+
+def test_lost_chunk_is_an_error_of_every_reader(tmp_path, messages):
+    """Also if the index does not mention it, and if it is in the file twice."""
+    path = synthetic_bag.write(tmp_path / 'bag', messages)
+    data = (path / 'bag_0.mcap').read_bytes()
+    chunk = next(raw for _, raw in raw_records(data) if raw[0] == Opcode.CHUNK)
+    start = int.from_bytes(data[-28:-20], 'little')  # of the description, without a checksum
+    for times in (0, 2):
+        begin = (start + (times - 1) * len(chunk)).to_bytes(8, 'little')
+        footer = data[-37:-28] + begin + bytes(12) + data[-8:]
+        changed = (data[:-37] + footer).replace(chunk, times * chunk, 1)
+        (path / 'bag_0.mcap').write_bytes(changed)
+        with pytest.raises(BagError, match=r'messages of .*, but its statistics count'):
+            read_run(path)
 
 
 @pytest.mark.parametrize('storage', [StoragePlugin.SQLITE3, StoragePlugin.MCAP])

@@ -12,6 +12,7 @@ import yaml
 from foreign_readers import messages_on_disk
 from mcap.reader import make_reader
 
+from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
@@ -169,7 +170,7 @@ def test_metadata_matches_rosbag2(tmp_path):
                 'message_count': 6,
             }
         ],
-        'custom_data': None,
+        'custom_data': {'package_version': __version__},
         'ros_distro': 'jazzy',
     }
     assert tree == {'rosbag2_bagfile_information': information}

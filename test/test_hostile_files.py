@@ -12,11 +12,10 @@ import pytest
 import recorded_run
 import synthetic_bag
 import zstandard
+from foreign_readers import raw_records
 from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk
 
-from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.mcap_reader import scan
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.params_file import load_loop
@@ -80,8 +79,7 @@ def chunk(data, declared, compression='zstd'):
 
 def with_chunks(file, *added):
     """Insert chunks after the header of a file and drop its index."""
-    _, *others = (piece.raw for piece in scan(file.read_bytes()))
-    header = next(scan(file.read_bytes())).raw
+    header, *others = (raw for _, raw in raw_records(file.read_bytes()))
     footer = others[-1][:9] + bytes(20)
     file.write_bytes(MAGIC + b''.join([header, *added, *others[:-1], footer]) + MAGIC)
     return file
@@ -103,7 +101,6 @@ def test_files_outside_the_bag_folder_are_not_read(bag, copy, refused, tmp_path,
         text = metadata.read_text()
         metadata.write_text(text.replace('- bag_0.mcap', '- ../elsewhere/secret.mcap'))
     refused(copy, 'outside of the folder', but=() if is_link else ('recover',))
-    assert read_context(copy).configurations == ()
 
 
 @pytest.mark.parametrize('name', ['bag_0.mcap', 'metadata.yaml'])
@@ -129,14 +126,14 @@ def test_named_pipe_is_rejected_as_parameter_file_and_urdf(tmp_path, capsys):
 def test_chunk_is_not_unpacked_beyond_its_declared_size(copy, refused):
     (copy / 'metadata.yaml').unlink()
     file = with_chunks(copy / 'bag_0.mcap', chunk(zstandard.compress(ZEROS), 100))
-    refused(file, 'more than 100 bytes, unpacked', but=('recover',))
+    refused(file, f'states 100 bytes, unpacked, but holds {len(ZEROS)}', but=('recover',))
     assert main(['recover', str(file), '--out', str(copy.parent / 'out')]) == 0
 
 
 @pytest.mark.parametrize('declared', [1 << 29 | 1, 1 << 62])
 def test_chunk_that_declares_too_large_a_size_is_not_unpacked(copy, refused, declared):
     file = with_chunks(copy / 'bag_0.mcap', chunk(zstandard.compress(b''), declared))
-    refused(file, f'{declared} bytes, unpacked; at most', but=('recover',))
+    refused(file, f'a chunk states {declared} bytes, unpacked', but=('recover',))
 
 
 def test_bag_is_not_unpacked_beyond_the_limit(copy, refused):
@@ -199,9 +196,6 @@ def test_unreasonable_yaml_is_rejected_everywhere(copy, refused, tmp_path, text,
     path.write_text(text)
     with pytest.raises(BlfDscError, match=words):
         load_loop(path)
-    entries = recorded_run.messages(copy / 'bag_0.mcap')
-    recorded = recorded_run.write(tmp_path / 'told', entries, text)
-    assert main(['report', str(recorded), '--out', str(tmp_path / 'page.html')]) == 0
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,8 @@ def test_parameter_change_takes_effect_at_the_published_sample(ros):
     assert response.result.successful, response.result.reason
     ros.until(lambda: arm.finished and len(commands) == 1001)
 
-    (change,) = [json.loads(message.data) for message in changes]
+    configured, change = [json.loads(message.data) for message in changes]
+    assert configured['configured']
     assert change['parameters'] == PUSHED
     at = (change['stamp'] - LOCKSTEP_START) * 1e-9
     assert 0.05 < at < 1.0

@@ -9,7 +9,6 @@ import sys
 import pytest
 import recorded_run
 
-from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.cli.replay import DIFFERENT, PARTIAL
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES
@@ -39,7 +38,7 @@ def test_difference_sets_the_exit_code_and_the_last_line(bag, tmp_path, capsys):
     entries = recorded_run.messages(bag)
     second = [entry for entry in entries if entry[0] == COMMANDS.resolved][1]
     second[3] = second[3][:-1] + bytes([second[3][-1] ^ 0x80])  # the sign
-    path = recorded_run.write(tmp_path / 'bag', entries, read_context(bag).configuration)
+    path = recorded_run.write(tmp_path / 'bag', entries)
     assert main(['replay', str(path)]) == DIFFERENT
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith('DIFFERENT, first at 0.001000 s (stamp 1001000000 ns), /blf_dsc_c')
@@ -52,7 +51,7 @@ def test_partial_comparison_has_a_verdict_of_its_own(bag, tmp_path, capsys, topi
     entries = recorded_run.messages(bag)
     lost = recorded_run.of(entries, topic)[100]
     kept = [entry for entry in entries if entry is not lost]
-    path = recorded_run.write(tmp_path / 'bag', kept, read_context(bag).configuration)
+    path = recorded_run.write(tmp_path / 'bag', kept)
     assert main(['replay', str(path)]) == PARTIAL
     last = capsys.readouterr().out.splitlines()[-1]
     percent = float(last.removeprefix('PARTLY COMPARED: ').split()[0])

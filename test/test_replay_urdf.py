@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 from random_arm import random_urdf
 
-from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.params_file import dump, load_loop
 from blf_dsc_controller.replay.verify import verify
@@ -46,7 +46,7 @@ def test_bag_replays_bit_for_bit_without_its_urdf_file(recorded):
 def test_changing_the_urdf_file_does_not_affect_the_bag(recorded):
     urdf, loop, bag = recorded
     urdf.write_text(random_urdf(3, seed=6)[0])
-    assert read_context(bag).controller_config() == loop.controller
+    assert read_content(bag).controller_config() == loop.controller
     assert verify(bag).difference is None
 
 

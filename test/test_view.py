@@ -20,6 +20,7 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import chain_of
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
+from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.view import address
 from blf_dsc_controller.view.address import free_port
 from blf_dsc_controller.view.arm import (
@@ -153,9 +154,8 @@ def test_server_opens_no_external_connections(player):
 
 
 def test_bag_without_configuration_is_rejected_in_one_line(tmp_path, capsys):
-    bare = recorded_run.write(
-        tmp_path / 'bare', recorded_run.messages(recorded_run.record(tmp_path / 'whole', 0.05))
-    )
+    entries = recorded_run.messages(recorded_run.record(tmp_path / 'whole', 0.05))
+    bare = recorded_run.write(tmp_path / 'bare', recorded_run.of(entries, JOINT_STATES))
     assert main(['view', str(bare), '--port', str(PORT)]) == 1
     printed = capsys.readouterr()
     assert 'does not hold the configuration of a controller' in printed.err

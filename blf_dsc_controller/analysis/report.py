@@ -58,7 +58,7 @@ def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
         names=[bag.name for bag in bags],
         seconds=max(bag.run.duration for bag in bags),
         thinned=max(_period(bag.run) for bag in bags),
-        versions=sorted({bag.version or 'another recorder' for bag in bags}),
+        versions=sorted({bag.content.version or 'another recorder' for bag in bags}),
         links=[*groups, 'The arm', 'Events', 'Configuration'],
         summaries=[
             (bag.name, colour(k), format_table(summarize(bag.run))) for k, bag in enumerate(bags)

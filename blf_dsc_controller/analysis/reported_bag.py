@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,13 +13,10 @@ import numpy as np
 
 from blf_dsc_controller.analysis.drawn_arm import DrawnArm, arm_of_chain, planar_arm
 from blf_dsc_controller.analysis.metrics import change_times, latch_time, outside
-from blf_dsc_controller.bags.content import NO_NAMES, NameMap
-from blf_dsc_controller.bags.context import Context, read_context
-from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.bags.sources import open_bag
-from blf_dsc_controller.configuration.ros_yaml import parse
-from blf_dsc_controller.errors import BlfDscError, ConfigurationError
-from blf_dsc_controller.messages.topics import CHANGES, DIAGNOSTICS
+from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
+from blf_dsc_controller.bags.reader import recorded_run
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages.topics import CONTROLLER, DIAGNOSTICS, PLANT
 from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Run
 
@@ -44,7 +40,7 @@ class ReportedBag:
 
     name: str
     run: Run
-    version: str  # that recorded it, empty for another recorder
+    content: Content
     parameters: dict[str, str]  # `node name: parameter` to its value as text
     arm: DrawnArm
     events: list[ReportedEvent]  # by time
@@ -77,44 +73,46 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 
 def _read(path: Path, name: str, namespace: str, names: NameMap) -> ReportedBag:
-    run, context = read_run(path, namespace, names), read_context(path)
-    try:
-        sections = parse(context.configuration)
-    except ConfigurationError:  # missing or unreadable
-        sections = ()
-    entries = {name: entry.value for section in sections for name, entry in section.entries.items()}
+    content = read_content(path, namespace, names)
+    run = recorded_run(content, names, namespace)
+    configured = content.configurations
     lost = (
-        ReportedEvent(0.0, 'lost', f'{topic}: {text}') for topic, text in context.losses.items()
+        ReportedEvent(0.0, 'lost', f'{topic}: {text}') for topic, text in content.losses.items()
     )
-    arm, problem = _drawn(context, entries, len(run.joints))
+    left_out = (ReportedEvent(0.0, 'left out', note) for note in run.notes)
+    arm, problem = _drawn(content, configured, len(run.joints))
     unread = [ReportedEvent(0.0, 'arm', problem)] if problem else []
-    changed = _changed(path, run, namespace)
-    events = (*unread, *_events(run), *_diagnosed(path, run), *changed, *lost)
+    events = (
+        *unread, *left_out, *_events(run), *_diagnosed(content, run), *_changed(content, run), *lost
+    )  # fmt: skip
     return ReportedBag(
         name,
         run,
-        context.version,
+        content,
         parameters={
-            f'{section.pattern.removeprefix("/")}: {name}': _shown(entry.value)
-            for section in sections
-            for name, entry in sorted(section.entries.items())
+            f'{node}: {parameter}': _shown(value)
+            for node in sorted(configured)
+            for parameter, value in sorted(configured[node].items())
         },
         arm=arm,
         events=sorted(events, key=lambda event: event.time),
     )
 
 
-def _drawn(context: Context, entries: Mapping[str, Any], n: int) -> tuple[DrawnArm, str]:
+def _drawn(
+    content: Content, configured: Mapping[str, Mapping[str, Any]], n: int
+) -> tuple[DrawnArm, str]:
     """Return the arm of the recorded URDF, else a planar one; and why a URDF cannot be read."""
     problem = ''
-    if context.facts.get('model') == 'urdf':
+    if configured.get(CONTROLLER, {}).get('model') == 'urdf':
         try:
-            config = context.controller_config()
+            config = content.controller_config()
             return arm_of_chain(config.robot.chain(config.joints)), ''
         except BlfDscError as error:
             problem = f'drawn as links in a plane, as its URDF cannot be read: {error}'
     # Links without a length take that of the first.
-    lengths = (entries.get(f'arm.l{i + 1}', entries.get('arm.l1', 1.0)) for i in range(n))
+    known = configured.get(PLANT, {})
+    lengths = (known.get(f'arm.l{i + 1}', known.get('arm.l1', 1.0)) for i in range(n))
     return planar_arm([float(f'{length}') for length in lengths]), problem
 
 
@@ -149,36 +147,28 @@ def _intervals(run: Run, holds: np.ndarray, kind: str, what: str) -> Iterator[Re
             yield ReportedEvent(at, kind, f'{joint}: {more} more intervals, not listed')
 
 
-def _diagnosed(path: Path, run: Run) -> Iterator[ReportedEvent]:
+def _diagnosed(content: Content, run: Run) -> Iterator[ReportedEvent]:
     """Yield each change of a level or message, at the time of the last sample received."""
     shown: dict[str, tuple[int, str]] = {}
-    with open_bag(path) as bag:
-        if (DIAGNOSTICS.resolved, DIAGNOSTICS.type) not in bag.held:
-            return
-        for _, received, raw in bag.messages({DIAGNOSTICS.resolved}):
-            message: Any = typestore().deserialize_cdr(raw, DIAGNOSTICS.type)
-            k = int(np.searchsorted(run.received, received)) - 1
-            time = float(run.time[k]) if k >= 0 else (received - int(run.received[0])) * 1e-9
-            for status in message.status:
-                now = (int(status.level), str(status.message))
-                if shown.get(status.name) != now:
-                    shown[status.name] = now
-                    level = _LEVELS[min(now[0], len(_LEVELS) - 1)]
-                    yield ReportedEvent(time, level, f'{status.name}: {now[1]}')
+    messages = content.topics.get(DIAGNOSTICS)
+    for received, raw in zip(messages.received, messages.raw, strict=True) if messages else ():
+        message: Any = typestore().deserialize_cdr(raw, DIAGNOSTICS.type)
+        k = int(np.searchsorted(run.received, received)) - 1
+        time = float(run.time[k]) if k >= 0 else (received - int(run.received[0])) * 1e-9
+        for status in message.status:
+            now = (int(status.level), str(status.message))
+            if shown.get(status.name) != now:
+                shown[status.name] = now
+                level = _LEVELS[min(now[0], len(_LEVELS) - 1)]
+                yield ReportedEvent(time, level, f'{status.name}: {now[1]}')
 
 
-def _changed(path: Path, run: Run, namespace: str) -> Iterator[ReportedEvent]:
+def _changed(content: Content, run: Run) -> Iterator[ReportedEvent]:
     """Yield each change of the simulated plant's parameters during the run."""
-    name = f'/{namespace.strip("/")}'.rstrip('/') + CHANGES.resolved
-    with open_bag(path) as bag:
-        if (name, CHANGES.type) not in bag.held:
-            return
-        for _, _, raw in bag.messages({name}):
-            message: Any = typestore().deserialize_cdr(raw, CHANGES.type)
-            content = json.loads(message.data)
-            time = (content['stamp'] - int(run.stamp[0])) * 1e-9
-            for parameter, value in content['parameters'].items():
-                yield ReportedEvent(time, 'plant', f'{parameter}: {_shown(value)}')
+    for change in content.changes:
+        time = (change['stamp'] - int(run.stamp[0])) * 1e-9
+        for parameter, value in () if change.get('configured') else change['parameters'].items():
+            yield ReportedEvent(time, 'plant', f'{parameter}: {_shown(value)}')
 
 
 def _shown(value: object) -> str:

@@ -3,27 +3,39 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
+import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-
-from blf_dsc_controller.bags.packed_messages import PackedMessages
-from blf_dsc_controller.bags.sources import BagError, open_bag
+from blf_dsc_controller import __version__
+from blf_dsc_controller.bags.sources import MESSAGES, VERSION, BagError, open_bag
 from blf_dsc_controller.bags.topic_messages import TopicMessages
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages.journal import Event, EventType, decode
 from blf_dsc_controller.messages.topics import (
+    CHANGES,
     CLOCK,
     COMMANDS,
+    CONTROLLER,
     JOINT_STATE,
     JOINT_STATES,
+    JOURNAL,
+    PLANT,
     TOPICS,
     Topic,
 )
+from blf_dsc_controller.messages.types import typestore
 
-_OF_INTEREST = tuple(one for one in TOPICS if one is not CLOCK)
+_OF_INTEREST = (*(topic for topic in TOPICS if topic is not CLOCK), CHANGES)
+_NOTHING_MISSED = '0 missed'
+_KEPT = frozenset(topic.leaf for topic in TOPICS if topic.offered.depth > 1)
 
 
 @dataclass(frozen=True)
@@ -71,28 +83,89 @@ NO_NAMES = NameMap()
 
 @dataclass(frozen=True)
 class Content:
-    """Messages of the package's topics in a bag, and the number of messages of every topic."""
+    """Messages of the package's topics in a bag, and the number of messages of every topic.
+
+    `facts` are what a recorder of this package noted: its version, and losses by topic.
+    """
 
     path: Path
     topics: Mapping[Topic, TopicMessages]
     message_counts: Mapping[str, int]
+    facts: Mapping[str, str]
 
-    def before(self, until: int) -> Content:
-        """Return the content received before a time [ns], with the counts of the whole bag."""
-        topics = {}
-        for topic, one in self.topics.items():
-            count = bisect_left(one.received, until)
-            topics[topic] = replace(one, received=one.received[:count], raw=one.raw[:count])
-        return replace(self, topics=topics)
+    @property
+    def version(self) -> str:
+        """Version of this package that recorded the bag, empty for another recorder."""
+        return self.facts.get(VERSION, '')
 
-    def of_joints(self, joints: Sequence[str]) -> Content:
-        """Return the content without joint states that name only other joints, such as a gripper's.
+    @property
+    def losses(self) -> dict[str, str]:
+        """Recorder's notes on the messages it missed, by topic.
+
+        Topics that keep only their last message are left out.
+        """
+        texts = {
+            name.removeprefix(MESSAGES): text.partition(', ')[2]
+            for name, text in self.facts.items()
+            if name.startswith(MESSAGES) and name.rsplit('/', 1)[-1] in _KEPT
+        }
+        return {topic: text for topic, text in texts.items() if text not in ('', _NOTHING_MISSED)}
+
+    def missed(self, topic: str) -> int:
+        """Return the number of messages of a topic that the recorder knows it missed."""
+        found = re.search(r'(\d+) missed', self.facts.get(f'{MESSAGES}{topic}', ''))
+        return int(found[1]) if found else 0
+
+    @cached_property
+    def events(self) -> list[tuple[int, Event]]:
+        """Events of the journal and when they were received [ns]; others' messages are skipped."""
+        journal = self.topics.get(JOURNAL)
+        found = []
+        for received, raw in zip(journal.received, journal.raw, strict=True) if journal else ():
+            with suppress(BlfDscError):
+                found.append((received, decode(raw)))
+        return found
+
+    @cached_property
+    def changes(self) -> list[dict[str, Any]]:
+        """What the plant said of its parameters: all of them first, then each change."""
+        changes = self.topics.get(CHANGES)
+        found = []
+        for raw in changes.raw if changes else ():
+            with suppress(Exception):  # of another node
+                message: Any = typestore().deserialize_cdr(raw, CHANGES.type)
+                found.append({'stamp': 0, 'parameters': {}, **json.loads(message.data)})
+        return found
+
+    @property
+    def configurations(self) -> dict[str, dict[str, Any]]:
+        """First recorded parameters of each node of the loop, by node."""
+        found: dict[str, dict[str, Any]] = {}
+        for _, event in self.events:
+            if event.type is EventType.CONFIGURE:
+                found.setdefault(CONTROLLER, event.content['parameters'])
+        for change in self.changes:
+            if change.get('configured'):
+                found[PLANT] = change['parameters']
+        return found
+
+    def controller_config(self) -> ControllerConfig:
+        """Return the configuration of the controller as first recorded.
 
         Raises:
-            BagError: all joint states have the same stamp.
+            BagError: the bag holds none.
+            ConfigurationError: this version of the package cannot run the configuration.
         """
-        states = self.topics[JOINT_STATES].of_joints(joints)
-        return replace(self, topics={**self.topics, JOINT_STATES: states})
+        values = self.configurations.get(CONTROLLER)
+        if values is None:
+            raise BagError(
+                f'{self.path} does not hold the configuration of a controller: it was recorded by '
+                'something else, or without the controller; pass one, as in --config recommended'
+            )
+        source = f'{self.path}, {JOURNAL.resolved}'
+        if self.version != __version__:
+            source += f' by version {self.version or "unknown"}, not {__version__}'
+        return build(ControllerConfig, values, source)
 
 
 def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Content:
@@ -104,7 +177,7 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
     """
     with open_bag(path) as bag:
         found = {topic: _find(topic, bag.held, namespace, names) for topic in _OF_INTEREST}
-        if not bag.held:
+        if not bag.held or not any(bag.counts.values()):
             raise BagError(f'{path} is empty: it holds no message')
         if found[JOINT_STATES] is None:
             raise _missing_topic(JOINT_STATES.name, JOINT_STATES.type, bag.held)
@@ -114,21 +187,15 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
             for topic, name in found.items()
             if name is not None
         }
-        lists = {one.name: (one.received.append, one.raw.append) for one in topics.values()}
-        for name, received, raw in bag.messages(lists):
-            append_received, append_raw = lists[name]
-            append_received(received)
-            append_raw(raw)
-        counts = bag.counts
-    if not topics[JOINT_STATES].raw:
+        adds = {one.name: one.add for one in topics.values()}
+        for message in bag.messages(adds):
+            adds[message.topic](message)
+        for one in topics.values():
+            one.decode()
+    if not topics[JOINT_STATES].size:
         raise BagError(f'{path} is empty: it holds no message of {found[JOINT_STATES]}')
-    for messages in topics.values():
-        times = np.array(messages.received, dtype=np.int64)
-        if (times[1:] < times[:-1]).any():
-            order = np.argsort(times, kind='stable').tolist()
-            messages.received = [messages.received[k] for k in order]
-            messages.raw = PackedMessages(messages.raw[k] for k in order)
-    return Content(path, {topic: one for topic, one in topics.items() if one.raw}, counts)
+    held = {topic: one for topic, one in topics.items() if one.size}
+    return Content(path, held, bag.counts, bag.facts)
 
 
 def _find(topic: Topic, held: list[tuple[str, str]], namespace: str, names: NameMap) -> str | None:

@@ -8,19 +8,9 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, TypeAlias
 
 import yaml
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
-from rosbags.rosbag2.errors import ReaderError
-from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
-from yaml import YAMLError
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability
 
-from blf_dsc_controller.configuration.bounded_yaml import check_yaml
+from blf_dsc_controller.configuration.bounded_yaml import load_yaml
 from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.topics import FOREVER, HISTORY, STREAM, Quality
 from blf_dsc_controller.messages.types import Definition
@@ -32,6 +22,12 @@ Profile: TypeAlias = dict[str, Any]
 """Quality of service of a publisher as rosbag2 writes it."""
 
 _DURATIONS = ('deadline', 'lifespan', 'liveliness_lease_duration')
+_POLICIES = {  # numbers in bags of earlier releases
+    'history': QosHistory,
+    'reliability': QosReliability,
+    'durability': QosDurability,
+    'liveliness': QosLiveliness,
+}
 
 
 @dataclass
@@ -123,48 +119,53 @@ def profile_of(quality: Quality) -> Profile:
     return {**profile, 'avoid_ros_namespace_conventions': False}
 
 
-def parse_profiles(text: str) -> list[Profile]:
-    """Parse the profiles in a text of any rosbag2 version; none if it is something else."""
-    return [{**profile} for profile in dump_qos_v9(_parsed(text))]
+def parse_qualities(profiles: str | Sequence[Qos] | None) -> list[Quality]:
+    """Return publishers' qualities of service, as in a channel of any rosbag2 or from rosbags.
 
-
-def strongest_quality(profiles: Any, *, is_latched: bool = False) -> Quality:
-    """Return a quality of service compatible with each subscriber that any publisher matched.
-
-    The publishers' `profiles` are text or plain data of any rosbag2 version. A latched topic keeps
-    its recorded depth; others get that of a stream, so that no message is lost in a burst.
+    None if the text is something else.
     """
-    offered = _parsed(profiles)
-    is_latched |= any(one.durability is QosDurability.TRANSIENT_LOCAL for one in offered)
-    depth = max((one.depth for one in offered if one.history is QosHistory.KEEP_LAST), default=0)
-    return replace(
-        HISTORY if is_latched else STREAM,
-        depth=depth if is_latched and depth else STREAM.depth,
-        reliability='best_effort'
-        if offered and all(one.reliability is QosReliability.BEST_EFFORT for one in offered)
-        else 'reliable',
-        deadline=_shortest(one.deadline for one in offered),
-        liveliness_lease_duration=_shortest(one.liveliness_lease_duration for one in offered),
-        liveliness='manual_by_topic'
-        if any(one.liveliness is QosLiveliness.MANUAL_BY_TOPIC for one in offered)
-        else 'automatic',
-    )
-
-
-def _parsed(profiles: Any) -> list[Qos]:
     try:
-        if isinstance(profiles, str):
-            check_yaml(profiles)
-        return parse_qos(profiles)
-    except (ReaderError, YAMLError, KeyError, TypeError, ValueError, AttributeError):
+        entries = load_yaml(profiles) if isinstance(profiles, str) else profiles
+        return [_quality(one if isinstance(one, dict) else one._asdict()) for one in entries or ()]
+    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError):
         return []
 
 
-def _shortest(times: Iterable[QosTime]) -> int:
-    """Return the shortest of the times [ns]; zero means unspecified."""
-    return min(
-        (time for one in times if (time := one.sec * NANOSECONDS + one.nsec)), default=FOREVER
+def _quality(entry: dict[str, Any]) -> Quality:
+    found: dict[str, Any] = {'depth': int(entry['depth'])}
+    for name, policy in _POLICIES.items():
+        value = entry[name]
+        found[name] = value.lower() if isinstance(value, str) else policy(value).name.lower()
+    for name in _DURATIONS:
+        time = entry[name]
+        sec, nsec = (time['sec'], time['nsec']) if isinstance(time, dict) else time
+        found[name] = int(sec) * NANOSECONDS + int(nsec)
+    return Quality(**found)
+
+
+def strongest_quality(offered: Sequence[Quality], *, is_latched: bool = False) -> Quality:
+    """Return a quality of service compatible with each subscriber that any publisher matched.
+
+    A latched topic keeps its recorded depth; others get that of a stream, so that no message is
+    lost in a burst.
+    """
+    is_latched |= any(one.durability == 'transient_local' for one in offered)
+    depth = max((one.depth for one in offered if one.history == 'keep_last'), default=0)
+    is_lossy = offered and all(one.reliability == 'best_effort' for one in offered)
+    is_manual = any(one.liveliness == 'manual_by_topic' for one in offered)
+    return replace(
+        HISTORY if is_latched else STREAM,
+        depth=depth if is_latched and depth else STREAM.depth,
+        reliability='best_effort' if is_lossy else 'reliable',
+        deadline=_shortest(one.deadline for one in offered),
+        liveliness_lease_duration=_shortest(one.liveliness_lease_duration for one in offered),
+        liveliness='manual_by_topic' if is_manual else 'automatic',
     )
+
+
+def _shortest(times: Iterable[int]) -> int:
+    """Return the shortest of the times [ns]; zero means unspecified."""
+    return min((time for time in times if time), default=FOREVER)
 
 
 def _period(files: Sequence[FileInformation]) -> dict[str, dict[str, int]]:

@@ -3,106 +3,234 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from blf_dsc_controller.bags.columns import ALL, Rows
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
-from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.bags.torque import TorqueError, applied_torque, next_effort
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.journal import Event, EventType, decode
+from blf_dsc_controller.messages.journal import Event, EventType
+from blf_dsc_controller.messages.topics import CONTROLLER
 from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Floats, LearnedArm, Run, Series, Stop
 
+_MOST_FALLS = 10  # of the stamps, by resets of a simulator
+_ALTERNATING = 0.9  # ratio of the intervals to and from the state of another publisher
+_FEW = 100  # states
+
+
+class RecordedRun(Run):
+    """Run whose arrays are read from its bag's tables each time that they are asked for."""
+
+    def __init__(self, known: dict[str, Any], computed: dict[str, Callable[[Rows], Any]]) -> None:
+        """Take what is in memory, and functions that return rows of the other arrays."""
+        for name, value in known.items():
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, '_computed', computed)
+
+    def __getattribute__(self, name: str) -> Any:
+        computed = object.__getattribute__(self, '__dict__').get('_computed', {})
+        return computed[name](ALL) if name in computed else object.__getattribute__(self, name)
+
+    def at(self, name: str, rows: Rows) -> Floats | None:
+        """Return some rows of an array; None if it is unknown."""
+        values: Floats | None = self.__dict__['_computed'][name](rows)
+        return values
+
+    def in_memory(self) -> Run:
+        """Return the run with all of its arrays in memory."""
+        values = {field.name: getattr(self, field.name) for field in fields(Run)}
+        for name, value in values.items():
+            if isinstance(value, Series):
+                values[name] = Series(value.names, value.stamp, value.values)
+        return Run(**values)
+
 
 def read_run(path: str | Path, namespace: str = '', names: NameMap = NO_NAMES) -> Run:
-    """Read the run of a bag; `namespace` selects one of several robots, `names` maps its names.
+    """Read the run of a bag into memory.
+
+    `namespace` selects one of several robots, `names` maps its names.
 
     Raises:
-        BagError: there is no bag, it is damaged, it holds no joint states, or the topics of several
-            robots.
+        BagError: there is no bag, it is damaged, it holds no joint states, the topics of several
+            robots, or the states of several runs.
         UnreadableMessageError: a message in it cannot be decoded.
     """
-    content = read_content(Path(path), namespace, names)
+    return recorded_run(read_content(Path(path), namespace, names), names, namespace).in_memory()
+
+
+def recorded_run(content: Content, names: NameMap = NO_NAMES, namespace: str = '') -> RecordedRun:
+    """Return the run of a bag; errors as for `read_run`."""
     joints = _joints(content, names)
-    theirs = names.joints_of(joints)
-    content = content.of_joints(theirs)
-    states = content.topics[topics.JOINT_STATES].joint_states(theirs, ('position',)).by_stamp()
-    errors = _decode(content, topics.TRACKING_ERROR, joints)
-    references = _decode(content, topics.REFERENCE, joints)
-    bounds = _decode(content, topics.BOUND, joints)
-    events = list(_events(content))
-    learning = _vector(content, topics.LEARNING)
-    reference = None if references is None else references.position.exact(states.stamp)
-    error = None if errors is None else errors.position.exact(states.stamp)
-    if error is None and reference is not None:
-        error = states.values[:, 0] - reference
-    elif error is not None and reference is not None and _is_decimated(events):
-        reference = np.where(np.isnan(reference), states.values[:, 0] - error, reference)
-    return Run(
-        joints=joints,
-        stamp=states.stamp,
-        received=states.received,
-        position=states.values[:, 0],
-        velocity=states.values[:, 1],
-        torque=_torque(content, states),
-        reference=reference,
-        error=error,
-        bound=None if bounds is None else bounds.position.held(states.stamp),
-        torque_limit=None if bounds is None else bounds.effort.held(states.stamp),
-        learning=learning,
-        truth=_vector(content, topics.TRUTH),
-        timing=_vector(content, topics.TIMING),
-        monitor=_vector(content, topics.MONITOR),
-        message_counts=content.message_counts,
-        rejected=_rejected_columns(content, learning, namespace),
-        stops=tuple(_stops(events, int(states.stamp[0]))),
-        arm=_arm(Path(path)),
-        learns=_learns(events),
-        effort=states.values[:, 2],
-        reference_velocity=None if references is None else references.velocity.exact(states.stamp),
-        xi2=None if errors is None else errors.velocity.exact(states.stamp),
+    states, notes, span = one_run(content, names.joints_of(joints))
+    stamp = states.stamp
+    within = partial(_within, content, span)
+    errors = within(topics.TRACKING_ERROR, joints)
+    references, bounds = within(topics.REFERENCE, joints), within(topics.BOUND, joints)
+    events = [one for at, one in content.events if span[0] <= at < span[1]]
+    learning = _series(within(topics.LEARNING))
+    try:
+        torque = applied_torque(content, states)
+    except TorqueError:
+        torque = next_effort(states)
+
+    def exact(found: JointStates | None, k: int, rows: Rows) -> Floats | None:
+        return None if found is None else found.series(k).exact(stamp[rows])
+
+    def held(k: int, rows: Rows) -> Floats | None:
+        return None if bounds is None else bounds.series(k).held(stamp[rows])
+
+    def error(rows: Rows) -> Floats | None:
+        if errors is None and references is not None:
+            return np.asarray(states.field(0, rows) - references.series(0).exact(stamp[rows]))
+        return exact(errors, 0, rows)
+
+    def reference(rows: Rows) -> Floats | None:
+        found, off = exact(references, 0, rows), exact(errors, 0, rows)
+        if found is not None and off is not None and _is_decimated(events):
+            found = np.where(np.isnan(found), states.field(0, rows) - off, found)
+        return found
+
+    return RecordedRun(
+        {
+            'joints': joints,
+            'stamp': stamp,
+            'received': states.received,
+            'learning': learning,
+            'truth': _series(within(topics.TRUTH)),
+            'timing': _series(within(topics.TIMING)),
+            'monitor': _series(within(topics.MONITOR)),
+            'message_counts': content.message_counts,
+            'rejected': _rejected_columns(content, learning, namespace),
+            'stops': tuple(_stops(events, int(stamp[0]))),
+            'arm': _arm(content),
+            'learns': _learns(events),
+            'notes': notes,
+        },
+        {
+            'position': partial(states.field, 0),
+            'velocity': partial(states.field, 1),
+            'effort': partial(states.field, 2),
+            'torque': torque.at,
+            'error': error,
+            'reference': reference,
+            'xi2': partial(exact, errors, 1),
+            'reference_velocity': partial(exact, references, 1),
+            'bound': partial(held, 0),
+            'torque_limit': partial(held, 2),
+        },
     )
+
+
+def one_run(
+    content: Content, joints: Sequence[str], required: Sequence[str] = ('position',)
+) -> tuple[JointStates, tuple[str, ...], tuple[int, int]]:
+    """Return the states of one run of one arm, what is left out, and when it was received [ns].
+
+    The stamps of the states increase. Where they fall, as when a simulator is reset, another run
+    begins; the longest one is taken.
+
+    Raises:
+        BagError: all stamps are the same, or several publishers share the topic.
+    """
+    messages = content.topics[topics.JOINT_STATES]
+    states = messages.joint_states(joints, required)
+    stamp, received, notes = states.stamp, states.received, []
+    if states.size > 1 and (stamp == stamp[0]).all():
+        raise BagError(
+            f'all {stamp.size} messages of {messages.name} have the stamp {stamp[0]} ns: each '
+            'needs a unique stamp, so the driver has to set header.stamp'
+        )
+    if messages.size > states.size:
+        count = messages.size - states.size
+        notes.append(f'{count} of {messages.size} joint states left out: they name other joints')
+    falls = np.flatnonzero(np.diff(stamp) < 0)
+    if falls.size > _MOST_FALLS or _alternates(states):
+        where = ''
+        if falls.size:
+            before, after = (stamp[falls[0] + k] * 1e-9 for k in (0, 1))
+            where = f': its stamps fall {falls.size} times, the first time '
+            where += f'from {before:.9g} s to {after:.9g} s'
+        raise BagError(
+            f'several publishers share {messages.name}, or its clock runs backwards{where}; '
+            'record one arm for each topic'
+        )
+    begin, end = np.iinfo(np.int64).min, np.iinfo(np.int64).max
+    if falls.size:
+        edges = np.concatenate([[0], falls + 1, [states.size]])
+        longest = int(np.argmax(np.diff(edges)))
+        first, last = (int(edge) for edge in edges[longest : longest + 2])
+        begin = int(received[first]) if first else begin
+        end = int(received[last]) if last < states.size else end
+        states = states.select(slice(first, last))
+        notes.append(
+            f'{stamp.size - states.size} of {stamp.size} joint states left out: their stamps fall '
+            f'{falls.size} times, so that {falls.size + 1} runs are in the bag; run '
+            f'{longest + 1}, the longest, is shown'
+        )
+        stamp = states.stamp
+    repeated = int((np.diff(stamp) == 0).sum())
+    if repeated:
+        notes.append(f'{repeated} joint states left out: they repeat the stamp before')
+    return states.by_stamp(), tuple(notes), (begin, end)
+
+
+def _alternates(states: JointStates) -> bool:
+    """Return whether the states come from two publishers in turn."""
+    sequence = states.sequence
+    if (np.diff(sequence) <= 0).sum() > _MOST_FALLS and sequence.any():
+        return True
+    intervals = np.diff(states.stamp)
+    if intervals.size < _FEW:
+        return False
+    turns = sorted(float(np.median(intervals[k::2])) for k in (0, 1))
+    return turns[0] < _ALTERNATING * turns[1]
 
 
 def _joints(content: Content, names: NameMap) -> tuple[str, ...]:
     """Return the controller's joints in its order; without it, those of `names`, or all."""
     sources = (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
-    of_controller = [content.topics[one] for one in sources if one in content.topics]
+    of_controller = [content.topics[topic] for topic in sources if topic in content.topics]
     if not of_controller and names.joints:
         return tuple(names.joints)
     return (*of_controller, content.topics[topics.JOINT_STATES])[0].joint_names()
 
 
-def _decode(content: Content, topic: topics.Topic, joints: Sequence[str]) -> JointStates | None:
-    """Decode a topic's messages of these joints, by stamp; None if there are none."""
+def _within(
+    content: Content, span: tuple[int, int], topic: topics.Topic, joints: Sequence[str] = ()
+) -> JointStates | None:
+    """Return a topic's messages received in a span, by stamp; None if there are none."""
     messages = content.topics.get(topic)
-    return None if messages is None else messages.joint_states(joints, ('position',)).by_stamp()
+    if messages is None:
+        return None
+    found = messages.joint_states(joints or messages.joint_names(), ('position',))
+    received = found.received
+    rows = np.flatnonzero((received >= span[0]) & (received < span[1]))
+    if rows.size < found.size:
+        found = found.select(rows)
+    return found.by_stamp() if rows.size else None
 
 
-def _vector(content: Content, topic: topics.Topic) -> Series | None:
-    messages = content.topics.get(topic)
-    return None if messages is None else messages.vectors()
-
-
-def _torque(content: Content, states: JointStates) -> Floats:
-    try:
-        return applied_torque(content, states)[0]
-    except TorqueError:
-        return next_effort(states)
+def _series(found: JointStates | None) -> Series | None:
+    return None if found is None else found.series()
 
 
 def _rejected_columns(content: Content, learning: Series | None, namespace: str) -> dict[str, str]:
     """Return columns that are NaN at the end of learning, with the reason in /diagnostics."""
     if learning is None:
         return {}
-    last = dict(zip(learning.names, learning.values[-1], strict=True))
+    values = learning.at(np.array([learning.stamp.size - 1]))[0]
+    last = dict(zip(learning.names, values, strict=True))
     columns = [
         name for name, value in last.items() if name != topics.COMPUTE_TIME and np.isnan(value)
     ]
@@ -122,22 +250,13 @@ def _rejected_columns(content: Content, learning: Series | None, namespace: str)
     return {column: reasons.get(column, '') for column in columns}
 
 
-def _events(content: Content) -> Iterator[Event]:
-    """Yield the events of the journal, without messages of other nodes' topics of that name."""
-    journal = content.topics.get(topics.JOURNAL)
-    for raw in journal.raw if journal is not None else ():
-        with suppress(BlfDscError):
-            yield decode(raw)
-
-
-def _arm(path: Path) -> LearnedArm | None:
+def _arm(content: Content) -> LearnedArm | None:
     """Return the arm of the recorded configuration; None unless its URDF can still be read."""
-    context = read_context(path)
-    if context.facts.get('model') == 'urdf':
+    if content.configurations.get(CONTROLLER, {}).get('model') == 'urdf':
         from blf_dsc_controller.messages.samples import learned_arm  # slow: compiles
 
         with suppress(BlfDscError):
-            return learned_arm(context.controller_config())
+            return learned_arm(content.controller_config())
     return None
 
 
@@ -146,7 +265,7 @@ def _stops(events: Iterable[Event], first: int) -> Iterator[Stop]:
     ordered = list(events)
     for k, event in enumerate(ordered):
         if event.type is EventType.STOP:
-            starts = [one.stamp for one in ordered[k:] if one.type is EventType.START]
+            starts = [later.stamp for later in ordered[k:] if later.type is EventType.START]
             what = event.content['reason'], event.content['text']
             yield Stop(max(event.stamp, first), *what, until=starts[0] if starts else None)
 

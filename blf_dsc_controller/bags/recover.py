@@ -1,25 +1,52 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recovery of a clean bag from a damaged one, which is only read."""
+"""Recovery of a clean bag from a damaged one, which is only read.
+
+Every chunk whose checksum matches is kept, wherever it is: after something unreadable, the next
+chunk is searched for. A chunk holds its length twice, so false matches are rare.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from io import BytesIO
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
+from struct import Struct
+from typing import Any
 
-from mcap.records import Channel
-from zstandard import FRAME_HEADER, ZstdError
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, DataEnd, Message, Metadata, Schema, Statistics
+from zstandard import ZstdError
 
-from blf_dsc_controller.bags.context import ATTACHMENT, MESSAGES, RECORD, Losses, statistics
-from blf_dsc_controller.bags.folder import checked
-from blf_dsc_controller.bags.mcap_reader import StoredMessage, mcap_files
-from blf_dsc_controller.bags.metadata import parse_profiles
-from blf_dsc_controller.bags.salvage import Loss, Salvage
-from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.bags.unpacking import Unpacker
-from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.bags.mcap_file import (
+    Allowance,
+    DamageError,
+    StoredMessage,
+    mcap_files,
+    records_in,
+    unpack,
+    unpacked,
+)
+from blf_dsc_controller.bags.metadata import parse_qualities
+from blf_dsc_controller.bags.sources import MESSAGES, RECORD, BagError, checked
+from blf_dsc_controller.bags.writer import BagWriter, Losses, statistics
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.types import Definition, UnknownTypeError, definition
+
+_MAGIC_SIZE = 8
+_CHUNK = Struct('<BQQQQII')  # up to the length of the compression's name
+_COMPRESSIONS = (b'', b'zstd', b'lz4')
+_KINDS: dict[int, Any] = {
+    opcode: getattr(records, ''.join(part.title() for part in opcode.name.split('_')))
+    for opcode in Opcode
+}
 
 
 @dataclass
@@ -29,7 +56,7 @@ class Recovery:
     path: Path  # of the clean bag
     messages: dict[str, int] = field(default_factory=dict)  # recovered, by topic
     missing: dict[str, Losses] = field(default_factory=dict)  # from sequence numbers, by topic
-    losses: list[Loss] = field(default_factory=list)
+    losses: list[str] = field(default_factory=list)
     unfinished: list[tuple[str, int | None]] = field(default_factory=list)  # file, last time [ns]
     unknown: int = 0  # messages of topics whose name or type is lost
 
@@ -52,79 +79,190 @@ def recover(path: Path, out: Path) -> Recovery:
         BlfDscError: it unpacks to more than the limit.
         OSError: a file is not a regular file, or is outside of the folder.
     """
-    files = [file for file in mcap_files(path) if file.exists()]
+    files = [file for file in mcap_files(path) if file.exists() and file.suffix == '.mcap']
     if not files:
         raise BagError(f'{path} cannot be read as a bag: there is no MCAP file to recover')
-    unpacker = Unpacker(checked(path, files))
+    allowance = Allowance(checked(path, files))
     recovery = Recovery(out)
     with BagWriter(out, flush_interval=None) as bag:
-        transfer = _Transfer(bag, recovery.missing, unpacker)
         for file in files:
-            salvage = Salvage(file, unpacker)
-            recovery.unknown += transfer.copy(salvage)
-            recovery.losses += salvage.losses
-            if not salvage.is_complete:
-                recovery.unfinished.append((file.name, salvage.last))
+            _Salvage(file, allowance, bag, recovery).run()
         recovery.messages = bag.message_counts
         bag.note({'recovered_from': str(path)} | statistics(bag.message_counts, recovery.missing))
     return recovery
 
 
-@dataclass
-class _Transfer:
-    """Transfer of the content of damaged files to a clean bag."""
+class _Salvage:
+    """Transfer of the content of one damaged file to a clean bag."""
 
-    bag: BagWriter
-    missing: dict[str, Losses]
-    unpacker: Unpacker
-    handles: dict[str, int] = field(default_factory=dict)
+    def __init__(self, path: Path, allowance: Allowance, bag: BagWriter, to: Recovery) -> None:
+        self._path, self._allowance, self._bag, self._to = path, allowance, bag, to
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._handles: dict[int, int | None] = {}
+        self._found: Counter[int] = Counter()
+        self._seen: set[tuple[int, ...]] = set()
+        self._stated: Counter[int] = Counter()
+        self._last: int | None = None  # latest time of a message [ns]
 
-    def copy(self, salvage: Salvage) -> int:
-        """Copy a file and return the number of messages whose topic is lost."""
-        with salvage.path.open('rb') as stream:
-            is_empty = salvage.path.stat().st_size == 0
+    def run(self) -> None:
+        """Copy the file, and add its losses."""
+        with self._path.open('rb') as stream:
+            is_empty = self._path.stat().st_size == 0
             data = b'' if is_empty else mmap(stream.fileno(), 0, access=ACCESS_READ)
-        # The index at the end, or another record, may still name the topic of a message.
-        early = [one for one in salvage.messages(data) if not self._write(salvage, one)]
-        unknown = sum(not self._write(salvage, one) for one in early)
-        for one in salvage.attachments:
-            if one.name == ATTACHMENT:
-                self.bag.configure(one.data.decode(errors='replace'), one.log_time)
-        facts = salvage.metadata.get(RECORD, {})
-        self.bag.note({k: v for k, v in facts.items() if not k.startswith(MESSAGES)})
-        return unknown
+            for record, _, _ in self._scan(data):  # topics may only be known from the end
+                if isinstance(record, (Schema, Channel, Statistics)):
+                    self._take(record)
+            if not self._copy_all(data):
+                self._to.unfinished.append((self._path.name, self._last))
+        for number, count in self._stated.items():
+            if count > self._found[number]:
+                lost = f'{count - self._found[number]} of {count} messages'
+                topic = self._channels[number].topic if number in self._channels else number
+                self._to.losses.append(f'{self._path.name}: {lost} of {topic}')
 
-    def _write(self, salvage: Salvage, message: StoredMessage) -> bool:
-        number, sequence, log_time, publish_time, raw = message
-        channel = salvage.channel(number)
-        if channel is None:
-            return False
-        handle = self.handles.get(channel.topic) or self._add_topic(salvage, channel)
-        if handle is None:
-            return False
-        self.missing[channel.topic].count(sequence)
-        if raw.startswith(FRAME_HEADER):  # compressed per message, as metadata.yaml would state
-            with suppress(ZstdError, ValueError):
-                raw = self.unpacker.unpack(raw, 'zstd')
-        self.bag.write(handle, raw, log_time, publish_time, sequence)
-        return True
+    def _copy_all(self, data: bytes | mmap) -> bool:
+        """Copy the messages; return whether the recording was closed."""
+        for record, at, end in self._scan(data):
+            if isinstance(record, DataEnd):
+                return True
+            if isinstance(record, str):
+                self._lose(at, end - at, record)
+            elif isinstance(record, Chunk):
+                self._copy(record, at, end)
+            elif isinstance(record, Message):
+                times = record.log_time, record.publish_time
+                self._take((record.channel_id, record.sequence, *times, record.data))
+            else:
+                self._take(record)
+        return False
 
-    def _add_topic(self, salvage: Salvage, channel: Channel) -> int | None:
-        schema = salvage.schemas.get(channel.schema_id)
-        type_name = salvage.type_of(channel)
-        if not type_name:
-            return None
+    def _scan(self, data: bytes | mmap) -> Iterator[tuple[Any, int, int]]:
+        """Yield each record with its begin and end, or why something is none."""
+        at = unsure = _MAGIC_SIZE
+        is_chunked = False
+        while at < len(data):
+            try:
+                record, end = _record(data, at)
+                problem = is_chunked and isinstance(record, Message)
+                reason = 'a message between the chunks' if problem else ''
+            except Exception as error:  # noqa: BLE001 - anything, if the bytes are arbitrary
+                reason = f'{error}' or type(error).__name__
+            if reason:
+                end = _next_chunk(data, unsure + 1)
+                yield reason, at, end
+                at = unsure = end
+                continue
+            yield record, at, end
+            is_chunked |= isinstance(record, Chunk)
+            # The length of another record than a chunk may be wrong: search from its begin then.
+            unsure = end if isinstance(record, Chunk) else at
+            at = end
+
+    def _copy(self, chunk: Chunk, at: int, end: int) -> None:
+        """Copy a chunk if its checksum matches and the file did not hold it before."""
+        mark = chunk.uncompressed_crc, chunk.message_start_time, len(chunk.data)
+        if mark in self._seen and chunk.uncompressed_crc:
+            self._lose(at, end - at, 'a chunk that the file holds twice')
+            return
         try:
-            known = definition(type_name)
+            found = [*records_in(unpack(chunk, self._allowance))]
+        except BlfDscError:
+            raise
+        except Exception as error:  # noqa: BLE001 - as above
+            self._lose(at, end - at, f'{error}')
+            return
+        self._seen.add(mark)
+        for record in found:
+            self._take(record)
+
+    def _take(self, record: Any) -> None:
+        """Write a message, or note what is known of the topics and the run."""
+        if isinstance(record, tuple):
+            self._write(record)
+        elif isinstance(record, Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self._channels[record.id] = record
+        elif isinstance(record, Statistics):
+            self._stated = Counter(record.channel_message_counts)
+        elif isinstance(record, Metadata) and record.name == RECORD:
+            facts = record.metadata.items()
+            self._bag.note({k: v for k, v in facts if not k.startswith(MESSAGES)})
+
+    def _write(self, message: StoredMessage) -> None:
+        number, sequence, log_time, publish_time, raw = message
+        if number not in self._handles and number in self._channels:
+            self._handles[number] = self._add_topic(self._channels[number])
+        handle = self._handles.get(number)
+        if handle is None:
+            self._to.unknown += 1
+            return
+        self._found[number] += 1
+        self._last = max(log_time, self._last or log_time)
+        self._to.missing[self._channels[number].topic].count(sequence)
+        with suppress(ZstdError):
+            raw = unpacked(raw, self._allowance)
+        self._bag.write(handle, raw, log_time, publish_time, sequence)
+
+    def _add_topic(self, channel: Channel) -> int | None:
+        schema = self._schemas.get(channel.schema_id)
+        if schema is None:
+            return None
+        if channel.topic in self._bag.message_counts:  # in an earlier file
+            return 1 + [*self._bag.message_counts].index(channel.topic)
+        try:
+            known = definition(schema.name)
         except UnknownTypeError:
             known = Definition('', '')
-        if schema is not None and schema.data:
+        if schema.data:
             text = schema.data.decode(errors='replace')
             known = known._replace(text=text, encoding=schema.encoding)
-        if channel.metadata.get('topic_type_hash'):
-            known = known._replace(hash=channel.metadata['topic_type_hash'])
-        offered = parse_profiles(channel.metadata.get('offered_qos_profiles', ''))
-        handle = self.bag.add_topic(channel.topic, type_name, offered, known)
-        self.handles[channel.topic] = handle
-        self.missing[channel.topic] = Losses(len(offered))
-        return handle
+        known = known._replace(hash=channel.metadata.get('topic_type_hash') or known.hash)
+        offered = parse_qualities(channel.metadata.get('offered_qos_profiles', ''))
+        self._to.missing[channel.topic] = Losses(len(offered))
+        return self._bag.add_topic(channel.topic, schema.name, offered, known)
+
+    def _lose(self, at: int, size: int, reason: str) -> None:
+        after = '' if self._last is None else f', after {format_time(self._last)}'
+        self._to.losses.append(f'{self._path.name}: {size} bytes at byte {at} ({reason}){after}')
+
+
+def _record(data: bytes | mmap, at: int) -> tuple[Any, int]:
+    """Return the record at an offset, and its end; any error if it does not match its length."""
+    opcode, length = data[at], int.from_bytes(data[at + 1 : at + 9], 'little')
+    end = at + 9 + length
+    if end > len(data):
+        raise DamageError('cut off')
+    if opcode not in _KINDS:
+        raise DamageError(f'unknown record type {opcode}')
+    stream, kind = ReadDataStream(BytesIO(data[at + 9 : end])), _KINDS[opcode]
+    record = kind.read(stream, length) if kind is Message else kind.read(stream)
+    if stream.count != length:
+        raise DamageError('a record does not match its length')
+    return record, end
+
+
+def _next_chunk(data: bytes | mmap, begin: int) -> int:
+    """Return where the next chunk may begin, by its lengths; the end of the data if nowhere."""
+    at = data.find(b'\x06', begin)
+    while at >= 0:
+        if at + _CHUNK.size <= len(data):
+            _, length, *_, name = _CHUNK.unpack_from(data, at)
+            named = at + _CHUNK.size
+            size = int.from_bytes(data[named + name : named + name + 8], 'little')
+            ends = named + name + 8 + size == at + 9 + length <= len(data)
+            if ends and data[named : named + name] in _COMPRESSIONS:
+                return at
+        at = data.find(b'\x06', at + 1)
+    return len(data)
+
+
+def format_time(stamp: int) -> str:
+    """Format a log time [ns] as seconds and UTC; as seconds only if UTC is out of range."""
+    plain = f'{stamp // NANOSECONDS}.{stamp % NANOSECONDS:09d} s'
+    try:
+        moment = datetime.fromtimestamp(stamp // NANOSECONDS, tz=timezone.utc)
+    except (OverflowError, OSError, ValueError):
+        return plain
+    return f'{plain} ({moment:%Y-%m-%d %H:%M:%S} UTC)'

@@ -5,13 +5,15 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.bags.reader import RecordedRun
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.run import Run
@@ -40,7 +42,7 @@ _VALUES = {  # prefix of names in the vectors: unit
     **dict.fromkeys((topics.LATCHED, topics.MODEL_CHANGES, topics.LATE_STEPS), '1'),
     **dict.fromkeys((topics.COMPUTE_TIME, topics.LATENCY, topics.LATENESS), 's'),
 }
-_ROWS = 1 << 16
+_ROWS = 1 << 14
 _PARAMETER = 'kg m^2'  # of arms without a URDF
 
 
@@ -51,27 +53,28 @@ class Column(NamedTuple):
     unit: str
 
 
-def table(run: Run) -> dict[str, Column]:
-    """Return every series of a run by name, aligned to the stamps of its joint states.
+def table(run: RecordedRun, rows: slice = slice(None)) -> dict[str, Column]:
+    """Return some rows of every series of a run by name, aligned to the stamps of its joint states.
 
     `stamp` and `received` are integers, all others floats. Values published with each sample
     are in the row of its stamp; those published less often (truth, timing, monitor) are held until
     the next message.
     """
+    stamp = run.stamp[rows]
     columns = {
-        'stamp': Column(run.stamp, 'ns'),
-        'received': Column(run.received, 'ns'),
-        'time': Column(run.time, 's'),
+        'stamp': Column(stamp, 'ns'),
+        'received': Column(run.received[rows], 'ns'),
+        'time': Column(run.time_of(stamp), 's'),
     }
     for field, unit in _FIELDS.items():
-        values = getattr(run, field)
-        if values is not None and not np.isnan(values).all():
+        values = run.at(field, rows)
+        if values is not None:
             for i, joint in enumerate(run.joints):
                 columns[f'{field} {joint}'] = Column(values[:, i], unit)
     for topic in ('learning', 'truth', 'timing', 'monitor'):
         series = getattr(run, topic)
         if series is not None:
-            values = (series.exact if topic == 'learning' else series.held)(run.stamp)
+            values = (series.exact if topic == 'learning' else series.held)(stamp)
             for j, name in enumerate(series.names):
                 columns[f'{topic} {name}'] = Column(values[:, j], _unit(name, run))
     return columns
@@ -87,26 +90,36 @@ def _unit(name: str, run: Run) -> str:
     return known[0] if known else '' if run.arm is not None else _PARAMETER
 
 
-def export(run: Run, path: Path) -> int:
+def export(run: RecordedRun, path: Path) -> int:
     """Write the table as CSV or Parquet, by the suffix of `path`; return the number of columns.
 
-    Numbers are read back exactly. Units are field metadata in Parquet; those of a CSV are in the
-    data package beside it (see `described`).
+    It is written block by block: a run may be larger than memory. Numbers are read back exactly.
+    Units are field metadata in Parquet; those of a CSV are in the data package beside it (see
+    `described`).
 
     Raises:
         BlfDscError: the suffix is neither .csv nor .parquet.
         MissingExtraError: pyarrow is not installed.
     """
-    columns = table(run)
-    if path.suffix == '.csv':
-        _write_csv(columns, path)
-    elif path.suffix == '.parquet':
-        _write_parquet(columns, path)
-    else:
+    if path.suffix not in ('.csv', '.parquet'):
         raise BlfDscError(
             f'{path} ends in neither .csv nor .parquet: the file extension selects the format'
         )
-    return len(columns)
+    blocks = [slice(begin, begin + _ROWS) for begin in range(0, run.stamp.size, _ROWS)]
+    unknown = tuple(f'{field} ' for field in _FIELDS if not _is_known(run, field, blocks))
+    tables = (
+        {name: one for name, one in table(run, rows).items() if not name.startswith(unknown)}
+        for rows in blocks
+    )
+    return (_write_csv if path.suffix == '.csv' else _write_parquet)(tables, path)
+
+
+def _is_known(run: RecordedRun, field: str, blocks: Iterable[slice]) -> bool:
+    """Return whether any value of a field is known."""
+    return any(
+        values is not None and not np.isnan(values).all()
+        for values in (run.at(field, rows) for rows in blocks)
+    )
 
 
 def described(path: Path) -> Path:
@@ -114,13 +127,15 @@ def described(path: Path) -> Path:
     return path.with_suffix('.datapackage.json')
 
 
-def _write_csv(columns: dict[str, Column], path: Path) -> None:
+def _write_csv(tables: Iterable[dict[str, Column]], path: Path) -> int:
+    columns: dict[str, Column] = {}
     with path.open('w', encoding='utf-8', newline='') as stream:
         writer = csv.writer(stream)
-        writer.writerow(columns)
-        for rows in _blocks(columns):
-            parts = (one.values[rows].tolist() for one in columns.values())
-            writer.writerows(zip(*parts, strict=True))
+        for block in tables:
+            if not columns:
+                writer.writerow(block)
+            columns = block
+            writer.writerows(zip(*(one.values.tolist() for one in block.values()), strict=True))
     fields = [
         {
             'name': name,
@@ -137,29 +152,28 @@ def _write_csv(columns: dict[str, Column], path: Path) -> None:
     }
     text = json.dumps({'profile': 'tabular-data-package', 'resources': [resource]}, indent=1)
     described(path).write_text(text + '\n', encoding='utf-8')
+    return len(columns)
 
 
-def _write_parquet(columns: dict[str, Column], path: Path) -> None:
+def _write_parquet(tables: Iterable[dict[str, Column]], path: Path) -> int:
     try:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError:
         raise MissingExtraError('pyarrow', 'parquet', 'writing Parquet') from None
-    schema = pa.schema(
-        pa.field(
-            name,
-            pa.from_numpy_dtype(one.values.dtype),
-            metadata={'unit': one.unit} if one.unit else None,
-        )
-        for name, one in columns.items()
-    )
-    with parquet.ParquetWriter(path, schema) as writer:
-        for rows in _blocks(columns):
-            arrays = [pa.array(one.values[rows]) for one in columns.values()]
+    with ExitStack() as stack:
+        schema = writer = None
+        for block in tables:
+            if writer is None:
+                schema = pa.schema(
+                    pa.field(
+                        name,
+                        pa.from_numpy_dtype(one.values.dtype),
+                        metadata={'unit': one.unit} if one.unit else None,
+                    )
+                    for name, one in block.items()
+                )
+                writer = stack.enter_context(parquet.ParquetWriter(path, schema))
+            arrays = [pa.array(one.values) for one in block.values()]
             writer.write_table(pa.table(arrays, schema=schema))
-
-
-def _blocks(columns: dict[str, Column]) -> Iterator[slice]:
-    """Yield blocks of rows to write, so that not all of them are in memory twice."""
-    for begin in range(0, columns['stamp'].values.size, _ROWS):
-        yield slice(begin, begin + _ROWS)
+        return 0 if schema is None else len(schema)

@@ -1,29 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of one topic of a bag, decoded in bulk where they differ only in numbers."""
+"""Messages of one topic of a bag, decoded block by block while it is read."""
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import MutableSequence, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from collections.abc import Sequence
+from operator import itemgetter
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.bags.packed_messages import BLOCK, PackedMessages
-from blf_dsc_controller.bags.sources import BagError
+from blf_dsc_controller.bags.columns import ALL, Columns, Rows
+from blf_dsc_controller.bags.sources import BagError, BagMessage
 from blf_dsc_controller.messages.cdr import (
+    NANOSECONDS,
+    ORIGIN,
+    STAMP_OFFSET,
     Layout,
     MessageError,
     MissingJointError,
     array_layout,
     joint_state_layout,
+    joint_state_places,
 )
-from blf_dsc_controller.messages.codecs import Decoder, Float64MultiArrayDecoder, JointStateDecoder
-from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY
+from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
 from blf_dsc_controller.run import Floats, Series, Stamps
+
+_WAITING = 512  # messages decoded at once
+_MOST_LAYOUTS = 100
+_NUMBER, _RECEIVED, _SEQUENCE, _STAMP, _VALUES = range(5)  # columns of a layout
 
 
 class UnreadableMessageError(BagError):
@@ -39,48 +44,222 @@ class UnreadableMessageError(BagError):
         super().__init__(f'message {index + 1} of {topic} cannot be read: {reason}')
 
 
-class JointStates(NamedTuple):
-    """N states of n joints, or N vectors of n named values in `position`."""
+class JointStates:
+    """N states of n joints, or N vectors of n named values in `position`, as received.
 
-    names: tuple[str, ...]
-    stamp: Stamps  # (N,) ns
-    received: Stamps  # (N,) ns
-    values: Floats  # (N, 3, n) position, velocity, effort; NaN where empty
+    Its arrays are read from the table when they are asked for.
+    """
 
-    def select(self, rows: NDArray[np.generic]) -> JointStates:
+    def __init__(
+        self, names: Sequence[str], table: Columns, places: NDArray[np.intp], rows: Rows = ALL
+    ) -> None:
+        """Take the columns `places` (3, n) of some rows of a table; -1 is NaN."""
+        self.names = tuple(names)
+        self._table, self._places, self._rows = table, places, rows
+        self.size = len(range(*rows.indices(len(table)))) if isinstance(rows, slice) else rows.size
+
+    def _integers(self, column: int) -> Stamps:
+        return self._table.read(np.array([column]), self._rows)[:, 0]
+
+    @property
+    def number(self) -> Stamps:
+        """Number of each among the messages of the topic (N,)."""
+        return self._integers(_NUMBER)
+
+    @property
+    def received(self) -> Stamps:
+        """When each was received (N,) [ns]."""
+        return self._integers(_RECEIVED)
+
+    @property
+    def sequence(self) -> Stamps:
+        """Number given by the publisher (N,); 0 if unknown."""
+        return self._integers(_SEQUENCE)
+
+    @property
+    def stamp(self) -> Stamps:
+        """Stamps (N,) [ns]."""
+        return self._integers(_STAMP)
+
+    @property
+    def values(self) -> Floats:
+        """Position, velocity, effort (N, 3, n); NaN where empty."""
+        found = [self.field(k) for k in range(3)]
+        return np.stack(found, axis=1)
+
+    def field(self, k: int, rows: Rows = ALL, columns: Rows = ALL) -> Floats:
+        """Return the positions (0), velocities (1) or efforts (2) of some rows and columns."""
+        if not isinstance(rows, slice) and rows.size and (np.diff(rows) == 1).all():
+            rows = slice(int(rows[0]), int(rows[-1]) + 1)  # much faster
+        places = self._places[k][columns]
+        known = np.flatnonzero(places >= 0)
+        found = self._table.read(places[known], self._chosen(rows)).view(np.float64)
+        if known.size == places.size:
+            return found
+        values = np.full((found.shape[0], places.size), np.nan)
+        values[:, known] = found
+        return values
+
+    def _chosen(self, rows: Rows) -> Rows:
+        """Return the rows of the table that these of ours are."""
+        if not isinstance(self._rows, slice):
+            return self._rows[rows]
+        first, last, _ = self._rows.indices(len(self._table))
+        if not isinstance(rows, slice):
+            return rows + first
+        begin, end, step = rows.indices(last - first)
+        return slice(first + begin, first + max(begin, end), step)
+
+    def select(self, rows: Rows) -> JointStates:
         """Return the states of these rows."""
-        return JointStates(self.names, self.stamp[rows], self.received[rows], self.values[rows])
+        return JointStates(self.names, self._table, self._places, self._chosen(rows))
 
     def by_stamp(self) -> JointStates:
         """Return the states ordered by stamp, one per stamp."""
-        if (self.stamp[1:] > self.stamp[:-1]).all():
+        stamp = self.stamp
+        if (stamp[1:] > stamp[:-1]).all():
             return self
-        return self.select(np.unique(self.stamp, return_index=True)[1])
+        return self.select(np.unique(stamp, return_index=True)[1])
+
+    def series(self, k: int = 0) -> Series:
+        """Return one field, ordered by stamp."""
+        ordered = self.by_stamp()
+        return StoredSeries(ordered, k)
+
+    @classmethod
+    def merged(
+        cls, names: Sequence[str], parts: Sequence[tuple[Columns, NDArray[np.intp]]]
+    ) -> JointStates:
+        """Return the states of several tables (with their places) in order of reception."""
+        if len(parts) == 1:
+            return cls(names, *parts[0])
+        n, heads, values = len(names), np.arange(_VALUES), []
+        for table, places in parts:
+            part = cls(names, table, places)
+            fields = [part.field(k).view(np.int64) for k in range(3)]
+            values.append(np.hstack([table.read(heads), *fields]))
+        rows = np.concatenate(values)
+        table = Columns(_VALUES + 3 * n)
+        table.append(rows[np.argsort(rows[:, _NUMBER])])
+        return cls(names, table, _VALUES + np.arange(3 * n).reshape(3, n))
+
+
+class StoredSeries(Series):
+    """Series whose values are read from a bag's table when they are asked for."""
+
+    def __init__(self, states: JointStates, k: int) -> None:
+        object.__setattr__(self, 'names', states.names)
+        object.__setattr__(self, 'stamp', states.stamp)
+        object.__setattr__(self, '_states', states)
+        object.__setattr__(self, '_k', k)
+
+    _states: JointStates
+    _k: int
 
     @property
-    def position(self) -> Series:
-        """Positions, or named values."""
-        return Series(self.names, self.stamp, self.values[:, 0])
+    def values(self) -> Floats:
+        """All values (m, number of names), read from the table."""
+        return self._states.field(self._k)
 
-    @property
-    def velocity(self) -> Series:
-        """Velocities."""
-        return Series(self.names, self.stamp, self.values[:, 1])
-
-    @property
-    def effort(self) -> Series:
-        """Efforts."""
-        return Series(self.names, self.stamp, self.values[:, 2])
+    def at(self, rows: Rows, columns: Rows = ALL) -> Floats:
+        """Return some rows and columns."""
+        return self._states.field(self._k, rows, columns)
 
 
-@dataclass
+class _LikeMessages:
+    """Messages of one layout, in a table: number, received, sequence, stamp, then all values."""
+
+    def __init__(self, raw: bytes, layout: Layout, *, is_stamped: bool) -> None:
+        self.layout = layout
+        self._size, self._is_stamped = len(raw), is_stamped
+        self._fixed_of = itemgetter(*layout.fixed_parts)
+        self._fixed = self._fixed_of(raw)
+        self._float = np.dtype(layout.byte_order + 'f8')
+        self._places = np.concatenate([one.place + np.arange(one.size) for one in layout.arrays])
+        self.table = Columns(_VALUES + self._places.size)
+
+    def holds(self, raw: bytes) -> bool:
+        """Return whether a message has this layout."""
+        return len(raw) == self._size and self._fixed_of(raw) == self._fixed
+
+    def add(self, first: int, messages: Sequence[BagMessage]) -> None:
+        """Decode messages of this layout with the numbers from `first` on."""
+        count, size = len(messages), self._size
+        rows = np.empty((count, self.table.width), np.int64)
+        rows[:, _NUMBER] = first + np.arange(count)
+        rows[:, _RECEIVED] = [one.received for one in messages]
+        rows[:, _SEQUENCE] = [one.sequence for one in messages]
+        joined = b''.join([one.raw for one in messages])
+        rows[:, _STAMP] = 0
+        if self._is_stamped:
+            kind = np.dtype([('s', 'i4'), ('ns', 'u4')]).newbyteorder(self._float.byteorder)
+            stamp = np.ndarray(count, kind, joined, STAMP_OFFSET, (size,))
+            rows[:, _STAMP] = stamp['s'].astype(np.int64) * NANOSECONDS + stamp['ns']
+        grid = np.ndarray((count, (size - ORIGIN) // 8), self._float, joined, ORIGIN, (size, 8))
+        rows[:, _VALUES:] = grid[:, self._places].astype(np.float64).view(np.int64)
+        self.table.append(rows)
+
+    def columns_of(self, places: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return the columns of values at these places in the grid; -1 stays."""
+        found = {place: _VALUES + k for k, place in enumerate(self._places.tolist())}
+        columns = [found.get(place, -1) for place in places.ravel().tolist()]
+        return np.array(columns, dtype=np.intp).reshape(places.shape)
+
+
 class TopicMessages:
-    """All messages of one topic, undecoded, in order of reception."""
+    """All messages of one topic: tables of those of known types, or the others as bytes."""
 
-    name: str
-    type: str = ''
-    received: MutableSequence[int] = field(default_factory=lambda: array('q'))  # ns
-    raw: PackedMessages | list[bytes] = field(default_factory=PackedMessages)
+    def __init__(self, name: str, type_name: str) -> None:
+        self.name, self.type = name, type_name
+        self.size = 0
+        self.raw: list[bytes] = []  # of other types
+        self.received: list[int] = []  # likewise [ns]
+        self._find = {JOINT_STATE: joint_state_layout, FLOAT64_MULTI_ARRAY: array_layout}.get(
+            type_name
+        )
+        self._likes: list[_LikeMessages] = []
+        self._unreadable: dict[int, MessageError] = {}
+        self._waiting: list[BagMessage] = []
+
+    def add(self, message: BagMessage) -> None:
+        """Add a message."""
+        self.size += 1
+        if self._find is None:
+            self.raw.append(message.raw)
+            self.received.append(message.received)
+        else:
+            self._waiting.append(message)
+            if len(self._waiting) == _WAITING:
+                self.decode()
+
+    def decode(self) -> None:
+        """Decode the messages added last; BagError if they have too many layouts."""
+        waiting, self._waiting = self._waiting, []
+        begin, first = 0, self.size - len(waiting)
+        while begin < len(waiting):
+            end = begin + 1
+            like = self._like(waiting[begin].raw, first + begin)
+            if like is not None:
+                while end < len(waiting) and like.holds(waiting[end].raw):
+                    end += 1
+                like.add(first + begin, waiting[begin:end])
+            begin = end
+
+    def _like(self, raw: bytes, number: int) -> _LikeMessages | None:
+        for like in self._likes:
+            if like.holds(raw):
+                return like
+        try:
+            layout: Any = self._find and self._find(raw)
+        except MessageError as error:
+            self._unreadable[number] = error
+            return None
+        if len(self._likes) == _MOST_LAYOUTS:
+            raise BagError(
+                f'{self.name} holds messages with more than {_MOST_LAYOUTS} lists of names'
+            )
+        self._likes.append(_LikeMessages(raw, layout, is_stamped=self.type == JOINT_STATE))
+        return self._likes[-1]
 
     def joint_states(
         self,
@@ -88,89 +267,62 @@ class TopicMessages:
         required: Sequence[str] = ('position', 'velocity'),
         errors: dict[int, MessageError] | None = None,
     ) -> JointStates:
-        """Decode sensor_msgs/JointState.
+        """Return sensor_msgs/JointState of these names, without those that name none of them.
 
-        Messages that cannot be decoded are added to `errors` by index; their values are zero.
+        Messages that cannot be decoded are added to `errors` by number.
 
         Raises:
-            UnreadableMessageError: a message cannot be decoded and `errors` is None.
+            UnreadableMessageError: a message cannot be decoded and `errors` is None, or none can.
         """
-        stamp, values = self._decode(JointStateDecoder(names, required), errors)
-        received = np.array(self.received, dtype=np.int64)
-        return JointStates(tuple(names), stamp, received, values.reshape(stamp.size, 3, len(names)))
+        unreadable, parts, foreign = dict(self._unreadable), [], None
+        for like in self._likes:
+            try:
+                places = joint_state_places(like.layout, names, required)
+            except MessageError as error:
+                if isinstance(error, MissingJointError) and error.is_foreign(names):
+                    foreign = foreign or error
+                else:
+                    numbers = like.table.read(np.array([_NUMBER]))[:, 0]
+                    unreadable.update(dict.fromkeys(numbers.tolist(), error))
+            else:
+                parts.append((like.table, like.columns_of(places)))
+        if not parts and foreign is not None and not unreadable:
+            unreadable[0] = foreign
+        if unreadable and (errors is None or not parts):
+            raise UnreadableMessageError(self.name, *min(unreadable.items()))
+        if errors is not None:
+            errors.update(unreadable)
+        return JointStates.merged(names, parts)
 
-    def vectors(self) -> Series:
-        """Decode named values, sent as positions of sensor_msgs/JointState, ordered by stamp.
+    def vectors(self) -> JointStates:
+        """Return named values, sent as positions; UnreadableMessageError as above."""
+        return self.joint_states(self.joint_names(), ('position',))
+
+    def arrays(self, size: int) -> JointStates | None:
+        """Return Float64MultiArrays of this size, as positions; None if one has another size.
 
         Raises:
             UnreadableMessageError: a message cannot be decoded.
         """
-        names = self.joint_names()
-        stamp, values = self._decode(JointStateDecoder(names, ('position',)), size=len(names))
-        received = np.array(self.received, dtype=np.int64)
-        return JointStates(names, stamp, received, values[:, np.newaxis]).by_stamp().position
-
-    def arrays(self, size: int) -> Floats | None:
-        """Decode Float64MultiArrays as values (N, size); None if one of them has another size.
-
-        Raises:
-            UnreadableMessageError: a message cannot be decoded.
-        """
-        sizes, values = self._decode(Float64MultiArrayDecoder(size))
-        return values if (sizes == size).all() else None
+        if self._unreadable:
+            raise UnreadableMessageError(self.name, *min(self._unreadable.items()))
+        if any(like.layout.arrays[0].size != size for like in self._likes):
+            return None
+        places = np.full((3, size), -1)
+        places[0] = _VALUES + np.arange(size)
+        names = [f'{k}' for k in range(size)]
+        return JointStates.merged(names, [(like.table, places) for like in self._likes])
 
     def layout(self) -> Layout:
         """Return the layout of the first message; UnreadableMessageError if it has none."""
-        find = array_layout if self.type == FLOAT64_MULTI_ARRAY else joint_state_layout
-        try:
-            return find(self.raw[0])
-        except MessageError as error:
-            raise UnreadableMessageError(self.name, 0, error) from error
-
-    def of_joints(self, joints: Sequence[str]) -> TopicMessages:
-        """Return the messages without those of only other joints, which the controller ignores.
-
-        All are returned if none would be left.
-
-        Raises:
-            BagError: all have the same stamp.
-        """
-        errors: dict[int, MessageError] = {}
-        stamp, _ = self._decode(JointStateDecoder(joints, ()), errors)
-        foreign = {
-            k
-            for k, error in errors.items()
-            if isinstance(error, MissingJointError) and error.is_foreign(joints)
-        }
-        stamps = np.delete(stamp, list(errors))
-        if stamps.size > 1 and (stamps == stamps[0]).all():
-            raise BagError(
-                f'all {stamps.size} messages of {self.name} have the stamp {stamps[0]} ns: each '
-                'needs a unique stamp, so the driver has to set header.stamp'
-            )
-        kept = [k for k in range(stamp.size) if k not in foreign]
-        if len(kept) in (0, stamp.size):
-            return self
-        received, raw = [self.received[k] for k in kept], [self.raw[k] for k in kept]
-        return replace(self, received=received, raw=raw)
+        if 0 in self._unreadable or not self._likes:
+            raise UnreadableMessageError(self.name, 0, self._unreadable[0])
+        return self._likes[0].layout
 
     def name_lists(self) -> list[tuple[str, ...]]:
-        """Return the different lists of names in the messages; those that are cut off are skipped.
-
-        Only one of the messages that begin alike is decoded.
-
-        Raises:
-            UnreadableMessageError: the first message cannot be decoded.
-        """
-        first = self.layout()
-        begin = slice(first.begin, first.arrays[0].size_offset)
-        found: dict[tuple[bytes, bytes], tuple[str, ...]] = {}
-        for raw in self.raw:
-            beginning = raw[:2], raw[begin]
-            if beginning not in found:
-                with suppress(MessageError):
-                    found[beginning] = joint_state_layout(raw).names
-        return list(found.values())
+        """Return the different lists of names; UnreadableMessageError as `layout`."""
+        self.layout()
+        return list(dict.fromkeys(like.layout.names for like in self._likes))
 
     def joint_names(self) -> tuple[str, ...]:
         """Return the longest list of names in a message; UnreadableMessageError if it is empty."""
@@ -179,31 +331,3 @@ class TopicMessages:
             unnamed = MessageError('it names no joint, so its values cannot be assigned to joints')
             raise UnreadableMessageError(self.name, 0, unnamed)
         return names
-
-    def _decode(
-        self,
-        decoder: Decoder,
-        errors: dict[int, MessageError] | None = None,
-        size: int | None = None,
-    ) -> tuple[NDArray[np.int64], Floats]:
-        """Return the result of `decoder` per message, and all or the first `size` of its values."""
-        count = len(self.raw)
-        returned = np.zeros(count, dtype=np.int64)
-        values = np.zeros((count, decoder.values[:size].size))
-        for begin in range(0, count, BLOCK):
-            rows = slice(begin, begin + BLOCK)
-            block = self.raw[rows]
-            with suppress(MessageError):
-                at_once = decoder.decode_all(block)
-                if at_once is not None:
-                    returned[rows], values[rows] = at_once[0], at_once[1][:, :size]
-                    continue
-            for k, raw in enumerate(block, begin):
-                try:
-                    returned[k] = decoder.decode(raw)
-                    values[k] = decoder.values[:size]
-                except MessageError as error:
-                    if errors is None:
-                        raise UnreadableMessageError(self.name, k, error) from error
-                    errors[k] = error
-        return returned, values

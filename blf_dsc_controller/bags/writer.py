@@ -8,31 +8,26 @@ from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from pathlib import Path
 from typing import IO, cast
-from zlib import crc32
 
 from mcap.writer import CompressionType, Writer
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.context import ATTACHMENT, RECORD, facts_of
 from blf_dsc_controller.bags.metadata import (
     BagInformation,
     FileInformation,
-    Profile,
     TopicInformation,
     profile_of,
 )
 from blf_dsc_controller.bags.reserved_file import ReservedFile
-from blf_dsc_controller.bags.sources import BagError
+from blf_dsc_controller.bags.sources import MESSAGES, RECORD, VERSION, BagError
 from blf_dsc_controller.messages.topics import Quality
 from blf_dsc_controller.messages.types import Definition, definition
-
-CHANNEL_RECORD = 'blf_dsc_controller channel '
-"""Prefix of the names of metadata records that repeat a topic outside of the chunks."""
 
 _COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
 _CHUNK_SIZE = 1 << 20
 _CHUNK_ENTRY = 100  # bytes that a chunk takes in the index at the end ...
 _CHANNEL_ENTRY = 16  # ... and for each channel
+_MOST_CHUNKS = 20_000  # in a file, whose index is kept in memory until it ends
 
 
 class DiskFullError(BagError):
@@ -74,8 +69,7 @@ class BagWriter:
         self._flush_interval = inf if flush_interval is None else flush_interval
         self._clock = clock
         self._split_size, self._split_duration = split_size, split_duration
-        self._bag = BagInformation()
-        self._configuration: tuple[str, int] | None = None
+        self._bag = BagInformation(custom_data={VERSION: __version__})
         try:
             self.path.mkdir(parents=True)
         except FileExistsError:
@@ -89,7 +83,7 @@ class BagWriter:
         self,
         name: str,
         type_name: str,
-        offered: Sequence[Quality | Profile],
+        offered: Sequence[Quality],
         known: Definition | None = None,
     ) -> int:
         """Add a topic by its full name, with the quality of service of each publisher.
@@ -101,8 +95,7 @@ class BagWriter:
             UnknownTypeError: no definition is given and the type is not one of Jazzy's common ones.
         """
         found = definition(type_name) if known is None else known
-        profiles = [profile_of(one) if isinstance(one, Quality) else one for one in offered]
-        topic = TopicInformation(name, type_name, profiles, found)
+        topic = TopicInformation(name, type_name, [profile_of(one) for one in offered], found)
         self._bag.topics.append(topic)
         return self._add_channel(topic)
 
@@ -134,12 +127,6 @@ class BagWriter:
         file.starting_time = min(file.starting_time, log_time)
         file.ending_time = max(file.ending_time, log_time)
         self.flush_if_due()
-
-    def configure(self, configuration: str, known_at: int | None = None) -> None:
-        """Store a parameter file of all nodes known so far, received now or at `known_at` [ns]."""
-        self._configuration = configuration, time.time_ns() if known_at is None else known_at
-        self._bag.custom_data.update(facts_of(configuration))
-        self._store_context()
 
     def note(self, facts: dict[str, str]) -> None:
         """Store facts about the run by name."""
@@ -184,6 +171,7 @@ class BagWriter:
         """Whether the next message starts a new file."""
         is_long = self._flushed - self._began >= self._split_duration
         is_full = is_long or self._stream.tell() >= self._split_size
+        is_full |= self._chunks >= _MOST_CHUNKS
         return is_full and self._bag.files[-1].message_count > 0
 
     def _begin_file(self) -> None:
@@ -196,11 +184,11 @@ class BagWriter:
         )
         self._writer.start(profile='ros2', library=f'blf_dsc_controller {__version__}')
         self._schemas: dict[str, int] = {}
-        self._index_size = 0
+        self._index_size = self._chunks = 0
         self._describe()
         for topic in self._bag.topics:
             self._add_channel(topic)
-        self._store_context()
+        self.note({})
         self._began = self._clock()
 
     def _describe(self) -> None:
@@ -208,35 +196,23 @@ class BagWriter:
         self._writer.add_metadata('rosbag2', {'serialized_metadata': self._bag.record_text()})
 
     def _add_channel(self, topic: TopicInformation) -> int:
-        """Add a topic to the file and return its number, the same in each file.
-
-        It is stored in the chunk of its first message, in the index at the end, and in a metadata
-        record, for files that have lost both.
-        """
+        """Add a topic to the file and return its number, the same in each file."""
         text, hash_, encoding = topic.definition
         if topic.type not in self._schemas:
             schema = self._writer.register_schema(topic.type, encoding, text.encode())
             self._schemas[topic.type] = schema
         metadata = {'offered_qos_profiles': topic.offered_text(), 'topic_type_hash': hash_}
-        metadata['checksum'] = channel_checksum(topic.name, topic.type, metadata)
         schema = self._schemas[topic.type]
-        number = self._writer.register_channel(topic.name, 'cdr', schema, metadata)
-        repeated = {'topic': topic.name, 'topic_type': topic.type, **metadata}
-        self._writer.add_metadata(f'{CHANNEL_RECORD}{number}', repeated)
-        return number
-
-    def _store_context(self) -> None:
-        if self._bag.custom_data:
-            self._writer.add_metadata(RECORD, self._bag.custom_data)
-        if self._configuration is not None:
-            text, at = self._configuration
-            self._writer.add_attachment(at, at, ATTACHMENT, 'application/yaml', text.encode())
+        return self._writer.register_channel(topic.name, 'cdr', schema, metadata)
 
     def _end_chunk(self) -> None:
+        before = self._stream.tell()
         self._writer.flush()  # type: ignore[no-untyped-call]
         self._stream.flush()
-        self._index_size += _CHUNK_ENTRY + _CHANNEL_ENTRY * len(self._bag.topics)
-        self._stream.reserve(self._index_size)
+        if self._stream.tell() > before:
+            self._chunks += 1
+            self._index_size += _CHUNK_ENTRY + _CHANNEL_ENTRY * len(self._bag.topics)
+            self._stream.reserve(self._index_size)
 
     def _end_file(self) -> None:
         self._describe()
@@ -244,7 +220,43 @@ class BagWriter:
         self._stream.close()
 
 
-def channel_checksum(topic: str, type_name: str, metadata: Mapping[str, str]) -> str:
-    """Return the CRC-32 of a channel, whose copy is not protected by a checksum of MCAP."""
-    profiles, type_hash = metadata.get('offered_qos_profiles'), metadata.get('topic_type_hash')
-    return f'{crc32(repr((topic, type_name, profiles, type_hash)).encode()):08x}'
+class Losses:
+    """Counter of one topic's published but unrecorded messages, by sequence number.
+
+    Each publisher numbers its own messages: losses of a topic that ever had several are unknown.
+    """
+
+    def __init__(self, publishers: int) -> None:
+        self.missed: int | None = 0  # between recorded ones; None if unknown
+        self.before = 0  # sent by a publisher before its first recorded one
+        self._last = 0
+        self.publishers_seen(publishers)
+
+    def publishers_seen(self, publishers: int) -> None:
+        """Update the number of publishers."""
+        if publishers > 1:
+            self.missed, self.before = None, 0
+
+    def count(self, sequence: int) -> None:
+        """Count a message; a number that is not higher than the last means a new publisher."""
+        if self.missed is not None:
+            if self._last and sequence > self._last:
+                self.missed += sequence - self._last - 1
+            else:
+                self.before += max(sequence - 1, 0)
+        self._last = sequence
+
+    def text(self) -> str:
+        """Return the text that follows the number of recorded messages."""
+        if self.missed is None:
+            return ''
+        earlier = f', {self.before} sent before the recorder connected' if self.before else ''
+        return f', {self.missed} missed{earlier}'
+
+
+def statistics(written: Mapping[str, int], losses: Mapping[str, Losses]) -> dict[str, str]:
+    """Return facts that state how many messages of each topic were written and lost."""
+    return {
+        f'{MESSAGES}{topic}': f'{count} written{losses[topic].text()}'
+        for topic, count in written.items()
+    }

@@ -10,9 +10,8 @@ from blf_dsc_controller.analysis import figures, summary
 from blf_dsc_controller.analysis.report import write_report
 from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.bags import recover as recovering
-from blf_dsc_controller.bags.content import NameMap
-from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.bags.salvage import format_time
+from blf_dsc_controller.bags.content import NameMap, read_content
+from blf_dsc_controller.bags.reader import RecordedRun, recorded_run
 from blf_dsc_controller.bags.table import described
 from blf_dsc_controller.bags.table import export as export_run
 from blf_dsc_controller.cli.output import make_room
@@ -26,11 +25,22 @@ def report(options: Namespace) -> None:
     print(f'wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB)')
 
 
+def _run(options: Namespace) -> RecordedRun:
+    """Read the run of a bag, and print what is left out."""
+    names = NameMap.parse(options.map)
+    run = recorded_run(
+        read_content(options.bag, options.namespace, names), names, options.namespace
+    )
+    for note in run.notes:
+        print(f'note: {note}')
+    return run
+
+
 def export(options: Namespace) -> None:
     """Write a bag as a table."""
     out = options.out
     make_room(out, *([described(out)] if out.suffix == '.csv' else ()), force=options.force)
-    run = read_run(options.bag, options.namespace, NameMap.parse(options.map))
+    run = _run(options)
     columns = export_run(run, options.out)
     print(f'wrote {options.out}: {run.stamp.size} rows of {columns} columns')
     if options.out.suffix == '.csv':
@@ -41,7 +51,7 @@ def plot(options: Namespace) -> None:
     """Plot and summarise a bag."""
     names = ('summary.json', *figures.NAMES)
     make_room(*(options.out / name for name in names), force=options.force)
-    run = read_run(options.bag, options.namespace, NameMap.parse(options.map))
+    run = _run(options)
     metrics = summary.summarize(run)
     options.out.mkdir(parents=True, exist_ok=True)
     summary.write_summary(metrics, options.out / 'summary.json')
@@ -68,7 +78,11 @@ def _losses(recovery: recovering.Recovery) -> Iterator[str]:
     for loss in recovery.losses:
         yield f'LOST {loss}'
     for name, last in recovery.unfinished:
-        after = 'nothing in it could be read' if last is None else f'it ends at {format_time(last)}'
+        after = (
+            'nothing in it could be read'
+            if last is None
+            else f'it ends at {recovering.format_time(last)}'
+        )
         yield (
             f'{name}: the recording was not closed; {after}. Later messages are lost: usually the '
             'last 0.1 s before a kill, more if the computer was overloaded or lost power'

@@ -53,8 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _handle(options: argparse.Namespace) -> int | None:
     if 'max_unpacked' in options:
-        unpacking = importlib.import_module('blf_dsc_controller.bags.unpacking')
-        unpacking.MAX_UNPACKED.set(options.max_unpacked * 1e9)
+        files = importlib.import_module('blf_dsc_controller.bags.mcap_file')
+        files.MAX_UNPACKED.set(options.max_unpacked * 1e9)
     module, function = options.handler
     code: int | None = getattr(
         importlib.import_module(f'blf_dsc_controller.cli.{module}'), function

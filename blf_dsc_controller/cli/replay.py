@@ -9,8 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
-from blf_dsc_controller.bags.content import NameMap
-from blf_dsc_controller.bags.context import read_context
+from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.cli.main import require_ros
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER
@@ -47,9 +46,7 @@ def replay(options: Namespace) -> int:
         _learn(options, config, names)
     elif config is None:
         result = verify(options.bag, options.namespace, names)
-        stamp = result.stamp
-        duration = float(np.ptp(stamp)) * 1e-9 if stamp.size else 0.0
-        _print_speed(stamp.size, duration, perf_counter() - begin)
+        _print_speed(result.samples, result.duration, perf_counter() - begin)
         print('\n'.join(_verification(result)))
         if result.difference is not None:
             return DIFFERENT
@@ -63,7 +60,7 @@ def replay(options: Namespace) -> int:
 
 
 def _learn(options: Namespace, config: ControllerConfig | None, names: NameMap) -> None:
-    config = config or read_context(options.bag).controller_config()
+    config = config or read_content(options.bag, options.namespace, names).controller_config()
     found = learn(options.bag, config, options.namespace, names)
     print(f'torque: {found.source}; window from {found.begin:.3f} s to {found.end:.3f} s')
     width = max(len(name) for name in found.names)
@@ -91,11 +88,30 @@ def _print_speed(samples: int, seconds: float, took: float) -> None:
 
 
 def _verification(result: Verification) -> Iterator[str]:
-    for one in result.comparisons:
-        verdict = 'bit-equal' if one.difference is None else 'DIFFERENT'
-        left_out = f' (not compared: {one.left_out})' if one.left_out else ''
-        yield f'{one.topic}: {one.values} values {verdict}{left_out}'
-    types = [one.type for one in result.events]
+    for found in result.comparisons:
+        verdict = 'bit-equal'
+        if found.difference is not None:
+            verdict = f'DIFFERENT by at most {found.largest:.3g}'
+        left_out = f' (not compared: {found.left_out})' if found.left_out else ''
+        yield f'{found.topic}: {found.values} values {verdict}{left_out}'
+    for topic in result.not_compared:
+        yield f'{topic}: not compared, as it holds text'
+    yield from _events(result)
+    if result.difference is not None:
+        yield f'DIFFERENT, first at {result.difference}'
+    elif result.compared < 1.0:
+        percent = min(round(100.0 * result.compared, 2), 99.99)
+        yield (
+            f'PARTLY COMPARED: {percent:g} % of the numbers in the bag, which are bit-equal; the '
+            'others could not be compared'
+        )
+    else:
+        yield 'bit-equal: all numbers of the controller in the bag'
+
+
+def _events(result: Verification) -> Iterator[str]:
+    """Yield what happened in the run, and what limits the result."""
+    types = [event.type for event in result.events]
     for type_, what in (
         (EventType.PARAMETERS, 'parameter changes'),
         (EventType.TRAJECTORY, 'trajectories'),
@@ -109,17 +125,6 @@ def _verification(result: Verification) -> Iterator[str]:
     if result.passed_over:
         yield f'{result.passed_over} states skipped: the controller did not use them'
     yield from (f'note: {remark}' for remark in result.remarks)
-    if result.difference is not None:
-        yield f'DIFFERENT, first at {result.difference}'
-        return
-    if result.compared < 1.0:
-        percent = min(round(100.0 * result.compared, 2), 99.99)
-        yield (
-            f'PARTLY COMPARED: {percent:g} % of the outputs in the bag, which are bit-equal; the '
-            'others could not be compared'
-        )
-    else:
-        yield 'bit-equal: all outputs in the bag'
 
 
 def _open_loop(found: WhatIf, config: ControllerConfig) -> Iterator[str]:

@@ -13,8 +13,8 @@ import numpy as np
 
 from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.summary import format_table, summarize, write_summary
-from blf_dsc_controller.bags.context import read_context
-from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.bags.content import read_content
+from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.cli.main import INTERRUPTED, require_ros, unwritable
 from blf_dsc_controller.cli.progress import LoopProgress
 from blf_dsc_controller.compiled.notice import announced_compilation
@@ -37,7 +37,6 @@ STOPPED = 5
 
 _FOLDER = 'closed_loop'
 _DURATION = 60.0  # s, if neither the file nor an option sets it
-_PARAMETERS_TIMEOUT = 60.0  # s; a bag without its configuration cannot be replayed
 
 
 def run(options: Namespace) -> int:
@@ -50,7 +49,8 @@ def run(options: Namespace) -> int:
         _check_view(options)
     out = make_folder(options.out)
     try:
-        recorder = {'output': str(out / 'bag'), 'wait_for_parameters': _PARAMETERS_TIMEOUT}
+        clock = 'plant' if config.plant.mode == 'lockstep' else 'wall'
+        recorder = {'output': str(out / 'bag'), 'clock': clock}
         config = config._replace(recorder=change(config.recorder, recorder))
         dump(out / 'config.yaml', config.by_node)
         if options.offline:
@@ -164,13 +164,14 @@ def print_notice(notice: str) -> None:
 def _report(out: Path) -> bool:
     """Draw and summarise the bag of a run; return whether the controller stopped in it."""
     print_notice('reading the bag')
-    recorded = read_run(out / 'bag')
+    content = read_content(out / 'bag')
+    recorded = recorded_run(content)
     summary = summarize(recorded)
     write_summary(summary, out / 'summary.json')
     print_notice('drawing the pictures')
     pictures = draw(recorded, out)
     print(format_table(summary))
-    for topic, text in read_context(out / 'bag').losses.items():
+    for topic, text in content.losses.items():
         print(f'warning: messages of {topic} are missing in the bag: {text}')
     print(f'wrote       {out}: bag, summary.json, {", ".join(path.name for path in pictures)}')
     last = recorded.stamp[-1]  # the plant ends after it, so the controller times out

@@ -144,7 +144,7 @@ class ControllerConfig(Sampled):
     model: str = _size('two_link', 'model of the arm', choices=tuple(MODELS))
     wait_for_subscribers: int = non_negative(
         0,
-        'subscribers per topic, besides the plant, required before the first state is used',
+        'recorders (nodes with `record` in their names) of each topic to wait for at first',
         read_only=_TOPICS,
     )
     autostart: bool = autostart()

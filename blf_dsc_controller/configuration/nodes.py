@@ -47,17 +47,10 @@ class RecorderConfig:
     split_duration: float = _of_bag(
         0.0, 'duration at which the bag continues in a new file; 0: never', 's', at_least=0.0
     )
-    ring: float = _of_bag(
-        0.0,
-        'time span kept in memory, and written on ~/trigger; 0: write everything',
-        's',
-        at_least=0.0,
-    )
-    wait_for_parameters: float = _of_bag(
-        0.0,
-        'longest wait for the parameters of the publishers before a topic is recorded',
-        's',
-        at_least=0.0,
+    clock: Literal['wall', 'plant'] = _of_bag(
+        'wall',
+        'log times: as received, or (lock-step) the stamp of the last joint state, so that the bag '
+        'plays at the speed of the arm',
     )
 
     def problems(self) -> list[str]:

@@ -190,7 +190,7 @@ class PlantConfig(Sampled):
     publish_clock: bool = _fixed(False, 'publish the simulated time on /clock')
     wait_for_subscribers: int = _fixed(
         0,
-        'subscribers per topic, besides the controller, required before the first state',
+        'recorders (nodes with `record` in their names) of each topic to wait for at first',
         at_least=0,
     )
     autostart: bool = autostart()

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.urdf import chain_joints, moving_joints
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap, read_content
+from blf_dsc_controller.bags.reader import one_run
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.torque import applied_torque
 from blf_dsc_controller.messages.topics import JOINT_STATES
@@ -57,15 +58,14 @@ def read_recording(
     named = content.topics[JOINT_STATES].name_lists()
     joints = tuple(joints) or _arm_joints(text, set().union(*named), names)
     theirs = names.joints_of(joints)
-    content = content.of_joints(theirs)
-    messages = content.topics[JOINT_STATES]
-    states = messages.joint_states(theirs, ('position',))
-    torque, source = states.values[:, 2], f'effort of {messages.name}'
+    states, _, _ = one_run(content, theirs)
+    torque, source = states.field(2), f'effort of {content.topics[JOINT_STATES].name}'
     if commanded or not np.nan_to_num(torque).any():
-        torque, source = applied_torque(content, states)
+        applied = applied_torque(content, states)
+        torque, source = applied.at(), applied.source
         if not np.nan_to_num(torque).any():
             raise BagError(f'{path}: all torques in the {source} are zero: record measured efforts')
-    return _resampled(joints, states.stamp, states.values[:, 0], torque, source)
+    return _resampled(joints, states.stamp, states.field(0), torque, source)
 
 
 def _arm_joints(text: str, in_bag: set[str], names: NameMap) -> tuple[str, ...]:

@@ -12,6 +12,9 @@ from collections.abc import Collection, Sequence
 from struct import unpack_from
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from blf_dsc_controller.errors import BlfDscError
 
 NANOSECONDS = 1_000_000_000
@@ -19,6 +22,7 @@ NANOSECONDS = 1_000_000_000
 
 ORIGIN = 4  # alignment is counted from here
 STAMP_OFFSET = 4  # of a message that starts with a std_msgs/Header
+JOINT_STATE_FIELDS = ('position', 'velocity', 'effort')
 _BYTE_ORDERS = {b'\x00\x00': '>', b'\x00\x01': '<'}
 
 
@@ -114,6 +118,11 @@ def joint_state_layout(raw: bytes | bytearray) -> Layout:
     )
 
 
+def joint_state_stamp(raw: bytes) -> int:
+    """Return the stamp of a message that starts with a header [ns]; MessageError as above."""
+    return _Cursor(raw).time()
+
+
 def array_layout(raw: bytes | bytearray) -> Layout:
     """Find the values of a std_msgs/Float64MultiArray after its dimensions; errors as above."""
     cursor = _Cursor(raw)
@@ -123,6 +132,31 @@ def array_layout(raw: bytes | bytearray) -> Layout:
         cursor.unsigned()
     cursor.unsigned()
     return Layout(cursor.byte_order, ORIGIN, (), (cursor.doubles(),))
+
+
+def joint_state_places(
+    layout: Layout, joints: Sequence[str], required: Collection[str]
+) -> NDArray[np.intp]:
+    """Return where position, velocity and effort of n `joints` are, (3, n) in a grid of doubles.
+
+    A field that is not `required` and is empty has -1.
+
+    Raises:
+        MissingJointError, DuplicatedJointError: as in `columns_of`.
+        ShortArrayError: an array differs in length from the names.
+    """
+    columns = np.array(layout.columns_of(joints), dtype=np.intp)
+    places = np.full((3, columns.size), -1)
+    for row, field, array in zip(places, JOINT_STATE_FIELDS, layout.arrays, strict=True):
+        if array.size == 0 and field not in required:
+            continue
+        if array.size != len(layout.names):
+            raise ShortArrayError(
+                f'`{field}` of the message holds {array.size} values for {len(layout.names)} '
+                'names: publish one value for each name'
+            )
+        row[:] = columns + array.place
+    return places
 
 
 class TrajectoryContent(NamedTuple):

@@ -17,20 +17,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.messages.cdr import (
+    JOINT_STATE_FIELDS,
     NANOSECONDS,
     ORIGIN,
     STAMP_OFFSET,
     Doubles,
     Layout,
-    ShortArrayError,
     array_layout,
     joint_state_layout,
+    joint_state_places,
 )
 from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
 from blf_dsc_controller.messages.types import typestore
-from blf_dsc_controller.run import Floats, Stamps
+from blf_dsc_controller.run import Floats
 
-JOINT_STATE_FIELDS = ('position', 'velocity', 'effort')
 _STAMPS = {'<': Struct('<iI'), '>': Struct('>iI')}
 _STAMP = _STAMPS['<']
 
@@ -112,31 +112,6 @@ class Decoder(ABC):
     def decode(self, raw: bytes) -> int:
         """Fill `values` and return the stamp or the size of a message."""
 
-    def decode_all(self, raw: Sequence[bytes]) -> tuple[NDArray[np.int64], Floats] | None:
-        """Return the results of `decode` for N messages (N,), and their values (N, s).
-
-        Returns None unless all have the layout of the first.
-
-        Raises:
-            MessageError: as in `decode`, for the first message.
-        """
-        self.decode(raw[0])
-        count, size = len(raw), self._length
-        if set(map(len, raw)) != {size}:
-            return None
-        joined = b''.join(raw)
-        table = np.frombuffer(joined, np.uint8).reshape(-1, size)
-        if any((table[:, part] != table[0, part]).any() for part in self._fixed_parts):
-            return None
-        grid = np.ndarray((count, self._count), self._float, joined, ORIGIN, (size, 8))
-        values = np.full((count, self.values.size), np.nan)
-        values[:, self._known] = grid[:, self._places]
-        return self._decoded(joined), values
-
-    @abstractmethod
-    def _decoded(self, joined: bytes) -> NDArray[np.int64]:
-        """Return the results of `decode` for concatenated messages."""
-
     def _is_known(self, raw: bytes) -> bool:
         return len(raw) == self._length and self._fixed_of(raw) == self._fixed
 
@@ -146,8 +121,7 @@ class Decoder(ABC):
         `places` (s,) are the values' indices in a grid of doubles from ORIGIN on, -1 for NaN.
         """
         self._length = len(raw)
-        self._fixed_parts = layout.fixed_parts
-        self._fixed_of = itemgetter(*self._fixed_parts)
+        self._fixed_of = itemgetter(*layout.fixed_parts)
         self._fixed = self._fixed_of(raw)
         self._float = np.dtype(layout.byte_order + 'f8')
         self._count = (len(raw) - ORIGIN) // 8
@@ -190,31 +164,12 @@ class JointStateDecoder(Decoder):
         """
         if not self._is_known(raw):
             layout = joint_state_layout(raw)
-            self._learn(raw, layout, self._places_in(layout))
+            places = joint_state_places(layout, self._joints, self._required)
+            self._learn(raw, layout, places.ravel())
             self._stamp = _STAMPS[layout.byte_order]
         self._fill(raw)
         seconds, nanoseconds = self._stamp.unpack_from(raw, STAMP_OFFSET)
         return int(seconds * NANOSECONDS + nanoseconds)
-
-    def _decoded(self, joined: bytes) -> Stamps:
-        kind = np.dtype([('sec', 'i4'), ('nanosec', 'u4')]).newbyteorder(self._float.byteorder)
-        count = len(joined) // self._length
-        stamp = np.ndarray(count, kind, joined, STAMP_OFFSET, (self._length,))
-        return np.asarray(stamp['sec'].astype(np.int64) * NANOSECONDS + stamp['nanosec'])
-
-    def _places_in(self, layout: Layout) -> NDArray[np.intp]:
-        columns = np.array(layout.columns_of(self._joints), dtype=np.intp)
-        places = np.full((3, columns.size), -1)
-        for row, field, array in zip(places, JOINT_STATE_FIELDS, layout.arrays, strict=True):
-            if array.size == 0 and field not in self._required:
-                continue
-            if array.size != len(layout.names):
-                raise ShortArrayError(
-                    f'`{field}` of the message holds {array.size} values for {len(layout.names)} '
-                    f'names: publish one value for each name'
-                )
-            row[:] = columns + array.place
-        return places.ravel()
 
 
 class Float64MultiArrayDecoder(Decoder):
@@ -238,6 +193,3 @@ class Float64MultiArrayDecoder(Decoder):
             self._learn(raw, layout, np.arange(array.size) + array.place)
         self._fill(raw)
         return self.values.size
-
-    def _decoded(self, joined: bytes) -> NDArray[np.int64]:
-        return np.full(len(joined) // self._length, self.values.size, dtype=np.int64)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections import deque
+from collections.abc import Mapping
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -18,6 +19,10 @@ from blf_dsc_controller.messages.types import typestore
 
 OUTSIDE_BOUND = 'error past the bound'
 """Reason for a stop: the error left its bound."""
+
+
+FORMAT = 2
+"""Of the journal: in 2, every torque that answers a message is in `~/tracking_error`, too."""
 
 
 class EventType(str, Enum):
@@ -54,6 +59,18 @@ class Event(NamedTuple):
         return bytes(typestore().serialize_cdr(message, JOURNAL.type))
 
 
+def encode_change(stamp: int, parameters: Mapping[str, Any], *, configured: bool = False) -> bytes:
+    """Return the message of `~/changes` on parameters of the plant, in force from a stamp [ns] on.
+
+    `configured`: these are all of them, at the start.
+    """
+    content = {'stamp': stamp, 'parameters': parameters} | (
+        {'configured': True} if configured else {}
+    )
+    message = typestore().types[JOURNAL.type](data=json.dumps(content))
+    return bytes(typestore().serialize_cdr(message, JOURNAL.type))
+
+
 def decode(raw: bytes) -> Event:
     """Decode the event of a serialised message.
 
@@ -86,6 +103,8 @@ class Journal:
 
     def note(self, event: EventType, **content: Any) -> None:
         """Add an event that happens now."""
+        if event is EventType.CONFIGURE:
+            content['format'] = FORMAT
         one = Event(self._number, event, self.stamp, self.messages, self.commands, content)
         self._number += 1
         self.pending.append(one)

@@ -67,10 +67,18 @@ class ControllerTelemetry:
         message = self._bound.encode(stamp, position=bound, effort=torque_limit)
         return topics.BOUND, message
 
+    def answer(self, stamp: int, torque: np.ndarray) -> Message:
+        """Encode a torque (n,) [N m] that is not the law's; the tracking errors are NaN.
+
+        `stamp` [ns] is that of the joint state, or of the last readable one.
+        """
+        unknown = np.full(torque.size, np.nan)
+        return topics.TRACKING_ERROR, self._error.encode(stamp, unknown, unknown, torque)
+
     def sample(self, stamp: int, sample: Sample, compute_time: float) -> Iterator[Message]:
         """Yield the messages for a joint state: its stamp [ns], telemetry sample, update time [s].
 
-        The tracking error is sent every time: it tells a replay which states the law has used.
+        The tracking error is sent every time: it tells a replay which states were used.
         """
         error = self._error.encode(stamp, sample.xi1, sample.xi2, sample.torque)
         yield topics.TRACKING_ERROR, error

@@ -190,6 +190,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._command(torque)
         if guard.has_sample:
             self._publish_telemetry(guard)
+        elif torque is not None and self._heard and self.config.telemetry.enabled:
+            self._publish(self._telemetry.answer(guard.journal.stamp, torque))
         if guard.waiting_for:
             self.get_logger().warning(
                 f'not started, waiting for a usable joint state: {guard.waiting_for}',

@@ -38,6 +38,7 @@ Config = TypeVar('Config', ControllerConfig, PlantConfig)
 
 POLL_PERIOD = 0.01  # s
 _DIAGNOSTICS_PERIOD = 1.0  # s
+_RECORDER = 'record'  # in the names bag_recorder and rosbag2_recorder
 
 
 class ManagedNode(LifecycleNode, process.PlainNode):
@@ -228,15 +229,16 @@ class LoopNode(ManagedNode, Generic[Config]):
         self._senders[topic](raw)
 
     def _is_observed(self) -> bool:
-        """Whether each output has its subscribers, and the first one also the other node."""
-        observers = self.config.wait_for_subscribers
+        """Whether each output has its recorders, and the first one also the other node."""
+        wanted = self.config.wait_for_subscribers
         return all(
-            publisher.get_subscription_count() - self._watchdogs(publisher.topic_name)
-            >= observers + (number == 0)
+            publisher.get_subscription_count() - self._subscribers(publisher, WATCHDOG_NODE)
+            >= wanted + (number == 0)
+            and (wanted == 0 or self._subscribers(publisher, _RECORDER) >= wanted)
             for number, publisher in enumerate(self._outputs.values())
         )
 
-    def _watchdogs(self, topic: str) -> int:
-        """Count the subscriptions of watchdogs, which neither record nor move the arm."""
-        found = self.get_subscriptions_info_by_topic(topic)
-        return sum(WATCHDOG_NODE in one.node_name for one in found)
+    def _subscribers(self, publisher: Publisher, kind: str) -> int:
+        """Return the number of subscribers whose nodes have this in their names."""
+        found = self.get_subscriptions_info_by_topic(publisher.topic_name)
+        return sum(kind in each.node_name for each in found)

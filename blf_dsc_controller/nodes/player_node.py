@@ -8,8 +8,9 @@ are std_srvs/Trigger: `is_paused` and `play_next` return their result in `succes
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from functools import partial
+from heapq import heappop, heappush
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
-from blf_dsc_controller.bags.sources import BagError, open_bag
+from blf_dsc_controller.bags.sources import BagError, BagMessage, Messages, open_bag
 from blf_dsc_controller.messages.codecs import encode_clock
 from blf_dsc_controller.messages.topics import CLOCK, Quality
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
@@ -27,6 +28,7 @@ from blf_dsc_controller.replay.timeline import Timeline
 
 _MOST_AT_ONCE = 100
 _CLOCK_PERIOD = 10_000_000  # ns
+_LATE = 64  # messages
 
 
 class PlayerNode(Node):
@@ -115,13 +117,13 @@ class PlayerNode(Node):
         """Publish the messages that are due; return the time [s] until the next one."""
         now = time.monotonic_ns()
         for _ in range(_MOST_AT_ONCE):
-            if self._next is None or self.timeline.wait(self._next[1], now) > 0.0:
+            if self._next is None or self.timeline.wait(self._next.received, now) > 0.0:
                 break
             self._publish(self._next, now)
         if self._clock_output is not None and now - self._clock_published >= _CLOCK_PERIOD:
             self._clock_published = now
             self._clock_output.publish(encode_clock(self.timeline.position(now)))
-        return 0.0 if self._next is None else self.timeline.wait(self._next[1], now)
+        return 0.0 if self._next is None else self.timeline.wait(self._next.received, now)
 
     def _add(self, name: str, type_name: str, quality: Quality) -> None:
         try:
@@ -132,21 +134,26 @@ class PlayerNode(Node):
         except NameValidationException:
             self.get_logger().warning(f'{name} is not played: it is not the name of a topic')
 
-    def _read(self) -> Iterator[tuple[str, int, bytes]]:
+    def _read(self) -> Messages:
         """Yield the messages to play, after each latched topic's last one before the range."""
         with open_bag(self._path) as bag:
             if self.begin > bag.times[0]:
                 latched = self._latched & {*self._outputs}
-                before = {one[0]: one for one in bag.in_order(latched, stop=self.begin)}
-                yield from ((name, self.begin, raw) for name, _, raw in before.values())
-            yield from bag.in_order({*self._outputs}, self.begin, self.end + 1)
+                before = {}
+                for message in bag.messages(latched) if latched else ():
+                    if message.received < self.begin:
+                        before[message.topic] = message._replace(received=self.begin)
+                yield from before.values()
+            for message in _in_order(bag.messages({*self._outputs}, self.begin)):
+                if message.received > self.end:
+                    return
+                yield message
 
-    def _publish(self, message: tuple[str, int, bytes], now: int) -> None:
+    def _publish(self, message: BagMessage, now: int) -> None:
         """Publish the next message, and read the one after it."""
-        name, at, raw = message
-        self._outputs[name].publish(raw)
+        self._outputs[message.topic].publish(message.raw)
         if self._rate == 0.0 or self.timeline.paused:
-            self.timeline.jump(at, now)
+            self.timeline.jump(message.received, now)
         self._next = next(self._messages, None)
         if self._next is None and self._loop:
             self._messages = self._read()
@@ -167,6 +174,17 @@ class PlayerNode(Node):
             return False, 'end of the bag' if self._next is None else 'pause first'
         self._publish(self._next, time.monotonic_ns())
         return True, f'at {self.elapsed:.3f} s'
+
+
+def _in_order(messages: Messages) -> Messages:
+    """Yield messages in order of reception, if none is more than 64 messages late in the file."""
+    waiting: list[tuple[int, int, BagMessage]] = []
+    for number, message in enumerate(messages):
+        heappush(waiting, (message.received, number, message))
+        if len(waiting) > _LATE:
+            yield heappop(waiting)[2]
+    while waiting:
+        yield heappop(waiting)[2]
 
 
 def _respond(

@@ -1,29 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bit-for-bit comparison of recorded and replayed messages of the controller."""
+"""Bit-for-bit comparison of replayed outputs with recorded ones, block by block."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.content import Content
-from blf_dsc_controller.bags.topic_messages import TopicMessages
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS
-from blf_dsc_controller.messages.samples import learning_of
+from blf_dsc_controller.bags.topic_messages import JointStates
+from blf_dsc_controller.law.factory import estimate_names
+from blf_dsc_controller.messages.cdr import JOINT_STATE_FIELDS
+from blf_dsc_controller.messages.samples import columns_of, learning_of
+from blf_dsc_controller.messages.telemetry import DECIMATION, Monitor
 from blf_dsc_controller.messages.topics import (
+    BOUND,
     COMMANDS,
+    DIAGNOSTICS,
     LEARNING,
     MONITOR,
     REFERENCE,
+    STATE,
     TRACKING_ERROR,
     Topic,
 )
-from blf_dsc_controller.replay.outputs import Commands, Outputs
 from blf_dsc_controller.run import Floats, Series, Stamps
+from blf_dsc_controller.supervision.guard import Guard
+
+_BLOCK = 4096  # outputs compared at once
 
 
 class Difference(NamedTuple):
@@ -43,145 +49,272 @@ class Difference(NamedTuple):
         )
 
 
-class Comparison(NamedTuple):
+@dataclass
+class Comparison:
     """Result of comparing one topic."""
 
     topic: str  # name in the bag
-    values: int  # numbers compared
     recorded: int  # numbers in the bag that a complete replay would give
-    difference: Difference | None
+    values: int = 0  # numbers compared
+    difference: Difference | None = None
+    largest: float = 0.0  # difference of two numbers; infinite if only one of them is finite
     left_out: str = ''  # what was not compared, and why
 
+    def add(
+        self, stamp: Stamps, start: int, names: Sequence[str], recorded: Floats, replayed: Floats
+    ) -> None:
+        """Compare tables (N, names) with the stamps (N,) of a run that began at `start`."""
+        self.values += recorded.size
+        bits = np.ascontiguousarray(recorded).view(np.int64)
+        unlike = bits != np.ascontiguousarray(replayed).view(np.int64)
+        unlike &= ~(np.isnan(recorded) & np.isnan(replayed))
+        if not unlike.any():
+            return
+        with np.errstate(invalid='ignore', over='ignore'):
+            sizes = np.abs(recorded[unlike] - replayed[unlike])
+        self.largest = max(self.largest, float(np.nan_to_num(sizes, nan=np.inf).max()))
+        if self.difference is None:
+            k, j = np.argwhere(unlike)[0]
+            pair = float(recorded[k, j]), float(replayed[k, j])
+            time = (int(stamp[k]) - start) * 1e-9
+            self.difference = Difference(self.topic, names[j], int(stamp[k]), time, *pair)
 
-def compare(
-    content: Content, config: ControllerConfig, outputs: Outputs, gappy: Collection[str]
-) -> Iterator[Comparison]:
-    """Compare each topic of the controller that the bag holds.
 
-    `gappy` are the names of topics with messages that the recorder missed.
+class Comparer:
+    """Compares a guard's outputs with those of a bag as they are added.
 
-    Raises:
-        UnreadableMessageError: a message cannot be decoded.
+    Attributes:
+        count, safe_torques: number of samples of the law, and of torques that are not the law's.
+        first, last: stamps [ns] of its first and last sample; -1 before the first.
+        results: by topic.
     """
-    messages = content.topics.get(COMMANDS)
-    if messages is not None:
-        names = _names(config.joints, ['effort'])
-        is_gappy = messages.name in gappy
-        found = _compare_commands(messages, outputs.commands, names, is_gappy=is_gappy)
-        yield _of_the_whole_bag(found, messages, content)
-    for topic, replayed in _replayed(config, outputs).items():
+
+    def __init__(self, content: Content, guard: Guard, answers: JointStates | None) -> None:
+        """Compare with `content`; `answers` are the messages on tracking errors, in order."""
+        self._guard, joints = guard, guard.config.joints
+        self._joints, self._estimates = joints, estimate_names(guard.config)
+        self._answers = answers
+        self.count = self.safe_torques = 0
+        self.first = self.last = -1
+        self._monitor: Monitor | None = None
+        self._bound = b''
+        self._rows = np.empty((_BLOCK, guard.controller.sample_vector.size))
+        self._stamps: list[int] = []  # of these samples [ns]
+        n = len(joints)
+        self._answers_rows = np.empty((_BLOCK, 3 * n))  # [xi1, xi2, torque]
+        self._answered: list[tuple[int, bool]] = []  # their stamps, and whether they are certain
+        self._torques = np.empty((_BLOCK, n))
+        self._commands: list[tuple[int, int]] = []  # their stamps and numbers
+        self._monitored: list[tuple[int, list[float]]] = []
+        self._bounds: list[tuple[int, Floats]] = []
+        self._compared = {TRACKING_ERROR: 0, BOUND: 0}  # messages, in order
+        self._series: dict[Topic, Series] = {}
+        self._names: dict[Topic, tuple[str, ...]] = {COMMANDS: _names(joints, ['effort'])}
+        self._recorded: dict[Topic, JointStates] = {}
+        self.results: dict[Topic, Comparison] = {}
+        for topic, fields in (
+            (COMMANDS, (0,)),
+            (TRACKING_ERROR, (0, 1, 2)),
+            (REFERENCE, (0, 1)),
+            (LEARNING, (0,)),
+            (MONITOR, (0,)),
+            (BOUND, (0, 2)),
+        ):
+            self._open(content, topic, fields)
+        self._fields = {REFERENCE: (0, 1), LEARNING: (0,), MONITOR: (0,)}
+
+    def _open(self, content: Content, topic: Topic, fields: Sequence[int]) -> None:
         messages = content.topics.get(topic)
-        if messages is not None:
-            recorded = _recorded(messages, is_vector=topic in (LEARNING, MONITOR))
-            found = _compare_series(messages.name, outputs.stamp, recorded, replayed)
-            yield _of_the_whole_bag(found, messages, content)
+        if messages is None:
+            return
+        count = len(self._joints)
+        if topic is COMMANDS:
+            found = messages.arrays(count)
+        elif topic in (LEARNING, MONITOR):
+            found = messages.vectors()
+            count = len(found.names)
+        else:
+            found = messages.joint_states(self._joints, ())
+            self._names[topic] = _names(self._joints, [JOINT_STATE_FIELDS[k] for k in fields])
+        result = Comparison(messages.name, messages.size * count * len(fields))
+        self.results[topic] = result
+        if found is None:
+            result.left_out = f'they do not have {count} values each'
+            return
+        self._recorded[topic] = found if topic in (COMMANDS, BOUND) else found.by_stamp()
+        if topic is COMMANDS:
+            self._numbers = found.sequence
+            if not self._numbers.any():  # of another recorder
+                self._numbers = np.arange(1, found.size + 1)
+                if self._answers is not None and found.size < self._answers.size:
+                    result.left_out = 'some are missing, and they have neither stamps nor numbers'
+                    del self._recorded[topic]
+            elif (np.diff(self._numbers) <= 0).any():
+                result.left_out = 'they are of several publishers'
+                del self._recorded[topic]
+
+    # Outputs of the guard.
+
+    def add_sample(self, stamp: int) -> None:
+        """Add the last sample of the law, for the state with this stamp [ns]."""
+        guard, controller = self._guard, self._guard.controller
+        sample = controller.sample
+        if self.first < 0:
+            self.first = stamp
+        self._rows[len(self._stamps)] = controller.sample_vector
+        self._stamps.append(stamp)
+        self.last, self.count = stamp, self.count + 1
+        if controller.samples == 1 or self._monitor is None:
+            self._monitor = Monitor(self._joints, self._estimates, controller.settings)
+            self._bound = b''
+        if sample.bound.tobytes() != self._bound:
+            self.add_bound(stamp, sample.bound)
+        if (controller.samples - 1) % DECIMATION == 0:
+            values = self._monitor.values(stamp, sample, guard.samples.ratio, sample.bound)
+            self._monitored.append((stamp, values))
+
+    def add_bound(self, stamp: int, bound: Floats) -> None:
+        """Add a bound [rad], published with this stamp [ns]."""
+        self._bound = bound.tobytes()
+        limit = self._guard.controller.settings.torque_limit
+        self._bounds.append((stamp, np.concatenate((bound, limit))))
+
+    def add_command(self, stamp: int, torque: Floats, *, is_answer: bool, is_certain: bool) -> None:
+        """Add a commanded torque (n,) [N m] after a state with this stamp [ns].
+
+        `is_answer`: it answers a message. One that is not certain is not compared.
+        """
+        n, guard = torque.size, self._guard
+        if is_certain:
+            self._torques[len(self._commands)] = torque
+            self._commands.append((stamp, guard.journal.commands))
+        if is_answer:
+            row = self._answers_rows[len(self._answered)]
+            row[2 * n :] = torque
+            row[: 2 * n] = np.nan
+            if guard.has_sample:
+                row[:n], row[n : 2 * n] = guard.controller.sample.xi1, guard.controller.sample.xi2
+            self._answered.append((stamp, is_certain))
+        self.safe_torques += not guard.has_sample
+        if _BLOCK in (len(self._commands), len(self._answered)):
+            self.flush()
+
+    # Comparison.
+
+    def flush(self) -> None:
+        """Compare what has been added since the last call."""
+        stamp = np.array(self._stamps, dtype=np.int64)
+        samples = columns_of(self._rows[: stamp.size], self._guard.controller.settings)
+        self._compare_series(REFERENCE, Series(
+            self._names.get(REFERENCE, ()), stamp, np.hstack((samples.qr, samples.dqr))
+        ))  # fmt: skip
+        self._compare_series(LEARNING, learning_of(self._guard.config, stamp, samples))
+        if self._monitor is not None and self._monitored:
+            at, values = zip(*self._monitored, strict=True)
+            monitored = Series(self._monitor.names, np.array(at), np.array(values))
+            self._compare_series(MONITOR, monitored)
+        stamps, certain = [at for at, _ in self._answered], [sure for _, sure in self._answered]
+        rows = self._answers_rows[: len(stamps)]
+        self._compare_in_order(TRACKING_ERROR, self._answers, stamps, rows, (0, 1, 2), certain)
+        stamps, bounds = [at for at, _ in self._bounds], [bound for _, bound in self._bounds]
+        self._compare_in_order(BOUND, self._recorded.get(BOUND), stamps, bounds, (0, 2))
+        self._compare_commands()
+        for waiting in (
+            self._stamps,
+            self._monitored,
+            self._answered,
+            self._bounds,
+            self._commands,
+        ):
+            waiting.clear()
+
+    def _compare_series(self, topic: Topic, replayed: Series) -> None:
+        """Compare values of the same name and stamp."""
+        recorded, result = self._recorded.get(topic), self.results.get(topic)
+        if recorded is None or result is None or not replayed.stamp.size:
+            return
+        if topic not in self._series:
+            self._series[topic] = recorded.series()
+        stamps = self._series[topic].stamp
+        index = np.minimum(np.searchsorted(stamps, replayed.stamp), stamps.size - 1)
+        known = stamps[index] == replayed.stamp
+        rows, at = index[known], replayed.stamp[known]
+        if topic is REFERENCE:
+            values = np.hstack([recorded.field(k, rows) for k in (0, 1)])
+            result.add(at, self.first, replayed.names, values, replayed.values[known])
+            return
+        shared = [name for name in replayed.names if name in recorded.names]
+        absent = {*replayed.names, *recorded.names}.difference(shared)
+        both = dict.fromkeys((*replayed.names, *recorded.names))
+        result.left_out = ', '.join(name for name in both if name in absent)
+        result.recorded = stamps.size * len(shared)
+        columns = np.array([recorded.names.index(name) for name in shared], np.intp)
+        own = replayed.select(shared)[known]
+        result.add(at, self.first, shared, recorded.field(0, rows, columns), own)
+
+    def _compare_in_order(
+        self,
+        topic: Topic,
+        recorded: JointStates | None,
+        stamps: Sequence[int],
+        replayed: Sequence[Floats] | Floats,
+        fields: Sequence[int],
+        certain: Sequence[bool] = (),
+    ) -> None:
+        """Compare messages by their number; one with another stamp differs."""
+        if recorded is None or topic not in self.results:
+            return
+        begin = self._compared[topic]
+        count = min(len(stamps), recorded.size - begin)
+        self._compared[topic] += count
+        if count <= 0:
+            return
+        rows = slice(begin, begin + count)
+        known = np.array(certain[:count], np.bool_) if certain else np.ones(count, np.bool_)
+        at, own = np.array(stamps[:count])[known], np.array(replayed[:count])[known]
+        values = np.hstack([recorded.field(k, rows)[known] for k in fields])
+        own[recorded.select(rows).stamp[known] != at] = np.inf
+        self.results[topic].add(at, self.first, self._names[topic], values, own)
+
+    def _compare_commands(self) -> None:
+        """Compare commands by the number that their publisher gave them."""
+        recorded = self._recorded.get(COMMANDS)
+        if recorded is None or not self._commands:
+            return
+        stamps, number = np.array(self._commands).T
+        torques = self._torques[: number.size]
+        index = np.minimum(np.searchsorted(self._numbers, number), self._numbers.size - 1)
+        known = self._numbers[index] == number
+        at, own = stamps[known], torques[known]
+        values = recorded.field(0, index[known])
+        self.results[COMMANDS].add(at, self.first, self._names[COMMANDS], values, own)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample of the law to the last [s]."""
+        return (self.last - self.first) * 1e-9
+
+    def finish(self) -> Iterator[Comparison]:
+        """Yield the results."""
+        self.flush()
+        commands, n = self.results.get(COMMANDS), len(self._joints)
+        if commands is not None and COMMANDS in self._recorded:
+            rest = (commands.recorded - commands.values) // n
+            last = self._recorded[COMMANDS].field(0, slice(-1, None))
+            # The last command of a node that shuts down normally is zero and belongs to no state.
+            if rest == 1 and not last.any():
+                commands.recorded -= n
+            elif rest:
+                commands.left_out = f'{rest} torques that the replay does not reach'
+        yield from self.results.values()
 
 
-def _of_the_whole_bag(found: Comparison, messages: TopicMessages, content: Content) -> Comparison:
-    """Return the comparison, counting the outputs of later controllers as recorded too."""
-    count = len(messages.raw)
-    whole = found.recorded * content.message_counts[messages.name] // count if count else 0
-    return found._replace(recorded=whole)
-
-
-def _replayed(config: ControllerConfig, outputs: Outputs) -> dict[Topic, Series]:
-    """Return the replayed values of every topic with a stamp."""
-    errors, reference = (_names(config.joints, JOINT_STATE_FIELDS[:count]) for count in (3, 2))
-    stamp, samples = outputs.stamp, outputs.samples
-    return {
-        TRACKING_ERROR: Series(
-            errors, stamp, np.hstack((samples.xi1, samples.xi2, samples.torque))
-        ),
-        REFERENCE: Series(reference, stamp, np.hstack((samples.qr, samples.dqr))),
-        LEARNING: learning_of(config, stamp, samples),
-        MONITOR: outputs.monitor,
-    }
-
-
-def _recorded(messages: TopicMessages, *, is_vector: bool) -> Series:
-    """Return the values of a vector, or the fields of joint states that are not empty."""
-    states = messages.joint_states(messages.layout().names, ())
-    if is_vector:
-        return states.position
-    names = _names(states.names, JOINT_STATE_FIELDS)
-    all_of_them = Series(names, states.stamp, states.values.reshape(states.stamp.size, -1))
-    filled = [name for name in names if not np.isnan(all_of_them.column(name)).all()]
-    return Series(tuple(filled), states.stamp, all_of_them.select(filled))
+def not_compared(content: Content) -> Iterator[str]:
+    """Yield the controller's topics in a bag that hold text, not numbers."""
+    for topic in (STATE, DIAGNOSTICS):
+        if topic in content.topics:
+            yield content.topics[topic].name
 
 
 def _names(joints: Sequence[str], fields: Sequence[str]) -> tuple[str, ...]:
     return tuple(f'{field} of {joint}' for field in fields for joint in joints)
-
-
-def _compare_commands(
-    recorded: TopicMessages, commands: Commands, names: Sequence[str], *, is_gappy: bool
-) -> Comparison:
-    """Compare commands by their number in the run, since they have no stamp."""
-    count = len(recorded.raw)
-    due = int(np.argmin(np.append(commands.of_law, values=False)))
-    if count < due or is_gappy:
-        reason = f'{count} commands for {due} states that the law used, and they have no stamp'
-        return Comparison(recorded.name, 0, count * len(names), None, reason)
-    values = recorded.arrays(len(names))
-    if values is None:
-        reason = f'they do not have {len(names)} values each'
-        return Comparison(recorded.name, 0, count * len(names), None, reason)
-    number = commands.number
-    # After a dropped state there may be more replayed torques than commands before the next event.
-    later = np.append(np.minimum.accumulate(number[::-1])[::-1][1:], count)
-    rows = np.flatnonzero((number < later) & (number < count))
-    alike = np.all(_alike(values[number[rows]], commands.torque[rows]), axis=1)
-    # Where the states in between are not certain, compare up to the first mismatch.
-    exact, k = commands.exact[rows], np.arange(rows.size)
-    mismatch = np.maximum.accumulate(np.where(exact | alike, -1, k))
-    rows = rows[alike | (mismatch <= np.maximum.accumulate(np.where(exact, k, -1)))]
-    left_out = ''
-    rest = np.delete(values, number[rows], axis=0)
-    # The last command of a node that shuts down normally is zero and belongs to no state.
-    if len(rest) > 1 or rest.any():
-        left_out = (
-            f'{len(rest)} torques that the bag does not determine: out of command, after states '
-            'that the middleware dropped, or from the watchdog at the end'
-        )
-    stamp, torque = commands.stamp[rows], commands.torque[rows]
-    compared = values[number[rows]]
-    found = _compare(recorded.name, stamp, stamp[:1], names, compared, torque, left_out)
-    return found._replace(recorded=values.size) if left_out else found
-
-
-def _compare_series(topic: str, stamp: Stamps, recorded: Series, replayed: Series) -> Comparison:
-    """Compare values with the same name in the samples (N,); NaN between two messages."""
-    shared = [name for name in replayed.names if name in recorded.names]
-    absent = {*replayed.names, *recorded.names}.difference(shared)
-    left_out = [name for name in (*replayed.names, *recorded.names) if name in absent]
-    known = np.isin(recorded.stamp, stamp)
-    sampled = recorded.stamp[known]
-    own = Series(tuple(shared), replayed.stamp, replayed.select(shared)).exact(sampled)
-    values = recorded.select(shared)[known]
-    found = _compare(topic, sampled, stamp[:1], shared, values, own, ', '.join(left_out))
-    return found._replace(recorded=known.size * len(shared))
-
-
-def _compare(
-    topic: str,
-    stamp: Stamps,
-    start: Stamps,
-    names: Sequence[str],
-    recorded: Floats,
-    replayed: Floats,
-    left_out: str,
-) -> Comparison:
-    """Compare tables (N, names) with the stamps (N,), of a run that began at `start` (1,)."""
-    difference = None
-    for k, j in np.argwhere(~_alike(recorded, replayed))[:1]:
-        time = float((stamp[k] - start[0]) * 1e-9)
-        pair = float(recorded[k, j]), float(replayed[k, j])
-        difference = Difference(topic, names[j], int(stamp[k]), time, *pair)
-    return Comparison(topic, recorded.size, recorded.size, difference, left_out)
-
-
-def _alike(recorded: Floats, replayed: Floats) -> NDArray[np.bool_]:
-    """Where the bits are the same, or both are NaN."""
-    bits = np.ascontiguousarray(recorded).view(np.int64)
-    equal = bits == np.ascontiguousarray(replayed).view(np.int64)
-    return np.asarray(equal | (np.isnan(recorded) & np.isnan(replayed)))

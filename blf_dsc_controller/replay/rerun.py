@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The guarded controller on recorded joint states, with every event of its journal.
 
-The journal states how many joint-state messages were processed before an event, and the stamp of
-the last. If the bag holds as many in between, each is processed again. If it holds more, the
-middleware has dropped some (in real time): the telemetry shows which ones the law used; out of
-command all are used, and the torques are compared as long as they match.
+For each message that the controller answered, it published a tracking error with that message's
+stamp: `answers`. An event of the journal states how many torques had been commanded before it.
+Both together give the exact order of messages and events; what was dropped has no answer.
 """
 
 from __future__ import annotations
@@ -12,23 +11,26 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
+from blf_dsc_controller.bags.content import Content
 from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.journal import Event, EventType
-from blf_dsc_controller.messages.topics import FOREVER, TRACKING_ERROR
+from blf_dsc_controller.messages.topics import TRACKING_ERROR
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
-from blf_dsc_controller.replay.comparison import Difference
-from blf_dsc_controller.replay.outputs import Outputs
+from blf_dsc_controller.replay.comparison import Comparer, Difference
 from blf_dsc_controller.run import Floats, Stamps
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.supervisor import Phase, Reason
+from blf_dsc_controller.supervision.supervisor import Reason
 
 _UNREADABLE = frozenset(
     (Reason.BAD_MESSAGE, Reason.JOINT_MISSING, Reason.JOINT_DUPLICATED, Reason.FIELD_MISSING)
 )
+_EXTERNAL = (Reason.STATE_TIMEOUT, Reason.FAILED)
+_BLOCK = 4096  # states in memory
 
 
 class Rerun:
@@ -36,23 +38,26 @@ class Rerun:
 
     Attributes:
         events: replayed events.
-        outputs: replayed samples and torques.
-        passed_over: number of joint states that the law did not use.
+        outputs: replayed outputs, compared with the recorded ones.
+        passed_over: number of joint states that the controller did not answer.
         departure: where the controller departed from the journal, which ends the replay.
         end: any other reason why the replay ended before the bag, or empty.
     """
 
     def __init__(
         self,
+        content: Content,
         config: ControllerConfig,
         states: JointStates,
         errors: Mapping[int, MessageError],
-        sampled: Stamps | None,
+        answers: JointStates | None,
+        *,
+        is_told: bool,
     ) -> None:
         """Start with `config`.
 
-        `errors` maps the number of each unreadable joint state to its error; `sampled` are the
-        stamps [ns] with telemetry, None if there is no telemetry.
+        `errors` maps the number of each unreadable joint state to its error; without `answers`
+        every message is taken as answered. `is_told`: safe torques have answers, too.
         """
         self.events: list[Event] = []
         self.passed_over = 0
@@ -60,162 +65,218 @@ class Rerun:
         self.end = ''
         self._guard = Guard(config, lambda: 0, lambda: 0)
         self._guard.journal.pending.clear()
-        self._states, self._errors = states, errors
-        self._stamps = states.stamp.tolist()
-        self.outputs = Outputs(self._guard, len(self._stamps))
-        self._sampled = None if sampled is None else frozenset(sampled.tolist())
-        lost = np.setdiff1d([] if sampled is None else sampled, states.stamp)
-        self._lost = int(lost[0]) if lost.size else FOREVER
-        self._position = -1  # number of the last joint state handled so far
-        self._messages = 0  # processed by then, according to the journal
+        self._states, self._errors, self._is_told = states, errors, is_told
+        self._values, self._loaded = np.empty((0, 3, 0)), range(0)
+        # All messages in order: row of the state, and its stamp; -1 for unreadable ones.
+        self._stamp = states.stamp
+        self._number: Stamps | None = None
+        self._row: NDArray[np.intp] | None = None
+        if errors:
+            number = np.concatenate([states.number, np.array(list(errors), dtype=np.int64)])
+            order = np.argsort(number, kind='stable')
+            self._number, self._row = number[order], np.where(order < states.size, order, -1)
+            unknown = np.full(len(errors), -1, dtype=np.int64)
+            self._stamp = np.concatenate([states.stamp, unknown])[order]
+        self._answered = None if answers is None else answers.stamp
+        self._gap = _first_gap(answers)
+        self._answer = 0  # number of answers reached
+        self._position = -1  # of the last message processed or passed over
+        self._last = -1  # stamp of the last answer
         self._failed = False
+        self.outputs = Comparer(content, self._guard, answers)
 
-    def run(self, events: Sequence[Event], *, in_step: bool) -> None:
-        """Process the joint states with the events after the configuration, in order.
-
-        `in_step`: the plant waited for each command, so that no state was dropped at the end.
-        """
+    def run(self, events: Sequence[Event]) -> None:
+        """Process the joint states with the events after the configuration, in order."""
         for event in events:
             if event.number != len(self.events) + 1:
                 self.end = 'an event of the journal is not in the bag'
                 return
-            end, is_exact = self._locate(event)
-            self._feed(event, end, is_exact=is_exact)
+            self._approach(event)
+            if not self._is_over:
+                self._repeat(event)
             if self._is_over:
                 return
-            self._repeat(event, is_exact=is_exact)
             self.events.append(event)
-            if self._is_over or event.type is EventType.RELEASE:
+            if event.type is EventType.RELEASE:
                 return
-        self._feed(None, len(self._stamps) - 1, is_exact=in_step)
+            if not self._is_told and event.type in (EventType.STOP, EventType.DEACTIVATE):
+                self.end = 'recorded by an earlier version, which did not say what it used then'
+        while not self._is_over and self._next():
+            pass
 
     @property
     def _is_over(self) -> bool:
         return bool(self.end or self.departure)
 
-    # Between two events.
+    # Messages.
 
-    def _locate(self, event: Event) -> tuple[int, bool]:
-        """Return the number of the last joint state before an event; True if none was dropped."""
-        stamps, processed = self._stamps, event.messages - self._messages
-        self._messages = event.messages
-        end = self._position + processed
-        if processed == 0 or (end < len(stamps) and self._seen(end) == event.stamp):
-            return end, True
-        is_unreadable = _reason(event) in _UNREADABLE
-        for k in range(self._position + 1, len(stamps)):
-            is_it = (k in self._errors) == is_unreadable and self._seen(k) == event.stamp
-            if is_it and (k >= end or stamps[k + 1 : k + 2] != [event.stamp]):
-                return k, False
-        if self.outputs.last >= 0:
-            self.end = f'the state with stamp {event.stamp} ns was received but is not in the bag'
-        return self._position, False
-
-    def _seen(self, k: int) -> int:
-        """Return the stamp of the last readable state up to number k."""
-        while k in self._errors:
-            k -= 1
-        return self._stamps[k] if k >= 0 else -1
-
-    def _feed(self, event: Event | None, end: int, *, is_exact: bool) -> None:
-        """Process the joint states up to number `end`, before an event."""
-        for k in range(self._position + 1, end + 1):
-            if self._is_over:
-                return
-            if k == end and _reason(event) is Reason.FAILED:
-                continue  # nothing shows how far the law got with this state
-            is_certain = event and (is_exact or k == end or self._stamps[k] == event.stamp)
-            if is_certain or self._was_used(k):
-                self._process(k, event, is_exact=is_exact)
-            else:
-                self.passed_over += 1
-        self._position = end
-
-    def _was_used(self, k: int) -> bool:
-        """Return whether the recorded controller processed a state that it may have missed."""
-        stamp = self._stamps[k]
-        if not self._guard.supervisor.uses_states:
-            return True
-        if k in self._errors or stamp == self.outputs.last:
+    def _next(self) -> bool:
+        """Process the message of the next answer; return False if there is none."""
+        if self._guard.journal.pending:  # the controller started or stopped on its own
+            self._report_departure(self._guard.journal.pending[0], None)
             return False
-        is_starting = self._guard.supervisor.phase is Phase.STARTING
-        return not is_starting and (self._sampled is None or stamp in self._sampled)
+        if self._answered is None:
+            if self._position + 1 >= self._stamp.size:
+                return False
+            self._process(self._position + 1)
+            return True
+        if self._answer == self._gap:
+            self.end = f'the recorder missed messages of {TRACKING_ERROR.resolved}'
+        if self._answer >= self._gap or self._answer >= self._answered.size:
+            return False
+        stamp = int(self._answered[self._answer])
+        k = self._find(stamp)
+        if k < 0:
+            self.end = f'the state with stamp {stamp} ns was used but is not in the bag'
+            return False
+        self._answer += 1
+        commands = self._guard.journal.commands
+        self._process(k)
+        while stamp == self._last and self._guard.journal.commands == commands:
+            k = self._find(stamp)  # a repeated stamp is skipped at first
+            if k < 0:
+                break
+            self._process(k)
+        self._last = stamp
+        if self._guard.journal.commands == commands and not self._is_over:
+            self._depart(f'used by the law ({self._guard.supervisor.text})', stamp)
+        return True
 
-    def _process(self, k: int, event: Event | None, *, is_exact: bool) -> None:
-        guard, stamp = self._guard, self._stamps[k]
-        if k in self._errors:
-            torque = guard.reject(self._errors[k])
-            self._command(guard.journal.stamp, torque, is_exact=is_exact)
-        elif guard.supervisor.uses_states and stamp > self._lost:
-            self.end = f'the state with stamp {self._lost} ns was used but is not in the bag'
+    def _find(self, stamp: int) -> int:
+        """Return the next message with a stamp; if it is the last one's, an unreadable one will do.
+
+        Returns -1 if there is none.
+        """
+        for k in range(self._position + 1, self._stamp.size):
+            if self._stamp[k] == stamp or (stamp == self._last and self._stamp[k] < 0):
+                return k
+        return -1
+
+    def _approach(self, event: Event) -> None:
+        """Process the messages before an event, and that which causes it, if one does."""
+        guard = self._guard
+        before = event.commands
+        if event.type is EventType.SILENCE:  # noted after its torques
+            before -= event.content['torques'] - guard.watchdog.torques
+        while guard.journal.commands < before and not self._is_over:
+            if not self._next():
+                self.end = self.end or 'the bag does not say which states were used'
+        while not (_is_own(event) or guard.commanding or guard.supervisor.uses_states):
+            k = self._position + 1
+            if k >= self._stamp.size or self._stamp[k] > event.stamp:
+                break
+            self._process(k)  # nothing was commanded for it
+        if _is_own(event) and not guard.journal.pending and not self._is_over:
+            self._reach(event)
+
+    def _reach(self, event: Event) -> None:
+        """Process the message in which the controller should start or stop."""
+        guard = self._guard
+        if self._answered is None:
+            while self._next() and not guard.journal.pending and not self._is_over:
+                pass
+        elif self._answered[self._answer :][:1] == [event.stamp]:
+            self._next()  # it was answered, at least with a safe torque
         else:
-            is_new = stamp > self.outputs.last and stamp in (self._sampled or ())
-            is_due = guard.supervisor.uses_states and is_new
-            torque = guard.update(stamp, self._states.values[k].ravel())
-            if guard.has_sample:
-                if stamp <= self.outputs.last:
-                    self.end = f'the stamps restart at {stamp} ns'
-                    return
-                self.outputs.add_sample(stamp)
-            self._command(stamp, torque, is_exact=is_exact)
-            if is_due and not guard.has_sample and not _stops_at(event, stamp):
-                self._depart(f'used by the law ({guard.supervisor.text})', stamp)
-        pending = guard.journal.pending
-        if pending and _key(pending[0]) != _key(event):
-            self._report_departure(pending[0], event)
+            k = self._find_error() if _reason(event) in _UNREADABLE else self._find(event.stamp)
+            if k >= 0:
+                self._process(k)
 
-    def _command(self, stamp: int, torque: Floats | None, *, is_exact: bool) -> None:
+    def _find_error(self) -> int:
+        """Return the next unreadable message, -1 if there is none."""
+        for k in range(self._position + 1, self._stamp.size):
+            if self._stamp[k] < 0:
+                return k
+        return -1
+
+    def _process(self, k: int) -> None:
+        guard, outputs, stamp = self._guard, self.outputs, int(self._stamp[k])
+        self.passed_over += k - self._position - 1
+        self._position = k
+        row = k if self._row is None else int(self._row[k])
+        if row < 0 and self._number is not None:
+            torque = guard.reject(self._errors[int(self._number[k])])
+            stamp = guard.journal.stamp
+        else:
+            torque = guard.update(stamp, self._measurement(row))
+        if guard.has_sample:
+            if stamp <= outputs.last:
+                self.end = f'the stamps restart at {stamp} ns'
+                return
+            outputs.add_sample(stamp)
+        self._command(stamp, torque, is_answer=True)
+
+    def _measurement(self, row: int) -> Floats:
+        if row not in self._loaded:
+            self._loaded = range(row, min(row + _BLOCK, self._states.size))
+            rows = slice(self._loaded.start, self._loaded.stop)
+            self._values = np.stack([self._states.field(k, rows) for k in range(3)], axis=1)
+        return np.ravel(self._values[row - self._loaded.start])
+
+    def _command(self, stamp: int, torque: Floats | None, *, is_answer: bool = False) -> None:
         if torque is not None:
-            self.outputs.add_command(stamp, torque, is_exact=is_exact and not self._failed)
+            self.outputs.add_command(
+                stamp, torque, is_answer=is_answer, is_certain=not self._failed
+            )
 
     # Events.
 
-    def _repeat(self, event: Event, *, is_exact: bool) -> None:
+    def _repeat(self, event: Event) -> None:
         """Repeat an event, or check that the controller has produced it itself."""
         pending = self._guard.journal.pending
-        is_own = event.type is EventType.START or (
-            event.type is EventType.STOP
-            and _reason(event) not in (Reason.STATE_TIMEOUT, Reason.FAILED)
-        )
-        if not is_own and pending:
+        if not _is_own(event) and pending:
             self._report_departure(pending[0], event)
             return
         try:
-            self._act(event, is_exact=is_exact)
+            self._act(event)
         except TrajectoryError as error:
             self._depart(f'trajectory accepted ({error})', event.stamp)
             return
         if not pending or _key(pending[0]) != _key(event):
+            if pending and _is_own(event):
+                self._report_departure(pending[0], event)
+                return
             is_stop = event.type is EventType.STOP
             self._depart(f'{event.type}: {_reason(event)}' if is_stop else event.type, event.stamp)
             return
-        self.outputs.count_from(pending.popleft().commands, event.commands)
+        pending.popleft()
 
-    def _act(self, event: Event, *, is_exact: bool) -> None:
+    def _act(self, event: Event) -> None:
         guard, content = self._guard, event.content
-        if event.type in (EventType.ACTIVATE, EventType.RESET):
+        if event.type is EventType.STOP:
+            self._stop(event)
+        elif event.type in (EventType.ACTIVATE, EventType.RESET):
             self._failed = False
             (guard.activate if event.type is EventType.ACTIVATE else guard.reset)()
         elif event.type is EventType.DEACTIVATE:
             guard.deactivate()
         elif event.type is EventType.RELEASE:
-            self._command(event.stamp, guard.release(), is_exact=is_exact)
+            torque = guard.release()
+            guard.journal.commands += torque is not None  # after the event's count
+            self._command(event.stamp, torque)
         elif event.type is EventType.TRAJECTORY:
             points = tuple(TrajectoryPoint(**point) for point in content['points'])
             trajectory = Trajectory(tuple(content['joints']), points, content['begin'])
             guard.adopt(guard.plan(trajectory, content['at']))
         elif event.type is EventType.PARAMETERS:
             guard.retune(change(guard.config, content['parameters']))
+            if guard.last_stamp >= 0:
+                bound = guard.controller.bound_at(guard.time)
+                self.outputs.add_bound(guard.journal.stamp, bound)
         elif event.type is EventType.SILENCE:
             while guard.watchdog.torques < content['torques']:
-                self._command(event.stamp, guard.time_out(''), is_exact=True)
+                self._command(event.stamp, guard.time_out(''))
             guard.end_silence()
-        elif _reason(event) is Reason.STATE_TIMEOUT:
-            self._command(event.stamp, guard.time_out(content['text']), is_exact=True)
+
+    def _stop(self, event: Event) -> None:
+        """Repeat a stop that no message caused."""
+        guard, text = self._guard, event.content['text']
+        if _reason(event) is Reason.STATE_TIMEOUT:
+            self._command(event.stamp, guard.time_out(text))
         elif _reason(event) is Reason.FAILED:
-            self._failed = True
             guard.journal.stamp = event.stamp
-            self._command(event.stamp, guard.fail(content['text']), is_exact=True)
+            self._command(event.stamp, guard.fail(text))
+            self._failed = True  # nothing shows how far the law got
 
     def _report_departure(self, own: Event, event: Event | None) -> None:
         """Note that the controller started or stopped differently from the recorded one."""
@@ -225,9 +286,21 @@ class Rerun:
 
     def _depart(self, what: str, stamp: int) -> None:
         if self.departure is None:
-            begin = int(self.outputs.stamp[0]) if self.outputs.last >= 0 else stamp
-            time = (stamp - begin) * 1e-9
+            time = (stamp - max(self.outputs.first, 0)) * 1e-9
             self.departure = Difference(TRACKING_ERROR.resolved, what, stamp, time, 1.0, 0.0)
+
+
+def _first_gap(answers: JointStates | None) -> int:
+    """Return the number of answers before the first that the recorder missed, by their sequence."""
+    sequence = np.zeros(0, np.int64) if answers is None else answers.sequence
+    gaps = np.flatnonzero(np.diff(sequence) > 1)
+    return int(gaps[0]) + 1 if gaps.size and sequence[0] > 0 else sequence.size + 1
+
+
+def _is_own(event: Event) -> bool:
+    """Whether the controller decides on an event itself, because of a message."""
+    is_stop = event.type is EventType.STOP
+    return event.type is EventType.START or (is_stop and _reason(event) not in _EXTERNAL)
 
 
 def _reason(event: Event | None) -> Reason:

@@ -11,17 +11,14 @@ import numpy as np
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
-from blf_dsc_controller.bags.context import Context, read_context
-from blf_dsc_controller.bags.topic_messages import JointStates, UnreadableMessageError
+from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.cdr import MessageError
-from blf_dsc_controller.messages.journal import Event, EventType, decode
-from blf_dsc_controller.messages.topics import JOINT_STATES, JOURNAL
-from blf_dsc_controller.replay.comparison import Comparison, Difference, compare
+from blf_dsc_controller.messages.journal import FORMAT, Event, EventType
+from blf_dsc_controller.messages.topics import FOREVER, JOINT_STATES, JOURNAL, TRACKING_ERROR
+from blf_dsc_controller.replay.comparison import Comparison, Difference, not_compared
 from blf_dsc_controller.replay.rerun import Rerun
-from blf_dsc_controller.replay.states import sampled_stamps
-from blf_dsc_controller.run import Stamps
 
 _TURNS = (EventType.ACTIVATE, EventType.DEACTIVATE, EventType.RESET, EventType.STOP)
 
@@ -29,9 +26,11 @@ _TURNS = (EventType.ACTIVATE, EventType.DEACTIVATE, EventType.RESET, EventType.S
 class Verification(NamedTuple):
     """Result of a verification."""
 
-    stamp: Stamps  #: (N,) ns, of the states that the law used
-    passed_over: int  #: number of states that it did not use
-    comparisons: tuple[Comparison, ...]  #: one for each topic of the controller
+    samples: int  #: number of states that the law used
+    duration: float  #: s, from the first of them to the last
+    passed_over: int  #: number of states that the controller did not answer
+    comparisons: tuple[Comparison, ...]  #: one for each topic of the controller with numbers
+    not_compared: tuple[str, ...]  #: topics with text
     events: tuple[Event, ...]  #: replayed events
     safe_torques: int  #: number of replayed torques that are not the law's
     remarks: tuple[str, ...]  #: limitations of the result
@@ -40,21 +39,21 @@ class Verification(NamedTuple):
     @property
     def compared(self) -> float:
         """Fraction of the controller's outputs in the bag that could be compared."""
-        recorded = sum(one.recorded for one in self.comparisons)
-        return sum(one.values for one in self.comparisons) / recorded if recorded else 0.0
+        recorded = sum(found.recorded for found in self.comparisons)
+        return sum(found.values for found in self.comparisons) / recorded if recorded else 0.0
 
     @property
     def turns(self) -> list[str]:
         """Activations, deactivations, resets and safe stops in order."""
         return [
-            f'safe stop ({one.content["reason"]})' if one.type is EventType.STOP else one.type
-            for one in self.events
-            if one.type in _TURNS
+            f'safe stop ({event.content["reason"]})' if event.type is EventType.STOP else event.type
+            for event in self.events
+            if event.type in _TURNS
         ]
 
 
 def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verification:
-    """Replay a bag and compare every message of the controller bit for bit.
+    """Replay a bag and compare every number of the controller bit for bit.
 
     `namespace` is that of the robot, if the bag holds several; `names` maps topics and joints that
     have other names in the bag.
@@ -64,68 +63,65 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
         BlfDscError: the bag holds no journal or nothing to compare, begins after the controller,
             or cannot be read.
     """
-    context, content = read_context(path), read_content(path, namespace, names)
-    events, content, end = _events(content)
-    recorded = events[0].content['parameters']
-    config = context.build_config(recorded, JOURNAL.resolved)
-    newer = sorted(flatten(config).keys() - recorded.keys())
-    states, errors = _states(content, names.joints_of(config.joints))
-    start = next((one.stamp for one in events if one.type is EventType.START), None)
+    content = read_content(path, namespace, names)
+    events, until, end = _events(content)
+    config = content.controller_config()
+    newer = sorted(flatten(config).keys() - events[0].content['parameters'].keys())
+    errors: dict[int, MessageError] = {}
+    recorded = content.topics[JOINT_STATES]
+    states = recorded.joint_states(names.joints_of(config.joints), ('position',), errors)
+    start = next((event.stamp for event in events if event.type is EventType.START), None)
     if start is not None and start not in states.stamp:
         reason = (
             f'{path} does not hold the first state that the controller used, with the stamp '
             f'{start} ns, so its outputs cannot be reproduced: start the recorder first'
         )
         raise BlfDscError(reason)
-    run = Rerun(config, states, errors, sampled_stamps(content))
-    run.run(events[1:], in_step=context.facts.get('clock') == 'lockstep')
-    gappy = [topic for topic in content.message_counts if context.missed(topic)]
-    comparisons = tuple(compare(content, config, run.outputs, gappy))
-    if not (run.departure or any(one.values for one in comparisons)):
+    messages = content.topics.get(TRACKING_ERROR)
+    answers = None
+    if messages is not None:
+        answers = _before(messages.joint_states(config.joints, ()), until)
+    is_told = events[0].content.get('format', 1) >= FORMAT
+    run = Rerun(content, config, _before(states, until), errors, answers, is_told=is_told)
+    run.run(events[1:])
+    comparisons = tuple(run.outputs.finish())
+    if not (run.departure or any(found.values for found in comparisons)):
         raise _nothing_to_compare(content)
-    found = [run.departure, *(one.difference for one in comparisons)]
+    differences = [run.departure, *(found.difference for found in comparisons)]
     return Verification(
-        run.outputs.stamp,
+        run.outputs.count,
+        run.outputs.duration,
         run.passed_over,
         comparisons,
+        tuple(not_compared(content)),
         tuple(run.events),
-        int(np.count_nonzero(~run.outputs.commands.of_law)),
-        tuple(_remarks(context, run.end or end, newer)),
-        min((one for one in found if one), key=lambda one: one.stamp, default=None),
+        run.outputs.safe_torques,
+        tuple(_remarks(content, run.end or end, newer)),
+        min((found for found in differences if found), key=lambda found: found.stamp, default=None),
     )
 
 
-def _events(content: Content) -> tuple[list[Event], Content, str]:
-    """Return the events of a bag's first controller, the content up to the next, and a remark."""
-    recorded = content.topics.get(JOURNAL)
-    if recorded is None:
+def _events(content: Content) -> tuple[list[Event], int, str]:
+    """Return the events of a bag's first controller, when the next begins [ns], and a remark."""
+    if JOURNAL not in content.topics:
         raise _nothing_to_compare(content)
     events: list[Event] = []
-    for received, raw in zip(recorded.received, recorded.raw, strict=True):
-        event = decode(raw)
+    for received, event in content.events:
         if events and event.type is EventType.CONFIGURE:
-            return events, content.before(received), 'another controller was started'
+            return events, received, 'another controller was started'
         events.append(event)
-    if events[0].type is not EventType.CONFIGURE:
+    if not events or events[0].type is not EventType.CONFIGURE:
         raise BlfDscError(
-            f'{content.path} does not hold the beginning of {recorded.name}: start the recorder '
-            'first'
+            f'{content.path} does not hold the beginning of {content.topics[JOURNAL].name}: start '
+            'the recorder first'
         )
-    return events, content, ''
+    return events, FOREVER, ''
 
 
-def _states(content: Content, joints: Sequence[str]) -> tuple[JointStates, dict[int, MessageError]]:
-    """Return all joint states, and the errors of the unreadable ones by number.
-
-    Raises:
-        UnreadableMessageError: none of them can be read.
-    """
-    recorded = content.topics[JOINT_STATES]
-    errors: dict[int, MessageError] = {}
-    states = recorded.joint_states(joints, ('position',), errors)
-    if len(errors) == len(recorded.received):
-        raise UnreadableMessageError(recorded.name, 0, errors[0])
-    return states, errors
+def _before(states: JointStates, until: int) -> JointStates:
+    """Return the messages received before a time [ns]."""
+    rows = np.flatnonzero(states.received < until)
+    return states if rows.size == states.size else states.select(rows)
 
 
 def _nothing_to_compare(content: Content) -> BlfDscError:
@@ -137,14 +133,14 @@ def _nothing_to_compare(content: Content) -> BlfDscError:
     )
 
 
-def _remarks(context: Context, end: str, newer: Sequence[str]) -> Iterator[str]:
+def _remarks(content: Content, end: str, newer: Sequence[str]) -> Iterator[str]:
     if end:
         yield f'{end}: the replay ends there'
-    for topic, what in context.losses.items():
+    for topic, what in content.losses.items():
         yield f'the recorder missed messages of {topic}: {what}'
-    if context.version != __version__:
+    if content.version != __version__:
         yield (
-            f'recorded by version {context.version or "unknown"} and replayed by {__version__}: '
+            f'recorded by version {content.version or "unknown"} and replayed by {__version__}: '
             'differences may come from the software'
         )
     if newer:

@@ -6,25 +6,27 @@ Open loop: the arm moved under the recorded torques, so learning uses those as t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.bags.content import NO_NAMES, NameMap, read_content
+from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
+from blf_dsc_controller.bags.reader import one_run
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.bags.torque import applied_torque
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.messages.samples import columns_of, run_of
-from blf_dsc_controller.messages.topics import JOINT_STATES
-from blf_dsc_controller.replay.states import law_states
+from blf_dsc_controller.messages.topics import JOINT_STATES, TRACKING_ERROR
 from blf_dsc_controller.run import Floats, Run
 from blf_dsc_controller.supervision.checks import Velocity
 
 _NANO = 1e-9
+_BLOCK = 65_536  # states checked at once
 
 
 class WhatIf(NamedTuple):
@@ -65,19 +67,43 @@ def read_states(
     Raises:
         BlfDscError: the bag cannot be read, or does not hold the applied torques.
     """
-    joints = names.joints_of(config.joints)
-    content = read_content(path, namespace, names).of_joints(joints)
-    every = law_states(content, joints)
-    finite = every.select(np.flatnonzero(np.isfinite(every.values[:, :2]).all(axis=(1, 2))))
-    applied, source = applied_torque(content, finite)
+    content = read_content(path, namespace, names)
+    every = law_states(content, names.joints_of(config.joints))
+    finite = np.concatenate([
+        np.isfinite(every.field(0, rows) + every.field(1, rows)).all(axis=1)
+        for rows in (slice(k, k + _BLOCK) for k in range(0, every.size, _BLOCK))
+    ])  # fmt: skip
+    states = every.select(np.flatnonzero(finite))
+    torque = applied_torque(content, states)
+    applied = torque.at()
     before = np.concatenate((applied[:1], applied[:-1]))
     known = np.flatnonzero(np.isfinite(before).all(axis=1))
-    states = finite.select(known)
-    if not states.stamp.size:
+    if not known.size:
         raise BagError(f'{path} holds no joint state that is finite and has a known torque')
-    left_out = every.stamp.size - states.stamp.size
-    is_measured = source == f'effort of {content.topics[JOINT_STATES].name}'
-    return RecordedStates(states, applied[known], source, left_out, is_measured)
+    left_out = every.size - known.size
+    is_measured = torque.source == f'effort of {content.topics[JOINT_STATES].name}'
+    return RecordedStates(
+        states.select(known), applied[known], torque.source, left_out, is_measured
+    )
+
+
+def law_states(content: Content, joints: Sequence[str]) -> JointStates:
+    """Return the states that the law used, according to its telemetry; all if there is none.
+
+    `joints` are the names in the bag. Raises BagError as `one_run`.
+    """
+    states, _, _ = one_run(content, joints, ('position', 'velocity'))
+    errors = content.topics.get(TRACKING_ERROR)
+    if errors is None:
+        return states
+    telemetry = errors.joint_states(errors.joint_names(), ())
+    used = telemetry.stamp[np.isfinite(telemetry.field(0)).any(axis=1)]
+    stamp = states.stamp
+    lost = np.setdiff1d(used, stamp)
+    kept = np.isin(stamp, used)
+    if lost.size:
+        kept &= stamp < lost[0]
+    return states.select(np.flatnonzero(kept))
 
 
 def what_if(

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,11 +11,12 @@ import numpy as np
 
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.params_file import dumps
 from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.journal import encode_change
 from blf_dsc_controller.messages.telemetry import (
     DECIMATION,
     ControllerTelemetry,
@@ -39,22 +40,23 @@ def write_bag(
     `compression` is `none` or `zstd`. Raises BagError if `path` exists already.
     """
     with BagWriter(path, compression=compression, flush_interval=None) as bag:
-        nodes: dict[str, object] = {topics.CONTROLLER: config}
-        if plant is not None:
-            nodes[topics.PLANT] = plant
-        bag.configure(dumps(nodes))
-        bag.note({'clock': 'offline'})
         handles: dict[topics.Topic, int] = {}
-        for stamp, (topic, raw) in _messages(record, config):
+        sent: Counter[topics.Topic] = Counter()
+
+        def write(stamp: int, topic: topics.Topic, raw: bytes) -> None:
             if topic not in handles:
                 handles[topic] = bag.add_topic(topic.resolved, topic.type, [topic.offered])
-            bag.write(handles[topic], raw, stamp)
+            sent[topic] += 1
+            bag.write(handles[topic], raw, stamp, sequence=sent[topic])
+
+        if plant is not None:
+            write(START, topics.CHANGES, encode_change(START, flatten(plant), configured=True))
+        for stamp, message in _messages(record, config):
+            write(stamp, *message)
         rejected = rejected_columns(record.controller, estimate_names(config))
         if rejected:
             stamp = START + int(record.stamps[-1])
-            topic = topics.DIAGNOSTICS
-            handle = bag.add_topic(topic.resolved, topic.type, [topic.offered])
-            bag.write(handle, encode_rejected_columns(stamp, rejected), stamp)
+            write(stamp, topics.DIAGNOSTICS, encode_rejected_columns(stamp, rejected))
 
 
 def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, Message]]:

@@ -12,7 +12,6 @@ import numpy as np
 
 from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
-from blf_dsc_controller.bags.context import read_context
 from blf_dsc_controller.messages.topics import LAMBDA_MIN
 from blf_dsc_controller.run import Floats, Run, Series, Stamps
 from blf_dsc_controller.view.arm import arm_of
@@ -39,7 +38,7 @@ class BagPlayer:
         self, page: Page, path: Path, namespace: str = '', names: NameMap = NO_NAMES
     ) -> None:
         (bag,) = read_bags([path], namespace, names)
-        config = read_context(path).controller_config()
+        config = bag.content.controller_config()
         run = bag.run
         estimates = estimates_of(config)
         self.moments = moments(run, tuple(estimates))

@@ -27,7 +27,6 @@ from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.messages.journal import Event, EventType, decode
 from blf_dsc_controller.messages.topics import Quality, Topic
 from blf_dsc_controller.nodes.endpoints import create_steady_timer, message_class
-from blf_dsc_controller.nodes.parameter_client import ParameterClient, Values
 from blf_dsc_controller.nodes.parameters import declare
 from blf_dsc_controller.nodes.process import PlainNode, run
 from blf_dsc_controller.nodes.raw_subscriptions import RawMessage, RawSubscriptions
@@ -80,8 +79,6 @@ class ViewNode(PlainNode):
         self._kept = self._subscribe(_EVENTS)
         prefix = self.get_namespace().rstrip('/')
         self._requests = Requests(self, self._newest.node, prefix, self.page.notify, self._restore)
-        self._reader = ParameterClient(self._meet_plant)
-        self._reader.request(self._newest.node, f'{prefix}/{topics.PLANT}')
         self.get_logger().info(f'open {self.page.url}')
         if config.host not in LOCAL:
             self.get_logger().warning(open_to_others(config.host))
@@ -103,7 +100,6 @@ class ViewNode(PlainNode):
 
     def update(self) -> None:
         """Process new messages, carry out requests, and draw."""
-        self._reader.poll()
         for message in self._kept.take():
             self._note(_EVENTS[message.handle], message.raw)
         self._requests.update(self.past[-1].time if self.past else 0.0)
@@ -134,10 +130,13 @@ class ViewNode(PlainNode):
         if topic is topics.STATE:
             self._state = _LEVELS[content.level[0]], content.message
         elif topic is topics.CHANGES:
-            one = json.loads(content.data)
-            self._plant |= one['parameters']
-            for name, value in one['parameters'].items():
-                self.page.event(self._time(one['stamp']), name, f'{value}')
+            said = json.loads(content.data)
+            if said.get('configured'):
+                self._meet_plant(said['parameters'])
+                return
+            self._plant |= said['parameters']
+            for name, value in said['parameters'].items():
+                self.page.event(self._time(said['stamp']), name, f'{value}')
         else:
             for status in content.status:
                 self._note_rejection({pair.key: pair.value for pair in status.values})
@@ -176,7 +175,7 @@ class ViewNode(PlainNode):
         self._confidence: Confidence | None = None
         self._draw_all()
 
-    def _meet_plant(self, _: str, values: Values) -> None:
+    def _meet_plant(self, values: Mapping[str, Any]) -> None:
         self._plant, self._noted = dict(values), -1.0
         self._requests.meet_plant(values)
         self._draw_all()
