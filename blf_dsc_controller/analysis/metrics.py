@@ -22,7 +22,7 @@ from blf_dsc_controller.messages.topics import (
     POSITION,
     VELOCITY,
 )
-from blf_dsc_controller.run import Floats, Regressor, Run
+from blf_dsc_controller.run import Floats, Regressor, Run, Series
 
 MOMENTS = (5, 10, 20, 40, 60)
 """Times at which the parameter error is reported [s]."""
@@ -30,6 +30,8 @@ MOMENTS = (5, 10, 20, 40, 60)
 _LEARNED = 0.01
 _POSTURES = 400  # of the reference, at which torques are compared
 _TAIL = 10.0  # s
+_MOST = 100_000  # samples of the estimates, evenly spaced
+_BLOCK = 8192
 _OTHERS = (LAMBDA_MIN, LATCHED, MODEL_CHANGES, COMPUTE_TIME)
 _NO_PARAMETERS = (*COLUMNS, DISTURBANCE, POSITION, VELOCITY, *_OTHERS)
 
@@ -49,16 +51,26 @@ class Estimates:
     @property
     def relative_error(self) -> Floats | None:
         """|P^ - P| / |P|, (m,); of the torques H P^ and H P if P has mixed units."""
+        R: Any = None
         if self.base is not None and self.torques is not None:
             true, rows = self.base
-            R: Any = np.linalg.qr(np.hstack((self.torques, rows)), 'r')
-            off, size = np.hstack((self.estimate, -true)) @ R.T, true @ R[:, len(self.names) :].T
+            R = np.linalg.qr(np.hstack((self.torques, rows)), 'r')
         elif self.true is not None:
-            off, size = self.estimate - self.true, self.true
+            true = self.true
         else:
             return None
-        with np.errstate(invalid='ignore'):  # no motion, no torques: unknown
-            return np.asarray(np.linalg.norm(off, axis=1) / np.linalg.norm(size, axis=1))
+        found = np.empty(self.time.size)
+        for begin in range(0, self.time.size, _BLOCK):
+            some = slice(begin, begin + _BLOCK)
+            off, size = self.estimate[some], true[some]
+            if R is None:
+                off = off - size
+            else:
+                off = np.hstack((off, -size)) @ R.T
+                size = size @ R[:, len(self.names) :].T
+            with np.errstate(invalid='ignore'):  # no motion, no torques: unknown
+                found[some] = np.linalg.norm(off, axis=1) / np.linalg.norm(size, axis=1)
+        return found
 
     @property
     def is_known(self) -> bool:
@@ -74,8 +86,11 @@ def estimates_of(run: Run) -> Estimates | None:
     """
     if run.learning is None:
         return None
-    names, at = _parameters(run.learning.names), run.time_of(run.learning.stamp)
-    estimate, truth, arm = run.learning.select(names), run.truth, run.arm
+    names, rows = _parameters(run.learning.names), _samples(run.learning)
+    columns = np.array([run.learning.names.index(name) for name in names], np.intp)
+    stamp = run.learning.stamp[rows]
+    at, estimate = run.time_of(stamp), run.learning.at(rows, columns)
+    truth, arm = run.truth, run.arm
     is_known = arm is not None and _parameters(arm.units) == names
     torques = _torques(run, arm.regressor) if arm and is_known else None
     theirs = () if truth is None else _parameters(truth.names)
@@ -83,7 +98,7 @@ def estimates_of(run: Run) -> Estimates | None:
     def true_of(names: Sequence[str]) -> Floats | None:
         if truth is None or run.learning is None or set(names) != set(theirs):
             return None
-        return truth.held(run.learning.stamp)[:, [truth.names.index(name) for name in names]]
+        return truth.held(stamp)[:, [truth.names.index(name) for name in names]]
 
     true, base = true_of(names), None
     if true is not None and torques is not None:
@@ -93,6 +108,12 @@ def estimates_of(run: Run) -> Estimates | None:
         base = None if P is None else (P, _torques(run, arm.base[1]))
     unlike = theirs if true is None and base is None else ()
     return Estimates(names, at, estimate, true, unlike, torques, base)
+
+
+def _samples(learning: Series) -> slice:
+    """Return the rows of what was learned that are looked at: all, if the run is not long."""
+    step = -(-learning.stamp.size // _MOST)
+    return slice((learning.stamp.size - 1) % step, None, step)
 
 
 def _torques(run: Run, regressor: Regressor) -> Floats:
@@ -197,7 +218,6 @@ class Metrics:
 
 def measure(run: Run) -> Metrics:
     """Compute the metrics of a run."""
-    error, torque = run.error, run.torque
     step = float(run.time[1]) if run.stamp.size > 1 else math.nan
     violation, joint = first_violation(run)
     latched = latch_time(run)
@@ -211,15 +231,15 @@ def measure(run: Run) -> Metrics:
         learning = _at_moments(at, learned), float(learned[-1]), tail, _settled(at, learned)
     n = len(run.joints)
     return Metrics(
-        _columns(_peak, error, n),
-        _columns(rms, error, n),
+        _columns(_peak, run.error, n),
+        _columns(rms, run.error, n),
         _columns(_least, run.bound, n),
         _columns(_peak, run.bound, n),
-        _columns(_peak, torque, n),
-        _columns(rms, torque, n),
+        _columns(_peak, run.torque, n),
+        _columns(rms, run.torque, n),
         _columns(_least, run.torque_limit, n),
-        tuple(change / step for change in _columns(rms, np.diff(torque, axis=0), n)),
-        math.nan if error is None or run.bound is None else _peak(error / run.bound),
+        tuple(change / step for change in _columns(_rms_change, run.torque, n)),
+        _largest_ratio(run),
         violation,
         joint,
         math.nan if latched is None else latched,
@@ -227,11 +247,24 @@ def measure(run: Run) -> Metrics:
     )
 
 
+def _largest_ratio(run: Run) -> float:
+    """Return the largest |xi1| / k_c; NaN if it is unknown."""
+    error, bound = run.error, run.bound
+    if error is None or bound is None:
+        return math.nan
+    ratios = [_peak(error[:, i] / bound[:, i]) for i in range(len(run.joints))]
+    return float(np.fmax.reduce(ratios))
+
+
 def rms(values: Floats) -> float:
     """Return the root mean square of the known values."""
     known = values[np.isfinite(values)]
     with np.errstate(over='ignore'):  # a bag may hold 1e308: the root is infinite then
         return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
+
+
+def _rms_change(values: Floats) -> float:
+    return rms(np.diff(values))
 
 
 def _columns(reduce: Callable[[Floats], float], values: Floats | None, n: int) -> tuple[float, ...]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from blf_dsc_controller.analysis.metrics import (
     true_change_times,
 )
 from blf_dsc_controller.analysis.style import ALARM, INK, MUTED
-from blf_dsc_controller.analysis.thinning import drawable
+from blf_dsc_controller.analysis.thinning import drawable, envelope
 from blf_dsc_controller.messages.topics import (
     COMPUTE_TIME,
     DISTURBANCE,
@@ -48,6 +49,7 @@ _LEAST = 1e-12  # J, the smallest value on a logarithmic axis
 _ROOM = 1.2  # limit of an axis as a multiple of the largest value
 _LEAST_ERROR = 1e-5  # %
 _PIECES = 300  # of a run, each with its largest error
+_LONG = 200_000  # samples
 
 
 class Line(NamedTuple):
@@ -98,7 +100,7 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
         changes = true_change_times(run)
         changed = dict.fromkeys(_CHANGED, 'the arm changes')
         stops = list(_stops(run))
-        for panel in (*_motion(run), *_learning(run), *_monitors(run), *_timing(run)):
+        for panel in chain(_motion(run), _learning(run), _monitors(run), _timing(run)):
             before = found.get((panel.group, panel.title), replace(panel, lines=(), marks=()))
             marks = latch if panel.group in _LEARNING else panel.marks
             marks = (*marks, *(stops if panel.group in _STOPPED else ()))
@@ -107,13 +109,24 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
                 marks = (*marks, *(Mark(*one, INK) for one in zip(changes, texts, strict=False)))
             found[panel.group, panel.title] = replace(
                 before,
-                lines=(*before.lines, *(line._replace(run=k) for line in panel.lines)),
+                lines=(
+                    *before.lines,
+                    *(_kept(panel, line)._replace(run=k) for line in panel.lines),
+                ),
                 marks=(*before.marks, *(mark._replace(run=k) for mark in marks)),
                 note=panel.note if len(runs) == 1 else '',
                 span=panel.span if len(runs) == 1 else 0.0,
             )
     drawn = [panel for panel in found.values() if panel.lines]
     return sorted(drawn, key=lambda panel: GROUPS.index(panel.group))
+
+
+def _kept(panel: Panel, line: Line) -> Line:
+    """Return a line that does not hold the memory of a long run, with its peaks."""
+    if panel.histogram or line.values.size <= _LONG:
+        return line
+    time, values = envelope(line.time, drawable(line.values), _LONG // 10)
+    return line._replace(time=time, values=values)
 
 
 def _stops(run: Run) -> Iterator[Mark]:
@@ -275,10 +288,15 @@ def _monitors(run: Run) -> Iterator[Panel]:
     if run.monitor is None:
         return
     if run.error is not None and run.bound is not None:
-        distance = 1e3 * (run.bound - np.abs(run.error))
+        distance = np.abs(run.error)
+        np.subtract(run.bound, distance, out=distance)
+        distance *= 1e3
         lines = [Line(joint, run.time, distance[:, i]) for i, joint in enumerate(run.joints)]
         lines.append(Line('bound', run.time, np.zeros_like(run.time), ALARM))
-        note, symbol = f'minimum {np.nanmin(distance):.3g}', r'$k_c - |\xi_1|$ [mrad]'
+        note, symbol = (
+            f'minimum {np.fmin.reduce(distance, axis=None):.3g}',
+            r'$k_c - |\xi_1|$ [mrad]',
+        )
         yield Panel('Monitors', 'distance to bound', 'mrad', tuple(lines), note, symbol)
     if LYAPUNOV_TERMS[0] in run.monitor.names:
         yield from _lyapunov(run, run.monitor)

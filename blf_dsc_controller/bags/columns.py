@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 BLOCK = 4096
 """Rows that are written at once, each column in one piece."""
 
+_PART = 16 * BLOCK  # rows in memory at once, if some of them are chosen
+
 Rows: TypeAlias = 'slice | NDArray[np.intp]'
 ALL = slice(None)
 
@@ -50,13 +52,15 @@ class Columns:
         """Return these columns and rows (m, number of columns) as an array of its own."""
         if not isinstance(rows, slice):
             found = np.empty((rows.size, columns.size), np.int64)
-            for begin in range(0, len(self), 64 * BLOCK):  # so that the file is mapped in parts
-                chosen = np.flatnonzero((rows >= begin) & (rows < begin + 64 * BLOCK))
+            for begin in range(0, len(self), _PART):
+                chosen = np.flatnonzero((rows >= begin) & (rows < begin + _PART))
                 if chosen.size:
-                    part = self.read(columns, slice(begin, begin + 64 * BLOCK))
+                    part = self.read(columns, slice(begin, begin + _PART))
                     found[chosen] = part[rows[chosen] - begin]
             return found
         first, last, step = rows.indices(len(self))
+        if step > 1:
+            return self.read(columns, np.arange(first, last, step))
         found = np.empty((max(last - first, 0), columns.size), np.int64)
         for number in range(first // BLOCK, -(-last // BLOCK)):
             begin = number * BLOCK
@@ -69,4 +73,4 @@ class Columns:
                     offset = 8 * (BLOCK * (number * self.width + column) + within.start)
                     raw = os.pread(self._file.fileno(), 8 * target.shape[0], offset)
                     target[:, k] = np.frombuffer(raw, np.int64)
-        return found[::step]
+        return found
