@@ -18,7 +18,6 @@ from blf_dsc_controller.arms.model import arm_model
 from blf_dsc_controller.arms.planar_chain import PlanarChain
 from blf_dsc_controller.arms.two_link import TwoLink
 
-STATES = range(20)
 CLOSE = {'rtol': 0.0, 'atol': 1e-9}
 
 
@@ -57,71 +56,64 @@ def momentum_regressor(q, dq):
     return Yp, Yr
 
 
-@pytest.fixture(params=STATES)
-def random(request):
-    return np.random.default_rng(request.param)
+def random_states():
+    """P, q [rad], dq [rad/s], with random parameters so that every term counts; the generator."""
+    for random in map(np.random.default_rng, range(20)):
+        P, q, dq = random.normal(size=3), *random.uniform(-1.0, 1.0, (2, 2))
+        yield P, np.pi * q, 3.0 * dq, random
 
 
-@pytest.fixture
-def state(random):
-    """P, q [rad], dq [rad/s], with random parameters so that every term counts."""
-    return random.normal(size=3), random.uniform(-np.pi, np.pi, 2), random.uniform(-3.0, 3.0, 2)
+def test_regressor_times_parameters_gives_the_dynamics():
+    for P, q, dq, random in random_states():
+        v, a = random.uniform(-5.0, 5.0, (2, 2))
+        H = filled(MODEL.regressor, (2, 3), q, dq, v, a)
+        torque = inertia(P, q) @ a + coriolis(P, q, dq) @ v + gravity(P, q)
+        np.testing.assert_allclose(H @ P, torque, rtol=0.0, atol=1e-12)
 
 
-def test_regressor_times_parameters_gives_the_dynamics(state, random):
-    P, q, dq = state
-    v, a = random.uniform(-5.0, 5.0, (2, 2))
-    H = filled(MODEL.regressor, (2, 3), q, dq, v, a)
-
-    np.testing.assert_allclose(
-        H @ P, inertia(P, q) @ a + coriolis(P, q, dq) @ v + gravity(P, q), rtol=0.0, atol=1e-12
-    )
+def test_momentum_regressors_times_parameters_give_momentum_and_rest():
+    for P, q, dq, _ in random_states():
+        Yp, Yr = momentum_regressor(q, dq)
+        rest = gravity(P, q) - coriolis(P, q, dq).T @ dq
+        np.testing.assert_allclose(Yp @ P, inertia(P, q) @ dq, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(Yr @ P, rest, rtol=0.0, atol=1e-12)
 
 
-def test_momentum_regressors_times_parameters_give_momentum_and_rest(state):
-    P, q, dq = state
-    Yp, Yr = momentum_regressor(q, dq)
+def test_both_regressors_describe_the_same_motion():
+    for _, q, dq, random in random_states():
+        ddq = random.uniform(-5.0, 5.0, 2)
+        H = filled(MODEL.regressor, (2, 3), q, dq, dq, ddq)
+        _, Yr = momentum_regressor(q, dq)
 
-    np.testing.assert_allclose(Yp @ P, inertia(P, q) @ dq, rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(
-        Yr @ P, gravity(P, q) - coriolis(P, q, dq).T @ dq, rtol=0.0, atol=1e-12
-    )
+        def momentum(s, q=q, dq=dq, ddq=ddq):
+            return momentum_regressor(q + s * dq + 0.5 * s * s * ddq, dq + s * ddq)[0]
 
-
-def test_both_regressors_describe_the_same_motion(state, random):
-    _, q, dq = state
-    ddq = random.uniform(-5.0, 5.0, 2)
-    H = filled(MODEL.regressor, (2, 3), q, dq, dq, ddq)
-    _, Yr = momentum_regressor(q, dq)
-
-    rate = derivative(lambda s: momentum_regressor(q + s * dq + 0.5 * s * s * ddq, dq + s * ddq)[0])
-
-    np.testing.assert_allclose(rate + Yr, H, **CLOSE)
+        np.testing.assert_allclose(derivative(momentum) + Yr, H, **CLOSE)
 
 
-def test_inertia_rate_minus_twice_coriolis_is_skew_symmetric(state):
-    P, q, dq = state
-
-    S = derivative(lambda s: inertia(P, q + s * dq)) - 2.0 * coriolis(P, q, dq)
-
-    np.testing.assert_allclose(S, -S.T, **CLOSE)
-
-
-def test_gravity_is_the_gradient_of_the_potential(state):
-    P, q, _ = state
-
-    gradient = [derivative(lambda s, axis=axis: potential(P, q + s * axis)) for axis in np.eye(2)]
-
-    np.testing.assert_allclose(gradient, gravity(P, q), **CLOSE)
+def test_inertia_rate_minus_twice_coriolis_is_skew_symmetric():
+    for P, q, dq, _ in random_states():
+        rate = derivative(lambda s, P=P, q=q, dq=dq: inertia(P, q + s * dq))
+        S = rate - 2.0 * coriolis(P, q, dq)
+        np.testing.assert_allclose(S, -S.T, **CLOSE)
 
 
-def test_model_agrees_with_the_simulated_arm(state):
+def test_gravity_is_the_gradient_of_the_potential():
+    for P, q, _, _ in random_states():
+        gradient = [
+            derivative(lambda s, P=P, q=q, axis=axis: potential(P, q + s * axis))
+            for axis in np.eye(2)
+        ]
+        np.testing.assert_allclose(gradient, gravity(P, q), **CLOSE)
+
+
+def test_model_agrees_with_the_simulated_arm():
     """M ddq + C dq + G = tau holds with the acceleration of the plant."""
-    _, q, dq = state
     tau = np.array([3.0, -1.0])
-    ddq = filled(physics.acceleration, 2, ARM, q, dq, tau)
-    torque = inertia(P, q) @ ddq + coriolis(P, q, dq) @ dq + gravity(P, q)
-    np.testing.assert_allclose(torque, tau, **CLOSE)
+    for _, q, dq, _ in random_states():
+        ddq = filled(physics.acceleration, 2, ARM, q, dq, tau)
+        torque = inertia(P, q) @ ddq + coriolis(P, q, dq) @ dq + gravity(P, q)
+        np.testing.assert_allclose(torque, tau, **CLOSE)
 
 
 def test_momentum_balance_holds_along_a_simulated_motion():
@@ -149,10 +141,11 @@ def test_model_names_its_parameters():
 
 
 @pytest.mark.parametrize('model', [MODEL, PlanarChain(3, R)], ids=['two', 'chain'])
-def test_regressors_computed_at_once_equal_the_separate_ones(random, model):
-    q, dq, v, a = random.normal(size=(4, model.n))
-    separate, together = np.full((2, 3, model.n, len(model.parameter_names)), np.nan)
-    model.regressor(q, dq, v, a, separate[0])
-    model.momentum_regressor(q, dq, separate[1], separate[2])
-    model.regressors(q, dq, v, a, *together)
-    np.testing.assert_array_equal(together, separate)
+def test_regressors_computed_at_once_equal_the_separate_ones(model):
+    for random in map(np.random.default_rng, range(20)):
+        q, dq, v, a = random.normal(size=(4, model.n))
+        separate, together = np.full((2, 3, model.n, len(model.parameter_names)), np.nan)
+        model.regressor(q, dq, v, a, separate[0])
+        model.momentum_regressor(q, dq, separate[1], separate[2])
+        model.regressors(q, dq, v, a, *together)
+        np.testing.assert_array_equal(together, separate)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc run` with three processes: its results are complete and nothing is lost.
+"""`blf_dsc run` over ROS: its results are complete and nothing is lost.
 
 The controller's model is `planar_chain`, whose parameters are those of the plant by name;
 test_presets has a run with `two_link`.
@@ -90,13 +90,13 @@ def reading(out):
 def counts(out, reading):
     """COUNTS, plus the states that the plant sent again when a torque took over 3 s to arrive."""
     repeated = [stamp for stamp, after in pairwise(reading[1]) if stamp == after]
-    log = (out / 'logs' / 'sim_plant.log').read_text()
+    log = (out / 'logs' / 'loop.log').read_text()
     assert len(repeated) == log.count('sending the state again')
     truths = sum(stamp % 10_000_000 == 0 for stamp in repeated)
     return COUNTS | {'/joint_states': SAMPLES + len(repeated), '/sim_plant/truth': 301 + truths}
 
 
-def test_torques_of_three_processes_match_the_offline_run_bit_for_bit(out, tmp_path):
+def test_torques_over_ros_match_the_offline_run_bit_for_bit(out, tmp_path):
     again = ['run', '--config', out / 'config.yaml', '--offline', '--out', tmp_path / 'out']
     assert main([str(each) for each in again]) == 0
     recorded, computed = read_run(out / 'bag'), read_run(tmp_path / 'out' / 'bag')
@@ -126,8 +126,8 @@ def test_command_reports_where_the_results_are(out, counts):
     output = (out / 'output.txt').read_text()
     assert 'bound       held by every joint' in output
     assert f'wrote       {out}: bag, summary.json, tracking.png, parameters.png' in output
-    for node in ('sim_plant', 'blf_dsc_controller', 'bag_recorder'):
-        log = (out / 'logs' / f'{node}.log').read_text()
+    for process in ('loop', 'bag_recorder'):
+        log = (out / 'logs' / f'{process}.log').read_text()
         assert log
         assert 'XMLPARSER' not in log  # config/fastdds.xml is accepted
 

@@ -49,13 +49,13 @@ def test_signal_shuts_down_cleanly_with_bag_and_report(running, number):
 
 
 def test_killed_node_is_reported_and_ends_the_others(running):
-    for process in (running.process.pid, *map(running.child, ('controller_node', 'sim_plant'))):
+    for process in (running.process.pid, running.child('sim_plant.loop')):
         # A killed process would leave it broken, and crash the others.
         assert 'shm/fastrtps' not in Path(f'/proc/{process}/maps').read_text()
-    os.kill(running.child('controller_node'), signal.SIGKILL)
+    os.kill(running.child('sim_plant.loop'), signal.SIGKILL)
     code, _, errors = running.end()
     assert code == 1, errors
-    assert 'blf_dsc run: blf_dsc_controller was terminated by SIGKILL' in errors
+    assert 'blf_dsc run: loop was terminated by SIGKILL' in errors
     assert f'the recording up to then is in {running.out / "bag"}' in errors
     assert 'Traceback' not in errors
     running.wait_for_children()

@@ -137,7 +137,7 @@ def _run_offline(config: LoopConfig, bag: Path) -> None:
 
 
 def _run_over_ros(config: LoopConfig, out: Path, options: Namespace) -> bool:
-    """Run the three nodes; return False if a signal ended the run."""
+    """Run the nodes; return False if a signal ended the run."""
     from blf_dsc_controller.cli.session import run_session
 
     return run_session(config, out, options.domain, options.view_host if options.view else '')

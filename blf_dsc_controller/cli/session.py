@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One run over ROS, with plant, controller and recorder as processes."""
+"""One run over ROS: plant and controller, in lock-step as one process, and the recorder."""
 
 from __future__ import annotations
 
@@ -23,11 +23,13 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, 
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.view.address import free_port, url_of
 
+_LOOP = 'loop'
 # Started in this order and stopped in reverse, so that the recorder gets every message.
 _MODULES = {
     RECORDER: 'blf_dsc_controller.nodes.recorder_node',
     CONTROLLER: 'blf_dsc_controller.nodes.controller_node',
     PLANT: 'sim_plant.node',
+    _LOOP: 'sim_plant.loop',  # both, in lock-step
     VIEW: 'blf_dsc_controller.view.node',  # only on request, once the loop runs
 }
 _ENDING = 20.0  # s that a node may take to exit before it is killed
@@ -39,7 +41,7 @@ _VIEW_PORT = 8080  # or the next free one
 
 
 def run_session(config: LoopConfig, out: Path, domain: int | None, view_host: str = '') -> bool:
-    """Run the three nodes on `out/config.yaml` until the plant has ended.
+    """Run recorder, controller and plant on `out/config.yaml` until the plant has ended.
 
     They run in a ROS domain of their own unless `domain` is given, and with a page at `view_host`
     unless that is empty. Returns False if SIGINT or SIGTERM ended the run; raises NodeFailedError
@@ -69,7 +71,7 @@ class NodeFailedError(BlfDscError):
 
 
 class NodeProcess:
-    """A node in its own process, which does not outlive this one."""
+    """A process of nodes, which does not outlive this one."""
 
     def __init__(self, name: str, params_file: Path, logs: Path, *arguments: str) -> None:
         self.name = name
@@ -135,7 +137,8 @@ def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, view_host: str
     }
     try:
         try:
-            for name in (RECORDER, CONTROLLER, PLANT):
+            loop_of_nodes = [_LOOP] if config.plant.mode == 'lockstep' else [CONTROLLER, PLANT]
+            for name in (RECORDER, *loop_of_nodes):
                 nodes.append(NodeProcess(name, params_file, logs))  # noqa: PERF401 - those that started are stopped
 
             def show() -> str:

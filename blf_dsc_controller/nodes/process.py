@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Running one node as a process: scheduling, spinning, and shutdown with the right exit code."""
+"""Running nodes as a process: scheduling, spinning, and shutdown with the right exit code."""
 
 from __future__ import annotations
 
@@ -64,36 +64,42 @@ class PlainNode(Node):
         return False
 
 
-def run(make_node: Callable[[], PlainNode]) -> int:
-    """Run a node until it finishes, receives a signal, or fails.
+def run(*make_nodes: Callable[[], PlainNode]) -> int:
+    """Run nodes until one finishes or fails, or the process receives a signal.
 
+    Those made last are closed first. Only a node that runs alone survives errors of its callbacks.
     Returns the exit code: 0 at the end or on SIGINT and SIGTERM, 1 after an error, which is printed
     to stderr.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: _signals.append(number))
-    node: PlainNode | None = None
+    nodes: list[PlainNode] = []
     problem = ''
     try:
         refuse_unknown(sys.argv)
         rclpy.init(args=sys.argv, signal_handler_options=rclpy.SignalHandlerOptions.NO)
         with EventsExecutor() as executor:
-            node = make_node()
-            executor.add_node(node)
+            for make in make_nodes:
+                nodes.append(make())
+                executor.add_node(nodes[-1])
             # What is loaded by now stays: scanning it again would stall the loop for 0.1 s.
             gc.collect()
             gc.freeze()
-            while not (node.finished or (interrupted() and node.ready_to_end())):
-                spin_once(executor, node)
-        if node.failure is not None:
-            raise node.failure
+            while not (interrupted() or any(node.finished for node in nodes)):
+                if len(nodes) == 1:
+                    spin_once(executor, nodes[0])
+                else:
+                    executor.spin_once(timeout_sec=_POLL)
+        for node in nodes:
+            if node.failure is not None:
+                raise node.failure
     except UnknownROSArgsError as error:
         problem = f'unknown arguments after --ros-args: {error}'
     except (BlfDscError, RCLError, OSError) as error:
         problem = str(error)
     finally:
         try:
-            if node is not None:
+            for node in reversed(nodes):
                 _close(node)
         finally:
             rclpy.try_shutdown()
