@@ -59,24 +59,24 @@ def momentum_regressor(q, dq):
 def random_states():
     """P, q [rad], dq [rad/s], with random parameters so that every term counts; the generator."""
     for random in map(np.random.default_rng, range(20)):
-        P, q, dq = random.normal(size=3), *random.uniform(-1.0, 1.0, (2, 2))
-        yield P, np.pi * q, 3.0 * dq, random
+        some_P, q, dq = random.normal(size=3), *random.uniform(-1.0, 1.0, (2, 2))
+        yield some_P, np.pi * q, 3.0 * dq, random
 
 
 def test_regressor_times_parameters_gives_the_dynamics():
-    for P, q, dq, random in random_states():
+    for some_P, q, dq, random in random_states():
         v, a = random.uniform(-5.0, 5.0, (2, 2))
         H = filled(MODEL.regressor, (2, 3), q, dq, v, a)
-        torque = inertia(P, q) @ a + coriolis(P, q, dq) @ v + gravity(P, q)
-        np.testing.assert_allclose(H @ P, torque, rtol=0.0, atol=1e-12)
+        torque = inertia(some_P, q) @ a + coriolis(some_P, q, dq) @ v + gravity(some_P, q)
+        np.testing.assert_allclose(H @ some_P, torque, rtol=0.0, atol=1e-12)
 
 
 def test_momentum_regressors_times_parameters_give_momentum_and_rest():
-    for P, q, dq, _ in random_states():
+    for some_P, q, dq, _ in random_states():
         Yp, Yr = momentum_regressor(q, dq)
-        rest = gravity(P, q) - coriolis(P, q, dq).T @ dq
-        np.testing.assert_allclose(Yp @ P, inertia(P, q) @ dq, rtol=0.0, atol=1e-12)
-        np.testing.assert_allclose(Yr @ P, rest, rtol=0.0, atol=1e-12)
+        rest = gravity(some_P, q) - coriolis(some_P, q, dq).T @ dq
+        np.testing.assert_allclose(Yp @ some_P, inertia(some_P, q) @ dq, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(Yr @ some_P, rest, rtol=0.0, atol=1e-12)
 
 
 def test_both_regressors_describe_the_same_motion():
@@ -92,19 +92,19 @@ def test_both_regressors_describe_the_same_motion():
 
 
 def test_inertia_rate_minus_twice_coriolis_is_skew_symmetric():
-    for P, q, dq, _ in random_states():
-        rate = derivative(lambda s, P=P, q=q, dq=dq: inertia(P, q + s * dq))
-        S = rate - 2.0 * coriolis(P, q, dq)
+    for some_P, q, dq, _ in random_states():
+        rate = derivative(lambda s, some_P=some_P, q=q, dq=dq: inertia(some_P, q + s * dq))
+        S = rate - 2.0 * coriolis(some_P, q, dq)
         np.testing.assert_allclose(S, -S.T, **CLOSE)
 
 
 def test_gravity_is_the_gradient_of_the_potential():
-    for P, q, _, _ in random_states():
+    for some_P, q, _, _ in random_states():
         gradient = [
-            derivative(lambda s, P=P, q=q, axis=axis: potential(P, q + s * axis))
+            derivative(lambda s, some_P=some_P, q=q, axis=axis: potential(some_P, q + s * axis))
             for axis in np.eye(2)
         ]
-        np.testing.assert_allclose(gradient, gravity(P, q), **CLOSE)
+        np.testing.assert_allclose(gradient, gravity(some_P, q), **CLOSE)
 
 
 def test_model_agrees_with_the_simulated_arm():

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,19 @@ def test_no_node_outlives_the_command(running):
     bag = running.out / 'bag'
     wait_for((bag / 'metadata.yaml').exists)
     assert whole(bag) > 100
+
+
+def test_loop_in_lockstep_waits_for_its_recorder(running):
+    """Which holds 5000 messages of each topic; the loop takes thousands of steps a second."""
+    recorder = running.child('recorder_node')
+    os.kill(recorder, signal.SIGSTOP)
+    time.sleep(8.0)
+    os.kill(recorder, signal.SIGCONT)
+    running.process.send_signal(signal.SIGINT)
+    code, output, errors = running.end()
+    assert code == 130, errors
+    assert f'{whole(running.out / "bag")} samples' in output
+    assert 'missing' not in output
 
 
 def last_progress(errors):

@@ -86,13 +86,9 @@ def run(*make_nodes: Callable[[], PlainNode]) -> int:
             gc.collect()
             gc.freeze()
             while not (interrupted() or any(node.finished for node in nodes)):
-                if len(nodes) == 1:
-                    spin_once(executor, nodes[0])
-                else:
-                    executor.spin_once(timeout_sec=_POLL)
-        for node in nodes:
-            if node.failure is not None:
-                raise node.failure
+                spin_once(executor, *nodes)
+        for failure in filter(None, (node.failure for node in nodes)):
+            raise failure
     except UnknownROSArgsError as error:
         problem = f'unknown arguments after --ros-args: {error}'
     except (BlfDscError, RCLError, OSError) as error:
@@ -112,14 +108,14 @@ def run(*make_nodes: Callable[[], PlainNode]) -> int:
     return 0
 
 
-def spin_once(executor: Any, node: PlainNode) -> None:
-    """Wait for work and execute it; an error is raised unless the node survives it."""
+def spin_once(executor: Any, *nodes: PlainNode) -> None:
+    """Wait for work and execute it; an error is raised unless the only node survives it."""
     try:
         executor.spin_once(timeout_sec=_POLL)
     except RCLError:
         raise
     except Exception as error:
-        if not node.survive(error):
+        if len(nodes) > 1 or not nodes[0].survive(error):
             raise
 
 
