@@ -85,7 +85,7 @@ def run(*make_nodes: Callable[[], PlainNode]) -> int:
             # What is loaded by now stays: scanning it again would stall the loop for 0.1 s.
             gc.collect()
             gc.freeze()
-            while not (interrupted() or any(node.finished for node in nodes)):
+            while not _is_over(nodes):
                 spin_once(executor, *nodes)
         for failure in filter(None, (node.failure for node in nodes)):
             raise failure
@@ -106,6 +106,12 @@ def run(*make_nodes: Callable[[], PlainNode]) -> int:
         print(problem, file=sys.stderr)  # noqa: T201
         return 1
     return 0
+
+
+def _is_over(nodes: list[PlainNode]) -> bool:
+    """Return whether a node has finished, or all are ready to end after a signal."""
+    ready = interrupted() and all(node.ready_to_end() for node in nodes)
+    return ready or any(node.finished for node in nodes)
 
 
 def spin_once(executor: Any, *nodes: PlainNode) -> None:
