@@ -35,6 +35,7 @@ class PlantSettings(NamedTuple):
     p: int  # parameters of the arm
     period_ns: int
     integrator: int  # RK4 or DOPRI5
+    steps: int  # of the integrator in a sample
     events: int  # number of events
     encoders: Encoders
     disturbance: JointDisturbance
@@ -180,15 +181,10 @@ def step(plant: PlantSettings, now: PlantState, command: np.ndarray) -> None:
     for i in range(plant.n):
         own.whole[i] = now.drives.applied[i] + own.added[i]
     size = 2 * plant.n + 6 if motion.contact.mass > 0.0 else 2 * plant.n
-    integrate(
-        plant.integrator,
-        motion,
-        now.sample[0] * plant.period_ns * 1e-9,
-        plant.period_ns * 1e-9,
-        own.whole,
-        part(now.x, 0, (size,)),
-        now.stages,
-    )
+    x, h = part(now.x, 0, (size,)), plant.period_ns * 1e-9 / plant.steps
+    for k in range(plant.steps):
+        t = now.sample[0] * plant.period_ns * 1e-9 + k * h
+        integrate(plant.integrator, motion, t, h, own.whole, x, now.stages)
     now.sample[0] += 1.0
 
 

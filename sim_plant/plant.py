@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.plant import PlantConfig
 from sim_plant.actuator import Drives, lag
+from sim_plant.arm import Arm
 from sim_plant.arms import arm_of, drive_bodies, parameter_names_of
 from sim_plant.compensation import Compensation, memory_size
 from sim_plant.contact import SloshSettings, WallSettings
@@ -28,6 +30,8 @@ from sim_plant.kernels import (
 )
 from sim_plant.sensors import VELOCITY_SOURCES, Encoders, generator, is_noisy
 
+_RESOLVED = 1.5  # decay within a step; both integrators are stable up to 2.7
+_MOST_STEPS = 1000
 FASTEST = 1e3
 """Norm of the joint velocities [rad/s] beyond which the arm breaks and stops where it was."""
 
@@ -182,6 +186,7 @@ def settings_of(config: PlantConfig) -> PlantSettings:
         p=arm.p,
         period_ns=config.sample_time_ns,
         integrator=INTEGRATORS[config.integrator],
+        steps=_steps_of(config, arm),
         events=len(config.events.begin),
         encoders=Encoders(
             sensor.position_noise,
@@ -216,6 +221,27 @@ def settings_of(config: PlantConfig) -> PlantSettings:
         slosh=_slosh_of(config),
         schedule=_schedule_of(config),
     )
+
+
+def _steps_of(config: PlantConfig, arm: Arm) -> int:
+    """Return how many steps of the integrator a sample needs to resolve friction near rest.
+
+    There it damps a joint at its slope over the inertia, at the initial position.
+    """
+    n, given, events = len(config.joints), config.disturbance, config.events
+    viscous, coulomb = (
+        np.reshape(each or 0.0, (-1, n) if each else (1, 1)).max(axis=0)
+        for each in (events.viscous, events.coulomb)
+    )
+    slope = (np.array(given.coulomb) + coulomb) * (1.0 + given.stribeck) / given.coulomb_velocity
+    slope += np.array(given.viscous) + viscous
+    position, rest, ddq = np.array(config.initial.position), np.zeros(n), np.zeros((2, n))
+    arm.accelerate(0.0, position, rest, rest, ddq[0])
+    rate = 0.0
+    for i, torque in enumerate(np.eye(n)):
+        arm.accelerate(0.0, position, rest, torque, ddq[1])
+        rate = max(rate, float(slope[i] * (ddq[1, i] - ddq[0, i])))
+    return min(max(1, math.ceil(config.sample_time * rate / _RESOLVED)), _MOST_STEPS)
 
 
 def _disturbance_of(config: PlantConfig) -> JointDisturbance:

@@ -95,6 +95,7 @@ def settings(
         p=3,
         period_ns=period_ns,
         integrator=integrator,
+        steps=1,
         events=0,
         encoders=Encoders(
             position_noise, velocity_noise, resolution, velocity_source, velocity_pole, 0

@@ -53,7 +53,7 @@ def test_update_is_the_written_law(seed, n, p, update):
     settings, state, signals = random_case = case(seed, n, p, update=update)
     rate = tracking_part(settings, signals) + prediction_part(settings, state)
     expected = state.estimate + DT * rate
-    d3_rate = -settings.gamma * (signals.xi2 + settings.eta * state.disturbance)
+    d3_rate = -state.gain_scale * settings.gamma * (signals.xi2 + settings.eta * state.disturbance)
     d3 = state.disturbance + DT * d3_rate
 
     estimate, disturbance = estimates_after(*random_case)
@@ -92,7 +92,8 @@ def test_learning_does_not_change_the_torque(saturated, most):
     limits = {'least': np.full(7, -np.inf), 'most': np.append(np.full(6, np.inf), most)}
     settings, state, signals = random_case = case(5, 3, 4, bumpless=1, eta=0.0, **limits)
     state.estimate[-1] = 0.0
-    change = signals.H @ tracking_part(settings, signals) - settings.gamma * signals.xi2
+    gamma = state.gain_scale * settings.gamma
+    change = signals.H @ tracking_part(settings, signals) - gamma * signals.xi2
     expected = signals.H @ state.estimate + state.disturbance + DT * change * (not saturated)
     learned = signals.H @ prediction_part(settings, state)
 
@@ -155,7 +156,7 @@ def test_disturbance_estimate_takes_nothing_over_before_the_latch():
     """The ball may move P^ then; (30) alone moves d^3."""
     settings, state, signals = random_case = case(6, 2, 3, latched=False, radius=1.0, bumpless=1)
     state.estimate[:3] *= 3.0 / np.linalg.norm(state.estimate[:3])
-    d3_rate = -settings.gamma * (signals.xi2 + settings.eta * state.disturbance)
+    d3_rate = -state.gain_scale * settings.gamma * (signals.xi2 + settings.eta * state.disturbance)
     d3 = state.disturbance + DT * d3_rate
 
     estimate, disturbance = estimates_after(*random_case)

@@ -66,7 +66,7 @@ class Robot:
     )
     rotor_inertia: Annotated[tuple[float, ...], 'joints'] = _fixed(
         (),
-        'inertia of each drive, reflected to its joint; empty: from its effort limit',
+        'inertia of each drive, reflected to its joint; empty: from its effort, then as measured',
         'kg m^2',
         at_least=0.0,
         omittable=True,

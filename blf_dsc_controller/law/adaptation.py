@@ -79,8 +79,9 @@ def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturat
     projection.retract(parameters, gain, settings.radius)
     if not saturated:
         for i in range(settings.n):
+            gamma = state.gain_scale[i] * settings.gamma[i]
             state.disturbance[i] -= (
-                dt * settings.gamma[i] * (signals.xi2[i] + settings.eta * state.disturbance[i])
+                dt * gamma * (signals.xi2[i] + settings.eta * state.disturbance[i])
             )
     if settings.bumpless == 1 and state.latched[0] == 1.0:
         hand_over(settings, state, signals)

@@ -118,6 +118,7 @@ class Controller:
         self.state.anchor[:] = self.settings.initial_estimate
         self.state.min_eigenvector.fill(self.settings.m**-0.5)
         self.state.active.fill(1.0)
+        self.state.gain_scale.fill(1.0)
 
     def check_start(self, joints: tuple[str, ...], q: np.ndarray, t: float = 0.0) -> None:
         """Raise OutsideBarrierError for positions (n,) [rad] outside the bound."""

@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel, arm_model
+from blf_dsc_controller.configuration.arm_defaults import over_postures
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.robot import drive_model, learned_of
+from blf_dsc_controller.configuration.robot import drive_model, learned_of, parameters_of
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import (
@@ -187,6 +188,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         initial_estimate=np.array(learning.initial_estimate + initial_columns(config)),
         information=np.linalg.inv(covariance),
         variance=np.diag(covariance).copy(),
+        **_rotors(config, model.n),
         least=np.array((-np.inf,) * p + friction[0]),
         most=np.array((np.inf,) * p + friction[1]),
         true_parameters=np.array(truth.parameters or (0.0,) * p),
@@ -195,6 +197,33 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         drive_inertias=drive_inertias,
     )
     return settings._replace(**_of_law(config, settings))
+
+
+def _rotors(config: ControllerConfig, n: int) -> dict[str, Any]:
+    """Return what `apparent_inertia` needs: it measures rotor inertias that are only assumed."""
+    settings = {
+        'rotors_unsure': 0,
+        'lag': config.robot.lag,
+        'unsure_rotor': np.zeros(n),
+        'joint_inertia': np.ones(n),
+        'link_inertia': np.ones(n),
+    }
+    if config.model != 'urdf' or config.robot.rotor_inertia:
+        return settings
+    robot, limits = config.robot, (config.limits.position_lower, config.limits.position_upper)
+    chain = robot.chain(config.joints)
+    rotors = robot.rotors(chain)
+    parameters = parameters_of(robot, chain)
+    links, joints = (
+        over_postures(chain, parameters, robot.payload, tuple(P), *limits)[0]
+        for P in (parameters.of(chain.inertias, J) for J in (np.zeros(n), rotors))
+    )
+    return settings | {
+        'rotors_unsure': 1,
+        'unsure_rotor': rotors,
+        'joint_inertia': joints,
+        'link_inertia': links,
+    }
 
 
 def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:

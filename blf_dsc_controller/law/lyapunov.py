@@ -15,14 +15,14 @@ _POSTURES = 181
 
 
 @inner
-def error_term(settings: Settings, signals: Signals) -> float:
+def error_term(settings: Settings, state: State, signals: Signals) -> float:
     """Return the weighted barrier potential (3) of xi1 [J]; w z1^2 / 2 without a barrier."""
     total = 0.0
     for i in range(settings.n):
         if settings.surface == LINEAR:
             total += 0.5 * settings.weight[i] * signals.xi1[i] ** 2
         else:
-            total += barrier.potential(
+            total += state.gain_scale[i] * barrier.potential(
                 signals.xi1[i],
                 signals.bound[i],
                 settings.weight[i],
@@ -61,7 +61,7 @@ def disturbance_term(settings: Settings, state: State, signals: Signals) -> floa
     for i in range(settings.n):
         if settings.gamma[i] > 0.0:
             error = signals.known[i] - state.disturbance[i]
-            total += 0.5 * error * error / settings.gamma[i]
+            total += 0.5 * error * error / (state.gain_scale[i] * settings.gamma[i])
     return total
 
 
@@ -70,7 +70,7 @@ def fill_energies(
     settings: Settings, state: State, signals: Signals, q: np.ndarray, sample: Sample
 ) -> None:
     """Compute the terms of (29) for the telemetry sample; NaN where the truth is unknown."""
-    sample.lyapunov[0] = error_term(settings, signals)
+    sample.lyapunov[0] = error_term(settings, state, signals)
     if settings.truth_known == 1:
         sample.lyapunov[1] = kinetic_term(settings, signals, q)
         sample.lyapunov[2] = parameter_term(settings, state)

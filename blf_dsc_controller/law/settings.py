@@ -44,6 +44,7 @@ class Settings(NamedTuple):
     drive: int  # columns of the gravity that the drive adds; 0: it adds none
     drive_size: int  # of drive_chain
     compensation: int
+    rotors_unsure: int  # 1: errors of the assumed rotor inertias are measured
     window: int  # N, rows in tau_d
     row_interval: int  # samples between two rows of the window
     interval: int  # samples between two checks of the excitation
@@ -68,6 +69,7 @@ class Settings(NamedTuple):
     motion_scale: float  # reference velocity below which rows count less, rad/s; 0: off
     damping_rate: float  # omega_v, of the damping by the initial estimate's inertia, 1/s
     pole: float  # of the regressor filter, rad/s
+    lag: float  # of measured velocities and applied torques together, s
     omega: float  # of the differentiating filter (8), rad/s
     coulomb_velocity: float  # rad/s
     radius: float  # omega_a of (4)
@@ -92,6 +94,9 @@ class Settings(NamedTuple):
     initial_estimate: Annotated[Array, 'm']  # P^(0), then that of the columns
     information: Annotated[Array, 'm', 'm']  # R, inverse covariance of the prior of theta
     variance: Annotated[Array, 'm']  # diagonal of R^-1
+    unsure_rotor: Annotated[Array, 'n']  # assumed rotor inertias J that are a guess, kg m^2
+    joint_inertia: Annotated[Array, 'n']  # with the others free, kg m^2
+    link_inertia: Annotated[Array, 'n']  # likewise, without J
     least: Annotated[Array, 'm']  # value that theta^ can have: friction is not negative
     most: Annotated[Array, 'm']  # value that theta^ can have
     true_parameters: Annotated[Array, 'p']

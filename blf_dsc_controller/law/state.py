@@ -52,6 +52,10 @@ class State(NamedTuple):
     anchor: Annotated[Array, 'm']  # theta^ to which windows with little information are pulled
     min_eigenvector: Annotated[Array, 'm']  # x of Phi x = lambda R x, x^T R x = 1
     active: Annotated[Array, 'm']  # 0 where a disturbance column has been rejected
+    lags: Annotated[Array, 14, 'n']  # of `apparent_inertia`
+    rotor_sums: Annotated[Array, 2, 'n']  # of z (tau - M_0 a) and z a
+    rotor_error: Annotated[Array, 'n']  # J~ <= 0 of the assumed rotor inertias, kg m^2
+    gain_scale: Annotated[Array, 'n']  # measured inertia of each joint over the assumed
     ring: Annotated[Array, 'window', 'n', 'm + 1']  # the window's rows
 
 
@@ -88,6 +92,7 @@ class Signals(NamedTuple):
     unit: Annotated[Array, 'n']  # scratch
     still: Annotated[Array, 'n']  # zeros
     drive: Annotated[Array, 'n', 'drive']  # columns of the gravity that the drive adds
+    swing: Annotated[Array, 'n']  # acceleration in the band of `apparent_inertia`, rad/s^2
     rate: Annotated[Array, 'm']  # theta^' [1/s]
     work: Annotated[Array, 'm']  # scratch
 

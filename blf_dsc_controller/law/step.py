@@ -14,6 +14,7 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.views import part
 from blf_dsc_controller.law import (
     adaptation,
+    apparent_inertia,
     barrier,
     consistency,
     drive,
@@ -130,6 +131,9 @@ def step(
     compute_regressors(settings, state, signals, q, dq)
     prediction.fill_compensation(settings, signals)
     update_window(settings, state, signals, t, dt, q, dq, signals.applied)
+    if settings.rotors_unsure == 1:
+        apparent_inertia.measure(settings, state, signals, dt, q, dq)
+        apparent_inertia.correct_feedback(settings, state, signals)
     torque.compute_demand(settings, state, signals)
     saturated = saturation.saturate(settings, state, signals, dt)
     adaptation.adapt(settings, state, signals, dt, saturated)

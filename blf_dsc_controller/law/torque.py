@@ -42,27 +42,29 @@ def known_disturbance(settings: Settings, signals: Signals, t: float) -> None:
 
 
 @inner
-def feedback(settings: Settings, signals: Signals, i: int) -> float:
+def feedback(settings: Settings, state: State, signals: Signals, i: int) -> float:
     """Return the feedback of joint i [N m]: barrier (16), robust term and damping of (28), (35)."""
     robust = settings.d2[i] * abs(signals.xi1[i]) + settings.mu_bar[i]
     torque = settings.Kp[i] * signals.xi2[i]
     torque += robust * smooth_sign(signals.xi2[i] / settings.boundary_layer)
     if settings.surface == LINEAR:
         return float(-torque - settings.weight[i] * signals.xi1[i])
-    return float(-torque) - barrier.gradient(
+    slope = barrier.gradient(
         signals.xi1[i],
         signals.bound[i],
         settings.weight[i],
         settings.slope_limit[i],
         signals.knee[i],
     )
+    return float(-torque) - float(state.gain_scale[i] * slope)
 
 
 @inner
 def compute_demand(settings: Settings, state: State, signals: Signals) -> None:
     """Compute the torque (28) or (35) before saturation, `signals.demand` (n,) [N m]."""
     for i in range(settings.n):
-        torque = feedback(settings, signals, i) + signals.model_torque[i] + state.disturbance[i]
+        torque = feedback(settings, state, signals, i) + signals.model_torque[i]
+        torque += state.disturbance[i]
         if settings.feed_forward == 1:
             torque += signals.known[i]
         for j in range(settings.m):

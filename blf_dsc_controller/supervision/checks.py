@@ -18,6 +18,7 @@ from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import LINEAR
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
+_LIGHT = 0.5  # of the assumed inertia: less is worth saying
 Vector = NDArray[np.float64]
 _NANO = 1e-9
 
@@ -261,7 +262,19 @@ class SampleCheck:
             f'joint {self._joints[worst]!r} is {xi1[worst]:+.6g} rad from its reference: '
             f'past {share}its bound of {bound[worst]:.6g} rad'
         )
-        return Fault(Reason.OUTSIDE_BOUND, text)
+        return Fault(Reason.OUTSIDE_BOUND, text + self._lightness(worst))
+
+    def _lightness(self, joint: int) -> str:
+        """Return what was found if the inertia of a joint's drive is far below the assumed."""
+        settings, state = self._controller.settings, self._controller.state
+        if state.gain_scale[joint] > _LIGHT:
+            return ''
+        assumed, error = settings.unsure_rotor[joint], state.rotor_error[joint]
+        return (
+            f'; its drive seems to have {assumed + error:.2g} kg m^2 instead of the {assumed:.2g} '
+            f'assumed, too little for these gains to hold: give robot.rotor_inertia, or a wider '
+            f'bound'
+        )
 
     def _saturated(self, dt: float) -> Fault | None:
         signals, limit = self._controller.signals, self._controller.settings.torque_limit

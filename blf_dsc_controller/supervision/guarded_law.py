@@ -90,6 +90,7 @@ class GuardedLaw:
         self.settled = self.compute_time = 0.0
         self._velocity = Velocity(n) if config.safety.velocity == 'estimated' else None
         self._safe_torque = SafeTorque(n)
+        self._safe_torque.scale = self.controller.state.gain_scale
         self._clean = True  # whether the window holds valid samples only
         self._resumable = False  # whether the law may continue along its reference
         self.journal.note(EventType.CONFIGURE, parameters=flatten(config))

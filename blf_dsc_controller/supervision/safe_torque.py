@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -138,11 +139,13 @@ class SafeTorque:
         load: torque (n,) [N m] that the model lacks; initially the disturbance estimate of the law.
         commanded: the last torque (n,) [N m], from the law or this ramp.
         last: the last usable joint state.
+        scale: factor (n,) on the damping: measured inertia of the joints over the assumed.
     """
 
     def __init__(self, n: int) -> None:
         self.commanded = np.zeros(n)
         self.load = np.zeros(n)
+        self.scale = np.ones(n)
         self.last = LastState(n)
         self._start = np.zeros(n)
         self._duration = self._elapsed = 0.0
@@ -176,7 +179,8 @@ class SafeTorque:
             return None
         if safety.torque == 'hold_gravity':
             self.observe(settings, estimate, dt)
-        goal = safe_torque(safety, settings, self.last, estimate, self.load)
+        damped = replace(safety, damping=tuple(self.scale * np.array(safety.damping)))
+        goal = safe_torque(damped, settings, self.last, estimate, self.load)
         self._elapsed += dt
         if self._elapsed < self._duration:
             goal = self._start + self._elapsed / self._duration * (goal - self._start)

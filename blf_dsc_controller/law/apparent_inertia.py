@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rotor inertias that the URDF lacks, measured while the law runs, for the gains of its feedback.
+
+The gains rest on the inertia of each joint, and a geared one's is mostly its rotor's, which nobody
+states.  The guess, rated torque over 400 rad/s^2, is an upper limit.  A joint that is much lighter
+makes the loop oscillate, and this oscillation shows its inertia before it has grown: between the
+bandwidth of the motion and that of the noise,
+
+    tau = M a = M_0 a + J~ a,        z^T (tau - M_0 a) = z^T a J~,
+
+with M_0 from P^(0), J~ the error of the guess and z = tau, all through the lags of the loop and the
+same band pass.  Sums over all time give J~ in [-J, 0] of each joint.  They grow only while the
+acceleration is clear of the noise, which is known by its second difference: noise comes back
+through the feedback, where it cannot be told from an arm without inertia.
+
+The feedback then acts on M_0 + J~ in place of M_0: its acceleration alpha2' - omega_v xi2 - qr''
+gets the torque of J~ as well, and the stiffness of the barrier and the gain of d^3 are scaled by
+the inertia of each joint with the others free, interpolated between J~ = -J and 0.  Along the
+reference nothing changes: what is learned acts there.
+"""
+
+import numpy as np
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.law import surface
+from blf_dsc_controller.law.settings import EFFORT, Settings
+from blf_dsc_controller.law.state import Signals, State
+
+_SMOOTH = 0.5  # upper end of the band, times the sample rate
+_SLOW = 0.06  # lower end, likewise
+_MEMORY = 0.02  # s, of the two powers that are compared
+_CLEAR = 0.1  # their ratio: noise has 0.005, an oscillation 100
+_EVIDENCE = 0.05  # s (rad/s^2)^2, times the inertia: least sum of z a that shows anything
+_RELEASE = 0.05  # s, in which the arm settles on its first torque
+
+# Rows of `State.lags`: poles of the torque, those of the acceleration, and the last samples.
+_HELD, _DRIVE, _SENSOR, _TORQUE1, _TORQUE2, _TORQUE_MEAN = range(6)
+_RATE1, _RATE2, _RATE_MEAN, _NOISE, _POWER, _VELOCITY, _LAST, _BEFORE = range(6, 14)
+
+
+@inner
+def low_pass(lags: np.ndarray, row: int, i: int, gain: float, x: float) -> float:
+    """Advance the first-order lag `lags[row, i]` and return it."""
+    lags[row, i] += gain * (x - lags[row, i])
+    return float(lags[row, i])
+
+
+@inner
+def begin(state: State, signals: Signals, dq: np.ndarray) -> None:
+    """Start the lags at rest, with the torque held that was applied last."""
+    for i in range(dq.size):
+        for row in range(_RATE1, _BEFORE + 1):
+            state.lags[row, i] = 0.0
+        state.lags[_VELOCITY, i] = dq[i]
+        for row in range(_RATE1):
+            state.lags[row, i] = signals.applied[i]
+
+
+@inner
+def pass_band(
+    settings: Settings, state: State, signals: Signals, dt: float, dq: np.ndarray
+) -> None:
+    """Write torque and acceleration in the band to `signals.unit` and `signals.swing`."""
+    lags = state.lags
+    late = surface.filter_gain(0.5 * settings.lag, dt) if settings.lag > 0.0 else 1.0
+    smooth, slow = surface.filter_gain(dt / _SMOOTH, dt), surface.filter_gain(dt / _SLOW, dt)
+    brief = surface.filter_gain(_MEMORY, dt)
+    for i in range(settings.n):
+        torque = signals.applied[i]
+        if settings.torque_source != EFFORT:  # which is measured after the drive
+            torque = low_pass(lags, _DRIVE, i, late, lags[_HELD, i])
+            lags[_HELD, i] = signals.applied[i]
+        torque = low_pass(lags, _SENSOR, i, late, torque)
+        torque = low_pass(lags, _TORQUE1, i, smooth, torque)
+        torque = low_pass(lags, _TORQUE2, i, smooth, torque)
+        signals.unit[i] = torque - low_pass(lags, _TORQUE_MEAN, i, slow, torque)
+        rate = (dq[i] - lags[_VELOCITY, i]) / dt
+        a = low_pass(lags, _RATE1, i, smooth, rate)
+        a = low_pass(lags, _RATE2, i, smooth, a)
+        signals.swing[i] = a - low_pass(lags, _RATE_MEAN, i, slow, a)
+        noise = rate - 2.0 * lags[_LAST, i] + lags[_BEFORE, i]
+        low_pass(lags, _NOISE, i, brief, noise * noise)
+        low_pass(lags, _POWER, i, brief, signals.swing[i] * signals.swing[i])
+        lags[_BEFORE, i] = lags[_LAST, i]
+        lags[_LAST, i] = rate
+        lags[_VELOCITY, i] = dq[i]
+
+
+@inner
+def measure(
+    settings: Settings,
+    state: State,
+    signals: Signals,
+    dt: float,
+    q: np.ndarray,
+    dq: np.ndarray,
+) -> None:
+    """Update J~ from the last interval; overwrites Yp and Yr of `signals`."""
+    if state.samples[0] <= 1.0:  # the first torque has had no effect yet
+        begin(state, signals, dq)
+        return
+    pass_band(settings, state, signals, dt, dq)
+    if state.samples[0] * dt < _RELEASE:
+        return
+    settings.model.momentum_regressor(q, signals.swing, signals.momentum, signals.rest)
+    for i in range(settings.n):
+        J = settings.unsure_rotor[i]
+        if J == 0.0 or state.lags[_POWER, i] <= _CLEAR * state.lags[_NOISE, i]:
+            continue
+        unexplained = signals.unit[i]
+        for j in range(settings.p):
+            unexplained -= signals.momentum[i, j] * settings.initial_estimate[j]
+        state.rotor_sums[0, i] += dt * signals.unit[i] * unexplained
+        state.rotor_sums[1, i] += dt * signals.unit[i] * signals.swing[i]
+        least = _EVIDENCE * settings.joint_inertia[i]
+        if state.rotor_sums[1, i] < least:
+            continue
+        error = state.rotor_sums[0, i] / (state.rotor_sums[1, i] + least)
+        state.rotor_error[i] = min(0.0, max(-J, error))
+        lost = 1.0 - settings.link_inertia[i] / settings.joint_inertia[i]
+        state.gain_scale[i] = 1.0 + state.rotor_error[i] / J * lost
+
+
+@inner
+def correct_feedback(settings: Settings, state: State, signals: Signals) -> None:
+    """Add the torque of J~ for what the feedback accelerates to H P^(0)."""
+    for i in range(settings.n):
+        signals.model_torque[i] += state.rotor_error[i] * (signals.damped[i] - signals.ddqr[i])
