@@ -53,6 +53,27 @@ def test_first_violation_is_the_earliest_of_all_joints(run):
     assert tracking['first_violation'] == {'time_s': pytest.approx(3.0), 'joint': 'elbow'}
 
 
+def test_commands_that_efforts_show_are_counted(run):
+    """Each second command is overwritten, the others take effect two samples after their state."""
+    torque = np.random.default_rng(0).normal(size=run.torque.shape)
+    effort = np.zeros_like(torque)
+    effort[2::2], effort[3::2] = torque[:-2:2], torque[:-3:2]
+    summary = summarize(dataclasses.replace(run, torque=torque, effort=effort))
+    assert summary['commands']['samples_late'] == {'p50': 2, 'max': 2}
+    assert summary['commands']['never_applied'] == pytest.approx(0.5, abs=1e-3)
+    assert 'commands    applied 2 samples later (median), at most 2; 50 %' in format_table(summary)
+    unlike = dataclasses.replace(run, torque=torque, effort=1.01 * effort)  # as with a lag
+    assert summarize(unlike)['commands'] is None
+
+
+def test_commands_applied_at_once_are_not_mentioned(run):
+    torque = np.random.default_rng(0).normal(size=run.torque.shape)
+    effort = np.vstack((torque[:1], torque[:-1]))
+    summary = summarize(dataclasses.replace(run, torque=torque, effort=effort))
+    assert summary['commands'] == {'never_applied': 0.0, 'samples_late': {'p50': 1, 'max': 1}}
+    assert 'commands' not in format_table(summary)
+
+
 def test_learning(run):
     learning = summarize(run)['learning']
     assert learning['latch_time_s'] == pytest.approx(LATCH_S)

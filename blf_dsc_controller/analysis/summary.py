@@ -35,6 +35,9 @@ _JOINT = {  # entry of the summary: metric; title, unit, factor and decimals in 
 }
 
 _OFTEN = 0.01  # of the samples
+_OLDEST = 20  # samples, age of a command that is looked for in the efforts
+_DIGITS = 1e-9  # relative, by which an effort may differ from its command
+_SHOWN = 0.5  # of the samples must show a command
 _WIDEST = 'widest_bound_rad'
 _NAMED = 3  # parameters, where the names of model and plant differ
 _MEASURED = {  # comparison with the truth: entry of the summary, its line of the table
@@ -69,6 +72,7 @@ def summarize(run: Run) -> Summary:
             },
         },
         'learning': None if estimates is None else _learning(run, estimates, metrics),
+        'commands': _commands(run),
         'timing': _timing(run),
         'compute_time_us': _percentiles(run.learning, COMPUTE_TIME),
         'messages': dict(run.message_counts),
@@ -128,6 +132,28 @@ def _timing(run: Run) -> Summary | None:
     }
 
 
+def _commands(run: Run) -> Summary | None:
+    """Return what the arm did with the commands, where its `effort` repeats them digit by digit.
+
+    `samples_late`: between the state that a torque answers and the one whose effort first shows it.
+    """
+    if run.effort is None:
+        return None
+    late = np.zeros(run.stamp.size, np.intp)
+    for ago in range(_OLDEST, 0, -1):  # the newest command that agrees
+        agree = np.isclose(run.effort[ago:], run.torque[:-ago], rtol=_DIGITS, atol=0.0).all(axis=1)
+        late[ago:][agree] = ago
+    shown = np.flatnonzero(late)
+    if shown.size < _SHOWN * run.stamp.size:
+        return None
+    commands, first = np.unique(shown - late[shown], return_index=True)
+    delays = late[shown[first]]
+    return {
+        'never_applied': 1.0 - commands.size / (commands[-1] - commands[0] + 1.0),
+        'samples_late': {'p50': int(np.median(delays)), 'max': int(delays.max())},
+    }
+
+
 def _percentiles(series: Series | None, name: str) -> Summary | None:
     if series is None or name not in series.names:
         return None
@@ -177,6 +203,13 @@ def _sentences(summary: Summary) -> Iterator[str]:
         yield f'stopped     at {stop["time_s"]:.3f} s, {stop["reason"]}: {stop["text"]}'
     if summary['learning'] is not None:
         yield from _learning_lines(summary['learning'])
+    if summary['commands'] is not None and summary['commands']['samples_late']['max'] > 1:
+        late = summary['commands']['samples_late']
+        never = 100.0 * summary['commands']['never_applied']
+        yield (
+            f'commands    applied {late["p50"]} samples later (median), at most {late["max"]}; '
+            f'{never:.3g} % overwritten by newer ones before'
+        )
     if summary['timing'] is not None:
         late = summary['timing']['late_steps']
         is_slow = late is not None and late > _OFTEN * summary['samples']
