@@ -10,6 +10,7 @@ import pytest
 import recorded_run
 from recorded_run import compared, of
 
+from blf_dsc_controller import __version__
 from blf_dsc_controller.analysis.summary import summarize
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
@@ -320,6 +321,20 @@ def test_bag_that_is_older_than_a_parameter_is_remarked(entries, rewritten):
     first[3] = event.encode()
     remarks = verify(rewritten(changed)).remarks
     assert any('before the law had learning.compensation' in text for text in remarks)
+
+
+def test_recording_on_another_processor_is_remarked(entries, tmp_path):
+    first = of([list(entry) for entry in entries], JOURNAL)[0]
+    event = decode(first[3])
+    event.content['machine'] |= {'tunables': 'glibc.cpu.hwcaps=-FMA', 'libc': 'glibc 2.99'}
+    first[3] = event.encode()
+    others = [entry for entry in entries if entry[0] != JOURNAL.resolved]
+    path = recorded_run.write(
+        tmp_path / 'bag', [first, *of(entries, JOURNAL)[1:], *others], package_version=__version__
+    )
+    libc, tunables = verify(path).remarks
+    assert libc.startswith('recorded with libc glibc 2.99 and replayed with')
+    assert tunables.startswith('recorded with tunables glibc.cpu.hwcaps=-FMA and replayed with')
 
 
 def test_configuration_of_another_version_is_rejected(entries, tmp_path, monkeypatch):

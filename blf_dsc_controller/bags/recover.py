@@ -232,7 +232,7 @@ def _record(data: bytes | mmap, at: int) -> tuple[Any, int]:
     """Return the record at an offset, and its end; any error if it does not match its length."""
     opcode, length = data[at], int.from_bytes(data[at + 1 : at + 9], 'little')
     end = at + 9 + length
-    if end > len(data):
+    if at + 9 > len(data) or end > len(data):
         raise DamageError('cut off')
     if opcode not in _KINDS:
         raise DamageError(f'unknown record type {opcode}')

@@ -8,9 +8,15 @@ of joint-state messages it follows, and the stamp of the last of them.
 from __future__ import annotations
 
 import json
+import os
+import platform
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from enum import Enum
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from blf_dsc_controller.errors import BlfDscError
@@ -23,6 +29,30 @@ OUTSIDE_BOUND = 'error past the bound'
 
 FORMAT = 2
 """Of the journal: in 2, every torque that answers a message is in `~/tracking_error`, too."""
+
+
+@cache
+def machine() -> dict[str, str]:
+    """Return what decides the last digits of sine, exponential and tanh on this computer.
+
+    The C library chooses its functions by the processor's features, which GLIBC_TUNABLES can mask.
+    """
+    with suppress(OSError):
+        for line in Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines():
+            name, _, value = line.partition(':')
+            if name.strip() in ('flags', 'Features'):
+                features = {'fma', 'fma4', 'avx2', 'avx512f', 'asimd', 'sve'}
+                found = ' '.join(sorted(features.intersection(value.split())))
+                break
+        else:
+            found = ''
+        return {
+            'processor': f'{platform.machine()} {found}'.strip(),
+            'libc': ' '.join(platform.libc_ver()),
+            'tunables': os.environ.get('GLIBC_TUNABLES', ''),
+            'numba': version('numba'),
+        }
+    return {}
 
 
 class EventType(str, Enum):
@@ -104,7 +134,7 @@ class Journal:
     def note(self, event: EventType, **content: Any) -> None:
         """Add an event that happens now."""
         if event is EventType.CONFIGURE:
-            content['format'] = FORMAT
+            content |= {'format': FORMAT, 'machine': machine()}
         one = Event(self._number, event, self.stamp, self.messages, self.commands, content)
         self._number += 1
         self.pending.append(one)

@@ -15,7 +15,7 @@ from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.cdr import MessageError
-from blf_dsc_controller.messages.journal import FORMAT, Event, EventType
+from blf_dsc_controller.messages.journal import FORMAT, Event, EventType, machine
 from blf_dsc_controller.messages.topics import FOREVER, JOINT_STATES, JOURNAL, TRACKING_ERROR
 from blf_dsc_controller.replay.comparison import Comparison, Difference, not_compared
 from blf_dsc_controller.replay.rerun import Rerun
@@ -96,7 +96,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
         tuple(not_compared(content)),
         tuple(run.events),
         run.outputs.safe_torques,
-        tuple(_remarks(content, run.end or end, newer)),
+        (*_remarks(content, run.end or end, newer), *_other_machine(events[0])),
         min((found for found in differences if found), key=lambda found: found.stamp, default=None),
     )
 
@@ -148,3 +148,15 @@ def _remarks(content: Content, end: str, newer: Sequence[str]) -> Iterator[str]:
             f'recorded before the law had {", ".join(newer)}: replayed with the present law and '
             'its defaults, so differences come from the software'
         )
+
+
+def _other_machine(configured: Event) -> Iterator[str]:
+    """Remark on what may change the last digits of sine, exponential and tanh."""
+    recorded, here = configured.content.get('machine', {}), machine()
+    for name, value in recorded.items():
+        if value != here.get(name, ''):
+            yield (
+                f'recorded with {name} {value or "unset"} and replayed with '
+                f'{here.get(name) or "unset"}: sine, exponential and tanh may differ in the last '
+                'digit'
+            )
