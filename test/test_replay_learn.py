@@ -15,7 +15,7 @@ from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.params_file import load_loop
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import JointStateDecoder, JointStateEncoder
-from blf_dsc_controller.messages.topics import JOINT_STATES
+from blf_dsc_controller.messages.topics import JOINT_STATE, JOINT_STATES
 from blf_dsc_controller.replay.learn import learn
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
@@ -148,6 +148,17 @@ def test_bag_shorter_than_the_window_is_rejected(tmp_path):
     path = recorded_run.record(tmp_path / 'bag', 0.3)
     with pytest.raises(BlfDscError, match=r'holds 0\.3 s, .* window of 6\.28 s'):
         learn(path, ControllerConfig())
+
+
+def test_states_a_nanosecond_apart_are_too_few(tmp_path):
+    """Their sample time would make the window of the learning larger than any memory."""
+    encoder = JointStateEncoder(('joint1', 'joint2'))
+    states = [
+        ['/joint_states', JOINT_STATE, at, encoder.encode(at, [1, 1], [0, 0], [2, 2])]
+        for at in (5, 6, 7)
+    ]
+    with pytest.raises(BlfDscError, match='too short for a window'):
+        learn(recorded_run.write(tmp_path / 'bag', states), ControllerConfig())
 
 
 def test_command_prints_estimates_and_excitation(bag, capsys):

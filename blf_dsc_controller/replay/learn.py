@@ -105,17 +105,18 @@ def learn(
         safety=replace(config.safety, velocity='measured'),
         learning=replace(config.learning, motion_scale=0.0),
     )
-    found = run_over(recorded, held)
-    run, rows, active, learning = found.run, found.rows, found.active, config.learning
+    learning = config.learning
     window = round(learning.window / sample_time)
     start = window + round(learning.settling_time / sample_time)
-    if rows.shape[0] < start + 1:
+    if stamp.size < start + 1:
         reason = (
-            f'{path} holds {run.duration:.3g} s, which is too short for a window of '
-            f'{learning.window:.3g} s and the settling time of the filters: record longer, '
+            f'{path} holds {(stamp[-1] - stamp[0]) * 1e-9:.3g} s, which is too short for a window '
+            f'of {learning.window:.3g} s and the settling time of the filters: record longer, '
             'or reduce learning.window'
         )
         raise BlfDscError(reason)
+    found = run_over(recorded, held)
+    run, rows, active = found.run, found.rows, found.active
     end = _most_excited(rows, active, window, start)
     chosen = slice(end - window, end)
     X, u = rows[chosen, :, :-1][:, :, active != 0.0], rows[chosen, :, -1]
