@@ -86,7 +86,7 @@ test-nightly: $(READY)-test ## Test nodes and recovery with ten thousand random 
 	@BLF_DSC_EXAMPLES=10000 $(RUN) -m pytest -q test/test_nodes_properties.py \
 	    test/test_bags_recover.py::test_flipped_bytes_lose_only_the_chunks_they_hit
 
-changes: $(READY) ## Simulate ten thousand randomly changing arms, with and without learning, into out/changes
+changes: $(READY) ## Simulate 14,000 randomly changing arms, each with and without learning, into out/changes
 	@$(RUN) benchmark/changing_arms.py
 
 expect: $(READY) ## Recompute the figures of doc/arms.md for the presets panda and ur5e

@@ -112,7 +112,10 @@ def draw_pairs(studies: dict[str, tuple[Study, Columns]], path: Path) -> None:
         lost = (results['outcome'] != KEPT) & (results[f'{WITHOUT}outcome'] == KEPT)
         x, y = (np.clip(values, _LEAST_RATIO, _FARTHEST) for values in (x, y))
         chosen = np.flatnonzero(~lost)[:_MOST_DOTS]
-        largest.plot(x[chosen], y[chosen], '.', ms=3, color=colour, alpha=0.4, mew=0, label=title)
+        size = 3.0 if chosen.size > _FEW_DOTS else 6.0
+        largest.plot(
+            x[chosen], y[chosen], '.', ms=size, color=colour, alpha=0.6, mew=0, label=title
+        )
         largest.plot(x[lost], y[lost], 'o', ms=5, color=ALARM, mew=0)
     ends = np.array([_LEAST_RATIO, _FARTHEST])
     largest.loglog(ends, ends, color=MUTED, lw=1.0, label='equal')
