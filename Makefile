@@ -76,7 +76,7 @@ test-long: $(READY)-test ## Run the long tests: recorder killed ten times, one-m
 	@LONG_TESTS=1 $(RUN) -m pytest -rP test/test_bag_recorder_killed.py \
 	    test/test_bag_recorder_beside_loop.py test/test_changed_arm.py
 
-test-browser: $(READY)-test ## Test the pages of bag_report and view in a headless Chromium, if installed
+test-browser: $(READY)-test ## Test the pages of report and view in a headless Chromium, if installed
 	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_analysis_report_page.py test/test_view_page.py
 
 pictures: $(READY)-test ## Make the README's animation, doc/view.webp, with a headless Chromium

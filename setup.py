@@ -100,13 +100,13 @@ setup(
         # Only for `monte_carlo`, whose results are Parquet files: 50 MB that a robot does not need.
         'monte-carlo': ['pyarrow'],
         'dask': ['pyarrow', 'distributed'],
-        # Only for `bag_report`, to draw its pages: 40 MB.
+        # Only for `blf_dsc report`, to draw its pages: 40 MB.
         'report': ['plotly>=6'],
         # Only for `view`, to serve its page: 130 MB, most of it for reading meshes.
         'view': ['viser>=1.1', 'yourdfpy>=0.0.57', 'trimesh'],
         # Only to draw known arms, such as the Panda, with their meshes: 414 MB.
         'meshes': ['example-robot-data', 'pycollada'],
-        'parquet': ['pyarrow'],  # only for `bag_export` into Parquet
+        'parquet': ['pyarrow'],  # only for `blf_dsc export` into Parquet
         # setuptools: test_package.py builds a wheel offline.
         'test': [
             'pytest>=7',
@@ -145,17 +145,7 @@ setup(
             'bag_recorder = blf_dsc_controller.cli.main:bag_recorder',
             'arm_markers = blf_dsc_controller.cli.main:arm_markers',
             'torque_watchdog = blf_dsc_controller.cli.main:torque_watchdog',
-            'view = blf_dsc_controller.cli.main:view',
-            # Aliases of sub-commands: run, replay, report, ...
-            'closed_loop = blf_dsc_controller.cli.main:closed_loop',
-            'bag_replay = blf_dsc_controller.cli.main:bag_replay',
-            'bag_report = blf_dsc_controller.cli.main:bag_report',
-            'bag_recover = blf_dsc_controller.cli.main:bag_recover',
-            'bag_export = blf_dsc_controller.cli.main:bag_export',
-            'bag_plot = blf_dsc_controller.cli.main:bag_plot',
-            'excite = blf_dsc_controller.cli.main:excite',
-            'paper_study = blf_dsc_controller.cli.main:paper_study',
-            'monte_carlo = blf_dsc_controller.cli.main:monte_carlo',
+            'arm_view = blf_dsc_controller.cli.main:arm_view',
         ],
     },
     # The cache of compiled kernels is keyed by a digest of the source files on disk.

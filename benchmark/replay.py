@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`bag_replay` against the reader of the package mcap, which only yields the messages."""
+"""`blf_dsc replay` against the reader of the package mcap, which only yields the messages."""
 
 from __future__ import annotations
 

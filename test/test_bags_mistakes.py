@@ -209,7 +209,7 @@ def test_bag_of_another_format(copy, all_say, original, replacement, words, tmp_
     text = (copy / METADATA).read_text()
     assert original in text
     (copy / METADATA).write_text(text.replace(original, replacement))
-    all_say(copy, words, f'to save the undamaged part: bag_recover {copy}')
+    all_say(copy, words, f'to save the undamaged part: blf_dsc recover {copy}')
     assert main(['recover', str(copy), '--out', str(tmp_path / 'clean')]) == 0
     assert 'none of the recorded messages was lost' in capsys.readouterr().out
 

@@ -101,11 +101,11 @@ def test_missing_file_error_lists_the_presets(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    'command', ['closed_loop', 'sim_plant', 'blf_dsc_controller', 'bag_recorder']
+    'command', [('main', 'run'), ('sim_plant',), ('blf_dsc_controller',), ('bag_recorder',)]
 )
 def test_without_ros_the_error_tells_how_to_source_it(tmp_path, command):
     out = tmp_path / 'out'
-    run = finished(sys.executable, '-c', WITHOUT_ROS, command, '--out', out)
+    run = finished(sys.executable, '-c', WITHOUT_ROS, *command, '--out', out)
     assert run.returncode == 1, run.stderr
     assert 'ROS 2 cannot be imported' in run.stderr
     assert 'source /opt/ros/jazzy/setup.bash' in run.stderr
@@ -115,7 +115,7 @@ def test_without_ros_the_error_tells_how_to_source_it(tmp_path, command):
 
 def test_offline_run_needs_no_ros(tmp_path):
     out = tmp_path / 'out'
-    offline = ('closed_loop', '--offline', '--duration', 0.1, '--out', out)
+    offline = ('main', 'run', '--offline', '--duration', 0.1, '--out', out)
     run = finished(sys.executable, '-c', WITHOUT_ROS, *offline)
     assert run.returncode == 0, run.stderr
     assert (out / 'bag' / 'metadata.yaml').is_file()

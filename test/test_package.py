@@ -30,16 +30,7 @@ EXECUTABLES = {
     'bag_recorder',
     'arm_markers',
     'torque_watchdog',
-    'view',
-    'closed_loop',
-    'excite',
-    'bag_plot',
-    'bag_replay',
-    'bag_recover',
-    'bag_export',
-    'bag_report',
-    'paper_study',
-    'monte_carlo',
+    'arm_view',
 }
 
 # rosdep's names for what pip installs. rosdep has no key for mcap alone.

@@ -286,7 +286,7 @@ def _reason(path: Path, error: Exception) -> str:
                 return f'the folder has no {METADATA}{guess}'
             return (
                 f'the folder has no {METADATA}; was the recording interrupted? '
-                f'Recover it: bag_recover {path}'
+                f'Recover it: blf_dsc recover {path}'
             )
     is_damaged = is_mcap and not isinstance(error, OSError)
-    return f'{text}; to save the undamaged part: bag_recover {path}' if is_damaged else text
+    return f'{text}; to save the undamaged part: blf_dsc recover {path}' if is_damaged else text

@@ -110,21 +110,6 @@ def require_ros() -> None:
         ) from error
 
 
-def _alias(command: str) -> int:
-    return main([command, *sys.argv[1:]])
-
-
-closed_loop = partial(_alias, 'run')
-bag_replay = partial(_alias, 'replay')
-bag_report = partial(_alias, 'report')
-bag_recover = partial(_alias, 'recover')
-bag_export = partial(_alias, 'export')
-bag_plot = partial(_alias, 'plot')
-excite = partial(_alias, 'excite')
-paper_study = partial(_alias, 'paper')
-monte_carlo = partial(_alias, 'monte-carlo')
-
-
 def _node(module: str) -> int:
     _keep_to_one_thread()
     for number in (signal.SIGINT, signal.SIGTERM):  # until the node installs its own handlers
@@ -143,4 +128,4 @@ blf_dsc_controller = partial(_node, 'blf_dsc_controller.nodes.controller_node')
 bag_recorder = partial(_node, 'blf_dsc_controller.nodes.recorder_node')
 arm_markers = partial(_node, 'blf_dsc_controller.nodes.markers_node')
 torque_watchdog = partial(_node, 'blf_dsc_controller.nodes.watchdog_node')
-view = partial(_node, 'blf_dsc_controller.view.node')
+arm_view = partial(_node, 'blf_dsc_controller.view.node')

@@ -55,10 +55,12 @@ class ProgressMonitor:
         message, self._latest = self._latest, None
         if message is None:
             return False
+        values = dict(zip(message.name, message.position, strict=True))
+        if not values.keys() >= set(self._parameters):
+            return False  # of another arm in the same ROS domain
         stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
         if not self.has_begun:
             self._start = stamp
-        values = dict(zip(message.name, message.position, strict=True))
         ratio = max(value for name, value in values.items() if name.startswith(RATIO))
         self._elapsed = stamp - self._start
         self.progress.show_loop(self._elapsed, ratio, [values[name] for name in self._parameters])

@@ -33,7 +33,7 @@ def play(options: Namespace) -> None:
     words = [word for remap in options.remap for word in ('--remap', remap)]
     try:
         rclpy.init(
-            args=['bag_replay', '--ros-args', *words] if words else [],
+            args=['blf_dsc', '--ros-args', *words] if words else [],
             signal_handler_options=rclpy.SignalHandlerOptions.NO,
         )
         node = PlayerNode(

@@ -140,7 +140,7 @@ class BagRecorderNode(PlainNode):
         except OSError as error:
             self.finished = True
             self.failure = BagError(
-                f'the bag cannot be written any further: {error}; bag_recover saves what '
+                f'the bag cannot be written any further: {error}; blf_dsc recover saves what '
                 'was written before'
             )
 

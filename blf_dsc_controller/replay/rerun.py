@@ -175,7 +175,7 @@ class Rerun:
         if self._answered is None:
             while self._next() and not guard.journal.pending and not self._is_over:
                 pass
-        elif self._answered[self._answer :][:1] == [event.stamp]:
+        elif self._answered[self._answer :][:1].tolist() == [event.stamp]:
             self._next()  # it was answered, at least with a safe torque
         else:
             k = self._find_error() if _reason(event) in _UNREADABLE else self._find(event.stamp)
