@@ -149,9 +149,9 @@ def test_replay_compared_with_mcap_reader(monkeypatch):
     measured = replay.interleaved
     monkeypatch.setattr(replay, 'interleaved', counting)
     assert len(contestants(list(replay.measure()))) == 2
-    # 101 samples of five messages, two more in every tenth from the first on, the bound, and
-    # three events of the journal.
-    assert units == 3 * [101 * 5 + 11 * 2 + 1 + 3]
+    # 101 samples of five messages, two more in every tenth from the first on, the bound, three
+    # events of the journal, and the parameters of the plant.
+    assert units == 3 * [101 * 5 + 11 * 2 + 1 + 3 + 1]
 
 
 def test_dead_contestant_aborts_the_measurement(monkeypatch):

@@ -258,7 +258,9 @@ def test_misspelt_preset_suggests_the_closest():
 
 def test_documented_file_for_a_real_arm_is_valid(file):
     page = (Path(__file__).parents[1] / 'doc/real_arm.md').read_text()
-    of_ros2_control, own = re.findall(r'```yaml\n(.*?)```', page, re.DOTALL)[:2]
+    blocks = re.findall(r'```yaml\n(.*?)```', page, re.DOTALL)
+    (at,) = (k for k, block in enumerate(blocks) if 'effort_controller:\n' in block)
+    of_ros2_control, own = blocks[at : at + 2]
     path = file(own.replace('topic://robot_description', 'ur5e.urdf'))
     config = load(path, 'blf_dsc_controller', ControllerConfig)
     effort_controller = yaml.safe_load(of_ros2_control)['effort_controller']

@@ -37,7 +37,8 @@ class Checks(NamedTuple):
     ratio: Annotated[Array, 'n']  # largest |xi1| / k so far
     kept: Annotated[Array, 'm + n']  # estimates and d^3 of the last sample that was not suspect
     sample_time: Cell  # s, for the check of the effect of commands; 0: none
-    q: Annotated[Array, 'n']  # rad, where a joint has last moved
+    still: Cell  # s, since a joint has last moved
+    q: Annotated[Array, 'n']  # rad, where it has
     moved: Annotated[Array, 'm + n']  # estimates and d^3 of then
     recent: Annotated[Array, 'n']  # N m, average of the commands over _RECENT
     before: Annotated[Array, 'n']  # N m, average of them over _BEFORE
@@ -45,7 +46,7 @@ class Checks(NamedTuple):
 
 _STILL = 0.02  # of the bound: a joint that stays within has not moved
 _CHANGED = 0.1  # of the torque limit: a command that differs by more should have moved something
-_RECENT = 0.05  # s, past the noise of the velocities
+_RECENT = 0.05  # s, past the chatter of encoders' steps in the velocities
 _BEFORE = 1.0  # s
 
 checks_of, checks_size = view_of(Checks), size_of(Checks)
@@ -87,25 +88,28 @@ def check_effect(settings: Settings, checks: Checks, state: State, sample: Sampl
     overcomes stiction. Otherwise brakes hold the arm, or its effort controller is not active, and
     the law learns what its own commands say.
     """
-    moves = state.samples[0] <= 1.0
+    begins = state.samples[0] <= 1.0
+    moves = begins
     for i in range(settings.n):
         moved = abs(sample.qr[i] + sample.xi1[i] - checks.q[i])
         moves = moves or not moved < _STILL * sample.bound[i]
-    if moves:
-        for i in range(settings.n):
-            checks.q[i] = sample.qr[i] + sample.xi1[i]
-            checks.recent[i] = checks.before[i] = sample.torque[i]
-        for j in range(settings.m + settings.n):
-            checks.moved[j] = checks.kept[j]
-        return 0
     flags = 0
     T = checks.sample_time[0]
+    checks.still[0] = 0.0 if moves else checks.still[0] + T
     for i in range(settings.n):
-        checks.recent[i] += min(1.0, T / _RECENT) * (sample.torque[i] - checks.recent[i])
-        checks.before[i] += min(1.0, T / _BEFORE) * (sample.torque[i] - checks.before[i])
+        smooth = 1.0 if begins else min(1.0, T / _RECENT)
+        checks.recent[i] += smooth * (sample.torque[i] - checks.recent[i])
+        if moves:
+            checks.q[i] = sample.qr[i] + sample.xi1[i]
+            checks.before[i] = checks.recent[i]
+        else:
+            checks.before[i] += min(1.0, T / _BEFORE) * (sample.torque[i] - checks.before[i])
         change = abs(checks.recent[i] - checks.before[i])
-        if change > _CHANGED * settings.torque_limit[i]:
+        if checks.still[0] > _RECENT and change > _CHANGED * settings.torque_limit[i]:
             flags |= NO_EFFECT | SUSPECT
+    if moves:
+        for j in range(settings.m + settings.n):
+            checks.moved[j] = checks.kept[j]
     return flags
 
 

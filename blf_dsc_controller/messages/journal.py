@@ -15,9 +15,10 @@ from collections.abc import Mapping
 from contextlib import suppress
 from enum import Enum
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numba
 
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import JOURNAL
@@ -50,7 +51,7 @@ def machine() -> dict[str, str]:
             'processor': f'{platform.machine()} {found}'.strip(),
             'libc': ' '.join(platform.libc_ver()),
             'tunables': os.environ.get('GLIBC_TUNABLES', ''),
-            'numba': version('numba'),
+            'numba': numba.__version__,
         }
     return {}
 
