@@ -29,7 +29,7 @@ doc/parameters.md`.
 """
 
 _HEADER = (
-    '| name | symbol | unit | type | default | range | live | description |\n'
+    '| name | description | default | unit | range | live | type | symbol |\n'
     '| --- | --- | --- | --- | --- | --- | --- | --- |\n'
 )
 
@@ -52,13 +52,13 @@ def _row(one: Parameter) -> str:
         each = f'{each}, or none' if each else 'may be empty'
     cells = (
         f'`{one.name}`',
-        one.symbol,
-        one.unit,
-        one.kind.value,
+        one.description,
         f'`{format_value(one.default)}`',
+        one.unit,
         '; '.join(part for part in (one.allowed, each) if part),
         '' if one.read_only else '•',
-        one.description,
+        one.kind.value,
+        one.symbol,
     )
     return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |\n'
 
