@@ -67,9 +67,8 @@ def excited_case(seed):
     random = np.random.default_rng(seed)
     for _ in range(settings.window):
         signals.row[:] = random.normal(size=signals.row.shape)
-        cursor = window.push_row(
-            state.ring, cursor, state.running, state.fresh, signals.row, is_full=True
-        )
+        sums = state.running, state.fresh, state.half
+        cursor = window.push_row(state.ring, cursor, *sums, signals.row, rows=settings.window)
     return case
 
 

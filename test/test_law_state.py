@@ -106,7 +106,7 @@ def test_state_has_the_documented_shapes():
             (n, p): 'momentum',
             (n, m): 'rest',
             (n, m + 1): 'filter1 filter2',
-            (m + 1, m + 1): 'running fresh',
+            (m + 1, m + 1): 'running fresh half',
             (m, m): 'Phi factor',
             (N, n, m + 1): 'ring',
         },

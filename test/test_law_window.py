@@ -16,22 +16,28 @@ class Window:
 
     def __init__(self, n, m, length):
         self.ring = np.zeros((length, n, m + 1))
-        self.running, self.fresh, self.naive = np.zeros((3, m + 1, m + 1))
+        self.running, self.fresh, self.half, self.naive = np.zeros((4, m + 1, m + 1))
         self.cursor = 0
         self.history = []
 
     def push(self, row):
         oldest = self.ring[self.cursor].copy()
         self.naive += terms(row) - terms(oldest)
-        is_full = len(self.history) == len(self.ring)
+        rows = len(self.history)
         self.cursor = window.push_row(
-            self.ring, self.cursor, self.running, self.fresh, row, is_full
+            self.ring, self.cursor, self.running, self.fresh, self.half, row, rows
         )
         self.history = [*self.history, row][-len(self.ring) :]
 
     def direct(self):
         """Sum over the rows in the window, in the order they came."""
         return sum(map(terms, self.history))
+
+    def newer_part(self):
+        """Sum over the newer part of the rows, and their number."""
+        newer = np.zeros_like(self.running)
+        rows = window.newer_part(self.cursor, len(self.ring), self.fresh, self.half, newer)
+        return newer, rows
 
     def average(self):
         m = len(self.running) - 1
@@ -65,6 +71,28 @@ def test_window_equals_the_direct_sum_whether_full_or_not(n, m, length, pushes, 
     )
     np.testing.assert_array_equal(Phi, Phi.T)
     np.testing.assert_allclose(b, np.einsum('kia,ki->a', X, u) / len(rows), atol=1e-13 * n * pushes)
+
+
+@pytest.mark.parametrize('length', [2, 3, 12, 13])
+def test_window_is_split_into_exact_parts_and_goes_on_with_the_newer_one(length):
+    """At each position of the ring; what was removed never returns."""
+    for begin in range(length):
+        random = np.random.default_rng(begin)
+        sliding = Window(2, 3, length)
+        for _ in range(length + begin):
+            sliding.push(random.normal(size=(2, 4)))
+        newer, rows = sliding.newer_part()
+        assert length // 4 <= rows <= length - length // 4
+        assert 0 < rows < length
+        sliding.history = sliding.history[-rows:]
+        np.testing.assert_allclose(newer, sliding.direct(), atol=1e-12)
+
+        sliding.running[:] = newer
+        for _ in range(3 * length):
+            sliding.push(random.normal(size=(2, 4)))
+            np.testing.assert_allclose(sliding.running, sliding.direct(), atol=1e-12)
+        newer, rows = sliding.newer_part()
+        np.testing.assert_allclose(newer, sum(map(terms, sliding.history[-rows:])), atol=1e-12)
 
 
 def test_sum_equals_that_of_the_ring_exactly_at_every_wrap():

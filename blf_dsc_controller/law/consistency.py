@@ -8,7 +8,10 @@ mean of u^T u, kept with Phi and b, gives the residual of the solution,
     r^2 = mean(u^T u) - b^T theta_LS   [(N m)^2],
 
 and a window is latched only if r^2 is at most four times the smallest of any full window, and if
-its solution gives the arm a positive inertia, which the residual does not show.  Rows that
+its solution gives the arm a positive inertia, which the residual does not show.  The first full
+window has only its own parts as a measure: fitted apart, neither may explain its rows better than
+by that factor, else the older part is removed from the window; again only if the residual has
+halved since, since parts of a period never agree about a lasting disturbance.  Rows that
 contradict the latched solution (their mean square error over 0.1 s exceeds eight times r^2) mean
 that the arm has changed: window, filters and latch are cleared, and learning restarts.  Until the
 new window is full, it does not average out disturbances, so its solution is pulled to the estimate
@@ -25,6 +28,7 @@ from blf_dsc_controller.law.state import Signals, State
 
 _GATE = 4.0  # ratio of mean squares: twice the torque
 _ALARM = 8.0  # likewise; larger, since a solution extrapolates
+_FALLEN = 0.5  # of the residual since the last split; that of a lasting disturbance does not fall
 _USUAL = 1.25  # times the smallest residual, which varies with the motion
 _DOUBT = 3.0  # pull to the anchor per (N m)^2 above that, 1/(kg m^2)^2
 _LEAST_INERTIA = 0.1  # fraction of the initial estimate's
@@ -65,21 +69,14 @@ def forget_window(settings: Settings, state: State) -> None:
     state.recent_residual[0] = 0.0
     state.rows[0] = 0.0
     state.cursor[0] = 0.0
-    clear(state.running)
-    clear(state.fresh)
-    clear(state.filter1)
-    clear(state.filter2)
+    window.clear(state.running)
+    window.clear(state.fresh)
+    window.clear(state.half)
+    window.clear(state.filter1)
+    window.clear(state.filter2)
     for j in range(settings.m):
         state.anchor[j] = state.estimate[j]
         state.min_eigenvector[j] = settings.m**-0.5
-
-
-@inner
-def clear(matrix: np.ndarray) -> None:
-    """Fill a matrix with zeros."""
-    for i in range(matrix.shape[0]):
-        for j in range(matrix.shape[1]):
-            matrix[i, j] = 0.0
 
 
 @inner
@@ -114,6 +111,64 @@ def is_physical(settings: Settings, signals: Signals, q: np.ndarray, theta: np.n
 
 
 @inner
+def is_in_question(settings: Settings, state: State, residual: float) -> bool:
+    """Return whether a full window must be compared with its parts, for want of another measure."""
+    is_full = state.rows[0] == settings.window
+    if not is_full or state.least_residual[0] > 0.0 or settings.window == 1:
+        return False
+    split = state.split_residual[0]
+    is_new = split == 0.0 or residual < _FALLEN * split
+    return bool(is_new and residual > _GATE * settings.residual_floor)
+
+
+@inner
+def solve(settings: Settings, state: State, signals: Signals) -> None:
+    """Factor Phi + rho R, and solve Phi theta = b, with theta in `signals.work`."""
+    window.regularized_factor(
+        state.active, settings.rho, settings.information, signals.Phi, signals.b, signals.factor
+    )
+    for j in range(settings.m):
+        signals.work[j] = signals.b[j]
+    cholesky.solve(signals.factor, signals.work)
+
+
+@inner
+def agrees_with_parts(settings: Settings, state: State, signals: Signals, residual: float) -> bool:
+    """Check the residual of a full window against those of its two parts, each fitted apart.
+
+    If they contradict each other, only the newer part stays in the window.  Restores Phi, b, its
+    factor and the solution of the whole window in `signals`.
+    """
+    cursor, length = int(state.cursor[0]), settings.window
+    newer_rows = window.newer_part(cursor, length, state.fresh, state.half, signals.newer)
+    least = residual
+    for k in range(3):
+        if k == 0:
+            rows = length - newer_rows
+            window.add(state.running, -1.0, signals.newer, signals.part)
+        elif k == 1:
+            rows = newer_rows
+            window.add(signals.newer, 0.0, signals.newer, signals.part)
+        else:
+            rows = length
+            window.add(state.running, 0.0, state.running, signals.part)
+        window.average_window(signals.part, rows, signals.Phi, signals.b)
+        if settings.prior_weight > 0.0:
+            prior, weight = settings.initial_estimate, settings.prior_weight
+            window.pull_to(prior, weight, settings.information, signals.Phi, signals.b)
+        solve(settings, state, signals)
+        least = min(least, window_residual(signals.part, signals.work) / rows)
+    if residual <= _GATE * explained(settings, least):
+        return True
+    state.split_residual[0] = residual
+    state.rows[0] = float(newer_rows)
+    window.add(signals.newer, 0.0, signals.newer, state.running)
+    for j in range(settings.m):
+        state.min_eigenvector[j] = settings.m**-0.5
+    return False
+
+
+@inner
 def accept_window(settings: Settings, state: State, signals: Signals, q: np.ndarray) -> bool:
     """Check that the window is consistent and its solution physical; if so, keep the solution.
 
@@ -128,6 +183,10 @@ def accept_window(settings: Settings, state: State, signals: Signals, q: np.ndar
     residual = window_residual(state.running, solution) / state.rows[0]
     missing = 1.0 - state.rows[0] / settings.window
     is_first = state.latched[0] == 0.0
+    if is_in_question(settings, state, residual) and not agrees_with_parts(
+        settings, state, signals, residual
+    ):
+        return False
     if missing <= 0.0 and (state.least_residual[0] == 0.0 or residual < state.least_residual[0]):
         state.least_residual[0] = residual
     if residual > _GATE * explained(settings, state.least_residual[0]):
@@ -136,17 +195,7 @@ def accept_window(settings: Settings, state: State, signals: Signals, q: np.ndar
     pull = settings.anchor_weight * missing + doubt
     if pull > 0.0:
         window.pull_to(state.anchor, pull, settings.information, signals.Phi, signals.b)
-        window.regularized_factor(
-            state.active,
-            settings.rho,
-            settings.information,
-            signals.Phi,
-            signals.b,
-            signals.factor,
-        )
-        for j in range(m):
-            solution[j] = signals.b[j]
-        cholesky.solve(signals.factor, solution)
+        solve(settings, state, signals)
     if not is_physical(settings, signals, q, solution):
         return False
     for j in range(m):

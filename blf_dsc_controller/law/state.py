@@ -26,6 +26,7 @@ class State(NamedTuple):
     columns_checked: Cell  # 1 once the disturbance columns are accepted or rejected
     residual: Cell  # mean square torque residual of the latched window, (N m)^2
     least_residual: Cell  # smallest residual of any full window, (N m)^2
+    split_residual: Cell  # of the last first window that its parts contradicted, (N m)^2
     recent_residual: Cell  # of the last rows against `solution`, (N m)^2
     changes: Cell  # number of times that the arm was found to have changed
     change_time: Cell  # time of the last change, s
@@ -45,6 +46,7 @@ class State(NamedTuple):
     filter2: Annotated[Array, 'n', 'm + 1']  # second pole
     running: Annotated[Array, 'm + 1', 'm + 1']  # S of the window
     fresh: Annotated[Array, 'm + 1', 'm + 1']  # F of the window
+    half: Annotated[Array, 'm + 1', 'm + 1']  # L of the window
     Phi: Annotated[Array, 'm', 'm']  # latched Phi_e
     b: Annotated[Array, 'm']  # latched b_e
     factor: Annotated[Array, 'm', 'm']  # Cholesky factor of Phi_e + rho R
@@ -88,6 +90,8 @@ class Signals(NamedTuple):
     Phi: Annotated[Array, 'm', 'm']  # of the current window
     b: Annotated[Array, 'm']
     factor: Annotated[Array, 'm', 'm']
+    newer: Annotated[Array, 'm + 1', 'm + 1']  # sum of the newer part of the window
+    part: Annotated[Array, 'm + 1', 'm + 1']  # of the part that is fitted
     inertia: Annotated[Array, 'n', 'n']  # M^(q) minus its least admissible value, or its factor
     unit: Annotated[Array, 'n']  # scratch
     still: Annotated[Array, 'n']  # zeros

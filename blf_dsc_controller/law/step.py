@@ -70,9 +70,14 @@ def update_window(
     if state.samples[0] == 0.0:
         return
     if int(state.samples[0]) % settings.row_interval == 0:
-        is_full = state.rows[0] == settings.window
         cursor = window.push_row(
-            state.ring, int(state.cursor[0]), state.running, state.fresh, signals.row, is_full
+            state.ring,
+            int(state.cursor[0]),
+            state.running,
+            state.fresh,
+            state.half,
+            signals.row,
+            int(state.rows[0]),
         )
         state.cursor[0] = cursor
         state.rows[0] = min(state.rows[0] + 1.0, float(settings.window))

@@ -4,7 +4,9 @@
 The window's sums of X^T [X | u] take constant time and do not drift.  A running sum that adds the
 new and subtracts the old term accumulates a rounding error in every sample.  The window therefore
 also keeps, beside the running sum S, the sum F of the rows written since the ring last wrapped; at
-the next wrap F is the exact sum over the ring and replaces S.
+the next wrap F is the exact sum over the ring and replaces S.  F also splits the window without
+further sums: with L, the sum of the last complete half of the ring, the newest rows sum to F + L,
+F or F - L, one of which has between a quarter and three quarters of the rows.
 
 Eigenvalues are relative to the information R of the prior, which makes parameters of different
 units comparable: Phi x = lambda R x.
@@ -26,19 +28,20 @@ def push_row(
     cursor: int,
     running: np.ndarray,
     fresh: np.ndarray,
+    half: np.ndarray,
     row: np.ndarray,
-    is_full: bool,
+    rows: int,
 ) -> int:
     """Replace the oldest row of the window by `row` and return the next cursor.
 
-    `ring` (N, n, m + 1) has the oldest row at `cursor`, which counts once the window is full;
-    `running` S and `fresh` F (m + 1, m + 1), the sums of [X | u]^T [X | u], have only their upper
-    triangle filled; `row` is [X | u] (n, m + 1).
+    `ring` (N, n, m + 1) has the oldest row at `cursor`, which counts once the window is full
+    (`rows` = N); `running` S, `fresh` F and `half` L (m + 1, m + 1), sums of [X | u]^T [X | u],
+    have only their upper triangle filled; `row` is [X | u] (n, m + 1).
     """
     old = ring[cursor]
     n = row.shape[0]
     m = row.shape[1] - 1
-    keep = 1.0 if is_full else 0.0
+    keep = 1.0 if rows == ring.shape[0] else 0.0
     for a in range(m + 1):
         for b in range(a, m + 1):
             new_term = 0.0
@@ -52,13 +55,47 @@ def push_row(
         for a in range(m + 1):
             old[i, a] = row[i, a]
     cursor += 1
+    if cursor == ring.shape[0] // 2:
+        add(fresh, 0.0, half, half)
     if cursor < ring.shape[0]:
         return cursor
-    for a in range(m + 1):
-        for b in range(a, m + 1):
-            running[a, b] = fresh[a, b]
-            fresh[a, b] = 0.0
+    if rows >= ring.shape[0] - 1:
+        add(fresh, 0.0, fresh, running)
+    add(fresh, -1.0, half, half)
+    clear(fresh)
     return 0
+
+
+@inner
+def add(first: np.ndarray, weight: float, second: np.ndarray, out: np.ndarray) -> None:
+    """Write the upper triangle of `first` + `weight` `second` to `out`."""
+    for a in range(out.shape[0]):
+        for b in range(a, out.shape[0]):
+            out[a, b] = first[a, b] + weight * second[a, b]
+
+
+@inner
+def clear(matrix: np.ndarray) -> None:
+    """Fill a matrix with zeros."""
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            matrix[i, j] = 0.0
+
+
+@inner
+def newer_part(
+    cursor: int, length: int, fresh: np.ndarray, half: np.ndarray, newer: np.ndarray
+) -> int:
+    """Fill `newer` with the sum of the newer part of a full ring; return its number of rows."""
+    middle = length // 2
+    if 4 * cursor < length:
+        add(fresh, 1.0, half, newer)
+        return cursor + length - middle
+    if 4 * cursor > 3 * length:
+        add(fresh, -1.0, half, newer)
+        return cursor - middle
+    add(fresh, 0.0, half, newer)
+    return cursor
 
 
 @inner
