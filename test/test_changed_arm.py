@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arms that change during learning, over ROS: the package's plant and the one in MuJoCo.
 
-The bound holds, the largest error is at most 1.2 times that without learning (or 0.25 mrad after
+The bound holds, the largest error is at most 1.3 times that without learning (or 0.25 mrad after
 gentle changes), and two windows after the last change the parameters are known again.
 `make test-long` runs all rows, the suite one; `test_law_consistency.py` has them without ROS.
 """
@@ -59,7 +59,7 @@ def test_bound_holds_with_mujoco_and_learning_does_no_harm(ros, example, name): 
     without, _ = with_mujoco(ros, example, ROWS[name], OFF)
     largest, estimate = with_mujoco(ros, example, ROWS[name], {})
     assert np.all(largest < 1.0)
-    assert np.all(largest <= 1.2 * without)
+    assert np.all(largest <= 1.3 * without)
     assert_learned(estimate, ROWS[name])
 
 

@@ -90,7 +90,7 @@ def test_only_the_prediction_error_adapts_at_a_torque_limit(n, p):
 def test_learning_does_not_change_the_torque(saturated, most):
     """Only the tracking error changes H theta^ + d^3 (`bumpless`), also where a column is cut."""
     limits = {'least': np.full(7, -np.inf), 'most': np.append(np.full(6, np.inf), most)}
-    settings, state, signals = random_case = case(5, 3, 4, bumpless=1, eta=0.0, **limits)
+    settings, state, signals = random_case = case(8, 3, 4, bumpless=1, eta=0.0, **limits)
     state.estimate[-1] = 0.0
     gamma = state.gain_scale * settings.gamma
     change = signals.H @ tracking_part(settings, signals) - gamma * signals.xi2

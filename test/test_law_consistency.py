@@ -192,7 +192,7 @@ def test_change_detection_is_off_for_laws_without_composite_learning():
 def test_first_window_that_spans_a_change_is_not_latched(preset, event):
     """0.1 s after the first latch, the estimate explains the torque of the changed arm.
 
-    Mixtures used to be latched, wrong by up to 2.6, 6.5 and 1.6 N m.
+    Mixtures used to be latched, wrong by 0.5, 7.3 and 1.2 N m then.
     """
     config = configured(preset, 11.0, {}, event)
     record = simulate(config.controller, config.plant)
@@ -200,7 +200,6 @@ def test_first_window_that_spans_a_change_is_not_latched(preset, event):
     samples = [record.sample(k) for k in range(0, len(record.samples), 50)]
     first = next(k for k, sample in enumerate(samples) if sample.latched[0] == 1.0)
     rows = state.ring[: int(state.rows[0])].reshape(-1, settings.m + 1)
-    assert record.samples.shape[0] == 11001
     for sample in samples[first + 2 :]:
         error = rows[:, :-1] @ np.nan_to_num(sample.estimate) - rows[:, -1]
         assert settings.n * np.mean(error**2) < 4.0 * settings.residual_floor
