@@ -482,3 +482,18 @@ def test_arm_that_stands_still_under_noise_is_not_taken_for_braked():
     rig.step(2000)
     assert np.abs(np.diff(rig.commands, axis=0)).max() > 2.0  # a tenth of the limit
     assert rig.supervisor.phase is Phase.TRACKING, rig.supervisor.text
+
+
+def test_torque_that_chatters_is_measured_and_named():
+    status = pytest.importorskip('blf_dsc_controller.nodes.controller_status')
+    hold = {'reference.type': 'hold', 'learning.initial_estimate': P.tolist()}
+    rig, quiet = Rig(hold), Rig(hold)
+    rng = np.random.default_rng(0)
+    rig.sense = lambda state: [state.raw(dq=state.dq + 0.04 * rng.normal(size=2))]
+    for each in (rig, quiet):
+        each.step(1500)
+    steps = np.diff(rig.commands, axis=0)[-1000:]
+    measured = np.sqrt(rig.guard.controller.checks.chatter)
+    assert measured == pytest.approx(np.sqrt((steps**2).mean(axis=0)), rel=0.2)
+    assert 'joint1 changes by' in status.chatter_of(rig.guard, ('joint1', 'joint2'))
+    assert status.chatter_of(quiet.guard, ('joint1', 'joint2')) == ''

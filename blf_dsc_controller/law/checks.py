@@ -37,6 +37,8 @@ class Checks(NamedTuple):
     ratio: Annotated[Array, 'n']  # largest |xi1| / k so far
     kept: Annotated[Array, 'm + n']  # estimates and d^3 of the last sample that was not suspect
     sample_time: Cell  # s, for the check of the effect of commands; 0: none
+    last: Annotated[Array, 'n']  # N m, command of the last sample
+    chatter: Annotated[Array, 'n']  # (N m)^2, mean square step of the commands over _CHATTERS
     still: Cell  # s, since a joint has last moved
     q: Annotated[Array, 'n']  # rad, where it has
     moved: Annotated[Array, 'm + n']  # estimates and d^3 of then
@@ -48,6 +50,7 @@ _STILL = 0.02  # of the bound: a joint that stays within has not moved
 _CHANGED = 0.1  # of the torque limit: a command that differs by more should have moved something
 _RECENT = 0.05  # s, past the chatter of encoders' steps in the velocities
 _BEFORE = 1.0  # s
+_CHATTERS = 0.5  # s
 
 checks_of, checks_size = view_of(Checks), size_of(Checks)
 
@@ -114,6 +117,16 @@ def check_effect(settings: Settings, checks: Checks, state: State, sample: Sampl
 
 
 @inner
+def average_steps(settings: Settings, checks: Checks, state: State, sample: Sample) -> None:
+    """Update the mean square step of the commands, which coarse encoders make chatter."""
+    share = min(1.0, checks.sample_time[0] / _CHATTERS)
+    for i in range(settings.n):
+        step = sample.torque[i] - checks.last[i] if state.samples[0] > 1.0 else 0.0
+        checks.chatter[i] += share * (step * step - checks.chatter[i])
+        checks.last[i] = sample.torque[i]
+
+
+@inner
 def check_sample(
     settings: Settings, checks: Checks, state: State, signals: Signals, sample: Sample
 ) -> int:
@@ -137,5 +150,6 @@ def check_sample(
         for i in range(settings.n):
             checks.kept[settings.m + i] = state.disturbance[i]
         if checks.sample_time[0] > 0.0:
+            average_steps(settings, checks, state, sample)
             flags |= check_effect(settings, checks, state, sample)
     return flags

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
@@ -27,6 +28,9 @@ _PHASES = {
 }
 
 
+_CHATTER = 0.11  # of the torque limit; 20 bits leave a Panda 0.01, 16 bits 0.13
+
+
 class ControllerStatus:
     """Publishes the state of the controller.
 
@@ -45,6 +49,8 @@ class ControllerStatus:
         self._diagnostics = DiagnosticsPublisher(node, joints, topics.STATE)
         self._revision = -1
         self._published: tuple[str, str, int] | None = None
+        self._logger = node.get_logger()
+        self._has_warned = False
 
     def has_news(self, guard: Guard) -> bool:
         """Whether there are events or a state to publish."""
@@ -113,6 +119,11 @@ class ControllerStatus:
             message = message.format('')
         elif guard.has_sample and guard.controller.sample.cuts.any():
             message = message.format(' rate')
+        elif chatter := chatter_of(guard, self._joints):
+            message = chatter
+            if not self._has_warned:
+                self._has_warned = True
+                self._logger.warning(chatter)
         else:
             level, message = OK, _PHASES[guard.supervisor.phase][1]
         return self._diagnostics.status('loop', level, message, values)
@@ -142,6 +153,19 @@ class ControllerStatus:
             columns = ', '.join(one.column for one in self.rejected)
             return self._diagnostics.status('learning', WARN, f'not estimated: {columns}', values)
         return self._diagnostics.status('learning', OK, learning, values)
+
+
+def chatter_of(guard: Guard, joints: Sequence[str]) -> str:
+    """Return the warning about a torque that chatters, as with coarse encoders; empty if none."""
+    steps = np.sqrt(guard.controller.checks.chatter)
+    worst = int(np.argmax(steps / guard.controller.settings.torque_limit))
+    if steps[worst] <= _CHATTER * guard.controller.settings.torque_limit[worst]:
+        return ''
+    return (
+        f'the torque of {joints[worst]} changes by {steps[worst]:.2g} N m rms each sample: its '
+        'measured velocity is coarse or noisy. Lower the pole of the velocity filter and add '
+        'its lag to robot.lag, whose gains are softer'
+    )
 
 
 def _watchdog(guard: Guard) -> str:
