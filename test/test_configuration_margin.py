@@ -13,7 +13,7 @@ from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.linear_loop import Loop, expected_errors, growth, margins
 
-ARMS = [('panda', 7), ('ur5e', 6)]
+ARMS = [('panda', 7), ('ur5e', 6), ('fr3', 7)]
 
 
 def configured(preset, sample_time, changes=None):
@@ -28,7 +28,7 @@ def inertias(config, settings):
 
 
 @pytest.mark.parametrize('sample_time', [0.001, 0.002, 0.004])
-@pytest.mark.parametrize('preset', ['panda', 'ur5e'])
+@pytest.mark.parametrize('preset', ['panda', 'ur5e', 'fr3'])
 def test_default_gains_have_margins_at_every_rate(preset, sample_time):
     """Inertias coupled, with the barrier at its softest and at its stiffest."""
     config = configured(preset, sample_time)
