@@ -41,7 +41,7 @@ PIP_FAILED := { echo 'The installation failed: see above. It needs a package ind
   'set HTTPS_PROXY, for a mirror PIP_INDEX_URL, without a network PIP_FIND_LINKS and' \
   'PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
 
-.PHONY: help venv demo paper arms changes expect test test-long test-browser pictures test-nightly soak fuzz docs lint clean bench release
+.PHONY: help venv demo paper arms changes expect test test-browser pictures test-nightly soak fuzz docs lint clean bench release
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' Makefile
@@ -72,19 +72,14 @@ test: $(READY)-test ## Run the tests (TESTS=test/test_x.py for some, WORKERS=0 i
 	@PYTHONDONTWRITEBYTECODE= PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(RUN) -m pytest -p xdist \
 	    -p _hypothesis_pytestplugin -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(TESTS)
 
-test-long: $(READY)-test ## Run the long tests: recorder killed ten times, one-minute recording, changing arms
-	@LONG_TESTS=1 $(RUN) -m pytest -rP test/test_bag_recorder_killed.py \
-	    test/test_bag_recorder_beside_loop.py test/test_changed_arm.py
-
 test-browser: $(READY)-test ## Test the pages of report and view in a headless Chromium, if installed
 	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_analysis_report_page.py test/test_view_page.py
 
 pictures: $(READY)-test ## Make the README's animation, doc/view.webp, with a headless Chromium
 	@PYTHONPATH="$(CURDIR):$(CURDIR)/test" $(VENV)/bin/python test/view_pictures.py
 
-test-nightly: $(READY)-test ## Test nodes and recovery with ten thousand random examples of each property
-	@BLF_DSC_EXAMPLES=10000 $(RUN) -m pytest -q test/test_nodes_properties.py \
-	    test/test_bags_recover.py::test_flipped_bytes_lose_only_the_chunks_they_hit
+test-nightly: ## Run all tests, those left out by make test as well, at length and with random examples
+	@NIGHTLY=1 PYTEST_ADDOPTS='-m "" -rP' $(MAKE) test
 
 changes: $(READY) ## Simulate 14,000 randomly changing arms, each with and without learning, into out/changes
 	@$(RUN) benchmark/changing_arms.py

@@ -214,6 +214,7 @@ def page(tmp_path_factory):
     return out
 
 
+@pytest.mark.nightly
 def test_page_shows_every_law_and_is_self_contained(page):
     text = (page / 'index.html').read_text(encoding='utf-8')
     assert not re.search(r'(?:src|href)="(?!data:)', text)
@@ -229,6 +230,7 @@ def test_page_shows_every_law_and_is_self_contained(page):
         assert gain.name in text
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize('name', ['proposed_tuned', 'slotine_li_tuned', 'pd_gravity_if'])
 def test_figures_are_reproduced_from_the_gains_of_the_page(page, name):
     """The same seed gives the same figures, in this process too."""
@@ -238,6 +240,7 @@ def test_figures_are_reproduced_from_the_gains_of_the_page(page, name):
     assert json.loads(json.dumps(again._asdict())) == found['runs'][0]
 
 
+@pytest.mark.nightly
 def test_learned_model_is_better_than_the_urdf(page):
     found = json.loads((page / 'figures.json').read_text(encoding='utf-8'))['ur5e']
     before, after = (

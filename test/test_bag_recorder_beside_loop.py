@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run in real time reports its timing, and the recorder beside it loses no message.
 
-Sequence numbers of the publishers reveal losses. `make test-long` records and prints a minute.
+Sequence numbers of the publishers reveal losses. `make test-nightly` records a minute.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.messages import topics
 
-DURATION = 60 if os.environ.get('LONG_TESTS') else 3  # s
+DURATION = 60 if os.environ.get('NIGHTLY') else 3  # s
 SAMPLES = DURATION * 1000 + 1
 EACH_SAMPLE = (
     topics.JOINT_STATES,
@@ -76,7 +76,7 @@ def test_every_message_of_a_real_time_loop_is_in_the_bag(out):
     facts = read_content(out / 'bag').facts
     for topic in EACH_SAMPLE:
         counts = facts[f'messages {topic.resolved}']
-        print(f'{topic.resolved}: {counts}')  # noqa: T201 - shown by make test-long
+        print(f'{topic.resolved}: {counts}')  # noqa: T201 - shown by make test-nightly
         count = len(recorded[topic.resolved])
         assert recorded[topic.resolved] == list(range(1, count + 1))
         assert counts == f'{count} written, 0 missed'

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """kill -9 of the recorder at random times: everything but the last 0.1 s is recovered.
 
-`make test-long` kills ten times within a minute of recording and prints the loss of each kill.
+`make test-nightly` kills ten times within a minute of recording, and prints each loss.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from recorder_rig import Rig
 
 from blf_dsc_controller.bags.recover import recover
 
-LONG = bool(os.environ.get('LONG_TESTS'))
+LONG = bool(os.environ.get('NIGHTLY'))
 KILLS = 10 if LONG else 3
 LONGEST = 12.0 if LONG else 1.0  # s of recording before a kill: ten take a minute on average
 PERIOD = 1_000_000  # ns between two messages of a topic
@@ -146,7 +146,7 @@ def test_kill_loses_at_most_the_last_tenth_of_a_second(k, memory, tmp_path):
         rest = stream.sent[numbers[-1] + 1 :]
         lost = killed - rest[0] if rest else 0  # ns
         excused = waiting.since(killed - lost) + own.since(killed - lost)
-        print(  # noqa: T201 - shown by make test-long
+        print(  # noqa: T201 - shown by make test-nightly
             f'killed after {len(numbers):5} of /{topic}: without the last {lost * 1e-6:5.1f} ms; '
             f'it and the publisher waited for a processor {excused * 1e-6:.1f} ms of these'
         )

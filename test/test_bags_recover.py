@@ -23,7 +23,7 @@ from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointSt
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES
 from blf_dsc_controller.messages.types import typestore
 
-EXAMPLES = int(os.environ.get('BLF_DSC_EXAMPLES', '60'))
+EXAMPLES = 10_000 if os.environ.get('NIGHTLY') else 60
 START = 1_734_000_000_000_000_000
 MILLISECOND = 1_000_000
 CHUNKS = 6

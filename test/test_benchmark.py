@@ -13,6 +13,8 @@ import pytest
 
 from blf_dsc_controller.monte_carlo.runs import run_chunk
 
+pytestmark = pytest.mark.nightly
+
 BENCHMARK = Path(__file__).parents[1] / 'benchmark'
 MODULES = [
     '.'.join(path.relative_to(BENCHMARK).with_suffix('').parts)

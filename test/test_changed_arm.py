@@ -3,7 +3,7 @@
 
 The bound holds, the largest error is at most 1.3 times that without learning (or 0.25 mrad after
 gentle changes), and two windows after the last change the parameters are known again.
-`make test-long` runs all rows, the suite one; `test_law_consistency.py` has them without ROS.
+`make test-nightly` runs all rows, `make test` one; `test_law_consistency.py` has them without ROS.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from sim_plant.plant import parameters_of
 
 QUIET = {'telemetry.enabled': False}
 OBSERVED = {'wait_for_subscribers': 1}
-TESTED = ROWS if os.environ.get('LONG_TESTS') else ['payload to 0.75 kg at 8 s']
+TESTED = ROWS if os.environ.get('NIGHTLY') else ['payload to 0.75 kg at 8 s']
 
 
 @pytest.mark.parametrize('name', TESTED)

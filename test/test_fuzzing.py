@@ -10,6 +10,8 @@ from hypothesis import HealthCheck, Phase, settings
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 
+pytestmark = pytest.mark.nightly
+
 FEW = settings(
     max_examples=8,
     phases=(Phase.generate,),

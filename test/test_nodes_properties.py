@@ -25,7 +25,7 @@ from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointSt
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from sim_plant.node import PlantNode
 
-EXAMPLES = int(os.environ.get('BLF_DSC_EXAMPLES', '60'))
+EXAMPLES = 10_000 if os.environ.get('NIGHTLY') else 60
 SETTINGS = settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck))
 LIMIT = 20.0
 START = (2.293, 1.696)

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import xml.etree.ElementTree as ET
 import zipfile
 from collections import Counter
@@ -62,18 +63,26 @@ def sources():
 
 
 @pytest.fixture(scope='module')
-def wheel(tmp_path_factory):
-    """Build the wheel from a copy of the sources, with what is installed and no network."""
+def sdist(tmp_path_factory):
+    """Build the source distribution from a copy of the sources."""
     copy = tmp_path_factory.mktemp('source') / NAME
     unwanted = ('.*', 'build', 'install', 'log', 'out', '*.egg-info', '__pycache__')
     shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*unwanted))
     text = (copy / 'package.xml').read_text()
     url = f'<url type="website">{URL}</url>'  # as its publisher would add it
     (copy / 'package.xml').write_text(text.replace('<exec_depend>', f'{url}<exec_depend>', 1))
+    subprocess.run([sys.executable, 'setup.py', '-q', 'sdist'], cwd=copy, check=True)
+    (path,) = copy.glob('dist/*.tar.gz')
+    return path
+
+
+@pytest.fixture(scope='module')
+def wheel(sdist, tmp_path_factory):
+    """Build the wheel from the source distribution, with what is installed and no network."""
     build = [sys.executable, '-m', 'pip', 'wheel', '--quiet', '--no-deps', '--no-index']
     out = tmp_path_factory.mktemp('wheel')
     subprocess.run(
-        [*build, '--no-build-isolation', '--wheel-dir', str(out), '.'], cwd=copy, check=True
+        [*build, '--no-build-isolation', '--wheel-dir', str(out), str(sdist)], check=True
     )
     (path,) = out.glob('*.whl')
     return zipfile.ZipFile(path)
@@ -168,6 +177,13 @@ def test_no_two_classes_have_the_same_name():
         if isinstance(node, ast.ClassDef)
     )
     assert [name for name, count in classes.items() if count > 1] == []
+
+
+def test_source_distribution_has_no_tests(sdist):
+    with tarfile.open(sdist) as archive:
+        folders = {name.split('/')[1] for name in archive.getnames() if '/' in name}
+    assert {*PACKAGES, 'config', 'launch', 'resource', 'setup.py', 'package.xml'} <= folders
+    assert 'test' not in folders
 
 
 def test_wheel_is_marked_as_typed(wheel):

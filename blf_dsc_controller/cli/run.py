@@ -15,7 +15,7 @@ from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.summary import format_table, summarize, write_summary
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import recorded_run
-from blf_dsc_controller.cli.main import INTERRUPTED, require_ros, unwritable
+from blf_dsc_controller.cli.main import INTERRUPTED, unwritable
 from blf_dsc_controller.cli.progress import LoopProgress
 from blf_dsc_controller.compiled.notice import announced_compilation
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
@@ -43,8 +43,6 @@ def run(options: Namespace) -> int:
     """Run the closed loop and write the results to a new folder."""
     with announced_compilation(print_notice):
         config = _configuration(options)
-    if not options.offline:
-        require_ros()
     if options.view:
         _check_view(options)
     out = make_folder(options.out)

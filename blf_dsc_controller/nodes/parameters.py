@@ -13,6 +13,7 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
@@ -39,6 +40,17 @@ _RANGES: dict[Kind, tuple[str, type[Any], type[Any], Any]] = {
 }
 
 
+class FixedParameterError(ParameterNotDeclaredException):
+    """Refusal to change a parameter that is fixed at the start.
+
+    rclpy refuses it before it asks any callback that can give a reason, but passes the text of its
+    own exception on to `ros2 param set`.
+    """
+
+    def __init__(self, one: Parameter) -> None:
+        Exception.__init__(self, f'{one.name} is {_fixed(one)}')
+
+
 def declare(node: Node, cls: type[Config]) -> Config:
     """Declare all parameters of a configuration, and return the one the node was started with.
 
@@ -57,6 +69,15 @@ def declare(node: Node, cls: type[Config]) -> Config:
         else:
             typed = list(value) if isinstance(value, tuple) else value
             node.declare_parameter(one.name, typed, descriptor(one), ignore_override=True)
+    fixed = {one.name: one for one in parameters(cls) if one.read_only}
+
+    def refuse_fixed(requested: list[RosParameter]) -> list[RosParameter]:
+        for each in requested:
+            if each.name in fixed:
+                raise FixedParameterError(fixed[each.name])
+        return requested
+
+    node.add_pre_set_parameters_callback(refuse_fixed)
     return config
 
 
@@ -122,7 +143,7 @@ def descriptor(one: Parameter) -> ParameterDescriptor:
     if one.length:
         constraints.append('as many entries as ' + ' times '.join(one.length))
     if one.read_only:
-        constraints.append(f'fixed at the start: {one.read_only}')
+        constraints.append(_fixed(one))
     described = ParameterDescriptor(
         description=f'{symbol}{one.description}{unit}',
         read_only=bool(one.read_only),
@@ -136,6 +157,10 @@ def descriptor(one: Parameter) -> ParameterDescriptor:
         to_value = largest if high is None else number(high)
         setattr(described, name, [message(from_value=from_value, to_value=to_value)])
     return described
+
+
+def _fixed(one: Parameter) -> str:
+    return f'fixed at the start: {one.read_only}'
 
 
 def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
