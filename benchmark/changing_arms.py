@@ -12,12 +12,10 @@ import sys
 from pathlib import Path
 
 from blf_dsc_controller.cli.main import main as blf_dsc
-from blf_dsc_controller.monte_carlo.figures import draw_pairs
-from blf_dsc_controller.monte_carlo.report import exceptions
-from blf_dsc_controller.monte_carlo.runs import Columns
-from blf_dsc_controller.monte_carlo.statistics import Summary, summarize
-from blf_dsc_controller.monte_carlo.store import Store
-from blf_dsc_controller.monte_carlo.study import Study
+from blf_dsc_controller.studies.monte_carlo import Study
+from blf_dsc_controller.studies.report import exceptions
+from blf_dsc_controller.studies.runs import Columns, Store
+from blf_dsc_controller.studies.statistics import Summary, draw_pairs, summarize
 
 STUDIES = {
     'monte_carlo_events': 'two links',

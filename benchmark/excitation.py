@@ -18,10 +18,9 @@ import time
 
 import numpy as np
 
-from blf_dsc_controller.cli.excite import clearance_of, guess_of
+from blf_dsc_controller.cli.identify import clearance_of, guess_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER
-from blf_dsc_controller.configuration.params_file import load, locate
+from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.identification.exciting_reference import ExcitationProblem, search
 
 _HARMONICS, _TORQUE, _SPEED, _RADIUS = 3, 0.8, 0.95, 0.07

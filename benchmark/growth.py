@@ -14,7 +14,7 @@ import numpy as np
 from harness import Ratio, interleaved, ratio
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import build, change, flatten, parameters
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import controller_of

@@ -139,7 +139,7 @@ def wait_for(
 @contextmanager
 def own_graph() -> Iterator[None]:
     """Isolate the ROS nodes of this process and of its contestants from all others."""
-    from blf_dsc_controller.cli.isolation import localhost_environment, own_domain
+    from blf_dsc_controller.cli.session import localhost_environment, own_domain
 
     with own_domain() as domain:
         os.environ.update({'ROS_DOMAIN_ID': str(domain), **localhost_environment()})

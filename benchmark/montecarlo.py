@@ -17,18 +17,17 @@ import numpy as np
 from c_reference import Reference
 from harness import Ratio, interleaved, ratio
 
-from blf_dsc_controller.configuration.params_file import locate
+from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.law.factory import controller_of
-from blf_dsc_controller.monte_carlo import executors
-from blf_dsc_controller.monte_carlo.runs import run_chunk, warm_up
-from blf_dsc_controller.monte_carlo.store import Span
-from blf_dsc_controller.monte_carlo.study import (
+from blf_dsc_controller.studies import runs
+from blf_dsc_controller.studies.monte_carlo import (
     Study,
     draw,
     load_study,
     origin_of,
     plant_of_draw,
 )
+from blf_dsc_controller.studies.runs import Span, run_chunk, warm_up
 
 _DURATION = 10.0  # s
 _RUNS = 50  # per round against C
@@ -99,14 +98,14 @@ def _processes(study: Study) -> Iterator[Ratio]:
 
 def _pool(study: Study, stack: ExitStack, workers: int) -> Callable[[], int]:
     """Return the engine's work on this many workers, which stay alive between rounds."""
-    engine = executors.processes(workers)
+    engine = runs.processes(workers)
     executor: Executor = stack.enter_context(engine.open())
     engine = engine._replace(open=lambda: nullcontext(executor))
     spans = [Span(k * _CHUNK, _CHUNK) for k in range(_CHUNKS)]
 
     def work() -> int:
         done: list[Span] = []
-        executors.compute(study, spans, engine, lambda span, _: done.append(span), print)
+        runs.compute(study, spans, engine, lambda span, _: done.append(span), print)
         return sum(span.runs for span in done)
 
     return work

@@ -24,8 +24,7 @@ import numpy as np
 from harness import Contestant, ContestantError, Ratio, Watched, own_graph, ratio, wait_for
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Telemetry
-from blf_dsc_controller.configuration.nodes import CONTROLLER, LoopConfig
-from blf_dsc_controller.configuration.params_file import dump, load_loop
+from blf_dsc_controller.configuration.nodes import CONTROLLER, LoopConfig, dump, load_loop
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.telemetry import PlantTelemetry
 from blf_dsc_controller.simulation.loop import simulate

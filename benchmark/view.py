@@ -17,7 +17,7 @@ from harness import Contestant, Ratio, own_graph, ratio
 from node import _HEARD, _UNHEARD, Run, StandIn, _recorded_states, _started
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.nodes import load_loop
 
 _ROUNDS = 7
 _VIEWED = 'controller, telemetry and view on'

@@ -16,13 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.configuration.nodes import LoopConfig
-from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.state import sample_of
-from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.simulation.loop import START, Record, simulate_law
 from blf_dsc_controller.simulation.metrics import another_motion, torque_error, torque_rows
-from blf_dsc_controller.simulation.record import START, Record
 from blf_dsc_controller.supervision.guard import Guard
 
 PRESETS = ('panda', 'ur5e')

@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from blf_dsc_controller.analysis.metrics import measure as measure
     from blf_dsc_controller.bags.reader import read_run as read_run
     from blf_dsc_controller.configuration.controller import ControllerConfig as ControllerConfig
-    from blf_dsc_controller.configuration.params_file import load_loop as load_loop
+    from blf_dsc_controller.configuration.nodes import load_loop as load_loop
     from blf_dsc_controller.configuration.plant import PlantConfig as PlantConfig
     from blf_dsc_controller.law.factory import controller_of as controller_of
-    from blf_dsc_controller.monte_carlo.runs import run_chunk as run_chunk
-    from blf_dsc_controller.monte_carlo.study import load_study as load_study
     from blf_dsc_controller.replay.verify import verify as verify
     from blf_dsc_controller.run import Run as Run
     from blf_dsc_controller.simulation.loop import simulate as simulate
+    from blf_dsc_controller.studies.monte_carlo import load_study as load_study
+    from blf_dsc_controller.studies.runs import run_chunk as run_chunk
 
 __version__ = '0.1.0'
 
@@ -32,11 +32,11 @@ _PUBLIC = {
     'Run': 'run',
     'controller_of': 'law.factory',
     'draw': 'analysis.figures',
-    'load_loop': 'configuration.params_file',
-    'load_study': 'monte_carlo.study',
+    'load_loop': 'configuration.nodes',
+    'load_study': 'studies.monte_carlo',
     'measure': 'analysis.metrics',
     'read_run': 'bags.reader',
-    'run_chunk': 'monte_carlo.runs',
+    'run_chunk': 'studies.runs',
     'simulate': 'simulation.loop',
     'verify': 'replay.verify',
 }

@@ -12,10 +12,9 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from blf_dsc_controller.configuration.nodes import PLANT
-from blf_dsc_controller.configuration.params_file import load, locate
+from blf_dsc_controller.configuration.files import share_folder
+from blf_dsc_controller.configuration.nodes import PLANT, load, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.share import share_folder
 from sim_plant.arms import urdf_of
 
 PACKAGE = 'blf_dsc_controller'

@@ -11,9 +11,8 @@ from blf_dsc_controller.arms.two_link_geometry import urdf
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.nodes import PLANT
-from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.plant import Deviation, PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of
-from blf_dsc_controller.configuration.truth import Deviation
 from sim_plant.arm import Arm
 from sim_plant.dynamics import PointMassArm
 from sim_plant.rigid_arm import rigid_arm

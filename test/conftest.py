@@ -29,7 +29,7 @@ os.environ.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
 if find_spec('rclpy'):  # some tests run without ROS
     from own_domain import own_domain
 
-    from blf_dsc_controller.cli.isolation import localhost_environment
+    from blf_dsc_controller.cli.session import localhost_environment
 
     os.environ.update({'ROS_DOMAIN_ID': str(own_domain()), **localhost_environment()})
 

@@ -37,7 +37,7 @@ from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.share import share_folder
+from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.errors import BlfDscError
 
 MOST_SECONDS = 60.0  # of CPU time
@@ -385,7 +385,7 @@ def parameters(data, preset):
         path.write_bytes('\n'.join(lines).encode('utf-8', 'surrogatepass'))
         with bounded('parameters'):
             command('replay', base(), '--config', path)
-            from blf_dsc_controller.configuration.params_file import load_loop
+            from blf_dsc_controller.configuration.nodes import load_loop
 
             with contextlib.suppress(BlfDscError):
                 load_loop(path)
@@ -446,7 +446,7 @@ def urdfs(data, arm):
             f'    barrier: {{bound: {[0.005] * (7 if arm == "panda" else 6)}}}\n'
         )
         with bounded('urdfs'):
-            from blf_dsc_controller.configuration.params_file import load_loop
+            from blf_dsc_controller.configuration.nodes import load_loop
 
             with contextlib.suppress(BlfDscError):
                 load_loop(given_file)

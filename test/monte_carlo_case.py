@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from blf_dsc_controller.monte_carlo.runs import run_chunk
-from blf_dsc_controller.monte_carlo.study import load_study
+from blf_dsc_controller.studies.monte_carlo import load_study
+from blf_dsc_controller.studies.runs import run_chunk
 
 RUNS = 24
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from contextlib import ExitStack
 
-from blf_dsc_controller.cli import isolation
+from blf_dsc_controller.cli import session as isolation
 from blf_dsc_controller.errors import BlfDscError
 
 _WANTED = 8

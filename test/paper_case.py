@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.configuration.nodes import LoopConfig
-from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.simulation.loop import simulate_law

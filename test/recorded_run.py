@@ -7,8 +7,7 @@ from collections import Counter
 
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.writer import BagWriter
-from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
-from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 

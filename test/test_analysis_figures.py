@@ -22,7 +22,7 @@ from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.analysis.style import COLOURS, formula
 from blf_dsc_controller.analysis.thinning import envelope
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.simulation.loop import simulate
 
 

@@ -15,11 +15,11 @@ from synthetic_bag import Synthetic
 from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.cli.progress import LoopProgress
+from blf_dsc_controller.cli.run import LoopProgress
 from blf_dsc_controller.configuration.nodes import LoopConfig
-from blf_dsc_controller.monte_carlo.runs import run_chunk
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.studies.runs import run_chunk
 
 CHAIN = {'model': 'planar_chain', 'learning.initial_estimate': [0.5, 0.2, 0.16]}
 

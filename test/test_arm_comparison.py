@@ -10,18 +10,16 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from blf_dsc_controller.arm_comparison import study
-from blf_dsc_controller.arm_comparison.baselines import simulate_baseline
-from blf_dsc_controller.arm_comparison.contenders import (
-    BASELINES,
-    CONTENDERS,
-    INTERVALS,
-    Figures,
-    joint_inertia,
-    law_changes,
-    run,
-)
-from blf_dsc_controller.arm_comparison.study import (
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
+from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.reference import terms
+from blf_dsc_controller.reference.approach import reference_of
+from blf_dsc_controller.simulation.metrics import torque_rows
+from blf_dsc_controller.studies import arms as study
+from blf_dsc_controller.studies.arms import (
     ROUGHEST,
     Result,
     cost_of,
@@ -29,15 +27,16 @@ from blf_dsc_controller.arm_comparison.study import (
     table_of,
     trial,
 )
-from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.nodes import LoopConfig
-from blf_dsc_controller.configuration.params_file import load_loop
-from blf_dsc_controller.configuration.robot import parameters_of
-from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.reference import terms
-from blf_dsc_controller.reference.approach import reference_of
-from blf_dsc_controller.simulation.metrics import torque_rows
+from blf_dsc_controller.studies.laws import (
+    BASELINES,
+    CONTENDERS,
+    INTERVALS,
+    Figures,
+    joint_inertia,
+    law_changes,
+    run,
+    simulate_baseline,
+)
 
 IDEAL = {
     'truth.mass_deviation': 0.0,

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from blf_dsc_controller.monte_carlo.runs import run_chunk
+from blf_dsc_controller.studies.runs import run_chunk
 
 pytestmark = pytest.mark.nightly
 

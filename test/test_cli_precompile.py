@@ -13,8 +13,8 @@ from blf_dsc_controller.cli.main import main
 
 SHOW = """
 import sys
-from blf_dsc_controller.cli import precompile
-from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.cli import run as precompile
+from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.reference.terms import _sample
 from sim_plant.kernels import KERNELS

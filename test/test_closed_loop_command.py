@@ -21,7 +21,7 @@ from ros_rig import simulated_torques
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.nodes import load_loop
 
 CHAIN = {'model': 'planar_chain', 'learning.initial_estimate': [0.5, 0.2, 0.16]}
 DURATION = 3  # s

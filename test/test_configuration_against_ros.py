@@ -11,7 +11,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.params_file import dump, locate, read
+from blf_dsc_controller.configuration.nodes import dump, locate, read
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import ConfigurationError
 

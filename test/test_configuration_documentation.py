@@ -7,8 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from blf_dsc_controller.configuration.documentation import parameter_page
-from blf_dsc_controller.configuration.nodes import known_names
+from blf_dsc_controller.configuration.nodes import known_names, parameter_page
 from blf_dsc_controller.messages import topics
 
 COMMITTED = Path(__file__).parents[1] / 'doc' / 'parameters.md'
@@ -16,13 +15,13 @@ COMMITTED = Path(__file__).parents[1] / 'doc' / 'parameters.md'
 
 def test_parameter_page_is_up_to_date():
     assert COMMITTED.read_text(encoding='utf-8') == parameter_page(), (
-        'run: python -m blf_dsc_controller.configuration.documentation doc/parameters.md'
+        'run: python -m blf_dsc_controller.configuration.nodes doc/parameters.md'
     )
 
 
 def test_command_writes_the_parameter_page(tmp_path):
     page = tmp_path / 'parameters.md'
-    module = 'blf_dsc_controller.configuration.documentation'
+    module = 'blf_dsc_controller.configuration.nodes'
     subprocess.run([sys.executable, '-m', module, str(page)], check=True, cwd=COMMITTED.parents[1])
     assert page.read_text(encoding='utf-8') == parameter_page()
 

@@ -9,10 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import LoopConfig, RecorderConfig
-from blf_dsc_controller.configuration.params_file import dump, format_value, load, load_loop
+from blf_dsc_controller.configuration.files import parse
+from blf_dsc_controller.configuration.nodes import (
+    LoopConfig,
+    RecorderConfig,
+    dump,
+    format_value,
+    load,
+    load_loop,
+)
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.ros_yaml import parse
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import ConfigurationError
 

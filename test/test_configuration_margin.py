@@ -8,7 +8,7 @@ import pytest
 
 from blf_dsc_controller.arms.batch import inertia_matrices
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.params_file import load, load_loop, locate
+from blf_dsc_controller.configuration.nodes import load, load_loop, locate
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.linear_loop import Loop, expected_errors, growth, margins

@@ -10,8 +10,15 @@ import pytest
 
 from blf_dsc_controller.arms.model import arm_model
 from blf_dsc_controller.configuration.controller import MODELS, ControllerConfig, parameter_count
-from blf_dsc_controller.configuration.nodes import NODES, LoopConfig, RecorderConfig, known_names
-from blf_dsc_controller.configuration.params_file import load_loop, locate, read
+from blf_dsc_controller.configuration.nodes import (
+    NODES,
+    LoopConfig,
+    RecorderConfig,
+    known_names,
+    load_loop,
+    locate,
+    read,
+)
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, parameters
 from blf_dsc_controller.errors import ConfigurationError
@@ -185,7 +192,7 @@ def test_known_names_cover_all_nodes():
 def test_configurations_load_without_ros():
     program = (
         'import sys; sys.modules.update(rclpy=None, rcl_interfaces=None, ament_index_python=None)\n'
-        'from blf_dsc_controller.configuration.params_file import load_loop, locate\n'
+        'from blf_dsc_controller.configuration.nodes import load_loop, locate\n'
         'print(load_loop(locate("noisy")).plant.actuator.delay)'
     )
     run = subprocess.run(

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.params_file import load, load_loop, locate, read
+from blf_dsc_controller.configuration.nodes import load, load_loop, locate, read
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import ConfigurationError
 

@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from blf_dsc_controller.configuration.ros_yaml import parse_scalar
+from blf_dsc_controller.configuration.files import parse_scalar
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from blf_dsc_controller.configuration import share
-from blf_dsc_controller.configuration.params_file import locate
-from blf_dsc_controller.configuration.share import share_folder
+from blf_dsc_controller.configuration import files as share
+from blf_dsc_controller.configuration.files import share_folder
+from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.errors import BlfDscError
 
 

@@ -28,7 +28,7 @@ from test_launch import NODES, arguments_of, launched, start  # noqa: F401 - fix
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.params_file import load, load_loop
+from blf_dsc_controller.configuration.nodes import load, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import simulate

@@ -18,9 +18,9 @@ from mcap.records import Chunk
 
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.files import share_folder
+from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.configuration.share import share_folder
 from blf_dsc_controller.errors import BlfDscError
 
 pytestmark = pytest.mark.usefixtures('blank_pictures')

@@ -9,8 +9,8 @@ from command import finished
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from blf_dsc_controller.cli import isolation
-from blf_dsc_controller.cli.isolation import localhost_environment
+from blf_dsc_controller.cli import session as isolation
+from blf_dsc_controller.cli.session import localhost_environment
 
 MULTIPLY = """
 import os, sys

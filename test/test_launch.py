@@ -21,7 +21,7 @@ from command import finished
 from own_domain import own_domain
 from rcl_interfaces.srv import GetParameters, ListParameters
 
-from blf_dsc_controller.configuration.params_file import dump, locate
+from blf_dsc_controller.configuration.nodes import dump, locate
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.nodes.arguments import assigned
 from blf_dsc_controller.nodes.controller_node import ControllerNode

@@ -15,7 +15,7 @@ from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.arms.prior import LINKS
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import estimate_names, model_of, prior_covariance
 from blf_dsc_controller.replay.verify import verify

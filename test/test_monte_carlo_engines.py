@@ -13,10 +13,8 @@ import pytest
 from monte_carlo_case import RUNS, same, study, whole
 
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.monte_carlo import executors as engines
-from blf_dsc_controller.monte_carlo.executors import RETRIES, chunk_size, compute
-from blf_dsc_controller.monte_carlo.runs import warm_up
-from blf_dsc_controller.monte_carlo.store import Span
+from blf_dsc_controller.studies import runs as engines
+from blf_dsc_controller.studies.runs import RETRIES, Span, chunk_size, compute, warm_up
 
 
 @pytest.fixture(scope='module')

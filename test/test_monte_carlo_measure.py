@@ -8,10 +8,10 @@ import pytest
 from monte_carlo_case import LOOP, STUDY, study, whole
 
 from blf_dsc_controller.law.state import sample_of
-from blf_dsc_controller.monte_carlo.report import plant_of_run
-from blf_dsc_controller.monte_carlo.runs import run_chunk
 from blf_dsc_controller.simulation.loop import simulate_law
 from blf_dsc_controller.simulation.metrics import another_motion, torque_rows
+from blf_dsc_controller.studies.report import plant_of_run
+from blf_dsc_controller.studies.runs import run_chunk
 
 LIMITS = 'blf_dsc_controller:\n  ros__parameters:\n'
 WEAK = LOOP.replace(LIMITS, LIMITS + '    torque: {limit: [8.0, 20.0]}\n')

@@ -12,11 +12,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from blf_dsc_controller.configuration.params_file import locate
+from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.monte_carlo.runs import run_chunk
-from blf_dsc_controller.monte_carlo.statistics import compare
-from blf_dsc_controller.monte_carlo.study import load_study
+from blf_dsc_controller.studies.monte_carlo import load_study
+from blf_dsc_controller.studies.runs import run_chunk
+from blf_dsc_controller.studies.statistics import compare
 
 FIRST = {'monte_carlo_events': 16, 'monte_carlo_panda': 6, 'monte_carlo_ur5e': 6}
 

@@ -17,12 +17,12 @@ from monte_carlo_case import LOOP, RUNS, STUDY, study, whole
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.cli.run import make_folder
-from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.monte_carlo.report import plant_of_run, reproduce, write_report
-from blf_dsc_controller.monte_carlo.statistics import influence, summarize, worst_first
-from blf_dsc_controller.monte_carlo.store import Span, Store
 from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.studies.report import plant_of_run, reproduce, write_report
+from blf_dsc_controller.studies.runs import Span, Store
+from blf_dsc_controller.studies.statistics import influence, summarize, worst_first
 
 
 @pytest.fixture(scope='module')

@@ -17,9 +17,8 @@ from monte_carlo_case import LOOP, RUNS, STUDY, same, study, whole, write
 
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.monte_carlo import store as stores
-from blf_dsc_controller.monte_carlo.runs import run_chunk
-from blf_dsc_controller.monte_carlo.store import Span, Store
+from blf_dsc_controller.studies import runs as stores
+from blf_dsc_controller.studies.runs import Span, Store, run_chunk
 
 pytestmark = pytest.mark.usefixtures('blank_pictures')
 

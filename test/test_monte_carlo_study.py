@@ -10,18 +10,19 @@ from hypothesis import strategies as st
 from monte_carlo_case import LOOP, STUDY, study, write
 from scipy import stats
 
-from blf_dsc_controller.configuration.params_file import locate
+from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.configuration.schema import Kind
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import controller_of
-from blf_dsc_controller.monte_carlo.study import (
+from blf_dsc_controller.studies.monte_carlo import (
+    TAIL,
     draw,
     load_study,
     origin_of,
+    parse,
     plant_of_draw,
     write_study,
 )
-from blf_dsc_controller.monte_carlo.variations import TAIL, parse
 
 FRACTIONS = st.floats(0.0, 1.0, exclude_max=True)
 

@@ -19,11 +19,11 @@ from plants import run as measurements
 from ros_rig import RosRig
 from test_plant_events import ALL_KINDS
 
-from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from blf_dsc_controller.simulation.record import START
+from blf_dsc_controller.simulation.loop import START
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Phase
 from sim_plant.plant import plant_of

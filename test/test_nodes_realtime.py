@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from blf_dsc_controller.configuration.common import Realtime
+from blf_dsc_controller.configuration.schema import Realtime
 from blf_dsc_controller.nodes.process import request_realtime
 
 

@@ -20,9 +20,8 @@ from markdown_it import MarkdownIt
 
 from blf_dsc_controller.cli import main as command_line
 from blf_dsc_controller.cli.parser import make_parser
-from blf_dsc_controller.configuration.nodes import NODES, known_names
-from blf_dsc_controller.configuration.params_file import load, read
-from blf_dsc_controller.monte_carlo.study import load_study
+from blf_dsc_controller.configuration.nodes import NODES, known_names, load, read
+from blf_dsc_controller.studies.monte_carlo import load_study
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTSIDE = ('README.md', 'CONTRIBUTING.md', 'examples/mujoco_plant/README.md')

@@ -13,14 +13,14 @@ import pytest
 
 from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.params_file import load_loop, locate
-from blf_dsc_controller.paper import claims, tune
-from blf_dsc_controller.paper.cases import CASES, SIDE_BY_SIDE, SWEEPS, case_name
-from blf_dsc_controller.paper.claims import FAILS, HOLDS, ONLY_IF, verdict
-from blf_dsc_controller.paper.report import kept_bounds
-from blf_dsc_controller.paper.results import Results
+from blf_dsc_controller.configuration.nodes import load_loop, locate
 from blf_dsc_controller.run import Run, Series
 from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.studies import paper_claims as claims
+from blf_dsc_controller.studies import tuning as tune
+from blf_dsc_controller.studies.paper import kept_bounds
+from blf_dsc_controller.studies.paper_cases import CASES, SIDE_BY_SIDE, SWEEPS, Results, case_name
+from blf_dsc_controller.studies.paper_claims import FAILS, HOLDS, ONLY_IF, verdict
 
 BOUND = np.array([0.002, 0.004])
 TRUE = np.array([3.0, 4.0])

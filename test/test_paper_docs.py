@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from paper_case import P, configured, run
 
-from blf_dsc_controller.configuration.nodes import known_names
-from blf_dsc_controller.configuration.params_file import locate
+from blf_dsc_controller.configuration.nodes import known_names, locate
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {name: (ROOT / 'doc' / f'{name}.md').read_text() for name in ('theory', 'errata', 'tuning')}

@@ -13,8 +13,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import NODES, RecorderConfig
-from blf_dsc_controller.configuration.params_file import load_loop, locate
+from blf_dsc_controller.configuration.nodes import NODES, RecorderConfig, load_loop, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change, flatten, parameters
 from blf_dsc_controller.errors import ConfigurationError

@@ -12,8 +12,8 @@ import pytest
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.params_file import load_loop
-from blf_dsc_controller.configuration.share import share_folder
+from blf_dsc_controller.configuration.files import share_folder
+from blf_dsc_controller.configuration.nodes import load_loop
 
 PRESETS = sorted(path.stem for path in (share_folder() / 'config').glob('*.yaml'))
 LAW = {'comparison': 'backstepping', 'comparison_detuned': 'backstepping'} | {

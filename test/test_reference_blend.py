@@ -6,8 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.reference import Approach, MotionLimits
+from blf_dsc_controller.configuration.controller import Approach, ControllerConfig, MotionLimits
 from blf_dsc_controller.reference.approach import blend, stop
 from blf_dsc_controller.reference.limits import MotionError, worst_violation
 from blf_dsc_controller.reference.polynomials import minimum_jerk

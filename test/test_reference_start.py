@@ -10,9 +10,8 @@ import pytest
 from fault_rig import Rig
 
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.controller import Approach, ControllerConfig, Reference
 from blf_dsc_controller.configuration.plant import Initial, PlantConfig
-from blf_dsc_controller.configuration.reference import Approach, Reference
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import (
     ConfigurationError,

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.reference import MotionLimits
+from blf_dsc_controller.configuration.controller import ControllerConfig, MotionLimits
 from blf_dsc_controller.reference.limits import MotionError
 from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term, spline_term, unpack
 from blf_dsc_controller.reference.trajectory import (

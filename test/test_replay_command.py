@@ -9,8 +9,8 @@ import sys
 import pytest
 import recorded_run
 
+from blf_dsc_controller.cli.bags import DIFFERENT, PARTIAL
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.cli.replay import DIFFERENT, PARTIAL
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES
 
 WITHOUT_ROS = """

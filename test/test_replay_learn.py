@@ -11,8 +11,7 @@ import recorded_run
 
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import PLANT
-from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import JointStateDecoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE, JOINT_STATES

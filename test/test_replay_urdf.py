@@ -8,7 +8,7 @@ from random_arm import random_urdf
 
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.configuration.params_file import dump, load_loop
+from blf_dsc_controller.configuration.nodes import dump, load_loop
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate

@@ -9,13 +9,12 @@ import pytest
 from blf_dsc_controller.analysis.summary import summarize
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.params_file import load, locate
+from blf_dsc_controller.configuration.nodes import load, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import simulate, simulate_law
-from blf_dsc_controller.simulation.record import START
+from blf_dsc_controller.simulation.loop import START, simulate, simulate_law
 from blf_dsc_controller.supervision.supervisor import Phase
 
 HELD = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.05}

@@ -11,7 +11,7 @@ from paper_case import EXACT, NO_DISTURBANCE, P, configured, run
 
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.params_file import load, load_loop, locate
+from blf_dsc_controller.configuration.nodes import load, load_loop, locate
 from blf_dsc_controller.configuration.robot import read_urdf
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import settings_of_config

@@ -16,7 +16,7 @@ import chromium
 import numpy as np
 from PIL import Image
 
-from blf_dsc_controller.configuration.params_file import load_loop
+from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.view.bag import BagPlayer

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import yaml
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability
 
-from blf_dsc_controller.configuration.bounded_yaml import load_yaml
+from blf_dsc_controller.configuration.files import load_yaml
 from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.topics import FOREVER, HISTORY, STREAM, Quality
 from blf_dsc_controller.messages.types import Definition

@@ -19,8 +19,7 @@ from zstandard import ZstdDecompressor
 
 from blf_dsc_controller.bags.mcap_file import Allowance, McapFile, unpacked
 from blf_dsc_controller.bags.metadata import parse_qualities, strongest_quality
-from blf_dsc_controller.configuration.bounded_yaml import load_yaml
-from blf_dsc_controller.configuration.share import read_text
+from blf_dsc_controller.configuration.files import load_yaml, read_text
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import Quality
 from blf_dsc_controller.messages.types import typestore

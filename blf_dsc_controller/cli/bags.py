@@ -1,24 +1,49 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc report`, `recover`, `export` and `plot`: outputs made from bags."""
+"""`blf_dsc report`, `plot`, `export`, `recover`, `replay`, `view`: what is made from bags."""
 
 from __future__ import annotations
 
+import re
+import sys
+import time
 from argparse import Namespace
 from collections.abc import Iterator
+from math import inf
+from typing import TYPE_CHECKING
 
-from blf_dsc_controller.analysis import figures, summary
-from blf_dsc_controller.analysis.report import write_report
-from blf_dsc_controller.analysis.reported_bag import read_bags
+import numpy as np
+
 from blf_dsc_controller.bags import recover as recovering
 from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.reader import RecordedRun, recorded_run
-from blf_dsc_controller.bags.table import described
-from blf_dsc_controller.bags.table import export as export_run
-from blf_dsc_controller.cli.output import make_room
+from blf_dsc_controller.cli.main import make_room, require_ros
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages.journal import EventType
+
+if TYPE_CHECKING:
+    from blf_dsc_controller.nodes.player_node import PlayerNode
+    from blf_dsc_controller.replay.verify import Verification
+    from blf_dsc_controller.replay.what_if import WhatIf
+
+DIFFERENT = 3
+"""Exit code if the replay differs from the bag."""
+
+PARTIAL = 4
+"""Exit code if all compared outputs are equal, but some outputs could not be compared."""
+
+_LONGEST_WAIT = 0.01  # s
+_RATES = (1e-3, 1e6)
+_NAME = r'(?:~?/)?[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*'
+_REMAP = re.compile(rf'(?:\w+:)?{_NAME}:=(?:{_NAME}|/)')
 
 
 def report(options: Namespace) -> None:
     """Write the HTML page of one or several bags."""
+    from blf_dsc_controller.analysis.report import write_report
+    from blf_dsc_controller.analysis.reported_bag import read_bags
+
     make_room(options.out, force=options.force)
     bags = read_bags(options.bags, options.namespace, NameMap.parse(options.map))
     write_report(bags, options.out)
@@ -38,6 +63,9 @@ def _run(options: Namespace) -> RecordedRun:
 
 def export(options: Namespace) -> None:
     """Write a bag as a table."""
+    from blf_dsc_controller.bags.table import described
+    from blf_dsc_controller.bags.table import export as export_run
+
     out = options.out
     make_room(out, *([described(out)] if out.suffix == '.csv' else ()), force=options.force)
     run = _run(options)
@@ -49,6 +77,8 @@ def export(options: Namespace) -> None:
 
 def plot(options: Namespace) -> None:
     """Plot and summarise a bag."""
+    from blf_dsc_controller.analysis import figures, summary
+
     names = ('summary.json', *figures.NAMES)
     make_room(*(options.out / name for name in names), force=options.force)
     run = _run(options)
@@ -94,3 +124,246 @@ def _losses(recovery: recovering.Recovery) -> Iterator[str]:
     if recovery.is_whole:
         yield 'none of the recorded messages was lost'
     yield f'wrote {recovery.path}'
+
+
+def replay(options: Namespace) -> int:
+    """Replay a bag in the mode selected by the options, and print the result."""
+    if options.play and options.map:
+        raise BlfDscError('--map has no effect on --play: rename topics with --remap')
+    if options.play:
+        require_ros()
+        play(options)
+        return 0
+    config = None
+    if options.config is not None:
+        config = load(locate(options.config), CONTROLLER, ControllerConfig)
+    names = NameMap.parse(options.map)
+    begin = time.perf_counter()
+    if options.learn:
+        _learn(options, config, names)
+    elif config is None:
+        from blf_dsc_controller.replay.verify import verify
+
+        result = verify(options.bag, options.namespace, names)
+        _print_speed(result.samples, result.duration, time.perf_counter() - begin)
+        print('\n'.join(_verification(result)))
+        if result.difference is not None:
+            return DIFFERENT
+        return PARTIAL if result.compared < 1.0 else 0
+    else:
+        from blf_dsc_controller.replay.what_if import what_if
+
+        found = what_if(options.bag, config, options.namespace, names)
+        run = found.run
+        _print_speed(run.stamp.size, run.duration, time.perf_counter() - begin)
+        print('\n'.join(_open_loop(found, config)))
+    return 0
+
+
+def _learn(options: Namespace, config: ControllerConfig | None, names: NameMap) -> None:
+    from blf_dsc_controller.replay.learn import learn
+
+    config = config or read_content(options.bag, options.namespace, names).controller_config()
+    found = learn(options.bag, config, options.namespace, names)
+    print(f'torque: {found.source}; window from {found.begin:.3f} s to {found.end:.3f} s')
+    width = max(len(name) for name in found.names)
+    for name, value, deviation in zip(found.names, found.estimate, found.deviation, strict=True):
+        if np.isnan(value):
+            print(f'{name:{width}}  unidentifiable: its column is rejected')
+        else:
+            print(f'{name:{width}}  {value:10.6g} +- {2 * deviation:.2g} (95 %)')
+    verdict = 'enough' if found.is_excited else 'NOT ENOUGH'
+    print(
+        f'excitation {found.excitation:.3g}, threshold {found.threshold:.3g}: {verdict}; '
+        f'residual {found.residual:.3g} N m rms of {found.torque:.3g}'
+    )
+    for line in (*_left_out(found.left_out), *found.notes, *found.doubts):
+        print(line)
+
+
+def _left_out(count: int) -> Iterator[str]:
+    if count:
+        yield f'note: {count} states left out: not finite, or with unknown torques'
+
+
+def _print_speed(samples: int, seconds: float, took: float) -> None:
+    print(f'{samples} samples, {seconds:.3f} s in {took:.2f} s: {seconds / took:.0f}x real time')
+
+
+def _verification(result: Verification) -> Iterator[str]:
+    for found in result.comparisons:
+        verdict = 'bit-equal'
+        if found.difference is not None:
+            verdict = f'DIFFERENT by at most {found.largest:.3g}'
+        left_out = f' (not compared: {found.left_out})' if found.left_out else ''
+        yield f'{found.topic}: {found.values} values {verdict}{left_out}'
+    for topic in result.not_compared:
+        yield f'{topic}: not compared, as it holds text'
+    yield from _events(result)
+    if result.difference is not None:
+        yield f'DIFFERENT, first at {result.difference}'
+    elif result.compared < 1.0:
+        percent = min(round(100.0 * result.compared, 2), 99.99)
+        yield (
+            f'PARTLY COMPARED: {percent:g} % of the numbers in the bag, which are bit-equal; the '
+            'others could not be compared'
+        )
+    else:
+        yield 'bit-equal: all numbers of the controller in the bag'
+
+
+def _events(result: Verification) -> Iterator[str]:
+    """Yield what happened in the run, and what limits the result."""
+    types = [event.type for event in result.events]
+    for type_, what in (
+        (EventType.PARAMETERS, 'parameter changes'),
+        (EventType.TRAJECTORY, 'trajectories'),
+    ):
+        if type_ in types:
+            yield f'{types.count(type_)} {what} replayed where they took effect'
+    if len(result.turns) > 1:
+        yield f'replayed in order: {", ".join(result.turns)}'
+    if result.safe_torques:
+        yield f'{result.safe_torques} of the commands are safe torques, or on the ramp to one'
+    if result.passed_over:
+        yield f'{result.passed_over} states skipped: the controller did not use them'
+    yield from (f'note: {remark}' for remark in result.remarks)
+
+
+def _open_loop(found: WhatIf, config: ControllerConfig) -> Iterator[str]:
+    yield 'OPEN LOOP: the arm moved under the recorded torques, not under these'
+    yield f'recorded torque: {found.source}'
+    yield from _left_out(found.left_out)
+    for i, joint in enumerate(config.joints):
+        known = found.difference[np.isfinite(found.difference[:, i]), i]
+        difference = (
+            f'differs from the recorded one by rms {np.sqrt(np.mean(known**2)):.4g}, '
+            f'max {np.abs(known).max():.4g} N m'
+            if known.size
+            else 'cannot be compared: no torque was recorded'
+        )
+        at_limit = np.mean(np.abs(found.run.torque[:, i]) >= config.torque.limit[i])
+        yield (
+            f'{joint}: torque {difference}; at its limit {100 * at_limit:.3g} % of the time; '
+            f'max |xi1| / bound {found.error_ratio[i]:.3g}'
+        )
+
+
+def view(options: Namespace) -> int:
+    """Serve the page until Ctrl-C."""
+    if options.bag is None:
+        require_ros()
+        from blf_dsc_controller.view.node import main
+
+        given = (f'host:={options.host}', f'port:={options.port}')
+        words = [word for parameter in given for word in ('-p', parameter)]
+        if options.namespace:
+            words += ['-r', f'__ns:=/{options.namespace.strip("/")}']
+        sys.argv[1:] = ['--ros-args', *words]
+        return main()
+    from blf_dsc_controller.view.address import LOCAL, open_to_others
+    from blf_dsc_controller.view.bag import BagPlayer
+    from blf_dsc_controller.view.page import Page
+
+    page = Page(options.host, options.port)
+    try:
+        player = BagPlayer(page, options.bag, options.namespace, NameMap.parse(options.map))
+        print(f'{options.bag} is shown at {page.url}  (Ctrl-C to quit)', flush=True)
+        if options.host not in LOCAL:
+            print(f'warning: {open_to_others(options.host)}', file=sys.stderr)
+        player.play()
+    finally:
+        page.close()
+    return 0
+
+
+def play(options: Namespace) -> None:
+    """Play a bag with PlayerNode, after `delay` [s] for the discovery of subscribers.
+
+    Raises:
+        BlfDscError: an option is out of range, or PlayerNode rejects the bag.
+    """
+    import rclpy
+
+    from blf_dsc_controller.nodes.player_node import PlayerNode
+    from blf_dsc_controller.nodes.rclpy_internals import RCLError
+
+    _check_play(options)
+    words = [word for remap in options.remap for word in ('--remap', remap)]
+    try:
+        rclpy.init(
+            args=['blf_dsc', '--ros-args', *words] if words else [],
+            signal_handler_options=rclpy.SignalHandlerOptions.NO,
+        )
+        node = PlayerNode(
+            options.bag,
+            options.rate,
+            loop=options.loop,
+            clock=options.clock,
+            topics=options.topics,
+            offset=options.start_offset,
+            duration=options.playback_duration,
+        )
+        _announce(node, options)
+        _play_node(node, options)
+    except RCLError as error:
+        raise BlfDscError(f'{error}') from error
+    except KeyboardInterrupt:
+        pass
+    finally:
+        rclpy.try_shutdown()
+
+
+def _check_play(options: Namespace) -> None:
+    slowest, fastest = _RATES
+    if options.rate != 0.0 and not slowest <= options.rate <= fastest:
+        raise BlfDscError(
+            f'--rate {options.rate:g}: expected a speed from {slowest:g} to {fastest:g}, or 0 for '
+            'as fast as possible'
+        )
+    for name in ('delay', 'start_offset', 'playback_duration'):
+        value = getattr(options, name)
+        if not 0.0 <= value < inf and (name, value) != ('playback_duration', inf):
+            option = name.replace('_', '-')
+            raise BlfDscError(f'--{option} {value:g}: expected a time in seconds, 0 or more')
+    for remap in options.remap:
+        if not _REMAP.fullmatch(remap):
+            raise BlfDscError(
+                f'--remap {remap}: expected FROM:=TO with names of topics, as in '
+                'joint_states:=recorded_states'
+            )
+
+
+def _announce(node: PlayerNode, options: Namespace) -> None:
+    rate = f'at rate {options.rate:g}' if options.rate else 'as fast as possible'
+    again = ', in a loop' if options.loop else ''
+    name, seconds = node.get_fully_qualified_name(), (node.end - node.begin) * 1e-9
+    print(f'{name} plays {seconds:.3f} s of {options.bag} {rate}{again}:')
+    for output in node.outputs:
+        print(f'  {output.topic_name}')
+    if options.start_paused:
+        print(f'paused: ros2 service call {name}/resume std_srvs/srv/Trigger', flush=True)
+
+
+def _play_node(node: PlayerNode, options: Namespace) -> None:
+    from rclpy.experimental import EventsExecutor
+
+    from blf_dsc_controller.cli.run import Progress
+    from blf_dsc_controller.nodes.process import drain
+
+    with EventsExecutor() as executor:
+        executor.add_node(node)
+        begin = time.monotonic()
+        while time.monotonic() - begin < options.delay:
+            executor.spin_once(timeout_sec=_LONGEST_WAIT)
+        if not options.start_paused:
+            node.resume()
+        progress = Progress('played', (node.end - node.begin) * 1e-9)
+        try:
+            while not node.is_over:
+                wait = node.play()
+                progress.show(node.elapsed, 'paused' if node.timeline.paused else '')
+                executor.spin_once(timeout_sec=min(wait, _LONGEST_WAIT))
+            drain(node.outputs)
+        finally:
+            progress.close()

@@ -49,7 +49,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     precompile = command(
         'precompile',
-        'precompile',
+        'run',
         'compile the kernels of a configuration before its first start',
         'Compile the kernels of the controller and the simulated arm of a configuration into the '
         "user's cache (NUMBA_CACHE_DIR, or ~/.cache/blf_dsc_controller), so that their nodes start "
@@ -62,7 +62,7 @@ def make_parser() -> argparse.ArgumentParser:
     _replay_options(
         command(
             'replay',
-            'replay',
+            'bags',
             'run a bag through the controller again and compare bit for bit',
             'Feed the joint states of a bag through the controller with the recorded '
             'configuration, and compare every output bit for bit. '
@@ -83,7 +83,7 @@ def make_parser() -> argparse.ArgumentParser:
     report.add_argument('--out', type=Path, default=Path('report.html'), help='file (report.html)')
     view = command(
         'view',
-        'view',
+        'bags',
         'show a running system, or a bag, on a page in the browser',
         'Serve a page with the arm in 3D, its errors inside their bounds, torques and estimates: '
         'of the system running in this ROS domain, with buttons and sliders, or of a bag, with '
@@ -131,7 +131,7 @@ def make_parser() -> argparse.ArgumentParser:
     _excite_options(
         command(
             'excite',
-            'excite',
+            'identify',
             'find a reference that excites the learning',
             'Find the sum of sinusoids with the period of the learning window that excites the '
             'learning most within the joint and torque limits, and write it as a preset. The links '

@@ -1,36 +1,48 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc run`: run plant, controller and recorder, and leave a bag and pictures of the run."""
+"""`blf_dsc run` and `precompile`: plant, controller and recorder, with a bag and pictures."""
 
 from __future__ import annotations
 
 import itertools
 import sys
+import time
 from argparse import Namespace
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
+from tqdm import tqdm
 
-from blf_dsc_controller.analysis.figures import draw
-from blf_dsc_controller.analysis.summary import format_table, summarize, write_summary
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.cli.main import INTERRUPTED, unwritable
-from blf_dsc_controller.cli.progress import LoopProgress
 from blf_dsc_controller.compiled.notice import announced_compilation
-from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
-from blf_dsc_controller.configuration.params_file import dump, load_loop, locate
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import (
+    CONTROLLER,
+    PLANT,
+    LoopConfig,
+    dump,
+    load_loop,
+    locate,
+)
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import estimate_names, model_of
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.simulation.record import Record
+from blf_dsc_controller.simulation.loop import Record, simulate
 from blf_dsc_controller.supervision.config_warnings import config_warnings, expectation
+from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Reason
 from blf_dsc_controller.view.address import LOCAL, free_port, open_to_others, require_viser
+from sim_plant.plant import parameter_order, parameters_of, plant_of
 
 STOPPED = 5
 """Exit code if the controller stopped before the end."""
@@ -161,6 +173,9 @@ def print_notice(notice: str) -> None:
 
 def _report(out: Path) -> bool:
     """Draw and summarise the bag of a run; return whether the controller stopped in it."""
+    from blf_dsc_controller.analysis.figures import draw  # slow: the libraries of the pictures
+    from blf_dsc_controller.analysis.summary import format_table, summarize, write_summary
+
     print_notice('reading the bag')
     content = read_content(out / 'bag')
     recorded = recorded_run(content)
@@ -174,3 +189,88 @@ def _report(out: Path) -> bool:
     print(f'wrote       {out}: bag, summary.json, {", ".join(path.name for path in pictures)}')
     last = recorded.stamp[-1]  # the plant ends after it, so the controller times out
     return any(stop.stamp < last or stop.reason != Reason.STATE_TIMEOUT for stop in recorded.stops)
+
+
+_FORMAT = '{desc} |{bar}| {n:.1f}/{total:g} s [{elapsed}<{remaining}]{postfix}'
+_LINE_PERIOD = 10.0  # s between two lines if stderr is not a terminal
+
+
+class Progress:
+    """Progress over time: a bar on a terminal, otherwise (as in a log) a line every few seconds."""
+
+    def __init__(self, title: str, seconds: float) -> None:
+        """Begin at 0 of `seconds`, which is 0 if the end is open."""
+        self._title, self._seconds = title, seconds
+        self._line = ''
+        self._due = time.monotonic() + _LINE_PERIOD
+        self._bar = tqdm(
+            total=seconds,
+            desc=title,
+            bar_format=_FORMAT,
+            mininterval=0.2,
+            disable=not sys.stderr.isatty(),
+        )
+
+    def show(self, elapsed: float, status: str = '') -> None:
+        """Show the elapsed time [s] and a short status."""
+        self._bar.set_postfix_str(status, refresh=False)
+        self._bar.update(min(elapsed, self._seconds) - self._bar.n)
+        self._line = f'{self._title} {elapsed:.1f}/{self._seconds:g} s' + (status and f', {status}')
+        if time.monotonic() >= self._due:
+            self._print_line()
+
+    def write(self, text: str) -> None:
+        """Print a line without disturbing the bar."""
+        self._bar.write(text, file=sys.stderr)
+        sys.stderr.flush()
+
+    def close(self) -> None:
+        """Close the bar, or print the last line."""
+        self._bar.close()
+        self._print_line()
+
+    def _print_line(self) -> None:
+        if self._bar.disable and self._line:
+            print(self._line, file=sys.stderr, flush=True)
+            self._line = ''
+            self._due = time.monotonic() + _LINE_PERIOD
+
+
+class LoopProgress(Progress):
+    """Progress over simulated time, with the largest |xi1| / k_c and the parameter error."""
+
+    def __init__(self, config: PlantConfig, parameters: Sequence[str]) -> None:
+        """Begin at 0 s; `parameters` are the names of the estimates."""
+        super().__init__('closed loop', config.duration)
+        self._order = parameter_order(parameters, config)
+        self._config = config
+
+    def show_loop(self, elapsed: float, ratio: float, estimate: ArrayLike) -> None:
+        """Show the simulated time [s], the largest |xi1| / k_c so far, and P^ (p,)."""
+        P = parameters_of(self._config, elapsed)[self._order]
+        error = np.linalg.norm(np.asarray(estimate) - P) / np.linalg.norm(P)
+        status = f'max|xi1|/bound {ratio:.2f}'
+        if np.all(self._order >= 0) and not self._config.robot.urdf:  # else P has mixed units
+            status += f', parameter error {100 * error:.2f} %'
+        self.show(elapsed, status)
+
+
+def precompile(options: Namespace) -> None:
+    """Compile the kernels of a configuration's controller and plant, in two parallel processes."""
+    config = load_loop(options.config)
+    with ProcessPoolExecutor(2, get_context('spawn')) as pool:
+        jobs = [
+            pool.submit(_compile_law, config.controller),
+            pool.submit(_compile_plant, config.plant),
+        ]
+        for job in jobs:
+            job.result()
+    print(f'{options.config}: the kernels are compiled; the nodes of this user now start at once')
+
+
+def _compile_law(config: ControllerConfig) -> None:
+    Guard(config)
+
+
+def _compile_plant(config: PlantConfig) -> None:
+    plant_of(config).compile()

@@ -11,22 +11,21 @@ import numpy as np
 from tqdm import tqdm
 
 from blf_dsc_controller.analysis.summary import format_table
-from blf_dsc_controller.arm_comparison.study import compare as compare_arms
 from blf_dsc_controller.cli.run import make_folder, print_notice
 from blf_dsc_controller.compiled.notice import announced_compilation
-from blf_dsc_controller.configuration.params_file import locate
+from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.monte_carlo import executors
-from blf_dsc_controller.monte_carlo.report import (
+from blf_dsc_controller.studies import runs
+from blf_dsc_controller.studies.arms import compare as compare_arms
+from blf_dsc_controller.studies.monte_carlo import load_study
+from blf_dsc_controller.studies.paper import compare
+from blf_dsc_controller.studies.report import (
     headline,
     reproduce,
     reproduce_command,
     write_report,
 )
-from blf_dsc_controller.monte_carlo.runs import KEPT, Columns, warm_up
-from blf_dsc_controller.monte_carlo.store import Span, Store, require_pyarrow
-from blf_dsc_controller.monte_carlo.study import load_study
-from blf_dsc_controller.paper.report import compare
+from blf_dsc_controller.studies.runs import KEPT, Columns, Span, Store, require_pyarrow, warm_up
 
 _PAUSE_IN_A_LOG = 10.0  # s between two updates of the bar
 
@@ -63,14 +62,14 @@ def _run_study(options: Namespace) -> None:
     overrides = {name: value for name, value in given.items() if value is not None}
     study = load_study(locate(options.config), overrides)
     require_pyarrow()
-    workers = options.workers or executors.cores()
+    workers = options.workers or runs.cores()
     if options.engine == 'dask':
-        engine = executors.dask(workers, options.address)
+        engine = runs.dask(workers, options.address)
     else:
-        engine = getattr(executors, options.engine)(workers)
+        engine = getattr(runs, options.engine)(workers)
     store = Store.create_or_open(options.out or Path('monte_carlo'), study)
     with store.locked():
-        size = options.chunk or executors.chunk_size(study.settings.runs, engine.workers)
+        size = options.chunk or runs.chunk_size(study.settings.runs, engine.workers)
         spans = store.missing(size)
         if spans:
             with announced_compilation(print_notice):
@@ -79,14 +78,14 @@ def _run_study(options: Namespace) -> None:
         _report(store)
 
 
-def _compute(store: Store, spans: list[Span], engine: executors.Engine) -> None:
-    runs = store.study.settings.runs
-    done = runs - sum(span.runs for span in spans)
+def _compute(store: Store, spans: list[Span], engine: runs.Engine) -> None:
+    total = store.study.settings.runs
+    done = total - sum(span.runs for span in spans)
     if done:
-        print(f'{done} of {runs} runs are done already', file=sys.stderr)
+        print(f'{done} of {total} runs are done already', file=sys.stderr)
     lost = 0
     pause = 0.5 if sys.stderr.isatty() else _PAUSE_IN_A_LOG
-    with tqdm(total=runs, initial=done, unit='run', desc='monte carlo', mininterval=pause) as bar:
+    with tqdm(total=total, initial=done, unit='run', desc='monte carlo', mininterval=pause) as bar:
 
         def keep(span: Span, columns: Columns) -> None:
             nonlocal lost
@@ -95,7 +94,7 @@ def _compute(store: Store, spans: list[Span], engine: executors.Engine) -> None:
             bar.set_postfix_str(f'{lost} did not keep the bound', refresh=False)
             bar.update(span.runs)
 
-        executors.compute(store.study, spans, engine, keep, bar.write)
+        runs.compute(store.study, spans, engine, keep, bar.write)
 
 
 def _report(store: Store) -> None:

@@ -1,20 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes of the package by name, their configurations, and what they must agree on."""
+"""The nodes by name: their configurations, the files and presets that set them, and their page.
+
+`python -m blf_dsc_controller.configuration.nodes doc/parameters.md` writes the page.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import difflib
+import json
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from blf_dsc_controller.arms.two_link_geometry import urdf
 from blf_dsc_controller.arms.urdf import Chain, read_chain
-from blf_dsc_controller.configuration.common import joint_problems
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.files import Section, parse, read_text, share_folder
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.robot import Robot, given_robot
-from blf_dsc_controller.configuration.schema import Value, parameter, parameters
+from blf_dsc_controller.configuration.schema import (
+    Parameter,
+    Value,
+    build,
+    flatten,
+    joint_problems,
+    parameter,
+    parameters,
+    unknown,
+)
+from blf_dsc_controller.errors import ConfigurationError
 
 PLANT = 'sim_plant'
 CONTROLLER = 'blf_dsc_controller'
@@ -184,3 +201,249 @@ def is_builtin(name: str) -> bool:
     """Whether ROS itself, not this package, declares the parameter."""
     builtin = ('use_sim_time', 'start_type_description_service')
     return name in builtin or name.startswith('qos_overrides.')
+
+
+Config = TypeVar('Config')
+
+
+def locate(given: str | Path) -> Path:
+    """Return the path of a preset by its name, or of a file by its path.
+
+    A preset takes precedence over a file of the same name in the current folder; `./name` is the
+    file. Raises ConfigurationError, which lists the presets, if neither exists.
+    """
+    presets = {path.stem: path for path in sorted((share_folder() / 'config').glob('*.yaml'))}
+    name, path = str(given), Path(given)
+    if name in presets:
+        return presets[name]
+    if path.is_file():
+        return path
+    if name.removesuffix('.yaml') in presets:
+        return presets[name.removesuffix('.yaml')]
+    what = 'is a folder' if path.is_dir() else 'does not exist'
+    close = difflib.get_close_matches(name.removesuffix('.yaml'), presets, n=1)
+    guess = f'did you mean {close[0]}? ' if close else ''
+    remedy = f'give a parameter file, or a preset: {", ".join(presets)}'
+    raise ConfigurationError([f'{name} {what}: {guess}{remedy}'])
+
+
+def read(path: str | Path) -> Sequence[Section]:
+    """Read the sections of a parameter file; ConfigurationError names the file and the line.
+
+    Those of the preset or file that it names as `base` under `monte_carlo`, if any, come first.
+    """
+    files, sections = [Path(path)], list[Section]()
+    while True:
+        try:
+            sections = [*parse(read_text(files[-1])), *sections]
+            base = _base_of(sections)
+            if base is None:
+                return sections
+            files.append(locate(base))
+        except (UnicodeDecodeError, OSError) as error:
+            raise ConfigurationError([str(error)], str(files[-1])) from error
+        except ConfigurationError as error:
+            raise ConfigurationError(error.problems, str(files[-1])) from error
+        if files[-1] in files[:-1]:
+            problem = f'monte_carlo: base: {base!r} leads back to a file that is based on it'
+            raise ConfigurationError([problem], str(path))
+
+
+def _base_of(sections: list[Section]) -> str | None:
+    """Take the base out of the first sections that name it."""
+    for k, section in enumerate(sections):
+        if section.pattern.rsplit('/', 1)[-1] == 'monte_carlo' and 'base' in section.entries:
+            entries = dict(section.entries)
+            sections[k] = section._replace(entries=entries)
+            return str(entries.pop('base').value)
+    return None
+
+
+def load(
+    path: str | Path, node: str, cls: type[Config], overrides: Mapping[str, object] | None = None
+) -> Config:
+    """Load the configuration of one node, whose name may have a namespace (`/left/sim_plant`).
+
+    `overrides`, by dotted name, take precedence over the file. Raises ConfigurationError with all
+    problems and their line numbers. Unknown names are rejected; in a section for several nodes, a
+    name that any node of the package knows is accepted.
+    """
+    sections = read(path)
+    problems = [*_unknown_names(sections), *unmatched_sections(sections, [node])]
+    try:
+        config = _load(sections, node, cls, overrides or {})
+    except ConfigurationError as error:
+        problems += error.problems
+    if problems:
+        raise ConfigurationError(problems, str(path))
+    return config
+
+
+def load_loop(
+    given: str | Path, overrides: Mapping[str, Mapping[str, object]] | None = None
+) -> LoopConfig:
+    """Load the configurations of plant, controller and recorder from a preset or a file.
+
+    `overrides`, by node and dotted name, take precedence over the file. Raises ConfigurationError
+    with the problems of all nodes, or if plant and controller disagree.
+    """
+    path = locate(given)
+    sections = read(path)
+    problems = [*_unknown_names(sections), *unmatched_sections(sections, NODES)]
+    configs: dict[str, Any] = {}
+    nodes_with: dict[str, list[str]] = {}
+    for node, cls in NODES.items():
+        try:
+            configs[node] = _load(sections, node, cls, (overrides or {}).get(node, {}))
+        except ConfigurationError as error:
+            for problem in error.problems:
+                nodes_with.setdefault(problem, []).append(node)
+    problems += [f'{", ".join(nodes)}: {problem}' for problem, nodes in nodes_with.items()]
+    if not problems:
+        loop = LoopConfig(configs[PLANT], configs[CONTROLLER], configs[RECORDER])
+        problems = loop.problems()
+    if problems:
+        raise ConfigurationError(problems, str(path))
+    return loop
+
+
+def dump(path: Path, nodes: Mapping[str, object]) -> None:
+    """Write all parameters of the nodes to a parameter file; loading it restores them exactly."""
+    path.write_text(dumps(nodes), encoding='utf-8')
+
+
+def dumps(nodes: Mapping[str, object]) -> str:
+    """Return the text of a parameter file.
+
+    `nodes` are configurations, or values by dotted name, by node name with or without a namespace.
+    """
+    lines = []
+    for node, config in nodes.items():
+        lines.append(f'/{node.removeprefix("/")}:\n  ros__parameters:\n')
+        values = config if isinstance(config, Mapping) else flatten(config)
+        lines += [f'    {name}: {format_value(value)}\n' for name, value in values.items()]
+    return ''.join(lines)
+
+
+def format_value(value: Value) -> str:
+    """Return a value as YAML that ROS and YAML libraries read as the same type."""
+    if isinstance(value, tuple):
+        return '[' + ', '.join(format_value(entry) for entry in value) + ']'
+    if isinstance(value, bool):
+        return 'true' if value else 'false'
+    if isinstance(value, float):  # 1e-05 is a string to many YAML libraries, 1.0e-05 is not
+        mantissa, exponent, power = repr(value).partition('e')
+        return mantissa + ('' if '.' in mantissa or not exponent else '.0') + exponent + power
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _load(
+    sections: Sequence[Section], node: str, cls: type[Config], overrides: Mapping[str, object]
+) -> Config:
+    """Build the configuration; names of other nodes in wildcard sections are left out."""
+    known = {one.name for one in parameters(cls)}
+    entries = {
+        name: entry
+        for section in sections
+        if section.matches('/' + node.removeprefix('/'))
+        for name, entry in section.entries.items()
+        if name in known or not (section.is_wildcard or is_builtin(name))
+    }
+    try:
+        return build(cls, {name: entry.value for name, entry in entries.items()} | dict(overrides))
+    except ConfigurationError as error:
+        problems = []
+        for problem in error.problems:
+            name = problem.split(':', 1)[0]
+            if name in overrides:
+                problems.append(f'{problem} (given as an override)')
+            else:
+                line = f'line {entries[name].line}: ' if name in entries else ''
+                problems.append(f'{line}{problem}')
+        raise ConfigurationError(problems) from None
+
+
+def _unknown_names(sections: Sequence[Section]) -> Iterator[str]:
+    known = known_names()
+    for section in sections:
+        for name, entry in section.entries.items():
+            if section.is_wildcard and name not in known and not is_builtin(name):
+                yield f'line {entry.line}: {unknown(name, known)}'
+
+
+def unmatched_sections(sections: Sequence[Section], nodes: Iterable[str]) -> Iterator[str]:
+    """Yield a problem for each section that is meant for one of these nodes but would be ignored.
+
+    Either its name is misspelt, or its namespace differs from the node's and no other section of
+    that name matches. `nodes` are full names; in the root namespace the slash may be omitted.
+    """
+    by_name = {section.pattern.rsplit('/', 1)[-1]: section for section in sections}
+    absent = [node for node in NODES if node not in by_name]
+    for name, section in by_name.items():
+        close = difflib.get_close_matches(name, absent, n=1, cutoff=0.8)
+        if close and name not in NODES:
+            yield f'line {section.line}: unknown node {name}, did you mean {close[0]}?'
+    for node in nodes:
+        full, name = '/' + node.removeprefix('/'), node.rsplit('/', 1)[-1]
+        if name in by_name and not any(
+            section.matches(full) for section in sections if not section.is_wildcard
+        ):
+            section = by_name[name]
+            yield (
+                f'line {section.line}: {section.pattern} does not match {full}: write /**/{name} '
+                'for the node in any namespace'
+            )
+
+
+_PREFACE = """\
+# Parameters
+
+All parameters of all nodes; the defaults are the recommended set. One parameter file serves all
+nodes ([config/recommended.yaml](../config/recommended.yaml) has all of them); a file needs only the
+parameters it changes. Values of type double need a decimal point: `1.0`, not `1`. Arrays have one
+entry per joint unless the range says otherwise.
+
+A dot under *live* marks a parameter that can change while the node runs (`ros2 param set`); the
+others are fixed at the start, and `ros2 param describe` gives the reason.
+
+This page is generated: `python -m blf_dsc_controller.configuration.nodes
+doc/parameters.md`.
+"""
+
+_HEADER = (
+    '| name | description | default | unit | range | live | type | symbol |\n'
+    '| --- | --- | --- | --- | --- | --- | --- | --- |\n'
+)
+
+
+def parameter_page() -> str:
+    """Return the Markdown page of all parameters."""
+    page = _PREFACE
+    for node, cls in NODES.items():
+        page += f'\n## {node}\n\n{_HEADER}{"".join(_row(one) for one in parameters(cls))}'
+    return page
+
+
+def _row(one: Parameter) -> str:
+    number = next((f'{length} entries' for length in one.length if length.isdigit()), '')
+    lengths = [name for name in one.length if name != 'joints' and not name.isdigit()]
+    if 'joints' in one.length and lengths:
+        lengths.insert(0, 'joint')
+    each = f'{number or "one entry"} per {" and ".join(lengths)}' if lengths else number
+    if one.omittable:
+        each = f'{each}, or none' if each else 'may be empty'
+    cells = (
+        f'`{one.name}`',
+        one.description,
+        f'`{format_value(one.default)}`',
+        one.unit,
+        '; '.join(part for part in (one.allowed, each) if part),
+        '' if one.read_only else '•',
+        one.kind.value,
+        one.symbol,
+    )
+    return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |\n'
+
+
+if __name__ == '__main__':
+    Path(sys.argv[1]).write_text(parameter_page(), encoding='utf-8')

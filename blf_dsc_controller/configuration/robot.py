@@ -16,8 +16,8 @@ import numpy as np
 from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.arms.prior import PAYLOAD_SIZE
 from blf_dsc_controller.arms.urdf import Chain, UrdfError, chain_joints, moving_joints, read_chain
+from blf_dsc_controller.configuration.files import read_text, resolve
 from blf_dsc_controller.configuration.schema import build, counted, parameter
-from blf_dsc_controller.configuration.share import read_text, resolve
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 
 if TYPE_CHECKING:

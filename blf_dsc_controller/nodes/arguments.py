@@ -11,8 +11,8 @@ from collections.abc import Iterator, Sequence
 
 from rclpy.utilities import remove_ros_args
 
-from blf_dsc_controller.configuration.params_file import read, unmatched_sections
-from blf_dsc_controller.configuration.ros_yaml import parse
+from blf_dsc_controller.configuration.files import parse
+from blf_dsc_controller.configuration.nodes import read, unmatched_sections
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 
 

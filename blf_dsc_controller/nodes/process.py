@@ -22,7 +22,7 @@ from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from blf_dsc_controller.configuration.common import Realtime
+from blf_dsc_controller.configuration.schema import Realtime
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.nodes.arguments import refuse_unknown
 from blf_dsc_controller.nodes.rclpy_internals import RCLError, UnknownROSArgsError

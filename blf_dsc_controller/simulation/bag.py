@@ -25,7 +25,7 @@ from blf_dsc_controller.messages.telemetry import (
     PlantTelemetry,
     encode_rejected_columns,
 )
-from blf_dsc_controller.simulation.record import START, Record
+from blf_dsc_controller.simulation.loop import START, Record
 
 
 def write_bag(

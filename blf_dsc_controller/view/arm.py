@@ -17,8 +17,8 @@ import numpy as np
 
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.files import resolve
 from blf_dsc_controller.configuration.robot import chain_of
-from blf_dsc_controller.configuration.share import resolve
 from blf_dsc_controller.errors import BlfDscError
 
 _THICKNESS = 0.025  # radius of a link relative to the length of all links

@@ -14,7 +14,12 @@ import numpy as np
 from tqdm import tqdm
 
 from blf_dsc_controller.analysis.page import Cell, write_page
-from blf_dsc_controller.arm_comparison.contenders import (
+from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.run import Floats
+from blf_dsc_controller.simulation.metrics import another_motion, torque_rows
+from blf_dsc_controller.studies.laws import (
     CONTENDERS,
     DURATION,
     INTERVALS,
@@ -22,13 +27,7 @@ from blf_dsc_controller.arm_comparison.contenders import (
     Figures,
     run,
 )
-from blf_dsc_controller.configuration.nodes import LoopConfig
-from blf_dsc_controller.configuration.params_file import load_loop
-from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.paper.tune import HOPELESS, search
-from blf_dsc_controller.run import Floats
-from blf_dsc_controller.simulation.metrics import another_motion, torque_rows
+from blf_dsc_controller.studies.tuning import HOPELESS, search
 
 POPULATION = 16
 ROUGHEST = 0.05

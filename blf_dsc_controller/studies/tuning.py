@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tuning of the compared laws, all by the same procedure, objective and budget.
 
-    python -m blf_dsc_controller.paper.tune proposed      config/paper_tuned.yaml
-    python -m blf_dsc_controller.paper.tune comparison    config/comparison.yaml
-    python -m blf_dsc_controller.paper.tune slotine_li    config/slotine_li.yaml
+    python -m blf_dsc_controller.studies.tuning proposed      config/paper_tuned.yaml
+    python -m blf_dsc_controller.studies.tuning comparison    config/comparison.yaml
+    python -m blf_dsc_controller.studies.tuning slotine_li    config/slotine_li.yaml
 
 Common to all: the arm, its disturbance, reference, start, P^(0), sample time and torque limit; two
 runs of 30 s, with ideal and with realistic sensors (preset noisy); the objective; the number of
@@ -25,8 +25,7 @@ from tqdm import tqdm
 
 from blf_dsc_controller.analysis.metrics import Metrics, measure
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import PLANT, LoopConfig
-from blf_dsc_controller.configuration.params_file import format_value, load_loop
+from blf_dsc_controller.configuration.nodes import PLANT, LoopConfig, format_value, load_loop
 from blf_dsc_controller.configuration.schema import change, flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Floats
@@ -204,7 +203,7 @@ def preset(name: str, exponents: Floats, value: float, evaluations: int) -> str:
     )
     return (
         f'# {task.title}.\n'
-        f'# Made by `python -m blf_dsc_controller.paper.tune {name} FILE`:\n'
+        f'# Made by `python -m blf_dsc_controller.studies.tuning {name} FILE`:\n'
         f'# {evaluations} evaluations, objective {value:.3f} (decades of error; less is better).\n'
         f'\n/**/blf_dsc_controller:\n  ros__parameters:\n{lines}'
     )

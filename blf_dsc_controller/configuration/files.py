@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS 2 parameter files, read as rcl_yaml_param_parser reads them, but without ROS.
+"""Files that are not trusted: their place, their limits, and parameter files as ROS 2 reads them.
 
-Node names nest or are joined by `/`; `*` matches one part of a name, `**` any number of parts. If
-several sections match a node, the last one wins, even if another is more specific. The types of
-unquoted words differ from those of YAML libraries: `1e-5` is a number and `1_000` a string for ROS,
-the other way round for PyYAML; `yes` is a bool, `010` is eight, `null` a string.
+Data files of this package and of others are found with or without a sourced ROS. YAML is limited in
+size and nesting, and has no aliases: a few lines of these can expand to a billion entries, and
+deeply nested brackets exceed the recursion limit of the interpreter.
+
+In a parameter file node names nest or are joined by `/`; `*` matches one part of a name, `**` any
+number of parts. If several sections match a node, the last one wins, even if another is more
+specific. The types of unquoted words differ from those of YAML libraries: `1e-5` is a number and
+`1_000` a string for ROS, the other way round for PyYAML; `yes` is a bool, `010` is eight, `null` a
+string.
 """
 
 from __future__ import annotations
@@ -13,14 +18,21 @@ import difflib
 import functools
 import math
 import re
+import stat
 import sys
+import sysconfig
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple, cast
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import yaml
 
-from blf_dsc_controller.configuration.bounded_yaml import UnreasonableYamlError, check_yaml
-from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 
 _TRUE = ('Y', 'y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON')
 _FALSE = ('N', 'n', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF')
@@ -193,3 +205,113 @@ def _error(line: int, problem: str) -> ConfigurationError:
 
 def _repeated(line: int, name: str, first: int) -> ConfigurationError:
     return _error(line, f'{name} is repeated, first given on line {first}')
+
+
+_PACKAGE = 'blf_dsc_controller'
+_CHECKOUT = Path(__file__).resolve().parents[2]
+_LARGEST = 1 << 24  # bytes of a parameter file, a URDF or a metadata.yaml
+
+
+def share_folder() -> Path:
+    """Return the folder that holds `config/` and `launch/`, regardless of the current folder.
+
+    If the code runs from a source tree, as in an editable install, that comes first; then the ament
+    index (colcon), then the data folders of this Python (pip).
+
+    Raises BlfDscError, listing the places searched, if the folder is not found.
+    """
+    searched = []
+    for folder in _candidates():
+        if (folder / 'config').is_dir():
+            return folder
+        searched.append(f'\n  - {folder / "config"}')
+    raise BlfDscError(
+        f'the data files of {_PACKAGE} were not found: install the package again. '
+        f'Searched:{"".join(searched)}'
+    )
+
+
+def resolve(url: str) -> Path:
+    """Return the path of a file, or of a resource as `package://name/path`.
+
+    A path that does not exist is looked up in `config/` of this package. Raises BlfDscError if
+    there is no such folder or package.
+    """
+    if url.startswith('package://'):
+        name, _, rest = url.removeprefix('package://').partition('/')
+        return _share_of(name) / rest
+    path = Path(url).expanduser()
+    own = share_folder() / 'config' / url
+    if path.is_file() or not own.is_file():
+        return path
+    return own
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file; OSError if not regular or too large, or UnicodeDecodeError."""
+    state = path.stat()
+    if not stat.S_ISREG(state.st_mode):
+        raise OSError(f'{path} is not a regular file: give a file')
+    if state.st_size > _LARGEST:
+        raise OSError(f'{path} has {state.st_size} bytes; expected text of at most {_LARGEST}')
+    return path.read_text(encoding='utf-8')
+
+
+def _share_of(package: str) -> Path:
+    if package == _PACKAGE:
+        return share_folder()
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        return Path(get_package_share_directory(package))
+    except (ImportError, LookupError, OSError) as error:
+        raise BlfDscError(
+            f'package {package!r} was not found: source the workspace that has it, or give a path'
+        ) from error
+
+
+def _candidates() -> Iterator[Path]:
+    if (_CHECKOUT / 'setup.py').is_file():
+        yield _CHECKOUT
+    with suppress(ImportError, LookupError, OSError):  # no ROS, no index, or package not in it
+        from ament_index_python.packages import get_package_share_directory
+
+        yield Path(get_package_share_directory(_PACKAGE))
+    for scheme in (sysconfig.get_default_scheme(), sysconfig.get_preferred_scheme('user')):
+        yield Path(sysconfig.get_path('data', scheme), 'share', _PACKAGE)
+
+
+_MOST_NODES = 50_000
+_DEEPEST = 50
+
+_Parser: Any = getattr(yaml, 'CLoader', yaml.Loader)  # ten times as fast, if available
+_Loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+
+
+class UnreasonableYamlError(yaml.MarkedYAMLError):
+    """YAML that would take too much memory or time."""
+
+
+def check_yaml(text: str) -> None:
+    """Raise UnreasonableYamlError, or another yaml.YAMLError if `text` is damaged."""
+    depth = nodes = 0
+    event: Any
+    for event in yaml.parse(text, Loader=_Parser):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        nodes += isinstance(event, yaml.NodeEvent)
+        problem = ''
+        if isinstance(event, yaml.AliasEvent):
+            problem = f'ROS does not support the alias *{event.anchor}'
+        elif depth > _DEEPEST:
+            problem = f'nested more than {_DEEPEST} levels deep'
+        elif nodes > _MOST_NODES:
+            problem = f'more than {_MOST_NODES} entries'
+        if problem:
+            raise UnreasonableYamlError(problem=problem, problem_mark=event.start_mark)
+
+
+def load_yaml(text: str) -> Any:
+    """Return the plain data of a YAML text; raises the errors of `check_yaml`."""
+    check_yaml(text)
+    return yaml.load(text, Loader=_Loader)  # noqa: S506 - a safe loader

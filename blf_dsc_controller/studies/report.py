@@ -12,25 +12,24 @@ from blf_dsc_controller.analysis.summary import summarize as summarize_run
 from blf_dsc_controller.analysis.summary import write_summary
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.compiled.layout import pack
-from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
-from blf_dsc_controller.configuration.params_file import dump
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, dump
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import controller_of
-from blf_dsc_controller.monte_carlo.figures import draw_study
-from blf_dsc_controller.monte_carlo.runs import (
+from blf_dsc_controller.simulation.bag import write_bag
+from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.simulation.metrics import metrics_of, new_metrics
+from blf_dsc_controller.studies.monte_carlo import Study, draw, origin_of, plant_of_draw
+from blf_dsc_controller.studies.runs import (
     OUTCOMES,
+    Store,
+    differences,
     metrics_row,
     metrics_settings,
     model_error,
     rows_of_another_motion,
 )
-from blf_dsc_controller.monte_carlo.statistics import ALLOWED, Summary, summarize
-from blf_dsc_controller.monte_carlo.store import Store, differences
-from blf_dsc_controller.monte_carlo.study import Study, draw, origin_of, plant_of_draw
-from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import simulate_law
-from blf_dsc_controller.simulation.metrics import metrics_of, new_metrics
+from blf_dsc_controller.studies.statistics import ALLOWED, Summary, draw_study, summarize
 
 _QUANTILES = ('min', 'median', 'p95', 'p99', 'max')
 

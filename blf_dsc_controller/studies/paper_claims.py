@@ -17,9 +17,8 @@ from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.lyapunov import ExponentialBound, decay_rate
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LYAPUNOV_TERMS
-from blf_dsc_controller.paper.cases import BOUND, CASES, SWEEPS
-from blf_dsc_controller.paper.results import Results
 from blf_dsc_controller.run import Floats, Run
+from blf_dsc_controller.studies.paper_cases import BOUND, CASES, SWEEPS, Results
 
 HOLDS = 'holds'
 ONLY_IF = 'holds only if'

@@ -1,0 +1,495 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A Monte Carlo study: a closed loop, the distributions of its parameters, and its runs.
+
+Its file is a parameter file of the loop with one additional section:
+
+    monte_carlo:
+      ros__parameters:
+        base: payload  # a preset or file that this one changes; none: the defaults
+        runs: 10000
+        vary:
+          arm.m2: uniform(0.4, 0.6)
+
+A value is the inverse of the distribution function at a number u in [0, 1), so each draw takes one
+random number. The inverses are written out because `ppf` of scipy.stats takes 0.1 ms a call.
+
+The start is relative to the reference: `initial.error` is the tracking error xi1(0) as a fraction
+of the bound, `initial.velocity_error` is dq(0) - dqr(0). So may be the events: `events.gap` is the
+time from the beginning of the event before, or from the start.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+import math
+import operator
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from hashlib import blake2b
+from pathlib import Path
+from statistics import NormalDist
+from typing import Annotated, Any, NamedTuple, cast
+
+import numpy as np
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import (
+    CONTROLLER,
+    PLANT,
+    LoopConfig,
+    dump,
+    format_value,
+    load_loop,
+    read,
+)
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import (
+    Kind,
+    Parameter,
+    build,
+    change,
+    flatten,
+    parameter,
+    parameters,
+    unknown,
+)
+from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.law.controller import Controller
+
+WITHOUT = 'without.'
+"""Prefix of the columns of a run without learning."""
+
+_NODE = 'monte_carlo'
+_VARY = 'vary.'
+_ONE_STUDY = 'a study has one configuration from its first run to its last'
+
+
+@dataclass(frozen=True)
+class MonteCarloConfig:
+    """Section `monte_carlo` of a study file: number of runs, and what is measured in each."""
+
+    runs: int = parameter(
+        1000, 'closed loops to run', at_least=1, at_most=100_000_000, read_only=_ONE_STUDY
+    )
+    seed: int = parameter(
+        0, 'run i is determined by this seed and i alone', at_least=0, read_only=_ONE_STUDY
+    )
+    pairs: bool = parameter(
+        default=False,
+        description='run each plant with learning and without it (learning.weight: 0)',
+        read_only=_ONE_STUDY,
+    )
+    settled_after: float = parameter(
+        0.0,
+        'time from which the rms and the largest settled error are computed, and pairs compared',
+        unit='s',
+        at_least=0.0,
+        read_only=_ONE_STUDY,
+    )
+    moments: tuple[float, ...] = parameter(
+        (),
+        'times at which the parameter error is stored, besides the end',
+        unit='s',
+        at_least=0.0,
+        may_be_empty=True,
+        read_only=_ONE_STUDY,
+    )
+
+    def duration_problems(self, duration: float) -> list[str]:
+        """Return the problems with times after the end of a run of this duration [s]."""
+        if duration == 0.0:
+            return ['sim_plant.duration: got 0 s, but every run must end: give its duration']
+        problems = [
+            f'moments: got {moment:g} s at entry {entry}, but a run ends at {duration:g} s'
+            for entry, moment in enumerate(self.moments, 1)
+            if moment > duration
+        ]
+        if self.settled_after >= duration:
+            problems.append(
+                f'settled_after: got {self.settled_after:g} s, but a run ends at {duration:g} s'
+            )
+        repeated = sorted({moment for moment in self.moments if self.moments.count(moment) > 1})
+        return problems + [f'moments: {moment:g} s is repeated' for moment in repeated]
+
+
+@dataclass(frozen=True)
+class Study:
+    """Everything that determines the results."""
+
+    controller: ControllerConfig
+    plant: PlantConfig
+    settings: MonteCarloConfig
+    variations: tuple[Variation, ...]
+
+    def laws(self) -> dict[str, ControllerConfig]:
+        """Return each law of a run by the prefix of its columns."""
+        if not self.settings.pairs:
+            return {'': self.controller}
+        return {'': self.controller, WITHOUT: change(self.controller, {'learning.weight': 0.0})}
+
+    def by_node(self) -> dict[str, Any]:
+        """Return the configurations by node name."""
+        return {PLANT: self.plant, CONTROLLER: self.controller, _NODE: self.settings}
+
+    def flat(self) -> dict[str, object]:
+        """Return every value by node and name, with the distributions as written."""
+        values: dict[str, object] = {
+            f'{node}.{name}': value
+            for node, config in self.by_node().items()
+            for name, value in flatten(config).items()
+        }
+        return values | {f'{_NODE}.{_VARY}{name}': text for name, text in self.varied().items()}
+
+    def varied(self) -> dict[str, str | tuple[str, ...]]:
+        """Return the distributions as written, in a list for each list parameter."""
+        texts: dict[str, str | tuple[str, ...]] = {}
+        for one in self.variations:
+            text = str(one.distribution)
+            texts[one.name] = text if one.entry < 0 else (*texts.get(one.name, ()), text)
+        return texts
+
+
+def load_study(path: str | Path, overrides: Mapping[str, object] | None = None) -> Study:
+    """Read a study; `overrides` of the section `monte_carlo` take precedence over the file.
+
+    Raises ConfigurationError with all problems of all sections, and their lines.
+    """
+    problems: list[str] = []
+    loop: LoopConfig | None = None
+    settings: MonteCarloConfig | None = None
+    try:
+        loop = load_loop(path)
+    except ConfigurationError as error:
+        problems += error.problems
+    given, lines = _read_section(path)
+    varied = {name.removeprefix(_VARY): given[name] for name in given if name.startswith(_VARY)}
+    others = {name: given[name] for name in given if not name.startswith(_VARY)}
+    own: list[str] = []
+    try:
+        settings = build(MonteCarloConfig, {**others, **(overrides or {})})
+    except ConfigurationError as error:
+        own += error.problems
+    if loop is None:  # the number of events is unknown
+        varied = {name: one for name, one in varied.items() if not name.startswith('events.')}
+    variations, found = read_variations(varied, loop.plant if loop else PlantConfig())
+    own += [f'{_VARY}{problem}' for problem in found]
+    if loop and settings:
+        own += settings.duration_problems(loop.plant.duration)
+    for problem in own:
+        name = problem.split(':', 1)[0]
+        where = f'line {lines[name]}: ' if name in lines else ''
+        problems.append(f'{_NODE}: {where}{problem}')
+    if loop and loop.plant.joints != loop.controller.joints:
+        problems.append(f'joints: {PLANT} and {CONTROLLER} have them in different orders')
+    if problems or loop is None or settings is None:
+        raise ConfigurationError(problems, str(path))
+    return Study(loop.controller, loop.plant, settings, variations)
+
+
+def write_study(study: Study, path: Path) -> None:
+    """Write a study so that `load_study` returns the same one."""
+    dump(path, study.by_node())
+    with path.open('a', encoding='utf-8') as file:
+        file.writelines(
+            f'    {_VARY}{name}: {format_value(text)}\n' for name, text in study.varied().items()
+        )
+
+
+def _read_section(path: str | Path) -> tuple[dict[str, Any], dict[str, int]]:
+    """Return values and lines of the section `monte_carlo`, by name."""
+    entries = {
+        name: entry
+        for section in read(path)
+        if section.matches(f'/{_NODE}') and not section.is_wildcard
+        for name, entry in section.entries.items()
+    }
+    if not entries:
+        problem = (
+            f'there is no section {_NODE}, which sets the number of runs and what varies: '
+            'see the preset monte_carlo'
+        )
+        raise ConfigurationError([problem], str(path))
+    lines = {name: entry.line for name, entry in entries.items()}
+    return {name: entry.value for name, entry in entries.items()}, lines
+
+
+class Origin(NamedTuple):
+    """Reference and bound at time 0, to which a start is relative."""
+
+    qr: np.ndarray  # (n,) rad
+    dqr: np.ndarray  # (n,) rad/s
+    bound: np.ndarray  # (n,) rad
+
+
+class Draw(NamedTuple):
+    """The random numbers of one run."""
+
+    run: int
+    seed: int  # of the sensor noise
+    values: tuple[Value, ...]  # of the variations, in their order
+
+
+def draw(study: Study, index: int) -> Draw:
+    """Draw run `index` from the seed of the study and the index alone.
+
+    Each variation has its own random number, by its name and regardless of what else varies: two
+    studies with the same seed that differ in one distribution have otherwise the same arms.
+    """
+
+    def bits(name: str) -> int:
+        text = f'{study.settings.seed} {index} {name}'
+        return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), 'big') >> 11
+
+    values = tuple(one.distribution.at(bits(one.column) / 2**53) for one in study.variations)
+    return Draw(index, bits('seed'), values)
+
+
+def origin_of(controller: Controller) -> Origin:
+    """Return the origin of a controller that has not begun."""
+    qr, dqr, _ = controller.reference_at(0.0)
+    return Origin(qr, dqr, controller.bound_at(0.0))
+
+
+def plant_of_draw(study: Study, drawn: Draw, origin: Origin) -> PlantConfig:
+    """Return the plant configuration of a run; `origin` is that of the study's controller."""
+    changes: dict[str, dict[str, Any]] = {}
+    for one, value in zip(study.variations, drawn.values, strict=True):
+        group, _, field = one.name.partition('.')
+        section = changes.setdefault(group, {})
+        section[field] = value if one.entry < 0 else (*section.get(field, ()), value)
+    relative = changes.pop('initial', {})
+    start: dict[str, Any] = {}
+    if 'error' in relative:
+        start['position'] = tuple((origin.qr + origin.bound * relative['error']).tolist())
+    if 'velocity_error' in relative:
+        start['velocity'] = tuple((origin.dqr + relative['velocity_error']).tolist())
+    if 'gap' in changes.get('events', {}):
+        changes['events']['begin'] = tuple(np.cumsum(changes['events'].pop('gap')).tolist())
+    groups = {
+        group: dataclasses.replace(getattr(study.plant, group), **section)
+        for group, section in (changes | {'initial': start}).items()
+    }
+    return dataclasses.replace(study.plant, seed=drawn.seed, **groups)
+
+
+Value = float | int | str
+
+FORMS = {
+    Kind.DOUBLE: (
+        'uniform(low, high)',
+        'loguniform(low, high)',
+        'normal(mean, deviation)',
+        'maybe(probability, low, high)',
+        'choice(a, b, ...)',
+    ),
+    Kind.INTEGER: ('integers(low, high)', 'choice(a, b, ...)'),
+    Kind.STRING: ('choice(a, b, ...)',),
+}
+"""Distributions for each kind of parameter."""
+
+TAIL = 4.0
+"""Standard deviations from the mean at which a normal distribution is cut off."""
+
+_CALL = re.compile(r'\s*(\w+)\s*\((.*)\)\s*')
+_NAMES = {Kind.DOUBLE: 'a number', Kind.INTEGER: 'an integer', Kind.STRING: 'a word'}
+_NORMAL = NormalDist()
+_GROUPS = (
+    'arm.',
+    'truth.',
+    'disturbance.',
+    'sensor.',
+    'actuator.',
+    'load.',
+    'wall.',
+    'events.',
+)
+_REALTIME = ('actuator.command_timeout', 'actuator.without_command')
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """A distribution of values of one kind."""
+
+    name: str
+    arguments: tuple[Value, ...]
+
+    def at(self, u: float) -> Value:
+        """Return the value below which the fraction `u`, in [0, 1), of all draws lies."""
+        if self.name == 'choice':
+            return self.arguments[int(u * len(self.arguments))]
+        if self.name == 'maybe':
+            probability, low, high = cast('tuple[float, float, float]', self.arguments)
+            return low + u / probability * (high - low) if u < probability else 0.0
+        low, high = cast('tuple[float, float]', self.arguments)
+        if self.name == 'uniform':
+            return low + u * (high - low)
+        if self.name == 'loguniform':
+            return min(high, low * math.exp(u * math.log(high / low)))
+        if self.name == 'integers':
+            return low + min(int(u * (high - low + 1)), high - low)
+        tail = _NORMAL.cdf(-TAIL)
+        return low + high * _NORMAL.inv_cdf(tail + u * (1.0 - 2.0 * tail))
+
+    @property
+    def extremes(self) -> tuple[Value, ...]:
+        """Lowest and highest value, or all values of a choice."""
+        if self.name == 'maybe':
+            return (0.0, *self.arguments[1:])
+        if self.name != 'normal':
+            return self.arguments
+        mean, deviation = cast('tuple[float, float]', self.arguments)
+        return (mean - TAIL * deviation, mean + TAIL * deviation)
+
+    def __str__(self) -> str:
+        return f'{self.name}({", ".join(map(str, self.arguments))})'
+
+
+def parse(text: object, kind: Kind) -> Distribution:
+    """Parse a distribution of a scalar kind; raises ValueError naming what is expected."""
+    call = _CALL.fullmatch(text) if isinstance(text, str) else None
+    forms = FORMS[kind]
+    if call is None or call[1] not in (form.partition('(')[0] for form in forms):
+        raise ValueError(f'got {text!r}, but one of these is expected: {", ".join(forms)}')
+    name = call[1]
+    try:
+        arguments = tuple(_argument(word.strip(), kind) for word in call[2].split(','))
+    except ValueError:
+        raise ValueError(f'got {text!r}, but {_NAMES[kind]} is expected between commas') from None
+    if name == 'choice':
+        return Distribution(name, arguments)
+    form = next(form for form in forms if form.startswith(f'{name}('))
+    if len(arguments) != form.count(',') + 1:
+        raise ValueError(f'got {text!r} with {len(arguments)} values, but {form} is expected')
+    first, second = cast('tuple[float, float]', arguments[-2:])
+    if name == 'maybe' and not 0.0 <= cast('float', arguments[0]) <= 1.0:
+        raise ValueError(f'got {text!r}, but a probability is from 0 to 1')
+    if name == 'normal' and second < 0.0:
+        raise ValueError(f'got {text!r}, but a deviation cannot be below 0')
+    if name != 'normal' and first > second:
+        raise ValueError(f'got {text!r}, but the first value must not be above the second')
+    if name == 'loguniform' and first <= 0.0:
+        raise ValueError(f'got {text!r}, but a loguniform distribution begins above 0')
+    return Distribution(name, arguments)
+
+
+def _argument(word: str, kind: Kind) -> Value:
+    if kind is Kind.INTEGER:
+        return int(word)
+    value = float(word) if kind is Kind.DOUBLE else word
+    if value == '' or (isinstance(value, float) and not math.isfinite(value)):
+        raise ValueError
+    return value
+
+
+@dataclass(frozen=True)
+class RelativeStart:
+    """Start of a run relative to the reference."""
+
+    error: Annotated[tuple[float, ...], 'joints'] = parameter(
+        (), 'fraction of the bound', above=-1.0, below=1.0
+    )
+    velocity_error: Annotated[tuple[float, ...], 'joints'] = parameter(
+        (), 'velocity error', unit='rad/s'
+    )
+
+
+@dataclass(frozen=True)
+class RelativeEvents:
+    """Events of a run, one after the other."""
+
+    gap: Annotated[tuple[float, ...], 'events.begin'] = parameter(
+        (), 'time since the event before began', unit='s', at_least=0.0
+    )
+
+
+@dataclass(frozen=True)
+class Variation:
+    """One number drawn for each run."""
+
+    name: str  # of the parameter
+    entry: int  # index in the list; -1: not a list
+    column: str  # name in the results
+    distribution: Distribution
+
+
+@functools.cache
+def variable_parameters() -> Mapping[str, Parameter]:
+    """Return every parameter that may vary, by name."""
+    found = [one for one in parameters(PlantConfig) if one.name.startswith(_GROUPS)]
+    for group, relative in (('initial', RelativeStart), ('events', RelativeEvents)):
+        found += [replace(one, name=f'{group}.{one.name}') for one in parameters(relative)]
+    return {
+        one.name: one for one in found if one.name not in _REALTIME and one.kind.element in FORMS
+    }
+
+
+def entries(one: Parameter, plant: PlantConfig) -> tuple[str, ...]:
+    """Return the names of the entries of a list parameter, by joint or number; else ()."""
+    if not one.kind.is_array:
+        return ()
+    if not one.length:
+        return _numbers(len(operator.attrgetter(one.name)(plant)))
+    each: list[Sequence[str]] = []
+    for name in one.length:
+        if name == 'joints':
+            each.append(plant.joints)
+        else:
+            count = int(name) if name.isdigit() else len(operator.attrgetter(name)(plant))
+            each.append(_numbers(count))
+    return tuple('.'.join(names) for names in itertools.product(*each))
+
+
+def _numbers(count: int) -> tuple[str, ...]:
+    return tuple(f'{number}' for number in range(1, count + 1))
+
+
+def read_variations(
+    given: Mapping[str, object], plant: PlantConfig
+) -> tuple[tuple[Variation, ...], list[str]]:
+    """Return the variations in the order of the plant's parameters, and their problems.
+
+    Each name has a distribution; a list parameter also takes a list of them.
+    """
+    known = variable_parameters()
+    problems = [unknown(name, known) for name in given if name not in known]
+    found: list[Variation] = []
+    for name, one in known.items():
+        if name in given:
+            try:
+                found += _variations_of(one, given[name], entries(one, plant))
+            except ValueError as error:
+                problems.append(f'{name}: {error}')
+    return tuple(found), problems
+
+
+def _variations_of(one: Parameter, given: object, names: tuple[str, ...]) -> list[Variation]:
+    if not one.kind.is_array:
+        return [Variation(one.name, -1, f'plant.{one.name}', _distribution(one, given))]
+    if not names:
+        raise ValueError('got a distribution, but there are no events: give events.begin')
+    each = list(given) if isinstance(given, (list, tuple)) else [given] * len(names)
+    if len(each) == len({name.rpartition('.')[2] for name in names}):
+        each *= len(names) // len(each)  # the same row for each event
+    if len(each) != len(names):
+        raise ValueError(
+            f'got {len(each)} distributions, but there are {len(names)} entries '
+            f'({", ".join(names)}): give one for each, or a single one for all'
+        )
+    return [
+        Variation(one.name, i, f'plant.{one.name}.{name}', _distribution(one, text))
+        for i, (name, text) in enumerate(zip(names, each, strict=True))
+    ]
+
+
+def _distribution(one: Parameter, text: object) -> Distribution:
+    """Parse a distribution and check that the parameter allows all of its values."""
+    scalar = replace(one, kind=one.kind.element)
+    distribution = parse(text, scalar.kind)
+    for value in distribution.extremes:
+        for problem in scalar.problems(value):
+            reason = problem.removeprefix(f'{one.name}: ')
+            raise ValueError(f'{distribution} can give values that are not allowed: {reason}')
+    return distribution

@@ -1,0 +1,529 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs of a Monte Carlo study: their figures, the folder that keeps them, and their workers.
+
+The folder of a study:
+
+    study.yaml       the whole configuration, a file that `blf_dsc monte-carlo --config` accepts
+    versions.json    the versions that computed the results
+    runs/            Parquet files, named after the first and the last run in them
+
+Files of results are written atomically, so a study that was killed resumes with the runs that have
+none. The workers are any `concurrent.futures.Executor`:
+
+    processes   processes of this machine (default)
+    threads     threads of this process: the kernels release the GIL
+    dask        a dask.distributed cluster: a running one, by its address, or a local one
+
+All of them give the same results.  Chunks of runs are submitted one after the other, a few ahead of
+the workers, so the memory needed does not grow with the number of runs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import json
+import multiprocessing
+import os
+import re
+import shutil
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
+from contextlib import AbstractContextManager, contextmanager
+from itertools import pairwise
+from math import nan
+from multiprocessing import connection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import blf_dsc_controller
+from blf_dsc_controller.compiled.jit import cache_folder
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.errors import BlfDscError, MissingExtraError, StartError
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.factory import begin, controller_of, model_of
+from blf_dsc_controller.reference.limits import MotionError
+from blf_dsc_controller.simulation.loop import run_loop, run_metrics
+from blf_dsc_controller.simulation.metrics import (
+    LoopMetrics,
+    MetricsSettings,
+    another_motion,
+    metrics_of,
+    new_metrics,
+    torque_error,
+    torque_rows,
+)
+from blf_dsc_controller.studies.monte_carlo import (
+    Origin,
+    Study,
+    draw,
+    load_study,
+    origin_of,
+    plant_of_draw,
+    write_study,
+)
+from sim_plant.arms import parameter_names_of
+from sim_plant.plant import Plant, parameter_order, plant_of, steps_of
+
+_UNSEEN = 1000  # seed of the motion on which the torque of the learned model is judged
+
+KEPT = 'kept'
+VIOLATED = 'violated'
+DIVERGED = 'diverged'
+REJECTED = 'rejected'
+OUTCOMES = {
+    KEPT: 'inside the bound to the end',
+    VIOLATED: 'outside at some sample',
+    DIVERGED: 'a number became infinite or NaN',
+    REJECTED: 'the controller refuses to start there',
+}
+"""Possible outcomes of a run."""
+
+Row = dict[str, float | int | str]
+Columns = dict[str, np.ndarray]
+"""Results by column name, one entry per run."""
+
+
+def run_chunk(study: Study, first: int, count: int) -> Columns:
+    """Compute runs `first` to `first + count - 1`.
+
+    All runs share one controller of each law, which take nearly all of the memory. The result
+    depends on the arguments alone, and no file is written.
+    """
+    laws = {prefix: controller_of(config) for prefix, config in study.laws().items()}
+    origin = origin_of(laws[''])
+    unseen = rows_of_another_motion(study)
+    rows = [_run(study, index, laws, origin, unseen) for index in range(first, first + count)]
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+def rows_of_another_motion(study: Study) -> np.ndarray | None:
+    """Return rows of H (k, p) of a motion that is never run; None without sinusoids."""
+    law = study.controller
+    if law.reference.type != 'sinusoids':
+        return None
+    return torque_rows(another_motion(law, _UNSEEN))
+
+
+def warm_up(study: Study) -> None:
+    """Compile what the workers run, so that they find it in the cache."""
+    plant = dataclasses.replace(study.plant, duration=study.plant.sample_time)
+    settings = dataclasses.replace(study.settings, settled_after=0.0, moments=())
+    run_chunk(dataclasses.replace(study, plant=plant, settings=settings), 0, 1)
+
+
+def metrics_settings(study: Study, plant: PlantConfig) -> MetricsSettings:
+    """Return the settings of the metrics of a run with this plant."""
+    order = parameter_order(model_of(study.controller).parameter_names, plant)
+    limits = zip(study.controller.torque.limit, plant.actuator.torque_limit, strict=True)
+    times = (study.settings.settled_after, *study.settings.moments)
+    settled, *moments = (round(t / plant.sample_time) for t in times)
+    return MetricsSettings(
+        n=len(plant.joints),
+        p=order.size,
+        true=len(parameter_names_of(plant)),
+        moments=len(moments) + 1,
+        settled=settled,
+        limit=np.array([min(law, motor or law) for law, motor in limits]),
+        order=order,
+        samples=np.array([*moments, steps_of(plant)]),
+    )
+
+
+def metrics_row(study: Study, metrics: LoopMetrics, model_error: float = nan) -> Row:
+    """Return the columns of a run from its metrics; NaN for events that did not happen."""
+    settled = metrics.settled[0]
+    outcome = KEPT if np.isnan(metrics.violation[0]) else VIOLATED
+    row: Row = {
+        'outcome': DIVERGED if metrics.finite[0] == 0.0 else outcome,
+        'first_violation_s': float(metrics.violation[0]),
+        'latch_time_s': float(metrics.latch[0]),
+        'saturated_fraction': float(metrics.saturated[0] / max(1.0, metrics.samples[0])),
+    }
+    rms = np.sqrt(metrics.squares / settled) if settled else np.full_like(metrics.squares, np.nan)
+    for i, joint in enumerate(study.plant.joints):
+        row[f'max_error_ratio.{joint}'] = float(metrics.ratio[i])
+        row[f'settled_error_ratio.{joint}'] = float(metrics.late[i]) if settled else np.nan
+        row[f'rms_error_rad.{joint}'] = float(rms[i])
+        row[f'peak_torque_nm.{joint}'] = float(metrics.peak[i])
+    for name, error in zip(error_columns(study), metrics.error.tolist(), strict=True):
+        row[name] = error
+    row['torque_error.end'] = model_error
+    return row
+
+
+def model_error(
+    unseen: np.ndarray | None, settings: MetricsSettings, estimate: np.ndarray, P: np.ndarray
+) -> float:
+    """Return the torque error of an estimate on another motion; NaN if it is not of the plant's."""
+    if unseen is None or settings.order.min() < 0:
+        return nan
+    return torque_error(unseen, estimate[: settings.p], P[settings.order])
+
+
+def error_columns(study: Study) -> Iterator[str]:
+    """Yield the column names of the parameter errors, the final one last."""
+    for moment in study.settings.moments:
+        yield f'parameter_error.{moment:g}_s'
+    yield 'parameter_error.end'
+
+
+def _run(
+    study: Study,
+    index: int,
+    laws: dict[str, Controller],
+    origin: Origin,
+    unseen: np.ndarray | None,
+) -> Row:
+    drawn = draw(study, index)
+    row: Row = {'run': drawn.run, 'seed': drawn.seed}
+    for variation, value in zip(study.variations, drawn.values, strict=True):
+        row[variation.column] = value
+    config = plant_of_draw(study, drawn, origin)
+    settings, plant = metrics_settings(study, config), plant_of(config)
+    for prefix, controller in laws.items():
+        found = _run_law(study, controller, plant, settings, unseen)
+        row |= {f'{prefix}{name}': value for name, value in found.items()}
+    return row
+
+
+def _run_law(
+    study: Study,
+    controller: Controller,
+    plant: Plant,
+    settings: MetricsSettings,
+    unseen: np.ndarray | None,
+) -> Row:
+    """Run a plant, from its beginning, with a controller; return the columns of its metrics."""
+    plant.reset()
+    q, dq, _ = plant.measure().reshape(3, -1)
+    controller.reset()
+    try:
+        begin(controller, study.controller, q, dq)
+    except (StartError, MotionError):
+        origin = origin_of(controller)
+        return _rejected_row(study, np.abs(q - origin.qr) / origin.bound)
+    metrics = run_metrics(controller, plant, steps_of(study.plant) + 1, settings)
+    error = model_error(unseen, settings, controller.state.estimate, plant.truth())
+    return metrics_row(study, metrics, error)
+
+
+def _rejected_row(study: Study, ratios: np.ndarray) -> Row:
+    """Return the columns of a run that does not begin, with |xi1(0)| / k_c (n,)."""
+    settings = metrics_settings(study, study.plant)
+    metrics = metrics_of(np.full_like(new_metrics(settings), np.nan), settings)
+    metrics.violation[0] = 0.0
+    metrics.ratio[:] = ratios
+    metrics.settled[0] = 0.0
+    return metrics_row(study, metrics) | {'outcome': REJECTED}
+
+
+_STUDY = 'study.yaml'
+_VERSIONS = 'versions.json'
+_RUNS = 'runs'
+_PART = re.compile(r'runs-(\d+)-(\d+)\.parquet')
+
+
+class Span(NamedTuple):
+    """Runs `first` to `first + runs - 1`."""
+
+    first: int
+    runs: int
+
+
+def require_pyarrow() -> Any:
+    """Return pyarrow with its Parquet module; raises MissingExtraError if it is not installed."""
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet
+    except ImportError:
+        raise MissingExtraError('pyarrow', 'monte-carlo', 'keeping the results') from None
+    return pa
+
+
+def versions() -> dict[str, str]:
+    """Return the versions on which the numbers depend besides the configuration."""
+    return {
+        'blf_dsc_controller': blf_dsc_controller.__version__,
+        'kernels': cache_folder(run_loop).name,
+        'numpy': np.__version__,
+    }
+
+
+def differences(there: Mapping[str, object], here: Mapping[str, object]) -> str:
+    """Return lines for a message, one for each value that differs; empty if none does."""
+    names = [*there, *(name for name in here if name not in there)]
+    pairs = ((name, there.get(name, 'nothing'), here.get(name, 'nothing')) for name in names)
+    return ''.join(
+        f'\n  - {name}: there {old}, here {new}'
+        for name, old, new in pairs
+        if old != new and (old == old or new == new)  # noqa: PLR0124 - NaN equals NaN here
+    )
+
+
+class Store:
+    """The folder of a study, with the `study` that its results belong to.
+
+    Raises BlfDscError if the folder holds no study.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        try:
+            self._versions = json.loads((folder / _VERSIONS).read_text(encoding='utf-8'))
+            if not (folder / _STUDY).is_file():
+                raise FileNotFoundError
+        except (OSError, ValueError):
+            raise BlfDscError(
+                f'{folder} exists already and holds no study: choose another folder'
+                if os.path.lexists(folder)
+                else f'{folder} does not exist: it should be the folder of a study'
+            ) from None
+        self.study = load_study(folder / _STUDY)
+
+    @classmethod
+    def create_or_open(cls, folder: Path, study: Study) -> Store:
+        """Create the folder of a study, or open it to resume.
+
+        Raises BlfDscError if it holds no study, another one, or the same by another version.
+        """
+        if not os.path.lexists(folder):
+            _create(folder, study)
+        store = cls(folder)
+        different = differences(store._versions, versions())
+        different = different or differences(store.study.flat(), study.flat())
+        if different:
+            raise BlfDscError(
+                f'{folder} holds another study, which is neither resumed nor overwritten: '
+                f'choose another folder, or make them equal:{different}'
+            )
+        return store
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from writing to the folder; the lock ends with its process.
+
+        Removes unfinished files of an earlier process. Raises BlfDscError if it is locked already.
+        """
+        with (self.folder / _STUDY).open(encoding='utf-8') as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise BlfDscError(
+                    f'another monte-carlo is running in {self.folder}: wait for it, or end it'
+                ) from None
+            for unfinished in (self.folder / _RUNS).glob('.runs-*'):
+                unfinished.unlink()
+            yield
+
+    def keep(self, span: Span, columns: Columns) -> None:
+        """Write the results of a span of runs atomically, even if the process is killed."""
+        pa = require_pyarrow()
+        last = span.first + span.runs - 1
+        path = self.folder / _RUNS / f'runs-{span.first:09d}-{last:09d}.parquet'
+        unfinished = path.with_name(f'.{path.name}.{os.getpid()}')
+        with unfinished.open('wb') as file:
+            pa.parquet.write_table(pa.table(columns), file)
+            file.flush()
+            os.fsync(file.fileno())
+        unfinished.replace(path)
+
+    def done(self) -> list[Span]:
+        """Return the runs that have results, in order."""
+        found = (_PART.fullmatch(path.name) for path in (self.folder / _RUNS).iterdir())
+        bounds = sorted((int(one[1]), int(one[2])) for one in found if one)
+        return [Span(first, last - first + 1) for first, last in bounds]
+
+    def missing(self, size: int) -> list[Span]:
+        """Return the runs without results, in chunks of at most `size`."""
+        edges = [Span(0, 0), *self.done(), Span(self.study.settings.runs, 0)]
+        return [
+            Span(first, min(size, after.first - first))
+            for before, after in pairwise(edges)
+            for first in range(before.first + before.runs, after.first, size)
+        ]
+
+    def results(self) -> Columns:
+        """Read all results, one row per run, in order.
+
+        Raises BlfDscError if there are none yet, or if a file is damaged.
+        """
+        pa = require_pyarrow()
+        paths = sorted(
+            path for path in (self.folder / _RUNS).iterdir() if _PART.fullmatch(path.name)
+        )
+        if not paths:
+            raise BlfDscError(f'{self.folder} has no results yet')
+        tables = []
+        for path in paths:
+            problem = ''
+            try:
+                tables.append(pa.parquet.read_table(path))
+                if tables[-1].column_names != tables[0].column_names:
+                    problem = f'its columns are not those of {paths[0].name}'
+            except (OSError, pa.ArrowException) as error:
+                problem = str(error)
+            if problem:
+                raise BlfDscError(
+                    f'{path} cannot be read ({problem}): remove it and start the study again '
+                    'to recompute these runs'
+                )
+        whole = pa.concat_tables(tables).sort_by('run')
+        return {name: np.asarray(whole[name].to_numpy()) for name in whole.column_names}
+
+
+def _create(folder: Path, study: Study) -> None:
+    """Create the folder atomically."""
+    unfinished = folder.with_name(f'.{folder.name}.{os.getpid()}')
+    shutil.rmtree(unfinished, ignore_errors=True)
+    (unfinished / _RUNS).mkdir(parents=True)
+    write_study(study, unfinished / _STUDY)
+    text = json.dumps(versions(), indent=2) + '\n'
+    (unfinished / _VERSIONS).write_text(text, encoding='utf-8')
+    unfinished.rename(folder)
+
+
+RETRIES = 3
+"""Consecutive losses of all workers that are tolerated before any has finished a chunk."""
+
+_AHEAD = 3  # chunks submitted for each worker
+
+
+class Engine(NamedTuple):
+    """Workers: `open` starts a new executor, which raises BrokenExecutor if they are lost."""
+
+    open: Callable[[], AbstractContextManager[Executor]]
+    workers: int
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
+
+
+def processes(workers: int) -> Engine:
+    """Use processes of this machine, each of which ends with this one."""
+    context = multiprocessing.get_context('forkserver')
+    context.set_forkserver_preload([run_chunk.__module__])  # imported once, for all workers
+    return Engine(lambda: ProcessPoolExecutor(workers, context, _end_with_parent), workers)
+
+
+def threads(workers: int) -> Engine:
+    """Use threads of this process."""
+    return Engine(lambda: ThreadPoolExecutor(workers), workers)
+
+
+def dask(workers: int, address: str = '') -> Engine:
+    """Start a dask.distributed cluster on this machine, or use the one at a scheduler's address.
+
+    Dask itself repeats the work of a lost worker, unless it fails repeatedly.
+    """
+    try:
+        import distributed
+    except ImportError:
+        raise MissingExtraError('dask.distributed', 'dask', 'the engine dask') from None
+
+    def client() -> Any:
+        if address:
+            return distributed.Client(address)
+        return distributed.Client(n_workers=workers, threads_per_worker=1, dashboard_address=None)
+
+    @contextmanager
+    def start() -> Iterator[Executor]:
+        with client() as connected:
+            try:
+                yield connected.get_executor(pure=False)
+            except distributed.KilledWorker as error:
+                raise BrokenExecutor(str(error)) from error
+
+    if address:
+        with client() as connected:
+            workers = max(1, sum(connected.nthreads().values()))
+    return Engine(start, workers)
+
+
+def chunk_size(runs: int, workers: int) -> int:
+    """Return the runs per chunk: few files, yet enough chunks for workers to finish together."""
+    largest = min(1000, max(100, runs // 1000))
+    return max(1, min(largest, runs // (20 * workers)))
+
+
+def compute(
+    study: Study,
+    spans: Iterable[Span],
+    engine: Engine,
+    keep: Callable[[Span, Columns], None],
+    warn: Callable[[str], None],
+) -> None:
+    """Compute all `spans` and pass each with its results to `keep` as soon as it is done.
+
+    The chunk of a lost worker is repeated, after a warning; raises BlfDscError if workers are lost
+    repeatedly.
+    """
+    waiting = deque(spans)
+    in_a_row = 0
+    while waiting:
+        before = len(waiting)
+        try:
+            with engine.open() as executor:
+                _hand_out(study, waiting, executor, engine.workers * _AHEAD, keep)
+        except BrokenExecutor as error:
+            in_a_row = in_a_row + 1 if len(waiting) == before else 1
+            if in_a_row > RETRIES:
+                raise BlfDscError(
+                    f'{in_a_row} times in a row all workers were lost before any finished a chunk '
+                    f'({error}); {len(waiting)} chunks are left. Is there enough memory? Start the '
+                    'same command again to resume: finished runs are kept'
+                ) from error
+            warn(f'a worker was lost: the {len(waiting)} chunks left go to new workers')
+
+
+def _hand_out(
+    study: Study,
+    waiting: deque[Span],
+    executor: Executor,
+    most: int,
+    keep: Callable[[Span, Columns], None],
+) -> None:
+    """Submit all of `waiting`; on an error, put back the spans that were not kept."""
+    handed: dict[Future[Columns], Span] = {}
+    try:
+        while waiting or handed:
+            while waiting and len(handed) < most:
+                span = waiting[0]
+                handed[executor.submit(run_chunk, study, *span)] = span
+                waiting.popleft()
+            for future in wait(handed, return_when=FIRST_COMPLETED).done:
+                keep(handed[future], future.result())
+                del handed[future]
+    finally:
+        for future in handed:
+            future.cancel()
+        waiting.extendleft(sorted(handed.values(), reverse=True))
+
+
+def _end_with_parent() -> None:
+    """Leave interrupts to the parent, and exit with it, even if it is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
