@@ -66,11 +66,14 @@ def test_cache_folder_of_a_kernel_follows_from_its_dependencies(kernel):
 
 
 COMPILE = """
+import sys
 import numpy as np
 from blf_dsc_controller.arms import batch
 from blf_dsc_controller.arms.two_link import TwoLink
+from blf_dsc_controller.compiled.notice import announced_compilation
 
-H = batch.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
+with announced_compilation(lambda text: print(text, file=sys.stderr)):
+    H = batch.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
 print(float(H[0, 0, 0]), *(sum(batch._fill_regressors.stats[k].values()) for k in (1, 2)))
 """
 
@@ -102,7 +105,7 @@ def test_second_checkout_finds_the_kernels_of_the_first_and_never_those_of_other
 
 @pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
 def test_kernels_compile_without_the_private_parts_of_numba(tmp_path):
-    """What other releases lack is done without: less quickly, with the same numbers."""
+    """What other releases lack is done without: less quickly, as a notice says, with the same numbers."""
     without = """
 import sys
 import numba.core.caching, numba.core.codegen
@@ -118,6 +121,8 @@ if sys.argv[1] == 'cache':
         ]
         outputs = [[float(word) for word in run.stdout.split()] for run in runs]
         assert [counts for _, *counts in outputs] == [[0, 1], [1, 0]], runs
+        slow = f'numba {numba.__version__} lacks what this package uses'
+        assert [run.stderr.count(slow) for run in runs] == [1, 0]
         entry, *_ = outputs[0]
         H = batch.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
         assert entry == H[0, 0, 0]

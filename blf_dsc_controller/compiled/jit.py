@@ -33,9 +33,14 @@ try:
 except ImportError:  # it uses parts of numba that other releases may lack: see there
     _INNER_COMPILER: dict[str, Any] = {}
     _KERNEL_COMPILER: dict[str, Any] = {}
+    SLOW = (
+        f'numba {numba.__version__} lacks what this package uses to compile kernels as a whole: '
+        'compilation takes three times as long, and each sample of a Panda half as long again'
+    )
 else:
     _INNER_COMPILER = {'pipeline_class': LinkedCompiler}
     _KERNEL_COMPILER = {'pipeline_class': KernelCompiler}
+    SLOW = ''
 
 F = TypeVar('F', bound=Callable[..., object])
 

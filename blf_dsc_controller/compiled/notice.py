@@ -9,7 +9,7 @@ from typing import Any
 
 from numba.core import event
 
-from blf_dsc_controller.compiled.jit import KERNELS
+from blf_dsc_controller.compiled.jit import KERNELS, SLOW
 
 COMPILING = 'compiling kernel '
 """How a notice begins."""
@@ -24,6 +24,8 @@ class _Listener(event.Listener):  # type: ignore[misc]
         kernel = started.data['dispatcher']
         if not any(kernel is other for other in KERNELS):
             return
+        if SLOW and self._count == 0:
+            self._say(SLOW)
         self._count += 1
         total = max(self._count, len(KERNELS))
         self._say(
