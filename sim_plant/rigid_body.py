@@ -169,7 +169,7 @@ def acceleration(
     fill_inertia(arm, now)
     for i in range(arm.n):
         for j in range(i + 1):
-            now.factor[i, j] = now.M[i, j]
+            now.factor[j, i] = now.M[i, j]
     cholesky.factor(now.factor)
     cholesky.solve(now.factor, ddq)
 

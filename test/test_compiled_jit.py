@@ -105,7 +105,7 @@ def test_second_checkout_finds_the_kernels_of_the_first_and_never_those_of_other
 
 @pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
 def test_kernels_compile_without_the_private_parts_of_numba(tmp_path):
-    """What other releases lack is done without: less quickly, as a notice says, with the same numbers."""
+    """Other releases may lack them: then it is slower, which is said, with the same numbers."""
     without = """
 import sys
 import numba.core.caching, numba.core.codegen

@@ -16,23 +16,23 @@ def excitation_matrix(random, m, rank):
     return rows.T @ rows
 
 
-@pytest.mark.parametrize(('m', 'rank'), [(1, 1), (5, 12), (5, 5), (5, 2), (7, 1), (6, 0)])
+@pytest.mark.parametrize(('m', 'rank'), [(1, 1), (13, 30), (5, 12), (5, 5), (5, 2), (7, 1), (6, 0)])
 @pytest.mark.parametrize('shift', [1e-5, 1.0])
 def test_factor_matches_numpy_and_solves(m, rank, shift):
     """Singular matrices included: the factor is of Phi + rho I."""
     random = np.random.default_rng(m)
     A = excitation_matrix(random, m, rank)
     x = random.normal(size=m)
-    L, y = np.tril(A + shift * np.eye(m)), x.copy()
+    U, y = np.triu(A + shift * np.eye(m)), x.copy()
 
-    assert cholesky.factor(L)
-    cholesky.solve(L, y)
+    assert cholesky.factor(U)
+    cholesky.solve(U, y)
 
-    np.fill_diagonal(L, 1.0 / np.diag(L))  # kept inverted
+    np.fill_diagonal(U, 1.0 / np.diag(U))  # kept inverted
     # Backward stable: the residual, and not the solution, is at the level of rounding.
     shifted = A + shift * np.eye(m)
-    np.testing.assert_allclose(L @ L.T, shifted, atol=1e-14 * np.linalg.norm(shifted))
-    np.testing.assert_allclose(L, np.linalg.cholesky(shifted), rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(U.T @ U, shifted, atol=1e-14 * np.linalg.norm(shifted))
+    np.testing.assert_allclose(U.T, np.linalg.cholesky(shifted), rtol=1e-5, atol=1e-9)
     np.testing.assert_allclose(
         shifted @ y, x, atol=1e-14 * np.linalg.norm(shifted) * np.linalg.norm(y)
     )
@@ -42,10 +42,10 @@ def test_factor_is_finite_when_rounding_destroys_a_pivot():
     """Rank one at 1e12 rounds at 1e-4, so the other two pivots of Phi + 1e-5 I are noise."""
     for seed in range(20):
         row = 1e6 * np.random.default_rng(seed).normal(size=3)
-        L = np.tril(np.outer(row, row) + 1e-5 * np.eye(3))
-        cholesky.factor(L)
-        assert np.all(np.isfinite(L))
-        assert np.diag(L).max() <= 1e7 / np.abs(row).min() * (1.0 + 1e-9)
+        U = np.triu(np.outer(row, row) + 1e-5 * np.eye(3))
+        cholesky.factor(U)
+        assert np.all(np.isfinite(U))
+        assert np.diag(U).max() <= 1e7 / np.abs(row).min() * (1.0 + 1e-9)
 
 
 def test_factor_shows_whether_a_matrix_is_positive_definite():
@@ -53,7 +53,7 @@ def test_factor_shows_whether_a_matrix_is_positive_definite():
     for _ in range(20):
         A = random.normal(size=(4, 4)) + np.diag(random.uniform(0.0, 3.0, 4))
         A = A + A.T
-        assert cholesky.factor(np.tril(A)) == (np.linalg.eigvalsh(A)[0] > 0.0)
+        assert cholesky.factor(np.triu(A)) == (np.linalg.eigvalsh(A)[0] > 0.0)
 
 
 def excited_case(seed):
@@ -123,7 +123,7 @@ def test_latch_keeps_the_whole_window_when_time_and_excitation_suffice(excited):
     assert (state.latched[0], state.latch_time[0]) == (1.0, settings.learning_start)
     np.testing.assert_allclose(state.Phi, Phi, atol=1e-14)
     np.testing.assert_allclose(state.b, b, atol=1e-14)
-    np.testing.assert_allclose(np.tril(state.factor), factor, atol=1e-13)
+    np.testing.assert_allclose(np.triu(state.factor), factor.T, atol=1e-13)
 
 
 @pytest.mark.parametrize('early', [True, False])

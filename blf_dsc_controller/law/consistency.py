@@ -103,10 +103,10 @@ def is_physical(settings: Settings, signals: Signals, q: np.ndarray, theta: np.n
             signals.unit[i] = 1.0 if i == k else 0.0
         settings.model.momentum_regressor(q, signals.unit, signals.momentum, signals.rest)
         for i in range(k, settings.n):
-            signals.inertia[i, k] = 0.0
+            signals.inertia[k, i] = 0.0
             for j in range(settings.p):
                 parameter = theta[j] - _LEAST_INERTIA * settings.initial_estimate[j]
-                signals.inertia[i, k] += signals.momentum[i, j] * parameter
+                signals.inertia[k, i] += signals.momentum[i, j] * parameter
     return cholesky.factor(signals.inertia)
 
 

@@ -146,7 +146,7 @@ def regularized_factor(
     remove_rejected(active, Phi, b)
     for i in range(Phi.shape[0]):
         for j in range(i + 1):
-            factor[i, j] = Phi[i, j] + rho * information[i, j]
+            factor[j, i] = Phi[i, j] + rho * information[i, j]
     cholesky.factor(factor)
 
 
