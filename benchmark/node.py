@@ -25,8 +25,8 @@ from harness import Contestant, ContestantError, Ratio, Watched, own_graph, rati
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Telemetry
 from blf_dsc_controller.configuration.nodes import CONTROLLER, LoopConfig, dump, load_loop
+from blf_dsc_controller.law.telemetry import PlantTelemetry
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.telemetry import PlantTelemetry
 from blf_dsc_controller.simulation.loop import simulate
 
 _ROUNDS = 5

@@ -14,7 +14,7 @@ import numpy as np
 from harness import Contestant, Ratio, own_graph, ratio, wait_for
 from node import StandIn
 
-from blf_dsc_controller.messages.telemetry import PlantTelemetry
+from blf_dsc_controller.law.telemetry import PlantTelemetry
 
 _ROUNDS = 3
 _NULL = 'null node'

@@ -19,6 +19,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.inertia import pseudo_inertia, rotational_inertia
 from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.compiled.vectors import (
@@ -31,7 +32,6 @@ from blf_dsc_controller.compiled.vectors import (
     times,
     vector,
 )
-from blf_dsc_controller.law import cholesky
 
 
 class RigidBodies(NamedTuple):

@@ -23,8 +23,8 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder, JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
+from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.simulation.loop import simulate
-from sim_plant.node import PlantNode
 
 PATIENCE = 300.0  # s, until a test gives up waiting
 JOINTS = ('joint1', 'joint2')

@@ -15,10 +15,10 @@ from ros_rig import RosRig
 
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.markers_node import MarkersNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 from blf_dsc_controller.view.node import ViewNode
-from sim_plant.node import PlantNode
 
 KINDS = (
     ('topics', 'publish', 'topic', 'get_publisher_names_and_types_by_node'),

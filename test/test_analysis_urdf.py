@@ -20,8 +20,8 @@ from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.law.telemetry import learned_arm
 from blf_dsc_controller.messages.journal import decode
-from blf_dsc_controller.messages.samples import learned_arm
 from blf_dsc_controller.messages.topics import JOURNAL, LAMBDA_MIN, LATCHED
 from blf_dsc_controller.run import LearnedArm, Run, Series
 

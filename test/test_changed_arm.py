@@ -24,8 +24,8 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.simulation.loop import simulate
-from sim_plant.node import PlantNode
 from sim_plant.plant import parameters_of
 
 QUIET = {'telemetry.enabled': False}

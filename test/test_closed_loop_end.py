@@ -50,10 +50,10 @@ def test_signal_shuts_down_cleanly_with_bag_and_report(running, number):
 
 
 def test_killed_node_is_reported_and_ends_the_others(running):
-    for process in (running.process.pid, running.child('sim_plant.loop')):
+    for process in (running.process.pid, running.child('blf_dsc_controller.nodes.lockstep_loop')):
         # A killed process would leave it broken, and crash the others.
         assert 'shm/fastrtps' not in Path(f'/proc/{process}/maps').read_text()
-    os.kill(running.child('sim_plant.loop'), signal.SIGKILL)
+    os.kill(running.child('blf_dsc_controller.nodes.lockstep_loop'), signal.SIGKILL)
     code, _, errors = running.end()
     assert code == 1, errors
     assert 'blf_dsc run: loop was terminated by SIGKILL' in errors

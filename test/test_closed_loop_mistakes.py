@@ -28,7 +28,7 @@ from blf_dsc_controller.cli import main
 command = sys.argv.pop(1)
 sys.exit(getattr(main, command)())
 """
-PLANT_NODE = (sys.executable, '-m', 'sim_plant.node', '--ros-args')
+PLANT_NODE = (sys.executable, '-m', 'blf_dsc_controller.nodes.plant_node', '--ros-args')
 
 
 def here(capsys, *arguments):

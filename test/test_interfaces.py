@@ -28,8 +28,8 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import message_class
 from blf_dsc_controller.nodes.markers_node import MarkersNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.simulation.loop import simulate
-from sim_plant.node import PlantNode
 
 CONFIG = Path(__file__).parents[1] / 'config'
 

@@ -26,9 +26,9 @@ from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.nodes.arguments import assigned
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.markers_node import MarkersNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
-from sim_plant.node import PlantNode
 
 ROOT = Path(__file__).resolve().parents[1]
 NODES = {
@@ -189,7 +189,9 @@ def test_section_that_does_not_match_the_node_is_an_error(start, tmp_path, secti
     assert start(*argv).config.seed == 2
 
 
-@pytest.mark.parametrize('module', ['sim_plant.node', 'blf_dsc_controller.nodes.controller_node'])
+@pytest.mark.parametrize(
+    'module', ['blf_dsc_controller.nodes.plant_node', 'blf_dsc_controller.nodes.controller_node']
+)
 def test_parameter_file_that_ros_would_ignore_is_rejected(module):
     run = finished(sys.executable, '-m', module, '--params-file', locate('recommended'))
     assert run.returncode == 1

@@ -11,7 +11,7 @@ from closed_loop_case import controller, plant, recommended
 from plain_law import dynamics
 from scipy.integrate import solve_ivp
 
-from blf_dsc_controller.law import cholesky
+from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.law.controller import Controller
 
 TRUE = np.array([1.0, 0.32, 0.4])

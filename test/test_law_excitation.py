@@ -8,7 +8,8 @@ import pytest
 from arbitrary_case import arbitrary
 from closed_loop_case import closed_loop, controller, plant, quick
 
-from blf_dsc_controller.law import cholesky, excitation, window
+from blf_dsc_controller.compiled import cholesky
+from blf_dsc_controller.law import excitation, window
 
 
 def excitation_matrix(random, m, rank):

@@ -11,10 +11,10 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from fake_clock import FakeClock
 from ros_rig import activate, cleanup, configure, deactivate, shutdown, torques, values
 
-import sim_plant.node
+import blf_dsc_controller.nodes.plant_node
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from sim_plant.node import PlantNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
 
 SECOND = 1_000_000_000  # ns
 
@@ -166,7 +166,7 @@ def test_restarted_plant_stops_the_controller_until_reset(ros):
 
 
 def test_restarted_controller_continues_from_where_the_arm_is(ros, monkeypatch):
-    monkeypatch.setattr(sim_plant.node, '_REPEAT_PERIOD', 0.1)
+    monkeypatch.setattr(blf_dsc_controller.nodes.plant_node, '_REPEAT_PERIOD', 0.1)
     arm, law = ros.loop()
     ros.run(arm, 50)
     ros.kill(law)

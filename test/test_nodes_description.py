@@ -18,7 +18,7 @@ from blf_dsc_controller.messages.topics import Quality
 from blf_dsc_controller.nodes import description
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import qos_profile
-from sim_plant.node import PlantNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
 
 TEXT = random_urdf(3, seed=5)[0]
 ON_TOPIC = {'robot.urdf': 'topic://robot_description', 'robot.tip': 'tip', 'autostart': False}

@@ -13,7 +13,7 @@ from ros_rig import simulated_torques, torques
 
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateDecoder
-from sim_plant.node import PlantNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
 
 ARM = {
     'robot.urdf': random_urdf(3, seed=5)[0],

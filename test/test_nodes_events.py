@@ -17,7 +17,7 @@ from test_plant_events import ALL_KINDS
 
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from sim_plant.node import LOCKSTEP_START, PlantNode
+from blf_dsc_controller.nodes.plant_node import LOCKSTEP_START, PlantNode
 
 OBSERVED = {'wait_for_subscribers': 1}
 QUIET = {'telemetry.enabled': False}

@@ -16,9 +16,9 @@ from ros_rig import simulated_torques, states, torques
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.plant_node import LOCKSTEP_START, PlantNode
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import reference_of
-from sim_plant.node import LOCKSTEP_START, PlantNode
 
 MILLISECOND = 1_000_000  # ns
 OBSERVED = {'wait_for_subscribers': 1}

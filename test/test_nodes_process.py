@@ -34,7 +34,7 @@ ENDED = """
 from pathlib import Path
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.process import run
-from sim_plant.node import PlantNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
 
 class Ended({node}):
     def _on_poll(self):

@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger
 
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from sim_plant.node import PlantNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
 
 EXAMPLES = 10_000 if os.environ.get('NIGHTLY') else 60
 SETTINGS = settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck))

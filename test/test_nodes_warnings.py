@@ -16,7 +16,7 @@ from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from sim_plant.node import PlantNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
 
 COSINE = {'learning.frequencies': [1.0], 'learning.bias': False}
 

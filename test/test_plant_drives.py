@@ -11,8 +11,8 @@ from random_arm import CONFIG
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.law.telemetry import PlantTelemetry
 from blf_dsc_controller.messages.codecs import JointStateDecoder
-from blf_dsc_controller.messages.telemetry import PlantTelemetry
 from sim_plant.plant import plant_of
 
 PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}

@@ -11,8 +11,8 @@ from recorded_run import compared, of
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.law.factory import estimate_names
+from blf_dsc_controller.law.telemetry import ControllerTelemetry
 from blf_dsc_controller.messages.journal import EventType, decode
-from blf_dsc_controller.messages.telemetry import ControllerTelemetry
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES, JOURNAL, TRACKING_ERROR
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.replay.verify import verify

@@ -16,7 +16,7 @@ from synthetic_bag import START, Synthetic
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.topics import ROBOT_DESCRIPTION
 from blf_dsc_controller.messages.types import typestore
-from blf_dsc_controller.replay.timeline import Timeline
+from blf_dsc_controller.nodes.player_node import Timeline
 
 PATIENCE = 300.0  # s, timeout of waits that should take a moment
 MEGABYTE = 10**6

@@ -20,9 +20,9 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.law.factory import controller_of, estimate_names
+from blf_dsc_controller.law.telemetry import ControllerTelemetry
 from blf_dsc_controller.messages.codecs import JointStateDecoder, JointStateEncoder
 from blf_dsc_controller.messages.journal import Event, EventType, decode
-from blf_dsc_controller.messages.telemetry import ControllerTelemetry
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
     JOINT_STATES,

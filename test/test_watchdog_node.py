@@ -14,8 +14,8 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 
+from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
-from sim_plant.node import PlantNode
 
 HELD_FOR_EVER = {'actuator.without_command': 'hold'}
 CONTROLLER = {

@@ -253,7 +253,7 @@ def _rejected_columns(content: Content, learning: Series | None, namespace: str)
 def _arm(content: Content) -> LearnedArm | None:
     """Return the arm of the recorded configuration; None unless its URDF can still be read."""
     if content.configurations.get(CONTROLLER, {}).get('model') == 'urdf':
-        from blf_dsc_controller.messages.samples import learned_arm  # slow: compiles
+        from blf_dsc_controller.law.telemetry import learned_arm  # slow: compiles
 
         with suppress(BlfDscError):
             return learned_arm(content.controller_config())

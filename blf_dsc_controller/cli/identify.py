@@ -65,7 +65,7 @@ def identify(options: Namespace) -> None:
         options.out.write_text(corrected, encoding='utf-8')
         print(f'wrote {options.out}')
     if options.report:
-        from blf_dsc_controller.analysis.identified_arm import write_identified
+        from blf_dsc_controller.identification.report import write_identified
 
         tables = (_load(found), _links(found), _joints(found), _errors(found), _base(found))
         lines = [*header, *doubts(found, options.effort)]

@@ -125,7 +125,7 @@ def _node(module: str) -> int:
     return code
 
 
-sim_plant = partial(_node, 'sim_plant.node')
+sim_plant = partial(_node, 'blf_dsc_controller.nodes.plant_node')
 blf_dsc_controller = partial(_node, 'blf_dsc_controller.nodes.controller_node')
 bag_recorder = partial(_node, 'blf_dsc_controller.nodes.recorder_node')
 arm_markers = partial(_node, 'blf_dsc_controller.nodes.markers_node')

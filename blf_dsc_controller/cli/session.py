@@ -30,8 +30,8 @@ from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, VIEW, LoopConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import model_of
+from blf_dsc_controller.law.telemetry import DECIMATION
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.telemetry import DECIMATION
 from blf_dsc_controller.messages.topics import RATIO
 from blf_dsc_controller.nodes.endpoints import qos_profile
 from blf_dsc_controller.view.address import free_port, url_of
@@ -41,8 +41,8 @@ _LOOP = 'loop'
 _MODULES = {
     RECORDER: 'blf_dsc_controller.nodes.recorder_node',
     CONTROLLER: 'blf_dsc_controller.nodes.controller_node',
-    PLANT: 'sim_plant.node',
-    _LOOP: 'sim_plant.loop',  # both, in lock-step
+    PLANT: 'blf_dsc_controller.nodes.plant_node',
+    _LOOP: 'blf_dsc_controller.nodes.lockstep_loop',  # both, in lock-step
     VIEW: 'blf_dsc_controller.view.node',  # only on request, once the loop runs
 }
 _ENDING = 20.0  # s that a node may take to exit before it is killed

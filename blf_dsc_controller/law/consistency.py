@@ -21,8 +21,9 @@ unusually large residual is pulled to an earlier solution, kept once per window.
 
 import numpy as np
 
+from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law import cholesky, window
+from blf_dsc_controller.law import window
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Signals, State
 

@@ -16,8 +16,8 @@ from math import sqrt
 
 import numpy as np
 
+from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import called, inner
-from blf_dsc_controller.law import cholesky
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Signals, State
 

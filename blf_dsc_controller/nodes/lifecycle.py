@@ -18,7 +18,7 @@ from blf_dsc_controller.compiled.notice import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.messages.telemetry import Message
+from blf_dsc_controller.law.telemetry import Message
 from blf_dsc_controller.messages.topics import WATCHDOG_NODE, Topic
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.endpoints import (

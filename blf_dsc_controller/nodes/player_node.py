@@ -24,11 +24,50 @@ from blf_dsc_controller.bags.sources import BagError, BagMessage, Messages, open
 from blf_dsc_controller.messages.codecs import encode_clock
 from blf_dsc_controller.messages.topics import CLOCK, Quality
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
-from blf_dsc_controller.replay.timeline import Timeline
 
 _MOST_AT_ONCE = 100
 _CLOCK_PERIOD = 10_000_000  # ns
 _LATE = 64  # messages
+
+
+class Timeline:
+    """Position in a bag over time; it begins paused.
+
+    All times are integers [ns], of the bag or of the caller's steady clock.
+
+    Attributes:
+        paused: whether only `jump` moves it.
+    """
+
+    def __init__(self, start: int, rate: float) -> None:
+        """Begin at `start`; rate 0 is as fast as possible: only `jump` moves the position."""
+        self._bag = start
+        self._now = 0
+        self._rate = rate
+        self.paused = True
+
+    def position(self, now: int) -> int:
+        """Return the time in the bag."""
+        return self._bag if self.paused else self._bag + round((now - self._now) * self._rate)
+
+    def pause(self, now: int) -> None:
+        """Hold the position."""
+        self._bag, self.paused = self.position(now), True
+
+    def resume(self, now: int) -> None:
+        """Continue from the position."""
+        self._bag, self._now, self.paused = self.position(now), now, False
+
+    def jump(self, to: int, now: int) -> None:
+        """Move to a time in the bag."""
+        self._bag, self._now = to, now
+
+    def wait(self, until: int, now: int) -> float:
+        """Return the time [s] until the position reaches `until`; infinite while paused."""
+        if self.paused:
+            return float('inf')
+        left = max(0, until - self.position(now))
+        return left / self._rate * 1e-9 if self._rate > 0.0 else 0.0
 
 
 class PlayerNode(Node):

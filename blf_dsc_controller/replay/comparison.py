@@ -12,9 +12,8 @@ import numpy as np
 from blf_dsc_controller.bags.content import Content
 from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.law.factory import estimate_names
+from blf_dsc_controller.law.telemetry import DECIMATION, Monitor, columns_of, learning_of
 from blf_dsc_controller.messages.cdr import JOINT_STATE_FIELDS
-from blf_dsc_controller.messages.samples import columns_of, learning_of
-from blf_dsc_controller.messages.telemetry import DECIMATION, Monitor
 from blf_dsc_controller.messages.topics import (
     BOUND,
     COMMANDS,

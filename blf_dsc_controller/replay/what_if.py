@@ -20,7 +20,7 @@ from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.bags.torque import applied_torque
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import begin, controller_of
-from blf_dsc_controller.messages.samples import columns_of, run_of
+from blf_dsc_controller.law.telemetry import columns_of, run_of
 from blf_dsc_controller.messages.topics import JOINT_STATES, TRACKING_ERROR
 from blf_dsc_controller.run import Floats, Run
 from blf_dsc_controller.supervision.checks import Velocity

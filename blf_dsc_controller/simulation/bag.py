@@ -15,9 +15,7 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.rejected_columns import rejected_columns
-from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.journal import encode_change
-from blf_dsc_controller.messages.telemetry import (
+from blf_dsc_controller.law.telemetry import (
     DECIMATION,
     ControllerTelemetry,
     Message,
@@ -25,6 +23,8 @@ from blf_dsc_controller.messages.telemetry import (
     PlantTelemetry,
     encode_rejected_columns,
 )
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.journal import encode_change
 from blf_dsc_controller.simulation.loop import START, Record
 
 

@@ -28,9 +28,8 @@ from blf_dsc_controller.law.lyapunov import fill_energies
 from blf_dsc_controller.law.settings import settings_of
 from blf_dsc_controller.law.state import Sample, sample_of, signals_of, state_of
 from blf_dsc_controller.law.step import step
+from blf_dsc_controller.law.telemetry import disturbance_names, run_of
 from blf_dsc_controller.messages.journal import EventType, Journal
-from blf_dsc_controller.messages.samples import run_of
-from blf_dsc_controller.messages.telemetry import disturbance_names
 from blf_dsc_controller.run import Run, Series, Stop
 from blf_dsc_controller.simulation.metrics import (
     LoopMetrics,

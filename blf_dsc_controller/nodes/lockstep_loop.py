@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Controller and plant in one process, for lock-step: `python -m sim_plant.loop`.
+"""Controller and plant in one process, for lock-step.
 
 These are the nodes of the two processes, with the same topics and messages. The middleware hands a
 message to a node of the same process without the network, and no process waits to be scheduled:
@@ -12,7 +12,7 @@ import sys
 
 from blf_dsc_controller.nodes import process
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from sim_plant.node import PlantNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
 
 
 def main() -> int:

@@ -25,18 +25,18 @@ from std_msgs.msg import String
 
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import Value, differences, flatten
+from blf_dsc_controller.law.telemetry import DECIMATION, PlantTelemetry
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder
 from blf_dsc_controller.messages.journal import encode_change
-from blf_dsc_controller.messages.telemetry import DECIMATION, PlantTelemetry
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import create_publisher, create_steady_timer
+from blf_dsc_controller.nodes.handshake import Handshake
 from blf_dsc_controller.nodes.lifecycle import LoopNode
 from sim_plant.arms import parameter_names_of, urdf_of
 from sim_plant.command_input import Latency, TorqueInput
-from sim_plant.handshake import Handshake
 from sim_plant.plant import FASTEST, Plant, plant_of, settings_of, steps_of
 
 LOCKSTEP_START = 1_000_000_000
