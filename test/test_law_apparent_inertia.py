@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from blf_dsc_controller import load_loop, simulate
-from blf_dsc_controller.configuration.arm_defaults import over_postures
+from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.law.factory import settings_of_config
 from sim_plant.plant import settings_of

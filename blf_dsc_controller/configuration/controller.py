@@ -5,12 +5,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
-from blf_dsc_controller.configuration.arm_defaults import controller_defaults, planar_defaults
+import numpy as np
+
+from blf_dsc_controller.arms import tuning
 from blf_dsc_controller.configuration.gains import (
     Barrier,
     ComparisonGains,
@@ -21,7 +24,7 @@ from blf_dsc_controller.configuration.gains import (
     Surface,
     Torque,
 )
-from blf_dsc_controller.configuration.robot import Robot, learned_of
+from blf_dsc_controller.configuration.robot import Robot, given_robot, learned_of, parameters_of
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
     Realtime,
@@ -250,9 +253,28 @@ class ControllerConfig(Sampled):
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> Mapping[str, Value]:
         """Return gains and limits for the arm of a URDF; the defaults suit the two-link arm."""
+        period = given.get('sample_time')  # validated later
+        period = period if isinstance(period, float) and 0.0 < period < math.inf else 0.001
         if given.get('model', 'urdf' if given.get('robot.urdf') else '') != 'urdf':
-            return planar_defaults(given)
-        return {'model': 'urdf', **controller_defaults(given)}
+            return {
+                'surface.time_constant': max(period, Surface().time_constant),
+                'learning.interval': max(1, round(0.01 / period)),
+            }
+        robot, chain = given_robot(given, given.get('joints', ()))
+        arm = tuning.Arm(
+            chain,
+            parameters_of(robot, chain),
+            learned_of(robot, chain).initial,
+            robot.efforts(chain),
+            robot.rotors(chain),
+            robot.payload,
+            robot.lag,
+            robot.learn,
+        )
+        bound = None
+        with suppress(KeyError, TypeError, ValueError):  # validated later
+            bound = np.broadcast_to(np.array(given['barrier.bound'], dtype=float), arm.rotors.shape)
+        return {'model': 'urdf', **tuning.gains_of(arm, period, bound)}
 
     def problems(self) -> list[str]:
         """Check the parameters against each other, joints and estimates against the model."""

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel, arm_model
-from blf_dsc_controller.configuration.arm_defaults import over_postures
+from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import drive_model, learned_of, parameters_of
 from blf_dsc_controller.law import barrier

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.inertia import pseudo_inertia
+from blf_dsc_controller.arms.tuning import SAMPLES, UNKNOWN_EFFORT, loop_delay
 from blf_dsc_controller.arms.urdf import Chain
-from blf_dsc_controller.configuration.arm_defaults import SAMPLES, UNKNOWN_EFFORT, loop_delay
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import Robot, implausible_friction
 from blf_dsc_controller.law.factory import settings_of_config

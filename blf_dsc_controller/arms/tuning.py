@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Default gains and limits of the controller, derived from the URDF of the arm.
+"""Design rules: the gains and limits of the controller that follow from the URDF of an arm.
 
 The delay of the loop, 3 T + robot.lag, gives the rate omega_b = 0.625 / delay. Gains are multiples
 of this rate and of the inertia of each joint with the others free, m_i = 1 / (M^-1)_ii, minimised
@@ -16,17 +16,13 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-
-from blf_dsc_controller.configuration.gains import Surface
-from blf_dsc_controller.configuration.robot import given_robot, learned_of, parameters_of
 
 if TYPE_CHECKING:
     from blf_dsc_controller.arms.base_parameters import BaseParameters
     from blf_dsc_controller.arms.urdf import Chain
-    from blf_dsc_controller.configuration.schema import Value
 
 UNKNOWN_EFFORT = 100.0
 """Torque limit [N m] of a joint without one in the URDF."""
@@ -53,52 +49,48 @@ def loop_delay(sample_time: float, lag: float) -> float:
     return SAMPLES * sample_time + lag
 
 
-def sample_time_of(given: Mapping[str, Any]) -> float:
-    """Return the given sample time [s], which is validated later, or the default."""
-    period = given.get('sample_time')
-    return period if isinstance(period, float) and 0.0 < period < math.inf else 0.001
+class Arm(NamedTuple):
+    """What the gains of an arm follow from."""
+
+    chain: Chain
+    parameters: BaseParameters
+    initial_estimate: np.ndarray  # (p,)
+    efforts: np.ndarray  # (n,) N m, rated torques
+    rotors: np.ndarray  # (n,) kg m^2, inertias of the drives
+    payload: float  # kg, rated
+    lag: float  # s
+    learn: str  # what is learned of it
 
 
-def planar_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
-    """Return what follows the sample time for the planar arms, whose gains do not."""
-    period = sample_time_of(given)
-    return {
-        'surface.time_constant': max(period, Surface().time_constant),
-        'learning.interval': max(1, round(0.01 / period)),
-    }
-
-
-def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
-    """Return the defaults by dotted name that follow from the given parameters and their URDF.
-
-    Raises ConfigurationError if the URDF has no such arm.
-    """
-    robot, chain = given_robot(given, given.get('joints', ()))
+def gains_of(
+    arm: Arm, sample_time: float, bound: np.ndarray | None
+) -> Mapping[str, bool | int | float | str | tuple[float, ...] | tuple[str, ...]]:
+    """Return gains and limits by the dotted name of their parameter; `bound` (n,) [rad] or None."""
+    chain, P0, learn = arm.chain, arm.initial_estimate, arm.learn
     n = len(chain.joints)
     effort = _finite([joint.effort for joint in chain.joints], UNKNOWN_EFFORT)
     velocity = _finite([joint.velocity for joint in chain.joints], 2.0)
     lower = _finite([joint.lower for joint in chain.joints], -_FREE)
     upper = _finite([joint.upper for joint in chain.joints], _FREE)
-    parameters = parameters_of(robot, chain)
-    P = parameters.of(chain.inertias, robot.rotors(chain))
-    P0 = learned_of(robot, chain).initial
-    period = sample_time_of(given)
-    rate = _PHASE / loop_delay(period, robot.lag)
+    P = arm.parameters.of(chain.inertias, arm.rotors)
+    rate = _PHASE / loop_delay(sample_time, arm.lag)
     limits = tuple(lower), tuple(upper)
-    m, gravity = over_postures(chain, parameters, robot.payload, tuple(P), *limits)
+    m, gravity = over_postures(chain, arm.parameters, arm.payload, tuple(P), *limits)
     sag = _SAG * gravity / (m * rate**2)
-    floor = _UNMODELLED * robot.efforts(chain)
+    floor = _UNMODELLED * arm.efforts
     zeros = (0.0,) * n
     return {
         'joints': tuple(joint.name for joint in chain.joints),
         'barrier.bound': (_BOUND,) * n,
-        'barrier.initial_bound': _listed(np.where(sag > _bound_of(given, n), sag, 0.0)),
+        'barrier.initial_bound': _listed(
+            np.where(sag > (_BOUND if bound is None else bound), sag, 0.0)
+        ),
         'barrier.funnel_rate': float(f'{rate / 20.0:.4g}'),
         'barrier.weight': _listed(0.25 * m * rate**2),
         'barrier.slope_limit': _listed(m * rate**2),
         'surface.gain': (2.0 * rate,) * n,
         'surface.mu': (0.5 * rate,) * n,
-        'surface.time_constant': max(period, _SURFACE),
+        'surface.time_constant': max(sample_time, _SURFACE),
         'feedback.gain': zeros,
         'feedback.damping': zeros,
         'feedback.damping_rate': 0.6 * rate,
@@ -115,15 +107,15 @@ def controller_defaults(given: Mapping[str, Any]) -> Mapping[str, Value]:
         'limits.acceleration': _listed(4.0 * _SLOW * velocity),
         'learning.initial_estimate': _listed(P0),
         'learning.adaptation_gain': (0.5,) * P0.size,
-        'learning.radius': 10.0 * max(float(np.linalg.norm(P0)), robot.payload),
-        'learning.window': _WINDOW[robot.learn],
-        'learning.regularization': _REGULARISATION[robot.learn],
+        'learning.radius': 10.0 * max(float(np.linalg.norm(P0)), arm.payload),
+        'learning.window': _WINDOW[learn],
+        'learning.regularization': _REGULARISATION[learn],
         'learning.settling_time': 0.3,
         'learning.filter_pole': 20.0,
-        'learning.row_interval': max(1, round(_ROWS / period)),
-        'learning.interval': max(1, round(_CHECKS / period)),
+        'learning.row_interval': max(1, round(_ROWS / sample_time)),
+        'learning.interval': max(1, round(_CHECKS / sample_time)),
         'learning.excitation_threshold': 1e-9,
-        'learning.prior_weight': _PRIOR[robot.learn],
+        'learning.prior_weight': _PRIOR[learn],
         'learning.anchor_weight': _ANCHOR * float(floor.min()) ** 2,
         'learning.motion_scale': 0.05,
         'learning.residual_floor': _listed(floor),
@@ -169,17 +161,9 @@ def over_postures(
     L = prior_factor(chain, parameters, payload, np.zeros(n))
     q = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, n))
     free = free_inertias(inertia_matrices(model, np.array(P), q))
-    rest = np.zeros_like(q)
-    deviation = np.linalg.norm(regressors_at(model, q, rest, rest, rest) @ L, axis=2)
+    zero = np.zeros_like(q)
+    deviation = np.linalg.norm(regressors_at(model, q, zero, zero, zero) @ L, axis=2)
     return free.min(axis=0), deviation.max(axis=0)
-
-
-def _bound_of(given: Mapping[str, Any], n: int) -> np.ndarray:
-    """Return the given bound [rad], which is validated later, or the default."""
-    try:
-        return np.broadcast_to(np.array(given['barrier.bound'], dtype=float), (n,))
-    except (KeyError, TypeError, ValueError):
-        return np.full(n, _BOUND)
 
 
 def _finite(values: list[float], instead: float) -> np.ndarray:
