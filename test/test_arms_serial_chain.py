@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Regressors of serial chains against pinocchio, on random arms, also with prismatic joints."""
+"""Chains of a URDF: regressors, base parameters, and the forms of what is learned."""
 
 from __future__ import annotations
 
@@ -8,11 +8,16 @@ import pinocchio
 import pytest
 from random_arm import CONFIG, PANDA, UR5E, configuration, pinocchio_model, random_urdf
 
+from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.batch import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.chain_kernels import ROTOR
+from blf_dsc_controller.arms.forms import TRUSTED, learned_parameters
+from blf_dsc_controller.arms.inertia import INERTIA_NAMES, inertia_of, pseudo_inertia
+from blf_dsc_controller.arms.prior import CENTRE, LINKS, ROTORS, prior_factor
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.compiled.jit import kernel
+from sim_plant.rigid_arm import rigid_arm
 
 # The base stands on the floor, is mounted on a wall, or is tilted.
 ARMS = {
@@ -170,3 +175,233 @@ def test_inertia_matrices_match_pinocchio():
     q = np.stack((case.q + 0.5, case.q))
     M = inertia_matrices(case.arm, case.phi, q)[1]
     np.testing.assert_allclose(M, case.matrices()[0], atol=1e-11)
+
+
+WALL = (0.0, 9.81, 0.0)
+PANDA_CHAIN = read_chain(
+    (CONFIG / 'panda.urdf').read_text(), 'panda_link0', 'panda_hand_tcp', PANDA
+)
+UR5E_CHAIN = read_chain((CONFIG / 'ur5e.urdf').read_text(), 'world', 'tool0', UR5E)
+RANDOM = [(text, joints) for text, joints in (random_urdf(4, 2), random_urdf(7, 3))]
+CHAINS = [PANDA_CHAIN, UR5E_CHAIN, *(read_chain(t, 'base', 'tip', j) for t, j in RANDOM)]
+
+
+@pytest.mark.parametrize('rotors', [True, False])
+@pytest.mark.parametrize('chain', CHAINS)
+def test_base_parameters_are_the_smallest_set_that_gives_the_same_torques(chain, rotors):
+    base = base_parameters(chain, WALL, rotors=rotors)
+    whole = serial_chain(chain, WALL)
+    n, p = base.model.n, base.model.p
+    random = np.random.default_rng(5)
+    inertias, joint_rotors = random.normal(size=(n, 10)), random.normal(size=n) * rotors
+    P, phi = base.of(inertias, joint_rotors), np.column_stack((inertias, joint_rotors)).ravel()
+    H, rows = np.zeros((n, p)), np.zeros((p, n, whole.p))
+    for full in rows:
+        q, dq, v, a = random.normal(size=(4, n))
+        whole.regressor(q, dq, v, a, full)
+        base.model.regressor(q, dq, v, a, H)
+        np.testing.assert_allclose(H @ P, full @ phi, rtol=1e-8, atol=1e-8)
+    shown = [k for k in range(whole.p) if rotors or k % (ROTOR + 1) != ROTOR]
+    singular = np.linalg.svd(rows[:, :, shown].reshape(-1, len(shown)), compute_uv=False)
+    assert singular[p - 1] > 1e-3
+    assert p == len(shown) or singular[p] < 1e-7  # pi / 2 has ten digits in the UR5e's file
+
+
+def test_number_of_base_parameters_on_the_floor_agrees_with_the_literature():
+    """43 for a Panda (Gaz et al., 2019), 36 for an arm like the UR; rotors except at the base."""
+    for chain, inertial, rotors in ((PANDA_CHAIN, 43, 5), (UR5E_CHAIN, 36, 4)):
+        assert base_parameters(chain, rotors=False).model.p == inertial
+        assert base_parameters(chain).model.p == inertial + rotors
+
+
+def test_combinations_have_the_usual_grouping():
+    base = base_parameters(PANDA_CHAIN, rotors=False)
+    sums = dict(zip(base.model.parameter_names, base.combinations, strict=True))
+    assert sums['Ixx7'] == 'Ixx7 - Iyy7'
+    assert sums['m*cx7'] == 'm*cx7'
+    assert sums['m*cx6'] == 'm*cx6 + 0.088 m7'
+    assert not any(name.startswith(('m7', 'm*cz', 'Iyy')) for name in sums)
+
+
+@pytest.mark.parametrize('chain', CHAINS)
+def test_prior_covers_heavier_links_moved_centres_and_the_payload(chain):
+    """A deviation in a single respect has a distance of at most 1, larger ones have more."""
+    base = base_parameters(chain, WALL)
+    n = base.model.n
+    rotors = np.full(n, 0.02)
+    L = prior_factor(chain, base, 3.0, rotors)
+    P = base.of(chain.inertias, rotors)
+
+    def distance(inertias, rotors=rotors):
+        off = base.of(inertias, rotors) - P
+        return np.linalg.norm(np.linalg.solve(L, off))
+
+    for i in range(n):
+        heavier = chain.inertias
+        heavier[i] *= 1.3
+        assert distance(heavier) < 1.0 + 1e-6
+        moved = chain.inertias
+        T = np.eye(4)
+        T[0, 3] = CENTRE / 100.0  # small, as this holds to first order only
+        moved[i] = inertia_of(T @ pseudo_inertia(moved[i]) @ T.T)
+        assert distance(moved) < 1.05 / 100.0
+    loaded = chain.inertias
+    tip = chain.tip_placement[:3, 3]
+    point = np.append(tip, 1.0)
+    loaded[-1] += inertia_of(3.0 * np.outer(point, point))
+    assert distance(loaded) < 1.5  # a point mass, where an extended body is expected
+    other = rotors.copy()
+    other[-1] += 0.02
+    assert distance(chain.inertias, other) < 1.0 + 1e-6
+
+    loaded[-1] += 9.0 * (loaded[-1] - chain.inertias[-1])
+    assert distance(loaded) > 2.0
+
+
+def test_prior_without_payload_is_tighter():
+    base = base_parameters(UR5E_CHAIN)
+    loaded, empty = (prior_factor(UR5E_CHAIN, base, load, np.full(6, 0.02)) for load in (5.0, 0.0))
+    for L in (loaded, empty):
+        np.testing.assert_array_equal(L, np.tril(L))
+        assert (np.diag(L) > 0.0).all()
+    assert np.linalg.eigvalsh(loaded @ loaded.T - empty @ empty.T)[0] > -1e-12
+    tool = base.model.parameter_names.index('m*cx6')
+    assert np.linalg.norm(empty[tool]) == pytest.approx(0.365 * CENTRE)
+
+
+RATED = 3.0  # kg
+ONE_JOINT = read_chain(random_urdf(1, 0)[0], 'base', 'tip', ('j1',))
+FORMS = ('payload', 'scale')
+
+
+class Learned:
+    """A chain with rotors, all its base parameters, and a form of it."""
+
+    def __init__(self, chain, form):
+        self.chain, self.n = chain, len(chain.joints)
+        self.rotors = np.linspace(0.02, 0.2, self.n)
+        self.base = base_parameters(chain, WALL)
+        self.form = learned_parameters(chain, self.base, form, RATED, self.rotors)
+        self.names = self.form.model.parameter_names
+
+    def assert_same_torques(self, P, inertias, rotors):
+        """All regressors times P agree with those of the base parameters and with each other."""
+        random = np.random.default_rng(1)
+        expected = self.base.of(inertias, rotors)
+        for _ in range(5):
+            q, dq, v, a = random.normal(size=(4, self.n))
+            H, Yp, Yr = np.full((3, self.n, P.size + 2), np.nan)
+            separate = np.full((3, self.n, P.size), np.nan)
+            whole = np.zeros((3, self.n, expected.size))
+            self.form.model.regressors(q, dq, v, a, H, Yp, Yr)
+            self.form.model.regressor(q, dq, v, a, separate[0])
+            self.form.model.momentum_regressor(q, dq, *separate[1:])
+            self.base.model.regressors(q, dq, v, a, *whole)
+            for combined, alone, other in zip((H, Yp, Yr), separate, whole, strict=True):
+                np.testing.assert_array_equal(combined[:, :-2], alone)
+                np.testing.assert_allclose(alone @ P, other @ expected, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize('form', FORMS)
+@pytest.mark.parametrize('chain', [*CHAINS, ONE_JOINT])
+def test_initial_parameters_give_the_torques_of_the_base_parameters(chain, form):
+    case = Learned(chain, form)
+    assert case.form.model.p == case.form.initial.size == len(case.form.model.parameter_units)
+    case.assert_same_torques(case.form.initial, chain.inertias, case.rotors)
+
+
+def load_at(chain):
+    """Inertial parameters of a random load in the frame of the tip, and of all bodies with it."""
+    random, inertias = np.random.default_rng(2), chain.inertias
+    points = np.vstack((random.normal(0.05, 0.1, (3, 5)), np.ones(5)))
+    load = points @ np.diag(random.uniform(0.1, 0.8, 5)) @ points.T
+    inertias[-1] += inertia_of(chain.tip_placement @ load @ chain.tip_placement.T)
+    return inertia_of(load), inertias
+
+
+@pytest.mark.parametrize('chain', [c for c in CHAINS if len(c.joints) > 5])
+def test_parameters_represent_any_load(chain):
+    case = Learned(chain, 'payload')
+    ten, inertias = load_at(chain)
+    heavier = case.rotors.copy()
+    heavier[-1] *= 1.3
+    P = case.form.initial.copy()
+    P[[case.names.index(f'load {name}') for name in INERTIA_NAMES]] = ten
+    P[case.names.index(f'rotor{case.n}')] = heavier[-1]
+    case.assert_same_torques(P, inertias, heavier)
+
+
+@pytest.mark.parametrize('chain', [ONE_JOINT, *(c for c in CHAINS if len(c.joints) < 6)])
+def test_short_arm_with_fewer_load_parameters_still_represents_any_load(chain):
+    case = Learned(chain, 'payload')
+    assert len(case.names) < case.n + 11
+    _, inertias = load_at(chain)
+    known = case.base.of(inertias, case.rotors)
+    motions = np.random.default_rng(5).normal(size=(40, 4, case.n))
+    H, whole = np.zeros((40, case.n, len(case.names))), np.zeros((40, case.n, known.size))
+    for motion, rows, all_rows in zip(motions, H, whole, strict=True):
+        case.form.model.regressor(*motion, rows)
+        case.base.model.regressor(*motion, all_rows)
+    P = np.linalg.lstsq(np.vstack(H), np.vstack(whole) @ known, rcond=None)[0]
+    case.assert_same_torques(P, inertias, case.rotors)
+
+
+def test_load_parameters_agree_with_the_payload_of_the_plant():
+    """The plant uses Newton-Euler, an independent algorithm, with a point mass at the tip."""
+    case = Learned(PANDA_CHAIN, 'payload')
+    arm = rigid_arm(PANDA_CHAIN, WALL, PANDA_CHAIN.inertias, case.rotors, case.base)
+    P = case.form.initial + 2.0 * case.form.load
+    assert P[case.names.index('load m')] == 2.0
+    H, found = np.zeros((7, P.size)), np.zeros(7)
+    for q, dq, ddq in np.random.default_rng(3).normal(size=(5, 3, 7)):
+        case.form.model.regressor(q, dq, dq, ddq, H)
+        arm.accelerate(2.0, q, dq, H @ P, found)
+        np.testing.assert_allclose(found, ddq, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize('chain', CHAINS)
+def test_parameters_represent_any_scale_factors_of_the_bodies(chain):
+    case = Learned(chain, 'scale')
+    kept = [i for i in range(case.n) if f'scale{i + 1}' in case.names]
+    assert len(kept) >= case.n - 1
+    factors = np.ones(case.n)
+    factors[kept] = np.random.default_rng(4).uniform(0.7, 1.3, len(kept))
+    P = case.form.initial.copy()
+    P[[case.names.index(f'scale{i + 1}') for i in kept]] = factors[kept]
+    case.assert_same_torques(P, factors[:, None] * chain.inertias, case.rotors)
+
+
+def test_first_body_of_an_arm_on_the_floor_is_learned_with_its_rotor():
+    base = base_parameters(PANDA_CHAIN)
+    learned = learned_parameters(PANDA_CHAIN, base, 'scale', RATED, np.full(7, 0.2))
+    assert learned.model.parameter_names[:2] == ('rotor1', 'rotor2')
+    assert 'scale1' not in learned.model.parameter_names
+    assert learned.initial[0] == pytest.approx(0.2 + PANDA_CHAIN.inertias[0, -1])
+    assert set(learned.initial[7:]) == {1.0}
+
+
+def test_prior_is_wide_for_what_the_form_learns_and_tight_elsewhere():
+    deviation = {}
+    for form in FORMS:
+        case = Learned(PANDA_CHAIN, form)
+        covariance = case.form.L @ case.form.L.T
+        assert np.linalg.eigvalsh(covariance)[0] > 0.0
+        deviation |= dict(zip(case.names, np.sqrt(np.diag(covariance)), strict=True))
+        assert deviation['rotor7'] == pytest.approx(ROTORS * case.rotors[-1])
+    assert deviation['load m'] == pytest.approx(RATED)
+    assert deviation['links'] == pytest.approx(TRUSTED)
+    assert deviation['scale3'] == pytest.approx(LINKS)
+    heaviest = PANDA_CHAIN.inertias[-1, 0] + RATED
+    assert deviation['scale7'] >= heaviest / PANDA_CHAIN.inertias[-1, 0] - 1.0
+
+
+def test_units_distinguish_prismatic_from_revolute_joints():
+    for chain in CHAINS[2:]:
+        for form in FORMS:
+            model = Learned(chain, form).form.model
+            units = dict(zip(model.parameter_names, model.parameter_units, strict=True))
+            for i, joint in enumerate(chain.joints, 1):
+                prismatic = joint.kind == 'prismatic'
+                assert units[f'rotor{i}'] == ('kg' if prismatic else 'kg m^2')
+                assert units.get(f'scale{i}', '') == ''
+    assert Learned(PANDA_CHAIN, 'payload').form.model.parameter_units[7:9] == ('kg', 'kg m')

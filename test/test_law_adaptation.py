@@ -1,15 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The update laws (20) and (30) against numpy on random states, and when they freeze."""
+"""The update laws (20) and (30), the projection onto the ball, and priors of different units."""
 
 from __future__ import annotations
+
+from math import sqrt
 
 import numpy as np
 import pytest
 from arbitrary_case import arbitrary
-from closed_loop_case import controller, plant, quick, record
+from closed_loop_case import closed_loop, controller, plant, quick, recommended, record
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import eigh
 
-from blf_dsc_controller.law import adaptation, cholesky
-from blf_dsc_controller.law.settings import UPDATES
+from blf_dsc_controller.compiled import cholesky
+from blf_dsc_controller.law import adaptation, consistency, projection, window
+from blf_dsc_controller.law.settings import COMPENSATIONS, UPDATES
 
 DT = 1e-3
 SHAPES = [(1, 1), (2, 3), (3, 4)]
@@ -163,3 +169,212 @@ def test_disturbance_estimate_takes_nothing_over_before_the_latch():
 
     assert np.linalg.norm(estimate[:3]) < 1.1
     np.testing.assert_allclose(disturbance, d3, rtol=0.0, atol=1e-15)
+
+
+RADIUS = 3.0
+GAIN = np.array([0.05, 1.0, 20.0])
+
+
+def projected(estimate, rate, gain=GAIN):
+    rate = rate.copy()
+    projection.project(estimate, rate, gain, RADIUS)
+    return rate
+
+
+def on_sphere(random, size=3):
+    w = random.normal(size=size)
+    return w * RADIUS / np.linalg.norm(w) * (1.0 + 1e-15)
+
+
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(1, 9),
+    st.sampled_from([1e-3, 1.0, 1e6]),
+    st.floats(0.1, 100.0),
+)
+def test_no_step_leaves_the_ball(seed, size, speed, radius):
+    random = np.random.default_rng(seed)
+    gain = 10.0 ** random.uniform(-3.0, 3.0, size)
+    estimate = random.normal(size=size) * radius
+    projection.retract(estimate, gain, radius)
+    for _ in range(20):
+        rate = random.normal(size=size) * speed
+        projection.project(estimate, rate, gain, radius)
+        estimate += 1e-2 * rate
+        projection.retract(estimate, gain, radius)
+        assert np.linalg.norm(estimate) <= radius * (1.0 + 1e-15)
+
+
+def test_nothing_is_changed_inside_the_ball():
+    estimate, rate = np.array([1.0, -2.0, 1.9]), np.array([1e3, -5.0, 7.0])
+    np.testing.assert_array_equal(projected(estimate, rate), rate)
+    before = estimate.copy()
+    projection.retract(estimate, GAIN, RADIUS)
+    np.testing.assert_array_equal(estimate, before)
+
+
+def test_inward_and_tangential_rates_are_kept_on_the_sphere():
+    estimate = np.array([RADIUS, 0.0, 0.0])
+    for rate in (np.array([-1.0, 4.0, 2.0]), np.array([0.0, 4.0, 2.0])):
+        np.testing.assert_array_equal(projected(estimate, rate), rate)
+
+
+def test_outward_part_of_the_rate_is_removed_on_the_sphere():
+    for random in map(np.random.default_rng, range(10)):
+        w = on_sphere(random)
+        v = random.normal(size=3)
+        v *= np.sign(w @ v)
+
+        rate = projected(w, v)
+
+        metric = w @ (GAIN * w)
+        np.testing.assert_allclose(rate, v - GAIN * w * (w @ v) / metric, atol=1e-13)
+        assert w @ rate == pytest.approx(0.0, abs=1e-13)
+
+
+def test_retracted_estimate_counts_as_on_the_sphere():
+    """Even if rounding puts it just inside: otherwise half the steps would not be projected."""
+    for seed in range(100):
+        random = np.random.default_rng(seed)
+        w, v = random.normal(size=(2, 3))
+        w *= 2.0 * RADIUS / np.linalg.norm(w)
+        projection.retract(w, GAIN, RADIUS)
+        v *= np.sign(w @ v)
+
+        assert w @ projected(w, v) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_projection_never_slows_the_decrease_of_the_lyapunov_function():
+    """d/dt (1/2 P~^T Gamma^-1 P~) = -P~^T Gamma^-1 P^', for any true P inside the ball."""
+    for random in map(np.random.default_rng, range(200)):
+        w, v = on_sphere(random), random.normal(size=3)
+        true = on_sphere(random) * random.uniform()
+        slope = [-(true - w) @ (rate / GAIN) for rate in (projected(w, v), v)]
+        assert slope[0] <= slope[1] + 1e-12
+
+
+def test_retracted_estimate_is_the_nearest_in_the_ball_in_the_metric_of_gamma():
+    """Then 1/2 P~^T Gamma^-1 P~ does not grow for any true P inside the ball."""
+    for random in map(np.random.default_rng, range(100)):
+        gain = 10.0 ** random.uniform(-3.0, 3.0, 4)
+        outside = random.normal(size=4)
+        outside *= RADIUS * 10.0 ** random.uniform(0.0, 3.0) / np.linalg.norm(outside)
+        inside = outside.copy()
+
+        projection.retract(inside, gain, RADIUS)
+
+        # Nearest: the difference is Gamma w nu, with the same nu > 0 in each direction.
+        nu = (outside - inside) / (gain * inside)
+        np.testing.assert_allclose(nu, np.full(4, nu.max()), rtol=1e-6)
+        assert nu.min() > 0.0
+        assert np.linalg.norm(inside) == pytest.approx(RADIUS, rel=1e-12)
+        true = np.array([on_sphere(random, 4) * random.uniform() for _ in range(10)])
+        before, after = (((true - w) ** 2 / gain).sum(axis=1) for w in (outside, inside))
+        assert np.all(after <= before * (1.0 + 1e-9))
+
+
+def test_uniform_gamma_retracts_along_the_radius():
+    estimate = np.array([3.0, 4.0])
+    projection.retract(estimate, np.array([0.5, 0.5]), 2.5)
+    np.testing.assert_allclose(estimate, [1.5, 2.0], rtol=1e-15)
+
+
+@pytest.mark.parametrize('bad', [np.nan, np.inf])
+def test_non_finite_estimates_are_left_for_the_supervisor(bad):
+    estimate = np.array([bad, 1.0, 1.0])
+    projection.retract(estimate, GAIN, RADIUS)
+    assert not np.isfinite(estimate[0])
+
+
+SCALE = np.array([1e-3, 5.0, 0.2, 30.0, 1.0, 1e-2, 4.0])  # of theta: p = 4 and 3 columns
+
+
+def window_case(seed, **changes):
+    """Case of a full random window, and its mean Phi (7, 7) and b (7,)."""
+    random = np.random.default_rng(seed)
+    A = random.normal(size=(7, 7))
+    R = (A @ A.T + np.eye(7)) / np.outer(SCALE, SCALE)
+    settings, state, signals = arbitrary(seed, information=R, rho=1e-5, **changes)
+    rows = random.normal(size=(8, 3, 8)) / np.append(SCALE, 1.0)
+    state.running[:] = np.einsum('kia,kib->ab', rows, rows)
+    state.rows[0] = 8.0
+    state.active[:] = 1.0
+    return settings, state, signals, state.running[:7, :7] / 8.0, state.running[:7, 7] / 8.0
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_excitation_is_the_minimum_eigenvalue_relative_to_the_information(seed):
+    settings, state, signals, Phi, _ = window_case(seed, prior_weight=0.0)
+    found = window.excitation(settings, state, signals, 200)
+
+    values, vectors = eigh(Phi, settings.information)
+    assert found == pytest.approx(values[0], rel=1e-8)
+    direction = state.min_eigenvector / state.min_eigenvector[0] * vectors[0, 0]
+    np.testing.assert_allclose(direction, vectors[:, 0], rtol=1e-5)
+
+
+def test_prior_pulls_the_solution_to_the_initial_estimate_in_its_own_metric():
+    settings, state, signals, Phi, b = window_case(4, prior_weight=0.5, change_detection=0)
+    window.excitation(settings, state, signals, 1)
+    R = settings.information
+
+    np.testing.assert_allclose(signals.Phi, Phi + 0.5 * R, rtol=1e-12)
+    np.testing.assert_allclose(signals.b, b + 0.5 * R @ settings.initial_estimate, rtol=1e-12)
+
+
+def test_tracking_error_adapts_each_parameter_in_its_scale():
+    settings, state, signals = arbitrary(1, variance=SCALE**2, kappa=0.0)
+    state.latched[0] = 0.0
+    before = state.estimate.copy()
+    adaptation.adapt(settings, state, signals, 1e-3, saturated=False)
+    H, xi2 = signals.H[:, :4], signals.xi2
+    expected = -1e-3 * settings.Gamma[:4] * SCALE[:4] ** 2 * (H.T @ xi2)
+    np.testing.assert_allclose((state.estimate - before)[:4], expected, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize('compensation', range(len(COMPENSATIONS)))
+def test_damping_by_the_initial_inertia_is_omega_v_M_xi2(compensation):
+    plain, damped = (
+        controller(recommended(Kp=np.zeros(2), damping_rate=rate, compensation=compensation))
+        for rate in (0.0, 30.0)
+    )
+    measurement = np.array([2.2935, 1.6961, 0.3, -0.2, 0.0, 0.0])
+    for law in (plain, damped):
+        law.update(0.0, 1e-3, measurement)
+    P1, P2, P3 = plain.settings.initial_estimate[:3]
+    c = P3 * np.cos(measurement[1])
+    M = np.array([[P1 + P2 + 2.0 * c, P2 + c], [P2 + c, P2]])
+
+    np.testing.assert_allclose(
+        damped.signals.demand - plain.signals.demand, -30.0 * M @ plain.signals.xi2, rtol=1e-9
+    )
+
+
+def test_window_of_every_fifth_row_gives_the_same_estimate():
+    sparse = controller(quick(row_interval=5, window=200, sigma=1e-9))
+    dense = controller(quick(sigma=1e-9))
+    runs = [record(law, plant(constant=(0, 0), amplitude=(0, 0)), 4.0) for law in (sparse, dense)]
+
+    assert sparse.state.ring.size * 5 == dense.state.ring.size
+    assert sparse.state.rows[0] == 200.0
+    np.testing.assert_allclose(runs[0].estimate[-1, :3], runs[1].estimate[-1, :3], rtol=0.02)
+
+
+def test_rows_of_a_joint_at_rest_count_less():
+    """Both sides of X theta = u are scaled by |dqr| / sqrt(dqr^2 + v^2)."""
+    scaled, plain = (controller(quick(motion_scale=scale)) for scale in (0.05, 0.0))
+    samples = zip(*(closed_loop(law, plant(), 0.5) for law in (scaled, plain)), strict=True)
+    for _ in samples:
+        dqr = abs(plain.signals.dqr[0])
+        weight = dqr / sqrt(dqr**2 + 0.05**2)
+        np.testing.assert_allclose(scaled.signals.row, weight * plain.signals.row, rtol=1e-9)
+
+
+@pytest.mark.parametrize(('P2', 'physical'), [(0.32, True), (0.02, False), (-0.3, False)])
+def test_only_estimates_with_a_positive_inertia_are_physical(P2, physical):
+    law = controller(recommended())
+    theta = np.array([1.0, P2, 0.0, 0.0, 0.0])
+    q = np.array([2.0, 1.4])
+    if P2 == 0.02:  # positive definite, but below a tenth of the initial estimate
+        law.settings.initial_estimate[:3] = [1.0, 0.32, 0.0]
+    assert consistency.is_physical(law.settings, law.signals, q, theta) == physical

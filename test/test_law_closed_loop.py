@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Performance of the recommended configuration in Section IV's case over a minute, without ROS."""
+"""The law in closed loops: start, tracking, handover, the limit of continuous time, and (29)."""
 
 from __future__ import annotations
+
+from functools import cache
 
 import numpy as np
 import pytest
 from closed_loop_case import (
+    JOINTS,
+    START,
     P,
     R,
     closed_loop,
@@ -15,10 +19,18 @@ from closed_loop_case import (
     recommended_minute,
     record,
 )
+from paper_case import EXACT, configured
 from plain_law import dynamics
+from scipy.integrate import solve_ivp
+from test_law_consistency import run
 
+from blf_dsc_controller.compiled import cholesky
+from blf_dsc_controller.errors import BlfDscError, OutsideBarrierError
 from blf_dsc_controller.law import barrier
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.settings import COMPENSATIONS
+from blf_dsc_controller.simulation.loop import simulate
 
 BOUND = 2e-3  # rad
 DISTURBANCE = 0.1  # N m, the constant part
@@ -116,3 +128,228 @@ def test_lyapunov_function_decreases_from_sample_to_sample(kappa, compensation):
     assert V[6000] < 0.5 * V[0]
     if kappa > 0.0:
         assert V[-1] < 0.1 * V[6000]
+
+
+TRUE = np.array([1.0, 0.32, 0.4])
+END = 0.5  # s
+K, MU, LAMBDA, KP, W, KC = 150.0, 20.0, 0.002, np.array([60.0, 20.0]), 1000.0, 0.002
+GAMMA, GAMMA3, KAPPA, RHO = 0.5, 100.0, 20.0, 1e-5
+PHI = np.array([[60.0, 5.0, 20.0], [5.0, 1.0, 2.0], [20.0, 2.0, 9.0]])
+TIMES = np.linspace(0.0, END, 11)
+
+
+def reference(t):
+    """qr of Section IV and its derivatives."""
+    qr = np.array([1.9935, 1.3961]) + 0.3 * np.cos(t)
+    return np.array([qr, [-0.3 * np.sin(t)] * 2, [-0.3 * np.cos(t)] * 2])
+
+
+def surface(xi1, dqr):
+    """beta2 of (18) with (15)."""
+    s = np.pi * xi1**2 / (2.0 * KC**2)
+    return -K * KC**2 / (np.pi * xi1) * np.sin(s) * np.cos(s) - MU * xi1 + dqr
+
+
+def regressor(q, dq, v, a):
+    """H(q, dq, v, a)."""
+    parts = [dynamics(e, R, q, dq) for e in np.eye(3)]
+    return np.column_stack([M @ a + C @ v + G for M, C, G in parts])
+
+
+def derivative(t, y):
+    """The whole loop: arm (1), filter (13), law (28), learning (20) from a latched window, (30)."""
+    q, dq, alpha2, estimate, d3 = np.split(y, [2, 4, 6, 9])
+    qr, dqr, ddqr = reference(t)
+    xi1, xi2 = q - qr, dq - alpha2
+    dalpha2 = (surface(xi1, dqr) - alpha2) / LAMBDA
+    H, H_r = regressor(q, dq, alpha2, dalpha2), regressor(qr, dqr, dqr, ddqr)
+    barrier = W * xi1 / np.cos(np.pi * xi1**2 / (2.0 * KC**2)) ** 2
+    P0 = 0.5 * TRUE
+    torque = H @ P0 + H_r @ (estimate - P0) + d3 - KP * xi2 - barrier
+    M, C, G = dynamics(TRUE, R, q, dq)
+    ddq = np.linalg.solve(M, torque - C @ dq - G - 0.1 - 0.1 * np.sin(t))
+    eps = np.linalg.solve(PHI + RHO * np.eye(3), PHI @ (TRUE - estimate))
+    learned = GAMMA * KAPPA * eps
+    update = learned - GAMMA * H_r.T @ xi2
+    return np.concatenate([dq, ddq, dalpha2, update, -GAMMA3 * xi2 - H_r @ learned])
+
+
+@cache
+def continuous():
+    """Positions and P^ at TIMES, to a tolerance far below the sampling error."""
+    start = np.array([2.293, 1.696])
+    qr, dqr, _ = reference(0.0)
+    alpha2 = surface(start - qr, dqr)
+    y = np.concatenate([start, np.zeros(2), alpha2, 0.5 * TRUE, np.zeros(2)])
+    solution = solve_ivp(
+        derivative, (0.0, END), y, method='LSODA', rtol=1e-10, atol=1e-13, t_eval=TIMES
+    )
+    assert solution.success
+    return solution.y[:2], solution.y[6:9]
+
+
+def sampled(dt):
+    """The same for the sampled loop with the package's own kernels."""
+    settings = recommended(
+        bias=False, Gamma=np.full(3, GAMMA), kappa=KAPPA, learning_start=1e9, window=10
+    )
+    law: Controller = controller(settings)
+    law.state.latched[0] = 1.0
+    law.state.Phi[:] = PHI
+    law.state.b[:] = PHI @ TRUE
+    law.state.factor[:] = PHI + RHO * np.eye(3)
+    cholesky.factor(law.state.factor)
+    arm = plant(sample_time=dt)
+    q, estimate = [], []
+    stride = round(END / dt / (TIMES.size - 1))
+    for k in range(stride * (TIMES.size - 1) + 1):
+        measurement = arm.measure()
+        if k % stride == 0:
+            q.append(measurement[:2].copy())
+            estimate.append(law.state.estimate[:3].copy())
+        law.update(k * dt, dt, measurement)
+        arm.step(law.signals.torque)
+    return np.array(q).T, np.array(estimate).T
+
+
+@pytest.mark.parametrize('quantity', [0, 1], ids=['position', 'estimate'])
+def test_sampled_loop_converges_to_the_continuous_one_at_first_order(quantity):
+    """Halve the sample time three times; held torque and Euler adaptation are of first order."""
+    exact = continuous()[quantity]
+    errors = [np.abs(sampled(dt)[quantity] - exact).max() for dt in (1e-3, 5e-4, 2.5e-4, 1.25e-4)]
+    order = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert np.all(order > 0.9), (errors, order)
+    assert errors[-1] < 0.15 * errors[0]
+
+
+LATCH = 6.79  # s
+FRICTION = {'disturbance.viscous': [0.3, 0.2], 'disturbance.coulomb': [0.5, 0.3]}
+COLUMNS = {'learning.viscous': True, 'learning.coulomb': True}
+
+
+def test_tracking_error_stays_small_over_the_first_latch():
+    """The estimate steps by half of P; without the handover the error reaches 0.42 mrad."""
+    bumpless = run(12.0)
+    paper = run(12.0, law={'learning.bumpless': False})
+
+    assert bumpless.error[np.searchsorted(bumpless.t, LATCH - 0.1)] > 0.1
+    assert bumpless.error[-1] < 1e-3
+    assert bumpless.largest(LATCH).max() < 0.02e-3
+    assert paper.largest(LATCH).max() > 0.4e-3
+
+
+def test_disturbance_estimate_is_accurate_a_second_after_the_first_latch():
+    end = LATCH + 1.0
+    true = 0.1 + 0.1 * np.sin(end)
+    errors = [
+        np.abs(run(end, law={'learning.bumpless': choice}).controller.state.disturbance - true)
+        for choice in (True, False)
+    ]
+    assert errors[0].max() < 0.02  # N m
+    assert errors[1].max() > 0.1
+
+
+@pytest.mark.parametrize(('preset', 'bound'), [('recommended', 0.01e-3), ('noisy', 0.05e-3)])
+def test_learned_friction_is_compensated(preset, bound):
+    with_columns = run(30.0, preset=preset, plant=FRICTION, law=COLUMNS)
+    without = run(30.0, preset=preset, plant=FRICTION)
+
+    assert with_columns.largest(15.0).max() < bound
+    assert without.largest(15.0).max() > 3.0 * bound
+
+
+def test_disturbance_in_telemetry_includes_friction():
+    config = configured('recommended', 30.0, COLUMNS, FRICTION)
+    found = simulate(config.controller, config.plant).run()
+    disturbance = [f'disturbance {joint}' for joint in found.joints]
+    estimated = found.learning.select(disturbance)[found.learning.stamp >= 20e9]
+    true = found.truth.select(disturbance)[found.truth.stamp >= 20e9]
+
+    moving = np.abs(found.velocity[found.stamp >= 20e9]).min(axis=1) > 0.1
+    assert np.abs(true[moving]).max() > 0.5  # more than the 0.2 N m without friction
+    np.testing.assert_allclose(estimated[moving], true[moving], atol=0.02)
+
+
+@pytest.mark.parametrize('error', [0.002, -0.0021, 1.5, np.nan])
+@pytest.mark.parametrize('joint', [0, 1])
+def test_start_outside_the_barrier_is_rejected_by_name(joint, error):
+    law = controller(recommended())
+    q = np.array([1.9935, 1.3961]) + 0.3  # the reference at t = 0
+    law.check_start(JOINTS, q)
+    q[joint] += error * (1.0 + 1e-9)
+
+    with pytest.raises(OutsideBarrierError) as caught:
+        law.check_start(JOINTS, q)
+
+    assert isinstance(caught.value, BlfDscError)
+    assert (caught.value.joint, caught.value.bound) == (JOINTS[joint], 0.002)
+    assert caught.value.error == pytest.approx(error, rel=1e-6, nan_ok=True)
+    for part in (JOINTS[joint], f'{error:+.6g} rad', '0.002 rad'):
+        assert part in str(caught.value)
+
+
+def test_start_is_checked_against_the_reference_at_its_time():
+    law = controller(recommended())
+    law.check_start(JOINTS, np.array(START))
+    with pytest.raises(OutsideBarrierError):
+        law.check_start(JOINTS, np.array(START), t=0.2)
+
+
+GAINS = {
+    'learning.adaptation_gain': [0.5, 2.0, 1.5],
+    'disturbance.gain': [40.0, 10.0],
+    'barrier.weight': [800.0, 300.0],
+    'comparison.position_gain': [25.0, 9.0],
+    'truth.phase': [0.0, 0.4],
+}
+
+
+def samples(law, **changes):
+    """Yield time, controller and measurement of 300 samples."""
+    controller = controller_of(configured('recommended', 1.0, EXACT | {'law': law} | changes)[1])
+    arm = plant()
+    for k in range(300):
+        measurement = arm.measure().copy()
+        controller.update(k * 1e-3, 1e-3, measurement)
+        yield k * 1e-3, controller, measurement
+        arm.step(controller.signals.torque)
+
+
+@pytest.mark.parametrize('law', ['blf_dsc', 'backstepping'])
+def test_terms_are_those_of_equation_29(law):
+    Gamma, gamma = np.array([0.5, 2.0, 1.5]), np.array([40.0, 10.0])
+    w = np.array([800.0, 300.0] if law == 'blf_dsc' else [25.0, 9.0])
+    for t, running, measurement in samples(law, **GAINS):
+        sample = running.sample
+        xi1, xi2 = sample.xi1, sample.xi2
+        M, _, _ = dynamics(P, 9.8, measurement[:2], measurement[2:4])
+        tau_dist = 0.1 + 0.1 * np.sin(t + np.array([0.0, 0.4]))
+        if law == 'blf_dsc':
+            error = np.sum(w * 0.002**2 / np.pi * np.tan(np.pi * xi1**2 / (2.0 * 0.002**2)))
+            disturbance = 0.5 * np.sum((tau_dist - sample.disturbance) ** 2 / gamma)
+        else:
+            error, disturbance = 0.5 * np.sum(w * xi1**2), 0.0  # (35) has no d^3
+        expected = (
+            error,
+            0.5 * xi2 @ M @ xi2,
+            0.5 * np.sum((P - sample.estimate[:3]) ** 2 / Gamma),
+            disturbance,
+        )
+        np.testing.assert_allclose(sample.lyapunov, expected, rtol=1e-11, atol=1e-18)
+
+
+def test_estimates_that_are_not_adapted_do_not_count():
+    frozen = {'learning.adaptation_gain': [0.0, 1.0, 0.0], 'disturbance.gain': [0.0, 50.0]}
+    for t, running, _ in samples('blf_dsc', **frozen):
+        sample = running.sample
+        tau_dist = 0.1 + 0.1 * np.sin(t)
+        np.testing.assert_allclose(sample.lyapunov[2], 0.5 * (P[1] - sample.estimate[1]) ** 2)
+        np.testing.assert_allclose(
+            sample.lyapunov[3], 0.5 * (tau_dist - sample.disturbance[1]) ** 2 / 50.0, rtol=1e-11
+        )
+
+
+def test_without_the_truth_only_the_term_of_the_error_is_published():
+    for _, running, _ in samples('blf_dsc', **{'truth.parameters': []}):
+        assert running.sample.lyapunov[0] >= 0.0
+        assert np.all(np.isnan(running.sample.lyapunov[1:]))

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sliding window equals the direct sum over its rows: always, for any shape, without drift."""
+"""The sliding window, its excitation, and the latch."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from arbitrary_case import arbitrary
+from closed_loop_case import closed_loop, controller, plant, quick
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from blf_dsc_controller.law import window
+from blf_dsc_controller.compiled import cholesky
+from blf_dsc_controller.law import excitation, window
 
 
 class Window:
@@ -128,3 +131,203 @@ def test_constant_rows_average_to_themselves_from_the_first_row_on(length):
         Phi, b = sliding.average()
         np.testing.assert_allclose(Phi, row[:, :2].T @ row[:, :2], rtol=1e-14)
         np.testing.assert_allclose(b, row[:, :2].T @ row[:, 2], rtol=1e-14)
+
+
+def excitation_matrix(random, m, rank):
+    rows = random.normal(size=(rank, m))
+    return rows.T @ rows
+
+
+@pytest.mark.parametrize(('m', 'rank'), [(1, 1), (13, 30), (5, 12), (5, 5), (5, 2), (7, 1), (6, 0)])
+@pytest.mark.parametrize('shift', [1e-5, 1.0])
+def test_factor_matches_numpy_and_solves(m, rank, shift):
+    """Singular matrices included: the factor is of Phi + rho I."""
+    random = np.random.default_rng(m)
+    A = excitation_matrix(random, m, rank)
+    x = random.normal(size=m)
+    U, y = np.triu(A + shift * np.eye(m)), x.copy()
+
+    assert cholesky.factor(U)
+    cholesky.solve(U, y)
+
+    np.fill_diagonal(U, 1.0 / np.diag(U))  # kept inverted
+    # Backward stable: the residual, and not the solution, is at the level of rounding.
+    shifted = A + shift * np.eye(m)
+    np.testing.assert_allclose(U.T @ U, shifted, atol=1e-14 * np.linalg.norm(shifted))
+    np.testing.assert_allclose(U.T, np.linalg.cholesky(shifted), rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(
+        shifted @ y, x, atol=1e-14 * np.linalg.norm(shifted) * np.linalg.norm(y)
+    )
+
+
+def test_factor_is_finite_when_rounding_destroys_a_pivot():
+    """Rank one at 1e12 rounds at 1e-4, so the other two pivots of Phi + 1e-5 I are noise."""
+    for seed in range(20):
+        row = 1e6 * np.random.default_rng(seed).normal(size=3)
+        U = np.triu(np.outer(row, row) + 1e-5 * np.eye(3))
+        cholesky.factor(U)
+        assert np.all(np.isfinite(U))
+        assert np.diag(U).max() <= 1e7 / np.abs(row).min() * (1.0 + 1e-9)
+
+
+def test_factor_shows_whether_a_matrix_is_positive_definite():
+    random = np.random.default_rng(1)
+    for _ in range(20):
+        A = random.normal(size=(4, 4)) + np.diag(random.uniform(0.0, 3.0, 4))
+        A = A + A.T
+        assert cholesky.factor(np.triu(A)) == (np.linalg.eigvalsh(A)[0] > 0.0)
+
+
+def excited_case(seed):
+    """Case with a window of eight excited rows that has not been evaluated yet."""
+    case = arbitrary(seed, sigma=0.01, learning_start=2.0)
+    settings, state, signals = case
+    state.running[:] = state.fresh[:] = state.ring[:] = 0.0
+    state.latched[0] = 0.0
+    state.rows[0] = settings.window
+    cursor = 0
+    random = np.random.default_rng(seed)
+    for _ in range(settings.window):
+        signals.row[:] = random.normal(size=signals.row.shape)
+        sums = state.running, state.fresh, state.half
+        cursor = window.push_row(state.ring, cursor, *sums, signals.row, rows=settings.window)
+    return case
+
+
+@pytest.fixture
+def excited():
+    return excited_case(2)
+
+
+def evaluate_until_settled(case, t):
+    """Evaluate the window often: the first evaluation starts from an arbitrary direction."""
+    for _ in range(50):
+        excitation.update_excitation(*case, t, 1e-3, np.zeros(case[0].n))
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_inverse_iteration_finds_the_minimum_eigenvalue_and_eigenvector(seed):
+    case = excited_case(seed)
+    evaluate_until_settled(case, 0.0)
+
+    values, vectors = np.linalg.eigh(case.signals.Phi)
+    assert case.state.lambda_min[0] == pytest.approx(values[0], rel=1e-10)
+    assert abs(vectors[:, 0] @ case.state.min_eigenvector) == pytest.approx(1.0, rel=1e-10)
+    assert np.linalg.norm(case.state.min_eigenvector) == pytest.approx(1.0, rel=1e-14)
+
+
+def test_warm_started_iteration_tracks_the_minimum_eigenvalue_in_a_loop():
+    """Never below it (a Rayleigh quotient cannot be), and close once the window has filled."""
+    settings = quick()
+    law = controller(settings)
+    evaluations = [
+        (law.state.lambda_min[0], np.linalg.eigvalsh(law.signals.Phi)[0], sample.t)
+        for sample in closed_loop(law, plant(), 4.0)
+        if sample.k > 0 and sample.k % settings.interval == 0
+    ]
+    found, exact, t = np.array(evaluations).T
+
+    assert np.all(found >= exact - 1e-13)
+    filled = t > 1.0
+    np.testing.assert_allclose(found[filled], exact[filled], rtol=1e-3)
+    assert np.median(found[filled] / exact[filled] - 1.0) < 1e-6
+
+
+def test_latch_keeps_the_whole_window_when_time_and_excitation_suffice(excited):
+    settings, state, _ = excited
+    evaluate_until_settled(excited, settings.learning_start)
+
+    rows = state.ring
+    Phi = np.einsum('kia,kib->ab', rows[:, :, :-1], rows[:, :, :-1]) / settings.window
+    b = np.einsum('kia,ki->a', rows[:, :, :-1], rows[:, :, -1]) / settings.window
+    factor = np.linalg.cholesky(Phi + settings.rho * np.eye(settings.m))
+    np.fill_diagonal(factor, 1.0 / np.diag(factor))
+    assert (state.latched[0], state.latch_time[0]) == (1.0, settings.learning_start)
+    np.testing.assert_allclose(state.Phi, Phi, atol=1e-14)
+    np.testing.assert_allclose(state.b, b, atol=1e-14)
+    np.testing.assert_allclose(np.triu(state.factor), factor.T, atol=1e-13)
+
+
+@pytest.mark.parametrize('early', [True, False])
+def test_latch_stays_open_before_learning_starts_or_without_excitation(excited, early):
+    settings, state, signals = excited
+    if not early:
+        excited = (settings._replace(sigma=1e3), state, signals)
+    before = state.Phi.copy(), state.b.copy()
+
+    evaluate_until_settled(excited, settings.learning_start - (1e-9 if early else 0.0))
+
+    assert state.latched[0] == 0.0
+    np.testing.assert_array_equal(state.Phi, before[0])
+    np.testing.assert_array_equal(state.b, before[1])
+
+
+def test_latched_window_is_kept_after_excitation_ends(excited):
+    settings, state, signals = excited
+    evaluate_until_settled(excited, settings.learning_start)
+    kept = state.Phi.copy()
+
+    state.running[:] = 0.0
+    evaluate_until_settled(excited, settings.learning_start + 1.0)
+
+    assert state.lambda_min[0] == 0.0
+    assert (state.latched[0], state.latch_time[0]) == (1.0, settings.learning_start)
+    np.testing.assert_array_equal(state.Phi, kept)
+    np.testing.assert_array_equal(signals.Phi, 0.0)
+
+
+def test_excitation_is_evaluated_once_per_interval_after_learning_may_start():
+    settings = quick(interval=7, sigma=1e-12)
+    law = controller(settings)
+    times = [
+        (sample.t, law.state.latch_time[0])
+        for sample in closed_loop(law, plant(), 1.5)
+        if law.state.latched[0]
+    ]
+    t, latch_time = np.array(times).T
+
+    first = np.ceil(settings.learning_start / 7e-3) * 7e-3
+    assert t[0] == latch_time[0] == pytest.approx(first)
+    np.testing.assert_allclose(np.unique(np.diff(np.unique(latch_time))), 7e-3, rtol=1e-9)
+
+
+def window_of(eigenvalues, vectors, **changes):
+    """Case whose window has these eigenvalues, for orthonormal columns `vectors`."""
+    case = arbitrary(3, sigma=1.0, **changes)
+    state, m = case.state, case.settings.m
+    state.rows[0] = case.settings.window
+    state.running[:] = 0.0
+    state.running[:m, :m] = case.settings.window * (vectors * eigenvalues) @ vectors.T
+    state.active[:] = 1.0
+    return case
+
+
+def basis(first, second):
+    """Orthonormal columns, the first two in the span of these directions."""
+    rest = np.random.default_rng(0).normal(size=(len(first), len(first) - 2))
+    return np.linalg.qr(np.column_stack((first, second, rest)))[0]
+
+
+def test_each_evaluation_refines_the_direction_by_four_iterations():
+    """tan of the angle to the minimum eigenvector falls by lambda_1 / lambda_2 in each."""
+    eye = np.eye(7)
+    vectors = basis(eye[0] + eye[5], eye[1] - eye[2])
+    case = window_of([1.0, 2.0, *[9.0] * 5], vectors, learning_start=1e9)
+    case.state.min_eigenvector[:] = (vectors[:, 0] + vectors[:, 1]) / np.sqrt(2.0)
+    excitation.update_excitation(*case, 0.0, 1e-3, np.zeros(case.settings.n))
+    tangent = ((1.0 + case.settings.rho) / (2.0 + case.settings.rho)) ** 4
+    expected = 1.0 + tangent**2 / (1.0 + tangent**2)
+    assert case.state.lambda_min[0] == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize('missing', [1e-6, -1e-6])
+def test_column_rejection_is_independent_of_the_starting_direction(missing):
+    """The iteration starts near the wrong eigenvector, whose eigenvalue is a fifth larger."""
+    p, m = 4, 7
+    ones, columns = np.ones(m), np.eye(m)[p] - np.eye(m)[p + 1]
+    least = 1.0 - missing  # sigma is 1
+    vectors = basis(columns + 0.02 * ones, ones)
+    case = window_of([least, 1.2 * least, *[9.0] * 5], vectors, rho=1e-5)
+    excitation.reject_columns(*case)
+    assert case.state.columns_checked[0] == 1.0
+    assert (case.state.active[p:].sum() < 3.0) == (missing > 0.0)

@@ -1,20 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results depend neither on the engine that computes them nor on lost workers."""
+"""Engines of a study: the same results in any order and number of processes, also after a kill."""
 
 from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
+import time
+import uuid
 from concurrent.futures import BrokenExecutor, Executor
 from contextlib import contextmanager, nullcontext
+from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet
 import pytest
-from monte_carlo_case import RUNS, same, study, whole
+from monte_carlo_case import LOOP, RUNS, STUDY, same, study, whole, write
 
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.studies import runs as engines
-from blf_dsc_controller.studies.runs import RETRIES, Span, chunk_size, compute, warm_up
+from blf_dsc_controller.studies import runs as stores
+from blf_dsc_controller.studies.runs import (
+    RETRIES,
+    Span,
+    Store,
+    chunk_size,
+    compute,
+    run_chunk,
+    warm_up,
+)
 
 
 @pytest.fixture(scope='module')
@@ -124,3 +140,163 @@ def test_chunks_are_few_but_enough_for_all_workers(runs, workers):
     size = chunk_size(runs, workers)
     assert 1 <= size <= 1000  # a crash costs about ten seconds of work
     assert runs / size >= min(runs, 20 * workers)
+
+
+pytestmark = pytest.mark.usefixtures('blank_pictures')
+TIMEOUT = 300.0  # s; the machine may be busy, and kernels may have to be compiled
+
+
+@pytest.fixture
+def store(tmp_path):
+    return Store.create_or_open(tmp_path / 'out', study(tmp_path))
+
+
+def filled(store, *ranges):
+    for first, runs in ranges:
+        store.keep(Span(first, runs), run_chunk(store.study, first, runs))
+    return store
+
+
+def stamps(folder):
+    return {path.name: path.stat().st_mtime_ns for path in (folder / 'runs').iterdir()}
+
+
+def until(condition):
+    end = time.monotonic() + TIMEOUT
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def processes_with(mark):
+    """Processes with this mark in their environment."""
+    found = []
+    for path in Path('/proc').glob('[0-9]*/environ'):
+        try:
+            if mark.encode() in path.read_bytes():
+                found.append(int(path.parent.name))
+        except OSError:
+            continue
+    return found
+
+
+def test_killed_study_resumes(tmp_path):
+    loop = LOOP.replace('duration: 0.3', 'duration: 3.0')
+    path, out = write(tmp_path, loop + STUDY), tmp_path / 'out'
+    command = [
+        sys.executable,
+        '-m',
+        'blf_dsc_controller',
+        'monte-carlo',
+        '--config',
+        path,
+        '--out',
+        out,
+    ]
+    command += ['--workers', '2', '--chunk', '1']
+    mark = str(uuid.uuid4())
+    with subprocess.Popen(
+        command, env={**os.environ, 'MARK': mark}, stderr=subprocess.DEVNULL
+    ) as process:
+        until(lambda: (out / 'runs').is_dir() and len(list((out / 'runs').glob('r*'))) >= 3)
+        process.send_signal(signal.SIGKILL)
+    until(lambda: not processes_with(mark))  # its workers have ended too
+    before = stamps(out)
+    assert 3 <= len(before) < RUNS
+    (out / 'runs' / '.runs-000000023-000000023.parquet.1').write_bytes(b'half a fi')
+
+    resumed = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert f'{sum(name[0] == "r" for name in before)} of 24 runs are done already' in resumed.stderr
+    after = stamps(out)
+    assert not [name for name in after if name.startswith('.')]
+    kept = {name: stamp for name, stamp in before.items() if name.startswith('r')}
+    assert kept.items() <= after.items()
+    assert len(after) == RUNS
+    opened = Store(out)
+    assert same(opened.results(), whole(opened.study))
+
+
+def test_complete_study_is_not_recomputed(tmp_path, capsys):
+    path, out = write(tmp_path), tmp_path / 'out'
+    command = ['monte-carlo', '--config', str(path), '--out', str(out), '--engine', 'threads']
+    assert main(command) == 0
+    before = stamps(out)
+    assert main(command) == 0
+    assert stamps(out) == before
+    assert 'of the runs kept the bound' in capsys.readouterr().out
+
+
+def test_missing_runs_are_found_between_completed_ones(store):
+    filled(store, (3, 4), (10, 1))
+    assert store.done() == [Span(3, 4), Span(10, 1)]
+    missing = store.missing(5)
+    assert missing[:3] == [Span(0, 3), Span(7, 3), Span(11, 5)]
+    runs = [i for first, count in missing for i in range(first, first + count)]
+    assert sorted([*runs, 3, 4, 5, 6, 10]) == list(range(RUNS))
+
+
+def test_results_can_be_read_with_pyarrow_alone(store):
+    filled(store, (12, 12), (0, 12))
+    table = pyarrow.parquet.read_table(store.folder / 'runs')
+    assert table['run'].to_pylist() == list(range(RUNS))
+    expected = whole(store.study)
+    assert table.column_names == list(expected)
+    assert table['outcome'].to_pylist() == expected['outcome'].tolist()
+    assert table['plant.arm.m2'].to_pylist() == expected['plant.arm.m2'].tolist()
+    assert same(store.results(), expected)
+
+
+@pytest.mark.parametrize(
+    ('before', 'after', 'difference'),
+    [
+        ('runs: 24', 'runs: 25', r'monte_carlo.runs: there 24, here 25'),
+        ('m2: uniform(0.3', 'm2: uniform(0.2', r'arm.m2: there uniform\(0.3, 0.7\), here uniform'),
+        ('arm.m2', 'arm.m1', r'arm.m2: there uniform\(0.3, 0.7\), here nothing'),
+        ('duration: 0.3', 'duration: 0.4', r'sim_plant.duration: there 0.3, here 0.4'),
+        ('window: 0.1', 'window: 0.12', r'learning.window: there 0.1, here 0.12'),
+    ],
+)
+def test_other_study_is_rejected_and_the_difference_is_named(
+    tmp_path, store, before, after, difference
+):
+    other = study(tmp_path, (LOOP + STUDY).replace(before, after, 1))
+    with pytest.raises(BlfDscError, match=difference):
+        Store.create_or_open(store.folder, other)
+    assert Store(store.folder).study == store.study
+
+
+def test_other_version_is_rejected(store, monkeypatch):
+    now = stores.versions()
+    monkeypatch.setattr(stores, 'versions', lambda: now | {'kernels': 'of tomorrow'})
+    with pytest.raises(BlfDscError, match=r'kernels: there .*, here of tomorrow'):
+        Store.create_or_open(store.folder, store.study)
+
+
+def test_folder_without_a_study_is_left_alone(tmp_path, capsys):
+    out = tmp_path / 'thesis'
+    out.mkdir()
+    (out / 'chapter1.txt').write_text('In the beginning')
+    with pytest.raises(BlfDscError, match='holds no study'):
+        Store.create_or_open(out, study(tmp_path))
+    assert main(['monte-carlo', '--config', str(write(tmp_path)), '--out', str(out)]) == 1
+    assert 'choose another folder' in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ['chapter1.txt']
+
+
+def test_two_processes_cannot_write_into_one_folder(store):
+    with (
+        store.locked(),
+        pytest.raises(BlfDscError, match='another monte-carlo is running'),
+        Store(store.folder).locked(),
+    ):
+        pass
+    with Store(store.folder).locked():
+        pass
+
+
+def test_damaged_file_is_named(store):
+    filled(store, (0, 2))
+    (part,) = (store.folder / 'runs').iterdir()
+    part.write_bytes(part.read_bytes()[:-20])
+    with pytest.raises(BlfDscError, match=f'{part.name} cannot be read .*remove it'):
+        store.results()

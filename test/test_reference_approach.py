@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starts from anywhere: approach, hand-over and tracking within the bound, or a rejection."""
+"""Approaches within the limits, and starts from anywhere: the bound holds, or a rejection."""
 
 from __future__ import annotations
 
@@ -10,7 +10,12 @@ import pytest
 from fault_rig import Rig
 
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.configuration.controller import Approach, ControllerConfig, Reference
+from blf_dsc_controller.configuration.controller import (
+    Approach,
+    ControllerConfig,
+    MotionLimits,
+    Reference,
+)
 from blf_dsc_controller.configuration.plant import Initial, PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import (
@@ -20,16 +25,124 @@ from blf_dsc_controller.errors import (
     VelocityMismatchError,
 )
 from blf_dsc_controller.law.factory import begin, controller_of
-from blf_dsc_controller.reference.approach import plan_start, reference_of
-from blf_dsc_controller.reference.terms import sampled, unpack
+from blf_dsc_controller.reference.approach import blend, plan_start, reference_of, stop
+from blf_dsc_controller.reference.limits import MotionError, worst_violation
+from blf_dsc_controller.reference.polynomials import minimum_jerk
+from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term, unpack
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 
+JOINTS = ('shoulder', 'elbow')
+PAPER = sinusoids_term((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))
+POINTS = minimum_jerk(np.array([0.0, 5.0, 11.0]), np.array([[0.0, 1.0], [1.0, -1.0], [0.3, 0.0]]))
+T0 = 1.7  # s
+AT_REST = np.array([[-0.4, 2.9], [0.0, 0.0]])
+MOVING = np.array([[0.8, 1.5], [0.6, -0.9]])
+
+
+def limits(velocity=(1.5, 1.5), acceleration=(2.0, 2.0), reach=(6.0, 6.0), longest=30.0):
+    lower = tuple(-limit for limit in reach)
+    allowed = MotionLimits(lower, reach, velocity, acceleration)
+    return ControllerConfig(JOINTS, limits=allowed, approach=Approach(longest=longest))
+
+
+def approach_to(main, start, limits):
+    """Motion to `main` from a measured state."""
+    return blend([stop(T0, *start, limits)], main, T0, limits)
+
+
+def at(vector, t):
+    return sampled(vector, np.array([t]))[0]
+
+
+@pytest.mark.parametrize('main', [PAPER, POINTS], ids=['sinusoids', 'points'])
+@pytest.mark.parametrize('start', [AT_REST, MOVING], ids=['at rest', 'moving'])
+def test_approach_begins_at_the_measured_state_and_ends_on_the_reference(main, start):
+    motion = approach_to(main, start, limits())
+    before, after = motion.settled - 1e-7, motion.settled
+
+    np.testing.assert_allclose(at(motion.vector, T0), [*start, (0.0, 0.0)], atol=1e-12)
+    for t in (after, after + 1.0, 1e4):
+        np.testing.assert_array_equal(at(motion.vector, t), at(pack(2, [main]), t))
+    # 1e-5 allows for the jerk over 1e-7 s: position, velocity and acceleration do not jump.
+    np.testing.assert_allclose(at(motion.vector, before), at(motion.vector, after), atol=1e-5)
+
+
+@pytest.mark.parametrize('main', [PAPER, POINTS], ids=['sinusoids', 'points'])
+@pytest.mark.parametrize('start', [AT_REST, MOVING], ids=['at rest', 'moving'])
+def test_approach_keeps_the_limits_and_a_slightly_shorter_one_would_not(main, start):
+    motion = approach_to(main, start, limits())
+    fine = np.linspace(T0, motion.settled + 10.0, 100_001)
+    _, dqr, ddqr = sampled(motion.vector, fine).transpose(1, 0, 2)
+
+    # The planner looks at times a 200th of the approach apart or closer: it misses at most 0.1 %.
+    assert np.all(np.abs(dqr).max(axis=0) <= 1.001 * np.array(limits().limits.velocity))
+    assert np.all(np.abs(ddqr).max(axis=0) <= 1.001 * np.array(limits().limits.acceleration))
+    shorter = 0.98 * (motion.settled - T0)
+    with pytest.raises(MotionError):
+        approach_to(main, start, limits(longest=shorter))
+
+
+def test_each_joint_keeps_its_own_limits():
+    motion = approach_to(PAPER, AT_REST, limits(velocity=(0.4, 3.0), acceleration=(9.0, 1.0)))
+    _, dqr, ddqr = sampled(motion.vector, np.linspace(T0, 40.0, 40_001)).transpose(1, 0, 2)
+    assert np.abs(dqr[:, 0]).max() == pytest.approx(0.4, rel=0.05)  # the active limit is reached
+    assert np.abs(ddqr[:, 1]).max() <= 1.001
+
+
+def test_running_reference_blends_into_another_without_a_jump():
+    motion = blend([PAPER], POINTS, T0, limits())
+    np.testing.assert_allclose(
+        at(motion.vector, T0), at(pack(2, [PAPER]), T0), rtol=1e-14, atol=1e-14
+    )
+    np.testing.assert_array_equal(
+        at(motion.vector, motion.settled), at(pack(2, [POINTS]), motion.settled)
+    )
+
+
+def test_reference_beyond_the_limits_is_rejected_with_the_name_of_the_joint():
+    with pytest.raises(MotionError) as rejection:
+        approach_to(PAPER, AT_REST, limits(velocity=(1.0, 0.25)))
+
+    violation = rejection.value.violation
+    assert (violation.joint, violation.quantity) == ('elbow', 'velocity')
+    assert abs(violation.value) == pytest.approx(0.3, rel=1e-4)  # 0.3 sin t
+    assert abs(violation.limit) == 0.25
+    assert 'limits.velocity' in str(rejection.value)
+
+
+def test_arm_that_is_already_too_fast_is_rejected_with_the_name_of_the_joint():
+    start = MOVING.copy()
+    start[1, 0] = -1.7
+    with pytest.raises(MotionError) as rejection:
+        approach_to(PAPER, start, limits())
+
+    violation = rejection.value.violation
+    assert (violation.joint, violation.quantity, violation.limit) == ('shoulder', 'velocity', -1.5)
+    assert violation.value <= -1.7
+    for part in ('shoulder', '-1.5 rad/s', 'at most 30 s', 'approach.longest'):
+        assert part in str(rejection.value)
+
+
+def test_approach_that_would_take_too_long_is_rejected():
+    with pytest.raises(MotionError):
+        approach_to(PAPER, AT_REST, limits(longest=0.5))
+
+
+def test_positions_are_checked_relative_to_the_middle_of_their_range():
+    allowed = MotionLimits((-1.0, 0.5), (3.0, 1.5), (9.0, 9.0), (9.0, 9.0))
+    config = ControllerConfig(JOINTS, limits=allowed)
+    violation = worst_violation(pack(2, [PAPER]), np.linspace(0.0, 7.0, 1001), config)
+    assert (violation.joint, violation.quantity, violation.limit) == ('elbow', 'position', 1.5)
+    assert violation.value == pytest.approx(1.6961, abs=1e-5)
+    assert worst_violation(pack(2, [PAPER]), np.linspace(2.0, 4.0, 101), config) is None
+
+
 CONFIG = ControllerConfig()
-PAPER = np.array([2.2935, 1.6961])  # qr(0)
+FIRST = np.array([2.2935, 1.6961])  # qr(0)
 STILL = np.zeros(2)
 BOUND = 2e-3  # rad
-STARTS = PAPER + np.random.default_rng(7).uniform(-2.0, 2.0, (10, 2))
+STARTS = FIRST + np.random.default_rng(7).uniform(-2.0, 2.0, (10, 2))
 
 
 def run(config, start, duration, velocity=(0.0, 0.0)):
@@ -81,28 +194,28 @@ def test_fast_reference_is_approached_through_rest_at_its_middle():
 
 def test_start_inside_the_bound_needs_no_approach():
     law = controller_of(CONFIG)
-    assert begin(law, CONFIG, PAPER + 0.9 * BOUND, STILL, 0.0) == 0.0
+    assert begin(law, CONFIG, FIRST + 0.9 * BOUND, STILL, 0.0) == 0.0
     np.testing.assert_array_equal(law.reference_vector, reference_of(CONFIG))
 
 
 def test_start_outside_the_bound_is_rejected_if_approaches_are_disabled():
     config = replace(CONFIG, approach=Approach(enabled=False))
     with pytest.raises(OutsideBarrierError):
-        begin(controller_of(config), config, PAPER + 1.1 * BOUND, STILL)
+        begin(controller_of(config), config, FIRST + 1.1 * BOUND, STILL)
 
 
 def test_approach_may_begin_later():
     law = controller_of(CONFIG)
-    settled = begin(law, CONFIG, PAPER, STILL, 3.0)  # the paper's reference is 0.6 rad away by then
+    settled = begin(law, CONFIG, FIRST, STILL, 3.0)  # the paper's reference is 0.6 rad away by then
     assert settled > 3.0
-    np.testing.assert_allclose(law.reference_at(3.0), [PAPER, STILL, STILL], atol=1e-12)
+    np.testing.assert_allclose(law.reference_at(3.0), [FIRST, STILL, STILL], atol=1e-12)
 
 
-MOVING = {'reference.phase': [-np.pi / 2]}  # passes its middle at 0.3 rad/s at t = 0
+SWINGING = {'reference.phase': [-np.pi / 2]}  # passes its middle at 0.3 rad/s at t = 0
 
 
 def test_start_at_rest_on_a_moving_reference_leads_to_an_approach():
-    config = build(ControllerConfig, MOVING)
+    config = build(ControllerConfig, SWINGING)
     record = run(config, config.reference.offset, 4.0)
     largest = np.abs(record.samples[:, 4:6]).max(axis=0)
     np.testing.assert_array_less(largest, 0.5 * BOUND)
@@ -112,7 +225,7 @@ def test_start_at_rest_on_a_moving_reference_leads_to_an_approach():
 
 
 def test_start_that_is_too_slow_is_rejected_if_approaches_are_disabled():
-    config = build(ControllerConfig, MOVING | {'approach.enabled': False})
+    config = build(ControllerConfig, SWINGING | {'approach.enabled': False})
     law = controller_of(config)
     offset, moving = np.array(config.reference.offset), np.full(2, 0.3)
     with pytest.raises(VelocityMismatchError, match='starts -0'):
@@ -127,8 +240,8 @@ def test_start_that_is_too_slow_is_rejected_if_approaches_are_disabled():
 
 def test_moving_arm_is_stopped_before_it_is_held():
     config = build(ControllerConfig, {'reference.type': 'hold'})
-    record = run(config, PAPER, 6.0, velocity=(0.5, -0.5))
-    np.testing.assert_array_equal(record.samples[-1, :2], PAPER)
+    record = run(config, FIRST, 6.0, velocity=(0.5, -0.5))
+    np.testing.assert_array_equal(record.samples[-1, :2], FIRST)
     assert np.abs(record.samples[:, 4:6]).max() < 0.5 * BOUND
 
 
@@ -153,7 +266,7 @@ def test_reactivation_on_the_reference_tracks_at_once_only_at_its_velocity(rest,
 
 def test_hold_reference_stays_where_the_arm_is():
     config = replace(CONFIG, reference=Reference(type='hold'))
-    start = PAPER - 0.7
+    start = FIRST - 0.7
     record = run(config, start, 1.0)
     np.testing.assert_array_equal(record.samples[:, :2], np.broadcast_to(start, (1001, 2)))
     assert np.abs(record.samples[:, 4:6]).max() < BOUND
@@ -200,7 +313,7 @@ def test_bag_of_an_offline_run_contains_the_moving_bound(tmp_path):
     config = build(
         ControllerConfig, {'barrier.initial_bound': [0.02, 0.01], 'barrier.funnel_rate': 4.0}
     )
-    record = run(config, PAPER + 0.009, 0.5)
+    record = run(config, FIRST + 0.009, 0.5)
     write_bag(tmp_path / 'bag', record, config, 'none')
     recorded = read_run(tmp_path / 'bag')
 

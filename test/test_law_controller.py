@@ -1,0 +1,447 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The controller: its state, the laws it can be, and its settings from a configuration."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+from arbitrary_case import arbitrary_settings
+from closed_loop_case import (
+    REFERENCE,
+    START,
+    closed_loop,
+    controller,
+    plant,
+    quick,
+    recommended,
+    record,
+)
+from numba.core.runtime import _nrt_python, rtsys
+from paper_case import EXACT, NO_DISTURBANCE, P, configured, run
+from plain_law import PlainLaw, dynamics
+
+from blf_dsc_controller.compiled.layout import pack, sizes_of
+from blf_dsc_controller.configuration.controller import LAWS, ControllerConfig
+from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.law.controller import update
+from blf_dsc_controller.law.factory import column_names, controller_of, settings_of_config
+from blf_dsc_controller.law.settings import Settings, settings_of
+from blf_dsc_controller.law.state import (
+    sample_of,
+    sample_size,
+    signals_of,
+    signals_size,
+    state_of,
+    state_size,
+)
+
+SHAPES = [(1, 1), (2, 3), (3, 4), (6, 30)]
+SIZES = ('n', 'p', 'm', 'tones', 'drive', 'drive_size', 'model')
+
+
+def distinct_settings(n, p):
+    """Settings whose numbers are all distinct, except for the sizes."""
+    settings = arbitrary_settings(np.random.default_rng(0), n, p)
+    number = iter(range(1000, 10_000))
+    values = {}
+    for name, value in settings._asdict().items():
+        if name in SIZES:
+            continue
+        if isinstance(value, np.ndarray):
+            values[name] = np.reshape([float(next(number)) for _ in range(value.size)], value.shape)
+        else:
+            values[name] = next(number) + (0 if isinstance(value, int) else 0.5)
+    return settings._replace(**values)
+
+
+@pytest.mark.parametrize(('n', 'p'), SHAPES)
+def test_settings_survive_packing_and_unpacking(n, p):
+    settings = distinct_settings(n, p)
+
+    unpacked = settings_of(pack(settings), sizes_of(settings), settings.model)
+
+    for name in Settings._fields:
+        np.testing.assert_array_equal(
+            getattr(unpacked, name), getattr(settings, name), err_msg=name
+        )
+        assert isinstance(getattr(unpacked, name), type(getattr(settings, name))), name
+
+
+@pytest.mark.parametrize(('n', 'p'), SHAPES)
+def test_views_cover_their_vectors_exactly_once(n, p):
+    settings = arbitrary_settings(np.random.default_rng(0), n, p)
+    sizes = state_size(settings), signals_size(settings), sample_size(settings)
+    state, signals, sample = (np.arange(float(size)) for size in sizes)
+
+    for views, size in zip(
+        (
+            state_of(state, settings),
+            signals_of(signals, settings),
+            sample_of(sample, settings),
+        ),
+        sizes,
+        strict=True,
+    ):
+        np.testing.assert_array_equal(
+            np.sort(np.concatenate([part.ravel() for part in views])), np.arange(size)
+        )
+
+
+def assert_shapes(view, shapes):
+    for shape, names in shapes.items():
+        for name in names.split():
+            assert getattr(view, name).shape == shape, name
+
+
+def test_state_has_the_documented_shapes():
+    n, p, m, N = 3, 4, 7, 8
+    settings = arbitrary_settings(np.random.default_rng(0), n, p)
+    assert_shapes(
+        state_of(np.zeros(state_size(settings)), settings),
+        {
+            (1,): 'samples cursor rows latched latch_time lambda_min',
+            (n,): 'alpha2 torque disturbance',
+            (m,): 'estimate b solution anchor min_eigenvector',
+            (n, p): 'momentum',
+            (n, m): 'rest',
+            (n, m + 1): 'filter1 filter2',
+            (m + 1, m + 1): 'running fresh half',
+            (m, m): 'Phi factor',
+            (N, n, m + 1): 'ring',
+        },
+    )
+
+
+def test_signals_have_the_documented_shapes():
+    n, p, m = 3, 4, 7
+    settings = arbitrary_settings(np.random.default_rng(0), n, p)
+    assert_shapes(
+        signals_of(np.zeros(signals_size(settings)), settings),
+        {
+            (n,): 'qr dqr ddqr xi1 beta2 dalpha2 xi2 demand torque unit',
+            (n, p): 'momentum',
+            (n, m): 'H rest',
+            (n, m + 1): 'row',
+            (n, n): 'inertia',
+            (m, m): 'Phi factor',
+            (m,): 'b rate work',
+        },
+    )
+
+
+def test_sample_contains_what_the_update_computed():
+    law = controller(quick(sigma=-1.0))
+    record(law, plant(), 1.3)
+    assert law.state.latched[0] == 1.0
+    for part, name in (
+        *((law.signals, name) for name in ('qr', 'dqr', 'xi1', 'xi2', 'torque')),
+        *((law.state, name) for name in ('disturbance', 'estimate', 'lambda_min', 'latched')),
+    ):
+        np.testing.assert_array_equal(getattr(law.sample, name), getattr(part, name), err_msg=name)
+        assert np.all(getattr(law.sample, name) != 0.0), name
+
+
+def test_restored_loop_continues_bit_for_bit():
+    """The state vector is the complete state, so another controller can continue from it too."""
+    law, arm = controller(quick()), plant(noise=1e-5, differenced=True, delay=2)
+    record(law, arm, 1.337)
+    saved, saved_arm = law.save(), arm.save()
+
+    def rest_of(law):
+        arm.restore(saved_arm)
+        torques = []
+        for k in range(1337, 2000):
+            torques.append(law.update(k * 1e-3, 1e-3, arm.measure()).copy())
+            arm.step(torques[-1])
+        return np.array(torques)
+
+    first = rest_of(law)
+    law.restore(saved)
+    other = controller(quick())
+    other.restore(saved)
+
+    np.testing.assert_array_equal(rest_of(law), first)
+    np.testing.assert_array_equal(rest_of(other), first)
+    assert np.any(saved != law.state_vector)
+
+
+@numba.njit
+def many_updates(model, sizes, settings, law, state, signals, measurement, sample, checks, count):
+    for k in range(count):
+        t = k * 1e-3
+        update(model, sizes, settings, law, state, signals, t, 1e-3, measurement, sample, checks)
+
+
+def test_updates_in_a_compiled_loop_allocate_nothing():
+    """Passing the vectors allocates a little, independently of the number of updates."""
+    law = controller(quick(window=50, learning_start=0.01, sigma=-1.0))
+    measurement = np.array([*START, *np.zeros(4)])
+    vectors = (
+        law.settings.model,
+        law.sizes,
+        law.settings_vector,
+        REFERENCE,
+        law.state_vector,
+        law.signals_vector,
+    )
+    arguments = (*vectors, measurement, law.sample_vector, law.checks_vector)
+    many_updates(*arguments, 1)
+    allocations = []
+    _nrt_python.memsys_enable_stats()
+    try:
+        for count in (100, 5000):
+            before = rtsys.get_allocation_stats()
+            many_updates(*arguments, count)
+            after = rtsys.get_allocation_stats()
+            allocations.append((after.alloc - before.alloc, after.mi_alloc - before.mi_alloc))
+    finally:
+        _nrt_python.memsys_disable_stats()
+
+    assert law.state.latched[0] == 1.0
+    assert allocations[0] == allocations[1]
+
+
+INTERPRETED = """
+from closed_loop_case import controller, plant, quick, record
+settings = quick(window=100, learning_start=0.2, sigma=-1.0)
+print(*record(controller(settings), plant(), 0.4).torque[-1])
+"""
+
+
+def test_interpreted_kernels_compute_the_same_torque():
+    """Without numba's compiler only the last bits differ (its libm, its order of operations)."""
+    here = Path(__file__).parent
+    environment = os.environ | {
+        'NUMBA_DISABLE_JIT': '1',
+        'PYTHONPATH': os.pathsep.join([str(here), str(here.parent)]),
+    }
+    run = subprocess.run(
+        [sys.executable, '-c', INTERPRETED],
+        env=environment,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    law = controller(quick(window=100, learning_start=0.2, sigma=-1.0))
+    torque = record(law, plant(), 0.4).torque[-1]
+
+    assert law.state.latched[0] == 1.0
+    np.testing.assert_allclose(np.array(run.stdout.split(), dtype=float), torque, rtol=1e-9)
+
+
+def test_first_update_starts_the_filter_at_the_virtual_control():
+    """alpha2(0) = beta2(0) is set by the first sample, not by the constructor's warm-up."""
+    law = controller(recommended())
+    next(closed_loop(law, plant(), 1.0))
+    np.testing.assert_array_equal(law.signals.dalpha2, 0.0)
+    assert law.state.samples[0] == 1.0
+
+
+ROUNDING = 1e-10
+R = 9.8  # 1/s^2, g / l1
+UNEVEN = {
+    'feedback.gain': [40.0, 25.0],
+    'feedback.boundary_layer': 0.02,
+    'learning.adaptation_gain': [0.7, 1.3, 2.1],
+    'comparison.surface_gain': [60.0, 35.0],
+    'comparison.position_gain': [30.0, 11.0],
+    'comparison.robust_gain': [0.4, 0.2],
+    'comparison.leakage': 0.05,
+}
+
+
+class PlainComparison:
+    """(35) as printed, P^ by Euler steps; `slotine_li` is the same without w, mu_bar and W_c."""
+
+    def __init__(self, config, *, bare):
+        gains = config.comparison
+        self.Kp = np.array(config.feedback.gain)
+        self.layer = config.feedback.boundary_layer
+        self.Gamma = np.array(config.learning.adaptation_gain)
+        self.lambda_s = np.array(gains.surface_gain)
+        self.w = np.zeros(2) if bare else np.array(gains.position_gain)
+        self.mu_bar = np.zeros(2) if bare else np.array(gains.robust_gain)
+        self.Wc = 0.0 if bare else gains.leakage
+        self.P = np.array(config.learning.initial_estimate)
+
+    def update(self, dt, qr, dqr, ddqr, q, dq):
+        z1 = q - qr
+        alpha2 = dqr - self.lambda_s * z1
+        dalpha2 = ddqr - self.lambda_s * (dq - dqr)
+        z2 = dq - alpha2
+        parts = [dynamics(e, R, q, dq) for e in np.eye(3)]
+        H = np.column_stack([M @ dalpha2 + C @ alpha2 + G for M, C, G in parts])
+        sat = np.clip(z2 / self.layer, -1.0, 1.0)
+        torque = H @ self.P - self.Kp * z2 - self.w * z1 - self.mu_bar * sat
+        self.P = self.P - dt * self.Gamma * (H.T @ z2 + self.Wc * self.P)
+        return torque
+
+
+@pytest.mark.parametrize('law', ['backstepping', 'slotine_li'])
+def test_comparison_laws_follow_their_equations_in_a_closed_loop(law):
+    config = configured('recommended', 1.0, UNEVEN | {'law': law}).controller
+    controller, plain = controller_of(config), PlainComparison(config, bare=law == 'slotine_li')
+    arm = plant()
+    for k in range(1000):
+        t = k * 1e-3
+        measurement = arm.measure()
+        controller.update(t, 1e-3, measurement)
+        qr = np.array([1.9935, 1.3961]) + 0.3 * np.cos(t)
+        dqr, ddqr = np.full(2, -0.3 * np.sin(t)), np.full(2, -0.3 * np.cos(t))
+        torque = plain.update(1e-3, qr, dqr, ddqr, measurement[:2], measurement[2:4])
+        np.testing.assert_allclose(controller.signals.torque, torque, atol=ROUNDING)
+        np.testing.assert_allclose(controller.state.estimate[:3], plain.P, atol=ROUNDING)
+        arm.step(controller.signals.torque)
+    assert np.abs(controller.state.estimate[:3] - [0.5, 0.16, 0.2]).max() > 0.05  # it did adapt
+
+
+def test_comparison_laws_do_not_use_the_barrier_or_composite_learning():
+    """Gains of the proposed law do not affect them: the runs are the same bit for bit."""
+    changed = {
+        'barrier.weight': [5.0, 7.0],
+        'surface.gain': [3.0, 3.0],
+        'surface.time_constant': 0.5,
+        'feedback.damping': [9.0, 9.0],
+        'disturbance.gain': [7.0, 7.0],
+        'learning.weight': 3.0,
+    }
+    for law in ('backstepping', 'slotine_li'):
+        runs = [run(configured('recommended', 8.0, {'law': law} | more)) for more in ({}, changed)]
+        np.testing.assert_array_equal(runs[0].torque, runs[1].torque)
+        assert runs[0].latched[-1] == 1.0  # there was something to learn from
+
+
+def test_zero_weight_of_the_prediction_error_equals_no_learning_bit_for_bit():
+    """kappa = 0 against a threshold that is never reached, beyond the latch at 6.8 s.
+
+    Without change detection, which holds the estimate where a full window is not excited.
+    """
+    paper = {'learning.change_detection': False}
+    off = run(configured('recommended', 10.0, paper | {'learning.weight': 0.0}))
+    never = run(configured('recommended', 10.0, paper | {'learning.excitation_threshold': 1e9}))
+    learning = run(configured('recommended', 10.0))
+
+    assert (off.latched[-1], never.latched[-1]) == (1.0, 0.0)
+    np.testing.assert_array_equal(off.torque, never.torque)
+    np.testing.assert_array_equal(off.estimate[:, :3], never.estimate[:, :3])
+    assert np.abs(learning.estimate - off.estimate)[-1, :3].max() > 0.01
+
+
+FROZEN = {
+    'learning.initial_estimate': list(P),
+    'learning.adaptation_gain': [0.0, 0.0, 0.0],
+    'disturbance.gain': [0.0, 0.0],
+    'truth.feed_forward': True,
+}
+
+
+def test_proposed_law_with_everything_known_and_frozen_equals_model_based():
+    frozen = run(configured('recommended', 10.0, EXACT | FROZEN))
+    model_based = run(configured('recommended', 10.0, EXACT | {'law': 'model_based'}))
+    np.testing.assert_allclose(frozen.torque, model_based.torque, atol=1e-12)
+    np.testing.assert_allclose(frozen.xi1, model_based.xi1, atol=1e-15)
+
+
+def test_model_based_law_follows_equation_16_in_a_closed_loop():
+    """Against the plain transcription with P^ = P, d^3 = tau_dist, and nothing adapted."""
+    config = configured('recommended', 1.0, EXACT | {'law': 'model_based'}).controller
+    controller = controller_of(config)
+    plain = PlainLaw(controller.settings)
+    arm = plant()
+    for k in range(1000):
+        t = k * 1e-3
+        measurement = arm.measure()
+        controller.update(t, 1e-3, measurement)
+        plain.theta[:3], plain.d3 = P, np.full(2, 0.1 + 0.1 * np.sin(t))
+        signals = controller.signals
+        reference = signals.qr, signals.dqr, signals.ddqr
+        torque = plain.update(t, 1e-3, *reference, measurement)
+        np.testing.assert_allclose(signals.torque, torque, atol=ROUNDING)
+        plain.tau = signals.torque.copy()
+        arm.step(signals.torque)
+
+
+@pytest.mark.parametrize('law', LAWS)
+def test_every_law_keeps_its_torque_within_the_limit(law):
+    limits = {'torque.limit': [8.0, 3.0]}
+    torque = np.abs(run(configured('recommended', 1.0, EXACT | limits | {'law': law})).torque)
+    assert np.all(torque <= [8.0, 3.0])
+    assert torque[:, 0].max() == 8.0
+
+
+def error_floor(changes):
+    """Largest |xi1| [rad] from 1 s on of the model-based law, which knows the disturbance."""
+    loop = run(configured('model_based', 8.0, changes))
+    return np.abs(loop.xi1[loop.t >= 1.0]).max(axis=0)
+
+
+def test_error_of_the_oracle_stays_below_twenty_microradians():
+    assert error_floor({}).max() < 2e-5
+
+
+@pytest.mark.parametrize('time_constant', [0.002, 0.004, 0.008, 0.016])
+@pytest.mark.parametrize(
+    ('gain', 'mu', 'weight'),
+    [(150.0, 20.0, 1000.0), (60.0, 20.0, 1000.0), (60.0, 60.0, 1.0), (0.0, 40.0, 500.0)],
+)
+def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(time_constant, gain, mu, weight):
+    """alpha2 lags beta2 by lambda alpha2', which xi1 compensates.
+
+    It does so by (K/2 + mu) xi1 in beta2, and by w xi1 = -K_p xi2 in the torque.  The reference's
+    acceleration is 0.3 rad/s^2; the held torque adds half a sample to the lag.
+    """
+    changes = {
+        'surface.time_constant': time_constant,
+        'surface.gain': [gain, gain],
+        'surface.mu': [mu, mu],
+        'barrier.weight': [weight, weight],
+    }
+    rate = gain / 2.0 + mu + weight / np.array([60.0, 20.0])
+    expected = (time_constant + 0.5e-3) * 0.3 / rate
+    np.testing.assert_allclose(error_floor(changes), expected, rtol=0.05)
+
+
+def test_lyapunov_function_of_the_oracle_decreases_to_the_floor_of_the_lag():
+    """(17): V decreases in every sample until only the barrier's energy of the lag remains."""
+    loop = run(configured('model_based', 8.0))
+    V = loop.lyapunov.sum(axis=1)
+    lag = 1000.0 * np.sum(loop.xi1[loop.t >= 1.0] ** 2, axis=1).max()  # J, twice the energy
+    above = np.flatnonzero(10.0 * lag < V)
+    assert above[-1] > 50  # there is a decrease to check
+    assert np.all(np.diff(V[: above[-1] + 2]) < 0.0)
+    assert V[0] > 1e4 * V[loop.t >= 1.0].max()
+
+
+def test_parameter_error_without_disturbance():
+    """Without disturbance and with exact measurements, learning finds P."""
+    loop = run(configured('recommended', 20.0, {}, NO_DISTURBANCE))
+    assert loop.parameter_error[-1] < 1e-3
+
+
+def test_parameter_error_with_the_disturbance_unknown():
+    loop = run(configured('recommended', 60.0))
+    assert loop.parameter_error[-1] < 5e-4
+
+
+def settings(**given):
+    return settings_of_config(build(ControllerConfig, given))
+
+
+def test_learning_waits_for_the_window_and_the_filters_to_settle():
+    """tau_d + T_a of (26)."""
+    learning = {'learning.window': 0.75, 'learning.settling_time': 0.25}
+    assert settings(**learning).learning_start == 1.0
+    assert settings(**learning).window == 750
+
+
+def test_parameters_and_columns_have_separate_gains():
+    config = {'learning.adaptation_gain': [1.0, 2.0, 3.0], 'learning.column_gain': 5.0}
+    columns = len(column_names(build(ControllerConfig, config)))
+    assert columns > 0
+    assert settings(**config).Gamma.tolist() == [1.0, 2.0, 3.0, *[5.0] * columns]
