@@ -246,8 +246,8 @@ def test_friction_that_the_drive_compensates_is_not_fed_forward_a_second_time():
     assert errors['rest'][0] < 0.8 * errors['twice'][0]  # 0.29, 0.39
     assert errors['rest'][0] < 0.5 * errors['all'][0]  # 0.29, 0.66
     assert errors['rest'][1] < errors['all'][1]
-    left = 0.2 * np.array([6.0, 6.0, 6.0, 1.1, 1.1, 1.1])
-    assert np.all(np.abs(learned['rest'][:3] - left[:3]) < 1.2)
+    left = 0.2 * 6.0  # in motion; at a reversal Stribeck's friction adds up to half of 6 N m
+    assert np.all((learned['rest'][:3] > left) & (learned['rest'][:3] < left + 3.0))
 
 
 @pytest.mark.parametrize(

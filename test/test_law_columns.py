@@ -69,7 +69,7 @@ def test_friction_columns_recover_friction():
         'learning.coulomb_velocity': 0.05,
         'learning.excitation_threshold': 1e-4,
     }
-    estimate, active = learned('recommended', 9.0, learning, arm)
+    estimate, active = learned('recommended', 20.0, learning, arm)
     assert all(active.values())
     for name, true in (('viscous', (0.5, 0.2)), ('coulomb', (0.3, 0.1)), ('bias', (0.0, 0.0))):
         for joint, value in zip(('joint1', 'joint2'), true, strict=True):

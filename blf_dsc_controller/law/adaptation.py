@@ -20,7 +20,7 @@ and d^3 is left to estimate the disturbance alone.
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.views import part
-from blf_dsc_controller.law import projection, saturation
+from blf_dsc_controller.law import friction, projection, saturation
 from blf_dsc_controller.law.settings import NEWTON, Settings
 from blf_dsc_controller.law.state import Signals, State
 
@@ -38,6 +38,7 @@ def prediction_error(settings: Settings, state: State, signals: Signals) -> None
             signals.rate[i] -= state.Phi[i, j] * state.estimate[j]
     if settings.update == NEWTON:
         cholesky.solve(state.factor, signals.rate)
+    friction.follow_flips(settings, state, signals)
 
 
 @inner

@@ -65,22 +65,6 @@ def fill_columns(settings: Settings, t: float, dq: np.ndarray, rest: np.ndarray)
 
 
 @inner
-def fill_compensation(settings: Settings, signals: Signals) -> None:
-    """Fill columns p.. of `signals.H` with friction at the reference velocity.
-
-    The measured velocity would feed its noise, and chatter at rest, into the torque.
-    """
-    n = settings.n
-    at = settings.p + n * settings.bias
-    for i in range(n):
-        if settings.viscous == 1:
-            signals.H[i, at + i] = signals.dqr[i]
-        if settings.coulomb == 1:
-            column = at + n * settings.viscous + i
-            signals.H[i, column] = tanh(signals.dqr[i] / settings.coulomb_velocity)
-
-
-@inner
 def filter_row(
     settings: Settings, state: State, signals: Signals, dt: float, torque: np.ndarray
 ) -> None:

@@ -58,6 +58,10 @@ class State(NamedTuple):
     rotor_sums: Annotated[Array, 2, 'n']  # of z (tau - M_0 a) and z a
     rotor_error: Annotated[Array, 'n']  # J~ <= 0 of the assumed rotor inertias, kg m^2
     gain_scale: Annotated[Array, 'n']  # measured inertia of each joint over the assumed
+    since_latch: Cell  # s
+    column_lags: Annotated[Array, 2, 'n']  # of c_h in `friction`
+    torque_lags: Annotated[Array, 2, 'n']  # of e_h, N m
+    flip_sums: Annotated[Array, 2, 'n']  # p int c_h e_h dt, N m, and p int c_h^2 dt
     ring: Annotated[Array, 'window', 'n', 'm + 1']  # the window's rows
 
 

@@ -19,6 +19,7 @@ from blf_dsc_controller.law import (
     consistency,
     drive,
     excitation,
+    friction,
     prediction,
     saturation,
     surface,
@@ -81,6 +82,7 @@ def update_window(
         )
         state.cursor[0] = cursor
         state.rows[0] = min(state.rows[0] + 1.0, float(settings.window))
+        friction.measure_flips(settings, state, settings.row_interval * dt)
     if settings.change_detection == 1:
         consistency.detect_change(settings, state, signals, t, dt)
     if int(state.samples[0]) % settings.interval == 0:
@@ -134,7 +136,7 @@ def step(
     barrier.update_bound(settings, signals, t)
     surface.compute_errors(settings, state, signals, dt, q, dq)
     compute_regressors(settings, state, signals, q, dq)
-    prediction.fill_compensation(settings, signals)
+    friction.fill_compensation(settings, signals)
     update_window(settings, state, signals, t, dt, q, dq, signals.applied)
     if settings.rotors_unsure == 1:
         apparent_inertia.measure(settings, state, signals, dt, q, dq)
