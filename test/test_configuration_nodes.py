@@ -143,6 +143,14 @@ def test_joint_names_are_unique_and_the_arm_has_two(cls):
             {'barrier.weight': [1000.0, 2e4]},
             'barrier.slope_limit: got 20000 N m/rad for joint2, but it must be above barrier.w',
         ),
+        (
+            {'barrier.initial_bound': [0.003, 0.001], 'barrier.funnel_rate': 1.0},
+            'barrier.initial_bound: got 0.001 rad for joint2, but it must be 0 (no funnel) or at',
+        ),
+        (
+            {'truth.parameters': [1.0, 0.32]},
+            'truth.parameters: got 2 entries, but model two_link has 3 parameters',
+        ),
         ({'barier.bound': [1.0, 1.0]}, 'barier.bound: unknown parameter, did you '),
     ],
 )

@@ -157,6 +157,8 @@ def test_limits_hold_for_the_command_and_for_the_whole_torque(demand, command, c
     last = {RATE_CUT: 5.0}.get(cuts, command)
     got = cut(demand, last, rate=1000.0 if cuts != RATE_CUT else 500.0, added=4.0)
     assert got[:2] == (command, cuts)
+    mirrored = cut(-demand, -last, rate=1000.0 if cuts != RATE_CUT else 500.0, added=-4.0)
+    assert mirrored[:2] == (-command, cuts)
 
 
 def test_any_change_is_allowed_without_a_rate_limit():
