@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Any mistake on the command line gives one line on stderr."""
+"""Mistakes at the command line and in files: one line that says what to do, and nothing lost."""
 
 from __future__ import annotations
 
+import json
+import subprocess
 import sys
 
 import numpy as np
 import pytest
 import synthetic_bag
-from command import finished
+from command import closed_loop, finished
 from synthetic_bag import Synthetic
 
 from blf_dsc_controller.cli.main import main
@@ -91,3 +93,157 @@ def test_interrupt_during_kernel_compilation_ends_the_command():
     run = finished(sys.executable, '-c', INTERRUPTED_WHILE_COMPILING)
     assert (run.returncode, run.stdout) == (130, '')
     assert run.stderr == 'blf_dsc plot: interrupted\n'
+
+
+pytestmark = pytest.mark.usefixtures('blank_pictures')
+WITHOUT_ROS = """
+import sys
+from importlib.machinery import PathFinder
+
+class Hidden:
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        return None if name.split('.')[0] == 'rclpy' else PathFinder.find_spec(name, path, target)
+
+sys.meta_path[:] = [Hidden if finder is PathFinder else finder for finder in sys.meta_path]
+from blf_dsc_controller.cli import main
+command = sys.argv.pop(1)
+sys.exit(getattr(main, command)())
+"""
+PLANT_NODE = (sys.executable, '-m', 'blf_dsc_controller.nodes.plant_node', '--ros-args')
+
+
+def here(capsys, *arguments):
+    """Run `blf_dsc run` in this process."""
+    code = main(['run', *map(str, arguments)])
+    return subprocess.CompletedProcess(arguments, code, *capsys.readouterr())
+
+
+def write_params(folder, plant='', controller=''):
+    """Write a parameter file with these lines for the nodes."""
+    path = folder / 'given.yaml'
+    path.write_text(
+        f'sim_plant:\n  ros__parameters: {{seed: 0, {plant}}}\n'
+        f'blf_dsc_controller:\n  ros__parameters: {{law: blf_dsc, {controller}}}\n'
+    )
+    return path
+
+
+@pytest.mark.parametrize(
+    ('plant', 'controller', 'expected'),
+    [
+        ('', 'barier.bound: [0.1, 0.1]', 'barier.bound: unknown parameter'),
+        ('', 'barrier.bound: [0.1]', 'barrier.bound: got 1 entry, but 2 are needed'),
+        ('', 'feedback.gain: [-6.0, 2.0]', 'feedback.gain: got -6.0 at entry 1'),
+        ('', 'barrier.bound: [0.0, 0.1]', 'barrier.bound: got 0.0 at entry 1'),
+        ('', 'joints: [joint1, wrist]', 'joints: sim_plant has joint1, joint2'),
+        (
+            'initial.position: [2.293, 0.1696]',
+            'approach.enabled: false',
+            "joint 'joint2' starts -1.5265 rad",
+        ),
+    ],
+)
+def test_invalid_configuration_is_rejected_before_anything_starts(
+    tmp_path, capsys, plant, controller, expected
+):
+    out = tmp_path / 'out'
+    run = here(capsys, '--config', write_params(tmp_path, plant, controller), '--out', out)
+    assert run.returncode == 1
+    assert run.stderr.startswith('blf_dsc run: ')
+    assert expected in run.stderr
+    assert run.stdout == ''
+    assert not out.exists()
+
+
+def test_results_are_never_overwritten(tmp_path, capsys):
+    kept = tmp_path / 'out' / 'kept.txt'
+    kept.parent.mkdir()
+    kept.write_text('mine')
+    run = here(capsys, '--offline', '--duration', 0.1, '--out', kept.parent)
+    assert run.returncode == 1
+    assert f'{kept.parent} exists already and is not overwritten' in run.stderr
+    assert [path.name for path in kept.parent.iterdir()] == ['kept.txt']
+
+
+def test_runs_without_out_option_get_separate_folders(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for folder in ('closed_loop', 'closed_loop-2'):
+        run = here(capsys, '--offline', '--duration', 0.1)
+        assert run.returncode == 0, run.stderr
+        assert f'wrote       {folder}:' in run.stdout
+        assert (tmp_path / folder / 'summary.json').is_file()
+
+
+def test_missing_file_error_lists_the_presets(tmp_path, capsys):
+    run = here(capsys, '--config', tmp_path / 'absent.yaml')
+    assert run.returncode == 1
+    assert f'{tmp_path / "absent.yaml"} does not exist' in run.stderr
+    assert 'recommended' in run.stderr
+
+
+@pytest.mark.parametrize(
+    'command', [('main', 'run'), ('sim_plant',), ('blf_dsc_controller',), ('bag_recorder',)]
+)
+def test_without_ros_the_error_tells_how_to_source_it(tmp_path, command):
+    out = tmp_path / 'out'
+    run = finished(sys.executable, '-c', WITHOUT_ROS, *command, '--out', out)
+    assert run.returncode == 1, run.stderr
+    assert 'ROS 2 cannot be imported' in run.stderr
+    assert 'source /opt/ros/jazzy/setup.bash' in run.stderr
+    assert 'Traceback' not in run.stderr
+    assert not out.exists()
+
+
+def test_offline_run_needs_no_ros(tmp_path):
+    out = tmp_path / 'out'
+    offline = ('main', 'run', '--offline', '--duration', 0.1, '--out', out)
+    run = finished(sys.executable, '-c', WITHOUT_ROS, *offline)
+    assert run.returncode == 0, run.stderr
+    assert (out / 'bag' / 'metadata.yaml').is_file()
+
+
+def test_exit_code_shows_that_the_controller_stopped(tmp_path, capsys):
+    path = write_params(tmp_path, controller='safety.velocity_limit: 0.0001')
+    out = tmp_path / 'out'
+    run = here(capsys, '--config', path, '--offline', '--duration', 0.1, '--out', out)
+    assert run.returncode == 5, run.stderr
+    assert 'bound       held by every joint until the stop' in run.stdout
+    assert 'stopped     at 0.001 s, velocity not plausible' in run.stdout
+    (stop,) = json.loads((out / 'summary.json').read_text())['tracking']['stops']
+    assert stop['reason'] == 'velocity not plausible'
+
+
+@pytest.mark.parametrize(
+    ('content', 'expected'),
+    [
+        ('sim_plant:\n  ros__parameters:\n    seed: [1,\n', 'params'),
+        ('sim_plant:\n  ros__parameters:\n    sede: 1\n', 'sede: unknown parameter'),
+    ],
+    ids=['no YAML', 'unknown name'],
+)
+def test_node_reports_what_is_wrong_with_its_parameter_file(tmp_path, content, expected):
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    path = tmp_path / 'given.yaml'
+    path.write_text(content)
+    run = finished(*PLANT_NODE, '--params-file', path)
+    assert run.returncode == 1
+    assert expected in run.stderr
+    assert 'Traceback' not in run.stderr
+
+
+def test_node_reports_unknown_ros_argument():
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    run = finished(*PLANT_NODE, '--param', 'seed:=1', '--sede')
+    assert run.returncode == 1
+    assert '--sede' in run.stderr
+    assert 'Traceback' not in run.stderr
+
+
+def test_help_lists_the_options():
+    run = closed_loop('--help')
+    assert run.returncode == 0
+    assert 'usage: blf_dsc run' in run.stdout
+    assert 'Example:\n  blf_dsc run --config' in run.stdout
+    for option in ('--config', '--duration', '--mode', '--seed', '--offline', '--out'):
+        assert option in run.stdout

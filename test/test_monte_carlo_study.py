@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Studies are read from a file, with clear errors; each run is drawn independently."""
+"""Studies: what is drawn, what is saved, and pairs with and without learning."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from monte_carlo_case import LOOP, STUDY, study, write
 from scipy import stats
 
 from blf_dsc_controller.configuration.nodes import locate
-from blf_dsc_controller.configuration.schema import Kind
+from blf_dsc_controller.configuration.schema import Kind, change
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.studies.monte_carlo import (
@@ -23,6 +25,8 @@ from blf_dsc_controller.studies.monte_carlo import (
     plant_of_draw,
     write_study,
 )
+from blf_dsc_controller.studies.runs import run_chunk
+from blf_dsc_controller.studies.statistics import compare
 
 FRACTIONS = st.floats(0.0, 1.0, exclude_max=True)
 
@@ -254,3 +258,30 @@ def test_start_is_as_configured_if_it_does_not_vary(tmp_path):
 
 def test_overrides_take_precedence_over_the_file(tmp_path):
     assert load_study(write(tmp_path), {'runs': 3}).settings.runs == 3
+
+
+FIRST = {'monte_carlo_events': 16, 'monte_carlo_panda': 6, 'monte_carlo_ur5e': 6}
+
+
+def pairs(name, **law):
+    """Return the comparison of the first runs of a study, with changes to the law."""
+    study = load_study(locate(name))
+    given = {f'learning.{parameter}': value for parameter, value in law.items()}
+    study = replace(study, controller=change(study.controller, given))
+    return compare(study, run_chunk(study, 0, FIRST[name]))
+
+
+@pytest.mark.parametrize('name', FIRST)
+def test_learning_breaks_no_bound_and_finds_the_model(name):
+    found = pairs(name)
+    assert found['kept']['without'] >= FIRST[name] // 3
+    assert found['broken_only_with'] == []
+    assert found['above'] == []
+    torque = found['median']['torque_error']
+    assert torque['with'] < torque['without']
+
+
+@pytest.mark.parametrize('name', FIRST)
+def test_papers_form_breaks_bounds_that_are_kept_without_learning(name):
+    with np.errstate(all='ignore'):  # some of these runs diverge
+        assert pairs(name, compensation='state')['broken_only_with'] != []
