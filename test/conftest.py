@@ -42,7 +42,6 @@ _FIRST = (
     'test_replay',
     'test_managed',
     'test_nodes',
-    'test_soak',
     'test_paper',
 )
 

@@ -64,7 +64,9 @@ def test_gains_follow_the_sample_time():
 
 
 @pytest.mark.parametrize(('preset', 'n'), ARMS)
-@pytest.mark.parametrize('sample_time', [0.001, 0.002, 0.004])
+@pytest.mark.parametrize(
+    'sample_time', [0.001, *(pytest.param(T, marks=pytest.mark.nightly) for T in (0.002, 0.004))]
+)
 def test_expected_peak_at_a_pick_up_is_that_of_the_simulated_arm(preset, n, sample_time):
     """The largest of ten moments of the simulated motion; the bound is far away."""
     largest = 0.0

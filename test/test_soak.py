@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 
+@pytest.mark.nightly
 def test_loop_survives_a_short_soak():
     """The script checks by itself: the bound outside of faults, memory and handles."""
     script = Path(__file__).with_name('soak.py')
