@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -83,9 +84,10 @@ print(float(H[0, 0, 0]), *(sum(batch._fill_regressors.stats[k].values()) for k i
 """
 
 
-def compiled_in(checkout, cache):
+def compiled_in(checkout, cache, **target):
     """Return an entry of a regressor, and how often its kernel was found and was compiled."""
     environment = {**os.environ, 'PYTHONPATH': str(checkout), 'NUMBA_CACHE_DIR': str(cache)}
+    environment |= target
     run = finished(sys.executable, '-c', COMPILE, cwd=checkout, env=environment)
     entry, found, compiled = map(float, run.stdout.split())
     return entry, found, compiled
@@ -106,6 +108,17 @@ def test_second_checkout_finds_the_kernels_of_the_first_and_never_those_of_other
     called.write_text(called.read_text().replace('H[0, 0] = a[0] +', 'H[0, 0] = 1.0 + a[0] +'))
     assert compiled_in(second, cache) == (pytest.approx(entry + 1.0), 0, 1)
     assert compiled_in(first, cache) == (entry, 1, 0)
+
+
+@pytest.mark.skipif(platform.machine() != 'x86_64', reason='names processors of this kind')
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
+def test_code_for_a_named_processor_is_found_again_and_not_loaded_elsewhere(tmp_path):
+    """As an image does that is compiled once for many computers."""
+    checkout, named = PACKAGE.parent, {'NUMBA_CPU_NAME': 'x86-64', 'NUMBA_CPU_FEATURES': ''}
+    entry, *counts = compiled_in(checkout, tmp_path, **named)
+    assert counts == [0, 1]
+    assert compiled_in(checkout, tmp_path, **named) == (entry, 1, 0)
+    assert compiled_in(checkout, tmp_path) == (entry, 0, 1)
 
 
 @pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')

@@ -9,6 +9,7 @@ from arbitrary_case import arbitrary
 from closed_loop_case import closed_loop, controller, plant, quick, recommended, record
 from plain_law import PlainLaw
 
+from blf_dsc_controller.law import drive
 from blf_dsc_controller.law.saturation import LEVEL_CUT, RATE_CUT, saturate
 from blf_dsc_controller.law.settings import COMPENSATIONS, EFFORT, UPDATES
 
@@ -159,6 +160,20 @@ def test_limits_hold_for_the_command_and_for_the_whole_torque(demand, command, c
     assert got[:2] == (command, cuts)
     mirrored = cut(-demand, -last, rate=1000.0 if cuts != RATE_CUT else 500.0, added=-4.0)
     assert mirrored[:2] == (-command, cuts)
+
+
+@pytest.mark.parametrize('source', ['command', 'effort without the drive', 'whole effort'])
+def test_applied_torque_has_the_mean_of_what_the_drive_adds_at_both_ends(source):
+    changes = {'torque_source': EFFORT * (source != 'command'), 'drive': 0}
+    case = arbitrary(3, effort_is_whole=int(source == 'whole effort'), **changes)
+    settings, state, signals = case
+    measurement = np.arange(9.0)
+    base = state.torque.copy() if source == 'command' else measurement[6:]
+    added = 0.0 if source == 'whole effort' else 0.5 * (state.added + signals.added)
+    expected = base + added
+    drive.find_applied(settings, state, signals, measurement)
+    np.testing.assert_array_equal(signals.applied, expected)
+    np.testing.assert_array_equal(state.added, signals.added)
 
 
 def test_any_change_is_allowed_without_a_rate_limit():
