@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 Rows = slice | NDArray[np.intp]
+_ALL = slice(None)
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,16 @@ class Run:
     reference_velocity: Floats | None = None  #: (N, n) rad/s
     xi2: Floats | None = None  #: (N, n) rad/s
     notes: tuple[str, ...] = ()  #: samples of a bag that are left out, and why
+
+    def at(self, name: str, rows: Rows = _ALL, columns: Rows = _ALL) -> Floats | None:
+        """Return some rows and joints of an array by name; None if it is unknown."""
+        values: Floats | None = getattr(self, name)
+        return None if values is None else values[rows][:, columns]
+
+    def column(self, name: str, i: int) -> Floats | None:
+        """Return the values of one joint (N,) in an array by name; None if it is unknown."""
+        found = self.at(name, _ALL, np.array([i]))
+        return None if found is None else found[:, 0]
 
     @property
     def time(self) -> Floats:

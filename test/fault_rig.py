@@ -13,12 +13,12 @@ import numpy as np
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayDecoder,
     Float64MultiArrayEncoder,
     JointStateDecoder,
     JointStateEncoder,
+    MessageError,
 )
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.command_input import TorqueInput

@@ -105,9 +105,9 @@ def size(bag):
 def recovered(bag, out):
     """Numbers of the recovered messages by topic; both independent readers agree on them."""
     recovery = recover(bag, out)
-    missed = {topic: losses.missed for topic, losses in recovery.missing.items()}
-    assert missed == {f'/{topic}': 0 for topic in TOPICS}
-    assert all('(cut off)' in loss for loss in recovery.losses)
+    *cut, last = recovery.losses
+    assert 'the recording was not closed' in last
+    assert all('(cut off)' in loss for loss in cut)
     (file,) = out.glob('*.mcap')
     found = read(out)
     with file.open('rb') as stream:

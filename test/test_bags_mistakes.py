@@ -125,7 +125,7 @@ def test_missing_definition_of_another_topic_loses_no_other_message(
         found = {c.topic: c.msgcount for c in reader.connections}
     assert found['/joint_states'] == 301
     if schema is None:  # not even the type's name is known
-        assert 'LOST 1 messages of topics whose name or type is unknown' in output
+        assert 'LOST bag_0.mcap: 1 messages of topics whose name or type is unknown' in output
     else:
         assert found['/odd'] == 1
 
@@ -144,7 +144,9 @@ def test_topics_of_unknown_type(entries, tmp_path, all_say, capsys):
     file = write_mcap(tmp_path / 'bag', entries, lambda _: None)
     all_say(file, '/joint_states (of unknown type)')
     assert main(['recover', str(file), '--out', str(tmp_path / 'clean')]) == 1
-    assert f'LOST {len(entries)} messages of topics whose' in capsys.readouterr().out
+    output = capsys.readouterr().out
+    lost = [int(line.split()[2]) for line in output.splitlines() if 'name or type' in line]
+    assert sum(lost) == len(entries)
 
 
 def test_empty_bag(rewritten, all_say, tmp_path, capsys):
@@ -158,7 +160,7 @@ def test_metadata_that_lists_missing_messages(copy, entries, all_say, tmp_path):
     others = [entry for entry in entries if entry[0] != JOINT_STATES.resolved]
     other = recorded_run.write(tmp_path / 'bag', others)
     shutil.copy(other / 'bag_0.mcap', copy)
-    all_say(copy, 'counts 301 messages of /joint_states, its files 0')
+    all_say(copy, 'it holds 0 messages of /joint_states, but counts 301')
 
 
 def test_bag_folder_without_its_mcap_file(copy, all_say, tmp_path, capsys):
@@ -200,9 +202,9 @@ def test_joint_states_without_joint_names(readers, tmp_path, capsys):
 @pytest.mark.parametrize(
     ('original', 'replacement', 'words'),
     [
-        ('version: 9', 'version: 99', 'its rosbag2 version is 99, but only versions up to 9 are'),
-        ('identifier: mcap', 'identifier: tape', "its storage is 'tape', but only mcap and sqlit"),
-        ('rosbag2_bagfile_information', 'other', 'its metadata.yaml does not describe a bag'),
+        ('version: 9', 'version: 99', 'Rosbag2 version 99 not supported'),
+        ('identifier: mcap', 'identifier: tape', "Storage plugin 'tape' not supported"),
+        ('rosbag2_bagfile_information', 'other', 'metadata key is missing'),
     ],
 )
 def test_bag_of_another_format(copy, all_say, original, replacement, words, tmp_path, capsys):

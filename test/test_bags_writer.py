@@ -1,26 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags are what rosbag2 would have written, and third-party software reads them."""
+"""Bags are what rosbag2 would have written, also at their limits: full disks, splits, kills."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import subprocess
 import sys
+import tracemalloc
 
 import pytest
 import yaml
-from foreign_readers import messages_on_disk
+from foreign_readers import messages_on_disk, read
 from mcap.reader import make_reader
+from small_disk import small_disk
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.bags.recover import recover
+from blf_dsc_controller.bags.sources import BagError, open_bag
+from blf_dsc_controller.bags.writer import BagWriter, DiskFullError, Losses
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
-from blf_dsc_controller.messages.topics import BOUND, COMMANDS, JOINT_STATES, Quality
+from blf_dsc_controller.messages.topics import BOUND, COMMANDS, JOINT_STATES, STREAM, Quality
 from blf_dsc_controller.messages.types import Definition, UnknownTypeError
 
 START = 1_734_000_000_000_000_000
 MILLISECOND = 1_000_000
+STATES = JointStateEncoder(['joint1', 'elbow'])
+TORQUES = Float64MultiArrayEncoder(2)
+HASHES = {  # as `ros2 topic info --verbose` shows them on Jazzy
+    JOINT_STATES: 'RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e',
+    COMMANDS: 'RIHS01_1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f',
+}
 
 # Reads a bag with public libraries only and prints its contents.
 READER = """
@@ -36,6 +46,7 @@ found = {'mcap': [], 'rosbags': [], 'texts': {}, 'hashes': {}, 'decoded': []}
 with next(folder.glob('*.mcap')).open('rb') as stream:
     reader = make_reader(stream)
     found['profile'] = reader.get_header().profile
+    found['schemas'] = len(reader.get_summary().schemas)
     for schema, channel, message in reader.iter_messages(log_time_order=False):
         found['mcap'].append([channel.topic, message.log_time, message.publish_time])
         found['texts'][schema.name] = schema.data.decode()
@@ -59,16 +70,24 @@ print(json.dumps(found))
 """
 
 
+def message(k):
+    return STATES.encode(k, [k, 0], [0, 0], [0, 0])
+
+
 def write_messages(path, count=50, **options):
-    states = JointStateEncoder(['joint1', 'elbow'])
-    torques = Float64MultiArrayEncoder(2)
     with BagWriter(path, **options) as bag:
         first = bag.add_topic(JOINT_STATES.resolved, JOINT_STATES.type, [Quality(depth=100)])
         second = bag.add_topic(COMMANDS.resolved, COMMANDS.type, [Quality(depth=100)])
         for k in range(count):
             stamp = START + k * MILLISECOND
-            bag.write(first, states.encode(stamp, [k, -k], [0, 1], [2, 3]), stamp, stamp - 5)
-            bag.write(second, torques.encode([k, k]), stamp + 1)
+            bag.write(first, STATES.encode(stamp, [k, -k], [0, 1], [2, 3]), stamp, stamp - 5)
+            bag.write(second, TORQUES.encode([k, k]), stamp + 1)
+    return sum(file.stat().st_size for file in path.iterdir())
+
+
+def write_endlessly(bag, handle, times):
+    for k in itertools.count():
+        bag.write(handle, message(k) * times, k)
 
 
 def read_with_public_libraries(path):
@@ -79,44 +98,32 @@ def read_with_public_libraries(path):
     return json.loads(run.stdout)
 
 
-@pytest.mark.parametrize('compression', ['none', 'zstd'])
-def test_other_libraries_read_the_whole_bag(tmp_path, compression):
-    write_messages(tmp_path / 'bag', count=300, compression=compression)
-    found = read_with_public_libraries(tmp_path / 'bag')
-
+def test_other_libraries_read_the_whole_bag(tmp_path):
     stamps = [START + k * MILLISECOND for k in range(300)]
     in_order = [
         entry
         for stamp in stamps
         for entry in (['/joint_states', stamp, stamp - 5], [COMMANDS.resolved, *[stamp + 1] * 2])
     ]
-    assert found['mcap'] == in_order
-    assert found['rosbags'] == [entry[:2] for entry in in_order]
-    assert found['decoded'] == [[stamp, 'joint1', 'elbow', k, -k] for k, stamp in enumerate(stamps)]
-    assert found['counts'] == {'/joint_states': 300, COMMANDS.resolved: 300}
-    assert found['types'] == {
-        '/joint_states': 'sensor_msgs/msg/JointState',
-        COMMANDS.resolved: 'std_msgs/msg/Float64MultiArray',
-    }
-    assert found['profile'] == 'ros2'
-    assert found['encodings'] == ['ros2msg', 'cdr']
-
-
-def test_compression_makes_the_bag_smaller(tmp_path):
-    sizes = {}
+    plain, packed = (
+        write_messages(tmp_path / compression, 300, compression=compression)
+        for compression in ('none', 'zstd')
+    )
+    assert packed < plain / 2  # both topics repeat their names and counts in each message
     for compression in ('none', 'zstd'):
-        write_messages(tmp_path / compression, count=300, compression=compression)
-        sizes[compression] = (tmp_path / compression / f'{compression}_0.mcap').stat().st_size
-    # Half: both topics repeat their names and counts in each message.
-    assert sizes['zstd'] < sizes['none'] / 2
+        found = read_with_public_libraries(tmp_path / compression)
+        assert found['mcap'] == in_order
+        assert found['rosbags'] == [entry[:2] for entry in in_order]
+        assert found['decoded'] == [
+            [stamp, 'joint1', 'elbow', k, -k] for k, stamp in enumerate(stamps)
+        ]
+        assert found['counts'] == {'/joint_states': 300, COMMANDS.resolved: 300}
+        assert found['types'] == {t.resolved: t.type for t in (JOINT_STATES, COMMANDS)}
+        assert (found['profile'], found['encodings']) == ('ros2', ['ros2msg', 'cdr'])
 
 
 def test_metadata_matches_rosbag2(tmp_path):
-    write_messages(tmp_path / 'run', count=3)
-    with BagWriter(tmp_path / 'other') as bag:
-        bag.add_topic(
-            BOUND.resolved, BOUND.type, [BOUND.offered, Quality(depth=0, history='unknown')]
-        )
+    write_messages(tmp_path / 'run', 3)
     tree = yaml.safe_load((tmp_path / 'run' / 'metadata.yaml').read_text())
     forever = {'sec': 9223372036, 'nsec': 854775807}
     quality = {
@@ -130,11 +137,15 @@ def test_metadata_matches_rosbag2(tmp_path):
         'liveliness_lease_duration': forever,
         'avoid_ros_namespace_conventions': False,
     }
+    period = {
+        'starting_time': {'nanoseconds_since_epoch': START},
+        'duration': {'nanoseconds': 2 * MILLISECOND + 1},
+    }
     information = {
         'version': 9,
         'storage_identifier': 'mcap',
-        'duration': {'nanoseconds': 2 * MILLISECOND + 1},
-        'starting_time': {'nanoseconds_since_epoch': START},
+        'duration': period['duration'],
+        'starting_time': period['starting_time'],
         'message_count': 6,
         'topics_with_message_count': [
             {
@@ -147,35 +158,17 @@ def test_metadata_matches_rosbag2(tmp_path):
                 },
                 'message_count': 3,
             }
-            for topic, hash_ in (
-                # As `ros2 topic info --verbose` shows them on Jazzy.
-                (
-                    JOINT_STATES,
-                    'RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e',
-                ),
-                (
-                    COMMANDS,
-                    'RIHS01_1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f',
-                ),
-            )
+            for topic, hash_ in HASHES.items()
         ],
         'compression_format': '',
         'compression_mode': '',
         'relative_file_paths': ['run_0.mcap'],
-        'files': [
-            {
-                'path': 'run_0.mcap',
-                'starting_time': {'nanoseconds_since_epoch': START},
-                'duration': {'nanoseconds': 2 * MILLISECOND + 1},
-                'message_count': 6,
-            }
-        ],
+        'files': [{'path': 'run_0.mcap', **period, 'message_count': 6}],
         'custom_data': {'package_version': __version__},
         'ros_distro': 'jazzy',
     }
     assert tree == {'rosbag2_bagfile_information': information}
     assert list(tree['rosbag2_bagfile_information']) == list(information)  # in rosbag2's order
-
     with (tmp_path / 'run' / 'run_0.mcap').open('rb') as stream:
         reader = make_reader(stream)
         record = list(reader.iter_metadata())[-1]
@@ -185,51 +178,50 @@ def test_metadata_matches_rosbag2(tmp_path):
     for channel in channels:
         assert yaml.safe_load(channel.metadata['offered_qos_profiles']) == [quality]
 
-    tree = yaml.safe_load((tmp_path / 'other' / 'metadata.yaml').read_text())
-    (topic,) = tree['rosbag2_bagfile_information']['topics_with_message_count']
-    offered = topic['topic_metadata']['offered_qos_profiles']
-    assert [profile['durability'] for profile in offered] == ['transient_local', 'volatile']
-    assert [profile['history'] for profile in offered] == ['keep_last', 'unknown']
-    assert topic['message_count'] == 0
 
-
-def test_existing_folder_is_rejected_and_left_alone(tmp_path):
-    (tmp_path / 'bag').mkdir()
-    (tmp_path / 'bag' / 'precious').write_text('kept')
-    with pytest.raises(BagError, match=r'bag exists already.*choose another folder'):
-        BagWriter(tmp_path / 'bag')
-    assert [entry.name for entry in (tmp_path / 'bag').iterdir()] == ['precious']
-
-
-def test_unknown_type_is_reported_and_recording_continues(tmp_path):
+def test_topics_are_described_as_offered(tmp_path):
+    """A topic of two publishers, types that are unknown or given, two of the same type."""
     with BagWriter(tmp_path / 'bag') as bag:
+        unknown = Quality(depth=0, history='unknown')
+        bag.add_topic(BOUND.resolved, BOUND.type, [BOUND.offered, unknown])
         with pytest.raises(UnknownTypeError, match='nowhere_msgs/msg/Nothing'):
             bag.add_topic('/nothing', 'nowhere_msgs/msg/Nothing', [])
-        known = bag.add_topic('/command', COMMANDS.type, [COMMANDS.offered])
-        bag.write(known, Float64MultiArrayEncoder(1).encode([1]), START)
-    assert read_with_public_libraries(tmp_path / 'bag')['counts'] == {'/command': 1}
-
-
-def test_given_definition_and_hash_are_stored(tmp_path):
-    with BagWriter(tmp_path / 'bag') as bag:
-        handle = bag.add_topic('/x', 'my_msgs/msg/X', [], Definition('int32 a\n', 'RIHS01_5'))
-        bag.write(handle, b'\0\1\0\0\7\0\0\0', START)
+        given = bag.add_topic('/x', 'my_msgs/msg/X', [], Definition('int32 a\n', 'RIHS01_5'))
+        bag.write(given, b'\0\1\0\0\7\0\0\0', START)
+        bag.write(bag.add_topic('/a', JOINT_STATES.type, []), message(0), START)
+    tree = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
+    topic, *_ = tree['rosbag2_bagfile_information']['topics_with_message_count']
+    offered = topic['topic_metadata']['offered_qos_profiles']
+    assert [(one['durability'], one['history']) for one in offered] == [
+        ('transient_local', 'keep_last'), ('volatile', 'unknown')
+    ]  # fmt: skip
     found = read_with_public_libraries(tmp_path / 'bag')
-    assert found['texts'] == {'my_msgs/msg/X': 'int32 a\n'}
-    assert found['hashes'] == {'/x': 'RIHS01_5'}
+    assert found['counts'] == {BOUND.resolved: 0, '/x': 1, '/a': 1}
+    assert (found['texts']['my_msgs/msg/X'], found['hashes']['/x']) == ('int32 a\n', 'RIHS01_5')
+    assert found['schemas'] == 2
+
+
+def test_empty_bag_is_valid_and_an_existing_folder_is_left_alone(tmp_path):
+    BagWriter(tmp_path / 'bag').close()
+    assert read_with_public_libraries(tmp_path / 'bag')['counts'] == {}
+    tree = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
+    files = tree['rosbag2_bagfile_information']['files']
+    assert files[0]['duration'] == {'nanoseconds': 0}  # rosbag2 reads it as unsigned
+    before = {path.name: path.read_bytes() for path in (tmp_path / 'bag').iterdir()}
+    with pytest.raises(BagError, match=r'bag exists already.*choose another folder'):
+        BagWriter(tmp_path / 'bag')
+    assert {path.name: path.read_bytes() for path in (tmp_path / 'bag').iterdir()} == before
 
 
 def test_data_is_flushed_periodically(tmp_path):
     now = 0.0
     bag = BagWriter(tmp_path / 'bag', flush_interval=0.1, clock=lambda: now)
     handle = bag.add_topic('/command', COMMANDS.type, [COMMANDS.offered])
-    raw = Float64MultiArrayEncoder(2).encode([1, 2])
     for k in range(1, 1001):
         now = k * 1e-3
-        bag.write(handle, raw, START + k)
-        if k % 7 == 0:  # at every phase of the flush interval
-            on_disk = messages_on_disk(tmp_path / 'bag' / 'bag_0.mcap')
-            assert on_disk >= k - 100  # at one message per millisecond
+        bag.write(handle, TORQUES.encode([1, 2]), START + k)
+        if k % 7 == 0:  # at every phase of the flush interval; one message per millisecond
+            assert messages_on_disk(tmp_path / 'bag' / 'bag_0.mcap') >= k - 100
     bag.close()
 
 
@@ -238,7 +230,7 @@ import os, signal, sys
 from blf_dsc_controller.messages.topics import COMMANDS
 from blf_dsc_controller.bags.writer import BagWriter
 
-bag = BagWriter(sys.argv[1], flush_interval=None, compression=sys.argv[2])
+bag = BagWriter(sys.argv[1], flush_interval=None, compression='zstd')
 handle = bag.add_topic('/command', COMMANDS.type, [COMMANDS.offered])
 for k in range(1000):
     bag.write(handle, bytes(36), k)
@@ -249,30 +241,97 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-@pytest.mark.parametrize('compression', ['none', 'zstd'])
-def test_flushed_data_survives_a_kill(tmp_path, compression):
-    run = subprocess.run(
-        [sys.executable, '-c', KILLED, str(tmp_path / 'bag'), compression], check=False
-    )
+def test_flushed_data_survives_a_kill(tmp_path):
+    run = subprocess.run([sys.executable, '-c', KILLED, str(tmp_path / 'bag')], check=False)
     assert run.returncode == -9
     assert messages_on_disk(tmp_path / 'bag' / 'bag_0.mcap') == 1000
 
 
-def test_empty_bag_is_valid(tmp_path):
-    BagWriter(tmp_path / 'bag').close()
-    assert read_with_public_libraries(tmp_path / 'bag')['counts'] == {}
-    information = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
-    information = information['rosbag2_bagfile_information']
-    assert information['duration'] == {'nanoseconds': 0}  # rosbag2 reads it as unsigned
-    assert information['files'][0]['duration'] == {'nanoseconds': 0}
+@pytest.mark.parametrize('compression', ['none', 'zstd'])
+@pytest.mark.parametrize('interval', [0.0, None])  # a chunk for each message; chunks of 1 MiB
+def test_full_disk_leaves_a_whole_bag_and_one_error(tmp_path, compression, interval):
+    with small_disk(tmp_path / 'disk', 18) as disk:
+        bag = BagWriter(disk / 'bag', compression=compression, flush_interval=interval)
+        handle = bag.add_topic('/a', JOINT_STATES.type, [STREAM])
+        with pytest.raises(DiskFullError, match='the disk is full') as caught:
+            write_endlessly(bag, handle, 8 if interval is None else 1)
+        bag.close()
+        written = caught.value.messages
+        assert written == bag.message_counts['/a']  # including the one that filled the disk
+        assert f'{written} messages' in str(caught.value)
+        assert len(read(disk / 'bag')) == written
+        assert not recover(disk / 'bag', tmp_path / 'clean').losses
+        assert not list((disk / 'bag').glob('.*'))
+    with small_disk(tmp_path / 'tiny', 1) as disk, pytest.raises(OSError, match='No space left'):
+        BagWriter(disk / 'bag')
 
 
-def test_topics_of_the_same_type_share_one_definition(tmp_path):
-    with BagWriter(tmp_path / 'bag') as bag:
-        for topic in ('/a', '/b'):
-            handle = bag.add_topic(topic, JOINT_STATES.type, [JOINT_STATES.offered])
-            bag.write(handle, JointStateEncoder(['x']).encode(0, [0], [0], [0]), START)
-    with (tmp_path / 'bag' / 'bag_0.mcap').open('rb') as stream:
-        summary = make_reader(stream).get_summary()
-    assert len(summary.schemas) == 1
-    assert len(summary.channels) == 2
+@pytest.mark.parametrize(
+    ('limits', 'count'),
+    [
+        ({'split_size': 20_000}, 3),  # 200 messages, about 290 bytes each with chunk and index
+        ({'split_duration': 0.5}, 4),  # of 2 s
+    ],
+)
+def test_split_bag_is_read_as_one(tmp_path, limits, count):
+    now = 0.0
+    bag = BagWriter(tmp_path / 'bag', flush_interval=0.01, clock=lambda: now, **limits)
+    first = bag.add_topic('/a', JOINT_STATES.type, [STREAM])
+    for k in range(200):
+        now = k * 0.01
+        if k == 100:
+            late = bag.add_topic('/late', JOINT_STATES.type, [STREAM])
+        bag.write(first if k < 100 or k % 2 else late, message(k), k)
+    bag.close()
+    files = sorted((tmp_path / 'bag').glob('*.mcap'))
+    assert len(files) == count
+    assert max(file.stat().st_size for file in files) < 30_000
+    assert [(at, raw) for _, at, raw in read(tmp_path / 'bag')] == [
+        (k, message(k)) for k in range(200)
+    ]
+    with open_bag(tmp_path / 'bag') as opened:
+        assert [one.raw for one in opened.messages(opened.counts)] == [*map(message, range(200))]
+    assert not recover(tmp_path / 'bag', tmp_path / 'clean').losses
+    assert read(tmp_path / 'clean') == read(tmp_path / 'bag')
+
+
+def test_no_file_is_started_without_a_message(tmp_path):
+    now = 0.0
+    bag = BagWriter(tmp_path / 'bag', flush_interval=0.0, clock=lambda: now, split_duration=0.1)
+    handle = bag.add_topic('/a', JOINT_STATES.type, [STREAM])
+    for k in range(50):  # mostly idle
+        now = 0.1 * k
+        bag.flush_if_due()
+        if k in (3, 30):
+            bag.write(handle, message(k), k)
+    bag.close()
+    assert len(list((tmp_path / 'bag').glob('*.mcap'))) == 2
+    assert [at for _, at, _ in read(tmp_path / 'bag')] == [3, 30]
+
+
+def test_memory_of_a_recorder_is_bounded(tmp_path):
+    """Every chunk has an entry in the index, which is in memory until its file ends."""
+    with BagWriter(tmp_path / 'bag', flush_interval=0.0) as bag:
+        handle = bag.add_topic('/a', JOINT_STATES.type, [STREAM])
+        peaks = []
+        tracemalloc.start()
+        for k in range(60_000):
+            bag.write(handle, message(k), k)
+            if k % 10_000 == 9_999:
+                peaks.append(tracemalloc.get_traced_memory()[1])
+                tracemalloc.reset_peak()
+        tracemalloc.stop()
+    assert len(list((tmp_path / 'bag').glob('*.mcap'))) == 6
+    assert max(peaks) < 1.1 * peaks[1]
+    with open_bag(tmp_path / 'bag') as found:
+        assert sum(1 for _ in found.messages({'/a'})) == 60_000
+
+
+def test_gaps_in_sequence_numbers_are_counted_as_losses():
+    losses = Losses(publishers=1)
+    for sequence in (4, 5, 8, 9, 2, 3):  # the 2 is from a new publisher
+        losses.count(sequence)
+    assert losses.text() == ', 2 missed, 4 sent before the recorder connected'
+    losses.publishers_seen(2)
+    losses.count(100)
+    assert losses.text() == ''

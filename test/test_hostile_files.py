@@ -16,7 +16,6 @@ from foreign_readers import raw_records
 from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk
 
-from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import load_loop
@@ -78,10 +77,13 @@ def chunk(data, declared, compression='zstd'):
 
 
 def with_chunks(file, *added):
-    """Insert chunks after the header of a file and drop its index."""
-    header, *others = (raw for _, raw in raw_records(file.read_bytes()))
-    footer = others[-1][:9] + bytes(20)
-    file.write_bytes(MAGIC + b''.join([header, *added, *others[:-1], footer]) + MAGIC)
+    """Insert chunks after the header of a file."""
+    data = file.read_bytes()
+    (header, _), *_ = ((raw, at) for at, raw in raw_records(data))
+    at, footer = len(MAGIC) + len(header), len(data) - len(MAGIC) - 20
+    start = int.from_bytes(data[footer : footer + 8], 'little') + sum(map(len, added))
+    end = start.to_bytes(8, 'little') + bytes(12) + MAGIC
+    file.write_bytes(b''.join([data[:at], *added, data[at:footer], end]))
     return file
 
 
@@ -100,14 +102,16 @@ def test_files_outside_the_bag_folder_are_not_read(bag, copy, refused, tmp_path,
         metadata = copy / 'metadata.yaml'
         text = metadata.read_text()
         metadata.write_text(text.replace('- bag_0.mcap', '- ../elsewhere/secret.mcap'))
-    refused(copy, 'outside of the folder', but=() if is_link else ('recover',))
+    refused(
+        copy, 'outside of the folder' if is_link else 'missing', but=() if is_link else ('recover',)
+    )
 
 
 @pytest.mark.parametrize('name', ['bag_0.mcap', 'metadata.yaml'])
 def test_named_pipe_in_a_bag_does_not_block(copy, refused, name):
     (copy / name).unlink()
     os.mkfifo(copy / name)
-    refused(copy, 'is not a regular file', but=('recover',) if name == 'metadata.yaml' else ())
+    refused(copy, 'is not a regular file')
     if name == 'bag_0.mcap':
         refused(copy / name, 'is not a regular file')
 
@@ -144,8 +148,6 @@ def test_bag_is_not_unpacked_beyond_the_limit(copy, refused):
         refused(path, 'if you trust it, raise --max-unpacked', *SMALL_LIMIT)
     # The size is within the default limit, but the chunks hold no valid record.
     refused(file, 'unknown record type 0', but=('recover',))
-    with pytest.raises(BlfDscError, match='unknown record type'), open_bag(file) as opened:
-        list(opened.in_order({'/joint_states'}))
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
@@ -189,9 +191,7 @@ def test_ros_1_bag_respects_the_limit(tmp_path, refused):
     ('text', 'words'),
     [('[' * 100_000, 'nested more than 50 levels'), (BOMB, 'does not support the alias')],
 )
-def test_unreasonable_yaml_is_rejected_everywhere(copy, refused, tmp_path, text, words):
-    (copy / 'metadata.yaml').write_text(text)
-    refused(copy, words, but=('recover',))
+def test_unreasonable_yaml_is_rejected(tmp_path, text, words):
     path = tmp_path / 'given.yaml'
     path.write_text(text)
     with pytest.raises(BlfDscError, match=words):

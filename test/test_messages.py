@@ -8,17 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from blf_dsc_controller.messages.cdr import (
-    DuplicatedJointError,
-    MessageError,
-    MissingJointError,
-    ShortArrayError,
-)
 from blf_dsc_controller.messages.codecs import (
+    DuplicatedJointError,
     Float64MultiArrayDecoder,
     Float64MultiArrayEncoder,
     JointStateDecoder,
     JointStateEncoder,
+    MessageError,
+    MissingJointError,
+    ShortArrayError,
     encode_clock,
 )
 from blf_dsc_controller.messages.types import typestore

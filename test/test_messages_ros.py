@@ -16,12 +16,12 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from blf_dsc_controller.messages.cdr import joint_state_layout
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayDecoder,
     Float64MultiArrayEncoder,
     JointStateDecoder,
     JointStateEncoder,
+    joint_state_layout,
 )
 from blf_dsc_controller.messages.topics import TOPICS
 from blf_dsc_controller.messages.types import definition

@@ -19,7 +19,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.cdr import MessageError, joint_trajectory
+from blf_dsc_controller.messages.codecs import MessageError, joint_trajectory
 from blf_dsc_controller.nodes import process
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.supervisor import Phase

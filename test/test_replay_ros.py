@@ -20,8 +20,7 @@ from sent_trajectory import JOINTS, SECOND, send, trajectory
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.messages.cdr import STAMP_OFFSET
-from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.codecs import STAMP_OFFSET, JointStateEncoder
 from blf_dsc_controller.messages.journal import EventType, decode
 from blf_dsc_controller.messages.topics import (
     COMMANDS,

@@ -76,7 +76,7 @@ def draw(run: Run, folder: Path) -> list[Path]:
         rows = [panel for i in range(n) for panel in motion[i::n]]
         draw_panels(paths[0], title, rows, len(motion) // n, _LOW, legend_above=True)
     changes = true_change_times(run)
-    if changes and run.error is not None:
+    if changes and run.column('error', 0) is not None:
         paths.append(folder / NAMES[1])
         title = f'The first change of the arm, from {changes[0] - _BEFORE:g} s on'
         draw_panels(paths[-1], title, list(_close_up(run, found, changes[0])), 1, _CLOSE_UP)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -121,15 +122,16 @@ def _torques(run: Run, regressor: Regressor) -> Floats:
 
     The derivatives are three-point differences.
     """
-    q = run.position if run.reference is None else run.reference
-    middle = np.arange(1, q.shape[0] - 1)
-    known = middle[np.isfinite(q[:-2] + q[1:-1] + q[2:]).all(axis=1)]
+    name = 'position' if run.column('reference', 0) is None else 'reference'
+    finite = np.isfinite(sum(_known(run, name, i) for i in range(len(run.joints))))
+    known = 1 + np.flatnonzero(finite[:-2] & finite[1:-1] & finite[2:])
     rows = known[np.linspace(0, known.size - 1, min(_POSTURES, known.size)).astype(int)]
     after, before = (np.diff(run.time)[rows + k, np.newaxis] for k in (0, -1))
-    forward, backward = (q[rows + 1] - q[rows]) / after, (q[rows] - q[rows - 1]) / before
+    earlier, q, later = (np.asarray(run.at(name, rows + k)) for k in (-1, 0, 1))
+    forward, backward = (later - q) / after, (q - earlier) / before
     dq = (after * backward + before * forward) / (after + before)
     ddq = 2.0 * (forward - backward) / (after + before)
-    H = regressor(q[rows], dq, dq, ddq)
+    H = regressor(q, dq, dq, ddq)
     return H.reshape(-1, H.shape[-1])
 
 
@@ -164,11 +166,16 @@ def true_change_times(run: Run) -> list[float]:
     return [float(t) for t in run.time_of(run.truth.stamp[begins])]
 
 
-def outside(run: Run) -> NDArray[np.bool_] | None:
-    """Return where |xi1| >= k_c, (N, n); None if error or bound is unknown."""
-    if run.error is None or run.bound is None:
-        return None
-    return np.asarray(np.abs(run.error) >= run.bound)
+def outside(run: Run, i: int) -> NDArray[np.bool_] | None:
+    """Return where |xi1| >= k_c for a joint, (N,); None if error or bound is unknown."""
+    error, bound = run.column('error', i), run.column('bound', i)
+    return None if error is None or bound is None else np.asarray(np.abs(error) >= bound)
+
+
+def _known(run: Run, name: str, i: int) -> Floats:
+    """Return the values of one joint, NaN where they are unknown."""
+    found = run.column(name, i)
+    return np.full(run.stamp.size, np.nan) if found is None else found
 
 
 def first_violation(run: Run) -> tuple[float, str]:
@@ -181,10 +188,11 @@ def first_violation(run: Run) -> tuple[float, str]:
         for time, stop in run.timed_stops
         if stop.reason == OUTSIDE_BOUND
     ]
-    violated = outside(run)
-    for row, column in () if violated is None else np.argwhere(violated)[:1].tolist():
-        found.append((float(run.time[row]), run.joints[column]))
-    return min(found, default=(math.nan, ''))
+    for i, joint in enumerate(run.joints):
+        violated = outside(run, i)
+        if violated is not None and violated.any():
+            found.append((float(run.time[violated.argmax()]), joint))
+    return min(found, key=itemgetter(0), default=(math.nan, ''))
 
 
 @dataclass(frozen=True)
@@ -229,16 +237,19 @@ def measure(run: Run) -> Metrics:
         at = estimates.time
         tail = rms(learned[at >= at[-1] - _TAIL])
         learning = _at_moments(at, learned), float(learned[-1]), tail, _settled(at, learned)
-    n = len(run.joints)
+
+    def each(reduce: Callable[[Floats], float], name: str) -> tuple[float, ...]:
+        return tuple(reduce(_known(run, name, i)) for i in range(len(run.joints)))
+
     return Metrics(
-        _columns(_peak, run.error, n),
-        _columns(rms, run.error, n),
-        _columns(_least, run.bound, n),
-        _columns(_peak, run.bound, n),
-        _columns(_peak, run.torque, n),
-        _columns(rms, run.torque, n),
-        _columns(_least, run.torque_limit, n),
-        tuple(change / step for change in _columns(_rms_change, run.torque, n)),
+        each(_peak, 'error'),
+        each(rms, 'error'),
+        each(_least, 'bound'),
+        each(_peak, 'bound'),
+        each(_peak, 'torque'),
+        each(rms, 'torque'),
+        each(_least, 'torque_limit'),
+        tuple(change / step for change in each(_rms_change, 'torque')),
         _largest_ratio(run),
         violation,
         joint,
@@ -249,11 +260,9 @@ def measure(run: Run) -> Metrics:
 
 def _largest_ratio(run: Run) -> float:
     """Return the largest |xi1| / k_c; NaN if it is unknown."""
-    error, bound = run.error, run.bound
-    if error is None or bound is None:
-        return math.nan
-    ratios = [_peak(error[:, i] / bound[:, i]) for i in range(len(run.joints))]
-    return float(np.fmax.reduce(ratios))
+    with np.errstate(invalid='ignore', divide='ignore'):
+        pairs = ((_known(run, 'error', i), _known(run, 'bound', i)) for i in range(len(run.joints)))
+        return float(np.fmax.reduce([_peak(error / bound) for error, bound in pairs]))
 
 
 def rms(values: Floats) -> float:
@@ -265,12 +274,6 @@ def rms(values: Floats) -> float:
 
 def _rms_change(values: Floats) -> float:
     return rms(np.diff(values))
-
-
-def _columns(reduce: Callable[[Floats], float], values: Floats | None, n: int) -> tuple[float, ...]:
-    if values is None:
-        return (math.nan,) * n
-    return tuple(reduce(values[:, i]) for i in range(n))
 
 
 def _peak(values: Floats) -> float:

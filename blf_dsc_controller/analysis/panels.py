@@ -100,7 +100,7 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
         changes = true_change_times(run)
         changed = dict.fromkeys(_CHANGED, 'the arm changes')
         stops = list(_stops(run))
-        for panel in chain(_motion(run), _learning(run), _monitors(run), _timing(run)):
+        for panel in map(_kept, chain(_motion(run), _learning(run), _monitors(run), _timing(run))):
             before = found.get((panel.group, panel.title), replace(panel, lines=(), marks=()))
             marks = latch if panel.group in _LEARNING else panel.marks
             marks = (*marks, *(stops if panel.group in _STOPPED else ()))
@@ -109,10 +109,7 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
                 marks = (*marks, *(Mark(*one, INK) for one in zip(changes, texts, strict=False)))
             found[panel.group, panel.title] = replace(
                 before,
-                lines=(
-                    *before.lines,
-                    *(_kept(panel, line)._replace(run=k) for line in panel.lines),
-                ),
+                lines=(*before.lines, *(line._replace(run=k) for line in panel.lines)),
                 marks=(*before.marks, *(mark._replace(run=k) for mark in marks)),
                 note=panel.note if len(runs) == 1 else '',
                 span=panel.span if len(runs) == 1 else 0.0,
@@ -121,9 +118,14 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
     return sorted(drawn, key=lambda panel: GROUPS.index(panel.group))
 
 
-def _kept(panel: Panel, line: Line) -> Line:
-    """Return a line that does not hold the memory of a long run, with its peaks."""
-    if panel.histogram or line.values.size <= _LONG:
+def _kept(panel: Panel) -> Panel:
+    """Return a panel whose lines do not hold the memory of a long run."""
+    return panel if panel.histogram else replace(panel, lines=tuple(map(_thinned, panel.lines)))
+
+
+def _thinned(line: Line) -> Line:
+    """Return a line that is not too long, with its peaks."""
+    if line.values.size <= _LONG:
         return line
     time, values = envelope(line.time, drawable(line.values), _LONG // 10)
     return line._replace(time=time, values=values)
@@ -140,61 +142,62 @@ def _stops(run: Run) -> Iterator[Mark]:
 
 def _motion(run: Run) -> Iterator[Panel]:
     t = run.time
+    errors: list[Panel] = []
     for i, joint in enumerate(run.joints):
-        lines = [Line('measured', t, run.position[:, i])]
-        if run.reference is not None:
-            lines.append(Line('reference', t, run.reference[:, i], INK, dashed=True))
+        position, reference = run.column('position', i), run.column('reference', i)
+        lines = [Line('measured', t, np.asarray(position))]
+        if reference is not None:
+            lines.append(Line('reference', t, reference, INK, dashed=True))
         yield Panel('Motion', f'position of {joint}', 'rad', tuple(lines))
-        if run.error is not None:
-            yield _error(run, i, 1e3 * run.error[:, i])
-        torque = run.torque[:, i]
-        if np.isnan(run.torque).all():
+        error = run.column('error', i)
+        if error is not None:
+            yield _error(run, t, i, 1e3 * error)
+            if t.size > _PIECES:
+                errors.append(_error_size(run, t, i, 1e3 * error))
+        torque, limit = run.column('torque', i), run.column('torque_limit', i)
+        if torque is None or np.isnan(torque).all():
             continue
         lines = [Line('torque', t, torque)]
-        if run.torque_limit is not None and not np.isnan(run.torque_limit[:, i]).all():
-            limit = run.torque_limit[:, i]
+        if limit is not None and not np.isnan(limit).all():
             lines.append(Line('limit', t, limit, MUTED, dashed=True, mirrored=True))
-        note = '' if np.isnan(torque).all() else f'peak {np.nanmax(np.abs(torque)):.3g}'
+        note = f'peak {np.nanmax(np.abs(torque)):.3g}'
         yield Panel('Torque', f'torque of {joint}', 'N m', tuple(lines), note)
-    if run.error is not None and run.stamp.size > _PIECES:
-        for i in range(len(run.joints)):
-            yield _error_size(run, i, 1e3 * run.error[:, i])
+    yield from errors
 
 
-def _error(run: Run, i: int, error: Floats) -> Panel:
-    lines, marks, note = [Line('error', run.time, error)], [], ''
-    violated = outside(run)
-    if run.bound is not None and violated is not None:
-        bound = 1e3 * run.bound[:, i]
-        lines.append(Line('bound', run.time, bound, MUTED, True, True, True))  # noqa: FBT003
-        first = run.time[violated[:, i]][:1].tolist()
+def _error(run: Run, t: Floats, i: int, error: Floats) -> Panel:
+    lines, marks, note = [Line('error', t, error)], [], ''
+    bound, violated = run.column('bound', i), outside(run, i)
+    if bound is not None and violated is not None:
+        lines.append(Line('bound', t, 1e3 * bound, MUTED, True, True, True))  # noqa: FBT003
+        first = t[violated][:1].tolist()
         marks = [Mark(time, f'outside from {time:.3f} s', ALARM) for time in first]
     if not np.isnan(error).all():
         note = f'max {np.nanmax(np.abs(error)):.3g}, rms {rms(error):.3g}'
-    title, span = f'error of {run.joints[i]}', _span(run, i, error)
+    title, span = f'error of {run.joints[i]}', _span(bound, error)
     return Panel('Tracking', title, 'mrad', tuple(lines), note, marks=tuple(marks), span=span)
 
 
-def _span(run: Run, i: int, error: Floats) -> float:
+def _span(bound: Floats | None, error: Floats) -> float:
     """Return the axis limit for a funnel, whose wide start would hide the error; 0 otherwise."""
-    if run.bound is None or run.bound[0, i] <= run.bound[-1, i]:
+    if bound is None or bound[0] <= bound[-1]:
         return 0.0
-    return float(_ROOM * np.nanmax(np.abs(drawable(error)), initial=1e3 * run.bound[-1, i]))
+    return float(_ROOM * np.nanmax(np.abs(drawable(error)), initial=1e3 * bound[-1]))
 
 
-def _error_size(run: Run, i: int, error: Floats) -> Panel:
+def _error_size(run: Run, t: Floats, i: int, error: Floats) -> Panel:
     """Return the panel of the largest error in each piece of the run, on a logarithmic axis."""
     begins = np.linspace(0, error.size, _PIECES, endpoint=False).astype(np.intp)
     size = np.fmax.reduceat(np.abs(error), begins)
     size[size == 0.0] = np.nan
-    lines = [Line('error', run.time[begins], size)]
-    if run.bound is not None:
-        bound = 1e3 * run.bound[begins, i]
-        lines.append(Line('bound', run.time[begins], bound, MUTED, dashed=True))
+    lines = [Line('error', t[begins], size)]
+    bound = run.column('bound', i)
+    if bound is not None:
+        lines.append(Line('bound', t[begins], 1e3 * bound[begins], MUTED, dashed=True))
     known = size[np.isfinite(size)]
     note = f'end {known[-1]:.2g}' if known.size else ''
     title = f'|error| of {run.joints[i]}'
-    span = _span(run, i, error)
+    span = _span(bound, error)
     return Panel('Tracking', title, 'mrad', tuple(lines), note, log=True, span=span)
 
 
@@ -287,16 +290,16 @@ def _monitors(run: Run) -> Iterator[Panel]:
     yield Panel('Excitation', 'minimum eigenvalue', '', tuple(lines), note, symbol, log=True)
     if run.monitor is None:
         return
-    if run.error is not None and run.bound is not None:
-        distance = np.abs(run.error)
-        np.subtract(run.bound, distance, out=distance)
-        distance *= 1e3
-        lines = [Line(joint, run.time, distance[:, i]) for i, joint in enumerate(run.joints)]
-        lines.append(Line('bound', run.time, np.zeros_like(run.time), ALARM))
-        note, symbol = (
-            f'minimum {np.fmin.reduce(distance, axis=None):.3g}',
-            r'$k_c - |\xi_1|$ [mrad]',
-        )
+    lines, t, smallest = [], run.time, []
+    for i, joint in enumerate(run.joints):
+        error, bound = run.column('error', i), run.column('bound', i)
+        if error is not None and bound is not None:
+            distance = 1e3 * (bound - np.abs(error))
+            smallest.append(np.fmin.reduce(distance))
+            lines.append(_thinned(Line(joint, t, distance)))
+    if lines:
+        lines.append(Line('bound', t, np.zeros_like(t), ALARM))
+        note, symbol = f'minimum {np.fmin.reduce(smallest):.3g}', r'$k_c - |\xi_1|$ [mrad]'
         yield Panel('Monitors', 'distance to bound', 'mrad', tuple(lines), note, symbol)
     if LYAPUNOV_TERMS[0] in run.monitor.names:
         yield from _lyapunov(run, run.monitor)

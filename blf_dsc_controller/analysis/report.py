@@ -153,10 +153,10 @@ def arm(bag: ReportedBag, k: int) -> dict[str, Any]:
     run = bag.run
     pictures = int(min(_MOST_PICTURES, max(2.0, run.duration * _RATE)))
     times = np.linspace(0.0, run.duration, pictures)
-    rows = np.minimum(np.searchsorted(run.time, times), run.time.size - 1)
+    rows = np.minimum(np.searchsorted(run.time, times), run.stamp.size - 1)
     position, reference = (
-        [] if angles is None else np.nan_to_num(angles[rows]).round(4).tolist()
-        for angles in (run.position, run.reference)
+        [] if angles is None else np.nan_to_num(angles).round(4).tolist()
+        for angles in (run.at('position', rows), run.at('reference', rows))
     )
     return {
         'name': bag.name,

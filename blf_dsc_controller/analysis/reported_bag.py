@@ -117,7 +117,7 @@ def _drawn(
 
 
 def _events(run: Run) -> Iterator[ReportedEvent]:
-    latched, violated = latch_time(run), outside(run)
+    latched = latch_time(run)
     if latched is not None:
         yield ReportedEvent(latched, 'learning', 'first excited window: learning began')
     for t in change_times(run):
@@ -127,24 +127,27 @@ def _events(run: Run) -> Iterator[ReportedEvent]:
         yield ReportedEvent(run.duration, 'learning', text)
     for t, stop in run.timed_stops:
         yield ReportedEvent(t, 'stop', f'{stop.reason}: {stop.text}')
-    if violated is not None:
-        yield from _intervals(run, violated, 'violation', 'outside its bound')
-    if run.torque_limit is not None:
-        limited = np.abs(run.torque) >= _AT_LIMIT * run.torque_limit
-        yield from _intervals(run, limited, 'saturation', 'at its torque limit')
-
-
-def _intervals(run: Run, holds: np.ndarray, kind: str, what: str) -> Iterator[ReportedEvent]:
     for i, joint in enumerate(run.joints):
-        edges = np.diff(np.concatenate([[0], holds[:, i].astype(np.int8), [0]]))
-        begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-        for begin, end in list(zip(begins, ends, strict=True))[:_MOST_OF_A_KIND]:
-            text = f'{joint} {what} for {end - begin} samples'
-            yield ReportedEvent(float(run.time[begin]), kind, text)
-        if begins.size > _MOST_OF_A_KIND:
-            more = begins.size - _MOST_OF_A_KIND
-            at = float(run.time[begins[_MOST_OF_A_KIND]])
-            yield ReportedEvent(at, kind, f'{joint}: {more} more intervals, not listed')
+        violated = outside(run, i)
+        if violated is not None:
+            yield from _intervals(run, violated, 'violation', joint, 'outside its bound')
+        torque, limit = run.column('torque', i), run.column('torque_limit', i)
+        if torque is not None and limit is not None:
+            limited = np.abs(torque) >= _AT_LIMIT * limit
+            yield from _intervals(run, limited, 'saturation', joint, 'at its torque limit')
+
+
+def _intervals(
+    run: Run, holds: np.ndarray, kind: str, joint: str, what: str
+) -> Iterator[ReportedEvent]:
+    edges = np.diff(np.concatenate([[0], holds.astype(np.int8), [0]]))
+    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    times = run.time_of(run.stamp[begins])
+    for time, begin, end in list(zip(times, begins, ends, strict=True))[:_MOST_OF_A_KIND]:
+        yield ReportedEvent(float(time), kind, f'{joint} {what} for {end - begin} samples')
+    if begins.size > _MOST_OF_A_KIND:
+        text = f'{joint}: {begins.size - _MOST_OF_A_KIND} more intervals, not listed'
+        yield ReportedEvent(float(times[_MOST_OF_A_KIND]), kind, text)
 
 
 def _diagnosed(content: Content, run: Run) -> Iterator[ReportedEvent]:

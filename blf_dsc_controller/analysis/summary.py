@@ -35,6 +35,7 @@ _JOINT = {  # entry of the summary: metric; title, unit, factor and decimals in 
 }
 
 _OFTEN = 0.01  # of the samples
+_BLOCK = 65_536  # samples looked at at once
 _OLDEST = 20  # samples, age of a command that is looked for in the efforts
 _DIGITS = 1e-9  # relative, by which an effort may differ from its command
 _SHOWN = 0.5  # of the samples must show a command
@@ -137,12 +138,15 @@ def _commands(run: Run) -> Summary | None:
 
     `samples_late`: between the state that a torque answers and the one whose effort first shows it.
     """
-    if run.effort is None:
-        return None
     late = np.zeros(run.stamp.size, np.intp)
-    for ago in range(_OLDEST, 0, -1):  # the newest command that agrees
-        agree = np.isclose(run.effort[ago:], run.torque[:-ago], rtol=_DIGITS, atol=0.0).all(axis=1)
-        late[ago:][agree] = ago
+    for begin in range(0, run.stamp.size, _BLOCK):
+        rows = slice(max(0, begin - _OLDEST), begin + _BLOCK)
+        effort, torque = run.at('effort', rows), run.at('torque', rows)
+        if effort is None or torque is None:
+            return None
+        for ago in range(_OLDEST, 0, -1):  # the newest command that agrees
+            agree = np.isclose(effort[ago:], torque[:-ago], rtol=_DIGITS, atol=0.0).all(axis=1)
+            late[rows][ago:][agree] = ago
     shown = np.flatnonzero(late)
     if shown.size < _SHOWN * run.stamp.size:
         return None

@@ -3,26 +3,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.bags.columns import ALL, Rows
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.bags.topic_messages import JointStates
+from blf_dsc_controller.bags.topic_messages import ALL, JointStates
 from blf_dsc_controller.bags.torque import TorqueError, applied_torque, next_effort
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.messages.topics import CONTROLLER
 from blf_dsc_controller.messages.types import typestore
-from blf_dsc_controller.run import Floats, LearnedArm, Run, Series, Stop
+from blf_dsc_controller.run import Floats, LearnedArm, Rows, Run, Series, Stop
 
 _MOST_FALLS = 10  # of the stamps, by resets of a simulator
 _ALTERNATING = 0.9  # ratio of the intervals to and from the state of another publisher
@@ -32,20 +30,38 @@ _FEW = 100  # states
 class RecordedRun(Run):
     """Run whose arrays are read from its bag's tables each time that they are asked for."""
 
-    def __init__(self, known: dict[str, Any], computed: dict[str, Callable[[Rows], Any]]) -> None:
-        """Take what is in memory, and functions that return rows of the other arrays."""
-        for name, value in known.items():
+    _stored: Mapping[str, tuple[JointStates | None, int]]
+    _is_decimated: bool
+
+    def __init__(self, **values: Any) -> None:
+        """Take what is in memory, and in `_stored` states and field of each other array.
+
+        `_is_decimated`: the reference was published for some samples only.
+        """
+        for name, value in values.items():
             object.__setattr__(self, name, value)
-        object.__setattr__(self, '_computed', computed)
 
     def __getattribute__(self, name: str) -> Any:
-        computed = object.__getattribute__(self, '__dict__').get('_computed', {})
-        return computed[name](ALL) if name in computed else object.__getattribute__(self, name)
+        stored = object.__getattribute__(self, '__dict__').get('_stored', ())
+        return self.at(name) if name in stored else object.__getattribute__(self, name)
 
-    def at(self, name: str, rows: Rows) -> Floats | None:
-        """Return some rows of an array; None if it is unknown."""
-        values: Floats | None = self.__dict__['_computed'][name](rows)
+    def at(self, name: str, rows: Rows = ALL, columns: Rows = ALL) -> Floats | None:
+        """Return some rows and joints of an array; None if it is unknown."""
+        states, k = self._stored[name]
+        if states is None:
+            is_known = name == 'error' and self._stored['reference'][0] is not None
+            return self._difference('reference', rows, columns) if is_known else None
+        values: Floats = states.field(k, rows, columns)
+        if name == 'reference' and self._is_decimated:
+            lost = np.isnan(values)
+            values[lost] = self._difference('error', rows, columns)[lost]
         return values
+
+    def _difference(self, name: str, rows: Rows, columns: Rows) -> Floats:
+        """Return the positions less another array."""
+        position, other = self.at('position', rows, columns), self.at(name, rows, columns)
+        difference: Floats = np.asarray(position) - np.asarray(other)
+        return difference
 
     def in_memory(self) -> Run:
         """Return the run with all of its arrays in memory."""
@@ -74,61 +90,61 @@ def recorded_run(content: Content, names: NameMap = NO_NAMES, namespace: str = '
     joints = _joints(content, names)
     states, notes, span = one_run(content, names.joints_of(joints))
     stamp = states.stamp
-    within = partial(_within, content, span)
-    errors = within(topics.TRACKING_ERROR, joints)
-    references, bounds = within(topics.REFERENCE, joints), within(topics.BOUND, joints)
-    events = [one for at, one in content.events if span[0] <= at < span[1]]
-    learning = _series(within(topics.LEARNING))
+
+    def within(topic: topics.Topic, names: Sequence[str] = ()) -> JointStates | None:
+        """Return a topic's messages in the run, by stamp; None if there are none."""
+        messages = content.topics.get(topic)
+        if messages is None:
+            return None
+        found = messages.joint_states(names or messages.joint_names(), ('position',))
+        received = found.received
+        inside = (received >= span[0]) & (received < span[1])
+        return found.select(np.flatnonzero(inside)).by_stamp() if inside.any() else None
+
+    def series(topic: topics.Topic) -> Series | None:
+        found = within(topic)
+        return None if found is None else found.series()
+
+    errors, references = within(topics.TRACKING_ERROR, joints), within(topics.REFERENCE, joints)
+    bounds = within(topics.BOUND, joints)
+    exact_errors = None if errors is None else errors.at_stamps(stamp)
+    exact_references = None if references is None else references.at_stamps(stamp)
+    held_bounds = None if bounds is None else bounds.held(stamp)
+    events = [event for at, event in content.events if span[0] <= at < span[1]]
+    settings = [event.content.get('parameters', {}) for event in events]
+    learning = series(topics.LEARNING)
     try:
         torque = applied_torque(content, states)
     except TorqueError:
         torque = next_effort(states)
-
-    def exact(found: JointStates | None, k: int, rows: Rows) -> Floats | None:
-        return None if found is None else found.series(k).exact(stamp[rows])
-
-    def held(k: int, rows: Rows) -> Floats | None:
-        return None if bounds is None else bounds.series(k).held(stamp[rows])
-
-    def error(rows: Rows) -> Floats | None:
-        if errors is None and references is not None:
-            return np.asarray(states.field(0, rows) - references.series(0).exact(stamp[rows]))
-        return exact(errors, 0, rows)
-
-    def reference(rows: Rows) -> Floats | None:
-        found, off = exact(references, 0, rows), exact(errors, 0, rows)
-        if found is not None and off is not None and _is_decimated(events):
-            found = np.where(np.isnan(found), states.field(0, rows) - off, found)
-        return found
-
     return RecordedRun(
-        {
-            'joints': joints,
-            'stamp': stamp,
-            'received': states.received,
-            'learning': learning,
-            'truth': _series(within(topics.TRUTH)),
-            'timing': _series(within(topics.TIMING)),
-            'monitor': _series(within(topics.MONITOR)),
-            'message_counts': content.message_counts,
-            'rejected': _rejected_columns(content, learning, namespace),
-            'stops': tuple(_stops(events, int(stamp[0]))),
-            'arm': _arm(content),
-            'learns': _learns(events),
-            'notes': notes,
+        joints=joints,
+        stamp=stamp,
+        received=states.received,
+        learning=learning,
+        truth=series(topics.TRUTH),
+        timing=series(topics.TIMING),
+        monitor=series(topics.MONITOR),
+        message_counts=content.message_counts,
+        rejected=_rejected_columns(content, learning, namespace),
+        stops=tuple(_stops(events, int(stamp[0]))),
+        arm=_arm(content),
+        learns=_learns(settings),
+        notes=notes,
+        _stored={
+            'position': (states, 0),
+            'velocity': (states, 1),
+            'effort': (states, 2),
+            'torque': (torque.efforts, 2),
+            'error': (exact_errors, 0),
+            'reference': (exact_references, 0),
+            'xi2': (exact_errors, 1),
+            'reference_velocity': (exact_references, 1),
+            'bound': (held_bounds, 0),
+            'torque_limit': (held_bounds, 2),
         },
-        {
-            'position': partial(states.field, 0),
-            'velocity': partial(states.field, 1),
-            'effort': partial(states.field, 2),
-            'torque': torque.at,
-            'error': error,
-            'reference': reference,
-            'xi2': partial(exact, errors, 1),
-            'reference_velocity': partial(exact, references, 1),
-            'bound': partial(held, 0),
-            'torque_limit': partial(held, 2),
-        },
+        _is_decimated=errors is not None
+        and any(one.get('telemetry.decimation', 1) > 1 for one in settings),
     )
 
 
@@ -206,25 +222,6 @@ def _joints(content: Content, names: NameMap) -> tuple[str, ...]:
     return (*of_controller, content.topics[topics.JOINT_STATES])[0].joint_names()
 
 
-def _within(
-    content: Content, span: tuple[int, int], topic: topics.Topic, joints: Sequence[str] = ()
-) -> JointStates | None:
-    """Return a topic's messages received in a span, by stamp; None if there are none."""
-    messages = content.topics.get(topic)
-    if messages is None:
-        return None
-    found = messages.joint_states(joints or messages.joint_names(), ('position',))
-    received = found.received
-    rows = np.flatnonzero((received >= span[0]) & (received < span[1]))
-    if rows.size < found.size:
-        found = found.select(rows)
-    return found.by_stamp() if rows.size else None
-
-
-def _series(found: JointStates | None) -> Series | None:
-    return None if found is None else found.series()
-
-
 def _rejected_columns(content: Content, learning: Series | None, namespace: str) -> dict[str, str]:
     """Return columns that are NaN at the end of learning, with the reason in /diagnostics."""
     if learning is None:
@@ -270,15 +267,8 @@ def _stops(events: Iterable[Event], first: int) -> Iterator[Stop]:
             yield Stop(max(event.stamp, first), *what, until=starts[0] if starts else None)
 
 
-def _is_decimated(events: Iterable[Event]) -> bool:
-    """Return whether the reference was published for some samples only."""
-    known = (event.content.get('parameters', {}) for event in events)
-    return any(one.get('telemetry.decimation', 1) > 1 for one in known)
-
-
-def _learns(events: Iterable[Event]) -> bool:
+def _learns(settings: Sequence[Mapping[str, Any]]) -> bool:
     """Return whether the law ever used the prediction error; true if the journal does not say."""
-    known = [event.content.get('parameters', {}) for event in events]
-    laws = {one['law'] for one in known if 'law' in one}
-    weights = [one['learning.weight'] for one in known if 'learning.weight' in one]
+    laws = {one['law'] for one in settings if 'law' in one}
+    weights = [one['learning.weight'] for one in settings if 'learning.weight' in one]
     return laws <= {'blf_dsc'} and any(weights or [1.0])

@@ -1,27 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """All kinds of bags as topics and CDR messages.
 
-MCAP files are read by `McapFile`; sqlite3, compressed files or messages, and ROS 1 by rosbags.
+The library rosbags opens them. It also reads the messages of sqlite3, ROS 1 and compressed ones;
+those of plain MCAP files are read by `mcap_file`, which is faster and checks every chunk.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from pathlib import Path, PurePath
-from typing import NamedTuple, TypeAlias
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
 
-import yaml
-from mcap.records import Channel
-from rosbags.highlevel import AnyReader
-from zstandard import ZstdDecompressor
+from rosbags.interfaces import QosDurability
+from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag2 import Reader
 
-from blf_dsc_controller.bags.mcap_file import Allowance, McapFile, unpacked
-from blf_dsc_controller.bags.metadata import parse_qualities, strongest_quality
-from blf_dsc_controller.configuration.files import load_yaml, read_text
+from blf_dsc_controller.bags.mcap_file import Allowance, McapFile
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.messages.topics import Quality
+from blf_dsc_controller.messages.topics import HISTORY, STREAM, Quality
 from blf_dsc_controller.messages.types import typestore
 
 METADATA = 'metadata.yaml'
@@ -31,11 +30,6 @@ RECORD = 'blf_dsc_controller'
 VERSION = 'package_version'
 MESSAGES = 'messages '
 """Prefix of the names of facts that count the written and lost messages of a topic."""
-
-_NEWEST = 9  # latest supported version of rosbag2's metadata.yaml
-_NAMES_ONLY = 4  # paths of earlier versions begin with the folder's name
-_STORAGES = ('mcap', 'sqlite3')
-_FILES = ('.mcap', '.db3', '.bag')
 
 
 class BagError(BlfDscError):
@@ -54,38 +48,35 @@ class BagMessage(NamedTuple):
 Messages: TypeAlias = Iterator[BagMessage]
 
 
-class StoredTopic(NamedTuple):
-    """One topic of a bag."""
-
-    name: str
-    type: str  # empty if it is unknown
-    message_count: int
-    offered: Quality  # by its publishers
-
-
 class OpenBag:
     """An open bag.
 
     Attributes:
         held: name and type, empty where unknown, of each topic.
         counts: number of messages of each topic.
-        offered: quality of service that the publishers of each topic offered.
+        offered: quality of service to publish each topic with.
         times: of the first message and after the last [ns].
+        facts: what a recorder of this package noted about the run; complete once all is read.
     """
 
-    def __init__(self, topics: Iterable[StoredTopic], times: tuple[int, int]) -> None:
-        topics = list(topics)
-        self.held = list(dict.fromkeys((one.name, one.type) for one in topics))
+    def __init__(self, reader: Any, path: Path) -> None:
+        self._reader = reader
+        every = reader.connections
+        types = ((one.topic, one.msgtype.replace('__schemaless__', '')) for one in every)
+        self.held = list(dict.fromkeys(types))
         self.counts: Counter[str] = Counter()
-        for one in topics:
-            self.counts[one.name] += one.message_count
-        self.offered = {one.name: one.offered for one in topics}
-        self.times = times
-
-    @property
-    def facts(self) -> dict[str, str]:
-        """What a recorder of this package noted about the run; complete once all is read."""
-        return {}
+        for one in every:
+            self.counts[one.topic] += one.msgcount
+        self.offered = {one.topic: _quality(one.ext) for one in every}
+        self.times: tuple[int, int] = reader.start_time, reader.end_time
+        self.facts: dict[str, str] = {}
+        self._allowance = Allowance(path)
+        self._files: list[McapFile] = []
+        if isinstance(reader, Reader) and reader.compression_mode != 'message':
+            storage: Any = reader.storage
+            parts: list[Any] = storage.storages if path.is_dir() else [storage]
+            paths = [part.path for part in parts if part.path.suffix == '.mcap']
+            self._files = [McapFile(one, self._allowance) for one in paths]
 
     def messages(self, topics: Collection[str], start: int = 0) -> Messages:
         """Yield the messages of `topics` from `start` [ns] on, nearly in order of reception.
@@ -94,93 +85,43 @@ class OpenBag:
             BagError: their number is not the one that the bag states.
         """
         found: Counter[str] = Counter()
-        for one in self._read(topics, start):
+        for one in (self._of_files if self._files else self._of_library)(topics, start):
             found[one.topic] += 1
             if one.received >= start:
                 yield one
-        for topic in topics if start == 0 else ():
+        for file in self._files:
+            self.facts |= file.metadata.get(RECORD, {})
+            for number, count in file.found.items():
+                if file.channels[number].topic not in topics:
+                    found[file.channels[number].topic] += count
+        for topic in (found | self.counts if self._files else topics) if start == 0 else ():
             if found[topic] != self.counts[topic]:
                 raise ValueError(
                     f'it holds {found[topic]} messages of {topic}, but counts {self.counts[topic]}'
                 )
 
-    def _read(self, topics: Collection[str], start: int) -> Messages:
-        raise NotImplementedError
-
-
-class _McapBag(OpenBag):
-    """One or several MCAP files, of which a metadata.yaml may state the counts."""
-
-    def __init__(self, paths: list[Path], stated: Mapping[str, int] | None = None) -> None:
-        self._allowance = Allowance(paths)
-        self._files = [McapFile(path, self._allowance) for path in paths]
-        super().__init__(
-            (topic for file in self._files for topic in _topics_of(file)),
-            (
-                min((one.statistics.message_start_time for one in self._files
-                     if one.statistics and one.statistics.message_count), default=0),
-                max((one.statistics.message_end_time + 1 for one in self._files
-                     if one.statistics and one.statistics.message_count), default=0),
-            ),
-        )  # fmt: skip
-        for topic, count in (stated or {}).items():
-            if count != self.counts[topic]:
-                raise ValueError(
-                    f'its {METADATA} counts {count} messages of {topic}, its files '
-                    f'{self.counts[topic]}'
-                )
-
-    @property
-    def facts(self) -> dict[str, str]:
-        """What a recorder of this package noted about the run; complete once all is read."""
-        records = (file.metadata.get(RECORD, {}) for file in self._files)
-        return {name: text for record in records for name, text in record.items()}
-
-    def _read(self, topics: Collection[str], start: int) -> Messages:
-        def wanted(channel: Channel) -> bool:
-            return channel.topic in topics
-
+    def _of_files(self, topics: Collection[str], start: int) -> Messages:
         for file in self._files:
-            for number, sequence, log_time, _, raw in file.messages(wanted, start):
-                raw = unpacked(raw, self._allowance)  # noqa: PLW2901
+            for number, sequence, log_time, _, raw in file.messages(topics, start):
                 yield BagMessage(file.channels[number].topic, log_time, raw, sequence)
 
-
-def _topics_of(file: McapFile) -> Iterator[StoredTopic]:
-    for number, one in file.channels.items():
-        type_ = file.schemas[one.schema_id].name if one.schema_id in file.schemas else ''
-        offered = strongest_quality(parse_qualities(one.metadata.get('offered_qos_profiles')))
-        yield StoredTopic(one.topic, type_, file.counts[number], offered)
-
-
-class _OtherBag(OpenBag):
-    """A bag that rosbags reads."""
-
-    def __init__(self, reader: AnyReader, files: list[Path]) -> None:
-        self._reader, self._allowance = reader, Allowance(files)
-        topics = (
-            StoredTopic(
-                one.topic,
-                one.msgtype,
-                one.msgcount,
-                strongest_quality(
-                    parse_qualities(getattr(one.ext, 'offered_qos_profiles', ())),
-                    is_latched=bool(getattr(one.ext, 'latching', 0)),
-                ),
-            )
-            for one in reader.connections
-        )
-        super().__init__(topics, (reader.start_time, reader.end_time))
-
-    def _read(self, topics: Collection[str], start: int) -> Messages:
+    def _of_library(self, topics: Collection[str], start: int) -> Messages:
         chosen = [one for one in self._reader.connections if one.topic in topics]
         for one, received, raw in self._reader.messages(chosen, start or None) if chosen else ():
             self._allowance.take(len(raw))
-            raw = unpacked(bytes(raw), self._allowance)  # noqa: PLW2901
-            if not self._reader.is2:
+            if isinstance(self._reader, Ros1Reader):
                 # ROS 1 and 2 serialise the common types alike, except for padding and `seq`.
-                raw = bytes(typestore().ros1_to_cdr(raw, one.msgtype))  # noqa: PLW2901
-            yield BagMessage(one.topic, received, raw)
+                raw = typestore().ros1_to_cdr(raw, one.msgtype)  # noqa: PLW2901
+            yield BagMessage(one.topic, received, bytes(raw))
+
+
+def _quality(ext: Any) -> Quality:
+    """Return a reliable quality of service, latched as deep as the recorded publishers were."""
+    offered = getattr(ext, 'offered_qos_profiles', ())
+    latched = [one.depth for one in offered if one.durability is QosDurability.TRANSIENT_LOCAL]
+    if bool(latched) or bool(getattr(ext, 'latching', 0)):
+        return replace(HISTORY, depth=max(latched, default=0) or HISTORY.depth)
+    return STREAM
 
 
 @contextmanager
@@ -192,100 +133,38 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
         BlfDscError: it unpacks to more than the limit.
     """
     try:
-        files, counts = (_described if path.is_dir() else _alone)(path)
-        if counts is not None:
-            yield _McapBag(files, counts)
-            return
-        with AnyReader([path], default_typestore=typestore()) as reader:
-            yield _OtherBag(reader, files)
+        checked_files(path)
+        reader: Any = Ros1Reader(path) if path.suffix == '.bag' else Reader(path)
+        with reader:
+            yield OpenBag(reader, path)
     except BlfDscError:
         raise
     except Exception as error:  # libraries raise nearly anything on damaged files
         raise BagError(f'{path} cannot be read as a bag: {_reason(path, error)}') from error
 
 
-def _alone(path: Path) -> tuple[list[Path], dict[str, int] | None]:
-    """Return a single file, and no counts for rosbags to read it."""
-    if path.suffix not in _FILES:
-        checked(path, [path])
-        raise ValueError(f'it is neither a folder nor one of {", ".join(_FILES)}')
-    return checked(path, [path]), {} if path.suffix == '.mcap' else None
-
-
-def _described(path: Path) -> tuple[list[Path], dict[str, int] | None]:
-    """Return files and counts of messages in a metadata.yaml; no counts for rosbags to read it.
-
-    Raises:
-        ValueError: it does not describe a supported bag.
-    """
-    (metadata,) = checked(path, [path / METADATA])
-    try:
-        tree = load_yaml(read_text(metadata))['rosbag2_bagfile_information']
-        version, storage = int(tree['version']), str(tree['storage_identifier'])
-        names = [PurePath(name) for name in tree['relative_file_paths']]
-        compression = str(tree.get('compression_mode') or 'none').lower()
-        counts: Counter[str] = Counter()
-        for one in tree['topics_with_message_count']:
-            counts[str(one['topic_metadata']['name'])] += int(one['message_count'])
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise ValueError(f'its {METADATA} does not describe a bag') from error
-    except yaml.YAMLError as error:
-        raise ValueError(
-            f'its {METADATA} cannot be read: {" ".join(str(error).split())}'
-        ) from error
-    if version > _NEWEST:
-        raise ValueError(
-            f'its rosbag2 version is {version}, but only versions up to {_NEWEST} are supported'
-        )
-    if storage not in _STORAGES:
-        raise ValueError(
-            f'its storage is {storage!r}, but only {" and ".join(_STORAGES)} are supported'
-        )
-    files = checked(path, [path / (name.name if version < _NAMES_ONLY else name) for name in names])
-    if compression == 'file':
-        allowance = Allowance(files)
-        for file in files:
-            with file.open('rb') as stream:
-                for part in ZstdDecompressor().read_to_iter(stream):
-                    allowance.take(len(part))
-    return files, counts if storage == 'mcap' and compression != 'file' else None
-
-
-def checked(path: Path, files: Iterable[Path]) -> list[Path]:
-    """Check the files of the bag at `path`, a folder or the file itself, and return them.
-
-    Raises:
-        OSError: one of them is missing, not a regular file, or outside of the folder.
-    """
-    found = list(files)
-    for file in found:
+def checked_files(path: Path) -> list[Path]:
+    """Return the files of a folder, or the one file; OSError for a pipe or a link out of it."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    for file in files:
         if path.is_dir() and not file.resolve().is_relative_to(path.resolve()):
-            raise OSError(
-                f'its file {file} is {file.resolve()}, outside of the folder: if you trust it, '
-                'copy it into the folder'
-            )
-        if not file.exists():
-            raise OSError(f'its file {file} is missing')
-        if not file.is_file():
+            raise OSError(f'its file {file} is outside of the folder: copy it if you trust it')
+        if file.exists() and not (file.is_file() or file.is_dir()):
             raise OSError(f'{file} is not a regular file')
-    return found
+    return files
 
 
 def _reason(path: Path, error: Exception) -> str:
     if not path.exists():
         return 'there is no such folder'
-    text = str(error).rstrip('.') or type(error).__name__
-    is_mcap = path.suffix == '.mcap'
-    if path.is_dir():
-        is_mcap = any(path.glob('*.mcap'))
-        if not (path / METADATA).exists():
-            if not is_mcap:
-                within = sorted(path.glob(f'*/{METADATA}'))
-                guess = f'; did you mean {within[0].parent}?' if within else ': it is not a bag'
-                return f'the folder has no {METADATA}{guess}'
-            return (
-                f'the folder has no {METADATA}; was the recording interrupted? '
-                f'Recover it: blf_dsc recover {path}'
-            )
+    text = ' '.join(f'{error}'.split()).rstrip('.') or type(error).__name__
+    is_mcap = any(path.glob('*.mcap')) if path.is_dir() else path.suffix == '.mcap'
+    if path.is_dir() and not (path / METADATA).exists():
+        within = sorted(path.glob(f'*/{METADATA}'))
+        if is_mcap:
+            text = f'the folder has no {METADATA}; was the recording interrupted?'
+            return f'{text} Recover it: blf_dsc recover {path}'
+        guess = f'; did you mean {within[0].parent}?' if within else ': it is not a bag'
+        return f'the folder has no {METADATA}{guess}'
     is_damaged = is_mcap and not isinstance(error, OSError)
     return f'{text}; to save the undamaged part: blf_dsc recover {path}' if is_damaged else text

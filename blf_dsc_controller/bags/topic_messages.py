@@ -4,31 +4,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.bags.columns import ALL, Columns, Rows
+from blf_dsc_controller.bags.columns import Columns
 from blf_dsc_controller.bags.sources import BagError, BagMessage
-from blf_dsc_controller.messages.cdr import (
+from blf_dsc_controller.messages.codecs import (
     NANOSECONDS,
     ORIGIN,
     STAMP_OFFSET,
     Layout,
     MessageError,
     MissingJointError,
+    Pattern,
     array_layout,
     joint_state_layout,
     joint_state_places,
 )
 from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
-from blf_dsc_controller.run import Floats, Series, Stamps
+from blf_dsc_controller.run import Floats, Rows, Series, Stamps
 
 _WAITING = 512  # messages decoded at once
 _MOST_LAYOUTS = 100
 _NUMBER, _RECEIVED, _SEQUENCE, _STAMP, _VALUES = range(5)  # columns of a layout
+ALL = slice(None)
 
 
 class UnreadableMessageError(BagError):
@@ -45,21 +46,26 @@ class UnreadableMessageError(BagError):
 
 
 class JointStates:
-    """N states of n joints, or N vectors of n named values in `position`, as received.
+    """N states of n joints, or N vectors of n named values in `position`.
 
-    Its arrays are read from the table when they are asked for.
+    Its arrays are read from a table when they are asked for.
     """
 
     def __init__(
-        self, names: Sequence[str], table: Columns, places: NDArray[np.intp], rows: Rows = ALL
+        self,
+        names: Sequence[str],
+        table: Columns,
+        places: NDArray[np.intp],
+        rows: NDArray[np.int32] | None = None,
     ) -> None:
-        """Take the columns `places` (3, n) of some rows of a table; -1 is NaN."""
+        """Take the columns `places` (3, n) and some rows of a table; -1 is unknown."""
         self.names = tuple(names)
-        self._table, self._places, self._rows = table, places, rows
-        self.size = len(range(*rows.indices(len(table)))) if isinstance(rows, slice) else rows.size
+        self._table, self._places = table, places
+        self._rows = np.arange(len(table), dtype=np.int32) if rows is None else rows
+        self.size = self._rows.size
 
     def _integers(self, column: int) -> Stamps:
-        return self._table.read(np.array([column]), self._rows)[:, 0]
+        return self._table.read(column, self._rows)
 
     @property
     def number(self) -> Stamps:
@@ -81,38 +87,27 @@ class JointStates:
         """Stamps (N,) [ns]."""
         return self._integers(_STAMP)
 
-    @property
-    def values(self) -> Floats:
-        """Position, velocity, effort (N, 3, n); NaN where empty."""
-        found = [self.field(k) for k in range(3)]
-        return np.stack(found, axis=1)
-
     def field(self, k: int, rows: Rows = ALL, columns: Rows = ALL) -> Floats:
-        """Return the positions (0), velocities (1) or efforts (2) of some rows and columns."""
-        if not isinstance(rows, slice) and rows.size and (np.diff(rows) == 1).all():
-            rows = slice(int(rows[0]), int(rows[-1]) + 1)  # much faster
-        places = self._places[k][columns]
-        known = np.flatnonzero(places >= 0)
-        found = self._table.read(places[known], self._chosen(rows)).view(np.float64)
-        if known.size == places.size:
-            return found
-        values = np.full((found.shape[0], places.size), np.nan)
-        values[:, known] = found
-        return values
-
-    def _chosen(self, rows: Rows) -> Rows:
-        """Return the rows of the table that these of ours are."""
-        if not isinstance(self._rows, slice):
-            return self._rows[rows]
-        first, last, _ = self._rows.indices(len(self._table))
-        if not isinstance(rows, slice):
-            return rows + first
-        begin, end, step = rows.indices(last - first)
-        return slice(first + begin, first + max(begin, end), step)
+        """Return positions (0), velocities (1) or efforts (2), (m, n); NaN where unknown."""
+        chosen, places = self._rows[rows], self._places[k][columns].tolist()
+        values = np.full((len(places), chosen.size), np.nan)
+        for row, place in zip(values, places, strict=True):
+            if place >= 0:
+                row[:] = self._table.read(place, np.maximum(chosen, 0)).view(np.float64)
+        values[:, chosen < 0] = np.nan
+        return np.asarray(values.T)
 
     def select(self, rows: Rows) -> JointStates:
-        """Return the states of these rows."""
-        return JointStates(self.names, self._table, self._places, self._chosen(rows))
+        """Return the states of these rows; -1 is an unknown one."""
+        chosen = self._rows[rows]
+        if not isinstance(rows, slice):
+            chosen[rows < 0] = -1
+        return JointStates(self.names, self._table, self._places, chosen)
+
+    def of(self, names: Sequence[str]) -> JointStates:
+        """Return the states of some of the names."""
+        columns = [self.names.index(name) for name in names]
+        return JointStates(names, self._table, self._places[:, columns], self._rows)
 
     def by_stamp(self) -> JointStates:
         """Return the states ordered by stamp, one per stamp."""
@@ -121,10 +116,20 @@ class JointStates:
             return self
         return self.select(np.unique(stamp, return_index=True)[1])
 
+    def at_stamps(self, stamp: Stamps) -> JointStates:
+        """Return the states with exactly these stamps; ours increase."""
+        own = self.stamp
+        index = np.minimum(np.searchsorted(own, stamp), own.size - 1)
+        index[own[index] != stamp] = -1
+        return self.select(index)
+
+    def held(self, stamp: Stamps) -> JointStates:
+        """Return the last states at or before these stamps, else the first."""
+        return self.select(np.maximum(np.searchsorted(self.stamp, stamp, side='right') - 1, 0))
+
     def series(self, k: int = 0) -> Series:
         """Return one field, ordered by stamp."""
-        ordered = self.by_stamp()
-        return StoredSeries(ordered, k)
+        return StoredSeries(self.by_stamp(), k)
 
     @classmethod
     def merged(
@@ -133,28 +138,29 @@ class JointStates:
         """Return the states of several tables (with their places) in order of reception."""
         if len(parts) == 1:
             return cls(names, *parts[0])
-        n, heads, values = len(names), np.arange(_VALUES), []
+        n, rows = len(names), []
         for table, places in parts:
             part = cls(names, table, places)
-            fields = [part.field(k).view(np.int64) for k in range(3)]
-            values.append(np.hstack([table.read(heads), *fields]))
-        rows = np.concatenate(values)
+            heads = [part._integers(column) for column in range(_VALUES)]
+            values = np.hstack([part.field(k) for k in range(3)])
+            rows.append(np.column_stack((*heads, values.view(np.int64))))
+        together = np.concatenate(rows)
         table = Columns(_VALUES + 3 * n)
-        table.append(rows[np.argsort(rows[:, _NUMBER])])
+        table.append(together[np.argsort(together[:, _NUMBER])])
         return cls(names, table, _VALUES + np.arange(3 * n).reshape(3, n))
 
 
 class StoredSeries(Series):
     """Series whose values are read from a bag's table when they are asked for."""
 
-    def __init__(self, states: JointStates, k: int) -> None:
-        object.__setattr__(self, 'names', states.names)
-        object.__setattr__(self, 'stamp', states.stamp)
-        object.__setattr__(self, '_states', states)
-        object.__setattr__(self, '_k', k)
-
     _states: JointStates
     _k: int
+
+    def __init__(self, states: JointStates, k: int) -> None:
+        for name, value in {
+            'names': states.names, 'stamp': states.stamp, '_states': states, '_k': k
+        }.items():  # fmt: skip
+            object.__setattr__(self, name, value)
 
     @property
     def values(self) -> Floats:
@@ -170,32 +176,23 @@ class _LikeMessages:
     """Messages of one layout, in a table: number, received, sequence, stamp, then all values."""
 
     def __init__(self, raw: bytes, layout: Layout, *, is_stamped: bool) -> None:
-        self.layout = layout
-        self._size, self._is_stamped = len(raw), is_stamped
-        self._fixed_of = itemgetter(*layout.fixed_parts)
-        self._fixed = self._fixed_of(raw)
-        self._float = np.dtype(layout.byte_order + 'f8')
+        self.layout, self.pattern, self._is_stamped = layout, Pattern(raw, layout), is_stamped
         self._places = np.concatenate([one.place + np.arange(one.size) for one in layout.arrays])
         self.table = Columns(_VALUES + self._places.size)
 
-    def holds(self, raw: bytes) -> bool:
-        """Return whether a message has this layout."""
-        return len(raw) == self._size and self._fixed_of(raw) == self._fixed
-
     def add(self, first: int, messages: Sequence[BagMessage]) -> None:
         """Decode messages of this layout with the numbers from `first` on."""
-        count, size = len(messages), self._size
-        rows = np.empty((count, self.table.width), np.int64)
+        count, size, double = len(messages), self.pattern.size, self.pattern.double
+        rows = np.zeros((count, self.table.width), np.int64)
         rows[:, _NUMBER] = first + np.arange(count)
         rows[:, _RECEIVED] = [one.received for one in messages]
         rows[:, _SEQUENCE] = [one.sequence for one in messages]
         joined = b''.join([one.raw for one in messages])
-        rows[:, _STAMP] = 0
         if self._is_stamped:
-            kind = np.dtype([('s', 'i4'), ('ns', 'u4')]).newbyteorder(self._float.byteorder)
+            kind = np.dtype([('s', 'i4'), ('ns', 'u4')]).newbyteorder(double.byteorder)
             stamp = np.ndarray(count, kind, joined, STAMP_OFFSET, (size,))
             rows[:, _STAMP] = stamp['s'].astype(np.int64) * NANOSECONDS + stamp['ns']
-        grid = np.ndarray((count, (size - ORIGIN) // 8), self._float, joined, ORIGIN, (size, 8))
+        grid = np.ndarray((count, (size - ORIGIN) // 8), double, joined, ORIGIN, (size, 8))
         rows[:, _VALUES:] = grid[:, self._places].astype(np.float64).view(np.int64)
         self.table.append(rows)
 
@@ -240,14 +237,14 @@ class TopicMessages:
             end = begin + 1
             like = self._like(waiting[begin].raw, first + begin)
             if like is not None:
-                while end < len(waiting) and like.holds(waiting[end].raw):
+                while end < len(waiting) and like.pattern.fits(waiting[end].raw):
                     end += 1
                 like.add(first + begin, waiting[begin:end])
             begin = end
 
     def _like(self, raw: bytes, number: int) -> _LikeMessages | None:
         for like in self._likes:
-            if like.holds(raw):
+            if like.pattern.fits(raw):
                 return like
         try:
             layout: Any = self._find and self._find(raw)
@@ -282,7 +279,7 @@ class TopicMessages:
                 if isinstance(error, MissingJointError) and error.is_foreign(names):
                     foreign = foreign or error
                 else:
-                    numbers = like.table.read(np.array([_NUMBER]))[:, 0]
+                    numbers = JointStates((), like.table, np.empty((3, 0), np.intp)).number
                     unreadable.update(dict.fromkeys(numbers.tolist(), error))
             else:
                 parts.append((like.table, like.columns_of(places)))
@@ -298,20 +295,21 @@ class TopicMessages:
         """Return named values, sent as positions; UnreadableMessageError as above."""
         return self.joint_states(self.joint_names(), ('position',))
 
-    def arrays(self, size: int) -> JointStates | None:
-        """Return Float64MultiArrays of this size, as positions; None if one has another size.
+    def arrays(self, columns: Sequence[int]) -> JointStates:
+        """Return these values of each std_msgs/Float64MultiArray as efforts.
 
         Raises:
-            UnreadableMessageError: a message cannot be decoded.
+            UnreadableMessageError: a message cannot be decoded, or has other values.
         """
-        if self._unreadable:
-            raise UnreadableMessageError(self.name, *min(self._unreadable.items()))
-        if any(like.layout.arrays[0].size != size for like in self._likes):
-            return None
-        places = np.full((3, size), -1)
-        places[0] = _VALUES + np.arange(size)
-        names = [f'{k}' for k in range(size)]
-        return JointStates.merged(names, [(like.table, places) for like in self._likes])
+        self.layout()
+        size = self._likes[0].layout.arrays[0].size
+        if len(self._likes) > 1 or self._unreadable or max(columns) >= size:
+            error = MessageError(f'not every message holds the same {size} values')
+            raise UnreadableMessageError(self.name, *min([*self._unreadable.items(), (0, error)]))
+        places = np.full((3, len(columns)), -1)
+        places[2] = _VALUES + np.array(columns)
+        names = [f'{k}' for k in columns]
+        return JointStates(names, self._likes[0].table, places)
 
     def layout(self) -> Layout:
         """Return the layout of the first message; UnreadableMessageError if it has none."""

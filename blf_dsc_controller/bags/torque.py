@@ -7,12 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.bags.columns import ALL, Rows
 from blf_dsc_controller.bags.content import Content
-from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages
+from blf_dsc_controller.bags.topic_messages import ALL, JointStates, TopicMessages
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE, JOINT_STATES, TRACKING_ERROR
-from blf_dsc_controller.run import Floats, Stamps
+from blf_dsc_controller.run import Floats, Rows
 
 
 class TorqueError(BlfDscError):
@@ -20,20 +19,14 @@ class TorqueError(BlfDscError):
 
 
 class AppliedTorque(NamedTuple):
-    """The torque from each of N states to the next, in a table."""
+    """The torque from each of N states to the next, as efforts."""
 
     source: str  # topic
-    table: JointStates
-    field: int
-    columns: Rows
-    row: Stamps  # (N,) row of the table for each state; -1 if unknown
+    efforts: JointStates  # (N,)
 
     def at(self, rows: Rows = ALL) -> Floats:
         """Return the torque after these states (m, n) [N m]; NaN where unknown."""
-        row = self.row[rows]
-        values = self.table.field(self.field, np.maximum(row, 0), self.columns)
-        values[row < 0] = np.nan
-        return values
+        return self.efforts.field(2, rows)
 
 
 def applied_torque(content: Content, states: JointStates) -> AppliedTorque:
@@ -50,10 +43,7 @@ def applied_torque(content: Content, states: JointStates) -> AppliedTorque:
         return _commanded(content, commands, states)
     if errors is not None:
         telemetry = errors.joint_states(states.names, ('effort',)).by_stamp()
-        stamp, wanted = telemetry.stamp, states.stamp
-        index = np.minimum(np.searchsorted(stamp, wanted), stamp.size - 1)
-        index[stamp[index] != wanted] = -1
-        return AppliedTorque(f'effort of {errors.name}', telemetry, 2, ALL, index)
+        return AppliedTorque(f'effort of {errors.name}', telemetry.at_stamps(states.stamp))
     found = next_effort(states, f'effort of {content.topics[JOINT_STATES].name}')
     if np.isnan(found.at(slice(0, 1000))).all():
         raise TorqueError(
@@ -65,36 +55,31 @@ def applied_torque(content: Content, states: JointStates) -> AppliedTorque:
 
 def next_effort(states: JointStates, source: str = '') -> AppliedTorque:
     """Return the effort measured with the next state; unknown for the last one."""
-    index = np.append(np.arange(1, states.size), -1)
-    return AppliedTorque(source, states, 2, ALL, index)
+    return AppliedTorque(source, states.select(np.append(np.arange(1, states.size), -1)))
 
 
 def _commanded(content: Content, commands: TopicMessages, states: JointStates) -> AppliedTorque:
     """Return the command after each state: k-th, or last before the next if counts differ."""
-    table, field, columns = _by_joint(content, commands, states.names)
-    index = np.arange(states.size)
-    if table.size != states.size:
+    efforts = _by_joint(content, commands, states.names)
+    if efforts.size != states.size:
         until = np.append(states.received[1:], np.iinfo(np.int64).max)
-        index = np.searchsorted(np.maximum.accumulate(table.received), until) - 1
-    return AppliedTorque(commands.name, table, field, columns, index)
+        index = np.searchsorted(np.maximum.accumulate(efforts.received), until) - 1
+        efforts = efforts.select(index)
+    return AppliedTorque(commands.name, efforts)
 
 
-def _by_joint(
-    content: Content, commands: TopicMessages, joints: tuple[str, ...]
-) -> tuple[JointStates, int, Rows]:
-    """Return commands as a table, a field and columns: by name, or in the order of `joints`.
-
-    Without names they may also be in the order of the joint states.
-    """
+def _by_joint(content: Content, commands: TopicMessages, joints: tuple[str, ...]) -> JointStates:
+    """Return commands by name; without names, in the order of `joints` or of the joint states."""
     if commands.type == JOINT_STATE:
-        return commands.joint_states(joints, ('effort',)), 2, ALL
+        return commands.joint_states(joints, ('effort',))
     size = commands.layout().arrays[0].size
-    table = commands.arrays(size)
     states = content.topics[JOINT_STATES].layout()
-    if table is None or size not in (len(joints), len(states.names)):
-        raise TorqueError(
-            f'{commands.name} has {size} values, but there are {len(joints)} joints, and '
-            f'{len(states.names)} in the joint states ({", ".join(states.names)}): their order is '
-            'not known'
-        )
-    return table, 0, ALL if size == len(joints) else np.array(states.columns_of(joints))
+    if size == len(joints):
+        return commands.arrays(range(size))
+    if size == len(states.names):
+        return commands.arrays(states.columns_of(joints))
+    raise TorqueError(
+        f'{commands.name} has {size} values, but there are {len(joints)} joints, and '
+        f'{len(states.names)} in the joint states ({", ".join(states.names)}): their order is '
+        'not known'
+    )

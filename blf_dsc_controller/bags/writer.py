@@ -3,31 +3,30 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from math import inf
 from pathlib import Path
-from typing import IO, cast
+from typing import IO, Any, cast
 
+import yaml
 from mcap.writer import CompressionType, Writer
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.metadata import (
-    BagInformation,
-    FileInformation,
-    TopicInformation,
-    profile_of,
-)
-from blf_dsc_controller.bags.reserved_file import ReservedFile
-from blf_dsc_controller.bags.sources import MESSAGES, RECORD, VERSION, BagError
-from blf_dsc_controller.messages.topics import Quality
+from blf_dsc_controller.bags.sources import MESSAGES, METADATA, RECORD, VERSION, BagError
+from blf_dsc_controller.messages.codecs import NANOSECONDS
+from blf_dsc_controller.messages.topics import FOREVER, Quality
 from blf_dsc_controller.messages.types import Definition, definition
 
 _COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
 _CHUNK_SIZE = 1 << 20
-_CHUNK_ENTRY = 100  # bytes that a chunk takes in the index at the end ...
-_CHANNEL_ENTRY = 16  # ... and for each channel
-_MOST_CHUNKS = 20_000  # in a file, whose index is kept in memory until it ends
+_MOST_CHUNKS = 10_000  # in a file, whose index is kept in memory until it ends
+_RESERVE = 16 << 20  # bytes: the current chunk, metadata.yaml, and the index of a file's chunks
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_DURATIONS = ('deadline', 'lifespan', 'liveliness_lease_duration')
 
 
 class DiskFullError(BagError):
@@ -39,6 +38,147 @@ class DiskFullError(BagError):
             f'the disk is full: recording into {path} has ended with {messages} messages, which '
             'are complete and readable; make room, or split and move bags while they are recorded'
         )
+
+
+class _ReservedFile:
+    """File, buffered until `flush`, that can still be completed when its disk is full.
+
+    The file `reserve` keeps room for what is not written yet. It is removed when the disk is full;
+    `is_full` then means: complete the file.
+    """
+
+    def __init__(self, path: Path, reserve: Path) -> None:
+        self.is_full = False
+        self._file = path.open('xb', buffering=0)
+        self._buffer = bytearray()
+        self._written = 0
+        self._reserve = reserve
+
+    def write(self, data: bytes) -> int:
+        """Buffer bytes."""
+        self._buffer += data
+        if len(self._buffer) >= _CHUNK_SIZE:
+            self.flush()
+        return len(data)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the file is closed."""
+        return self._file.closed
+
+    def tell(self) -> int:
+        """Return the number of bytes received so far."""
+        return self._written + len(self._buffer)
+
+    def flush(self) -> None:
+        """Pass all bytes to the operating system, giving up the reserve if needed."""
+        waiting = bytes(self._buffer)
+        self._buffer = bytearray()
+        while waiting:
+            try:
+                count = self._file.write(waiting) or 0
+            except OSError as error:
+                if error.errno not in _FULL or self.is_full:
+                    raise
+                self.is_full = True
+                self._reserve.unlink(missing_ok=True)
+                continue
+            self._written += count
+            waiting = waiting[count:]
+
+    def close(self) -> None:
+        """Flush and close the file."""
+        self.flush()
+        self._file.close()
+
+
+@dataclass
+class _Topic:
+    """One topic of a bag."""
+
+    name: str
+    type: str
+    offered: list[dict[str, Any]]
+    definition: Definition
+    message_count: int = 0
+
+
+@dataclass
+class _File:
+    """One file of a bag; times in ns."""
+
+    path: str
+    starting_time: int = FOREVER  # if it is empty
+    ending_time: int = 0
+    message_count: int = 0
+
+
+@dataclass
+class _Bag:
+    """Contents of rosbag2's metadata, version 9 (that of Jazzy)."""
+
+    topics: list[_Topic] = field(default_factory=list)
+    files: list[_File] = field(default_factory=list)
+    facts: dict[str, str] = field(default_factory=lambda: {VERSION: __version__})
+
+    def information(self) -> dict[str, Any]:
+        """Return plain data in rosbag2's order.
+
+        The compression fields are those of rosbag2's own compression of whole files.
+        """
+        topics = [
+            {
+                'topic_metadata': {
+                    'name': topic.name,
+                    'type': topic.type,
+                    'serialization_format': 'cdr',
+                    'offered_qos_profiles': topic.offered,
+                    'type_description_hash': topic.definition.hash,
+                },
+                'message_count': topic.message_count,
+            }
+            for topic in self.topics
+        ]
+        files = [
+            {'path': file.path, **_period([file]), 'message_count': file.message_count}
+            for file in self.files
+        ]
+        period = _period(self.files)
+        return {
+            'version': 9,
+            'storage_identifier': 'mcap',
+            'duration': period['duration'],
+            'starting_time': period['starting_time'],
+            'message_count': sum(file.message_count for file in self.files),
+            'topics_with_message_count': topics,
+            'compression_format': '',
+            'compression_mode': '',
+            'relative_file_paths': [file.path for file in self.files],
+            'files': files,
+            'custom_data': self.facts,
+            'ros_distro': 'jazzy',
+        }
+
+
+def _period(files: Sequence[_File]) -> dict[str, dict[str, int]]:
+    start = min(file.starting_time for file in files)
+    end = max(file.ending_time for file in files)
+    return {
+        'starting_time': {'nanoseconds_since_epoch': start},
+        'duration': {'nanoseconds': max(end - start, 0)},
+    }
+
+
+def _profile(quality: Quality) -> dict[str, Any]:
+    """Return a quality of service as rosbag2 writes it, in its order."""
+    profile = {'history': quality.history, **asdict(quality)}
+    for name in _DURATIONS:
+        profile[name] = dict(zip(('sec', 'nsec'), divmod(profile[name], NANOSECONDS), strict=True))
+    return {**profile, 'avoid_ros_namespace_conventions': False}
+
+
+def _dump(tree: object) -> str:
+    return str(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=2**20))
 
 
 class BagWriter:
@@ -69,13 +209,16 @@ class BagWriter:
         self._flush_interval = inf if flush_interval is None else flush_interval
         self._clock = clock
         self._split_size, self._split_duration = split_size, split_duration
-        self._bag = BagInformation(custom_data={VERSION: __version__})
+        self._bag = _Bag()
         try:
             self.path.mkdir(parents=True)
         except FileExistsError:
             raise BagError(
                 f'{path} exists already and is not overwritten: choose another folder or remove it'
             ) from None
+        self._reserve = self.path / '.reserve'
+        with self._reserve.open('xb') as reserve:
+            os.posix_fallocate(reserve.fileno(), 0, _RESERVE)
         self._begin_file()
         self._flushed = self._began
 
@@ -83,21 +226,20 @@ class BagWriter:
         self,
         name: str,
         type_name: str,
-        offered: Sequence[Quality],
+        offered: Sequence[Quality | dict[str, Any]],
         known: Definition | None = None,
     ) -> int:
         """Add a topic by its full name, with the quality of service of each publisher.
 
-        Returns:
-            the handle for `write`.
+        A quality may also be plain data, as in another bag. Returns the handle for `write`.
 
         Raises:
             UnknownTypeError: no definition is given and the type is not one of Jazzy's common ones.
         """
         found = definition(type_name) if known is None else known
-        topic = TopicInformation(name, type_name, [profile_of(one) for one in offered], found)
-        self._bag.topics.append(topic)
-        return self._add_channel(topic)
+        profiles = [_profile(one) if isinstance(one, Quality) else one for one in offered]
+        self._bag.topics.append(_Topic(name, type_name, profiles, found))
+        return self._add_channel(self._bag.topics[-1])
 
     def write(
         self,
@@ -116,8 +258,8 @@ class BagWriter:
             DiskFullError: there is no room left; the bag is complete and closed.
         """
         if self._is_due:
-            self._end_chunk()
             self._end_file()
+            self._stop_if_full()
             self._begin_file()
         published = log_time if publish_time is None else publish_time
         self._writer.add_message(handle, log_time, raw, published, sequence)
@@ -128,10 +270,10 @@ class BagWriter:
         file.ending_time = max(file.ending_time, log_time)
         self.flush_if_due()
 
-    def note(self, facts: dict[str, str]) -> None:
+    def note(self, facts: Mapping[str, str]) -> None:
         """Store facts about the run by name."""
-        self._bag.custom_data.update(facts)
-        self._writer.add_metadata(RECORD, self._bag.custom_data)
+        self._bag.facts.update(facts)
+        self._writer.add_metadata(RECORD, self._bag.facts)
 
     def flush_if_due(self) -> None:
         """Flush if the flush interval has passed; DiskFullError as in `write`."""
@@ -142,18 +284,22 @@ class BagWriter:
         """Pass everything written so far to the operating system; DiskFullError as in `write`."""
         self._end_chunk()
         self._flushed = self._clock()
-        if self._stream.is_full:
-            self.close()
-            raise DiskFullError(self.path, sum(self.message_counts.values()))
+        self._stop_if_full()
 
     def close(self) -> None:
         """Complete the bag; a second call does nothing."""
         if self.closed:
             return
         self.closed = True
-        self._end_chunk()
+        self._reserve.unlink(missing_ok=True)
         self._end_file()
-        (self.path / 'metadata.yaml').write_text(self._bag.file_text(), encoding='utf-8')
+        text = _dump({'rosbag2_bagfile_information': self._bag.information()})
+        (self.path / METADATA).write_text(text, encoding='utf-8')
+
+    def _stop_if_full(self) -> None:
+        if self._stream.is_full:
+            self.close()
+            raise DiskFullError(self.path, sum(self.message_counts.values()))
 
     @property
     def message_counts(self) -> dict[str, int]:
@@ -176,15 +322,15 @@ class BagWriter:
 
     def _begin_file(self) -> None:
         """Begin the next file, with the topics of the previous one."""
-        file = FileInformation(f'{self.path.name}_{len(self._bag.files)}.mcap')
+        file = _File(f'{self.path.name}_{len(self._bag.files)}.mcap')
         self._bag.files.append(file)
-        self._stream = ReservedFile(self.path / file.path)
+        self._stream = _ReservedFile(self.path / file.path, self._reserve)
         self._writer = Writer(
             cast('IO[bytes]', self._stream), chunk_size=_CHUNK_SIZE, compression=self._compression
         )
         self._writer.start(profile='ros2', library=f'blf_dsc_controller {__version__}')
         self._schemas: dict[str, int] = {}
-        self._index_size = self._chunks = 0
+        self._chunks = 0
         self._describe()
         for topic in self._bag.topics:
             self._add_channel(topic)
@@ -193,15 +339,16 @@ class BagWriter:
 
     def _describe(self) -> None:
         """Store the metadata so far; rosbag2 reads the last such record of a file."""
-        self._writer.add_metadata('rosbag2', {'serialized_metadata': self._bag.record_text()})
+        text = _dump(self._bag.information())
+        self._writer.add_metadata('rosbag2', {'serialized_metadata': text})
 
-    def _add_channel(self, topic: TopicInformation) -> int:
+    def _add_channel(self, topic: _Topic) -> int:
         """Add a topic to the file and return its number, the same in each file."""
         text, hash_, encoding = topic.definition
         if topic.type not in self._schemas:
             schema = self._writer.register_schema(topic.type, encoding, text.encode())
             self._schemas[topic.type] = schema
-        metadata = {'offered_qos_profiles': topic.offered_text(), 'topic_type_hash': hash_}
+        metadata = {'offered_qos_profiles': _dump(topic.offered), 'topic_type_hash': hash_}
         schema = self._schemas[topic.type]
         return self._writer.register_channel(topic.name, 'cdr', schema, metadata)
 
@@ -209,12 +356,13 @@ class BagWriter:
         before = self._stream.tell()
         self._writer.flush()  # type: ignore[no-untyped-call]
         self._stream.flush()
-        if self._stream.tell() > before:
-            self._chunks += 1
-            self._index_size += _CHUNK_ENTRY + _CHANNEL_ENTRY * len(self._bag.topics)
-            self._stream.reserve(self._index_size)
+        self._chunks += self._stream.tell() > before
 
     def _end_file(self) -> None:
+        """Complete the file, unless it is complete."""
+        if self._stream.closed:
+            return
+        self._end_chunk()
         self._describe()
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.close()

@@ -95,35 +95,16 @@ def recover(options: Namespace) -> int:
     bag = options.bag.resolve()
     out = options.out or bag.with_name(f'{bag.stem}_recovered')
     recovery = recovering.recover(options.bag, out)
-    print('\n'.join(_losses(recovery)))
-    return int(recovery.is_empty)
-
-
-def _losses(recovery: recovering.Recovery) -> Iterator[str]:
     for topic, count in recovery.messages.items():
-        missing = recovery.missing[topic]
-        gaps = f', {missing.missed} numbers missing in between' if missing.missed else ''
-        begun = f', {missing.before} numbers missing before the first' if missing.before else ''
-        yield f'{topic}: {count} messages{gaps}{begun}'
+        print(f'{topic}: {count} messages')
     for loss in recovery.losses:
-        yield f'LOST {loss}'
-    for name, last in recovery.unfinished:
-        after = (
-            'nothing in it could be read'
-            if last is None
-            else f'it ends at {recovering.format_time(last)}'
-        )
-        yield (
-            f'{name}: the recording was not closed; {after}. Later messages are lost: usually the '
-            'last 0.1 s before a kill, more if the computer was overloaded or lost power'
-        )
-    if recovery.unknown:
-        yield f'LOST {recovery.unknown} messages of topics whose name or type is unknown'
+        print(f'LOST {loss}')
     if recovery.is_empty:
-        yield 'ALL LOST: no message could be recovered'
-    if recovery.is_whole:
-        yield 'none of the recorded messages was lost'
-    yield f'wrote {recovery.path}'
+        print('ALL LOST: no message could be recovered')
+    elif not recovery.losses:
+        print('none of the recorded messages was lost')
+    print(f'wrote {recovery.path}')
+    return int(recovery.is_empty)
 
 
 def replay(options: Namespace) -> int:

@@ -23,8 +23,8 @@ from blf_dsc_controller.law.rejected_columns import RejectedColumn, rejected_col
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Sample, sample_of
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.cdr import NANOSECONDS
 from blf_dsc_controller.messages.codecs import (
+    NANOSECONDS,
     Float64MultiArrayEncoder,
     JointStateEncoder,
     encode_clock,

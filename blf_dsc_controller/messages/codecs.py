@@ -1,38 +1,252 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Conversion between arrays and serialised messages, in about a microsecond.
+"""Messages of the control loop to bytes and back, in about a microsecond.
 
-An encoder serialises a template once and then only overwrites its numbers; nodes publish these
-bytes and bags store them as they are. A decoder locates the values once and keeps their positions
-for as long as the messages have the same names and lengths.
+Plain CDR, version 1, as ROS 2 sends it: two bytes for the byte order, two unused, then the fields,
+each number aligned to its own size, from the fifth byte on. Padding bytes, and bytes after the
+last field, may hold anything. An encoder serialises a template once and then only overwrites its
+numbers. A decoder finds the values once and keeps their places for as long as the messages have the
+same names and lengths. Messages of all other types are left to the library rosbags.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
 from operator import itemgetter
-from struct import Struct
+from struct import Struct, unpack_from
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from blf_dsc_controller.messages.cdr import (
-    JOINT_STATE_FIELDS,
-    NANOSECONDS,
-    ORIGIN,
-    STAMP_OFFSET,
-    Doubles,
-    Layout,
-    array_layout,
-    joint_state_layout,
-    joint_state_places,
-)
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
 from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Floats
 
-_STAMPS = {'<': Struct('<iI'), '>': Struct('>iI')}
-_STAMP = _STAMPS['<']
+NANOSECONDS = 1_000_000_000
+"""Per second."""
+
+ORIGIN = 4  # alignment is counted from here
+STAMP_OFFSET = 4  # of a message that starts with a std_msgs/Header
+JOINT_STATE_FIELDS = ('position', 'velocity', 'effort')
+_BYTE_ORDERS = {b'\x00\x00': '>', b'\x00\x01': '<'}
+_STAMP = Struct('<iI')
+
+
+class MessageError(BlfDscError):
+    """A serialised message that cannot be used."""
+
+
+class MissingJointError(MessageError):
+    """An expected joint is not among the names of the message."""
+
+    def __init__(self, joint: str, names: tuple[str, ...]) -> None:
+        self.joint, self.names = joint, names
+        self.fact = (
+            f'joint {joint!r} is not in the message, which names {", ".join(names) or "none"}'
+        )
+        super().__init__(
+            f'{self.fact}: set the parameter `joints` to names from this list, or publish the joint'
+        )
+
+    def is_foreign(self, joints: Collection[str]) -> bool:
+        """Return whether the message is for other joints only: drivers may share a topic."""
+        return bool(self.names) and not set(joints) & set(self.names)
+
+
+class DuplicatedJointError(MessageError):
+    """An expected joint is named more than once."""
+
+
+class ShortArrayError(MessageError):
+    """An array of the message does not hold one value for each name."""
+
+
+class Doubles(NamedTuple):
+    """A sequence of float64: offset of its uint32 length, of its first value, and the length."""
+
+    size_offset: int
+    offset: int
+    size: int
+
+    @property
+    def place(self) -> int:
+        """Index of the first value in a grid of doubles that starts at ORIGIN."""
+        return (self.offset - ORIGIN) // 8
+
+
+class Layout(NamedTuple):
+    """Byte order of a message, names in it, and positions of its arrays."""
+
+    byte_order: str
+    begin: int  # offset of what follows the stamp
+    names: tuple[str, ...]
+    arrays: tuple[Doubles, ...]
+
+    def columns_of(self, joints: Sequence[str]) -> list[int]:
+        """Return the index of each joint among the names.
+
+        Raises:
+            MissingJointError, DuplicatedJointError: a joint is not among them, or more than once.
+        """
+        for joint in joints:
+            count = self.names.count(joint)
+            if count == 0:
+                raise MissingJointError(joint, self.names)
+            if count > 1:
+                raise DuplicatedJointError(
+                    f'joint {joint!r} appears {count} times in the message '
+                    f'({", ".join(self.names)}): name each joint once'
+                )
+        return [self.names.index(joint) for joint in joints]
+
+
+class Pattern:
+    """What is the same in all messages of one layout: size, byte order, names, array sizes."""
+
+    def __init__(self, raw: bytes, layout: Layout) -> None:
+        first, *others = (array.size_offset for array in layout.arrays)
+        sizes = (slice(at, at + 4) for at in others)
+        self.size, self.double = len(raw), np.dtype(layout.byte_order + 'f8')
+        self._parts_of = itemgetter(slice(2), slice(layout.begin, first + 4), *sizes)
+        self._parts = self._parts_of(raw)
+
+    def fits(self, raw: bytes) -> bool:
+        """Return whether a message has this layout."""
+        return len(raw) == self.size and self._parts_of(raw) == self._parts
+
+
+class _Cursor:
+    """Cursor over the fields of one serialised message."""
+
+    def __init__(self, raw: bytes | bytearray) -> None:
+        self._raw, self._offset = raw, 0
+        self._take(ORIGIN)
+        encapsulation = bytes(raw[:2])
+        if encapsulation not in _BYTE_ORDERS:
+            raise MessageError(
+                f'message starts with the bytes {encapsulation.hex(" ")}, not with 00 00 or 00 01: '
+                'it is not plain CDR; publish it with a ROS 2 middleware in its default encoding'
+            )
+        self.byte_order = _BYTE_ORDERS[encapsulation]
+
+    def unsigned(self) -> int:
+        self._align(4)
+        return int(unpack_from(self.byte_order + 'I', self._raw, self._take(4))[0])
+
+    def time(self) -> int:
+        self._align(4)
+        seconds, nanoseconds = unpack_from(self.byte_order + 'iI', self._raw, self._take(8))
+        return int(seconds * NANOSECONDS + nanoseconds)
+
+    def text(self) -> str:
+        length = self.unsigned()
+        start = self._take(length)
+        return self._raw[start : start + length].rstrip(b'\0').decode(errors='replace')
+
+    def texts(self) -> tuple[str, ...]:
+        return tuple(self.text() for _ in range(self.unsigned()))
+
+    def doubles(self) -> Doubles:
+        size = self.unsigned()
+        size_offset = self._offset - 4
+        if size:
+            self._align(8)
+        return Doubles(size_offset, self._take(8 * size), size)
+
+    def values(self) -> tuple[float, ...]:
+        array = self.doubles()
+        return unpack_from(f'{self.byte_order}{array.size}d', self._raw, array.offset)
+
+    def _align(self, size: int) -> None:
+        self._offset += -(self._offset - ORIGIN) % size
+
+    def _take(self, size: int) -> int:
+        start = self._offset
+        self._offset += size
+        if self._offset > len(self._raw):
+            raise MessageError(
+                f'message of {len(self._raw)} bytes is cut off: '
+                f'its contents need at least {self._offset} bytes'
+            )
+        return start
+
+
+def joint_state_layout(raw: bytes | bytearray) -> Layout:
+    """Find position, velocity and effort of a sensor_msgs/JointState.
+
+    Raises:
+        MessageError: `raw` is not plain CDR, or is cut off.
+    """
+    cursor = _Cursor(raw)
+    cursor.time()
+    cursor.text()
+    names = cursor.texts()
+    arrays = tuple(cursor.doubles() for _ in JOINT_STATE_FIELDS)
+    return Layout(cursor.byte_order, STAMP_OFFSET + _STAMP.size, names, arrays)
+
+
+def joint_state_stamp(raw: bytes) -> int:
+    """Return the stamp of a message that starts with a header [ns]; MessageError as above."""
+    return _Cursor(raw).time()
+
+
+def array_layout(raw: bytes | bytearray) -> Layout:
+    """Find the values of a std_msgs/Float64MultiArray after its dimensions; errors as above."""
+    cursor = _Cursor(raw)
+    for _ in range(cursor.unsigned()):
+        cursor.text()
+        cursor.unsigned()
+        cursor.unsigned()
+    cursor.unsigned()
+    return Layout(cursor.byte_order, ORIGIN, (), (cursor.doubles(),))
+
+
+def joint_state_places(
+    layout: Layout, joints: Sequence[str], required: Collection[str]
+) -> NDArray[np.intp]:
+    """Return where position, velocity and effort of n `joints` are, (3, n) in a grid of doubles.
+
+    A field that is not `required` and is empty has -1.
+
+    Raises:
+        MissingJointError, DuplicatedJointError: as in `columns_of`.
+        ShortArrayError: an array differs in length from the names.
+    """
+    columns = np.array(layout.columns_of(joints), dtype=np.intp)
+    places = np.full((3, columns.size), -1)
+    for row, field, array in zip(places, JOINT_STATE_FIELDS, layout.arrays, strict=True):
+        if array.size == len(layout.names):
+            row[:] = columns + array.place
+        elif array.size or field in required:
+            raise ShortArrayError(
+                f'`{field}` of the message holds {array.size} values for {len(layout.names)} '
+                'names: publish one value for each name'
+            )
+    return places
+
+
+class TrajectoryContent(NamedTuple):
+    """Content of a trajectory_msgs/JointTrajectory."""
+
+    stamp: int  # ns
+    names: tuple[str, ...]
+    points: tuple[tuple[int, list[tuple[float, ...]]], ...]  # ns from the start, the four arrays
+
+
+def joint_trajectory(raw: bytes) -> TrajectoryContent:
+    """Read a trajectory_msgs/JointTrajectory; MessageError as above.
+
+    Decoding by rclpy would block all other threads, for 10 ms with a thousand points.
+    """
+    cursor = _Cursor(raw)
+    stamp = cursor.time()
+    cursor.text()
+    names, points = cursor.texts(), []
+    for _ in range(cursor.unsigned()):
+        arrays = [cursor.values() for _ in range(4)]
+        points.append((cursor.time(), arrays))
+    return TrajectoryContent(stamp, names, tuple(points))
 
 
 class JointStateEncoder:
@@ -101,40 +315,28 @@ def _view(buffer: bytearray, doubles: Doubles) -> Floats:
     return np.frombuffer(buffer, '<f8', doubles.size, doubles.offset if doubles.size else 0)
 
 
-class Decoder(ABC):
-    """Decoder of `values` (s,) at positions that are the same in all messages of one layout."""
+class _Decoder:
+    """Decoder of `values` (s,) at places that are the same in all messages of one layout."""
 
     def __init__(self, size: int) -> None:
         self.values = np.full(size, np.nan)
-        self._length = -1  # of the messages whose layout is known
-
-    @abstractmethod
-    def decode(self, raw: bytes) -> int:
-        """Fill `values` and return the stamp or the size of a message."""
-
-    def _is_known(self, raw: bytes) -> bool:
-        return len(raw) == self._length and self._fixed_of(raw) == self._fixed
+        self._pattern: Pattern | None = None
 
     def _learn(self, raw: bytes, layout: Layout, places: NDArray[np.intp]) -> None:
-        """Store a layout.
-
-        `places` (s,) are the values' indices in a grid of doubles from ORIGIN on, -1 for NaN.
-        """
-        self._length = len(raw)
-        self._fixed_of = itemgetter(*layout.fixed_parts)
-        self._fixed = self._fixed_of(raw)
-        self._float = np.dtype(layout.byte_order + 'f8')
+        """Store a layout, with the values' `places` in a grid of doubles; -1 for NaN."""
+        self._pattern = Pattern(raw, layout)
         self._count = (len(raw) - ORIGIN) // 8
         self._known = np.flatnonzero(places >= 0)
         self._places = places[self._known]
+        self._stamp = Struct(layout.byte_order + 'iI')
         self.values[:] = np.nan
 
     def _fill(self, raw: bytes) -> None:
-        grid = np.frombuffer(raw, self._float, self._count, ORIGIN)
+        grid = np.frombuffer(raw, self._pattern.double, self._count, ORIGIN)  # type: ignore[union-attr]
         self.values[self._known] = grid[self._places]
 
 
-class JointStateDecoder(Decoder):
+class JointStateDecoder(_Decoder):
     """Decoder of sensor_msgs/JointState into arrays in the order of the n `joints`, by name.
 
     Other joints in the message are ignored. A field that is not `required` and is empty in the
@@ -149,30 +351,25 @@ class JointStateDecoder(Decoder):
         self, joints: Sequence[str], required: Collection[str] = ('position', 'velocity')
     ) -> None:
         super().__init__(3 * len(joints))
-        self._joints = tuple(joints)
-        self._required = frozenset(required)
+        self._joints, self._required = tuple(joints), frozenset(required)
         self.position, self.velocity, self.effort = self.values.reshape(3, -1)
 
     def decode(self, raw: bytes) -> int:
         """Fill the arrays from a serialised message and return its stamp [ns].
 
         Raises:
-            MessageError: not plain CDR, or `raw` ends too early.
-            MissingJointError: one of `joints` is not named.
-            DuplicatedJointError: one of `joints` is named twice.
-            ShortArrayError: an array differs in length from the names.
+            MessageError: as `joint_state_layout` and `joint_state_places`.
         """
-        if not self._is_known(raw):
+        if self._pattern is None or not self._pattern.fits(raw):
             layout = joint_state_layout(raw)
             places = joint_state_places(layout, self._joints, self._required)
             self._learn(raw, layout, places.ravel())
-            self._stamp = _STAMPS[layout.byte_order]
         self._fill(raw)
         seconds, nanoseconds = self._stamp.unpack_from(raw, STAMP_OFFSET)
         return int(seconds * NANOSECONDS + nanoseconds)
 
 
-class Float64MultiArrayDecoder(Decoder):
+class Float64MultiArrayDecoder(_Decoder):
     """Decoder of std_msgs/Float64MultiArray of an expected size; dimensions are skipped.
 
     Attributes:
@@ -183,9 +380,9 @@ class Float64MultiArrayDecoder(Decoder):
         """Return the number of values in the message; fill `values` if it is the expected one.
 
         Raises:
-            MessageError: not plain CDR, or `raw` ends too early.
+            MessageError: as `array_layout`.
         """
-        if not self._is_known(raw):
+        if self._pattern is None or not self._pattern.fits(raw):
             layout = array_layout(raw)
             (array,) = layout.arrays
             if array.size != self.values.size:

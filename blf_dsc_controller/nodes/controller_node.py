@@ -18,8 +18,7 @@ from blf_dsc_controller.law import factory
 from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.law.telemetry import DECIMATION, ControllerTelemetry, Monitor
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.cdr import MessageError
-from blf_dsc_controller.messages.codecs import JointStateDecoder
+from blf_dsc_controller.messages.codecs import JointStateDecoder, MessageError
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.controller_status import ControllerStatus
 from blf_dsc_controller.nodes.lifecycle import POLL_PERIOD, LoopNode

@@ -18,8 +18,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from blf_dsc_controller.arms.chain_geometry import skeleton, tip_radius
 from blf_dsc_controller.configuration.nodes import MarkersConfig
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.cdr import MessageError
-from blf_dsc_controller.messages.codecs import JointStateDecoder
+from blf_dsc_controller.messages.codecs import JointStateDecoder, MessageError
 from blf_dsc_controller.nodes.endpoints import create_steady_timer, qos_profile
 from blf_dsc_controller.nodes.parameters import declare
 from blf_dsc_controller.nodes.process import PlainNode, run

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from rclpy.node import Node
 from trajectory_msgs.msg import JointTrajectory
 
-from blf_dsc_controller.messages.cdr import joint_trajectory
+from blf_dsc_controller.messages.codecs import joint_trajectory
 from blf_dsc_controller.messages.topics import JOINT_TRAJECTORY
 from blf_dsc_controller.nodes.endpoints import qos_profile
 from blf_dsc_controller.reference.trajectory import (

@@ -21,11 +21,11 @@ from blf_dsc_controller.configuration.nodes import WatchdogConfig
 from blf_dsc_controller.configuration.schema import build, parameters
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.cdr import MessageError
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayDecoder,
     Float64MultiArrayEncoder,
     JointStateDecoder,
+    MessageError,
 )
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import create_steady_timer, message_class, qos_profile

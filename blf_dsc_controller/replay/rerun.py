@@ -13,15 +13,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.bags.content import Content
 from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.messages.cdr import MessageError
+from blf_dsc_controller.messages.codecs import MessageError
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.messages.topics import TRACKING_ERROR
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
-from blf_dsc_controller.replay.comparison import Comparer, Difference
+from blf_dsc_controller.replay.comparison import Difference, ReplayedMessages
 from blf_dsc_controller.run import Floats, Stamps
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Reason
@@ -38,7 +37,7 @@ class Rerun:
 
     Attributes:
         events: replayed events.
-        outputs: replayed outputs, compared with the recorded ones.
+        outputs: replayed outputs.
         passed_over: number of joint states that the controller did not answer.
         departure: where the controller departed from the journal, which ends the replay.
         end: any other reason why the replay ended before the bag, or empty.
@@ -46,26 +45,19 @@ class Rerun:
 
     def __init__(
         self,
-        content: Content,
         config: ControllerConfig,
         states: JointStates,
         errors: Mapping[int, MessageError],
-        answers: JointStates | None,
-        *,
-        is_told: bool,
+        answers: JointStates,
     ) -> None:
-        """Start with `config`.
-
-        `errors` maps the number of each unreadable joint state to its error; without `answers`
-        every message is taken as answered. `is_told`: safe torques have answers, too.
-        """
+        """Start with `config`; `errors` maps the number of each unreadable state to its error."""
         self.events: list[Event] = []
         self.passed_over = 0
         self.departure: Difference | None = None
         self.end = ''
         self._guard = Guard(config, lambda: 0, lambda: 0)
         self._guard.journal.pending.clear()
-        self._states, self._errors, self._is_told = states, errors, is_told
+        self._states, self._errors = states, errors
         self._values, self._loaded = np.empty((0, 3, 0)), range(0)
         # All messages in order: row of the state, and its stamp; -1 for unreadable ones.
         self._stamp = states.stamp
@@ -77,13 +69,13 @@ class Rerun:
             self._number, self._row = number[order], np.where(order < states.size, order, -1)
             unknown = np.full(len(errors), -1, dtype=np.int64)
             self._stamp = np.concatenate([states.stamp, unknown])[order]
-        self._answered = None if answers is None else answers.stamp
+        self._answered = answers.stamp
         self._gap = _first_gap(answers)
         self._answer = 0  # number of answers reached
         self._position = -1  # of the last message processed or passed over
         self._last = -1  # stamp of the last answer
         self._failed = False
-        self.outputs = Comparer(content, self._guard, answers)
+        self.outputs = ReplayedMessages(self._guard)
 
     def run(self, events: Sequence[Event]) -> None:
         """Process the joint states with the events after the configuration, in order."""
@@ -99,8 +91,6 @@ class Rerun:
             self.events.append(event)
             if event.type is EventType.RELEASE:
                 return
-            if not self._is_told and event.type in (EventType.STOP, EventType.DEACTIVATE):
-                self.end = 'recorded by an earlier version, which did not say what it used then'
         while not self._is_over and self._next():
             pass
 
@@ -115,11 +105,6 @@ class Rerun:
         if self._guard.journal.pending:  # the controller started or stopped on its own
             self._report_departure(self._guard.journal.pending[0], None)
             return False
-        if self._answered is None:
-            if self._position + 1 >= self._stamp.size:
-                return False
-            self._process(self._position + 1)
-            return True
         if self._answer == self._gap:
             self.end = f'the recorder missed messages of {TRACKING_ERROR.resolved}'
         if self._answer >= self._gap or self._answer >= self._answered.size:
@@ -171,11 +156,7 @@ class Rerun:
 
     def _reach(self, event: Event) -> None:
         """Process the message in which the controller should start or stop."""
-        guard = self._guard
-        if self._answered is None:
-            while self._next() and not guard.journal.pending and not self._is_over:
-                pass
-        elif self._answered[self._answer :][:1].tolist() == [event.stamp]:
+        if self._answered[self._answer :][:1].tolist() == [event.stamp]:
             self._next()  # it was answered, at least with a safe torque
         else:
             k = self._find_error() if _reason(event) in _UNREADABLE else self._find(event.stamp)
@@ -290,9 +271,9 @@ class Rerun:
             self.departure = Difference(TRACKING_ERROR.resolved, what, stamp, time, 1.0, 0.0)
 
 
-def _first_gap(answers: JointStates | None) -> int:
+def _first_gap(answers: JointStates) -> int:
     """Return the number of answers before the first that the recorder missed, by their sequence."""
-    sequence = np.zeros(0, np.int64) if answers is None else answers.sequence
+    sequence = answers.sequence
     gaps = np.flatnonzero(np.diff(sequence) > 1)
     return int(gaps[0]) + 1 if gaps.size and sequence[0] > 0 else sequence.size + 1
 

@@ -14,10 +14,17 @@ from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_con
 from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.messages.cdr import MessageError
+from blf_dsc_controller.messages.codecs import MessageError
 from blf_dsc_controller.messages.journal import FORMAT, Event, EventType, machine
-from blf_dsc_controller.messages.topics import FOREVER, JOINT_STATES, JOURNAL, TRACKING_ERROR
-from blf_dsc_controller.replay.comparison import Comparison, Difference, not_compared
+from blf_dsc_controller.messages.topics import (
+    DIAGNOSTICS,
+    FOREVER,
+    JOINT_STATES,
+    JOURNAL,
+    STATE,
+    TRACKING_ERROR,
+)
+from blf_dsc_controller.replay.comparison import Comparison, Difference
 from blf_dsc_controller.replay.rerun import Rerun
 
 _TURNS = (EventType.ACTIVATE, EventType.DEACTIVATE, EventType.RESET, EventType.STOP)
@@ -77,14 +84,11 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
             f'{start} ns, so its outputs cannot be reproduced: start the recorder first'
         )
         raise BlfDscError(reason)
-    messages = content.topics.get(TRACKING_ERROR)
-    answers = None
-    if messages is not None:
-        answers = _before(messages.joint_states(config.joints, ()), until)
-    is_told = events[0].content.get('format', 1) >= FORMAT
-    run = Rerun(content, config, _before(states, until), errors, answers, is_told=is_told)
+    answers = content.topics[TRACKING_ERROR].joint_states(config.joints, ())
+    answers = _before(answers, until)
+    run = Rerun(config, _before(states, until), errors, answers)
     run.run(events[1:])
-    comparisons = tuple(run.outputs.finish())
+    comparisons = tuple(run.outputs.compare(content, answers))
     if not (run.departure or any(found.values for found in comparisons)):
         raise _nothing_to_compare(content)
     differences = [run.departure, *(found.difference for found in comparisons)]
@@ -93,7 +97,9 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
         run.outputs.duration,
         run.passed_over,
         comparisons,
-        tuple(not_compared(content)),
+        tuple(
+            content.topics[topic].name for topic in (STATE, DIAGNOSTICS) if topic in content.topics
+        ),
         tuple(run.events),
         run.outputs.safe_torques,
         (*_remarks(content, run.end or end, newer), *_other_machine(events[0])),
@@ -103,19 +109,27 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
 
 def _events(content: Content) -> tuple[list[Event], int, str]:
     """Return the events of a bag's first controller, when the next begins [ns], and a remark."""
-    if JOURNAL not in content.topics:
+    if not {JOURNAL, TRACKING_ERROR} <= content.topics.keys():
         raise _nothing_to_compare(content)
     events: list[Event] = []
+    until, end = FOREVER, ''
     for received, event in content.events:
         if events and event.type is EventType.CONFIGURE:
-            return events, received, 'another controller was started'
+            until, end = received, 'another controller was started'
+            break
         events.append(event)
     if not events or events[0].type is not EventType.CONFIGURE:
         raise BlfDscError(
             f'{content.path} does not hold the beginning of {content.topics[JOURNAL].name}: start '
             'the recorder first'
         )
-    return events, FOREVER, ''
+    if events[0].content.get('format', 1) < FORMAT:
+        raise BlfDscError(
+            f'{content.path} was recorded by an earlier version, whose controller did not say '
+            'which states it used, so that it cannot be replayed; report, plot, export and '
+            'replay --config read it'
+        )
+    return events, until, end
 
 
 def _before(states: JointStates, until: int) -> JointStates:

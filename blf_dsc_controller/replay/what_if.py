@@ -127,7 +127,7 @@ def run_over(recorded_states: RecordedStates, config: ControllerConfig) -> WhatI
     controller = controller_of(config)
     n, m = len(states.names), controller.settings.m
     stamps = states.stamp.tolist()
-    recorded = states.values.reshape(-1, 3 * n)
+    recorded = np.hstack([states.field(k) for k in range(3)])
     measurements = recorded.copy()
     measurements[1:, 2 * n :] = applied[:-1]
     samples = np.empty((len(stamps), controller.sample_vector.size))

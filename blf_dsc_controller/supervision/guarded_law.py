@@ -20,7 +20,7 @@ from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError, StartError
 from blf_dsc_controller.law.checks import INVALID, is_valid_state
 from blf_dsc_controller.law.factory import begin, controller_of
-from blf_dsc_controller.messages import cdr
+from blf_dsc_controller.messages import codecs
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.reference.approach import check_takeover
 from blf_dsc_controller.reference.limits import MotionError
@@ -34,10 +34,10 @@ Vector = NDArray[np.float64]
 _NANO = 1e-9
 _LONG_SILENCE = 2.0  # s
 
-_REASONS: dict[type[cdr.MessageError], Reason] = {
-    cdr.MissingJointError: Reason.JOINT_MISSING,
-    cdr.DuplicatedJointError: Reason.JOINT_DUPLICATED,
-    cdr.ShortArrayError: Reason.FIELD_MISSING,
+_REASONS: dict[type[codecs.MessageError], Reason] = {
+    codecs.MissingJointError: Reason.JOINT_MISSING,
+    codecs.DuplicatedJointError: Reason.JOINT_DUPLICATED,
+    codecs.ShortArrayError: Reason.FIELD_MISSING,
 }
 
 
@@ -245,10 +245,10 @@ class GuardedLaw:
         self.samples.relax((stamp - self.last_stamp) * _NANO)
         self._advance_to(stamp)
 
-    def reject(self, error: cdr.MessageError) -> Vector | None:
+    def reject(self, error: codecs.MessageError) -> Vector | None:
         """Return the torque for an unreadable message, None if it is for another arm."""
         self._begin_message()
-        if isinstance(error, cdr.MissingJointError) and error.is_foreign(self.config.joints):
+        if isinstance(error, codecs.MissingJointError) and error.is_foreign(self.config.joints):
             self.foreign += 1
             return None
         self.watchdog.restart()

@@ -22,8 +22,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import VIEW, ViewConfig, is_builtin
 from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.cdr import MessageError, joint_state_layout
-from blf_dsc_controller.messages.codecs import JointStateDecoder
+from blf_dsc_controller.messages.codecs import JointStateDecoder, MessageError, joint_state_layout
 from blf_dsc_controller.messages.journal import Event, EventType, decode
 from blf_dsc_controller.messages.topics import Quality, Topic
 from blf_dsc_controller.nodes.endpoints import create_steady_timer, message_class
