@@ -93,48 +93,6 @@ def test_views_cover_their_vectors_exactly_once(n, p):
         )
 
 
-def assert_shapes(view, shapes):
-    for shape, names in shapes.items():
-        for name in names.split():
-            assert getattr(view, name).shape == shape, name
-
-
-def test_state_has_the_documented_shapes():
-    n, p, m, N = 3, 4, 7, 8
-    settings = arbitrary_settings(np.random.default_rng(0), n, p)
-    assert_shapes(
-        state_of(np.zeros(state_size(settings)), settings),
-        {
-            (1,): 'samples cursor rows latched latch_time lambda_min',
-            (n,): 'alpha2 torque disturbance',
-            (m,): 'estimate b solution anchor min_eigenvector',
-            (n, p): 'momentum',
-            (n, m): 'rest',
-            (n, m + 1): 'filter1 filter2',
-            (m + 1, m + 1): 'running fresh half',
-            (m, m): 'Phi factor',
-            (N, n, m + 1): 'ring',
-        },
-    )
-
-
-def test_signals_have_the_documented_shapes():
-    n, p, m = 3, 4, 7
-    settings = arbitrary_settings(np.random.default_rng(0), n, p)
-    assert_shapes(
-        signals_of(np.zeros(signals_size(settings)), settings),
-        {
-            (n,): 'qr dqr ddqr xi1 beta2 dalpha2 xi2 demand torque unit',
-            (n, p): 'momentum',
-            (n, m): 'H rest',
-            (n, m + 1): 'row',
-            (n, n): 'inertia',
-            (m, m): 'Phi factor',
-            (m,): 'b rate work',
-        },
-    )
-
-
 def test_sample_contains_what_the_update_computed():
     law = controller(quick(sigma=-1.0))
     record(law, plant(), 1.3)
