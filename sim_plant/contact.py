@@ -17,8 +17,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.compiled.views import part
+from blf_dsc_controller.compiled.layout import Array, part
 from sim_plant.arm import Arm
 
 

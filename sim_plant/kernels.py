@@ -11,8 +11,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
-from blf_dsc_controller.compiled.views import part, view
+from blf_dsc_controller.compiled.layout import Array, Cell, part, size_of, view, view_of
 from sim_plant.actuator import Drives, DriveState, actuate
 from sim_plant.arm import Arm
 from sim_plant.compensation import Compensation, CompensationState, compensate, jumps

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.views import part
+from blf_dsc_controller.compiled.layout import part
 from sim_plant.arm import Arm
 from sim_plant.contact import Contact, subtract_contact_torque
 from sim_plant.disturbance import JointDisturbance, disturbance_torque

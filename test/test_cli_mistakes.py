@@ -14,7 +14,7 @@ from command import closed_loop, finished
 from synthetic_bag import Synthetic
 
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.compiled.notice import COMPILING
+from blf_dsc_controller.compiled.jit import COMPILING
 
 INTERRUPTED_WHILE_COMPILING = """
 import os, signal, sys

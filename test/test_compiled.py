@@ -76,7 +76,7 @@ import sys
 import numpy as np
 from blf_dsc_controller.arms import batch
 from blf_dsc_controller.arms.two_link import TwoLink
-from blf_dsc_controller.compiled.notice import announced_compilation
+from blf_dsc_controller.compiled.jit import announced_compilation
 
 with announced_compilation(lambda text: print(text, file=sys.stderr)):
     H = batch.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))

@@ -24,7 +24,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.compiled import jit
-from blf_dsc_controller.compiled.notice import COMPILING
+from blf_dsc_controller.compiled.jit import COMPILING
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.messages.journal import EventType

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.cli.main import INTERRUPTED, unwritable
-from blf_dsc_controller.compiled.notice import announced_compilation
+from blf_dsc_controller.compiled.jit import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,

@@ -25,7 +25,7 @@ from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import JointState
 
 from blf_dsc_controller.cli.run import LoopProgress
-from blf_dsc_controller.compiled.notice import COMPILING
+from blf_dsc_controller.compiled.jit import COMPILING
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, VIEW, LoopConfig
 from blf_dsc_controller.errors import BlfDscError

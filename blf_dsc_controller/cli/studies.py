@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from blf_dsc_controller.analysis.summary import format_table
 from blf_dsc_controller.cli.run import make_folder, print_notice
-from blf_dsc_controller.compiled.notice import announced_compilation
+from blf_dsc_controller.compiled.jit import announced_compilation
 from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.studies import runs

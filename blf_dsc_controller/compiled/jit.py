@@ -8,6 +8,8 @@ compiled from and of the constants it uses, and of nothing else: an edit recompi
 it, and a reinstall or a second checkout finds the existing cache.
 
 If the user's cache folder is not writable, the cache is in the folder for temporary files.
+
+Compilation is announced, since the wait would look like a hang.
 """
 
 from __future__ import annotations
@@ -19,12 +21,13 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.core import caching, config
+from numba.core import caching, config, event
 from numba.core.types.containers import BaseNamedTuple
 from numba.extending import overload_method, register_jitable
 
@@ -51,6 +54,9 @@ INLINED = {
     **_INNER_COMPILER,
 }
 """Compiler options for functions that are compiled into kernels."""
+
+COMPILING = 'compiling kernel '
+"""How a notice begins."""
 
 KERNELS: list[Any] = []
 """All kernels that have been imported."""
@@ -235,3 +241,37 @@ def _cache(folder: Path) -> Any:
         _impl_class = CachedCode
 
     return Cache
+
+
+class _Listener(event.Listener):  # type: ignore[misc]
+    def __init__(self, say: Callable[[str], object]) -> None:
+        self._say = say
+        self._count = 0
+
+    def on_start(self, started: Any) -> None:
+        kernel = started.data['dispatcher']
+        if not any(kernel is other for other in KERNELS):
+            return
+        if SLOW and self._count == 0:
+            self._say(SLOW)
+        self._count += 1
+        total = max(self._count, len(KERNELS))
+        self._say(
+            f'{COMPILING}{self._count} of at most {total}, once for this version: '
+            f'{kernel.py_func.__name__}'
+        )
+
+    def on_end(self, _event: object) -> None:
+        pass
+
+
+def announced_compilation(say: Callable[[str], object]) -> AbstractContextManager[object]:
+    """Call `say` with a notice for each kernel not in the cache that is compiled in this context.
+
+    Only numba knows this: a kernel has a version for each type of arguments. Of those that are
+    loaded, some may not be called.
+    """
+    listener: AbstractContextManager[object] = event.install_listener(
+        'numba:compile', _Listener(say)
+    )
+    return listener

@@ -19,7 +19,7 @@ and d^3 is left to estimate the disturbance alone.
 
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.views import part
+from blf_dsc_controller.compiled.layout import part
 from blf_dsc_controller.law import friction, projection, saturation
 from blf_dsc_controller.law.settings import NEWTON, Settings
 from blf_dsc_controller.law.state import Signals, State

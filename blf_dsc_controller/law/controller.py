@@ -7,8 +7,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import kernel
-from blf_dsc_controller.compiled.layout import pack, sizes_of
-from blf_dsc_controller.compiled.views import part
+from blf_dsc_controller.compiled.layout import pack, part, sizes_of
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.checks import (
     INVALID,

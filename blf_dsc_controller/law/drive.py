@@ -18,8 +18,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.chain_kernels import fill_regressor
 from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.compiled.views import part
+from blf_dsc_controller.compiled.layout import Array, part
 from blf_dsc_controller.law.settings import EFFORT, Settings
 from blf_dsc_controller.law.state import Signals, State
 

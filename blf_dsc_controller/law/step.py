@@ -11,7 +11,7 @@ from math import nan
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.views import part
+from blf_dsc_controller.compiled.layout import part
 from blf_dsc_controller.law import (
     adaptation,
     apparent_inertia,

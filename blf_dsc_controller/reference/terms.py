@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.views import part, view
+from blf_dsc_controller.compiled.layout import part, view
 
 SINUSOIDS = 0
 SPLINE = 1

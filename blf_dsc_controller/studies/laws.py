@@ -23,8 +23,7 @@ import numpy as np
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.layout import Array, pack, size_of, view_of
-from blf_dsc_controller.compiled.views import part, view
+from blf_dsc_controller.compiled.layout import Array, pack, part, size_of, view, view_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.robot import parameters_of
