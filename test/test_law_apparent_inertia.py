@@ -9,7 +9,7 @@ import pytest
 from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.configuration.robot import parameters_of
-from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.law.factory import controller_of, settings_of_config
 from sim_plant.plant import settings_of
 
 BITS_16 = 2.0 * np.pi / 2**16  # rad
@@ -89,3 +89,16 @@ def test_integrator_takes_as_many_steps_as_friction_on_a_light_joint_needs():
     ]
     assert steps[0] == 1
     assert steps[1] > 5
+
+
+@pytest.mark.parametrize(('evidence', 'share'), [(1e6, 0.0), (-1e6, -1.0)])
+def test_error_of_the_guess_is_between_no_rotor_and_the_guess(evidence, share):
+    """Whatever the sums say: a heavier drive would need higher gains, which are not for granted."""
+    law = controller_of(load_loop('panda').controller)
+    q = law.reference_at(0.0)[0]
+    for k in range(200):
+        swing = np.full(7, 0.1 * np.sin(0.4 * k))  # 64 Hz
+        if k == 199:
+            law.state.rotor_sums[:] = np.array([[evidence], [1e6]])
+        law.update(k * 1e-3, 1e-3, np.concatenate((q, swing, np.zeros(7))))
+    np.testing.assert_allclose(law.state.rotor_error, share * law.settings.unsure_rotor, atol=1e-12)
