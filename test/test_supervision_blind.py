@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from closed_loop_case import recommended
 from fault_rig import Rig
 from fault_table import named
 from plain_law import dynamics
 
+from blf_dsc_controller.supervision.safe_torque import SafeTorque
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
 HOLDING = {'safety.torque': 'hold_gravity'}
@@ -97,6 +99,7 @@ def test_held_gravity_fades_out_without_states_and_returns_with_them(raw):
     assert (fading[0] > 1.0).all()
     steps = np.diff(fading, axis=0)[:480]
     np.testing.assert_allclose(steps, steps[[0] * 480], atol=1e-9)  # a straight line
+    assert (steps[0] < -1e-3).all()
     np.testing.assert_array_equal(fading[-1], [0.0, 0.0])
     rig.sense = good
     rig.step(1)
@@ -199,3 +202,12 @@ def test_arm_settles_after_a_deactivation():
     assert not rig.guard.is_settled  # on the ramp
     rig.step(3000)
     assert rig.guard.is_settled
+
+
+def test_observed_load_is_at_most_half_of_the_torque_limit():
+    settings, safe = recommended(), SafeTorque(2)
+    safe.last.q[:], safe.last.ddq = (np.pi / 2.0, 0.0), np.zeros(2)  # upright: no gravity
+    safe.commanded[:] = (20.0, -20.0)
+    for _ in range(1000):
+        safe.observe(settings, settings.initial_estimate, 1e-3)
+    np.testing.assert_allclose(safe.load, [10.0, -10.0])

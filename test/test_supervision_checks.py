@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.law.checks import INVALID, OUTSIDE, SUSPECT, check_sample
 from blf_dsc_controller.law.settings import EFFORT
-from blf_dsc_controller.supervision.checks import StateCheck
+from blf_dsc_controller.supervision.checks import SampleCheck, StateCheck
 from blf_dsc_controller.supervision.supervisor import Reason
 
 DT = 1e-3
@@ -54,6 +54,17 @@ def test_non_finite_values_are_suspect_and_not_kept(law, part, name, i, bad):
     law.checks.kept[:] = 3.0
     assert verdict(law) & SUSPECT
     assert (law.checks.kept == 3.0).all()
+
+
+@pytest.mark.parametrize(('every', 'stops'), [(4, True), (6, False)])
+def test_cuts_add_up_if_they_take_more_than_a_fifth_of_the_time(law, every, stops):
+    check = SampleCheck(Safety(saturation_time=0.05), ('joint1', 'joint2'), law, DT)
+    faults = []
+    for k in range(2000):
+        law.signals.demand[1] = 21.0 * (k % every == 0)
+        law.flags = verdict(law)
+        faults.append(check.check(DT))
+    assert any(fault and fault.reason is Reason.SATURATED for fault in faults) == stops
 
 
 def test_demand_past_the_limit_is_suspect(law):
