@@ -264,6 +264,22 @@ def test_reactivation_on_the_reference_tracks_at_once_only_at_its_velocity(rest,
     assert np.abs(rig.commands[first:]).max() < 15.0
 
 
+def test_reference_continues_after_a_deactivation_but_begins_anew_after_a_stop():
+    rig = Rig({'safety.keep_estimates': True})
+    rig.step(500)
+    rig.guard.deactivate()
+    rig.step(1)
+    rig.guard.activate()
+    rig.step(500)
+    assert rig.guard.time == pytest.approx(1.0)
+    rig.deliver(b'')
+    rig.step(1)
+    rig.guard.activate()
+    rig.step(1)
+    assert rig.supervisor.running
+    assert rig.guard.time == 0.0
+
+
 def test_hold_reference_stays_where_the_arm_is():
     config = replace(CONFIG, reference=Reference(type='hold'))
     start = FIRST - 0.7
