@@ -370,7 +370,7 @@ def test_gain_change_causes_no_delayed_bump(given):
     ('given', 'message'),
     [
         ({'barrier.bound': (1e-6, 0.002)}, 'barrier.bound: joint1 is'),
-        ({'torque.limit': (20.0, 1.0)}, 'torque.limit: joint2 is held with'),
+        ({'torque.limit': (20.0, 2.6)}, 'torque.limit: joint2 is held with'),  # 2.675 N m
         ({'learning.radius': 0.58}, 'learning.radius: the norm of the estimate is'),
     ],
 )
