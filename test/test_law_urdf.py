@@ -24,6 +24,7 @@ from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import (
     controller_of,
     estimate_names,
+    initial_columns,
     model_of,
     prior_covariance,
     settings_of_config,
@@ -176,6 +177,14 @@ def test_urdf_and_tip_are_enough_to_configure_an_arm():
     names = estimate_names(config)
     assert len(names) == 48 + 14
     assert {'m*cx7', 'rotor7', 'viscous panda_joint1', 'coulomb panda_joint7'} <= set(names)
+
+
+def test_friction_of_the_urdf_is_known_unless_the_drives_compensate_it():
+    config = load_loop('fr3').controller
+    known = {'gravity': [0.003] * 7 + [0.2] * 7, 'gravity_and_friction': [0.0] * 14}
+    for compensated, friction in known.items():
+        given = change(config, {'robot.drive_compensates': compensated})
+        assert list(initial_columns(given)) == friction
 
 
 def test_given_parameters_override_the_derived_ones():
