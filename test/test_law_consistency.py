@@ -11,12 +11,12 @@ import pytest
 from changes import BOUND, CHANGED, LIGHTER, OFF, ROWS, WINDOW, allowed, begin_of, end_of, payload
 from paper_case import NO_DISTURBANCE, configured
 
+from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.analysis.metrics import estimates_of
 from blf_dsc_controller.law import consistency, excitation, window
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.messages.topics import MODEL_CHANGES
-from blf_dsc_controller.simulation.loop import simulate
 
 SENSORS = {
     'ideal': {},
@@ -274,3 +274,33 @@ def test_anchor_is_kept_at_the_first_latch_and_once_per_window(learned, latched,
     state.latched[0], state.cursor[0] = latched, cursor
     assert consistency.accept_window(settings, state, signals, Q)
     assert np.array_equal(state.anchor, state.solution) == kept
+
+
+@pytest.mark.parametrize(
+    ('floor', 'least', 'residual', 'expected'),
+    [
+        (1.0, 0.0, 0.2, 1.0),  # no full window yet: as configured
+        (1.0, 0.05, 0.1, 0.2),  # the best window left a quarter of this
+        (1.0, 0.5, 0.1, 1.0),  # never above the configured floor
+        (1.0, 1e-9, 1e-9, 0.01),  # nor below a tenth of its torque
+        (1.0, 0.05, 3.0, 3.0),
+    ],
+)
+def test_residual_floor_follows_the_residual_learned(learned, floor, least, residual, expected):
+    controller, _ = learned
+    settings, state = controller.settings._replace(residual_floor=floor), controller.state
+    before, state.least_residual[0] = state.least_residual[0], least
+    assert consistency.explained(settings, state, residual) == pytest.approx(expected)
+    state.least_residual[0] = before
+
+
+def test_half_the_rated_load_is_noticed_with_a_floor_that_is_three_times_too_large():
+    """As of a URDF with placeholder efforts; the configured floor alone hides this pick-up."""
+    floor = load_loop('panda').controller.learning.residual_floor
+    event = {'begin': [9.0], 'duration': [0.0], 'payload': [1.5]}
+    plant = {'duration': 10.0} | {f'events.{name}': value for name, value in event.items()}
+    law = {'learning.residual_floor': [3.0 * each for each in floor]}
+    loop = load_loop('panda', {'blf_dsc_controller': law, 'sim_plant': plant})
+    state = simulate(loop.controller, loop.plant).controller.state
+    assert state.changes[0] == 1.0
+    assert 9.0 < state.change_time[0] < 9.2

@@ -7,8 +7,9 @@ mean of u^T u, kept with Phi and b, gives the residual of the solution,
 
     r^2 = mean(u^T u) - b^T theta_LS   [(N m)^2],
 
-and a window is latched only if r^2 is at most four times the smallest of any full window, and if
-its solution gives the arm a positive inertia, which the residual does not show.  The first full
+and a window is latched only if r^2 is at most four times the smallest of any full window, or what
+unmodelled torque explains (configured, but no more than the smallest residual shows), and if its
+solution gives the arm a positive inertia, which the residual does not show.  The first full
 window has only its own parts as a measure: fitted apart, neither may explain its rows better than
 by that factor, else the older part is removed from the window; again only if the residual has
 halved since, since parts of a period never agree about a lasting disturbance.  Rows that
@@ -29,6 +30,8 @@ from blf_dsc_controller.law.state import Signals, State
 
 _GATE = 4.0  # ratio of mean squares: twice the torque
 _ALARM = 8.0  # likewise; larger, since a solution extrapolates
+_QUIET = 4.0  # times the smallest residual: the floor, where that is below the configured one
+_LEAST_FLOOR = 0.01  # of the configured floor: a tenth of the torque
 _FALLEN = 0.5  # of the residual since the last split; that of a lasting disturbance does not fall
 _USUAL = 1.25  # times the smallest residual, which varies with the motion
 _DOUBT = 3.0  # pull to the anchor per (N m)^2 above that, 1/(kg m^2)^2
@@ -37,9 +40,16 @@ _MEMORY = 0.1  # s, averaging time of the last rows
 
 
 @inner
-def explained(settings: Settings, residual: float) -> float:
-    """Return the mean square residual that noise and unmodelled torque explain (>= `residual`)."""
-    return max(residual, settings.residual_floor)
+def explained(settings: Settings, state: State, residual: float) -> float:
+    """Return the mean square residual that noise and unmodelled torque explain (>= `residual`).
+
+    Their configured floor is an upper limit: the best full window shows how little they are.
+    """
+    floor = settings.residual_floor
+    if state.least_residual[0] > 0.0:
+        shown = max(_QUIET * state.least_residual[0], _LEAST_FLOOR * floor)
+        floor = min(floor, shown)
+    return max(residual, floor)
 
 
 @inner
@@ -54,7 +64,7 @@ def detect_change(settings: Settings, state: State, signals: Signals, t: float, 
             error += signals.row[i, j] * state.solution[j]
         square += error * error
     state.recent_residual[0] += min(1.0, dt / _MEMORY) * (square - state.recent_residual[0])
-    if state.recent_residual[0] > _ALARM * explained(settings, state.residual[0]):
+    if state.recent_residual[0] > _ALARM * explained(settings, state, state.residual[0]):
         state.changes[0] += 1.0
         state.change_time[0] = t
         state.contradiction[0] = state.recent_residual[0]
@@ -159,7 +169,7 @@ def agrees_with_parts(settings: Settings, state: State, signals: Signals, residu
             window.pull_to(prior, weight, settings.information, signals.Phi, signals.b)
         solve(settings, state, signals)
         least = min(least, window_residual(signals.part, signals.work) / rows)
-    if residual <= _GATE * explained(settings, least):
+    if residual <= _GATE * explained(settings, state, least):
         return True
     state.split_residual[0] = residual
     state.rows[0] = float(newer_rows)
@@ -190,7 +200,7 @@ def accept_window(settings: Settings, state: State, signals: Signals, q: np.ndar
         return False
     if missing <= 0.0 and (state.least_residual[0] == 0.0 or residual < state.least_residual[0]):
         state.least_residual[0] = residual
-    if residual > _GATE * explained(settings, state.least_residual[0]):
+    if residual > _GATE * explained(settings, state, state.least_residual[0]):
         return False
     doubt = _DOUBT * max(0.0, residual - _USUAL * state.least_residual[0])
     pull = settings.anchor_weight * missing + doubt
