@@ -28,8 +28,7 @@ from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.identify import Identified, identify_arm
 from blf_dsc_controller.identification.prior import columns_of
-from blf_dsc_controller.identification.recording import Recording
-from blf_dsc_controller.identification.rows import rows_of
+from blf_dsc_controller.identification.recording import Recording, rows_of
 from blf_dsc_controller.run import Floats
 
 _DURATION, _UNSEEN = 30.0, 10.0  # s

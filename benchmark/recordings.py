@@ -34,10 +34,14 @@ from blf_dsc_controller.identification.identify import (
     regression,
     windows_of,
 )
-from blf_dsc_controller.identification.physical import solve
-from blf_dsc_controller.identification.prior import Prior, columns_of, prior_of
-from blf_dsc_controller.identification.recording import Recording, joined, read_recording
-from blf_dsc_controller.identification.rows import Rows, rows_of
+from blf_dsc_controller.identification.prior import Prior, columns_of, prior_of, solve
+from blf_dsc_controller.identification.recording import (
+    Recording,
+    Rows,
+    joined,
+    read_recording,
+    rows_of,
+)
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE
 from blf_dsc_controller.run import Floats
@@ -167,8 +171,12 @@ def _weigh(taken: Taken, empty: Recording) -> str:
     assert taken.loaded  # noqa: S101 - for the type checker
     bag, mass = taken.loaded
     together, boundary = joined(empty, read_recording(bag, taken.robot.text, taken.joints))
-    (m, *_), (s, *_) = identify_arm(together, taken.robot, picked_up=boundary).load
-    return f'{taken.name} with {mass:.3f} kg: {m:.3f} +- {1.96 * s:.2g} kg'
+    texts = []
+    for told in (boundary, float('nan')):
+        found = identify_arm(together, taken.robot, picked_up=told)
+        (m, *_), (s, *_) = found.load
+        texts.append(f'{m:.3f} +- {1.96 * s:.2g} kg from {found.picked_up:.1f} s on')
+    return f'{taken.name} with {mass:.3f} kg: {texts[0]}; as one bag: {texts[1]}'
 
 
 def _percent(error: Floats, torque: Floats) -> str:

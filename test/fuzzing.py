@@ -167,7 +167,7 @@ def secret():
     return folder
 
 
-READ = ('export', 'replay', 'replay --config', 'replay --learn', 'recover', 'part')
+READ = ('export', 'replay', 'replay --config', 'recover', 'part')
 DRAW = ('report', 'plot')
 WAYS = st.sampled_from((*READ * 5, *DRAW))
 
@@ -180,8 +180,7 @@ def read(bag, way):
         with contextlib.suppress(BlfDscError), open_bag(bag) as opened:
             list(opened.messages(opened.counts, 1_050_000_000))
     elif name == 'replay':
-        words = {'': (), '--config': (option, 'recommended'), '--learn': (option,)}[option]
-        command('replay', bag, *words)
+        command('replay', bag, *((option, 'recommended') if option else ()))
     elif way == 'report':
         command('report', bag, '--out', out / 'page.html')
     elif way == 'export':

@@ -55,7 +55,6 @@ def readers(tmp_path):
     return {
         'replay': lambda bag: main(['replay', str(bag)]),
         'replay --config': lambda bag: main(['replay', str(bag), '--config', 'recommended']),
-        'replay --learn': lambda bag: main(['replay', str(bag), '--learn']),
         'report': lambda bag: main(['report', str(bag), '--out', str(tmp_path / 'page.html')]),
         'export': lambda bag: main(['export', str(bag), '--out', str(tmp_path / 'table.csv')]),
         'plot': lambda bag: main(['plot', str(bag), '--out', str(tmp_path / 'plots')]),

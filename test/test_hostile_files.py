@@ -51,7 +51,6 @@ def refused(tmp_path, capsys):
         for command in (
             ('replay', bag),
             ('replay', bag, '--config', 'recommended'),
-            ('replay', bag, '--learn'),
             ('report', bag, '--out', tmp_path / 'page.html'),
             ('export', bag, '--out', tmp_path / 'table.csv'),
             ('plot', bag, '--out', tmp_path / 'plots'),
@@ -165,7 +164,7 @@ def test_compressed_files_and_messages_respect_the_limit(tmp_path, refused, stor
         )
         for k in range(3):
             writer.write(topic, k, ZEROS)
-    refused(tmp_path / 'bag', 'raise --max-unpacked', *SMALL_LIMIT, but=('recover', '--learn'))
+    refused(tmp_path / 'bag', 'raise --max-unpacked', *SMALL_LIMIT, but=('recover',))
 
 
 def test_ros_1_bag_respects_the_limit(tmp_path, refused):
@@ -181,7 +180,7 @@ def test_ros_1_bag_respects_the_limit(tmp_path, refused):
         )
         writer.write(topic, 1, ZEROS)
     assert (tmp_path / 'one.bag').stat().st_size < 10_000
-    refused(tmp_path / 'one.bag', 'raise --max-unpacked', *SMALL_LIMIT, but=('recover', '--learn'))
+    refused(tmp_path / 'one.bag', 'raise --max-unpacked', *SMALL_LIMIT, but=('recover',))
 
 
 # YAML and XML.

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import re
+
 import mujoco
 import numpy as np
 import pinocchio
@@ -26,6 +28,7 @@ from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
@@ -34,6 +37,8 @@ from blf_dsc_controller.identification.prior import columns_of
 from blf_dsc_controller.identification.recording import Recording, read_recording
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE
+from blf_dsc_controller.simulation.bag import write_bag
+from blf_dsc_controller.simulation.loop import simulate
 
 ROBOT = Robot(urdf=PANDA_TEXT)
 TRUTH = truth_of(PANDA_CHAIN, 1)
@@ -226,18 +231,29 @@ def test_other_publishers_joint_names_and_orders_are_recognised(states, tmp_path
     np.testing.assert_allclose(recording.torque, states[: len(recording.q), 2], atol=1e-12)
 
 
-def test_commands_replace_missing_efforts(states, tmp_path):
-    q, commands = JointStateEncoder(PANDA, ('position', 'velocity')), Float64MultiArrayEncoder(7)
+@pytest.mark.parametrize('effort', ['torque', 'command'])
+def test_commands_replace_efforts_that_are_missing_or_not_wanted(states, tmp_path, capsys, effort):
+    """With `--effort command` those in the bag, here currents, are not used."""
+    fields = ('position', 'velocity', 'effort')[: 2 + (effort == 'command')]
+    q, commands = JointStateEncoder(PANDA, fields), Float64MultiArrayEncoder(7)
     with BagWriter(tmp_path / 'bag', flush_interval=None) as bag:
         handle = bag.add_topic('/joint_states', JOINT_STATE, [])
         other = bag.add_topic('/arm/commands', COMMANDS.type, [])
         for k, state in enumerate(states[:8000]):
             stamp = 1_000_000_000 + 1_000_000 * k
-            bag.write(handle, bytes(q.encode(stamp, state[0], state[1])), stamp)
+            values = (state[0], state[1], 0.1 * state[2])[: len(fields)]
+            bag.write(handle, bytes(q.encode(stamp, *values)), stamp)
             bag.write(other, bytes(commands.encode(state[2])), stamp + 1000)
-    recording = read_recording(tmp_path / 'bag', PANDA_TEXT)
+    recording = read_recording(tmp_path / 'bag', PANDA_TEXT, commanded=effort == 'command')
     assert recording.source == '/arm/commands'
     np.testing.assert_allclose(recording.torque, states[: len(recording.q), 2], atol=1e-12)
+    urdf, out = tmp_path / 'robot.urdf', tmp_path / 'corrected.urdf'
+    urdf.write_text(PANDA_TEXT)
+    command = ['identify', str(tmp_path / 'bag'), '--urdf', str(urdf), '--out', str(out)]
+    assert main([*command, '--effort', effort]) == 0
+    output = capsys.readouterr().out
+    assert output.startswith('/arm/commands, 8.0 s of 7 joints')
+    assert 'DO NOT USE' not in output
 
 
 def test_lost_states_do_not_bias_the_result(states, found, tmp_path):
@@ -250,44 +266,53 @@ def test_lost_states_do_not_bias_the_result(states, found, tmp_path):
     np.testing.assert_allclose(other.joint_terms[1], found.joint_terms[1], rtol=0.01)
 
 
-def rejection(tmp_path, states, fields=None, joints=PANDA, **options):
-    bag = write_states(tmp_path / 'bag', joints, states, fields=fields, **options)
-    with pytest.raises(BlfDscError) as error:
-        identify_bag(bag, ROBOT)
-    return str(error.value)
-
-
-def test_bag_without_efforts_is_rejected(states, tmp_path):
-    message = rejection(tmp_path, states[:8000], ('position', 'velocity'))
-    assert 'does not hold the torques' in message
-
-
-def test_bag_of_zero_efforts_is_rejected(states, tmp_path):
-    assert 'are zero' in rejection(tmp_path, states[:8000] * [[1.0], [1.0], [0.0]])
-
-
-def test_bag_of_another_robot_is_rejected(states, tmp_path):
-    others = tuple(f'ur_{i}' for i in range(7))
-    assert 'no joint of the URDF' in rejection(tmp_path, states[:8000], joints=others)
-
-
-def test_bag_without_an_inner_joint_is_rejected(states, tmp_path):
-    joints = tuple(name.replace('panda_joint4', 'elbow') for name in PANDA)
-    assert "joint 'panda_joint4' is not in" in rejection(tmp_path, states[:8000], joints=joints)
-
-
-def test_short_bag_is_rejected(states, tmp_path):
-    assert 'the bag holds 2 s' in rejection(tmp_path, states[:2001])
-
-
-def test_slow_bag_is_rejected(states, tmp_path):
-    assert 'at least one in 0.02 s' in rejection(tmp_path, states[:8000], period=0.1)
-
-
-def test_arm_at_rest_is_rejected(states, tmp_path):
-    still = np.repeat(states[:1], 8000, axis=0)
+def test_bags_that_cannot_be_identified_are_rejected_for_their_reason(states, tmp_path):
+    some, still = states[:8000], np.repeat(states[:1], 8000, axis=0)
     still[:, 2] += 1.0
-    assert 'no joint moves' in rejection(tmp_path, still)
+    inner = tuple(name.replace('panda_joint4', 'elbow') for name in PANDA)
+    bags = {
+        'does not hold the torques': {'states': some, 'fields': ('position', 'velocity')},
+        'are zero': {'states': some * [[1.0], [1.0], [0.0]]},
+        'no joint of the URDF': {'states': some, 'joints': tuple(f'ur_{i}' for i in range(7))},
+        "joint 'panda_joint4' is not in": {'states': some, 'joints': inner},
+        'the bag holds 2 s': {'states': states[:2001]},
+        'at least one in 0.02 s': {'states': some, 'period': 0.1},
+        'no joint moves': {'states': still},
+    }
+    for k, (reason, given) in enumerate(bags.items()):
+        bag = write_states(tmp_path / f'{k}', **{'joints': PANDA, **given})
+        with pytest.raises(BlfDscError, match=re.escape(reason)):
+            identify_bag(bag, ROBOT)
+
+
+@pytest.mark.parametrize('stamps', [(5, 6, 7), (*range(1, 6), 3_600_000_000_000)])
+def test_states_a_nanosecond_apart_take_no_memory(states, tmp_path, stamps):
+    """Resampled at their interval, an hour would be 26 TB."""
+    encoder = JointStateEncoder(PANDA)
+    with BagWriter(tmp_path / 'bag', flush_interval=None) as bag:
+        handle = bag.add_topic('/joint_states', JOINT_STATE, [])
+        for stamp, state in zip(stamps, states, strict=False):
+            bag.write(handle, bytes(encoder.encode(stamp, *state)), stamp)
+    with pytest.raises(BagError, match='are their stamps of one clock'):
+        read_recording(tmp_path / 'bag', PANDA_TEXT)
+
+
+def test_arm_of_the_paper_is_identified_from_its_urdf(tmp_path, capsys):
+    """With its sinusoidal disturbance, which lasts; not to be mistaken for noise."""
+    plant = {'duration': 20.0, 'arm.m2': 0.7}
+    config = load_loop('recommended', {PLANT: plant})
+    run = simulate(config.controller, config.plant)
+    write_bag(tmp_path / 'bag', run, config.controller, 'none', config.plant)
+    robot = Robot(urdf='two_link.urdf', gravity=(0.0, 0.0, -9.8))
+    found = identify_bag(tmp_path / 'bag', robot)
+    K = columns_of(found.parameters, 2)[: len(found.parameters.combinations)]
+    shown = dict(zip(found.parameters.combinations, K @ found.values, strict=True))
+    assert shown['m*cx2'] == pytest.approx(0.7 * 0.8, rel=0.02)
+    assert shown['m*cx1 + m2'] == pytest.approx(0.5 + 0.7, rel=0.05)
+    bag, out = str(tmp_path / 'bag'), str(tmp_path / 'new.urdf')
+    command = ['identify', bag, '--urdf', 'two_link.urdf', '--gravity', '0', '0', '-9.8']
+    assert main([*command, '--out', out]) == 0
+    assert 'the residual of joint1 lasts' in capsys.readouterr().out
 
 
 def test_repeated_stamps_are_rejected(states, tmp_path):

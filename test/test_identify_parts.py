@@ -15,9 +15,8 @@ from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.urdf import attached, read_chain
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
-from blf_dsc_controller.identification.physical import Cone, solve
-from blf_dsc_controller.identification.recording import Recording
-from blf_dsc_controller.identification.rows import rows_of
+from blf_dsc_controller.identification.prior import Cone, solve
+from blf_dsc_controller.identification.recording import Recording, rows_of
 
 UNIT = np.array([pseudo_inertia(e) for e in np.eye(10)])  # E_a of sum_a ten_a E_a
 

@@ -6,12 +6,16 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import recorded_run
 
 from blf_dsc_controller.cli.bags import DIFFERENT, PARTIAL
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.messages.codecs import JointStateDecoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES
+
+JOINTS = ('joint1', 'joint2')
 
 WITHOUT_ROS = """
 import sys
@@ -64,6 +68,22 @@ def test_replay_with_another_configuration_is_reported_as_open_loop(bag, capsys)
     output = capsys.readouterr().out
     assert 'OPEN LOOP' in output
     assert 'joint2: torque differs from the recorded one by rms' in output
+
+
+def test_states_that_are_not_finite_are_left_out_of_an_open_loop(bag, tmp_path, capsys):
+    decoder, encoder = (codec(JOINTS) for codec in (JointStateDecoder, JointStateEncoder))
+    entries = recorded_run.messages(bag)
+    for k, entry in enumerate(recorded_run.of(entries, JOINT_STATES)):
+        stamp, values = decoder.decode(entry[3]), decoder.values.reshape(3, 2).copy()
+        values[0, 1] = np.nan if k == 200 else values[0, 1]
+        values[2] = np.nan if k < 40 else values[2]  # no torque yet
+        entry[3] = encoder.encode(stamp, *values)
+    states = recorded_run.of(entries, JOINT_STATES)
+    path = recorded_run.write(tmp_path / 'bag', states)
+    assert main(['replay', str(path), '--config', 'recommended']) == 0
+    output = capsys.readouterr().out
+    assert 'note: 41 states left out: not finite' in output
+    assert 'nan' not in output
 
 
 @pytest.mark.parametrize(

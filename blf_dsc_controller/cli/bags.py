@@ -120,9 +120,7 @@ def replay(options: Namespace) -> int:
         config = load(locate(options.config), CONTROLLER, ControllerConfig)
     names = NameMap.parse(options.map)
     begin = time.perf_counter()
-    if options.learn:
-        _learn(options, config, names)
-    elif config is None:
+    if config is None:
         from blf_dsc_controller.replay.verify import verify
 
         result = verify(options.bag, options.namespace, names)
@@ -131,35 +129,13 @@ def replay(options: Namespace) -> int:
         if result.difference is not None:
             return DIFFERENT
         return PARTIAL if result.compared < 1.0 else 0
-    else:
-        from blf_dsc_controller.replay.what_if import what_if
+    from blf_dsc_controller.replay.what_if import what_if
 
-        found = what_if(options.bag, config, options.namespace, names)
-        run = found.run
-        _print_speed(run.stamp.size, run.duration, time.perf_counter() - begin)
-        print('\n'.join(_open_loop(found, config)))
+    found = what_if(options.bag, config, options.namespace, names)
+    run = found.run
+    _print_speed(run.stamp.size, run.duration, time.perf_counter() - begin)
+    print('\n'.join(_open_loop(found, config)))
     return 0
-
-
-def _learn(options: Namespace, config: ControllerConfig | None, names: NameMap) -> None:
-    from blf_dsc_controller.replay.learn import learn
-
-    config = config or read_content(options.bag, options.namespace, names).controller_config()
-    found = learn(options.bag, config, options.namespace, names)
-    print(f'torque: {found.source}; window from {found.begin:.3f} s to {found.end:.3f} s')
-    width = max(len(name) for name in found.names)
-    for name, value, deviation in zip(found.names, found.estimate, found.deviation, strict=True):
-        if np.isnan(value):
-            print(f'{name:{width}}  unidentifiable: its column is rejected')
-        else:
-            print(f'{name:{width}}  {value:10.6g} +- {2 * deviation:.2g} (95 %)')
-    verdict = 'enough' if found.is_excited else 'NOT ENOUGH'
-    print(
-        f'excitation {found.excitation:.3g}, threshold {found.threshold:.3g}: {verdict}; '
-        f'residual {found.residual:.3g} N m rms of {found.torque:.3g}'
-    )
-    for line in (*_left_out(found.left_out), *found.notes, *found.doubts):
-        print(line)
 
 
 def _left_out(count: int) -> Iterator[str]:

@@ -21,11 +21,13 @@ from blf_dsc_controller.identification import exciting_reference
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.identify import Identified, identify_bag
 from blf_dsc_controller.identification.prior import JOINT_TERMS, columns_of
+from blf_dsc_controller.identification.recording import HOP
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.reference.clearance import Clearance
 
 _TWO_SIDED = 1.96  # standard deviations of a 95 % interval
 _UNSEEN = 0.5  # of the prior's variance; parameters that keep more are not shown
+_LASTING = 0.05  # of the motion, longest correlation length of noise
 _POOR = 0.2  # of the torque, largest accepted error on the part held back
 _LEAST_GRAVITY, _MOST_GRAVITY = 0.4, 1.6  # of the URDF's; beyond, it is missing or double
 
@@ -167,6 +169,13 @@ def _errors(found: Identified) -> Iterator[str]:
     yield f'{"all":{width}}  {total[0]:8.2f}  {total[1]:9.2f}  {total[2]:8.2f}'
     if found.rest:
         yield f'{found.rest:.1f} s in which no joint moves were left out'
+    moving = found.time.size * HOP
+    for joint, seconds in zip(found.chain.joints, found.lasting, strict=True):
+        if seconds > _LASTING * moving:
+            yield (
+                f'the residual of {joint.name} lasts ({seconds:.2g} s): it is a torque, not noise, '
+                'and may have shifted values beyond their intervals'
+            )
     for name in found.still:
         yield f'{name} did not move: its rotor and friction are guesses'
 

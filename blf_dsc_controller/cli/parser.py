@@ -240,11 +240,6 @@ def _replay_options(parser: argparse.ArgumentParser) -> None:
     _map(parser)
     _namespace(parser)
     _max_unpacked(parser)
-    parser.add_argument(
-        '--learn',
-        action='store_true',
-        help='identify the arm: run the learning alone on the recorded states and torques',
-    )
     option = parser.add_argument_group('playing over ROS').add_argument
     option('--play', action='store_true', help='publish the recorded topics')
     option('--rate', type=float, default=1.0, help='speed; 0: as fast as possible (1)')

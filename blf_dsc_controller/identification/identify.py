@@ -25,10 +25,18 @@ from blf_dsc_controller.arms.urdf import Chain, attached
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.identification.physical import solve
-from blf_dsc_controller.identification.prior import JOINT_TERMS, Prior, columns_of, prior_of
-from blf_dsc_controller.identification.recording import Recording, joined, read_recording
-from blf_dsc_controller.identification.rows import COUPLING, HOP, LOAD, WINDOW, Rows, rows_of
+from blf_dsc_controller.identification.prior import JOINT_TERMS, Prior, columns_of, prior_of, solve
+from blf_dsc_controller.identification.recording import (
+    COUPLING,
+    HOP,
+    LOAD,
+    WINDOW,
+    Recording,
+    Rows,
+    joined,
+    read_recording,
+    rows_of,
+)
 from blf_dsc_controller.run import Floats
 
 Effort = Literal['torque', 'without-gravity', 'command']
@@ -60,6 +68,7 @@ class Identified(NamedTuple):
     errors: Floats  # (3, n) rms torque error of the URDF, the corrected URDF, all values
     torque: Floats  # (n,) root mean square of the torque held back, N m or N
     still: tuple[str, ...]  # joints that did not move
+    lasting: Floats  # (n,) correlation length of the residual, s
     held_back: tuple[float, float]  # s, from, to
     rest: float  # s in which no joint moves, which were left out
     gravity: float  # share of the URDF's gravity in the torques; NaN if it would hardly show
@@ -201,6 +210,7 @@ def identify_arm(
         still=tuple(
             joint for joint, v in zip(recording.joints, rows.speed, strict=True) if v < _STILL
         ),
+        lasting=found.lasting,
         held_back=(float(rows.time[test][0]), float(rows.time[test][-1])),
         rest=(rows.time.size - moving.size) * HOP,
         gravity=_gravity_share(rows, fit, P),
@@ -241,6 +251,7 @@ class Regression(NamedTuple):
     b: Floats  # (.,)
     folds: Floats  # (parts, k + 1, k + 1) [A | b]^T [A | b] of successive windows
     scatter: Floats  # (k, k) covariance of A^T b
+    lasting: Floats  # (n,) correlation length of each joint's residual, s
 
 
 def regression(
@@ -270,15 +281,16 @@ def regression(
         left = full[:, :, :-1] @ theta - full[:, :, -1]
         deviation = np.maximum(np.sqrt(np.sum(left**2, axis=0) / counted), floor)
     scatter = np.zeros((A.shape[1], A.shape[1]))
+    lengths = np.array([correlation_length(left[:, i]) for i in range(n)])
     for i in range(n):
         a = scaled[:, i, :-1] @ B
-        scatter += correlation_length(left[:, i]) * a.T @ a
+        scatter += lengths[i] * a.T @ a
     folds = []
     for part in np.array_split(scaled, parts):
         all_rows = part.reshape(-1, theta.size + 1)
         Ab = np.column_stack((all_rows[:, :-1] @ B, all_rows[:, -1] - all_rows[:, :-1] @ mean))
         folds.append(Ab.T @ Ab)
-    return Regression(A, b, np.array(folds), scatter)
+    return Regression(A, b, np.array(folds), scatter, lengths * HOP)
 
 
 def _worthwhile(found: Regression, prior: Prior) -> list[tuple[int, ...]]:
