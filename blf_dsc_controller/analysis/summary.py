@@ -18,7 +18,8 @@ from blf_dsc_controller.analysis.metrics import (
     estimates_of,
     measure,
 )
-from blf_dsc_controller.messages.topics import COMPUTE_TIME, LATE_STEPS, LATENCY
+from blf_dsc_controller.law.telemetry import load_text
+from blf_dsc_controller.messages.topics import COMPUTE_TIME, LATE_STEPS, LATENCY, LOAD
 from blf_dsc_controller.run import Floats, Run, Series
 
 Summary = dict[str, Any]
@@ -73,6 +74,7 @@ def summarize(run: Run) -> Summary:
             },
         },
         'learning': None if estimates is None else _learning(run, estimates, metrics),
+        'loads': _loads(run),
         'commands': _commands(run),
         'timing': _timing(run),
         'compute_time_us': _percentiles(run.learning, COMPUTE_TIME),
@@ -113,6 +115,20 @@ def _learning(run: Run, estimates: Estimates, metrics: Metrics) -> Summary:
         }
     )
     return learning
+
+
+def _loads(run: Run) -> list[Summary]:
+    """Return what the tip held, each at the end of a time in which it was known."""
+    if run.monitor is None or LOAD[0] not in run.monitor.names:
+        return []
+    values = run.monitor.select(LOAD)
+    known = np.append(np.isfinite(values[:, 0]), False)
+    ends = np.flatnonzero(known[:-1] & ~known[1:])
+    times = run.time_of(run.monitor.stamp[ends])
+    return [
+        {'until_s': float(t), **plain(dict(zip(LOAD, load.tolist(), strict=True)))}
+        for t, load in zip(times, values[ends], strict=True)
+    ]
 
 
 def _named(estimates: Estimates, values: Floats) -> dict[str, float]:
@@ -207,6 +223,9 @@ def _sentences(summary: Summary) -> Iterator[str]:
         yield f'stopped     at {stop["time_s"]:.3f} s, {stop["reason"]}: {stop["text"]}'
     if summary['learning'] is not None:
         yield from _learning_lines(summary['learning'])
+    for load in summary['loads']:
+        values = [math.nan if load[name] is None else load[name] for name in LOAD]
+        yield f'held        {load_text(values)}, until {load["until_s"]:.1f} s'
     if summary['commands'] is not None and summary['commands']['samples_late']['max'] > 1:
         late = summary['commands']['samples_late']
         never = 100.0 * summary['commands']['never_applied']

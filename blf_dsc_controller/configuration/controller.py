@@ -274,7 +274,9 @@ class ControllerConfig(Sampled):
         bound = None
         with suppress(KeyError, TypeError, ValueError):  # validated later
             bound = np.broadcast_to(np.array(given['barrier.bound'], dtype=float), arm.rotors.shape)
-        return {'model': 'urdf', **tuning.gains_of(arm, period, bound)}
+        is_filtered = given.get('learning.prediction', 'filtered') == 'filtered'
+        weighs = {'learning.weighing': robot.learn == 'base' and is_filtered}
+        return {'model': 'urdf', **weighs, **tuning.gains_of(arm, period, bound)}
 
     def problems(self) -> list[str]:
         """Check the parameters against each other, joints and estimates against the model."""
@@ -284,6 +286,10 @@ class ControllerConfig(Sampled):
             count = learned_of(self.robot, self.robot.chain(self.joints)).model.p
         elif self.robot.learn != 'base':
             return [f'robot.learn: got {self.robot.learn}, but model {self.model} learns base only']
+        learning, learned = self.learning, (self.model, self.robot.learn, self.learning.prediction)
+        if learning.weighing and learned != ('urdf', 'base', 'filtered'):
+            needs = 'model urdf, robot.learn base and learning.prediction filtered'
+            return [f'learning.weighing: got true with {", ".join(learned)}, but needs {needs}']
         return [
             *joint_problems(self.joints, f'model {self.model}', needed),
             *(f'robot.{problem}' for problem in self.robot.problems()),

@@ -285,6 +285,9 @@ class Learning:
     interval: int = _size(
         10, 'samples between two eigenvalue checks of the excitation matrix', 'samples', at_least=1
     )
+    weighing: bool = _size(
+        False, 'weigh what the tip of a URDF holds, beyond what it held in the first window'
+    )
     torque_source: Literal['command', 'effort'] = _in_window(
         'command', 'torque to learn from: the limited command, or the effort of the joint states'
     )

@@ -27,6 +27,7 @@ from blf_dsc_controller.law.state import (
     state_size,
 )
 from blf_dsc_controller.law.step import step
+from blf_dsc_controller.law.weighing import weigh
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import check_start
 
@@ -93,6 +94,7 @@ class Controller:
         self.reset()
         self.reference_at(0.0)
         self.update(0.0, 1e-3, np.zeros(3 * self.settings.n))
+        self.weigh(1e-3)
         self.reset()
 
     def bound_at(self, t: float) -> np.ndarray:
@@ -144,6 +146,18 @@ class Controller:
             self.checks_vector,
         )
         return self.sample.torque
+
+    def weigh(self, dt: float) -> None:
+        """Weigh the load by the row of the last update, `dt` [s] after the one before."""
+        if self.settings.weighed:
+            weigh(
+                self.settings.model,
+                self.sizes,
+                self.settings_vector,
+                self.state_vector,
+                self.signals_vector,
+                dt,
+            )
 
     def save(self) -> np.ndarray:
         """Return a copy of the whole state."""

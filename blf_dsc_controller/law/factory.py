@@ -17,7 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from blf_dsc_controller.arms.chain_kernels import ROTOR
+from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.model import ArmModel, arm_model
+from blf_dsc_controller.arms.prior import PAYLOAD_SIZE, deviations, payload_inertia
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import drive_model, learned_of, parameters_of
@@ -189,6 +192,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         information=np.linalg.inv(covariance),
         variance=np.diag(covariance).copy(),
         **_rotors(config, model.n),
+        **_load(config, p + columns),
         least=np.array((-np.inf,) * p + friction[0]),
         most=np.array((np.inf,) * p + friction[1]),
         true_parameters=np.array(truth.parameters or (0.0,) * p),
@@ -224,6 +228,20 @@ def _rotors(config: ControllerConfig, n: int) -> dict[str, Any]:
         'joint_inertia': joints,
         'link_inertia': links,
     }
+
+
+def _load(config: ControllerConfig, m: int) -> dict[str, Any]:
+    """Return what `weighing` needs: how a load in the tip changes the base parameters."""
+    if not config.learning.weighing:
+        return {'weighed': 0, 'load_columns': np.zeros((0, 10)), 'load_scale': np.zeros((4, 10))}
+    robot = config.robot
+    chain = robot.chain(config.joints)
+    D = deviations(payload_inertia(max(robot.payload, 1.0)), 1.0, 2.0 * PAYLOAD_SIZE)
+    T = chain.tip_placement
+    K = parameters_of(robot, chain).K[:, -(ROTOR + 1) : -1]
+    columns = np.zeros((m + 1, 10))
+    columns[: len(K)] = K @ np.transpose([inertia_of(T @ pseudo_inertia(d) @ T.T) for d in D.T])
+    return {'weighed': m + 1, 'load_columns': columns, 'load_scale': D[:4]}
 
 
 def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:

@@ -45,6 +45,7 @@ class Settings(NamedTuple):
     drive_size: int  # of drive_chain
     compensation: int
     rotors_unsure: int  # 1: errors of the assumed rotor inertias are measured
+    weighed: int  # m + 1 where the load in the tip is weighed, else 0
     window: int  # N, rows in tau_d
     row_interval: int  # samples between two rows of the window
     interval: int  # samples between two checks of the excitation
@@ -101,6 +102,8 @@ class Settings(NamedTuple):
     most: Annotated[Array, 'm']  # value that theta^ can have
     true_parameters: Annotated[Array, 'p']
     frequencies: Annotated[Array, 'tones']  # of the sine and cosine columns, rad/s
+    load_columns: Annotated[Array, 'weighed', 10]  # N D of `weighing`, and a row of zeros
+    load_scale: Annotated[Array, 4, 10]  # rows of D: mass [kg] and moments [kg m] in the tip
     drive_chain: Annotated[Array, 'drive_size']  # `Bodies` of the drive's model, with its memory
     drive_inertias: Annotated[Array, 'drive']  # masses [kg] and moments [kg m] of the drive's model
 

@@ -62,6 +62,14 @@ class State(NamedTuple):
     column_lags: Annotated[Array, 2, 'n']  # of c_h in `friction`
     torque_lags: Annotated[Array, 2, 'n']  # of e_h, N m
     flip_sums: Annotated[Array, 2, 'n']  # p int c_h e_h dt, N m, and p int c_h^2 dt
+    weighed_rows: Annotated[Array, 3]  # moving rows of the first window, and of two parts since
+    weighed_sums: Annotated[Array, 3, 'weighed', 'weighed']  # of their [X | u]^T [X | u]
+    weighed_model: Annotated[Array, 'weighed']  # theta with the load
+    weighed_noise: Annotated[Array, 2]  # mean square residual before and since, (N m)^2
+    weighed_recent: Cell  # of the last rows, (N m)^2
+    weighed_changes: Cell  # `changes` at the last row
+    weighing_wait: Cell  # rows until the filters have settled
+    load: Annotated[Array, 8]  # mass [kg] and centre [m] in the tip, their deviations; 0: unknown
     ring: Annotated[Array, 'window', 'n', 'm + 1']  # the window's rows
 
 
@@ -103,6 +111,10 @@ class Signals(NamedTuple):
     swing: Annotated[Array, 'n']  # acceleration in the band of `apparent_inertia`, rad/s^2
     rate: Annotated[Array, 'm']  # theta^' [1/s]
     work: Annotated[Array, 'm']  # scratch
+    since: Annotated[Array, 'weighed', 'weighed']  # sum of the rows since the first window
+    load_normal: Annotated[Array, 'weighed + 9', 'weighed + 9']  # normal equations, or their factor
+    load_solution: Annotated[Array, 'weighed + 9']  # theta and z of `weighing`
+    load_spread: Annotated[Array, 4, 10]  # scratch
 
 
 class Sample(NamedTuple):
@@ -121,6 +133,7 @@ class Sample(NamedTuple):
     lambda_min: Cell  # of the current window's Phi
     latched: Cell  # 0 or 1
     changes: Cell  # number of times that the arm was found to have changed
+    load: Annotated[Array, 8]  # of the state, with 95 % intervals (half); NaN where unknown
 
 
 state_of, state_size = view_of(State), size_of(State)

@@ -28,6 +28,7 @@ from blf_dsc_controller.law import (
 )
 from blf_dsc_controller.law.settings import FILTERED, REFERENCE, Settings
 from blf_dsc_controller.law.state import Sample, Signals, State
+from blf_dsc_controller.law.weighing import DEVIATION, TWO_SIDED
 from blf_dsc_controller.reference import terms as reference
 
 
@@ -108,6 +109,10 @@ def fill_sample(settings: Settings, state: State, signals: Signals, sample: Samp
     sample.lambda_min[0] = state.lambda_min[0]
     sample.latched[0] = state.latched[0]
     sample.changes[0] = state.changes[0]
+    for k in range(state.load.size):
+        is_known = state.load[DEVIATION + k % DEVIATION] > 0.0
+        factor = 1.0 if k < DEVIATION else TWO_SIDED
+        sample.load[k] = factor * state.load[k] if is_known else nan
 
 
 @inner

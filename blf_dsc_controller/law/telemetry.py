@@ -7,6 +7,7 @@ as JointState with the values in `position`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -163,6 +164,9 @@ class Monitor:
     def __init__(self, joints: Sequence[str], estimates: Sequence[str], settings: Settings) -> None:
         names = [what + joint for what in (topics.RATIO, topics.DISTANCE) for joint in joints]
         names += [*estimates, topics.LAMBDA_MIN, topics.LATCHED]
+        self._weighs = settings.weighed > 0
+        if self._weighs:
+            names += topics.LOAD
         self._ceiling = None
         if settings.truth_known == 1:
             names += [*topics.LYAPUNOV_TERMS, topics.LYAPUNOV_BOUND]
@@ -180,6 +184,8 @@ class Monitor:
         """
         distance = bound - np.abs(sample.xi1)
         values = [*ratio, *distance, *sample.estimate, sample.lambda_min[0], sample.latched[0]]
+        if self._weighs:
+            values += sample.load.tolist()
         if self._ceiling is not None:
             self._start = stamp if self._start is None else self._start
             V = float(sample.lyapunov.sum())
@@ -192,6 +198,19 @@ class Monitor:
         """Encode these values."""
         values = self.values(stamp, sample, ratio, bound)
         return topics.MONITOR, self._encoder.encode(stamp, values)
+
+
+def load_text(load: Sequence[float]) -> str:
+    """Return what the tip holds as text, from the values (8,) of LOAD."""
+    mass, *centre = load[:4]
+    interval, *spread = load[4:]
+    if not math.isfinite(mass):
+        return 'unknown'
+    text = f'{mass:.3f} +- {interval:.2g} kg'
+    if not math.isfinite(centre[0]):
+        return text
+    each = (f'{1e3 * c:.1f} +- {1e3 * s:.2g}' for c, s in zip(centre, spread, strict=True))
+    return f'{text}, its centre at {", ".join(each)} mm'
 
 
 def encode_rejected_columns(stamp: int, columns: Sequence[RejectedColumn]) -> bytes:

@@ -75,6 +75,15 @@ def add(first: np.ndarray, weight: float, second: np.ndarray, out: np.ndarray) -
 
 
 @inner
+def add_products(row: np.ndarray, sums: np.ndarray) -> None:
+    """Add the upper triangle of [X | u]^T [X | u] of a row (n, m + 1) to `sums`."""
+    for i in range(row.shape[0]):
+        for a in range(row.shape[1]):
+            for b in range(a, row.shape[1]):
+                sums[a, b] += row[i, a] * row[i, b]
+
+
+@inner
 def clear(matrix: np.ndarray) -> None:
     """Fill a matrix with zeros."""
     for i in range(matrix.shape[0]):

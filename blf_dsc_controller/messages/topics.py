@@ -140,6 +140,9 @@ LYAPUNOV_BOUND = 'V bound'  # of (32)
 LAMBDA_MIN = 'lambda_min'
 LATCHED = 'latched'
 MODEL_CHANGES = 'model_changes'
+LOAD = tuple(
+    f'load {name}{what}' for what in ('', ' +-') for name in ('mass', 'x', 'y', 'z')
+)  # kg and m in the tip, and half of their 95 % intervals
 COMPUTE_TIME = 'compute_time'
 LATENCY = 'latency'
 LATENESS = 'lateness'

@@ -187,6 +187,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.survive(error)
             return
         self._command(torque)
+        guard.weigh()
         if guard.has_sample:
             self._publish_telemetry(guard)
         elif torque is not None and self._heard and self.config.telemetry.enabled:

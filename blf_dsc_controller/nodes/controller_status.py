@@ -11,8 +11,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
 from blf_dsc_controller.law.rejected_columns import RejectedColumn
+from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.topics import PHASE, REASON, REJECTED, STOPS
+from blf_dsc_controller.messages.topics import LOAD, PHASE, REASON, REJECTED, STOPS
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import create_publisher
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
@@ -67,9 +68,11 @@ class ControllerStatus:
         if guard is not None:
             self.publish_events(guard)
         state = self._state(life, guard)
-        parts = (
-            [state] if guard is None else [state, self._loop(guard, rivals), self._learning(guard)]
-        )
+        parts = [state]
+        if guard is not None:
+            parts += [self._loop(guard, rivals), self._learning(guard)]
+            if guard.controller.settings.weighed:
+                parts.append(self._load(guard))
         self._diagnostics.publish(parts)
         stops = guard.supervisor.stops if guard else 0
         if (state.message, life, stops) != self._published:
@@ -153,6 +156,11 @@ class ControllerStatus:
             columns = ', '.join(one.column for one in self.rejected)
             return self._diagnostics.status('learning', WARN, f'not estimated: {columns}', values)
         return self._diagnostics.status('learning', OK, learning, values)
+
+    def _load(self, guard: Guard) -> DiagnosticStatus:
+        load = guard.controller.sample.load.tolist()
+        values = {name: f'{value:.6g}' for name, value in zip(LOAD, load, strict=True)}
+        return self._diagnostics.status('load', OK, f'held: {load_text(load)}', values)
 
 
 def chatter_of(guard: Guard, joints: Sequence[str]) -> str:

@@ -180,6 +180,7 @@ class Rerun:
             stamp = guard.journal.stamp
         else:
             torque = guard.update(stamp, self._measurement(row))
+            guard.weigh()
         if guard.has_sample:
             if stamp <= outputs.last:
                 self.end = f'the stamps restart at {stamp} ns'

@@ -33,8 +33,6 @@ class WhatIf(NamedTuple):
     """Torques of another configuration beside the applied ones."""
 
     run: Run  # over the states that the law used, with its own torques
-    rows: Floats  # of the window's regression in each sample, [X | u] (N, n, m + 1)
-    active: Floats  # which disturbance columns are estimated at the end (m,)
     applied: Floats  # torque from each state to the next (N, n), N m; NaN where unknown
     source: str  # topic of the applied torque
     left_out: int  # number of states, as in `RecordedStates`
@@ -125,13 +123,12 @@ def run_over(recorded_states: RecordedStates, config: ControllerConfig) -> WhatI
     if not is_measured:
         config = replace(config, robot=replace(config.robot, effort='commanded'))
     controller = controller_of(config)
-    n, m = len(states.names), controller.settings.m
+    n = len(states.names)
     stamps = states.stamp.tolist()
     recorded = np.hstack([states.field(k) for k in range(3)])
     measurements = recorded.copy()
     measurements[1:, 2 * n :] = applied[:-1]
     samples = np.empty((len(stamps), controller.sample_vector.size))
-    rows = np.zeros((len(stamps), n, m + 1))
     last = stamps[0] - config.sample_time_ns
     velocity = Velocity(n) if config.safety.velocity == 'estimated' else None
     for k, (stamp, measurement) in enumerate(zip(stamps, measurements, strict=True)):
@@ -141,10 +138,9 @@ def run_over(recorded_states: RecordedStates, config: ControllerConfig) -> WhatI
             begin(controller, config, measurement[:n], measurement[n : 2 * n])
         controller.update((stamp - stamps[0]) * _NANO, (stamp - last) * _NANO, measurement)
         samples[k] = controller.sample_vector
-        rows[k] = controller.signals.row
+        controller.weigh(config.sample_time)
         last = stamp
     run = run_of(config, controller, states.stamp, recorded, samples)
     columns = columns_of(samples, controller.settings)
     ratio = (np.abs(columns.xi1) / columns.bound).max(axis=0)
-    active = controller.state.active.copy()
-    return WhatIf(run, rows, active, applied, source, left_out, ratio)
+    return WhatIf(run, applied, source, left_out, ratio)

@@ -28,6 +28,7 @@ from blf_dsc_controller.law.settings import settings_of
 from blf_dsc_controller.law.state import Sample, sample_of, signals_of, state_of
 from blf_dsc_controller.law.step import step
 from blf_dsc_controller.law.telemetry import disturbance_names, run_of
+from blf_dsc_controller.law.weighing import add_row
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.run import Run, Series, Stop
 from blf_dsc_controller.simulation.metrics import (
@@ -103,6 +104,7 @@ def run_loop(
             plants.truth(plant, now, view(truths)[row])
             q = part(measurement, 0, (law.n,))
             fill_energies(law, law_state, law_signals, q, sample)
+            add_row(law, law_state, law_signals, dt)
         if is_checked and check_sample(law, checks, law_state, law_signals, sample) & SUSPECT:
             return False
         if chosen.n > 0:
@@ -174,6 +176,7 @@ def _run_guarded(guard: Guard, plant: Plant, record: Record, chunk: range) -> No
         record.measurements[row] = measurement
         record.truths[row] = plant.truth()
         torque = guard.update(START + int(record.stamps[row]), measurement)
+        guard.weigh()
         if torque is None:
             return
         if guard.has_sample:

@@ -174,6 +174,11 @@ class GuardedLaw:
         self.journal.commands += 1
         return torque
 
+    def weigh(self) -> None:
+        """Weigh what the tip holds by the last state, after its torque has been sent."""
+        if self.has_sample:
+            self.controller.weigh(self.config.sample_time)
+
     def _wait(self, problem: str) -> None:
         """Go on waiting for a state to start from."""
         self.waiting_for = problem

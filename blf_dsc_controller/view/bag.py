@@ -12,7 +12,7 @@ import numpy as np
 
 from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
-from blf_dsc_controller.messages.topics import LAMBDA_MIN
+from blf_dsc_controller.messages.topics import LAMBDA_MIN, LOAD
 from blf_dsc_controller.run import Floats, Run, Series, Stamps
 from blf_dsc_controller.view.arm import arm_of
 from blf_dsc_controller.view.moment import Confidence, Moment, estimates_of, plant_events
@@ -116,7 +116,8 @@ def moments(run: Run, estimates: tuple[str, ...]) -> list[Moment]:
     loaded = (np.abs(truth - truth[0]) > 0.0).any(axis=1)
     arrays = (run.position, run.error, run.bound, run.torque, run.torque_limit)
     columns = (run.time[rows].tolist(), *map(at, arrays), figures[:, :-1], truth)
-    each = zip(*columns, figures[:, -1].tolist(), loaded.tolist(), strict=True)
+    load = _held(run.monitor, stamps, LOAD)
+    each = zip(*columns, figures[:, -1].tolist(), load, loaded.tolist(), strict=True)
     return [Moment(*one) for one in each]
 
 

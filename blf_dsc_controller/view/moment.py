@@ -35,6 +35,7 @@ class Moment(NamedTuple):
     estimate: Floats  # (m,) theta^; NaN: a rejected column
     truth: Floats  # (m,)
     lambda_min: float
+    load: Sequence[float] = (np.nan,) * 8  # of topics.LOAD
     loaded: bool = False  # the true parameters differ from those at the start
 
 

@@ -169,7 +169,7 @@ class ViewNode(PlainNode):
         self._decoders = {
             topic: JointStateDecoder(config.joints, ('position',)) for topic in _STREAMS[:3]
         }
-        self._learned = np.full(len(self._estimates) + 2, np.nan)
+        self._learned = np.full(len(self._estimates) + len(topics.LOAD) + 2, np.nan)
         self._truth = np.full(len(self._estimates), np.nan)
         self._confidence: Confidence | None = None
         self._draw_all()
@@ -216,7 +216,7 @@ class ViewNode(PlainNode):
                 elif topic is topics.TRUTH:
                     self._truth = _named(message.raw, (*self._estimates,))
                 else:
-                    figures = (topics.LAMBDA_MIN, topics.LATCHED)
+                    figures = (*topics.LOAD, topics.LAMBDA_MIN, topics.LATCHED)
                     self._learn(_named(message.raw, (*self._estimates, *figures)))
             except MessageError as error:
                 self.get_logger().warning(f'not shown: {error}', throttle_duration_sec=10.0)
@@ -238,9 +238,10 @@ class ViewNode(PlainNode):
         torque = state.effort if np.isnan(error.effort).any() else error.effort
         arrays = (state.position, error.position, bound.position, torque, bound.effort)
         q, xi1, k_c, tau, limit = (one.copy() for one in arrays)
-        *estimate, lambda_min, _ = self._learned
+        m = len(self._estimates)
+        load, (lambda_min, _) = self._learned[m:-2], self._learned[-2:]
         loaded = self._payload(time) > 0.0
-        learned = np.array(estimate), self._truth, float(lambda_min), loaded
+        learned = self._learned[:m], self._truth, float(lambda_min), load.tolist(), loaded
         self.past.append(Moment(time, q, xi1, k_c, tau, limit, *learned))
         while self.past[0].time < time - self._longest:
             self.past.popleft()

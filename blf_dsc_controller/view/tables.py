@@ -9,6 +9,7 @@ from html import escape
 import numpy as np
 
 from blf_dsc_controller.analysis.style import GREEN, MUTED
+from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.moment import Moment
 
@@ -21,7 +22,9 @@ def joint_table(joints: Sequence[str], now: Moment) -> str:
     head = _row('th', f't = {now.time:.2f} s', 'error [mrad]', 'bound', 'torque [N m]', 'limit')
     columns = 1e3 * now.error, 1e3 * now.bound, now.torque, now.torque_limit
     rows = zip(joints, *columns, strict=True)
-    return _in_table([head, *(_row('td', escape(name), *map(_figure, row)) for name, *row in rows)])
+    table = _in_table([head, *(_row('td', escape(n), *map(_figure, row)) for n, *row in rows)])
+    known = np.isfinite(now.load[0])
+    return table + (f'<div style="{_CELL}">held: {load_text(now.load)}</div>' if known else '')
 
 
 def estimate_table(units: Mapping[str, str], now: Moment, prior: Floats, deviation: Floats) -> str:

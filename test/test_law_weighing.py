@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the tip holds, weighed in the loop: values, intervals, and no torque depends on it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop, locate
+from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.law.telemetry import columns_of, load_text
+from blf_dsc_controller.law.weighing import BEFORE, NEWER, describe, solve
+from blf_dsc_controller.law.window import add_products
+from blf_dsc_controller.simulation.loop import simulate
+
+PICKED_UP, PUT_DOWN, END = 8.0, 12.0, 15.0  # s
+LOAD = 2.0  # kg
+
+
+def loop(name, plant=None, **controller):
+    """An arm up to 30 % off its URDF that picks up a load and puts it down."""
+    events = {'begin': [PICKED_UP], 'duration': [PUT_DOWN - PICKED_UP], 'payload': [LOAD]}
+    values = {f'events.{key}': value for key, value in events.items()}
+    values |= {'duration': END, 'truth.mass_deviation': 0.3, 'sensor.incomplete_states': 0}
+    return load_loop(locate(name), {PLANT: values | (plant or {}), CONTROLLER: controller})
+
+
+def weighed(record):
+    """Loads (N, 8) and the times of all samples [s]."""
+    samples = columns_of(record.samples, record.controller.settings)
+    return samples.load, record.stamps * 1e-9
+
+
+@pytest.fixture(scope='module')
+def panda():
+    config = loop('panda')
+    return simulate(config.controller, config.plant)
+
+
+def is_as_told(load, mass, within):
+    assert load[0] == pytest.approx(mass, abs=within)
+    assert abs(load[0] - mass) < load[4]
+    assert load[4] < 4.0 * within  # with the strong friction of a UR5e
+    if mass:
+        assert (np.abs(load[1:4]) < load[5:]).all()  # held in the tip
+        assert (load[5:] < 0.05).all()
+
+
+@pytest.mark.parametrize('name', ['panda', 'ur5e', 'fr3'])
+def test_load_is_weighed_within_three_seconds_with_wrong_links(name, panda):
+    """To 5 % of 2 kg, and 50 g if nothing is held; an FR3's drives compensate gravity, wrongly."""
+    record = panda
+    if name != 'panda':
+        config = loop(name)
+        record = simulate(config.controller, config.plant)
+    load, t = weighed(record)
+    is_as_told(load[t == PICKED_UP][0], 0.0, 0.05)
+    is_as_told(load[t == PUT_DOWN - 1.0][0], LOAD, 0.05 * LOAD)
+    is_as_told(load[-1], 0.0, 0.05)
+    assert not np.isfinite(load[t < 5.0]).any()  # the first window is not full
+
+
+def test_change_makes_the_load_unknown_until_the_filters_have_settled(panda):
+    load, t = weighed(panda)
+    after = (t > PICKED_UP) & (t < PICKED_UP + 1.0)
+    unknown = t[after][~np.isfinite(load[after, 0])]
+    assert PICKED_UP < unknown[0] < PICKED_UP + 0.2
+    assert 0.3 < unknown[-1] - unknown[0] < 0.5
+    half = load[(t > unknown[-1]) & (t < PICKED_UP + 1.0), 4]
+    assert half[0] > 3.0 * half[-1]
+
+
+def test_no_torque_depends_on_it(panda):
+    config = loop('panda', **{'learning.weighing': False})
+    without = simulate(config.controller, config.plant)
+    torque, other = (
+        columns_of(record.samples, record.controller.settings).torque for record in (panda, without)
+    )
+    np.testing.assert_array_equal(torque, other)
+    assert not np.isfinite(weighed(without)[0]).any()
+
+
+def test_solution_is_the_joint_least_squares_of_arm_and_load(panda):
+    """As numpy solves the stacked rows with both priors; deviations from the inverse."""
+    controller = controller_of(panda.config)
+    settings, state, signals = controller.settings, controller.state, controller.signals
+    random, n, m = np.random.default_rng(1), settings.n, settings.m
+    ND, D, lasting, noise = settings.load_columns[:m], settings.load_scale, 7.0, 0.04
+    theta, z = settings.initial_estimate + 0.1 * random.normal(size=m), random.normal(size=10)
+    blocks = []
+    for part, rows, model in ((BEFORE, 90, theta), (NEWER, 60, theta + ND @ z)):
+        X = random.normal(size=(rows, n, m))
+        u = X @ model + noise * random.normal(size=(rows, n))
+        for row in np.concatenate((X, u[:, :, None]), axis=2):
+            add_products(row, state.weighed_sums[part])
+        state.weighed_rows[part] = rows
+        blocks.append((X.reshape(-1, m), u.ravel()))
+    state.weighed_noise[:] = noise**2, 0.5 * noise**2
+    a = lasting * noise**2
+    solve(settings, state, signals, lasting)
+    (X, u), (Xs, us) = blocks
+    H = np.zeros((m + 10, m + 10))
+    both = np.vstack((np.hstack((X, np.zeros((len(X), 10)))), np.hstack((Xs, Xs @ ND))))
+    H[:m, :m], H[m:, m:] = settings.information, np.eye(10)
+    H = both.T @ both + a * H
+    g = both.T @ np.append(u, us)
+    g[:m] += a * settings.information @ settings.initial_estimate
+    expected = np.linalg.solve(H, g)
+    np.testing.assert_allclose(signals.load_solution, expected, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(state.weighed_model[:m], expected[:m] + ND @ expected[m:], atol=1e-9)
+    residual = (
+        np.mean((X @ expected[:m] - u) ** 2),
+        np.mean((Xs @ state.weighed_model[:m] - us) ** 2),
+    )
+    np.testing.assert_allclose(state.weighed_noise, residual, rtol=1e-6)
+    describe(settings, state, signals, lasting)
+    mass, *moments = D @ expected[m:]
+    C = lasting * max(residual) * D @ np.linalg.inv(H)[m:, m:] @ D.T
+    J = np.column_stack((-np.array(moments) / mass, np.eye(3))) / mass
+    np.testing.assert_allclose(state.load[:4], (mass, *np.array(moments) / mass), rtol=1e-6)
+    deviation = np.sqrt(np.append(C[0, 0], np.diag(J @ C @ J.T)))
+    np.testing.assert_allclose(state.load[4:], deviation, rtol=1e-5)
+
+
+def test_light_load_that_the_law_does_not_notice_is_weighed():
+    config = loop('panda', {'events.payload': [0.1]})
+    record = simulate(config.controller, config.plant)
+    load, t = weighed(record)
+    assert record.controller.state.changes[0] == 0.0
+    is_as_told(load[t == PUT_DOWN - 0.5][0], 0.1, 0.05)
+
+
+@pytest.mark.parametrize('given', [{'robot.learn': 'payload'}, {'learning.prediction': 'lambda'}])
+def test_weighing_what_cannot_be_weighed_is_rejected(given):
+    with pytest.raises(ConfigurationError, match=r'weighing: got true with .*, but needs'):
+        load_loop(locate('panda'), {CONTROLLER: {'learning.weighing': True, **given}})
+    assert not ControllerConfig().learning.weighing
+
+
+def test_text_of_a_load_leaves_out_what_is_unknown():
+    nan = float('nan')
+    assert load_text([nan] * 8) == 'unknown'
+    assert load_text([0.003, nan, nan, nan, 0.0124, nan, nan, nan]) == '0.003 +- 0.012 kg'
+    text = load_text([2.0, 0.001, 0.0, -0.02, 0.05, 0.001, 0.002, 0.0031])
+    assert text == '2.000 +- 0.05 kg, its centre at 1.0 +- 1, 0.0 +- 2, -20.0 +- 3.1 mm'
