@@ -10,6 +10,7 @@ from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.law.factory import controller_of, settings_of_config
+from blf_dsc_controller.supervision.config_warnings import expectation
 from sim_plant.plant import settings_of
 
 BITS_16 = 2.0 * np.pi / 2**16  # rad
@@ -36,10 +37,25 @@ def test_panda_keeps_its_bound_whatever_its_rotors_are(factor, sample_time):
     assert np.abs(run.error / run.bound).max() < 1.0
 
 
-@pytest.mark.parametrize('sample_time', [0.001, 0.002])
-def test_ur5e_keeps_its_bound_with_light_rotors(sample_time):
-    run = ran('ur5e', 0.4, sample_time=sample_time).run()
+@pytest.mark.parametrize(('factor', 'sample_time'), [(0.2, 0.001), (0.4, 0.002)])
+def test_ur5e_keeps_its_bound_with_light_rotors(factor, sample_time):
+    run = ran('ur5e', factor, sample_time=sample_time).run()
     assert not run.stops
+
+
+@pytest.mark.parametrize(
+    ('preset', 'joint', 'share'), [('ur5e', 'wrist_3_joint', 0.31), ('fr3', 'fr3_joint7', 0.054)]
+)
+def test_run_says_how_light_its_drives_may_be(preset, joint, share):
+    text = expectation(load_loop(preset).controller)
+    assert f'the drive of {joint} has less than {share:g} of the inertia assumed' in text
+    assert ran(preset, 0.3 * share).run().stops
+
+
+def test_run_says_nothing_of_drives_that_may_weigh_nothing_or_are_known():
+    for preset, given in (('panda', {}), ('ur5e', {'robot.rotor_inertia': [0.5] * 6})):
+        config = load_loop(preset, {'blf_dsc_controller': given}).controller
+        assert 'rotor_inertia' not in expectation(config)
 
 
 def test_wrist_that_its_friction_moves_more_than_its_gains_stops_with_the_reason():

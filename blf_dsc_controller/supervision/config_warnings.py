@@ -149,13 +149,35 @@ def _of_placeholders(robot: Robot, chain: Chain) -> Iterator[str]:
 
 def expectation(config: ControllerConfig) -> str:
     """Return the largest errors to expect of an arm of a URDF, in a sentence."""
-    errors = expected_errors(config, settings_of_config(config))
+    settings = settings_of_config(config)
+    errors = expected_errors(config, settings)
     usual, most = (1e3 * float(each.max()) for each in errors)
     joint = config.joints[int(errors.pick_up.argmax())]
-    return (
+    text = (
         f'{usual:.2g} mrad by friction and unmodelled torque; {most:.2g} mrad of {joint} when '
         f'{config.robot.payload:g} kg are picked up in motion'
     )
+    lightest = lightest_drives(settings, errors)
+    worst = int(lightest.argmax())
+    if lightest[worst] <= 0.0:
+        return text
+    return (
+        f'{text}; perhaps past the bound if the drive of {config.joints[worst]} has less than '
+        f'{lightest[worst]:.2g} of the inertia assumed: then give robot.rotor_inertia'
+    )
+
+
+def lightest_drives(settings: Settings, errors: ExpectedErrors) -> Floats:
+    """Return the rotor inertia (n,) over the assumed with which friction alone reaches the bound.
+
+    The gains follow the inertia that the law measures (`apparent_inertia`), and so the errors grow
+    with its inverse.  Negative: never; zero where the inertia is given.
+    """
+    drives = settings.joint_inertia - settings.link_inertia
+    excess = settings.joint_inertia * errors.unmodelled / settings.bound - settings.link_inertia
+    lightest: Floats = np.zeros_like(drives)
+    np.divide(excess, drives, out=lightest, where=settings.unsure_rotor > 0.0)
+    return lightest
 
 
 def _of_errors(config: ControllerConfig, errors: ExpectedErrors) -> Iterator[str]:
