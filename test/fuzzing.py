@@ -85,7 +85,7 @@ def bounded(name):
         resource.setrlimit(resource.RLIMIT_AS, limits)
         signal.signal(signal.SIGPROF, handler)
     assert not _opened, _opened
-    odd = {one for one in set(sys.modules) - before if one.split('.')[0] in ODD_MODULES}
+    odd = {module for module in set(sys.modules) - before if module.split('.')[0] in ODD_MODULES}
     assert not odd, odd
 
 
@@ -193,9 +193,9 @@ def read(bag, way):
 def folder():
     """Provide a folder for one example, beside the secret one."""
     secret()
-    with tempfile.TemporaryDirectory(dir=_folder) as one:
-        (Path(one) / 'bag').mkdir()
-        yield Path(one) / 'bag'
+    with tempfile.TemporaryDirectory(dir=_folder) as made:
+        (Path(made) / 'bag').mkdir()
+        yield Path(made) / 'bag'
 
 
 SCALARS = st.one_of(
@@ -319,11 +319,11 @@ def records(data, way):
 @given(data=st.data(), way=WAYS)
 def messages(data, way):
     """Serialised messages: bytes changed, added or removed, or another message's content."""
-    changed = [list(one) for one in entries()]
-    topics = sorted({one[0] for one in changed})
+    changed = [list(message) for message in entries()]
+    topics = sorted({message[0] for message in changed})
     for _ in range(data.draw(st.integers(1, 3))):
         topic = data.draw(st.sampled_from(topics))
-        numbers = [k for k, one in enumerate(changed) if one[0] == topic]
+        numbers = [k for k, message in enumerate(changed) if message[0] == topic]
         k = data.draw(st.sampled_from(numbers))
         raw = bytearray(changed[k][3])
         place = data.draw(st.integers(0, len(raw)))
@@ -379,8 +379,8 @@ def parameters(data, preset):
             lines.insert(data.draw(st.integers(0, len(lines))), lines[at])
         else:
             lines[at] += data.draw(WORDS)
-    with folder() as one:
-        path = one / 'given.yaml'
+    with folder() as inside:
+        path = inside / 'given.yaml'
         path.write_bytes('\n'.join(lines).encode('utf-8', 'surrogatepass'))
         with bounded('parameters'):
             command('replay', base(), '--config', path)
@@ -414,31 +414,31 @@ def urdfs(data, arm):
     root = ET.fromstring((share_folder() / 'config' / f'{arm}.urdf').read_text())  # noqa: S314 - ours
     for _ in range(data.draw(st.integers(1, 4))):
         every = list(root.iter())
-        one, other = (data.draw(st.sampled_from(every)) for _ in range(2))
+        element, other = (data.draw(st.sampled_from(every)) for _ in range(2))
         action = data.draw(st.sampled_from(('value', 'value', 'name', 'remove', 'move', 'nest')))
-        if action == 'value' and one.attrib:
-            key = data.draw(st.sampled_from(sorted(one.attrib)))
-            one.set(key, data.draw(NUMBERS_OF_XML))
-        elif action == 'name' and one.attrib and other.attrib:
-            key = data.draw(st.sampled_from(sorted(one.attrib)))
-            one.set(key, data.draw(st.sampled_from(sorted(other.attrib.values()))))
-        elif action == 'remove' and len(one):
-            one.remove(data.draw(st.sampled_from(list(one))))
-        elif action == 'move' and one is not other and other not in one.iter():
-            one.append(other)
+        if action == 'value' and element.attrib:
+            key = data.draw(st.sampled_from(sorted(element.attrib)))
+            element.set(key, data.draw(NUMBERS_OF_XML))
+        elif action == 'name' and element.attrib and other.attrib:
+            key = data.draw(st.sampled_from(sorted(element.attrib)))
+            element.set(key, data.draw(st.sampled_from(sorted(other.attrib.values()))))
+        elif action == 'remove' and len(element):
+            element.remove(data.draw(st.sampled_from(list(element))))
+        elif action == 'move' and element is not other and other not in element.iter():
+            element.append(other)
         elif action == 'nest':
             tag = data.draw(st.sampled_from(('link', 'origin')))
-            ET.SubElement(other, tag, one.attrib)
+            ET.SubElement(other, tag, element.attrib)
     text = ET.tostring(root, encoding='unicode')
     if data.draw(st.integers(0, 9)) == 0:
         at = data.draw(st.integers(0, len(text)))
         text = (
             text[:at] + data.draw(st.one_of(st.text(max_size=9), st.sampled_from(XML))) + text[at:]
         )
-    with folder() as one:
-        path = one / 'arm.urdf'
+    with folder() as inside:
+        path = inside / 'arm.urdf'
         path.write_bytes(text.encode('utf-8', 'surrogatepass'))
-        given_file = one / 'given.yaml'
+        given_file = inside / 'given.yaml'
         given_file.write_text(
             f'/**:\n  ros__parameters:\n    robot: {{urdf: {path}, lag: 0.005}}\n'
             '/**/blf_dsc_controller:\n  ros__parameters:\n'
@@ -449,7 +449,7 @@ def urdfs(data, arm):
 
             with contextlib.suppress(BlfDscError):
                 load_loop(given_file)
-            command('identify', base(), '--urdf', path, '--out', one / 'out.urdf')
+            command('identify', base(), '--urdf', path, '--out', inside / 'out.urdf')
 
 
 PROPERTIES = (names, metadata, records, messages, parameters, urdfs)
@@ -464,15 +464,15 @@ def run_for(minutes, examples=50):
         phases=(Phase.reuse, Phase.generate),
         suppress_health_check=list(HealthCheck),
     )
-    for one in itertools.cycle([quick(each) for each in PROPERTIES]):
+    for check in itertools.cycle([quick(each) for each in PROPERTIES]):
         if time.monotonic() >= end:
             return failed
         try:
-            one()
+            check()
         except BaseException as error:  # noqa: BLE001 - any exception is a finding
             if isinstance(error, KeyboardInterrupt):
                 return failed
-            failed.add(one.__name__)
+            failed.add(check.__name__)
             traceback.print_exc()
     raise AssertionError
 

@@ -60,9 +60,9 @@ def whole(a_study):
     return run_chunk(a_study, 0, a_study.settings.runs)
 
 
-def same(one, other):
+def same(results, other):
     """Return True if two results are the same, bit for bit; fail otherwise."""
-    assert list(one) == list(other)
-    for name, values in one.items():
+    assert list(results) == list(other)
+    for name, values in results.items():
         np.testing.assert_array_equal(values, other[name], err_msg=name)
     return True

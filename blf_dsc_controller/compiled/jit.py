@@ -176,7 +176,7 @@ def compile_methods(interface: type, names: Sequence[str], *types: type) -> None
     `interface` declares them, `types` implement them; a kernel depends on the files of all types.
     """
     for name in names:
-        _METHODS.setdefault(name, []).extend(getattr(one, name) for one in types)
+        _METHODS.setdefault(name, []).extend(getattr(type_, name) for type_ in types)
         _compile_method(name, inspect.signature(getattr(interface, name)))
 
 

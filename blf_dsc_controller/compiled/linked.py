@@ -76,14 +76,15 @@ class _LowerKernel(NativeLowering):  # type: ignore[misc]
         """Lower a kernel, and set the environments of the functions in it."""
         counting = state.targetctx
         _without_reference_counts(state)
-        if any(isinstance(one, NumPyRandomGeneratorType) for one in state.args):
+        if any(isinstance(argument, NumPyRandomGeneratorType) for argument in state.args):
             # It is allocated for the call, and freed by the wrapper that counts references.
             state.targetctx.create_cpython_wrapper = counting.create_cpython_wrapper
         changed = bool(super().run_pass(state))
         library = state.library
-        if any(one.name.startswith(_ALLOCATORS) for one in library._final_module.functions):  # noqa: SLF001
+        module = library._final_module  # noqa: SLF001 - as numba's cache
+        if any(function.name.startswith(_ALLOCATORS) for function in module.functions):
             raise UnsupportedError(f'the kernel {state.func_id.func_name} allocates an array')
-        for variable in library._final_module.global_variables:  # noqa: SLF001 - as numba's cache
+        for variable in module.global_variables:
             if variable.name.startswith(_ENVIRONMENT):
                 environment = lookup_environment(variable.name)
                 if environment is not None:
@@ -96,8 +97,8 @@ class _Compiler(CompilerBase):  # type: ignore[misc]
 
     def define_pipelines(self) -> list[Any]:
         pipeline = PassManager(self.lowering.__name__)
-        for one, about in DefaultPassBuilder.define_nopython_pipeline(self.state).passes:
-            pipeline.add_pass(self.lowering if one is NativeLowering else one, about)
+        for step, about in DefaultPassBuilder.define_nopython_pipeline(self.state).passes:
+            pipeline.add_pass(self.lowering if step is NativeLowering else step, about)
         pipeline.finalize()
         return [pipeline]
 
