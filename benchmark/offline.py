@@ -14,7 +14,7 @@ from c_reference import Reference
 from harness import Ratio, interleaved, ratio
 from peers import loops
 
-from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.simulation.loop import simulate
 
 GROUP = 'closed loop offline'
 PACKAGE = 'blf_dsc_controller'
@@ -47,7 +47,7 @@ def disagreement() -> float:
     """Return the largest difference to C over 10 s in errors [rad], torques and estimates."""
     plant = replace(loops.PLANT, duration=_AGREEMENT)
     rows = Reference().rows(loops.CONTROLLER, plant)
-    record = simulate_law(loops.CONTROLLER, plant)
+    record = simulate(loops.CONTROLLER, plant, supervised=False)
     samples = [record.sample(k) for k in range(len(rows))]
     mine = np.array([np.concatenate((s.xi1, s.torque, s.estimate)) for s in samples])
     return float(np.abs(mine - rows).max())
@@ -55,7 +55,7 @@ def disagreement() -> float:
 
 def _package(duration: float) -> Callable[[], int]:
     plant = replace(loops.PLANT, duration=duration)
-    return lambda: simulate_law(loops.CONTROLLER, plant).stamps.size
+    return lambda: simulate(loops.CONTROLLER, plant, supervised=False).stamps.size
 
 
 def _peer(loop: Callable[[float], np.ndarray]) -> int:

@@ -19,7 +19,7 @@ import numpy as np
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.state import sample_of
-from blf_dsc_controller.simulation.loop import START, Record, simulate_law
+from blf_dsc_controller.simulation.loop import START, Record, simulate
 from blf_dsc_controller.simulation.metrics import another_motion, torque_error, torque_rows
 from blf_dsc_controller.supervision.guard import Guard
 
@@ -54,7 +54,7 @@ def simulated(
 ) -> tuple[Record, np.ndarray]:
     """Run such a loop; also return the largest true joint error of each sample (k,) [mrad]."""
     loop = loop_of(name, seed, pick_up, kg, changes or {})
-    record = simulate_law(loop.controller, loop.plant)
+    record = simulate(loop.controller, loop.plant, supervised=False)
     settings = record.controller.settings
     n, p = settings.n, settings.p
     columns = sample_of(np.arange(record.samples.shape[1]), settings)

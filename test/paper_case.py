@@ -11,7 +11,7 @@ import numpy as np
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.state import sample_of
-from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.simulation.loop import simulate
 
 P = np.array([1.0, 0.32, 0.4])
 NO_DISTURBANCE = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
@@ -58,7 +58,7 @@ class Loop(NamedTuple):
 
 def run(config: LoopConfig) -> Loop:
     """Run a configuration offline."""
-    record = simulate_law(config.controller, config.plant)
+    record = simulate(config.controller, config.plant, supervised=False)
     columns = sample_of(np.arange(record.samples.shape[1]), record.controller.settings)
     names = ('xi1', 'xi2', 'torque', 'estimate', 'lyapunov')
     parts = (record.samples[:, getattr(columns, name)] for name in names)

@@ -28,14 +28,15 @@ from blf_dsc_controller.studies.arms import (
     trial,
 )
 from blf_dsc_controller.studies.laws import (
-    BASELINES,
     CONTENDERS,
     INTERVALS,
     Figures,
+    computed_torque,
     joint_inertia,
     law_changes,
+    pd_gravity,
     run,
-    simulate_baseline,
+    simulate_with,
 )
 
 IDEAL = {
@@ -76,9 +77,7 @@ def error_of(period):
     """Errors of computed torque with the true model, and those of e'' + k_d e' + k_p e = 0."""
     loop = ideal(period, 0.2, REST)
     gains = {'position': 900.0, 'velocity': 50.0}
-    errors, _ = simulate_baseline(
-        loop, joint_inertia(loop.controller), gains, computed=True, friction=False
-    )
+    errors, _ = simulate_with(loop, computed_torque, gains, friction=False)
     A = np.array([[0.0, 1.0], [-900.0, -50.0]])
     decay = [expm(A * period * k)[0, 0] for k in range(len(errors))]
     return errors, np.outer(decay, E0)
@@ -97,9 +96,8 @@ def test_computed_torque_with_the_true_model_follows_a_moving_reference():
     """With the true model, the acceleration of the reference causes no error."""
     loop = ideal(1e-3, 2.0)
     loop = loop._replace(plant=change(loop.plant, {'initial.position': list(HOLD)}))
-    m = joint_inertia(loop.controller)
     gains = {'position': 900.0, 'velocity': 50.0}
-    errors, torques = simulate_baseline(loop, m, gains, computed=True, friction=False)
+    errors, torques = simulate_with(loop, computed_torque, gains, friction=False)
     assert np.abs(errors[1000:]).max() < 5e-5  # half a sample of the reference's jerk, over k_p
     assert np.ptp(torques, axis=0).max() > 5.0
 
@@ -107,8 +105,7 @@ def test_computed_torque_with_the_true_model_follows_a_moving_reference():
 def resting(gains, **plant):
     start = {'initial.position': list(HOLD)}
     loop = ideal(1e-3, 3.0, REST, **start | plant)
-    inertia = joint_inertia(loop.controller)
-    return inertia, simulate_baseline(loop, inertia, gains, computed=False, friction=False)
+    return joint_inertia(loop.controller), simulate_with(loop, pd_gravity, gains, friction=False)
 
 
 def test_gravity_compensation_holds_the_arm_at_rest():
@@ -131,9 +128,8 @@ def test_known_friction_is_compensated_along_the_reference():
     ((q, dq, _),) = terms.sampled(reference_of(config), np.zeros(1))
     start = {'initial.position': q.tolist(), 'initial.velocity': dq.tolist()}  # no approach
     loop = ideal(1e-3, 0.01, **start)
-    m = joint_inertia(config)
     (_, compensated), (_, uncompensated) = (
-        simulate_baseline(loop, m, {}, computed=False, friction=on) for on in (True, False)
+        simulate_with(loop, pd_gravity, {}, friction=on) for on in (True, False)
     )
     robot, v = config.robot, config.learning.coulomb_velocity
     friction = robot.viscous * dq + robot.coulomb * np.tanh(dq / v)
@@ -149,7 +145,7 @@ def test_integral_gain_of_slotine_li_is_the_gain_of_its_disturbance_estimate():
     assert not settings_of_config(change(config, {'law': 'slotine_li'})).gamma.any()
 
 
-@pytest.mark.parametrize('name', [k for k, c in CONTENDERS.items() if c.law not in BASELINES])
+@pytest.mark.parametrize('name', [k for k, c in CONTENDERS.items() if isinstance(c.law, str)])
 def test_limits_of_the_gain_search_are_valid_configurations(name):
     config, contender = load_loop('panda').controller, CONTENDERS[name]
     for side in ('least', 'most'):

@@ -8,7 +8,7 @@ import pytest
 from monte_carlo_case import LOOP, STUDY, study, whole
 
 from blf_dsc_controller.law.state import sample_of
-from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.simulation.metrics import another_motion, torque_rows
 from blf_dsc_controller.studies.report import plant_of_run
 from blf_dsc_controller.studies.runs import run_chunk
@@ -29,7 +29,7 @@ UNSTABLE = LOOP.replace(
 def metrics_of_record(a_study, run):
     """Metrics of a run from its full record, straight from their definitions."""
     plant = plant_of_run(a_study, run)
-    record = simulate_law(a_study.controller, plant)
+    record = simulate(a_study.controller, plant, supervised=False)
     names = sample_of(np.arange(record.samples.shape[1]), record.controller.settings)
     t = record.stamps * 1e-9
     error = np.abs(record.samples[:, names.xi1])

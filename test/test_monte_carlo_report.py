@@ -19,7 +19,7 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.cli.run import make_folder
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.report import plant_of_run, reproduce, write_report
 from blf_dsc_controller.studies.runs import Span, Store
 from blf_dsc_controller.studies.statistics import influence, summarize, worst_first
@@ -109,7 +109,7 @@ def test_commands_in_the_report_reproduce_the_worst_runs(store, tmp_path, monkey
     # The run can also be repeated from its configuration.
     loop = load_loop(out / 'config.yaml')
     assert loop.plant == plant_of_run(store.study, run)
-    again = simulate_law(loop.controller, loop.plant)
+    again = simulate(loop.controller, loop.plant, supervised=False)
     np.testing.assert_array_equal(again.measurements[:, :2], bag.position)
     # An existing folder is not overwritten.
     assert main(arguments) == 1

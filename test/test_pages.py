@@ -26,6 +26,7 @@ from blf_dsc_controller.studies.monte_carlo import load_study
 ROOT = Path(__file__).resolve().parents[1]
 OUTSIDE = ('README.md', 'CONTRIBUTING.md', 'examples/mujoco_plant/README.md')
 PAGES = [*(ROOT / name for name in OUTSIDE), *sorted((ROOT / 'doc').glob('*.md'))]
+SAVED = re.compile(r'Save this as\s`(\w+\.py)`')
 MAKEFILE = (ROOT / 'Makefile').read_text()
 LAUNCH = (ROOT / 'launch/closed_loop.launch.py').read_text()
 SETUP = (ROOT / 'setup.py').read_text()
@@ -62,14 +63,25 @@ def each_page(pages):
 
 @each_page([page for page in PAGES[1:] if fences(page, 'python')])
 def test_python_blocks_run_and_print_the_output_shown_below_them(page, tmp_path, monkeypatch):
-    """The blocks of a page are run as one program, in a folder with the page's YAML file."""
+    """The blocks of a page are run as one program, in a folder with the page's YAML file.
+
+    Those below "Save this as `name.py`" are saved in this folder instead, to be imported.
+    """
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
     for text in fences(page, 'yaml'):
         Path('my.yaml').write_text(text)
     program = {'__name__': page.stem}
-    blocks = [token for token in tokens(page) if token.type == 'fence']
-    for block, below in pairwise([*blocks, None]):
-        if block.info == 'python':
+    blocks, saved = [], {}
+    for before, token in pairwise(tokens(page)):
+        if token.type == 'fence':
+            blocks.append(token)
+        elif before.type == 'paragraph_open' and (name := SAVED.search(token.content)):
+            saved[len(blocks)] = name[1]
+    for index, (block, below) in enumerate(pairwise([*blocks, None])):
+        if index in saved:
+            Path(saved[index]).write_text(block.content)
+        elif block.info == 'python':
             printed = io.StringIO()
             with contextlib.redirect_stdout(printed):
                 exec(compile(block.content, page, 'exec'), program)  # noqa: S102 - our own pages

@@ -15,7 +15,7 @@ from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.nodes import load_loop, locate
 from blf_dsc_controller.run import Run, Series
-from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies import paper_claims as claims
 from blf_dsc_controller.studies import tuning as tune
 from blf_dsc_controller.studies.paper import kept_bounds
@@ -167,7 +167,7 @@ def test_saved_configurations_are_those_that_ran(report):
     """Running one case of a sweep again from its file reproduces the number in the report."""
     name = case_name('delay', 'comparison', 1.0)
     loop = load_loop(report / 'configurations' / f'{name.replace(" ", "_")}.yaml')
-    again = measure(simulate_law(loop.controller, loop.plant).run())
+    again = measure(simulate(loop.controller, loop.plant, supervised=False).run())
     metrics = json.loads((report / 'metrics.json').read_text(encoding='utf-8'))
     assert metrics[name]['max_error_ratio'] == again.max_error_ratio
     assert loop.plant.actuator.delay == 1

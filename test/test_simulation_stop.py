@@ -14,7 +14,7 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import START, simulate, simulate_law
+from blf_dsc_controller.simulation.loop import START, simulate
 from blf_dsc_controller.supervision.supervisor import Phase
 
 HELD = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.05}
@@ -30,9 +30,9 @@ CASES = {
 }
 
 
-def run(given, simulation=simulate, duration=2.5):
-    plant = build(PlantConfig, {'duration': duration} | NOISY)
-    return simulation(build(ControllerConfig, given), plant)
+def run(given, *, supervised=True):
+    plant = build(PlantConfig, {'duration': 2.5} | NOISY)
+    return simulate(build(ControllerConfig, given), plant, supervised=supervised)
 
 
 @pytest.mark.parametrize(('reason', 'given'), CASES.items(), ids=lambda value: str(value)[:30])
@@ -77,7 +77,7 @@ def test_bag_of_a_stopped_run_replays_with_its_stop(tmp_path, reason):
 
 
 def test_unguarded_law_continues_past_every_limit():
-    stopped, alone = run(CASES['error past the bound']), run(WEAK, simulate_law)
+    stopped, alone = run(CASES['error past the bound']), run(WEAK, supervised=False)
     (row,) = np.flatnonzero(stopped.stamps == stopped.run().stops[0].stamp)
     assert 0 < row < 100
     np.testing.assert_array_equal(stopped.samples[:row], alone.samples[:row])
@@ -90,7 +90,7 @@ def test_switching_between_guard_and_compiled_loop_does_not_change_the_run():
     given = CASES[GOES_ON]
     chunked = run(given).run()
     assert not chunked.stops
-    np.testing.assert_array_equal(chunked.torque, run(given, simulate_law).run().torque)
+    np.testing.assert_array_equal(chunked.torque, run(given, supervised=False).run().torque)
     assert (np.abs(chunked.torque[:1000]) == given['torque.limit']).any()
     assert not (np.abs(chunked.torque[1001:2000]) == given['torque.limit']).any()
 

@@ -15,7 +15,7 @@ from blf_dsc_controller.configuration.nodes import load, load_loop, locate
 from blf_dsc_controller.configuration.robot import read_urdf
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
 from blf_dsc_controller.supervision.reference_load import reference_load, windows_along
 
@@ -106,7 +106,7 @@ def test_predicted_excitation_matches_the_window_of_the_controller(preset):
     """With columns and filters; the loop's window is along q, within a milliradian of qr."""
     loop = configured(preset, 14.0)
     windows = windows_along(loop.controller, settings_of_config(loop.controller))
-    record = simulate_law(loop.controller, loop.plant)
+    record = simulate(loop.controller, loop.plant, supervised=False)
     least = np.linalg.eigvalsh(windows)[:, 0].max()
     assert least == pytest.approx(record.sample(-1).lambda_min[0], rel=0.02)
 

@@ -174,6 +174,13 @@ def make_parser() -> argparse.ArgumentParser:
     )
     option = arms.add_argument
     option('--config', nargs='+', default=['panda', 'ur5e'], help='presets or files (panda ur5e)')
+    option(
+        '--laws',
+        nargs='+',
+        default=[],
+        metavar='LAW',
+        help='laws of the study by name, or Python files that add some (all of the study)',
+    )
     option('--truths', type=int, default=5, help='runs of each law after tuning (5)')
     option('--generations', type=int, default=7, help='generations of tuning after the first (7)')
     option('--out', type=Path, default=Path('arms'), help='new folder for the page')

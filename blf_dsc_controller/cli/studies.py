@@ -41,7 +41,9 @@ def arms(options: Namespace) -> None:
     """Tune and run every law on URDF arms, write the page and print the best law of each figure."""
     folder = make_folder(options.out)
     with announced_compilation(print_notice):
-        rows = compare_arms(folder, options.config, options.truths, options.generations)
+        rows = compare_arms(
+            folder, options.config, options.laws, options.truths, options.generations
+        )
     for arm, figure, best, least, *ours in rows:
         print(f'{arm:<6} {figure:<36} {best}: {least} (proposed {ours[0]}, tuned {ours[1]})')
     print(f'wrote {options.out / "index.html"}')

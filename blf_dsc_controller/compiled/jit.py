@@ -71,19 +71,21 @@ _METHODS: dict[str, list[Callable[..., object]]] = {}  # by name, see `compile_m
 def dependencies(function: Callable[..., object]) -> tuple[set[Path], set[str]]:
     """Return the source files of a kernel, and the constants in it as `name=value`.
 
-    The kernel itself may be outside the package.
+    The kernel itself may be outside the package, and so may methods of `compile_methods`.
     """
+    function = getattr(function, 'py_func', function)
     files, constants = set(_IN_EVERY_KERNEL), set()
     pending: list[tuple[str, Any]] = [('', function)]
+    compiled_in = {id(method) for methods in _METHODS.values() for method in methods}
+    compiled_in.add(id(function))
     seen: list[object] = []
-    function = getattr(function, 'py_func', function)
     while pending:
         name, value = pending.pop()
         value = getattr(value, 'py_func', value)
         if isinstance(value, (int, float, str, tuple)):
             constants.add(f'{name}={value!r}')
         module = getattr(value, '__module__', None) or ''
-        ours = value is function or module.startswith(_PACKAGES)
+        ours = id(value) in compiled_in or module.startswith(_PACKAGES)
         if not ours or any(value is other for other in seen):
             continue
         seen.append(value)

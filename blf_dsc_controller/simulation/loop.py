@@ -27,7 +27,7 @@ from blf_dsc_controller.law.lyapunov import fill_energies
 from blf_dsc_controller.law.settings import settings_of
 from blf_dsc_controller.law.state import Sample, sample_of, signals_of, state_of
 from blf_dsc_controller.law.step import step
-from blf_dsc_controller.law.telemetry import disturbance_names, run_of
+from blf_dsc_controller.law.telemetry import columns_of, disturbance_names, run_of
 from blf_dsc_controller.law.weighing import add_row
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.run import Run, Series, Stop
@@ -122,21 +122,55 @@ def simulate(
     controller_config: ControllerConfig,
     plant_config: PlantConfig,
     progress: Callable[[Record, int], None] | None = None,
+    *,
+    supervised: bool = True,
+    metrics: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Record:
     """Run controller and plant in closed loop for `duration` and return every sample.
 
     The plant's duration must not be 0.  `progress` is called periodically with the record and the
-    number of rows that are filled.
+    number of rows that are filled.  If not `supervised`, the law runs alone, past its limits too;
+    then `metrics`, packed `MetricsSettings` and the vector of `new_metrics`, are updated.
 
     Raises StartError if the law cannot take over and approach.enabled is false, and MotionError if
     there is no approach within the limits.
     """
-    guard = Guard(controller_config, lambda: 0, lambda: 0)
-    guard.activate()
-    plant = plant_of(plant_config)
+    plant, guard, journal = plant_of(plant_config), None, Journal()
     rows = steps_of(plant_config) + 1
-    true = parameter_names_of(plant_config)
-    record = new_record(controller_config, guard.controller, plant, true, rows, guard.journal)
+    if supervised:
+        guard = Guard(controller_config, lambda: 0, lambda: 0)
+        guard.activate()
+        controller, journal = guard.controller, guard.journal
+    else:
+        controller = controller_of(controller_config)
+    record = Record(
+        stamps=np.arange(rows, dtype=np.int64) * plant.period_ns,
+        measurements=np.zeros((rows, 3 * plant.joints)),
+        samples=np.zeros((rows, controller.sample_vector.size)),
+        truths=np.zeros((rows, plant.truth().size)),
+        parameters=parameter_names_of(plant_config),
+        config=controller_config,
+        controller=controller,
+        journal=journal,
+    )
+    if guard is not None:
+        _run_supervised(guard, plant, record, progress)
+        return record
+    q, dq, _ = plant.measure().reshape(3, -1)
+    begin(controller, controller_config, q, dq)
+    journal.note(EventType.CONFIGURE, parameters=flatten(controller_config))
+    journal.note(EventType.ACTIVATE)
+    journal.stamp, journal.messages = START, 1
+    journal.note(EventType.START, resumed=False)
+    arrays = record.measurements, record.samples, record.truths
+    _run_samples(controller, plant, (0, rows - 1, True), arrays, metrics or _NO_METRICS)
+    return record
+
+
+def _run_supervised(
+    guard: Guard, plant: Plant, record: Record, progress: Callable[[Record, int], None] | None
+) -> None:
+    rows = record.stamps.size
     _run_guarded(guard, plant, record, range(1))
     if guard.start_error is not None:
         raise guard.start_error
@@ -146,7 +180,6 @@ def simulate(
             _run_guarded(guard, plant, record, chunk)
         if progress is not None:
             progress(record, chunk.stop)
-    return record
 
 
 def _run_compiled(guard: Guard, plant: Plant, record: Record, chunk: range) -> bool:
@@ -188,36 +221,6 @@ def _run_guarded(guard: Guard, plant: Plant, record: Record, chunk: range) -> No
             sample.bound[:] = record.sample(row - 1).bound
         if row + 1 < record.stamps.size:
             plant.step(torque)
-
-
-def simulate_law(
-    controller_config: ControllerConfig,
-    plant_config: PlantConfig,
-    metrics: tuple[np.ndarray, np.ndarray] | None = None,
-) -> Record:
-    """Run the law alone, without a supervisor, and return every sample.
-
-    The plant's duration must not be 0.  `metrics` are packed `MetricsSettings` and the vector of
-    `new_metrics`, which is updated.
-
-    Raises StartError if the law cannot take over and approach.enabled is false, and MotionError if
-    there is no approach within the limits.
-    """
-    controller, plant = controller_of(controller_config), plant_of(plant_config)
-    n = controller.settings.n
-    measurement = plant.measure()
-    begin(controller, controller_config, measurement[:n], measurement[n : 2 * n])
-    journal = Journal()
-    journal.note(EventType.CONFIGURE, parameters=flatten(controller_config))
-    journal.note(EventType.ACTIVATE)
-    journal.stamp, journal.messages = START, 1
-    journal.note(EventType.START, resumed=False)
-    rows = steps_of(plant_config) + 1
-    true = parameter_names_of(plant_config)
-    record = new_record(controller_config, controller, plant, true, rows, journal)
-    arrays = (record.measurements, record.samples, record.truths)
-    _run_samples(controller, plant, (0, rows - 1, True), arrays, metrics or _NO_METRICS)
-    return record
 
 
 def run_metrics(
@@ -277,6 +280,12 @@ class Record:
         """Return one row of `samples` with named fields."""
         return sample_of(self.samples[row], self.controller.settings)
 
+    def true_errors(self) -> np.ndarray:
+        """Return the errors (k, n) [rad] of the true positions, not of the measured ones."""
+        n, p = len(self.config.joints), len(self.parameters)
+        qr = columns_of(self.samples, self.controller.settings).qr
+        return np.asarray(self.truths[:, p + n : p + 2 * n] - qr)
+
     def run(self) -> Run:
         """Return all samples as a `Run`, with the truth and the terms of (29) that the law has."""
         config = self.config
@@ -291,24 +300,3 @@ class Record:
                 if event.type is EventType.STOP
             ),
         )
-
-
-def new_record(
-    config: ControllerConfig,
-    controller: Controller,
-    plant: Plant,
-    parameters: tuple[str, ...],
-    rows: int,
-    journal: Journal,
-) -> Record:
-    """Return a record of `rows` samples to fill; `parameters` are the names of the plant's."""
-    return Record(
-        stamps=np.arange(rows, dtype=np.int64) * plant.period_ns,
-        measurements=np.zeros((rows, 3 * plant.joints)),
-        samples=np.zeros((rows, controller.sample_vector.size)),
-        truths=np.zeros((rows, plant.truth().size)),
-        parameters=parameters,
-        config=config,
-        controller=controller,
-        journal=journal,
-    )

@@ -25,6 +25,7 @@ from blf_dsc_controller.studies.laws import (
     INTERVALS,
     PICK_UP,
     Figures,
+    load_laws,
     run,
 )
 from blf_dsc_controller.studies.tuning import HOPELESS, search
@@ -47,7 +48,7 @@ class Result(NamedTuple):
 
     def columns(self) -> Floats:
         """Return the values of all runs for each of _COLUMNS, in mrad or %; NaN without a model."""
-        rows = [(*one.errors, *(one.model or (np.nan, np.nan))) for one in self.runs]
+        rows = [(*figures.errors, *(figures.model or (np.nan, np.nan))) for figures in self.runs]
         units = np.where(np.arange(len(_COLUMNS)) < len(INTERVALS), 1e3, 1e2)
         return np.asarray((np.array(rows) * units).T)
 
@@ -105,57 +106,86 @@ def tuning_cost(exponents: Floats, name: str, loop: LoopConfig, unseen: Floats) 
     return cost_of(run(name, loop._replace(plant=delayed), values, unseen))
 
 
-def compare(folder: Path, names: Sequence[str], truths: int, generations: int) -> list[list[str]]:
-    """Tune and run everything, write the page into an empty folder; return `least_errors`."""
-    loops = {name: [trial(name, seed) for seed in range(truths + 1)] for name in names}
-    tuned = sum(bool(contender.gains) for contender in CONTENDERS.values())
-    each = tuned * POPULATION * (generations + 1) + len(CONTENDERS) * truths
+def chosen_laws(given: Sequence[str]) -> list[str]:
+    """Return the names of contenders from names and Python files, `proposed` first; all for none.
+
+    Raises BlfDscError if there is no such contender or file.
+    """
+    if not given:
+        return list(CONTENDERS)
+    names = ['proposed']
+    for name in given:
+        names += [name] if name in CONTENDERS else load_laws(Path(name).resolve())
+    return list(dict.fromkeys(names))
+
+
+def compare(
+    folder: Path, arms: Sequence[str], laws: Sequence[str], truths: int, generations: int
+) -> list[list[str]]:
+    """Tune and run everything, write the page into an empty folder; return `least_errors`.
+
+    `laws` are as in `chosen_laws`.
+    """
+    names = chosen_laws(laws)
+    files = [Path(law).resolve() for law in laws if law not in names]
+    loops = {arm: [trial(arm, seed) for seed in range(truths + 1)] for arm in arms}
+    tuned = sum(bool(CONTENDERS[name].gains) for name in names)
+    each = tuned * POPULATION * (generations + 1) + len(names) * truths
     results: Results = {}
-    with tqdm(total=len(names) * each, unit='run') as bar, ProcessPoolExecutor() as pool:
-        for name in names:
-            unseen = torque_rows(trial(name, _UNSEEN).controller)
+    with (
+        tqdm(total=len(arms) * each, unit='run') as bar,
+        ProcessPoolExecutor(initializer=_load_all, initargs=(files,)) as pool,
+    ):
+
+        def computed(
+            function: Callable[[Floats], float], points: Iterable[Floats]
+        ) -> Iterator[float]:
+            for value in pool.map(function, points):
+                bar.update()
+                yield value
+
+        for arm in arms:
+            unseen = torque_rows(trial(arm, _UNSEEN).controller)
             if not results:  # compile now; the workers inherit or load the result
-                for contender in ('proposed', 'computed_torque'):
-                    run(contender, loops[name][0], {}, unseen)
-
-            def computed(
-                function: Callable[[Floats], float], points: Iterable[Floats]
-            ) -> Iterator[float]:
-                for value in pool.map(function, points):
-                    bar.update()
-                    yield value
-
-            results[name] = {}
-            for contender, what in CONTENDERS.items():
-                bar.set_description(f'{name} {contender}')
+                for name in {str(CONTENDERS[name].law): name for name in names}.values():
+                    least = {gain.name: gain.least for gain in CONTENDERS[name].gains}
+                    run(name, loops[arm][0], least, unseen)
+            results[arm] = {}
+            for name in names:
+                bar.set_description(f'{arm} {name}')
                 gains, cost = {}, None
-                if what.gains:
+                if ranges := CONTENDERS[name].gains:
                     point, cost, _ = search(
-                        partial(tuning_cost, name=contender, loop=loops[name][0], unseen=unseen),
-                        np.log10([(gain.least, gain.most) for gain in what.gains]),
+                        partial(tuning_cost, name=name, loop=loops[arm][0], unseen=unseen),
+                        np.log10([(gain.least, gain.most) for gain in ranges]),
                         POPULATION,
                         generations,
                         workers=computed,
                         updating='deferred',
                     )
-                    gains = values_of(contender, point)
-                runs = partial(run, contender, values=gains, unseen=unseen)
-                figures = list(pool.map(runs, loops[name][1:]))
+                    gains = values_of(name, point)
+                runs = partial(run, name, values=gains, unseen=unseen)
+                figures = list(pool.map(runs, loops[arm][1:]))
                 bar.update(truths)
-                results[name][contender] = Result(gains, cost, figures)
+                results[arm][name] = Result(gains, cost, figures)
     _write(folder, results, truths, generations)
     return least_errors(results)
+
+
+def _load_all(files: Sequence[Path]) -> None:
+    for file in files:
+        load_laws(file)
 
 
 def least_errors(results: Results) -> list[list[str]]:
     """Return rows of arm, column, law with the best worst run, its value, and those of _OURS."""
     rows = []
     for arm, laws in results.items():
-        worst = {name: one.columns().max(axis=1) for name, one in laws.items()}
+        worst = {name: result.columns().max(axis=1) for name, result in laws.items()}
         best = np.nanargmin(list(worst.values()), axis=0)
         for k, title in enumerate(_titles()):
             name = list(worst)[best[k]]
-            shown = [f'{worst[each][k]:.3g}' for each in (name, *_OURS)]
+            shown = [f'{worst[law][k]:.3g}' if law in worst else '-' for law in (name, *_OURS)]
             rows.append([arm, title, label_of(name), *shown])
     return rows
 
@@ -169,17 +199,19 @@ def label_of(name: str) -> str:
 def table_of(laws: dict[str, Result]) -> list[list[str | Cell]]:
     """Return a header and a row for each contender: median / worst of its runs, best marked."""
     rows: list[list[str | Cell]] = [['law', *_titles(), 'bound kept', 'roughness [%]', 'gains']]
-    best = np.nanmin([one.columns().max(axis=1) for one in laws.values()], axis=0)
-    for name, one in laws.items():
+    best = np.nanmin([result.columns().max(axis=1) for result in laws.values()], axis=0)
+    for name, result in laws.items():
         row: list[str | Cell] = [label_of(name)]
-        for values, least in zip(one.columns(), best, strict=True):
+        for values, least in zip(result.columns(), best, strict=True):
             text = f'{np.median(values):.2f} / {values.max():.2f}'
             style = 'good' if values.max() == least else 'number'
             row.append('-' if np.isnan(values[0]) else Cell(text, style))
-        kept = sum(figures.ratio < 1.0 for figures in one.runs)
-        rough = max(figures.roughness for figures in one.runs)
-        gains = ', '.join(f'{gain} {value:g}' for gain, value in one.gains.items())
-        rows.append([*row, f'{kept} of {len(one.runs)}', f'{100.0 * rough:.1f}', gains or 'rule'])
+        kept = sum(figures.ratio < 1.0 for figures in result.runs)
+        rough = max(figures.roughness for figures in result.runs)
+        gains = ', '.join(f'{gain} {value:g}' for gain, value in result.gains.items())
+        rows.append(
+            [*row, f'{kept} of {len(result.runs)}', f'{100.0 * rough:.1f}', gains or 'rule']
+        )
     return rows
 
 
@@ -190,8 +222,8 @@ def _titles() -> list[str]:
 def _write(folder: Path, results: Results, truths: int, generations: int) -> None:
     plain = {
         arm: {
-            name: {**one._asdict(), 'runs': [figures._asdict() for figures in one.runs]}
-            for name, one in laws.items()
+            name: {**result._asdict(), 'runs': [figures._asdict() for figures in result.runs]}
+            for name, result in laws.items()
         }
         for arm, laws in results.items()
     }

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The laws that are compared on arms from URDFs, their tuned gains, and the figures of one run.
 
-Two baselines are simulated here, in a compiled loop of their own:
+Laws of the package are chosen by name. Any other is a `Law`: a named tuple of gains and arrays with
+a method that computes the torque, compiled into the closed loop. Two are here:
 
     u   = -k_p e - k_d e' - k_i int e,   e = q - qr
     tau = M0 (qr'' + u) + C0 q' + G0 + F0(qr')                               computed torque
@@ -9,30 +10,36 @@ Two baselines are simulated here, in a compiled loop of their own:
 
 M0, C0, G0 are those of P0, the initial estimate of the law, and m is the inertia of each joint with
 the others free.  F0 is the friction known to the controller, at the velocity of the reference as in
-the law.  The integrators are held while any torque is saturated.
+the law.  The integrators are held while any torque is saturated.  `load_laws` adds those of a file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+import importlib.util
+import sys
+from collections.abc import Callable, Mapping
+from functools import partial
 from math import tanh
-from typing import Annotated, NamedTuple
+from pathlib import Path
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.arms.tuning import over_postures
-from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.layout import Array, pack, part, size_of, view, view_of
+from blf_dsc_controller.compiled.jit import compile_methods, kernel
+from blf_dsc_controller.compiled.layout import Array, part, view
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import model_of
-from blf_dsc_controller.law.state import sample_of
+from blf_dsc_controller.law.telemetry import columns_of
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import plan_start
-from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.simulation.metrics import torque_error
 from sim_plant import kernels as plants
 from sim_plant.arm import Arm
@@ -50,6 +57,163 @@ _BEFORE = PICK_UP - 0.01  # s, when the model is evaluated for the first time
 _STIFFEST = 4.0  # least slope limit of the barrier, as a multiple of its weight
 
 
+class Known(NamedTuple):
+    """What every law is told of an arm of n joints; P0, m and friction are those of its URDF."""
+
+    model: ArmModel
+    P: Array  # (p,) P0
+    inertia: Array  # (n,) kg m^2, m
+    viscous: Array  # (n,) N m s/rad
+    coulomb: Array  # (n,) N m
+    coulomb_velocity: float  # rad/s
+    limit: Array  # (n,) N m
+    bound: Array  # (n,) rad, on the error
+
+
+class Now(NamedTuple):
+    """What every law is told in a sample."""
+
+    dt: float  # s
+    q: Array  # (n,) rad, measured
+    dq: Array  # (n,) rad/s, measured
+    qr: Array  # (n,) rad
+    dqr: Array  # (n,) rad/s
+    ddqr: Array  # (n,) rad/s^2
+
+
+class Law(Protocol):
+    """A law: a `NamedTuple` of its gains (float), its memory and its scratch (arrays)."""
+
+    def command(self, arm: Known, now: Now, torque: Array) -> None:
+        """Write the torque (n,) [N m]; the loop cuts it at its limit afterwards."""
+
+
+class ModelBased(NamedTuple):
+    """Computed torque, or PD with gravity compensation, both with an integrator."""
+
+    computed: float  # 1: computed torque, 0: PD with gravity
+    position: float  # k_p, 1/s^2
+    velocity: float  # k_d, 1/s
+    integral: float  # k_i, 1/s^3
+    integrated: Array  # (n,) rad s, int e
+    u: Array  # (n,) rad/s^2
+    v: Array  # (n,) rad/s, velocity of the model
+    a: Array  # (n,) rad/s^2, acceleration of the model
+    H: Array  # (n, p)
+
+    def command(self, arm: Known, now: Now, torque: Array) -> None:
+        """Write the torque."""
+        n = now.q.size
+        for i in range(n):
+            self.u[i] = -self.position * (now.q[i] - now.qr[i])
+            self.u[i] -= self.velocity * (now.dq[i] - now.dqr[i])
+            self.u[i] -= self.integral * self.integrated[i]
+            self.v[i] = self.computed * now.dq[i]
+            self.a[i] = self.computed * (now.ddqr[i] + self.u[i])
+        arm.model.regressor(now.q, self.v, self.v, self.a, self.H)
+        cut = False
+        for i in range(n):
+            torque[i] = (1.0 - self.computed) * arm.inertia[i] * self.u[i]
+            torque[i] += arm.viscous[i] * now.dqr[i]
+            torque[i] += arm.coulomb[i] * tanh(now.dqr[i] / arm.coulomb_velocity)
+            for j in range(arm.P.size):
+                torque[i] += self.H[i, j] * arm.P[j]
+            cut = cut or abs(torque[i]) > arm.limit[i]
+        if not cut:
+            for i in range(n):
+                self.integrated[i] += now.dt * (now.q[i] - now.qr[i])
+
+
+def model_based(gains: Mapping[str, float], arm: Known, *, computed: bool) -> ModelBased:
+    """Return the law with these gains; those that are not given are zero."""
+    n, p = arm.inertia.size, arm.P.size
+    k_p, k_d, k_i = (gains.get(name, 0.0) for name in ('position', 'velocity', 'integral'))
+    integrated, u, v, a = np.zeros((4, n))
+    return ModelBased(float(computed), k_p, k_d, k_i, integrated, u, v, a, np.zeros((n, p)))
+
+
+computed_torque = partial(model_based, computed=True)
+pd_gravity = partial(model_based, computed=False)
+
+
+def _run(
+    arm: Arm,
+    plant_settings: np.ndarray,
+    plant_state: np.ndarray,
+    rng: np.random.Generator,
+    law: Law,
+    known: Known,
+    motion: np.ndarray,
+    rows: np.ndarray,
+) -> None:
+    """Run a sample for each of `rows` (k, 8 n): [q, dq, effort, qr, dqr, ddqr, true q, torque]."""
+    plant, state = plants.plant_views(arm, plant_settings, plant_state)
+    n, dt = plant.n, plant.period_ns * 1e-9
+    every = view(rows)
+    for k in range(rows.shape[0]):
+        row = every[k]
+        q, dq, torque = part(row, 0, (n,)), part(row, n, (n,)), part(row, 7 * n, (n,))
+        qr, dqr, ddqr = part(row, 3 * n, (n,)), part(row, 4 * n, (n,)), part(row, 5 * n, (n,))
+        plants.draw_noise(plant, state, rng)
+        plants.observe(plant, state, part(row, 0, (3 * n,)))
+        reference.evaluate(view(motion), (k * plant.period_ns) * 1e-9, qr, dqr, ddqr)
+        law.command(known, Now(dt, q, dq, qr, dqr, ddqr), torque)
+        for i in range(n):
+            row[6 * n + i] = state.x[i]
+            torque[i] = min(max(torque[i], -known.limit[i]), known.limit[i])
+        plants.step(plant, state, torque)
+
+
+@functools.cache
+def _loop_with(law: type) -> Callable[..., None]:
+    """Return the loop compiled for a type of law, from its cache if its file has not changed."""
+    compile_methods(Law, ('command',), law)
+    return kernel(_run)
+
+
+def known_of(config: ControllerConfig, *, friction: bool) -> Known:
+    """Return what a law is told of the arm of a configuration; without `friction` it knows none."""
+    robot = config.robot
+    on_joints = robot.friction(robot.chain(config.joints))
+    return Known(
+        model=model_of(config),
+        P=np.array(config.learning.initial_estimate),
+        inertia=joint_inertia(config),
+        viscous=friction * np.array(on_joints['viscous']),
+        coulomb=friction * np.array(on_joints['coulomb']),
+        coulomb_velocity=config.learning.coulomb_velocity,
+        limit=np.array(config.torque.limit),
+        bound=np.array(config.barrier.bound),
+    )
+
+
+def simulate_with(
+    loop: LoopConfig,
+    make: Callable[[Mapping[str, float], Known], Law],
+    gains: Mapping[str, float],
+    *,
+    friction: bool = True,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return true errors (k, n) [rad] and torques (k, n) [N m] of `make(gains, known)`.
+
+    The loop starts as that of the package's law does.
+
+    Raises MotionError if there is no approach within the limits.
+    """
+    config, plant = loop.controller, plant_of(loop.plant)
+    n, known = plant.joints, known_of(config, friction=friction)
+    q, dq, _ = plant.measure().reshape(3, n)
+    motion = plan_start(config, np.array(config.barrier.widest), q, dq)
+    rows = np.zeros((steps_of(loop.plant) + 1, 8, n))
+    law = make(gains, known)
+    run_with = _loop_with(type(law))
+    run_with(
+        *(plant.arm, plant.settings, plant.state, plant.rng),
+        *(law, known, motion.vector, rows.reshape(len(rows), -1)),
+    )
+    return rows[:, 6] - rows[:, 3], rows[:, 7]
+
+
 class Gain(NamedTuple):
     """One tuned number: its name, its range, and whether it multiplies each joint's inertia m."""
 
@@ -64,12 +228,11 @@ class Contender(NamedTuple):
 
     label: str
     gains: tuple[Gain, ...] = ()
-    law: str = 'blf_dsc'  # or one of BASELINES
+    law: str | Callable[[Mapping[str, float], Known], Law] = 'blf_dsc'
+    """Law of the package by its name, or a function of the gains by name that makes another."""
     learns: bool = True
     friction: bool = True  # compensates the friction that the controller knows
 
-
-BASELINES = ('computed_torque', 'pd_gravity')
 
 _DAMPING = Gain('feedback.damping_rate', 10.0, 200.0)
 _ADAPTATION = Gain('learning.adaptation_gain', 0.01, 30.0)
@@ -96,12 +259,12 @@ CONTENDERS = {
     'proposed_tuned': Contender('proposed, tuned', (*_FEEDBACK, _ADAPTATION)),
     'no_learning_tuned': Contender('without learning, tuned', _FEEDBACK, learns=False),
     'slotine_li_tuned': Contender('Slotine-Li with integrator, tuned', _SLOTINE_LI, 'slotine_li'),
-    'computed_torque': Contender('computed torque', _PD, BASELINES[0], friction=False),
-    'computed_torque_i': Contender('+ integrator', _PID, BASELINES[0], friction=False),
-    'computed_torque_if': Contender('+ integrator, friction', _PID, BASELINES[0]),
-    'pd_gravity': Contender('PD + gravity', _PD, BASELINES[1], friction=False),
-    'pd_gravity_i': Contender('+ integrator', _PID, BASELINES[1], friction=False),
-    'pd_gravity_if': Contender('+ integrator, friction', _PID, BASELINES[1]),
+    'computed_torque': Contender('computed torque', _PD, computed_torque, friction=False),
+    'computed_torque_i': Contender('+ integrator', _PID, computed_torque, friction=False),
+    'computed_torque_if': Contender('+ integrator, friction', _PID, computed_torque),
+    'pd_gravity': Contender('PD + gravity', _PD, pd_gravity, friction=False),
+    'pd_gravity_i': Contender('+ integrator', _PID, pd_gravity, friction=False),
+    'pd_gravity_if': Contender('+ integrator, friction', _PID, pd_gravity),
 }
 
 
@@ -155,17 +318,13 @@ def run(name: str, loop: LoopConfig, values: Mapping[str, float], unseen: np.nda
     """
     contender = CONTENDERS[name]
     with np.errstate(all='ignore'):  # a run that diverges has figures too
-        if contender.law in BASELINES:
-            errors, torques = simulate_baseline(
-                loop,
-                joint_inertia(loop.controller),
-                dict(values),
-                computed=contender.law == BASELINES[0],
-                friction=contender.friction,
-            )
-            model: tuple[float, ...] = ()
+        if isinstance(contender.law, str):
+            errors, torques, model = _simulate_named(contender, loop, values, unseen)
         else:
-            errors, torques, model = _simulate_law(contender, loop, values, unseen)
+            errors, torques = simulate_with(
+                loop, contender.law, values, friction=contender.friction
+            )
+            model = ()
         time = np.arange(len(errors)) * loop.plant.sample_time
         peaks = [
             np.abs(errors[(time >= begin) & (time < end)]).max(initial=0.0)
@@ -177,162 +336,40 @@ def run(name: str, loop: LoopConfig, values: Mapping[str, float], unseen: np.nda
     return Figures(tuple(map(float, peaks)), float(ratio), float(rough), model)
 
 
-def _simulate_law(
+def _simulate_named(
     contender: Contender, loop: LoopConfig, values: Mapping[str, float], unseen: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, ...]]:
     config = change(loop.controller, law_changes(contender, loop.controller, values))
-    record = simulate_law(config, loop.plant)
-    settings = record.controller.settings
-    n, p = settings.n, settings.p
-    columns = sample_of(np.arange(record.samples.shape[1]), settings)
-    errors = record.truths[:, p + n : p + 2 * n] - record.samples[:, columns.qr]
-    rows = [round(_BEFORE / config.sample_time), -1]
-    estimates = record.samples[rows][:, columns.estimate[:p]]
+    record = simulate(config, loop.plant, supervised=False)
+    samples = columns_of(record.samples, record.controller.settings)
+    p = record.controller.settings.p
     model = tuple(
-        torque_error(unseen, estimate, P)
-        for estimate, P in zip(estimates, record.truths[rows, :p], strict=True)
+        torque_error(unseen, samples.estimate[row, :p], record.truths[row, :p])
+        for row in (round(_BEFORE / config.sample_time), -1)
     )
-    return errors, record.samples[:, columns.torque], model
+    return record.true_errors(), samples.torque, model
 
 
-class Gains(NamedTuple):
-    """Gains of a baseline, and its model of the arm."""
+def load_laws(path: Path) -> list[str]:
+    """Add the contenders of a Python file, by name in its `CONTENDERS`, and return their names.
 
-    n: int
-    p: int
-    computed: float  # 1: computed torque, 0: PD with gravity
-    position: float  # k_p, 1/s^2
-    velocity: float  # k_d, 1/s
-    integral: float  # k_i, 1/s^3
-    coulomb_velocity: float  # rad/s
-    inertia: Annotated[Array, 'n']  # m, kg m^2
-    viscous: Annotated[Array, 'n']  # N m s/rad, compensated
-    coulomb: Annotated[Array, 'n']  # N m, likewise
-    limit: Annotated[Array, 'n']  # N m
-    P: Annotated[Array, 'p']  # P0
-
-
-class Memory(NamedTuple):
-    """State of a baseline, and what it computes in a sample."""
-
-    integrated: Annotated[Array, 'n']  # int e, rad s
-    measurement: Annotated[Array, '3 * n']  # [q, dq, effort]
-    qr: Annotated[Array, 'n']  # rad
-    dqr: Annotated[Array, 'n']  # rad/s
-    ddqr: Annotated[Array, 'n']  # rad/s^2
-    u: Annotated[Array, 'n']  # rad/s^2
-    v: Annotated[Array, 'n']  # velocity of the model, rad/s
-    a: Annotated[Array, 'n']  # acceleration of the model, rad/s^2
-    torque: Annotated[Array, 'n']  # N m
-    H: Annotated[Array, 'n', 'p']
-
-
-gains_of = view_of(Gains)
-memory_of, memory_size = view_of(Memory), size_of(Memory)
-
-
-@inner
-def compute_torque(model: ArmModel, gains: Gains, memory: Memory, dt: float) -> None:
-    """Write the torque for the measurement and the reference of this sample."""
-    n = gains.n
-    q, dq = part(memory.measurement, 0, (n,)), part(memory.measurement, n, (n,))
-    for i in range(n):
-        memory.u[i] = -gains.position * (q[i] - memory.qr[i])
-        memory.u[i] -= gains.velocity * (dq[i] - memory.dqr[i])
-        memory.u[i] -= gains.integral * memory.integrated[i]
-        memory.v[i] = gains.computed * dq[i]
-        memory.a[i] = gains.computed * (memory.ddqr[i] + memory.u[i])
-    model.regressor(q, memory.v, memory.v, memory.a, memory.H)
-    cut = False
-    for i in range(n):
-        torque = (1.0 - gains.computed) * gains.inertia[i] * memory.u[i]
-        torque += gains.viscous[i] * memory.dqr[i]
-        torque += gains.coulomb[i] * tanh(memory.dqr[i] / gains.coulomb_velocity)
-        for j in range(gains.p):
-            torque += memory.H[i, j] * gains.P[j]
-        memory.torque[i] = min(max(torque, -gains.limit[i]), gains.limit[i])
-        cut = cut or memory.torque[i] != torque
-    if not cut:
-        for i in range(n):
-            memory.integrated[i] += dt * (q[i] - memory.qr[i])
-
-
-@kernel
-def run_baseline(
-    arm: Arm,
-    plant_settings: np.ndarray,
-    plant_state: np.ndarray,
-    rng: np.random.Generator,
-    model: ArmModel,
-    gains_vector: np.ndarray,
-    memory_vector: np.ndarray,
-    reference_vector: np.ndarray,
-    errors: np.ndarray,
-    torques: np.ndarray,
-) -> None:
-    """Run as many samples as `errors` (k, n) [rad] and `torques` (k, n) [N m] have rows.
-
-    The errors are those of the true state, not of the measured one.
+    Raises BlfDscError if it has none, if it cannot be imported, or if a name is taken.
     """
-    plant, now = plants.plant_views(arm, plant_settings, plant_state)
-    gains = gains_of(view(gains_vector))
-    memory = memory_of(view(memory_vector), gains)
-    dt = plant.period_ns * 1e-9
-    for k in range(errors.shape[0]):
-        plants.draw_noise(plant, now, rng)
-        plants.observe(plant, now, memory.measurement)
-        t = (k * plant.period_ns) * 1e-9
-        reference.evaluate(view(reference_vector), t, memory.qr, memory.dqr, memory.ddqr)
-        compute_torque(model, gains, memory, dt)
-        for i in range(gains.n):
-            errors[k, i] = now.x[i] - memory.qr[i]
-            torques[k, i] = memory.torque[i]
-        plants.step(plant, now, memory.torque)
-
-
-def simulate_baseline(
-    loop: LoopConfig,
-    inertia: np.ndarray,
-    values: dict[str, float],
-    *,
-    computed: bool,
-    friction: bool,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return errors (k, n) [rad] and torques (k, n) [N m] of a loop that starts as its law does.
-
-    `inertia` (n,) is m, `values` are gains by name; gains that are not given are zero.
-
-    Raises MotionError if there is no approach within the limits.
-    """
-    config, plant = loop.controller, plant_of(loop.plant)
-    n, known = plant.joints, config.robot.friction(config.robot.chain(config.joints))
-    gains = Gains(
-        n=n,
-        p=len(config.learning.initial_estimate),
-        computed=float(computed),
-        position=values.get('position', 0.0),
-        velocity=values.get('velocity', 0.0),
-        integral=values.get('integral', 0.0),
-        coulomb_velocity=config.learning.coulomb_velocity,
-        inertia=inertia,
-        viscous=friction * np.array(known['viscous']),
-        coulomb=friction * np.array(known['coulomb']),
-        limit=np.array(config.torque.limit),
-        P=np.array(config.learning.initial_estimate),
-    )
-    q, dq = np.split(plant.measure()[: 2 * n], 2)
-    motion = plan_start(config, np.array(config.barrier.widest), q, dq)
-    errors, torques = np.zeros((2, steps_of(loop.plant) + 1, n))
-    run_baseline(
-        plant.arm,
-        plant.settings,
-        plant.state,
-        plant.rng,
-        model_of(config),
-        pack(gains),
-        np.zeros(memory_size(gains)),
-        motion.vector,
-        errors,
-        torques,
-    )
-    return errors, torques
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise BlfDscError(f'{path}: expected a law of the study, or a Python file with CONTENDERS')
+    module = sys.modules.get(path.stem)
+    if module is None or getattr(module, '__file__', '') != str(path):
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[path.stem] = module
+        try:
+            spec.loader.exec_module(module)
+        except Exception as error:
+            raise BlfDscError(f'{path} cannot be imported: {error!r}') from error
+    added: dict[str, Contender] = getattr(module, 'CONTENDERS', {})
+    if not added or not all(isinstance(each, Contender) for each in added.values()):
+        raise BlfDscError(f'{path}: CONTENDERS must be a dict of Contender by name')
+    for name, contender in added.items():
+        if CONTENDERS.setdefault(name, contender) is not contender:
+            raise BlfDscError(f'{path}: the study has a law {name} already: choose another name')
+    return list(added)

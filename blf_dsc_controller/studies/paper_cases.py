@@ -16,7 +16,7 @@ from blf_dsc_controller.analysis.metrics import Metrics, measure
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.run import Run
-from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.simulation.loop import simulate
 
 DURATION = 60.0  # s
 
@@ -218,7 +218,7 @@ def run_case(case: Case) -> tuple[Metrics, Run | None]:
     """Simulate a case; return its metrics and, if the case keeps it, the run."""
     loop = case.loop()
     with np.errstate(all='ignore'):  # a run that diverges has metrics too
-        run = simulate_law(loop.controller, loop.plant).run()
+        run = simulate(loop.controller, loop.plant, supervised=False).run()
         return measure(run), run if case.keep_run else None
 
 

@@ -17,7 +17,7 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.simulation.metrics import metrics_of, new_metrics
 from blf_dsc_controller.studies.monte_carlo import Study, draw, origin_of, plant_of_draw
 from blf_dsc_controller.studies.runs import (
@@ -100,7 +100,7 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
         folder.mkdir(exist_ok=True)
         dump(folder / 'config.yaml', {PLANT: plant, CONTROLLER: law})
         metrics = new_metrics(settings)
-        record = simulate_law(law, plant, metrics=(pack(settings), metrics))
+        record = simulate(law, plant, metrics=(pack(settings), metrics), supervised=False)
         write_bag(folder / 'bag', record, law, 'none')
         recorded = read_run(folder / 'bag')
         summaries.append(summarize_run(recorded))

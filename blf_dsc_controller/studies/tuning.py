@@ -29,7 +29,7 @@ from blf_dsc_controller.configuration.nodes import PLANT, LoopConfig, format_val
 from blf_dsc_controller.configuration.schema import change, flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Floats
-from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.simulation.loop import simulate
 
 SEED = 1
 POPULATION = 96
@@ -136,7 +136,7 @@ def objective(exponents: Floats, task: Task, loops: Sequence[LoopConfig]) -> flo
     for loop in loops:
         config = change(loop.controller, settings_of(task, exponents))
         with np.errstate(all='ignore'):
-            metrics = measure(simulate_law(config, loop.plant).run())
+            metrics = measure(simulate(config, loop.plant, supervised=False).run())
             values.append(cost_of(metrics, config.sample_time))
     return min(float(np.mean(values)), HOPELESS)
 
