@@ -124,8 +124,8 @@ setup(
         ],
         'docs': DOCS,
         'release': ['build', 'twine'],
-        # The peers of `make bench`; Octave and a C compiler come from the system.
-        'bench': ['mujoco', 'drake', 'pin', 'pyarrow'],
+        # The peers of `make bench`; a C compiler comes from the system.
+        'bench': ['mujoco', 'pin', 'pyarrow'],
         # Pinned: with nearly all rules enabled, each release of the linter finds something new.
         'lint': [
             'ruff~=0.17.5',

@@ -41,9 +41,9 @@ def chain(n: int, **changes: Any) -> ControllerConfig:
     """Return the same settings for a planar arm of n links, with a window of 1 s."""
     default: Mapping[str, Any] = flatten(ControllerConfig())
     values: dict[str, Any] = {'model': 'planar_chain', 'joints': [f'joint{i}' for i in range(n)]}
-    for one in parameters(ControllerConfig):
-        if one.length == ('joints',) and default[one.name]:
-            values[one.name] = [default[one.name][0]] * n
+    for param in parameters(ControllerConfig):
+        if param.length == ('joints',) and default[param.name]:
+            values[param.name] = [default[param.name][0]] * n
     p = n * (n + 1) // 2
     values |= {
         'reference.amplitude': [0.3] * n,
@@ -105,11 +105,11 @@ def measure() -> Iterator[Ratio]:
     tones = {'learning__viscous': True, 'learning__frequencies': [1.0, 2.0]}
     columns = (chain(7), chain(7, **wide), chain(7, **tones))
     cases: dict[str, dict[str, ControllerConfig]] = {
-        'joints and unknowns': {label(one): one for one in map(chain, range(2, 8))},
+        'joints and unknowns': {label(config): config for config in map(chain, range(2, 8))},
         'arms from a URDF': {
             f'{name}: {label(of_urdf(name))}': of_urdf(name) for name in ('panda', 'ur5e')
         },
-        'disturbance columns': {label(one): one for one in columns},
+        'disturbance columns': {label(config): config for config in columns},
         'window': {
             f'window of {samples} samples': two_link(learning__window=samples * _T)
             for samples in (100, 1000, 10_000, 100_000)

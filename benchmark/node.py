@@ -5,6 +5,9 @@ This process stands in for the plant: it publishes the joint states of a recorde
 the torques. Every contestant is restarted in each round: as a process of its own, or as a node of
 this process, on the same executor.
 
+No browser has the page of the view open: the controller pays only for the subscriptions; the view
+draws in a process of its own, and only while a page is open.
+
 There are two null nodes: a typical rclpy node, and one that passes serialised messages without
 decoding them, the least that Python can do.
 """
@@ -12,6 +15,7 @@ decoding them, the least that Python can do.
 from __future__ import annotations
 
 import gc
+import itertools
 import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -47,6 +51,14 @@ _PROCESSES = (_NULL, _NULL_TYPED, _QUIET, _UNHEARD, _SPARSE, _HEARD, _RECORDED)
 _GUESTS = (_NULL, _QUIET, _UNHEARD, _SPARSE, _HEARD)
 _PRESETS = {'recommended': 'node', 'panda': 'node with seven joints'}
 _HERE = Path(__file__).parent
+_VIEW_ROUNDS = 7
+_STARTS = 3
+_WARM = 'controller, warm cache'
+_COLD = 'controller, cold cache'
+_POLL = 0.002  # s
+_VIEWED = 'controller, telemetry and view on'
+_BESIDE = _UNHEARD, _HEARD
+_VIEW = ('-m', 'blf_dsc_controller.view.node', '--ros-args', '-p', 'port:=8480')
 
 
 class Run(NamedTuple):
@@ -311,3 +323,77 @@ def _recorded_states(loop: LoopConfig) -> list[bytes]:
     telemetry = PlantTelemetry(plant.joints, record.parameters)
     rows = zip(record.stamps[:-1].tolist(), record.measurements, strict=False)
     return [telemetry.joint_states(_START + stamp, row)[1] for stamp, row in rows]
+
+
+def measure_view() -> Iterator[Ratio]:
+    """Measure latency and CPU of the controller with the view relative to those without it."""
+    loop = load_loop('recommended')
+    runs: dict[str, list[Run]] = {name: [] for name in (*_BESIDE, _VIEWED)}
+    states = _recorded_states(loop)
+    with own_graph(), tempfile.TemporaryDirectory() as folder, closing(StandIn(states)) as arm:
+        for k in range(_VIEW_ROUNDS):
+            for name, each in runs.items():
+                path = Path(folder, f'{k}-{name}'.replace(' ', '_'))
+                with _viewed(name, loop.controller, path) as these:
+                    each.append(arm.play(these, 1e-3))
+                arm.left_alone()
+    group = 'view, real time at 1 kHz'
+    percentiles = {'median': 50.0, 'p99.9': 99.9}
+    for base in _BESIDE:
+        for what, percentile in percentiles.items():
+            latency = {
+                name: np.array([np.percentile(run.latency, percentile) for run in each])
+                for name, each in runs.items()
+            }
+            yield ratio(group, f'{_VIEWED}: {what} latency', base, latency[_VIEWED], latency[base])
+        cpu = {name: np.array([run.cpu for run in each]) for name, each in runs.items()}
+        yield ratio(group, f'{_VIEWED}: CPU', base, cpu[_VIEWED], cpu[base])
+
+
+@contextmanager
+def _viewed(name: str, config: ControllerConfig, path: Path) -> Iterator[list[Contestant]]:
+    """Start the controller's processes, after that of the view if it is measured."""
+    views = [Contestant('view', _VIEW)] if name == _VIEWED else []
+    try:
+        with _started(_UNHEARD if views else name, config, path) as nodes:
+            yield [*views, *nodes]
+    finally:
+        for view in views:
+            view.end()
+
+
+def measure_start() -> Iterator[Ratio]:
+    """Measure the time to the first torque relative to the null node's."""
+    seconds: dict[str, list[float]] = {name: [] for name in (_NULL_TYPED, _WARM, _COLD)}
+    with own_graph(), tempfile.TemporaryDirectory() as caches:
+        _first_torque(_WARM, f'{caches}/warm')
+        for k in range(_STARTS):
+            for name, values in seconds.items():
+                cache = f'{caches}/{k}' if name == _COLD else f'{caches}/warm'
+                values.append(_first_torque(name, cache))
+    times = {name: np.array(values) for name, values in seconds.items()}
+    for name in (_WARM, _COLD):
+        note = f'{np.median(times[name]):.1f} s here'
+        yield ratio('first torque', name, _NULL_TYPED, times[name], times[_NULL_TYPED], note)
+
+
+def _first_torque(name: str, cache: str) -> float:
+    encoder = PlantTelemetry(('joint1', 'joint2'), ())
+    state = np.array((2.293, 1.696, 0.0, 0.0, 0.0, 0.0))
+    stamps = itertools.count(1_000_000_000, 1_000_000)
+    command = ['-m', 'blf_dsc_controller.nodes.controller_node']
+    if name == _NULL_TYPED:
+        command = [str(Path(__file__).with_name('null_node.py')), 'raw']
+    with closing(StandIn(())) as arm:
+
+        def publish() -> None:
+            arm.publisher.publish(encoder.joint_states(next(stamps), state)[1])
+            arm.executor.spin_once(timeout_sec=_POLL)
+
+        begin = time.perf_counter()
+        contestant = Contestant(name, command, {'NUMBA_CACHE_DIR': cache})
+        try:
+            wait_for(lambda: arm.has_torque, 'the first torque', [contestant], publish)
+            return time.perf_counter() - begin
+        finally:
+            contestant.end()

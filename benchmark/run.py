@@ -21,18 +21,18 @@ from matplotlib.figure import Figure
 
 from blf_dsc_controller import __version__
 
-_GROUPS = (
-    'offline',
-    'montecarlo',
-    'growth',
-    'node',
-    'view',
-    'recording',
-    'replay',
-    'startup',
-)
+_GROUPS = {  # module and function of each
+    'offline': ('offline', 'measure'),
+    'montecarlo': ('offline', 'measure_study'),
+    'growth': ('growth', 'measure'),
+    'node': ('node', 'measure'),
+    'view': ('node', 'measure_view'),
+    'recording': ('bags', 'measure'),
+    'replay': ('bags', 'measure_replay'),
+    'startup': ('node', 'measure_start'),
+}
 _HERE = Path(__file__).parent
-_PACKAGES = ('numpy', 'numba', 'scipy', 'mujoco', 'drake', 'pin', 'ros-jazzy-rclpy')
+_PACKAGES = ('numpy', 'numba', 'scipy', 'mujoco', 'pin', 'ros-jazzy-rclpy')
 
 
 def machine() -> str:
@@ -100,7 +100,8 @@ def main() -> None:
     rows: list[Ratio] = []
     for name in chosen.groups or _GROUPS:
         print(f'measuring: {name}', flush=True)
-        for row in importlib.import_module(name).measure():
+        module, function = _GROUPS[name]
+        for row in getattr(importlib.import_module(module), function)():
             print(f'  {row.what}: {row.median:.3g} times {row.baseline}  {row.note}', flush=True)
             rows.append(row)
     today = dt.datetime.now(dt.timezone.utc).date()

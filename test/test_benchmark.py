@@ -69,7 +69,6 @@ def test_growth_is_written_as_table_and_picture(monkeypatch, tmp_path):
 def test_loop_compared_with_c_and_numpy(monkeypatch):
     offline = tiny(monkeypatch, 'offline', _LONG=0.1, _SHORT=0.02)
     monkeypatch.setattr(offline, '_PEERS', {'numpy': offline._PEERS['numpy']})
-    monkeypatch.setattr(shutil, 'which', lambda _: None)  # no Octave
     assert contestants(list(offline.measure())) == ['blf_dsc_controller', 'numpy']
 
 
@@ -81,18 +80,18 @@ def test_c_reference_gives_the_same_trajectory():
 
 @pytest.mark.skipif(shutil.which('cc') is None, reason='there is no C compiler')
 def test_study_compared_with_c_and_on_two_processes(monkeypatch):
-    sizes = {'_DURATION': 0.05, '_RUNS': 2, '_CHUNKS': 2, '_CHUNK': 1}
-    montecarlo = tiny(monkeypatch, 'montecarlo', **sizes)
-    assert len(contestants(list(montecarlo.measure()))) == 2
+    sizes = {'_DURATION': 0.05, '_RUNS': 2, '_CHUNKS': 2, '_CHUNK': 1, '_STUDY_ROUNDS': 1}
+    study = tiny(monkeypatch, 'offline', **sizes)
+    assert len(contestants(list(study.measure_study()))) == 2
 
 
 @pytest.mark.skipif(shutil.which('cc') is None, reason='there is no C compiler')
 def test_c_reference_runs_the_same_study(monkeypatch):
-    montecarlo = tiny(monkeypatch, 'montecarlo', _RUNS=8, _DURATION=9.0)  # learning from 6.8 s on
-    drawn = run_chunk(montecarlo.preset(), 0, 8)
+    offline = tiny(monkeypatch, 'offline', _RUNS=8, _DURATION=9.0)  # learning from 6.8 s on
+    drawn = run_chunk(offline.preset(), 0, 8)
     assert set(drawn['plant.sensor.velocity']) == {'measured', 'differenced'}
     assert set(drawn['plant.actuator.delay']) == {0, 1, 2}
-    assert montecarlo.disagreement(montecarlo.preset()) < 1e-9
+    assert offline.study_disagreement(offline.preset()) < 1e-9
 
 
 def test_node_compared_with_null_node_in_two_processes_and_in_one(monkeypatch):
@@ -121,10 +120,10 @@ def test_node_compared_with_null_node_in_two_processes_and_in_one(monkeypatch):
 
 def test_controller_with_view_running(monkeypatch):
     pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
-    tiny(monkeypatch, 'node', _STEPS=20, _WARM_UP=2, _SETTLING=0.05)
-    view = tiny(monkeypatch, 'view')
+    sizes = {'_STEPS': 20, '_WARM_UP': 2, '_SETTLING': 0.05, '_VIEW_ROUNDS': 1}
+    node = tiny(monkeypatch, 'node', **sizes)
     assert (
-        contestants(list(view.measure()))
+        contestants(list(node.measure_view()))
         == [
             'controller, telemetry and view on: median latency',
             'controller, telemetry and view on: p99.9 latency',
@@ -136,12 +135,12 @@ def test_controller_with_view_running(monkeypatch):
 
 def test_recorder_compared_with_raw_subscriber(monkeypatch):
     sizes = {'_TOPICS': 2, '_MESSAGES': 20, '_SETTLING': 0.0, '_RECORDERS': {'recorder': 'none'}}
-    recording = tiny(monkeypatch, 'recording', **sizes)
+    recording = tiny(monkeypatch, 'bags', **sizes)
     assert contestants(list(recording.measure())) == ['recorder: CPU']
 
 
 def test_replay_compared_with_mcap_reader(monkeypatch):
-    replay = tiny(monkeypatch, 'replay', _DURATION=0.1)
+    replay = tiny(monkeypatch, 'bags', _DURATION=0.1)
     units = []
 
     def counting(each, rounds):
@@ -150,14 +149,14 @@ def test_replay_compared_with_mcap_reader(monkeypatch):
 
     measured = replay.interleaved
     monkeypatch.setattr(replay, 'interleaved', counting)
-    assert len(contestants(list(replay.measure()))) == 2
+    assert len(contestants(list(replay.measure_replay()))) == 2
     # 101 samples of five messages, two more in every tenth from the first on, the bound, three
     # events of the journal, and the parameters of the plant.
     assert units == 3 * [101 * 5 + 11 * 2 + 1 + 3 + 1]
 
 
 def test_dead_contestant_aborts_the_measurement(monkeypatch):
-    recording = tiny(monkeypatch, 'recording')
+    recording = tiny(monkeypatch, 'bags')
     monkeypatch.setattr(recording, '_command', lambda *_: ['-c', 'raise SystemExit("no disk")'])
     error = importlib.import_module('harness').ContestantError
     with pytest.raises(error, match=r'raw subscriber.* ended with exit code 1:\nno disk'):

@@ -244,7 +244,7 @@ def _preset(options: Namespace) -> str:
     if config.learning.prior_weight > 0.0:
         remaining = problem.remaining(parameters)
         left = [
-            f'{100.0 * np.exp(-one.gain / 2 / remaining.size):.0f} %' for one in (before, after)
+            f'{100.0 * np.exp(-each.gain / 2 / remaining.size):.0f} %' for each in (before, after)
         ]
         figures = (
             f'a window leaves {left[1]} of the deviation of the prior, in the geometric mean over '

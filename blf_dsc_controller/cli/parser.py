@@ -25,15 +25,15 @@ def make_parser() -> argparse.ArgumentParser:
     def command(
         name: str, module: str, summary: str, about: str, example: str
     ) -> argparse.ArgumentParser:
-        one = commands.add_parser(
+        parser_of = commands.add_parser(
             name,
             help=summary,
             description=textwrap.fill(about, _WIDTH),
             epilog=f'Example:\n  blf_dsc {name} {example}',
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        one.set_defaults(handler=(module, name.replace('-', '_')))
-        return one
+        parser_of.set_defaults(handler=(module, name.replace('-', '_')))
+        return parser_of
 
     _run_options(
         command(
@@ -121,13 +121,13 @@ def make_parser() -> argparse.ArgumentParser:
     )
     plot.add_argument('bag', type=Path, help=_BAG)
     plot.add_argument('--out', type=Path, default=Path(), help='folder to write into (.)')
-    for one in (report, view, export, plot):
-        _map(one)
-        _namespace(one)
-    for one in (report, view, recover, export, plot):
-        _max_unpacked(one)
-    for one in (report, export, plot):
-        _force(one)
+    for command_parser in (report, view, export, plot):
+        _map(command_parser)
+        _namespace(command_parser)
+    for command_parser in (report, view, recover, export, plot):
+        _max_unpacked(command_parser)
+    for command_parser in (report, export, plot):
+        _force(command_parser)
     _excite_options(
         command(
             'excite',

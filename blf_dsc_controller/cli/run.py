@@ -119,7 +119,7 @@ def _configuration(options: Namespace) -> LoopConfig:
         config = load_loop(path, overrides)
     controller, plant = config.controller, config.plant
     order = [plant.joints.index(joint) for joint in controller.joints]
-    q, dq = (np.array(one)[order] for one in (plant.initial.position, plant.initial.velocity))
+    q, dq = (np.array(values)[order] for values in (plant.initial.position, plant.initial.velocity))
     plan_start(controller, np.array(controller.barrier.widest), q, dq)
     for warning in config_warnings(controller, q):
         print(f'warning: {warning}', file=sys.stderr)

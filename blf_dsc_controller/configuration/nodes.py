@@ -194,7 +194,7 @@ class LoopConfig(NamedTuple):
 
 def known_names() -> frozenset[str]:
     """Return the parameter names of all nodes of the package."""
-    return frozenset(one.name for cls in NODES.values() for one in parameters(cls))
+    return frozenset(param.name for cls in NODES.values() for param in parameters(cls))
 
 
 def is_builtin(name: str) -> bool:
@@ -341,7 +341,7 @@ def _load(
     sections: Sequence[Section], node: str, cls: type[Config], overrides: Mapping[str, object]
 ) -> Config:
     """Build the configuration; names of other nodes in wildcard sections are left out."""
-    known = {one.name for one in parameters(cls)}
+    known = {param.name for param in parameters(cls)}
     entries = {
         name: entry
         for section in sections
@@ -420,27 +420,27 @@ def parameter_page() -> str:
     """Return the Markdown page of all parameters."""
     page = _PREFACE
     for node, cls in NODES.items():
-        page += f'\n## {node}\n\n{_HEADER}{"".join(_row(one) for one in parameters(cls))}'
+        page += f'\n## {node}\n\n{_HEADER}{"".join(_row(param) for param in parameters(cls))}'
     return page
 
 
-def _row(one: Parameter) -> str:
-    number = next((f'{length} entries' for length in one.length if length.isdigit()), '')
-    lengths = [name for name in one.length if name != 'joints' and not name.isdigit()]
-    if 'joints' in one.length and lengths:
+def _row(param: Parameter) -> str:
+    number = next((f'{length} entries' for length in param.length if length.isdigit()), '')
+    lengths = [name for name in param.length if name != 'joints' and not name.isdigit()]
+    if 'joints' in param.length and lengths:
         lengths.insert(0, 'joint')
     each = f'{number or "one entry"} per {" and ".join(lengths)}' if lengths else number
-    if one.omittable:
+    if param.omittable:
         each = f'{each}, or none' if each else 'may be empty'
     cells = (
-        f'`{one.name}`',
-        one.description,
-        f'`{format_value(one.default)}`',
-        one.unit,
-        '; '.join(part for part in (one.allowed, each) if part),
-        '' if one.read_only else '•',
-        one.kind.value,
-        one.symbol,
+        f'`{param.name}`',
+        param.description,
+        f'`{format_value(param.default)}`',
+        param.unit,
+        '; '.join(part for part in (param.allowed, each) if part),
+        '' if param.read_only else '•',
+        param.kind.value,
+        param.symbol,
     )
     return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |\n'
 

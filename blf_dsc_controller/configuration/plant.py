@@ -309,7 +309,7 @@ class PlantConfig(Sampled):
         middles = [(joint.lower + joint.upper) / 2.0 for joint in joints]
         zero = (0.0,) * len(joints)
         return {
-            **{one.name: zero for one in parameters(cls) if one.length == ('joints',)},
+            **{param.name: zero for param in parameters(cls) if param.length == ('joints',)},
             'robot.rotor_inertia': (),
             'joints': tuple(joint.name for joint in joints),
             'initial.position': tuple(q if math.isfinite(q) else 0.0 for q in middles),

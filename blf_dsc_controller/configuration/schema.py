@@ -158,7 +158,9 @@ def parameters(cls: Any) -> tuple[Parameter, ...]:
 
 def flatten(config: object) -> dict[str, Value]:
     """Return the values of a configuration by dotted name, as `build` takes them."""
-    return {one.name: operator.attrgetter(one.name)(config) for one in parameters(type(config))}
+    return {
+        param.name: operator.attrgetter(param.name)(config) for param in parameters(type(config))
+    }
 
 
 def differences(before: object, after: object) -> dict[str, Value]:
@@ -173,7 +175,7 @@ def build(cls: type[Config], given: Mapping[str, object], source: str = '') -> C
     Raises ConfigurationError with all problems: unknown names, types, ranges and lengths, and, if
     each value is valid by itself, conflicts between parameters.
     """
-    known = {one.name: one for one in parameters(cls)}
+    known = {param.name: param for param in parameters(cls)}
     given = _kept(known, given, source)
     try:
         derived: Mapping[str, Value] = getattr(cls, 'defaults', lambda _: {})(given)
@@ -181,13 +183,13 @@ def build(cls: type[Config], given: Mapping[str, object], source: str = '') -> C
         raise ConfigurationError(error.problems, source) from error
     problems = [unknown(name, known) for name in given if name not in known]
     values: dict[str, Any] = {}
-    for name, one in known.items():
-        value = given.get(name, derived.get(name, one.default))
-        found = one.problems(value) if name in given else []
+    for name, param in known.items():
+        value = given.get(name, derived.get(name, param.default))
+        found = param.problems(value) if name in given else []
         problems += found
         if not found:
-            values[name] = tuple(value) if one.kind.is_array else value  # type: ignore[arg-type]
-    lengths = [problem for one in known.values() for problem in _length_problems(one, values)]
+            values[name] = tuple(value) if param.kind.is_array else value  # type: ignore[arg-type]
+    lengths = [problem for param in known.values() for problem in _length_problems(param, values)]
     problems += lengths
     if len(values) == len(known) and not lengths:
         config: Config = _assemble(cls, values)
@@ -224,19 +226,19 @@ def unknown(name: str, known: Iterable[str]) -> str:
     return f'{name}: unknown parameter' + (f', did you mean {close[0]}?' if close else '')
 
 
-def counted(count: int, one: str, many: str) -> str:
+def counted(count: int, single: str, many: str) -> str:
     """Return a number with its noun, such as `1 entry`."""
-    return f'{count} {one if count == 1 else many}'
+    return f'{count} {single if count == 1 else many}'
 
 
 @functools.cache
 def _parameters(cls: Any) -> tuple[Parameter, ...]:
     found: list[Parameter] = []
-    for name, one in _fields(cls).items():
-        if isinstance(one, Parameter):
-            found.append(one)
+    for name, param in _fields(cls).items():
+        if isinstance(param, Parameter):
+            found.append(param)
         else:
-            found += [dataclasses.replace(p, name=f'{name}.{p.name}') for p in _parameters(one)]
+            found += [dataclasses.replace(p, name=f'{name}.{p.name}') for p in _parameters(param)]
     return tuple(found)
 
 
@@ -247,15 +249,15 @@ def _fields(cls: Any) -> dict[str, Any]:
     annotated = typing.get_type_hints(cls, include_extras=True)
     found: dict[str, Any] = {}
     for field in dataclasses.fields(cls):
-        hint, one = types[field.name], field.metadata.get('parameter')
-        if one is None:
+        hint, param = types[field.name], field.metadata.get('parameter')
+        if param is None:
             found[field.name] = hint
             continue
         if typing.get_origin(hint) is typing.Literal:
-            one, hint = dataclasses.replace(one, choices=typing.get_args(hint)), str
+            param, hint = dataclasses.replace(param, choices=typing.get_args(hint)), str
         length = getattr(annotated[field.name], '__metadata__', ())
         found[field.name] = dataclasses.replace(
-            one, name=field.name, kind=_KINDS[hint], length=length
+            param, name=field.name, kind=_KINDS[hint], length=length
         )
     return found
 
@@ -263,26 +265,26 @@ def _fields(cls: Any) -> dict[str, Any]:
 def _assemble(cls: Any, values: Mapping[str, Value], prefix: str = '') -> Any:
     content = {
         name: values[prefix + name]
-        if isinstance(one, Parameter)
-        else _assemble(one, values, f'{prefix}{name}.')
-        for name, one in _fields(cls).items()
+        if isinstance(param, Parameter)
+        else _assemble(param, values, f'{prefix}{name}.')
+        for name, param in _fields(cls).items()
     }
     return cls(**content)
 
 
-def _length_problems(one: Parameter, values: Mapping[str, Any]) -> Iterator[str]:
-    named = [name for name in one.length if not name.isdigit()]
-    if not one.length or any(name not in values for name in (one.name, *named)):
+def _length_problems(param: Parameter, values: Mapping[str, Any]) -> Iterator[str]:
+    named = [name for name in param.length if not name.isdigit()]
+    if not param.length or any(name not in values for name in (param.name, *named)):
         return
-    counts = [int(name) if name.isdigit() else len(values[name]) for name in one.length]
-    length, needed = len(values[one.name]), math.prod(counts)
-    if length != needed and not (one.omittable and length == 0):
+    counts = [int(name) if name.isdigit() else len(values[name]) for name in param.length]
+    length, needed = len(values[param.name]), math.prod(counts)
+    if length != needed and not (param.omittable and length == 0):
         factors = ' times '.join(
             name if name.isdigit() else f'{count} of {name}'
-            for count, name in zip(counts, one.length, strict=True)
+            for count, name in zip(counts, param.length, strict=True)
         )
         entries = counted(length, 'entry', 'entries')
-        yield f'{one.name}: got {entries}, but {needed} are needed ({factors})'
+        yield f'{param.name}: got {entries}, but {needed} are needed ({factors})'
 
 
 def _is(value: object, kind: Kind) -> bool:

@@ -146,9 +146,11 @@ class Study:
     def varied(self) -> dict[str, str | tuple[str, ...]]:
         """Return the distributions as written, in a list for each list parameter."""
         texts: dict[str, str | tuple[str, ...]] = {}
-        for one in self.variations:
-            text = str(one.distribution)
-            texts[one.name] = text if one.entry < 0 else (*texts.get(one.name, ()), text)
+        for variation in self.variations:
+            text = str(variation.distribution)
+            texts[variation.name] = (
+                text if variation.entry < 0 else (*texts.get(variation.name, ()), text)
+            )
         return texts
 
 
@@ -173,7 +175,7 @@ def load_study(path: str | Path, overrides: Mapping[str, object] | None = None) 
     except ConfigurationError as error:
         own += error.problems
     if loop is None:  # the number of events is unknown
-        varied = {name: one for name, one in varied.items() if not name.startswith('events.')}
+        varied = {name: text for name, text in varied.items() if not name.startswith('events.')}
     variations, found = read_variations(varied, loop.plant if loop else PlantConfig())
     own += [f'{_VARY}{problem}' for problem in found]
     if loop and settings:
@@ -243,7 +245,9 @@ def draw(study: Study, index: int) -> Draw:
         text = f'{study.settings.seed} {index} {name}'
         return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), 'big') >> 11
 
-    values = tuple(one.distribution.at(bits(one.column) / 2**53) for one in study.variations)
+    values = tuple(
+        variation.distribution.at(bits(variation.column) / 2**53) for variation in study.variations
+    )
     return Draw(index, bits('seed'), values)
 
 
@@ -256,10 +260,10 @@ def origin_of(controller: Controller) -> Origin:
 def plant_of_draw(study: Study, drawn: Draw, origin: Origin) -> PlantConfig:
     """Return the plant configuration of a run; `origin` is that of the study's controller."""
     changes: dict[str, dict[str, Any]] = {}
-    for one, value in zip(study.variations, drawn.values, strict=True):
-        group, _, field = one.name.partition('.')
+    for variation, value in zip(study.variations, drawn.values, strict=True):
+        group, _, field = variation.name.partition('.')
         section = changes.setdefault(group, {})
-        section[field] = value if one.entry < 0 else (*section.get(field, ()), value)
+        section[field] = value if variation.entry < 0 else (*section.get(field, ()), value)
     relative = changes.pop('initial', {})
     start: dict[str, Any] = {}
     if 'error' in relative:
@@ -418,22 +422,24 @@ class Variation:
 @functools.cache
 def variable_parameters() -> Mapping[str, Parameter]:
     """Return every parameter that may vary, by name."""
-    found = [one for one in parameters(PlantConfig) if one.name.startswith(_GROUPS)]
+    found = [param for param in parameters(PlantConfig) if param.name.startswith(_GROUPS)]
     for group, relative in (('initial', RelativeStart), ('events', RelativeEvents)):
-        found += [replace(one, name=f'{group}.{one.name}') for one in parameters(relative)]
+        found += [replace(param, name=f'{group}.{param.name}') for param in parameters(relative)]
     return {
-        one.name: one for one in found if one.name not in _REALTIME and one.kind.element in FORMS
+        param.name: param
+        for param in found
+        if param.name not in _REALTIME and param.kind.element in FORMS
     }
 
 
-def entries(one: Parameter, plant: PlantConfig) -> tuple[str, ...]:
+def entries(param: Parameter, plant: PlantConfig) -> tuple[str, ...]:
     """Return the names of the entries of a list parameter, by joint or number; else ()."""
-    if not one.kind.is_array:
+    if not param.kind.is_array:
         return ()
-    if not one.length:
-        return _numbers(len(operator.attrgetter(one.name)(plant)))
+    if not param.length:
+        return _numbers(len(operator.attrgetter(param.name)(plant)))
     each: list[Sequence[str]] = []
-    for name in one.length:
+    for name in param.length:
         if name == 'joints':
             each.append(plant.joints)
         else:
@@ -456,18 +462,18 @@ def read_variations(
     known = variable_parameters()
     problems = [unknown(name, known) for name in given if name not in known]
     found: list[Variation] = []
-    for name, one in known.items():
+    for name, param in known.items():
         if name in given:
             try:
-                found += _variations_of(one, given[name], entries(one, plant))
+                found += _variations_of(param, given[name], entries(param, plant))
             except ValueError as error:
                 problems.append(f'{name}: {error}')
     return tuple(found), problems
 
 
-def _variations_of(one: Parameter, given: object, names: tuple[str, ...]) -> list[Variation]:
-    if not one.kind.is_array:
-        return [Variation(one.name, -1, f'plant.{one.name}', _distribution(one, given))]
+def _variations_of(param: Parameter, given: object, names: tuple[str, ...]) -> list[Variation]:
+    if not param.kind.is_array:
+        return [Variation(param.name, -1, f'plant.{param.name}', _distribution(param, given))]
     if not names:
         raise ValueError('got a distribution, but there are no events: give events.begin')
     each = list(given) if isinstance(given, (list, tuple)) else [given] * len(names)
@@ -479,17 +485,17 @@ def _variations_of(one: Parameter, given: object, names: tuple[str, ...]) -> lis
             f'({", ".join(names)}): give one for each, or a single one for all'
         )
     return [
-        Variation(one.name, i, f'plant.{one.name}.{name}', _distribution(one, text))
+        Variation(param.name, i, f'plant.{param.name}.{name}', _distribution(param, text))
         for i, (name, text) in enumerate(zip(names, each, strict=True))
     ]
 
 
-def _distribution(one: Parameter, text: object) -> Distribution:
+def _distribution(param: Parameter, text: object) -> Distribution:
     """Parse a distribution and check that the parameter allows all of its values."""
-    scalar = replace(one, kind=one.kind.element)
+    scalar = replace(param, kind=param.kind.element)
     distribution = parse(text, scalar.kind)
     for value in distribution.extremes:
         for problem in scalar.problems(value):
-            reason = problem.removeprefix(f'{one.name}: ')
+            reason = problem.removeprefix(f'{param.name}: ')
             raise ValueError(f'{distribution} can give values that are not allowed: {reason}')
     return distribution

@@ -49,7 +49,7 @@ def compare(folder: Path) -> list[Claim]:
     _write_csv(folder / 'side_by_side.csv', laws)
     _write_csv(folder / 'claims.csv', [Claim._fields, *found])
     _write_csv(folder / 'robustness.csv', _robustness(results))
-    metrics = {name: plain(asdict(one)) for name, one in sorted(results.metrics.items())}
+    metrics = {name: plain(asdict(metrics)) for name, metrics in sorted(results.metrics.items())}
     text = json.dumps(metrics, indent=1) + '\n'
     (folder / 'metrics.json').write_text(text, encoding='utf-8')
     write_page(
@@ -183,9 +183,11 @@ def draw_robustness(results: Results, folder: Path) -> list[Path]:
     """Draw the largest error and the parameter error of every sweep; return both paths."""
     tracking, learning = folder / 'robustness_tracking.png', folder / 'robustness_learning.png'
     title = 'Largest error, in units of the bound: above the red line it is violated'
-    _draw_sweeps(title, results, lambda one: min(one.max_error_ratio, _BROKEN), _ratio, tracking)
+    _draw_sweeps(
+        title, results, lambda metrics: min(metrics.max_error_ratio, _BROKEN), _ratio, tracking
+    )
     title = 'Parameter error over the last ten of 30 s'
-    _draw_sweeps(title, results, lambda one: one.tail_parameter_error, _learning, learning)
+    _draw_sweeps(title, results, lambda metrics: metrics.tail_parameter_error, _learning, learning)
     return [tracking, learning]
 
 

@@ -210,7 +210,7 @@ class Results(NamedTuple):
 
     def held(self, sweep: str, law: str) -> list[float]:
         """Return the values of a sweep at which the law keeps its bound."""
-        (values,) = (one.values for one in SWEEPS if one.name == sweep)
+        (values,) = (each.values for each in SWEEPS if each.name == sweep)
         return [value for value in values if self.metrics[case_name(sweep, law, value)].held]
 
 

@@ -120,11 +120,11 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
 def _write_page(path: Path, study: Study, summary: Summary, figures: list[Path]) -> None:
     varied = [
         (
-            Cell(one.column.removeprefix('plant.'), 'code'),
-            Cell(str(one.distribution), 'code'),
-            _explained(summary['influence'].get(one.column.removeprefix('plant.'))),
+            Cell(variation.column.removeprefix('plant.'), 'code'),
+            Cell(str(variation.distribution), 'code'),
+            _explained(summary['influence'].get(variation.column.removeprefix('plant.'))),
         )
-        for one in study.variations
+        for variation in study.variations
     ]
     write_page(
         path,
@@ -137,12 +137,12 @@ def _write_page(path: Path, study: Study, summary: Summary, figures: list[Path])
         quantiles=[
             ('', *_QUANTILES),
             *(
-                (Cell(name, 'code'), *(_number(values[one]) for one in _QUANTILES))
+                (Cell(name, 'code'), *(_number(values[quantile]) for quantile in _QUANTILES))
                 for name, values in summary['figures'].items()
                 if values is not None
             ),
         ],
-        worst=[_worst_row(one, path.parent) for one in summary['worst']],
+        worst=[_worst_row(run, path.parent) for run in summary['worst']],
         exceptions=[
             (run, what, Cell(command, 'code'))
             for run, what, command in exceptions(summary['pairs'], path.parent)
@@ -151,14 +151,14 @@ def _write_page(path: Path, study: Study, summary: Summary, figures: list[Path])
     )
 
 
-def _worst_row(one: Summary, folder: Path) -> tuple[str | Cell, ...]:
-    first = one['first_violation_s']
+def _worst_row(run: Summary, folder: Path) -> tuple[str | Cell, ...]:
+    first = run['first_violation_s']
     return (
-        f'{one["run"]}',
-        one['outcome'],
-        ', '.join(_number(ratio) for ratio in one['max_error_ratio'].values()),
+        f'{run["run"]}',
+        run['outcome'],
+        ', '.join(_number(ratio) for ratio in run['max_error_ratio'].values()),
         '-' if first is None else f'{first:.3f} s',
-        Cell(reproduce_command(folder, one['run']), 'code'),
+        Cell(reproduce_command(folder, run['run']), 'code'),
     )
 
 

@@ -344,7 +344,7 @@ class Store:
     def done(self) -> list[Span]:
         """Return the runs that have results, in order."""
         found = (_PART.fullmatch(path.name) for path in (self.folder / _RUNS).iterdir())
-        bounds = sorted((int(one[1]), int(one[2])) for one in found if one)
+        bounds = sorted((int(match[1]), int(match[2])) for match in found if match)
         return [Span(first, last - first + 1) for first, last in bounds]
 
     def missing(self, size: int) -> list[Span]:

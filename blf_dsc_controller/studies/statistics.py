@@ -52,7 +52,7 @@ def summarize(study: Study, results: Columns) -> Summary:
     kept = int((outcomes == KEPT).sum())
     interval = binomtest(kept, runs).proportion_ci(_CONFIDENCE, method='wilson')
     others = ('run', 'seed', 'outcome', f'{WITHOUT}outcome')
-    figures = [one for one in results if one not in others and not one.startswith(_DRAWN)]
+    figures = [name for name in results if name not in others and not name.startswith(_DRAWN)]
     return {
         'runs': runs,
         'planned': study.settings.runs,
@@ -137,9 +137,9 @@ def influence(study: Study, results: Columns) -> dict[str, float]:
     """
     ranks = rankdata(worst_ratio(study, results))
     found = {
-        one.column.removeprefix(_DRAWN): _explained(results[one.column], ranks)
-        for one in study.variations
-        if np.unique(results[one.column]).size > 1
+        variation.column.removeprefix(_DRAWN): _explained(results[variation.column], ranks)
+        for variation in study.variations
+        if np.unique(results[variation.column]).size > 1
     }
     return dict(sorted(found.items(), key=lambda item: -item[1]))
 
@@ -364,7 +364,7 @@ def _draw_influence(
     lost = results['outcome'] != KEPT
     beyond = worst > _FARTHEST
     size, opacity = (5.0, 0.5) if kept.size < _FEW_DOTS else (2.5, 0.25)
-    distributions = {one.column: one.distribution for one in study.variations}
+    distributions = {variation.column: variation.distribution for variation in study.variations}
     for axes, (name, fraction) in zip(picture.axes.flat, strongest, strict=False):
         values = results[f'plant.{name}']
         axes.plot(values[kept], ratios[kept], '.', ms=size, color=BLUE, alpha=opacity, mew=0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CPU time of the recorder per message against a raw subscriber that writes nothing."""
+"""The recorder against a raw subscriber, and replay against the mcap reader, which only reads."""
 
 from __future__ import annotations
 
@@ -10,10 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harness import Contestant, Ratio, own_graph, ratio, wait_for
+from harness import Contestant, Ratio, interleaved, own_graph, ratio, wait_for
+from mcap.reader import make_reader
 
+from blf_dsc_controller.bags.content import read_content
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import STREAM
+from blf_dsc_controller.replay.verify import verify
+from blf_dsc_controller.simulation.bag import write_bag
+from blf_dsc_controller.simulation.loop import simulate
 
 _ROUNDS = 5
 _TOPICS = 5
@@ -21,6 +28,10 @@ _MESSAGES = 5000  # per topic, at 1 kHz
 _SETTLING = 1.0  # s for discovery
 _SUBSCRIBER = 'raw subscriber, nothing written'
 _RECORDERS = {'recorder': 'none', 'recorder, zstd': 'zstd'}
+_DURATION = 60.0  # s
+_READER = 'mcap reader, messages as bytes'
+_CONTENT = 'messages read and decoded'
+_REPLAY = 'bag replayed through the law and compared'
 
 
 def measure() -> Iterator[Ratio]:
@@ -72,7 +83,7 @@ def _play(node: Any, contestant: Contestant) -> float:
     encoder = JointStateEncoder(('joint1', 'joint2'))
     try:
         wait_for(
-            lambda: all(one.get_subscription_count() == 1 for one in publishers),
+            lambda: all(publisher.get_subscription_count() == 1 for publisher in publishers),
             f'the subscriptions of {contestant.name}',
             [contestant],
         )
@@ -91,3 +102,36 @@ def _play(node: Any, contestant: Contestant) -> float:
         contestant.end()
         for publisher in publishers:
             node.destroy_publisher(publisher)
+
+
+def measure_replay() -> Iterator[Ratio]:
+    """Measure messages per second relative to the reader alone, on a bag of all topics."""
+    controller, plant = ControllerConfig(), PlantConfig(duration=_DURATION)
+    with tempfile.TemporaryDirectory() as folder:
+        bag = Path(folder, 'bag')
+        write_bag(bag, simulate(controller, plant), controller, 'none', plant)
+        messages = _iterated(bag)
+
+        def replayed() -> int:
+            found = verify(bag)
+            if found.difference is not None:
+                raise ValueError(f'{bag}: {found.difference}')
+            return messages
+
+        contestants = {
+            _READER: lambda: _iterated(bag),
+            _CONTENT: lambda: sum(read_content(bag).message_counts.values()),
+            _REPLAY: replayed,
+        }
+        times = interleaved(contestants, _ROUNDS)
+    for name in (_CONTENT, _REPLAY):
+        note = f'{1e-3 / np.median(times[name]):.0f} thousand messages a second here'
+        what = f'{name}: messages a second'
+        yield ratio('replay', what, _READER, 1.0 / times[name], 1.0 / times[_READER], note)
+
+
+def _iterated(bag: Path) -> int:
+    """Iterate over the messages of a bag of one file and return their number."""
+    (file,) = bag.glob('*.mcap')
+    with file.open('rb') as stream:
+        return sum(1 for _ in make_reader(stream).iter_messages(log_time_order=False))
