@@ -31,12 +31,25 @@ def files(folder: str) -> list[str]:
 # Maintainer and URLs are given in package.xml only.
 MANIFEST = ET.parse(HERE / 'package.xml').getroot()  # noqa: S314 - our own file
 (MAINTAINER,) = MANIFEST.findall('maintainer')
+URLS = {url.get('type', 'website'): url.text for url in MANIFEST.findall('url')}
+
+
+def readme() -> str:
+    """Return README.md as PyPI can show it: links and pictures lead to the repository, if known."""
+    text = (HERE / 'README.md').read_text(encoding='utf-8')
+    if 'repository' not in URLS:
+        return text
+    for link, place in ((r'(!\[[^]]*\]\()', 'raw'), (r'((?<!!)\[[^]]*\]\()', 'blob')):
+        address = rf'\1{URLS["repository"]}/{place}/{version()}/'
+        text = re.sub(rf'{link}(?![a-z]+://|#)', address, text)
+    return text
+
 
 setup(
     name=NAME,
     version=version(),
     description='Output-constrained tracking of robot arms with unknown dynamics, for ROS 2',
-    long_description=(HERE / 'README.md').read_text(encoding='utf-8'),
+    long_description=readme(),
     long_description_content_type='text/markdown',
     keywords=[
         'ROS 2',
@@ -49,7 +62,7 @@ setup(
     author=MAINTAINER.text,
     maintainer=MAINTAINER.text,
     maintainer_email=MAINTAINER.get('email'),
-    project_urls={url.get('type', 'website'): url.text for url in MANIFEST.findall('url')},
+    project_urls=URLS,
     license='Apache-2.0',
     classifiers=[
         'Development Status :: 4 - Beta',

@@ -69,7 +69,7 @@ def sdist(tmp_path_factory):
     unwanted = ('.*', 'build', 'install', 'log', 'out', '*.egg-info', '__pycache__')
     shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*unwanted))
     text = (copy / 'package.xml').read_text()
-    url = f'<url type="website">{URL}</url>'  # as its publisher would add it
+    url = f'<url type="repository">{URL}</url>'  # as its publisher would add it
     (copy / 'package.xml').write_text(text.replace('<exec_depend>', f'{url}<exec_depend>', 1))
     subprocess.run([sys.executable, 'setup.py', '-q', 'sdist'], cwd=copy, check=True)
     (path,) = copy.glob('dist/*.tar.gz')
@@ -127,9 +127,13 @@ def test_version_is_the_same_everywhere(metadata):
 def test_metadata_matches_the_manifest_and_readme(wheel, metadata):
     fields = dict(metadata)
     (name,) = (name for name in wheel.namelist() if name.endswith('.dist-info/METADATA'))
-    assert wheel.read(name).decode().endswith((ROOT / 'README.md').read_text())
+    text = wheel.read(name).decode()
+    assert not re.search(r'\]\((?!https?://|#)', text)  # PyPI shows no relative picture or link
+    for place in ('raw', 'blob'):
+        text = text.replace(f'({URL}/{place}/{blf_dsc_controller.__version__}/', '(')
+    assert text.endswith((ROOT / 'README.md').read_text())
     assert fields['Description-Content-Type'] == 'text/markdown'
-    assert fields['Project-URL'] == f'website, {URL}'
+    assert fields['Project-URL'] == f'repository, {URL}'
     assert fields['Author'] == fields['Maintainer'] == manifest().findtext('maintainer')
     assert fields['Maintainer-email'] == manifest().find('maintainer').get('email')
     license_name = fields.get('License-Expression') or fields['License']  # depends on setuptools
