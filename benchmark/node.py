@@ -2,14 +2,8 @@
 """The controller node against a null node, which echoes a torque immediately.
 
 This process stands in for the plant: it publishes the joint states of a recorded run and receives
-the torques. Every contestant is restarted in each round: as a process of its own, or as a node of
-this process, on the same executor.
-
-No browser has the page of the view open: the controller pays only for the subscriptions; the view
-draws in a process of its own, and only while a page is open.
-
-There are two null nodes: a typical rclpy node, and one that passes serialised messages without
-decoding them, the least that Python can do.
+the torques. Every contestant is restarted in each round, as a process of its own. The null node
+passes serialised messages without decoding them, the least that Python can do.
 """
 
 from __future__ import annotations
@@ -18,7 +12,7 @@ import gc
 import itertools
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -39,26 +33,20 @@ _WARM_UP = 500
 _START = 1_000_000_000
 _SETTLING = 0.5  # s for discovery, or for a message to arrive
 _PATIENCE = 60.0  # s for one torque
-_NULL = 'null node, serialised messages'
-_NULL_TYPED = 'null node'
+_NULL = 'null node'
 _QUIET = 'controller, telemetry off'
 _UNHEARD = 'controller, telemetry on, no subscriber'
 _SPARSE = 'controller, telemetry of every 10th sample, a subscriber'
 _HEARD = 'controller, telemetry on, a subscriber'
 _RECORDED = 'controller, telemetry on, recorder'
 _LISTENED = (_SPARSE, _HEARD)
-_PROCESSES = (_NULL, _NULL_TYPED, _QUIET, _UNHEARD, _SPARSE, _HEARD, _RECORDED)
-_GUESTS = (_NULL, _QUIET, _UNHEARD, _SPARSE, _HEARD)
+_PROCESSES = (_NULL, _QUIET, _UNHEARD, _SPARSE, _HEARD, _RECORDED)
 _PRESETS = {'recommended': 'node', 'panda': 'node with seven joints'}
 _HERE = Path(__file__).parent
-_VIEW_ROUNDS = 7
 _STARTS = 3
 _WARM = 'controller, warm cache'
 _COLD = 'controller, cold cache'
 _POLL = 0.002  # s
-_VIEWED = 'controller, telemetry and view on'
-_BESIDE = _UNHEARD, _HEARD
-_VIEW = ('-m', 'blf_dsc_controller.view.node', '--ros-args', '-p', 'port:=8480')
 
 
 class Run(NamedTuple):
@@ -76,38 +64,6 @@ def _telemetry_of(name: str) -> Telemetry:
 def _silent(context: Any) -> dict[str, Any]:
     """Return options of a node without /rosout, on which nodes of one name would conflict."""
     return {'context': context, 'enable_rosout': False}
-
-
-class Guest:
-    """A contestant that is a node of this process; its CPU time includes the stand-in's."""
-
-    def __init__(self, name: str, context: Any) -> None:
-        import rclpy
-        from null_node import echo, listen
-        from rclpy.parameter import Parameter
-
-        from blf_dsc_controller.nodes.controller_node import ControllerNode
-
-        self.name = name
-        self.listener: Any = None
-        if name in _LISTENED:
-            self.listener = rclpy.create_node('listener', **_silent(context))
-            listen(self.listener)
-        if name == _NULL:
-            self.node: Any = rclpy.create_node(topics.CONTROLLER, **_silent(context))
-            echo(self.node, 'raw')
-        else:
-            parameter: Any = Parameter  # untyped in rclpy
-            telemetry = vars(_telemetry_of(name)).items()
-            overrides = [parameter(f'telemetry.{key}', value=value) for key, value in telemetry]
-            self.node = ControllerNode(parameter_overrides=overrides, **_silent(context))
-
-    def check(self) -> None:
-        """Do nothing: an error of the node is raised in this process."""
-
-    def cpu_time(self) -> float:
-        """Return the CPU time of this process [s]."""
-        return time.process_time()
 
 
 class StandIn:
@@ -195,23 +151,6 @@ class StandIn:
         while time.perf_counter() < end:
             self.executor.spin_once(timeout_sec=0.01)
 
-    @contextmanager
-    def host(self, name: str) -> Iterator[list[Guest]]:
-        """Run a contestant as a node of this process."""
-        guest = Guest(name, self.context)
-        nodes = [node for node in (guest.listener, guest.node) if node is not None]
-        for node in nodes:
-            self.executor.add_node(node)
-        try:
-            yield [guest] * len(nodes)
-        finally:
-            for node in nodes:
-                self.executor.remove_node(node)
-            self.executor.spin_once(timeout_sec=0.1)  # drains pending events of the nodes
-            for node in nodes:
-                node.destroy_node()
-            guest.node = guest.listener = None
-
     def close(self) -> None:
         """Destroy the stand-in's node, so that no participant is left in a later round."""
         self.executor.remove_node(self.node)
@@ -240,8 +179,6 @@ def _measure(preset: str, group: str) -> Iterator[Ratio]:
     loop = load_loop(preset)
     real: dict[str, list[Run]] = {name: [] for name in _PROCESSES}
     lockstep: dict[str, list[Run]] = {name: [] for name in _PROCESSES}
-    hosted = _GUESTS if preset == 'recommended' else ()
-    together: dict[str, list[Run]] = {name: [] for name in hosted}
     states = _recorded_states(loop)
     with own_graph(), tempfile.TemporaryDirectory() as folder, closing(StandIn(states)) as arm:
         for k in range(_ROUNDS):
@@ -251,15 +188,8 @@ def _measure(preset: str, group: str) -> Iterator[Ratio]:
                     with _started(name, loop.controller, Path(folder, tag)) as these:
                         runs[name].append(arm.play(these, period))
                     arm.left_alone()
-            for name, each in together.items():
-                # A new stand-in: readers within its process receive nothing from a publisher that
-                # has sent more than its history keeps for late joiners.
-                with closing(StandIn(states)) as here, here.host(name) as guests:
-                    each.append(here.play(guests, 0.0))
     yield from _real_time(f'{group}, real time at 1 kHz', real)
     yield from _rates(f'{group}, lock-step', lockstep)
-    if together:
-        yield from _rates(f'{group} and arm in one process, lock-step', together)
 
 
 def _real_time(group: str, runs: dict[str, list[Run]]) -> Iterator[Ratio]:
@@ -269,7 +199,8 @@ def _real_time(group: str, runs: dict[str, list[Run]]) -> Iterator[Ratio]:
         for name, each in runs.items()
     }
     cpu = {name: np.array([r.cpu for r in each]) for name, each in runs.items()}
-    for name, base in _pairs(runs):
+    base = _NULL
+    for name in list(runs)[1:]:
         yield ratio(group, f'{name}: median latency', base, median[name], median[base])
         yield ratio(group, f'{name}: p99.9 latency', base, tail[name], tail[base])
         yield ratio(group, f'{name}: CPU', base, cpu[name], cpu[base])
@@ -277,16 +208,10 @@ def _real_time(group: str, runs: dict[str, list[Run]]) -> Iterator[Ratio]:
 
 def _rates(group: str, runs: dict[str, list[Run]]) -> Iterator[Ratio]:
     rate = {name: np.array([_STEPS / r.elapsed for r in each]) for name, each in runs.items()}
-    for name, base in _pairs(runs):
+    base = _NULL
+    for name in list(runs)[1:]:
         note = f'{np.median(rate[name]):.0f} steps a second here'
         yield ratio(group, f'{name}: steps a second', base, rate[name], rate[base], note)
-
-
-def _pairs(runs: Collection[str]) -> Iterator[tuple[str, str]]:
-    """Yield each contestant with each null node as its baseline."""
-    for base in (_NULL_TYPED, _NULL):
-        if base in runs:
-            yield from ((name, base) for name in runs if name not in (_NULL_TYPED, _NULL))
 
 
 @contextmanager
@@ -308,8 +233,8 @@ def _started(name: str, config: ControllerConfig, path: Path) -> Iterator[list[C
 
 
 def _command(name: str, config: ControllerConfig, params: Path) -> list[str]:
-    if name in (_NULL, _NULL_TYPED):
-        return [str(_HERE / 'null_node.py'), 'raw' if name == _NULL else 'typed']
+    if name == _NULL:
+        return [str(_HERE / 'null_node.py'), 'echo']
     telemetry = _telemetry_of(name)
     observers = int(name == _RECORDED)  # of all outputs
     dump(params, {CONTROLLER: replace(config, telemetry=telemetry, wait_for_subscribers=observers)})
@@ -325,46 +250,9 @@ def _recorded_states(loop: LoopConfig) -> list[bytes]:
     return [telemetry.joint_states(_START + stamp, row)[1] for stamp, row in rows]
 
 
-def measure_view() -> Iterator[Ratio]:
-    """Measure latency and CPU of the controller with the view relative to those without it."""
-    loop = load_loop('recommended')
-    runs: dict[str, list[Run]] = {name: [] for name in (*_BESIDE, _VIEWED)}
-    states = _recorded_states(loop)
-    with own_graph(), tempfile.TemporaryDirectory() as folder, closing(StandIn(states)) as arm:
-        for k in range(_VIEW_ROUNDS):
-            for name, each in runs.items():
-                path = Path(folder, f'{k}-{name}'.replace(' ', '_'))
-                with _viewed(name, loop.controller, path) as these:
-                    each.append(arm.play(these, 1e-3))
-                arm.left_alone()
-    group = 'view, real time at 1 kHz'
-    percentiles = {'median': 50.0, 'p99.9': 99.9}
-    for base in _BESIDE:
-        for what, percentile in percentiles.items():
-            latency = {
-                name: np.array([np.percentile(run.latency, percentile) for run in each])
-                for name, each in runs.items()
-            }
-            yield ratio(group, f'{_VIEWED}: {what} latency', base, latency[_VIEWED], latency[base])
-        cpu = {name: np.array([run.cpu for run in each]) for name, each in runs.items()}
-        yield ratio(group, f'{_VIEWED}: CPU', base, cpu[_VIEWED], cpu[base])
-
-
-@contextmanager
-def _viewed(name: str, config: ControllerConfig, path: Path) -> Iterator[list[Contestant]]:
-    """Start the controller's processes, after that of the view if it is measured."""
-    views = [Contestant('view', _VIEW)] if name == _VIEWED else []
-    try:
-        with _started(_UNHEARD if views else name, config, path) as nodes:
-            yield [*views, *nodes]
-    finally:
-        for view in views:
-            view.end()
-
-
 def measure_start() -> Iterator[Ratio]:
     """Measure the time to the first torque relative to the null node's."""
-    seconds: dict[str, list[float]] = {name: [] for name in (_NULL_TYPED, _WARM, _COLD)}
+    seconds: dict[str, list[float]] = {name: [] for name in (_NULL, _WARM, _COLD)}
     with own_graph(), tempfile.TemporaryDirectory() as caches:
         _first_torque(_WARM, f'{caches}/warm')
         for k in range(_STARTS):
@@ -374,7 +262,7 @@ def measure_start() -> Iterator[Ratio]:
     times = {name: np.array(values) for name, values in seconds.items()}
     for name in (_WARM, _COLD):
         note = f'{np.median(times[name]):.1f} s here'
-        yield ratio('first torque', name, _NULL_TYPED, times[name], times[_NULL_TYPED], note)
+        yield ratio('first torque', name, _NULL, times[name], times[_NULL], note)
 
 
 def _first_torque(name: str, cache: str) -> float:
@@ -382,8 +270,8 @@ def _first_torque(name: str, cache: str) -> float:
     state = np.array((2.293, 1.696, 0.0, 0.0, 0.0, 0.0))
     stamps = itertools.count(1_000_000_000, 1_000_000)
     command = ['-m', 'blf_dsc_controller.nodes.controller_node']
-    if name == _NULL_TYPED:
-        command = [str(Path(__file__).with_name('null_node.py')), 'raw']
+    if name == _NULL:
+        command = [str(Path(__file__).with_name('null_node.py')), 'echo']
     with closing(StandIn(())) as arm:
 
         def publish() -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The least a node can do: echo a torque immediately, or discard messages.
 
-Usage: python null_node.py typed|raw      echo, typed as usual in rclpy, or serialised
+Usage: python null_node.py echo           echo, without decoding the messages
        python null_node.py listen         subscribe to states and telemetry in serialised form
        python null_node.py drop TOPICS    subscribe to this many topics in serialised form
 """
@@ -9,7 +9,6 @@ Usage: python null_node.py typed|raw      echo, typed as usual in rclpy, or seri
 from __future__ import annotations
 
 import sys
-from array import array
 from typing import Any
 
 import rclpy
@@ -25,28 +24,18 @@ from blf_dsc_controller.nodes.endpoints import qos_profile
 from blf_dsc_controller.nodes.raw_subscriptions import compatible_profile
 
 
-def echo(node: Any, kind: str) -> None:
-    """Make a node respond to every joint state with the same torque, `typed` or `raw`."""
+def echo(node: Any) -> None:
+    """Make a node respond to every joint state with the same torque."""
     publisher = node.create_publisher(
         Float64MultiArray, topics.COMMANDS.relative, qos_profile(topics.COMMANDS.offered)
     )
-    torque = Float64MultiArray(data=[1.0, 2.0])
-    serialised = serialize_message(torque)
-
-    def typed(_state: JointState) -> None:
-        torque.data = array('d', (1.0, 2.0))
-        publisher.publish(torque)
-
-    def raw(_state: bytes) -> None:
-        publisher.publish(serialised)
-
-    callbacks: dict[str, Any] = {'typed': typed, 'raw': raw}
+    torque = serialize_message(Float64MultiArray(data=[1.0, 2.0]))
     node.create_subscription(
         JointState,
         topics.JOINT_STATES.relative,
-        callbacks[kind],
+        lambda _: publisher.publish(torque),
         qos_profile(topics.JOINT_STATES.requested),
-        raw=kind == 'raw',
+        raw=True,
     )
 
 
@@ -74,7 +63,7 @@ def main() -> None:
     elif kind == 'listen':
         listen(node)
     else:
-        echo(node, kind)
+        echo(node)
     executor = EventsExecutor()
     executor.add_node(node)
     while True:

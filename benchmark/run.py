@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run all benchmarks, with interleaved measurements, and write a table and a picture.
+"""Run all benchmarks, with interleaved measurements, and write a table.
 
 Usage: python benchmark/run.py [GROUP ...]   (--help lists the groups)
 """
@@ -14,10 +14,7 @@ import platform
 from itertools import groupby
 from pathlib import Path
 
-import numpy as np
 from harness import Ratio
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from blf_dsc_controller import __version__
 
@@ -26,7 +23,6 @@ _GROUPS = {  # module and function of each
     'montecarlo': ('offline', 'measure_study'),
     'growth': ('growth', 'measure'),
     'node': ('node', 'measure'),
-    'view': ('node', 'measure_view'),
     'recording': ('bags', 'measure'),
     'replay': ('bags', 'measure_replay'),
     'startup': ('node', 'measure_start'),
@@ -68,30 +64,8 @@ def table(rows: list[Ratio]) -> str:
     return '\n'.join(parts) + '\n'
 
 
-def draw(rows: list[Ratio], path: Path) -> None:
-    """Plot all ratios and ranges on a logarithmic axis, one panel per group and baseline."""
-    panels = [list(panel) for _, panel in groupby(rows, key=lambda row: (row.group, row.baseline))]
-    heights = [len(panel) + 1.0 for panel in panels]
-    figure = Figure(figsize=(11.0, 0.25 * sum(heights) + 0.3 * len(panels)), layout='constrained')
-    FigureCanvasAgg(figure)
-    grid = figure.subplots(len(panels), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
-    for axes, panel in zip(grid, panels, strict=True):
-        median = np.array([row.median for row in panel])
-        spread = [median - [row.low for row in panel], [row.high for row in panel] - median]
-        axes.errorbar(median, range(len(panel)), xerr=spread, fmt='o', capsize=2, color='#0072b2')
-        axes.axvline(1.0, color='#404040', linewidth=1.0)
-        axes.set_xscale('log')
-        axes.set_yticks(range(len(panel)), [row.what for row in panel], fontsize=8)
-        axes.set_ylim(len(panel) - 0.4, -0.6)
-        axes.set_title(f'{panel[0].group}: times {panel[0].baseline}', fontsize=9, loc='left')
-        axes.grid(visible=True, axis='x', which='both', alpha=0.2)
-        axes.spines[['top', 'right']].set_visible(False)
-    grid[-1].set_xlabel('ratio, median and range of the rounds')
-    figure.savefig(path, dpi=80)
-
-
 def main() -> None:
-    """Run the groups and write RESULTS.md and results.png."""
+    """Run the groups and write RESULTS.md."""
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument('groups', nargs='*', metavar='GROUP', help=', '.join(_GROUPS))
     options.add_argument('--out', type=Path, default=_HERE, help='folder for the results')
@@ -109,10 +83,9 @@ def main() -> None:
         '# Results of the benchmarks\n\n'
         f'Written by `make bench` on {today}. Every figure is a ratio of two things measured in '
         'turns in\nthe same run: median and range of its rounds. Absolute times are notes about '
-        f'one machine.\n\n{machine()}\n\n![all ratios](results.png)\n' + table(rows)
+        f'one machine.\n\n{machine()}\n' + table(rows)
     )
     (chosen.out / 'RESULTS.md').write_text(text, encoding='utf-8')
-    draw(rows, chosen.out / 'results.png')
     print(f'written: {chosen.out / "RESULTS.md"}')
 
 
