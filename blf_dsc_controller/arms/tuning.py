@@ -49,7 +49,7 @@ def loop_delay(sample_time: float, lag: float) -> float:
     return SAMPLES * sample_time + lag
 
 
-class Arm(NamedTuple):
+class Design(NamedTuple):
     """What the gains of an arm follow from."""
 
     chain: Chain
@@ -63,7 +63,7 @@ class Arm(NamedTuple):
 
 
 def gains_of(
-    arm: Arm, sample_time: float, bound: np.ndarray | None
+    arm: Design, sample_time: float, bound: np.ndarray | None
 ) -> Mapping[str, bool | int | float | str | tuple[float, ...] | tuple[str, ...]]:
     """Return gains and limits by the dotted name of their parameter; `bound` (n,) [rad] or None."""
     chain, P0, learn = arm.chain, arm.initial_estimate, arm.learn

@@ -261,7 +261,7 @@ class ControllerConfig(Sampled):
                 'learning.interval': max(1, round(0.01 / period)),
             }
         robot, chain = given_robot(given, given.get('joints', ()))
-        arm = tuning.Arm(
+        arm = tuning.Design(
             chain,
             parameters_of(robot, chain),
             learned_of(robot, chain).initial,

@@ -16,7 +16,6 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import kernel
-from blf_dsc_controller.compiled.layout import pack, part, view
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
@@ -31,14 +30,6 @@ from blf_dsc_controller.law.telemetry import columns_of, disturbance_names, run_
 from blf_dsc_controller.law.weighing import add_row
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.run import Run, Series, Stop
-from blf_dsc_controller.simulation.metrics import (
-    LoopMetrics,
-    MetricsSettings,
-    metrics_of,
-    metrics_settings_of,
-    new_metrics,
-    update_metrics,
-)
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant import kernels as plants
 from sim_plant.arm import Arm
@@ -46,8 +37,6 @@ from sim_plant.arms import parameter_names_of
 from sim_plant.plant import Plant, plant_of, steps_of
 
 _CHUNK = 1000  # samples; the guard takes about 20 ms for them
-_NOTHING = MetricsSettings(0, 0, 0, 0, 0, *np.zeros((3, 0)))
-_NO_METRICS = pack(_NOTHING), new_metrics(_NOTHING)
 
 
 @kernel
@@ -67,52 +56,35 @@ def run_loop(
     is_end: bool,
     measurements: np.ndarray,
     samples: np.ndarray,
-    truths: np.ndarray | None,
-    metrics_settings: np.ndarray,
-    metrics: np.ndarray,
+    truths: np.ndarray,
     checks_vector: np.ndarray,
 ) -> bool:
     """Run the samples `first` to `last`; with `is_end`, the torque of the last is not applied.
 
     With checks (`law.checks`), stop at the first invalid or suspect sample and return False.
-
-    Without `truths`, `measurements` and `samples` have one row, which each sample overwrites, no
-    energies are computed, and a non-finite number ends the run; numba compiles this separately.
-    Metrics are updated if their settings have joints.
     """
     law = settings_of(settings, sizes, model)
     law_state = state_of(state, law)
     law_signals = signals_of(signals, law)
     plant, now = plants.plant_views(arm, plant_settings, plant_state)
-    reference_view, measured = view(reference), view(measurements)
+    reference_view, measured, true = view(reference), view(measurements), view(truths)
     rows = view(samples)
-    chosen = metrics_settings_of(view(metrics_settings))
-    found = metrics_of(view(metrics), chosen)
     checks = checks_of(view(checks_vector), law)
     is_checked = checks.velocity_limit[0] > 0.0
     dt = plant.period_ns * 1e-9
     for k in range(first, last + 1):
-        row = 0 if truths is None else k - first
-        measurement, sample = measured[row], sample_of(rows[row], law)
+        measurement, sample = measured[k - first], sample_of(rows[k - first], law)
         t = (k * plant.period_ns) * 1e-9
         plants.draw_noise(plant, now, rng)
         plants.observe(plant, now, measurement)
         if is_checked and not is_valid_state(law, checks, measurement):
             return False
         step(law, reference_view, law_state, law_signals, t, dt, measurement, sample)
-        if truths is not None:
-            plants.truth(plant, now, view(truths)[row])
-            q = part(measurement, 0, (law.n,))
-            fill_energies(law, law_state, law_signals, q, sample)
-            add_row(law, law_state, law_signals, dt)
+        plants.truth(plant, now, true[k - first])
+        fill_energies(law, law_state, law_signals, part(measurement, 0, (law.n,)), sample)
+        add_row(law, law_state, law_signals, dt)
         if is_checked and check_sample(law, checks, law_state, law_signals, sample) & SUSPECT:
             return False
-        if chosen.n > 0:
-            if found.finite[0] == 1.0:
-                plants.true_parameters(plant, now, found.P)
-                update_metrics(chosen, found, t, measurement, sample)
-            elif truths is None:
-                return True
         if not (is_end and k == last):
             plants.step(plant, now, sample.torque)
     return True
@@ -124,47 +96,42 @@ def simulate(
     progress: Callable[[Record, int], None] | None = None,
     *,
     supervised: bool = True,
-    metrics: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Record:
     """Run controller and plant in closed loop for `duration` and return every sample.
 
     The plant's duration must not be 0.  `progress` is called periodically with the record and the
-    number of rows that are filled.  If not `supervised`, the law runs alone, past its limits too;
-    then `metrics`, packed `MetricsSettings` and the vector of `new_metrics`, are updated.
+    number of rows that are filled.  If not `supervised`, the law runs alone, past its limits too.
 
     Raises StartError if the law cannot take over and approach.enabled is false, and MotionError if
     there is no approach within the limits.
     """
-    plant, guard, journal = plant_of(plant_config), None, Journal()
-    rows = steps_of(plant_config) + 1
+    plant = plant_of(plant_config)
     if supervised:
         guard = Guard(controller_config, lambda: 0, lambda: 0)
         guard.activate()
-        controller, journal = guard.controller, guard.journal
-    else:
-        controller = controller_of(controller_config)
-    record = Record(
-        stamps=np.arange(rows, dtype=np.int64) * plant.period_ns,
-        measurements=np.zeros((rows, 3 * plant.joints)),
-        samples=np.zeros((rows, controller.sample_vector.size)),
-        truths=np.zeros((rows, plant.truth().size)),
-        parameters=parameter_names_of(plant_config),
-        config=controller_config,
-        controller=controller,
-        journal=journal,
-    )
-    if guard is not None:
+        record = new_record(guard.controller, controller_config, plant_config, guard.journal)
         _run_supervised(guard, plant, record, progress)
         return record
-    q, dq, _ = plant.measure().reshape(3, -1)
-    begin(controller, controller_config, q, dq)
+    journal = Journal()
+    record = new_record(controller_of(controller_config), controller_config, plant_config, journal)
+    run_alone(record, plant)
     journal.note(EventType.CONFIGURE, parameters=flatten(controller_config))
     journal.note(EventType.ACTIVATE)
     journal.stamp, journal.messages = START, 1
     journal.note(EventType.START, resumed=False)
-    arrays = record.measurements, record.samples, record.truths
-    _run_samples(controller, plant, (0, rows - 1, True), arrays, metrics or _NO_METRICS)
     return record
+
+
+def run_alone(record: Record, plant: Plant) -> None:
+    """Fill a record by its law alone; law and plant are at their beginning.
+
+    Raises StartError if the law cannot take over and approach.enabled is false, and MotionError if
+    there is no approach within the limits.
+    """
+    q, dq, _ = plant.measure().reshape(3, -1)
+    begin(record.controller, record.config, q, dq)
+    arrays = record.measurements, record.samples, record.truths
+    _run_samples(record.controller, plant, (0, record.stamps.size - 1, True), arrays)
 
 
 def _run_supervised(
@@ -191,7 +158,7 @@ def _run_compiled(guard: Guard, plant: Plant, record: Record, chunk: range) -> b
     rows = slice(chunk.start, chunk.stop)
     arrays = record.measurements[rows], record.samples[rows], record.truths[rows]
     samples = chunk.start, chunk.stop - 1, chunk.stop == record.stamps.size
-    if _run_samples(controller, plant, samples, arrays, _NO_METRICS):
+    if _run_samples(controller, plant, samples, arrays):
         last = chunk.stop - 1
         guard.advance(START + int(record.stamps[last]), record.measurements[last], len(chunk))
         return True
@@ -223,22 +190,11 @@ def _run_guarded(guard: Guard, plant: Plant, record: Record, chunk: range) -> No
             plant.step(torque)
 
 
-def run_metrics(
-    controller: Controller, plant: Plant, samples: int, settings: MetricsSettings
-) -> LoopMetrics:
-    """Run `samples` samples with a controller that has begun, and return only the metrics."""
-    metrics = new_metrics(settings)
-    arrays = (np.zeros((1, 3 * plant.joints)), controller.sample_vector.reshape(1, -1), None)
-    _run_samples(controller, plant, (0, samples - 1, True), arrays, (pack(settings), metrics))
-    return metrics_of(metrics, settings)
-
-
 def _run_samples(
     controller: Controller,
     plant: Plant,
     samples: tuple[int, int, bool],
-    arrays: tuple[np.ndarray, np.ndarray, np.ndarray | None],
-    metrics: tuple[np.ndarray, np.ndarray],
+    arrays: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> bool:
     """Call `run_loop` with (first, last, is_end) and arrays (measurements, samples, truths)."""
     return run_loop(
@@ -254,7 +210,6 @@ def _run_samples(
         controller.signals_vector,
         *samples,
         *arrays,
-        *metrics,
         controller.checks_vector,
     )
 
@@ -300,3 +255,21 @@ class Record:
                 if event.type is EventType.STOP
             ),
         )
+
+
+def new_record(
+    controller: Controller, config: ControllerConfig, plant: PlantConfig, journal: Journal
+) -> Record:
+    """Return a record for a run of a plant, to be filled."""
+    rows, n = steps_of(plant) + 1, len(plant.joints)
+    names = parameter_names_of(plant)
+    return Record(
+        stamps=np.arange(rows, dtype=np.int64) * plant.sample_time_ns,
+        measurements=np.zeros((rows, 3 * n)),
+        samples=np.zeros((rows, controller.sample_vector.size)),
+        truths=np.zeros((rows, len(names) + 3 * n)),
+        parameters=names,
+        config=config,
+        controller=controller,
+        journal=journal,
+    )

@@ -11,22 +11,18 @@ from blf_dsc_controller.analysis.page import Cell, write_page
 from blf_dsc_controller.analysis.summary import summarize as summarize_run
 from blf_dsc_controller.analysis.summary import write_summary
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, dump
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.simulation.metrics import metrics_of, new_metrics
 from blf_dsc_controller.studies.monte_carlo import Study, draw, origin_of, plant_of_draw
 from blf_dsc_controller.studies.runs import (
     OUTCOMES,
     Store,
     differences,
-    metrics_row,
-    metrics_settings,
-    model_error,
+    figures_of,
     rows_of_another_motion,
 )
 from blf_dsc_controller.studies.statistics import ALLOWED, Summary, draw_study, summarize
@@ -92,22 +88,20 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
         raise BlfDscError(f'{store.folder} has no run {run}: it has {results["run"].size} runs')
     study = store.study
     plant = plant_of_run(study, run)
-    settings, unseen = metrics_settings(study, plant), rows_of_another_motion(study)
+    unseen = rows_of_another_motion(study)
     row = int((results['run'] == run).argmax())
     summaries = []
     for prefix, law in study.laws().items():
         folder = out / 'without_learning' if prefix else out
         folder.mkdir(exist_ok=True)
         dump(folder / 'config.yaml', {PLANT: plant, CONTROLLER: law})
-        metrics = new_metrics(settings)
-        record = simulate(law, plant, metrics=(pack(settings), metrics), supervised=False)
+        record = simulate(law, plant, supervised=False)
         write_bag(folder / 'bag', record, law, 'none')
         recorded = read_run(folder / 'bag')
         summaries.append(summarize_run(recorded))
         write_summary(summaries[-1], folder / 'summary.json')
         draw_run(recorded, folder)
-        error = model_error(unseen, settings, record.sample(-1).estimate, record.truths[-1])
-        here = metrics_row(study, metrics_of(metrics, settings), error)
+        here = figures_of(study, record, plant, unseen)
         different = differences({name: results[f'{prefix}{name}'][row] for name in here}, here)
         if different:
             raise BlfDscError(

@@ -53,19 +53,13 @@ import blf_dsc_controller
 from blf_dsc_controller.compiled.jit import cache_folder
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError, StartError
-from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.factory import begin, controller_of, model_of
+from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.law.state import sample_of
+from blf_dsc_controller.messages.journal import Journal
 from blf_dsc_controller.reference.limits import MotionError
-from blf_dsc_controller.simulation.loop import run_loop, run_metrics
-from blf_dsc_controller.simulation.metrics import (
-    LoopMetrics,
-    MetricsSettings,
-    another_motion,
-    metrics_of,
-    new_metrics,
-    torque_error,
-    torque_rows,
-)
+from blf_dsc_controller.run import Floats
+from blf_dsc_controller.simulation.loop import Record, new_record, run_alone, run_loop
+from blf_dsc_controller.simulation.metrics import another_motion, torque_error, torque_rows
 from blf_dsc_controller.studies.monte_carlo import (
     Origin,
     Study,
@@ -75,8 +69,7 @@ from blf_dsc_controller.studies.monte_carlo import (
     plant_of_draw,
     write_study,
 )
-from sim_plant.arms import parameter_names_of
-from sim_plant.plant import Plant, parameter_order, plant_of, steps_of
+from sim_plant.plant import Plant, parameter_order, plant_of
 
 _UNSEEN = 1000  # seed of the motion on which the torque of the learned model is judged
 
@@ -100,13 +93,15 @@ Columns = dict[str, np.ndarray]
 def run_chunk(study: Study, first: int, count: int) -> Columns:
     """Compute runs `first` to `first + count - 1`.
 
-    All runs share one controller of each law, which take nearly all of the memory. The result
-    depends on the arguments alone, and no file is written.
+    All runs share one record of each law, which takes nearly all of the memory. The result depends
+    on the arguments alone, and no file is written.
     """
-    laws = {prefix: controller_of(config) for prefix, config in study.laws().items()}
-    origin = origin_of(laws[''])
+    records = {
+        prefix: new_record(controller_of(config), config, study.plant, Journal())
+        for prefix, config in study.laws().items()
+    }
     unseen = rows_of_another_motion(study)
-    rows = [_run(study, index, laws, origin, unseen) for index in range(first, first + count)]
+    rows = [_run(study, index, records, unseen) for index in range(first, first + count)]
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
@@ -125,53 +120,58 @@ def warm_up(study: Study) -> None:
     run_chunk(dataclasses.replace(study, plant=plant, settings=settings), 0, 1)
 
 
-def metrics_settings(study: Study, plant: PlantConfig) -> MetricsSettings:
-    """Return the settings of the metrics of a run with this plant."""
-    order = parameter_order(model_of(study.controller).parameter_names, plant)
-    limits = zip(study.controller.torque.limit, plant.actuator.torque_limit, strict=True)
-    times = (study.settings.settled_after, *study.settings.moments)
-    settled, *moments = (round(t / plant.sample_time) for t in times)
-    return MetricsSettings(
-        n=len(plant.joints),
-        p=order.size,
-        true=len(parameter_names_of(plant)),
-        moments=len(moments) + 1,
-        settled=settled,
-        limit=np.array([min(law, motor or law) for law, motor in limits]),
-        order=order,
-        samples=np.array([*moments, steps_of(plant)]),
+def figures_of(study: Study, record: Record, plant: PlantConfig, unseen: Floats | None) -> Row:
+    """Return the columns of a run from its record; NaN for events that did not happen.
+
+    Nothing counts from the first number on that is not finite. `unseen` are the rows of H of
+    another motion.
+    """
+    settings, t = record.controller.settings, record.stamps * 1e-9
+    n, at = settings.n, sample_of(np.arange(record.samples.shape[1]), settings)
+    xi1, torque, bound, latched = (
+        record.samples[:, part.astype(np.intp)]
+        for part in (at.xi1, at.torque, at.bound, at.latched)
     )
-
-
-def metrics_row(study: Study, metrics: LoopMetrics, model_error: float = nan) -> Row:
-    """Return the columns of a run from its metrics; NaN for events that did not happen."""
-    settled = metrics.settled[0]
-    outcome = KEPT if np.isnan(metrics.violation[0]) else VIOLATED
+    finite = np.isfinite(record.measurements).all(axis=1) & np.isfinite(torque).all(axis=1)
+    end = t.size if finite.all() else int(finite.argmin())
+    error = np.abs(xi1[:end])
+    ratio = error / bound[:end]
+    outside = np.flatnonzero((error >= bound[:end]).any(axis=1))
+    violation = outside[0] if outside.size else end  # where a number is not finite, if at all
+    latch = np.flatnonzero(latched[:end])
+    limit = [
+        min(law, motor or law)
+        for law, motor in zip(
+            study.controller.torque.limit, plant.actuator.torque_limit, strict=True
+        )
+    ]
     row: Row = {
-        'outcome': DIVERGED if metrics.finite[0] == 0.0 else outcome,
-        'first_violation_s': float(metrics.violation[0]),
-        'latch_time_s': float(metrics.latch[0]),
-        'saturated_fraction': float(metrics.saturated[0] / max(1.0, metrics.samples[0])),
+        'outcome': DIVERGED if end < t.size else VIOLATED if outside.size else KEPT,
+        'first_violation_s': float(t[violation]) if violation < t.size else nan,
+        'latch_time_s': float(t[latch[0]]) if latch.size else nan,
+        'saturated_fraction': float((np.abs(torque[:end]) >= limit).any(axis=1).mean()),
     }
-    rms = np.sqrt(metrics.squares / settled) if settled else np.full_like(metrics.squares, np.nan)
+    settled, *moments = (
+        round(moment / plant.sample_time)
+        for moment in (study.settings.settled_after, *study.settings.moments)
+    )
     for i, joint in enumerate(study.plant.joints):
-        row[f'max_error_ratio.{joint}'] = float(metrics.ratio[i])
-        row[f'settled_error_ratio.{joint}'] = float(metrics.late[i]) if settled else np.nan
-        row[f'rms_error_rad.{joint}'] = float(rms[i])
-        row[f'peak_torque_nm.{joint}'] = float(metrics.peak[i])
-    for name, error in zip(error_columns(study), metrics.error.tolist(), strict=True):
-        row[name] = error
-    row['torque_error.end'] = model_error
+        late, effort = error[settled:, i], np.abs(record.measurements[:end, 2 * n + i])
+        row[f'max_error_ratio.{joint}'] = float(ratio[:, i].max(initial=0.0))
+        row[f'settled_error_ratio.{joint}'] = float(ratio[settled:, i].max()) if late.size else nan
+        row[f'rms_error_rad.{joint}'] = float(np.sqrt(np.mean(late**2))) if late.size else nan
+        row[f'peak_torque_nm.{joint}'] = float(effort.max(initial=0.0))
+    order = parameter_order(settings.model.parameter_names, plant)
+    estimates = record.samples[:, at.estimate[: settings.p].astype(np.intp)]
+    for name, sample in zip(error_columns(study), (*moments, t.size - 1), strict=True):
+        P = record.truths[sample, order]
+        known = sample < end and order.min() >= 0
+        off = np.linalg.norm(estimates[sample] - P) / np.linalg.norm(P) if known else nan
+        row[name] = float(off)
+    row['torque_error.end'] = nan
+    if unseen is not None and order.min() >= 0:
+        row['torque_error.end'] = torque_error(unseen, estimates[-1], record.truths[-1, order])
     return row
-
-
-def model_error(
-    unseen: np.ndarray | None, settings: MetricsSettings, estimate: np.ndarray, P: np.ndarray
-) -> float:
-    """Return the torque error of an estimate on another motion; NaN if it is not of the plant's."""
-    if unseen is None or settings.order.min() < 0:
-        return nan
-    return torque_error(unseen, estimate[: settings.p], P[settings.order])
 
 
 def error_columns(study: Study) -> Iterator[str]:
@@ -181,54 +181,36 @@ def error_columns(study: Study) -> Iterator[str]:
     yield 'parameter_error.end'
 
 
-def _run(
-    study: Study,
-    index: int,
-    laws: dict[str, Controller],
-    origin: Origin,
-    unseen: np.ndarray | None,
-) -> Row:
+def _run(study: Study, index: int, records: dict[str, Record], unseen: Floats | None) -> Row:
+    origin = origin_of(records[''].controller)
     drawn = draw(study, index)
     row: Row = {'run': drawn.run, 'seed': drawn.seed}
     for variation, value in zip(study.variations, drawn.values, strict=True):
         row[variation.column] = value
     config = plant_of_draw(study, drawn, origin)
-    settings, plant = metrics_settings(study, config), plant_of(config)
-    for prefix, controller in laws.items():
-        found = _run_law(study, controller, plant, settings, unseen)
+    plant = plant_of(config)
+    for prefix, record in records.items():
+        plant.reset()
+        record.controller.reset()
+        try:
+            with np.errstate(all='ignore'):  # a run that diverges has figures too
+                run_alone(record, plant)
+                found = figures_of(study, record, config, unseen)
+        except (StartError, MotionError):
+            plant.reset()
+            found = _rejected(study, record, plant, origin)
         row |= {f'{prefix}{name}': value for name, value in found.items()}
     return row
 
 
-def _run_law(
-    study: Study,
-    controller: Controller,
-    plant: Plant,
-    settings: MetricsSettings,
-    unseen: np.ndarray | None,
-) -> Row:
-    """Run a plant, from its beginning, with a controller; return the columns of its metrics."""
-    plant.reset()
-    q, dq, _ = plant.measure().reshape(3, -1)
-    controller.reset()
-    try:
-        begin(controller, study.controller, q, dq)
-    except (StartError, MotionError):
-        origin = origin_of(controller)
-        return _rejected_row(study, np.abs(q - origin.qr) / origin.bound)
-    metrics = run_metrics(controller, plant, steps_of(study.plant) + 1, settings)
-    error = model_error(unseen, settings, controller.state.estimate, plant.truth())
-    return metrics_row(study, metrics, error)
-
-
-def _rejected_row(study: Study, ratios: np.ndarray) -> Row:
-    """Return the columns of a run that does not begin, with |xi1(0)| / k_c (n,)."""
-    settings = metrics_settings(study, study.plant)
-    metrics = metrics_of(np.full_like(new_metrics(settings), np.nan), settings)
-    metrics.violation[0] = 0.0
-    metrics.ratio[:] = ratios
-    metrics.settled[0] = 0.0
-    return metrics_row(study, metrics) | {'outcome': REJECTED}
+def _rejected(study: Study, record: Record, plant: Plant, origin: Origin) -> Row:
+    """Return the columns of a run that does not begin, with |xi1(0)| / k_c."""
+    q = plant.measure()[: plant.joints]
+    with np.errstate(all='ignore'):
+        found: Row = dict.fromkeys(figures_of(study, record, study.plant, None), nan)
+    for joint, ratio in zip(study.plant.joints, np.abs(q - origin.qr) / origin.bound, strict=True):
+        found[f'max_error_ratio.{joint}'] = float(ratio)
+    return found | {'outcome': REJECTED, 'first_violation_s': 0.0}
 
 
 _STUDY = 'study.yaml'
