@@ -258,8 +258,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
         controller, stamp = guard.controller, guard.last_stamp
         sample, samples = controller.sample, controller.samples
         is_due = (samples - 1) % DECIMATION == 0
-        if is_due:
-            self._follow_progress(guard)
+        if is_due:  # of what rarely changes
+            self._heard = any(count() for count in self._listeners)
+            self._report_learning(guard)
+            self._warn_of_rate(guard)
         if not self.config.telemetry.enabled:
             return
         if samples == 1 or self._monitor is None:
@@ -273,13 +275,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if is_due:
             self._publish(self._monitor.message(stamp, sample, guard.samples.ratio, sample.bound))
 
-    def _follow_progress(self, guard: Guard) -> None:
-        """Check what rarely changes: subscribers, learning and the rate of the joint states."""
-        self._heard = any(count() for count in self._listeners)
-        state, samples = guard.controller.state, guard.controller.samples
-        events = (state.columns_checked[0], state.active.sum(), state.changes[0])
-        if events != self._learning_events:
-            self._report_learning(guard, events)
+    def _warn_of_rate(self, guard: Guard) -> None:
+        samples = guard.controller.samples
         period, expected = guard.time / max(samples - 1, 1), self.config.sample_time
         if samples == _RATE_SAMPLES and period < _FAST * expected:
             self.get_logger().warning(
@@ -287,8 +284,13 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 'it to that of the arm, since gains and windows depend on it'
             )
 
-    def _report_learning(self, guard: Guard, events: tuple[float, float, float]) -> None:
+    def _report_learning(self, guard: Guard) -> None:
+        """Report columns that were rejected or taken back, and changes of the arm."""
+        state = guard.controller.state
+        events = (state.columns_checked[0], state.active.sum(), state.changes[0])
         before, self._learning_events = self._learning_events, events
+        if events == before:
+            return
         if events[2] > before[2]:
             residual = guard.controller.state.contradiction[0] ** 0.5
             self.get_logger().warning(
