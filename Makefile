@@ -93,8 +93,9 @@ bench: $(READY)-bench ## Run the benchmarks (GROUPS=offline for one group), into
 soak: $(READY)-test ## Run half an hour of plant time (MINUTES) with a fault every few seconds
 	@$(RUN) test/soak.py --minutes "$(MINUTES)"
 
-docs: $(READY)-docs ## Build the documentation site, into out/docs
-	@$(RUN) -m sphinx -q -W --keep-going -n doc out/docs && echo 'Open out/docs/index.html'
+docs: $(READY)-docs ## Build the documentation site and check its links, into out/docs
+	@$(RUN) -m sphinx -q -W --keep-going -n doc out/docs && $(RUN) doc/links.py out/docs && \
+	echo 'Open out/docs/index.html'
 
 release: $(READY)-release ## Check versions and metadata, and build sdist and wheel into out/dist
 	@$(MAKE) test TESTS=test/test_package.py

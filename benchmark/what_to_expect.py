@@ -18,7 +18,6 @@ import numpy as np
 
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.simulation.loop import START, Record, simulate
 from blf_dsc_controller.simulation.metrics import another_motion, torque_error, torque_rows
 from blf_dsc_controller.supervision.guard import Guard
@@ -55,11 +54,7 @@ def simulated(
     """Run such a loop; also return the largest true joint error of each sample (k,) [mrad]."""
     loop = loop_of(name, seed, pick_up, kg, changes or {})
     record = simulate(loop.controller, loop.plant, supervised=False)
-    settings = record.controller.settings
-    n, p = settings.n, settings.p
-    columns = sample_of(np.arange(record.samples.shape[1]), settings)
-    errors = record.truths[:, p + n : p + 2 * n] - record.samples[:, columns.qr]
-    return record, 1e3 * np.abs(errors).max(axis=1)
+    return record, 1e3 * np.abs(record.true_errors()).max(axis=1)
 
 
 def in_mujoco(name: str, seed: int, changes: Mapping[str, Any]) -> np.ndarray:
