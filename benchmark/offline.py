@@ -36,10 +36,10 @@ from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies import runs
 from blf_dsc_controller.studies.monte_carlo import (
     Study,
-    draw,
     load_study,
     origin_of,
-    plant_of_draw,
+    plant_with,
+    random_numbers,
 )
 from blf_dsc_controller.studies.runs import Span, run_chunk, warm_up
 from sim_plant.sensors import generator
@@ -374,7 +374,7 @@ def study_disagreement(study: Study) -> float:
 
 def _reference_of(study: Study) -> Callable[[], np.ndarray]:
     origin = origin_of(controller_of(study.controller))
-    plants = [plant_of_draw(study, draw(study, run), origin) for run in range(_RUNS)]
+    plants = [plant_with(study, random_numbers(study, run), origin) for run in range(_RUNS)]
     return Reference().study(study.controller, plants, study.settings.settled_after)
 
 

@@ -22,7 +22,7 @@ from shaken_arm import (
 )
 
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
-from blf_dsc_controller.cli.identify import doubts
+from blf_dsc_controller.cli.identify import problems_of
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
@@ -148,15 +148,17 @@ def test_rest_at_the_end_is_left_out(plain, found):
     assert other.rest == pytest.approx(10.0, abs=0.5)
     assert other.held_back[1] < 30.5
     assert total(other) == pytest.approx(total(found), rel=0.2)
-    assert not list(doubts(other, 'torque'))
+    assert not list(problems_of(other, 'torque'))
 
 
 def test_efforts_without_gravity_are_named_and_used(plain, found):
     states, gravity = plain[0].copy(), plain[1]
     states[:, 2] -= gravity
-    assert 'GRAVITY IS MISSING' in next(doubts(identify_arm(recording_of(states), ROBOT), 'torque'))
+    assert 'GRAVITY IS MISSING' in next(
+        problems_of(identify_arm(recording_of(states), ROBOT), 'torque')
+    )
     whole = identify_arm(recording_of(plain[0]), ROBOT, 'without-gravity')
-    assert 'GRAVITY IS DOUBLE' in next(doubts(whole, 'without-gravity'))
+    assert 'GRAVITY IS DOUBLE' in next(problems_of(whole, 'without-gravity'))
     # The drive compensates the gravity of the URDF exactly: then this is the whole torque.
     model = pinocchio_model(PANDA_TEXT, PANDA)
     data = model.createData()
@@ -164,7 +166,7 @@ def test_efforts_without_gravity_are_named_and_used(plain, found):
     states[:, 2] -= [pinocchio.computeGeneralizedGravity(model, data, q) for q in states[:, 0]]
     right = identify_arm(recording_of(states), ROBOT, 'without-gravity')
     assert total(right) < 2.0 * total(found)
-    assert not list(doubts(right, 'without-gravity'))
+    assert not list(problems_of(right, 'without-gravity'))
 
 
 def is_the_load(found):

@@ -18,11 +18,11 @@ from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.studies.monte_carlo import (
     TAIL,
-    draw,
     load_study,
     origin_of,
     parse,
-    plant_of_draw,
+    plant_with,
+    random_numbers,
     write_study,
 )
 from blf_dsc_controller.studies.runs import run_chunk
@@ -32,7 +32,11 @@ FRACTIONS = st.floats(0.0, 1.0, exclude_max=True)
 
 
 def drawn_values(a_study, run):
-    return dict(zip((s.column for s in a_study.variations), draw(a_study, run).values, strict=True))
+    return dict(
+        zip(
+            (s.column for s in a_study.variations), random_numbers(a_study, run).values, strict=True
+        )
+    )
 
 
 @pytest.mark.parametrize(
@@ -157,10 +161,10 @@ def test_written_study_reads_back_unchanged(tmp_path):
 
 def test_run_depends_on_seed_and_index_alone(tmp_path):
     a_study = study(tmp_path)
-    assert draw(a_study, 5) == draw(study(tmp_path, runs=100), 5)
-    assert draw(a_study, 5) != draw(a_study, 6)
-    assert draw(a_study, 5).seed != draw(a_study, 6).seed
-    assert draw(a_study, 5) != draw(study(tmp_path, seed=8), 5)
+    assert random_numbers(a_study, 5) == random_numbers(study(tmp_path, runs=100), 5)
+    assert random_numbers(a_study, 5) != random_numbers(a_study, 6)
+    assert random_numbers(a_study, 5).seed != random_numbers(a_study, 6).seed
+    assert random_numbers(a_study, 5) != random_numbers(study(tmp_path, seed=8), 5)
 
 
 def test_draw_does_not_depend_on_other_variations(tmp_path):
@@ -175,10 +179,10 @@ def test_draw_does_not_depend_on_other_variations(tmp_path):
 def test_drawn_values_are_used_in_the_plant_of_the_run(tmp_path):
     a_study = study(tmp_path)
     origin = origin_of(controller_of(a_study.controller))
-    drawn = draw(a_study, 2)
+    numbers = random_numbers(a_study, 2)
     values = drawn_values(a_study, 2)
-    plant = plant_of_draw(a_study, drawn, origin)
-    assert plant.seed == drawn.seed
+    plant = plant_with(a_study, numbers, origin)
+    assert plant.seed == numbers.seed
     assert plant.arm.m2 == values['plant.arm.m2']
     assert plant.arm.m1 == a_study.plant.arm.m1
     assert plant.disturbance.constant[1] == values['plant.disturbance.constant.joint2']
@@ -196,7 +200,7 @@ def test_events_are_drawn_entry_by_entry(tmp_path):
     a_study = study(tmp_path)
     values = drawn_values(a_study, 3)
     origin = origin_of(controller_of(a_study.controller))
-    events = plant_of_draw(a_study, draw(a_study, 3), origin).events
+    events = plant_with(a_study, random_numbers(a_study, 3), origin).events
     assert events.begin == (values['plant.events.begin.1'], 0.2)
     assert events.duration == (0.1, 0.0)
     assert events.payload == (values['plant.events.payload.1'], values['plant.events.payload.2'])
@@ -210,7 +214,7 @@ def test_events_may_follow_each_other_by_gaps(tmp_path):
     a_study = study(tmp_path, LOOP + text.replace('GAP', '["uniform(0.0, 0.1)", "choice(0.15)"]'))
     first = drawn_values(a_study, 3)['plant.events.gap.1']
     origin = origin_of(controller_of(a_study.controller))
-    begin = plant_of_draw(a_study, draw(a_study, 3), origin).events.begin
+    begin = plant_with(a_study, random_numbers(a_study, 3), origin).events.begin
     assert begin == (first, first + 0.15)
 
 
@@ -253,7 +257,7 @@ def test_start_is_as_configured_if_it_does_not_vary(tmp_path):
     text = '\n'.join(line for line in STUDY.splitlines() if 'initial' not in line) + '\n'
     a_study = study(tmp_path, LOOP + text)
     origin = origin_of(controller_of(a_study.controller))
-    assert plant_of_draw(a_study, draw(a_study, 0), origin).initial == a_study.plant.initial
+    assert plant_with(a_study, random_numbers(a_study, 0), origin).initial == a_study.plant.initial
 
 
 def test_overrides_take_precedence_over_the_file(tmp_path):

@@ -58,7 +58,7 @@ def identify(options: Namespace) -> None:
         pick_up=pick_up,
     )
     header = [f'{found.source}, {found.duration:.1f} s of {len(found.chain.joints)} joints']
-    kept = [*_load(found), *_joints(found), *_errors(found), *doubts(found, options.effort)]
+    kept = [*_load(found), *_joints(found), *_errors(found), *problems_of(found, options.effort)]
     print('\n'.join([*header, *_links(found), *_base(found), *kept]))
     if options.out:
         note = '\n'.join(['Inertias and friction by blf_dsc identify:', *header, *kept])
@@ -70,7 +70,7 @@ def identify(options: Namespace) -> None:
         from blf_dsc_controller.identification.report import write_identified
 
         tables = (_load(found), _links(found), _joints(found), _errors(found), _base(found))
-        lines = [*header, *doubts(found, options.effort)]
+        lines = [*header, *problems_of(found, options.effort)]
         write_identified(found, options.report, lines, [[*table] for table in tables])
         print(f'wrote {options.report}')
 
@@ -186,7 +186,7 @@ def total_errors(found: Identified) -> np.ndarray:
     return np.asarray(100.0 * np.sqrt(total))
 
 
-def doubts(found: Identified, effort: str) -> Iterator[str]:
+def problems_of(found: Identified, effort: str) -> Iterator[str]:
     """Yield why the result should not be used."""
     if found.gravity < _LEAST_GRAVITY:
         yield (

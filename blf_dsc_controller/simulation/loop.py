@@ -54,6 +54,7 @@ def run_loop(
     first: int,
     last: int,
     is_end: bool,
+    energies: bool,
     measurements: np.ndarray,
     samples: np.ndarray,
     truths: np.ndarray,
@@ -61,6 +62,7 @@ def run_loop(
 ) -> bool:
     """Run the samples `first` to `last`; with `is_end`, the torque of the last is not applied.
 
+    The terms of (29) are computed with `energies`; they take 5 % of a run of two links.
     With checks (`law.checks`), stop at the first invalid or suspect sample and return False.
     """
     law = settings_of(settings, sizes, model)
@@ -81,8 +83,9 @@ def run_loop(
             return False
         step(law, reference_view, law_state, law_signals, t, dt, measurement, sample)
         plants.truth(plant, now, true[k - first])
-        fill_energies(law, law_state, law_signals, part(measurement, 0, (law.n,)), sample)
-        add_row(law, law_state, law_signals, dt)
+        if energies:
+            fill_energies(law, law_state, law_signals, part(measurement, 0, (law.n,)), sample)
+            add_row(law, law_state, law_signals, dt)
         if is_checked and check_sample(law, checks, law_state, law_signals, sample) & SUSPECT:
             return False
         if not (is_end and k == last):
@@ -122,8 +125,8 @@ def simulate(
     return record
 
 
-def run_alone(record: Record, plant: Plant) -> None:
-    """Fill a record by its law alone; law and plant are at their beginning.
+def run_alone(record: Record, plant: Plant, *, energies: bool = True) -> None:
+    """Fill a record, with or without the terms of (29), by its law alone from the beginning.
 
     Raises StartError if the law cannot take over and approach.enabled is false, and MotionError if
     there is no approach within the limits.
@@ -131,7 +134,8 @@ def run_alone(record: Record, plant: Plant) -> None:
     q, dq, _ = plant.measure().reshape(3, -1)
     begin(record.controller, record.config, q, dq)
     arrays = record.measurements, record.samples, record.truths
-    _run_samples(record.controller, plant, (0, record.stamps.size - 1, True), arrays)
+    samples = 0, record.stamps.size - 1, True, energies
+    _run_samples(record.controller, plant, samples, arrays)
 
 
 def _run_supervised(
@@ -157,7 +161,7 @@ def _run_compiled(guard: Guard, plant: Plant, record: Record, chunk: range) -> b
     before = controller.save(), plant.save(), controller.checks_vector.copy()
     rows = slice(chunk.start, chunk.stop)
     arrays = record.measurements[rows], record.samples[rows], record.truths[rows]
-    samples = chunk.start, chunk.stop - 1, chunk.stop == record.stamps.size
+    samples = chunk.start, chunk.stop - 1, chunk.stop == record.stamps.size, True
     if _run_samples(controller, plant, samples, arrays):
         last = chunk.stop - 1
         guard.advance(START + int(record.stamps[last]), record.measurements[last], len(chunk))
@@ -193,10 +197,10 @@ def _run_guarded(guard: Guard, plant: Plant, record: Record, chunk: range) -> No
 def _run_samples(
     controller: Controller,
     plant: Plant,
-    samples: tuple[int, int, bool],
+    samples: tuple[int, int, bool, bool],
     arrays: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> bool:
-    """Call `run_loop` with (first, last, is_end) and arrays (measurements, samples, truths)."""
+    """Call `run_loop` on samples (first, last, is_end, energies), into measurements and so on."""
     return run_loop(
         plant.arm,
         plant.settings,

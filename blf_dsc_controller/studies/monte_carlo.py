@@ -226,7 +226,7 @@ class Origin(NamedTuple):
     bound: np.ndarray  # (n,) rad
 
 
-class Draw(NamedTuple):
+class RandomNumbers(NamedTuple):
     """The random numbers of one run."""
 
     run: int
@@ -234,8 +234,8 @@ class Draw(NamedTuple):
     values: tuple[Value, ...]  # of the variations, in their order
 
 
-def draw(study: Study, index: int) -> Draw:
-    """Draw run `index` from the seed of the study and the index alone.
+def random_numbers(study: Study, index: int) -> RandomNumbers:
+    """Return those of run `index`, from the seed of the study and the index alone.
 
     Each variation has its own random number, by its name and regardless of what else varies: two
     studies with the same seed that differ in one distribution have otherwise the same arms.
@@ -248,7 +248,7 @@ def draw(study: Study, index: int) -> Draw:
     values = tuple(
         variation.distribution.at(bits(variation.column) / 2**53) for variation in study.variations
     )
-    return Draw(index, bits('seed'), values)
+    return RandomNumbers(index, bits('seed'), values)
 
 
 def origin_of(controller: Controller) -> Origin:
@@ -257,10 +257,10 @@ def origin_of(controller: Controller) -> Origin:
     return Origin(qr, dqr, controller.bound_at(0.0))
 
 
-def plant_of_draw(study: Study, drawn: Draw, origin: Origin) -> PlantConfig:
+def plant_with(study: Study, numbers: RandomNumbers, origin: Origin) -> PlantConfig:
     """Return the plant configuration of a run; `origin` is that of the study's controller."""
     changes: dict[str, dict[str, Any]] = {}
-    for variation, value in zip(study.variations, drawn.values, strict=True):
+    for variation, value in zip(study.variations, numbers.values, strict=True):
         group, _, field = variation.name.partition('.')
         section = changes.setdefault(group, {})
         section[field] = value if variation.entry < 0 else (*section.get(field, ()), value)
@@ -276,12 +276,12 @@ def plant_of_draw(study: Study, drawn: Draw, origin: Origin) -> PlantConfig:
         group: dataclasses.replace(getattr(study.plant, group), **section)
         for group, section in (changes | {'initial': start}).items()
     }
-    return dataclasses.replace(study.plant, seed=drawn.seed, **groups)
+    return dataclasses.replace(study.plant, seed=numbers.seed, **groups)
 
 
 Value = float | int | str
 
-FORMS = {
+DISTRIBUTIONS = {
     Kind.DOUBLE: (
         'uniform(low, high)',
         'loguniform(low, high)',
@@ -354,7 +354,7 @@ class Distribution:
 def parse(text: object, kind: Kind) -> Distribution:
     """Parse a distribution of a scalar kind; raises ValueError naming what is expected."""
     call = _CALL.fullmatch(text) if isinstance(text, str) else None
-    forms = FORMS[kind]
+    forms = DISTRIBUTIONS[kind]
     if call is None or call[1] not in (form.partition('(')[0] for form in forms):
         raise ValueError(f'got {text!r}, but one of these is expected: {", ".join(forms)}')
     name = call[1]
@@ -428,7 +428,7 @@ def variable_parameters() -> Mapping[str, Parameter]:
     return {
         param.name: param
         for param in found
-        if param.name not in _REALTIME and param.kind.element in FORMS
+        if param.name not in _REALTIME and param.kind.element in DISTRIBUTIONS
     }
 
 

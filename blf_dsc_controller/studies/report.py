@@ -17,7 +17,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.studies.monte_carlo import Study, draw, origin_of, plant_of_draw
+from blf_dsc_controller.studies.monte_carlo import Study, origin_of, plant_with, random_numbers
 from blf_dsc_controller.studies.runs import (
     OUTCOMES,
     Store,
@@ -72,7 +72,7 @@ def reproduce_command(folder: Path, run: int) -> str:
 
 def plant_of_run(study: Study, run: int) -> PlantConfig:
     """Return the plant configuration of a run."""
-    return plant_of_draw(study, draw(study, run), origin_of(controller_of(study.controller)))
+    return plant_with(study, random_numbers(study, run), origin_of(controller_of(study.controller)))
 
 
 def reproduce(store: Store, run: int, out: Path) -> Summary:

@@ -63,10 +63,10 @@ from blf_dsc_controller.simulation.metrics import another_motion, torque_error, 
 from blf_dsc_controller.studies.monte_carlo import (
     Origin,
     Study,
-    draw,
     load_study,
     origin_of,
-    plant_of_draw,
+    plant_with,
+    random_numbers,
     write_study,
 )
 from sim_plant.plant import Plant, parameter_order, plant_of
@@ -183,18 +183,18 @@ def error_columns(study: Study) -> Iterator[str]:
 
 def _run(study: Study, index: int, records: dict[str, Record], unseen: Floats | None) -> Row:
     origin = origin_of(records[''].controller)
-    drawn = draw(study, index)
-    row: Row = {'run': drawn.run, 'seed': drawn.seed}
-    for variation, value in zip(study.variations, drawn.values, strict=True):
+    numbers = random_numbers(study, index)
+    row: Row = {'run': numbers.run, 'seed': numbers.seed}
+    for variation, value in zip(study.variations, numbers.values, strict=True):
         row[variation.column] = value
-    config = plant_of_draw(study, drawn, origin)
+    config = plant_with(study, numbers, origin)
     plant = plant_of(config)
     for prefix, record in records.items():
         plant.reset()
         record.controller.reset()
         try:
             with np.errstate(all='ignore'):  # a run that diverges has figures too
-                run_alone(record, plant)
+                run_alone(record, plant, energies=False)
                 found = figures_of(study, record, config, unseen)
         except (StartError, MotionError):
             plant.reset()
