@@ -15,7 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -65,18 +65,6 @@ def interleaved(contestants: Mapping[str, Callable[[], int]], rounds: int) -> di
     return {name: np.array(values) for name, values in seconds.items()}
 
 
-class Watched(Protocol):
-    """Contestant to wait for: a process, or a node in this one."""
-
-    name: str
-
-    def check(self) -> None:
-        """Raise ContestantError if it cannot continue."""
-
-    def cpu_time(self) -> float:
-        """Return the CPU time so far [s]."""
-
-
 class ContestantError(BlfDscError):
     """A contestant has exited early, or does not respond."""
 
@@ -122,7 +110,7 @@ class Contestant:
 def wait_for(
     condition: Callable[[], bool],
     what: str,
-    contestants: Sequence[Watched] = (),
+    contestants: Sequence[Contestant] = (),
     pause: Callable[[], object] = lambda: time.sleep(0.02),
     timeout: float = _START_UP,
 ) -> None:

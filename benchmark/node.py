@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from harness import Contestant, ContestantError, Ratio, Watched, own_graph, ratio, wait_for
+from harness import Contestant, ContestantError, Ratio, own_graph, ratio, wait_for
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Telemetry
 from blf_dsc_controller.configuration.nodes import CONTROLLER, LoopConfig, dump, load_loop
@@ -98,7 +98,7 @@ class StandIn:
     def _take(self, _torque: bytes) -> None:
         self.has_torque = True
 
-    def play(self, contestants: Sequence[Watched], period: float) -> Run:
+    def play(self, contestants: Sequence[Contestant], period: float) -> Run:
         """Publish all states, one per `period` [s] or, if 0, each after the previous torque.
 
         The last of the contestants is the measured node; the others run beside it.
@@ -134,7 +134,7 @@ class StandIn:
             contestant.check()
         return Run(latency[_WARM_UP:], elapsed, node.cpu_time() - busy)
 
-    def _greet(self, node: Watched) -> None:
+    def _greet(self, node: Contestant) -> None:
         """Send the first state until its torque arrives: a half-matched reader loses messages."""
         self.has_torque = False
         end = time.perf_counter() + _PATIENCE
@@ -164,7 +164,9 @@ class StandIn:
         self._wait_for(lambda: self.publisher.get_subscription_count() == 0)
         self._wait_for(lambda: self.node.count_publishers(self.commands) == 0)
 
-    def _wait_for(self, condition: Callable[[], bool], contestants: Sequence[Watched] = ()) -> None:
+    def _wait_for(
+        self, condition: Callable[[], bool], contestants: Sequence[Contestant] = ()
+    ) -> None:
         what = f'{contestants[-1].name} to appear' if contestants else 'a contestant to disappear'
         wait_for(condition, what, contestants, lambda: self.executor.spin_once(timeout_sec=0.05))
 

@@ -19,6 +19,7 @@ from blf_dsc_controller.reference import terms
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.simulation.metrics import torque_rows
 from blf_dsc_controller.studies import arms as study
+from blf_dsc_controller.studies import laws
 from blf_dsc_controller.studies.arms import (
     ROUGHEST,
     Result,
@@ -54,6 +55,7 @@ IDEAL = {
     'actuator.ripple': 0.0,
     'events.payload': [0.0],
 }
+IMPORT = 'from blf_dsc_controller.studies.laws import Contender\n'
 HOLD = (0.15, -1.85, 1.36, -1.63, -1.71, 0.42)  # rad
 E0 = 0.004 * np.array([1.0, -0.5, 0.2, 0.8, -1.0, 0.6])  # rad, inside the bound
 REST = {  # sinusoids of zero amplitude, as a hold would begin where the arm is
@@ -248,3 +250,36 @@ def test_learned_model_is_better_than_the_urdf(page):
 def test_arm_without_a_urdf_is_rejected(tmp_path, capsys):
     assert main(['arms', '--config', 'recommended', '--out', str(tmp_path / 'out')]) == 1
     assert 'got model two_link' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('name', 'text', 'problem'),
+    [
+        ('missing.py', None, 'expected a law of the study (proposed, '),
+        ('law.txt', '', 'should end in .py'),
+        ('broken.py', '1 / 0', 'cannot be imported: ZeroDivisionError'),
+        ('empty.py', '', 'CONTENDERS must be a dict of Contender by name'),
+        (
+            'taken.py',
+            f"{IMPORT}CONTENDERS = {{'pd_gravity': Contender('mine')}}",
+            'has a law pd_gravity already',
+        ),
+    ],
+)
+def test_file_without_a_usable_law_is_rejected(tmp_path, capsys, name, text, problem):
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    out = tmp_path / 'out'
+    assert main(['arms', '--laws', str(tmp_path / name), '--out', str(out)]) == 1
+    assert problem in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_laws_of_a_file_join_those_chosen_by_name(tmp_path, monkeypatch):
+    monkeypatch.setattr(study, 'CONTENDERS', dict(CONTENDERS))
+    monkeypatch.setattr(laws, 'CONTENDERS', study.CONTENDERS)
+    file = tmp_path / 'law_of_mine.py'
+    file.write_text(f"{IMPORT}CONTENDERS = {{'mine': Contender('mine')}}")
+    assert study.chosen_laws([]) == list(CONTENDERS)
+    for _ in range(2):  # a worker that was forked has it already
+        assert study.chosen_laws(['pd_gravity', str(file)]) == ['proposed', 'pd_gravity', 'mine']

@@ -16,6 +16,7 @@ from blf_dsc_controller.compiled.jit import announced_compilation
 from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.studies import runs
+from blf_dsc_controller.studies.arms import chosen_laws
 from blf_dsc_controller.studies.arms import compare as compare_arms
 from blf_dsc_controller.studies.monte_carlo import load_study
 from blf_dsc_controller.studies.paper import compare
@@ -39,6 +40,7 @@ def paper(options: Namespace) -> None:
 
 def arms(options: Namespace) -> None:
     """Tune and run every law on URDF arms, write the page and print the best law of each figure."""
+    chosen_laws(options.laws)  # before there is a folder
     folder = make_folder(options.out)
     with announced_compilation(print_notice):
         rows = compare_arms(

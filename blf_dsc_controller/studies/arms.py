@@ -115,6 +115,11 @@ def chosen_laws(given: Sequence[str]) -> list[str]:
         return list(CONTENDERS)
     names = ['proposed']
     for name in given:
+        if name not in CONTENDERS and not Path(name).is_file():
+            raise BlfDscError(
+                f'--laws {name}: expected a law of the study ({", ".join(CONTENDERS)}), or a '
+                'Python file with CONTENDERS'
+            )
         names += [name] if name in CONTENDERS else load_laws(Path(name).resolve())
     return list(dict.fromkeys(names))
 

@@ -356,8 +356,8 @@ def load_laws(path: Path) -> list[str]:
     Raises BlfDscError if it has none, if it cannot be imported, or if a name is taken.
     """
     spec = importlib.util.spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None or not path.is_file():
-        raise BlfDscError(f'{path}: expected a law of the study, or a Python file with CONTENDERS')
+    if spec is None or spec.loader is None:
+        raise BlfDscError(f'{path} is no Python file: its name should end in .py')
     module = sys.modules.get(path.stem)
     if module is None or getattr(module, '__file__', '') != str(path):
         module = importlib.util.module_from_spec(spec)
