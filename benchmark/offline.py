@@ -66,6 +66,22 @@ SOURCE = Path(__file__).with_name('reference.c')
 # numbers that are compared.
 FLAGS = ('-O3', '-march=native', '-ffp-contract=off')
 _N, _P, _COLUMNS = 2, 3, 9  # joints, parameters, columns of a row: xi1, torque, theta
+Step = Callable[[float, np.ndarray], None]
+State = Callable[[], tuple[np.ndarray, np.ndarray]]
+CONTROLLER = ControllerConfig()
+PLANT = PlantConfig()
+T = PLANT.sample_time
+_ARM = PLANT.arm
+_A = (
+    np.array([]),
+    np.array([1 / 5]),
+    np.array([3 / 40, 9 / 40]),
+    np.array([44 / 45, -56 / 15, 32 / 9]),
+    np.array([19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729]),
+    np.array([9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656]),
+)
+_B = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
+_NODES = (0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0)
 
 
 class Reference:
@@ -162,15 +178,6 @@ def _settings(controller: ControllerConfig, plant: PlantConfig) -> ctypes.Struct
     return settings
 
 
-Step = Callable[[float, np.ndarray], None]
-State = Callable[[], tuple[np.ndarray, np.ndarray]]
-
-CONTROLLER = ControllerConfig()
-PLANT = PlantConfig()
-T = PLANT.sample_time
-_ARM = PLANT.arm
-
-
 def disturbance(t: float) -> np.ndarray:
     """Return tau_dist (2,) [N m]."""
     d = PLANT.disturbance
@@ -245,18 +252,6 @@ def mujoco_loop(duration: float) -> np.ndarray:
         mujoco.mj_step(model, data)
 
     return run(duration, lambda: (data.qpos.copy(), data.qvel.copy()), step)
-
-
-_A = (
-    np.array([]),
-    np.array([1 / 5]),
-    np.array([3 / 40, 9 / 40]),
-    np.array([44 / 45, -56 / 15, 32 / 9]),
-    np.array([19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729]),
-    np.array([9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656]),
-)
-_B = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
-_NODES = (0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0)
 
 
 def _integrated(

@@ -30,6 +30,10 @@ _UNSEEN = 0.5  # of the prior's variance; parameters that keep more are not show
 _LASTING = 0.05  # of the motion, longest correlation length of noise
 _POOR = 0.2  # of the torque, largest accepted error on the part held back
 _LEAST_GRAVITY, _MOST_GRAVITY = 0.4, 1.6  # of the URDF's; beyond, it is missing or double
+_DIGITS = 4  # decimals of an angle [rad] in the file
+_UNITS = {'frequency': 'rad/s, of the cosines, then of the sines'}
+_UNSHOWN = 0.8  # of the prior's deviation; parameters that keep more are hardly shown
+_WIDTH = 98
 
 
 def identify(options: Namespace) -> None:
@@ -208,12 +212,6 @@ def problems_of(found: Identified, effort: str) -> Iterator[str]:
             'N m (currents need --gains), is --gravity given in the base frame, and was the load '
             'the same throughout?'
         )
-
-
-_DIGITS = 4  # decimals of an angle [rad] in the file
-_UNITS = {'frequency': 'rad/s, of the cosines, then of the sines'}
-_UNSHOWN = 0.8  # of the prior's deviation; parameters that keep more are hardly shown
-_WIDTH = 98
 
 
 def excite(options: Namespace) -> None:

@@ -49,6 +49,8 @@ STOPPED = 5
 
 _FOLDER = 'closed_loop'
 _DURATION = 60.0  # s, if neither the file nor an option sets it
+_FORMAT = '{desc} |{bar}| {n:.1f}/{total:g} s [{elapsed}<{remaining}]{postfix}'
+_LINE_PERIOD = 10.0  # s between two lines if stderr is not a terminal
 
 
 def run(options: Namespace) -> int:
@@ -189,10 +191,6 @@ def _report(out: Path) -> bool:
     print(f'wrote       {out}: bag, summary.json, {", ".join(path.name for path in pictures)}')
     last = recorded.stamp[-1]  # the plant ends after it, so the controller times out
     return any(stop.stamp < last or stop.reason != Reason.STATE_TIMEOUT for stop in recorded.stops)
-
-
-_FORMAT = '{desc} |{bar}| {n:.1f}/{total:g} s [{elapsed}<{remaining}]{postfix}'
-_LINE_PERIOD = 10.0  # s between two lines if stderr is not a terminal
 
 
 class Progress:

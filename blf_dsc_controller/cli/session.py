@@ -51,6 +51,12 @@ _ROOM = 1_000_000  # bytes; with less free space the disk counts as full
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)  # loaded before there are threads
 _VIEW_PORT = 8080  # or the next free one
+FIRST_SIGN = 5.0  # s, at most, to the first message of a running loop, even on a busy machine
+_LAST = 1.0  # s without a message after which none is expected, even on a busy machine
+_LINGER = 0.5  # s to wait for messages of an interrupted loop that still runs
+_RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+_DOMAINS = range(1, 101)  # 0 is the default; above 101, ports are ephemeral
 
 
 def run_session(config: LoopConfig, out: Path, domain: int | None, view_host: str = '') -> bool:
@@ -215,11 +221,6 @@ def _die_with_parent() -> None:
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
 
 
-FIRST_SIGN = 5.0  # s, at most, to the first message of a running loop, even on a busy machine
-_LAST = 1.0  # s without a message after which none is expected, even on a busy machine
-_LINGER = 0.5  # s to wait for messages of an interrupted loop that still runs
-
-
 class ProgressMonitor:
     """Progress display of the loop that runs in this process's ROS domain."""
 
@@ -287,11 +288,6 @@ class ProgressMonitor:
 
     def _receive(self, message: JointState) -> None:
         self._latest = message
-
-
-_RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
-_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
-_DOMAINS = range(1, 101)  # 0 is the default; above 101, ports are ephemeral
 
 
 def localhost_environment() -> dict[str, str]:

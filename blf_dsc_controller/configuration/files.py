@@ -45,6 +45,12 @@ _SPECIAL = re.compile(r'[+-]?(?i:inf|infinity|nan)|[+-]?\.(?:inf|Inf|INF)|\.(?:n
 
 _PARAMETERS = 'ros__parameters'
 _PART = re.compile(r'\*|\*\*|[A-Za-z_][A-Za-z0-9_]*')
+_PACKAGE = 'blf_dsc_controller'
+_LARGEST = 1 << 24  # bytes of a parameter file, a URDF or a metadata.yaml
+_MOST_NODES = 50_000
+_DEEPEST = 50
+_Parser: Any = getattr(yaml, 'CLoader', yaml.Loader)  # ten times as fast, if available
+_Loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
 class Entry(NamedTuple):
@@ -207,9 +213,7 @@ def _repeated(line: int, name: str, first: int) -> ConfigurationError:
     return _error(line, f'{name} is repeated, first given on line {first}')
 
 
-_PACKAGE = 'blf_dsc_controller'
 _CHECKOUT = Path(__file__).resolve().parents[2]
-_LARGEST = 1 << 24  # bytes of a parameter file, a URDF or a metadata.yaml
 
 
 def share_folder() -> Path:
@@ -279,13 +283,6 @@ def _candidates() -> Iterator[Path]:
         yield Path(get_package_share_directory(_PACKAGE))
     for scheme in (sysconfig.get_default_scheme(), sysconfig.get_preferred_scheme('user')):
         yield Path(sysconfig.get_path('data', scheme), 'share', _PACKAGE)
-
-
-_MOST_NODES = 50_000
-_DEEPEST = 50
-
-_Parser: Any = getattr(yaml, 'CLoader', yaml.Loader)  # ten times as fast, if available
-_Loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
 class UnreasonableYamlError(yaml.MarkedYAMLError):

@@ -43,6 +43,25 @@ WATCHDOG = 'torque_watchdog'
 _of_bag = partial(parameter, read_only='a bag is opened once, when the recorder starts')
 _of_view = partial(parameter, read_only='the page is served once, when the node starts')
 _of_markers = partial(parameter, read_only='it is read once, when the node starts')
+Config = TypeVar('Config')
+_PREFACE = """\
+# Parameters
+
+All parameters of all nodes; the defaults are the recommended set. One parameter file serves all
+nodes ([config/recommended.yaml](../config/recommended.yaml) has all of them); a file needs only the
+parameters it changes. Values of type double need a decimal point: `1.0`, not `1`. Arrays have one
+entry per joint unless the range says otherwise.
+
+A dot under *live* marks a parameter that can change while the node runs (`ros2 param set`); the
+others are fixed at the start, and `ros2 param describe` gives the reason.
+
+This page is generated: `python -m blf_dsc_controller.configuration.nodes
+doc/parameters.md`.
+"""
+_HEADER = (
+    '| name | description | default | unit | range | live | type | symbol |\n'
+    '| --- | --- | --- | --- | --- | --- | --- | --- |\n'
+)
 
 
 @dataclass(frozen=True)
@@ -201,9 +220,6 @@ def is_builtin(name: str) -> bool:
     """Whether ROS itself, not this package, declares the parameter."""
     builtin = ('use_sim_time', 'start_type_description_service')
     return name in builtin or name.startswith('qos_overrides.')
-
-
-Config = TypeVar('Config')
 
 
 def locate(given: str | Path) -> Path:
@@ -393,27 +409,6 @@ def unmatched_sections(sections: Sequence[Section], nodes: Iterable[str]) -> Ite
                 f'line {section.line}: {section.pattern} does not match {full}: write /**/{name} '
                 'for the node in any namespace'
             )
-
-
-_PREFACE = """\
-# Parameters
-
-All parameters of all nodes; the defaults are the recommended set. One parameter file serves all
-nodes ([config/recommended.yaml](../config/recommended.yaml) has all of them); a file needs only the
-parameters it changes. Values of type double need a decimal point: `1.0`, not `1`. Arrays have one
-entry per joint unless the range says otherwise.
-
-A dot under *live* marks a parameter that can change while the node runs (`ros2 param set`); the
-others are fixed at the start, and `ros2 param describe` gives the reason.
-
-This page is generated: `python -m blf_dsc_controller.configuration.nodes
-doc/parameters.md`.
-"""
-
-_HEADER = (
-    '| name | description | default | unit | range | live | type | symbol |\n'
-    '| --- | --- | --- | --- | --- | --- | --- | --- |\n'
-)
 
 
 def parameter_page() -> str:

@@ -37,6 +37,8 @@ from sim_plant.arms import parameter_names_of
 from sim_plant.plant import Plant, plant_of, steps_of
 
 _CHUNK = 1000  # samples; the guard takes about 20 ms for them
+START = 1_000_000_000
+"""Stamp of the first sample [ns], as in lock-step."""
 
 
 @kernel
@@ -216,10 +218,6 @@ def _run_samples(
         *arrays,
         controller.checks_vector,
     )
-
-
-START = 1_000_000_000
-"""Stamp of the first sample [ns], as in lock-step."""
 
 
 @dataclass(frozen=True)

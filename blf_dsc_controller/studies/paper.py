@@ -35,6 +35,30 @@ from blf_dsc_controller.studies.paper_claims import FAILS, HOLDS, ONLY_IF, Claim
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 
 _STYLES = {HOLDS: 'good', ONLY_IF: 'partly', FAILS: 'bad'}
+_PAIRS = (  # name, caption, labels and cases
+    (
+        'tuned',
+        'both laws tuned by the same procedure',
+        {'proposed': 'paper_tuned', 'comparison': 'comparison'},
+    ),
+    (
+        'low_gains',
+        "the paper's choices against a comparison with low gains",
+        {'proposed': 'paper', 'comparison': 'comparison_detuned'},
+    ),
+    (
+        'recommended',
+        'the recommended form against the tuned comparison',
+        {'recommended': 'recommended', 'comparison': 'comparison'},
+    ),
+)
+_TRACKING = (6.4, 2.5)  # inches
+_ESTIMATES = (8.6, 2.4)
+_PANEL = (4.6, 2.9)
+_COLUMNS = 3
+_UNTIL = 10.0  # s, end of Fig. 2
+_BROKEN = 10.0  # multiple of the bound at which all larger ratios are drawn
+_MARKS = 'os^D'
 
 
 def compare(folder: Path) -> list[Claim]:
@@ -130,32 +154,6 @@ def _robustness(results: Results) -> Iterator[tuple[object, ...]]:
 def _write_csv(path: Path, rows: Iterable[Iterable[object]]) -> None:
     with path.open('w', encoding='utf-8', newline='') as file:
         csv.writer(file).writerows(rows)
-
-
-_PAIRS = (  # name, caption, labels and cases
-    (
-        'tuned',
-        'both laws tuned by the same procedure',
-        {'proposed': 'paper_tuned', 'comparison': 'comparison'},
-    ),
-    (
-        'low_gains',
-        "the paper's choices against a comparison with low gains",
-        {'proposed': 'paper', 'comparison': 'comparison_detuned'},
-    ),
-    (
-        'recommended',
-        'the recommended form against the tuned comparison',
-        {'recommended': 'recommended', 'comparison': 'comparison'},
-    ),
-)
-_TRACKING = (6.4, 2.5)  # inches
-_ESTIMATES = (8.6, 2.4)
-_PANEL = (4.6, 2.9)
-_COLUMNS = 3
-_UNTIL = 10.0  # s, end of Fig. 2
-_BROKEN = 10.0  # multiple of the bound at which all larger ratios are drawn
-_MARKS = 'os^D'
 
 
 def draw_pairs(results: Results, folder: Path) -> Iterator[tuple[Path, str]]:

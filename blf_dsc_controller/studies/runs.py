@@ -89,6 +89,15 @@ Row = dict[str, float | int | str]
 Columns = dict[str, np.ndarray]
 """Results by column name, one entry per run."""
 
+_STUDY = 'study.yaml'
+_VERSIONS = 'versions.json'
+_RUNS = 'runs'
+_PART = re.compile(r'runs-(\d+)-(\d+)\.parquet')
+RETRIES = 3
+"""Consecutive losses of all workers that are tolerated before any has finished a chunk."""
+
+_AHEAD = 3  # chunks submitted for each worker
+
 
 def run_chunk(study: Study, first: int, count: int) -> Columns:
     """Compute runs `first` to `first + count - 1`.
@@ -211,12 +220,6 @@ def _rejected(study: Study, record: Record, plant: Plant, origin: Origin) -> Row
     for joint, ratio in zip(study.plant.joints, np.abs(q - origin.qr) / origin.bound, strict=True):
         found[f'max_error_ratio.{joint}'] = float(ratio)
     return found | {'outcome': REJECTED, 'first_violation_s': 0.0}
-
-
-_STUDY = 'study.yaml'
-_VERSIONS = 'versions.json'
-_RUNS = 'runs'
-_PART = re.compile(r'runs-(\d+)-(\d+)\.parquet')
 
 
 class Span(NamedTuple):
@@ -376,12 +379,6 @@ def _create(folder: Path, study: Study) -> None:
     text = json.dumps(versions(), indent=2) + '\n'
     (unfinished / _VERSIONS).write_text(text, encoding='utf-8')
     unfinished.rename(folder)
-
-
-RETRIES = 3
-"""Consecutive losses of all workers that are tolerated before any has finished a chunk."""
-
-_AHEAD = 3  # chunks submitted for each worker
 
 
 class Engine(NamedTuple):

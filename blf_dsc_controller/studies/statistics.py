@@ -37,8 +37,22 @@ _DRAWN = 'plant.'
 
 ALLOWED = 1.3
 """Largest error with learning that is called no larger than that without, as a factor."""
+
 LAWS = {'': 'with', WITHOUT: 'without'}
 """The laws of a study of pairs: what they are called, by the prefix of their columns."""
+
+_PANEL = (6.2, 3.4)  # inches
+_MOST_BINS = 60
+_PANELS_OF_INFLUENCE = 6
+_MOST_DOTS = 20_000
+_FEW_DOTS = 1000
+_LEAST_ERROR = 1e-6
+_FAR = 1.25  # |xi1| / k_c of the last bar, which includes all larger ones
+_LEAST_RATIO = 0.03  # smallest |xi1| / k_c drawn beside each other
+_FARTHEST = 2.0  # largest |xi1| / k_c drawn; larger ones are clipped
+_FEW_DECADES = 50.0
+_RATIO = r'max $|\xi_1| \; / \; k_c$'
+_PERCENT = FuncFormatter(lambda value, _: f'{100 * value:g} %')
 
 
 def summarize(study: Study, results: Columns) -> Summary:
@@ -185,20 +199,6 @@ def _one_run(study: Study, results: Columns, row: int) -> Summary:
         'first_violation_s': None if math.isnan(violation) else violation,
         'drawn': drawn,
     }
-
-
-_PANEL = (6.2, 3.4)  # inches
-_MOST_BINS = 60
-_PANELS_OF_INFLUENCE = 6
-_MOST_DOTS = 20_000
-_FEW_DOTS = 1000
-_LEAST_ERROR = 1e-6
-_FAR = 1.25  # |xi1| / k_c of the last bar, which includes all larger ones
-_LEAST_RATIO = 0.03  # smallest |xi1| / k_c drawn beside each other
-_FARTHEST = 2.0  # largest |xi1| / k_c drawn; larger ones are clipped
-_FEW_DECADES = 50.0
-_RATIO = r'max $|\xi_1| \; / \; k_c$'
-_PERCENT = FuncFormatter(lambda value, _: f'{100 * value:g} %')
 
 
 def draw_study(study: Study, results: Columns, folder: Path) -> list[Path]:
