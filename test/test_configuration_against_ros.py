@@ -113,7 +113,7 @@ def test_files_rejected_by_ros_are_rejected(context, tmp_path, text):
 
 
 @pytest.mark.parametrize('node', ['sim_plant', 'blf_dsc_controller', 'bag_recorder'])
-@pytest.mark.parametrize('preset', ['recommended', 'noisy'])
+@pytest.mark.parametrize('preset', ['panda', 'noisy'])
 def test_presets_have_the_same_values(context, preset, node):
     ours = without_ros(locate(preset), f'/{node}')
     expected = with_ros(context, locate(preset), f'/{node}')

@@ -16,8 +16,6 @@ from blf_dsc_controller.configuration.nodes import (
     RecorderConfig,
     known_names,
     load_loop,
-    locate,
-    read,
 )
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, parameters
@@ -40,15 +38,6 @@ def test_defaults_are_valid(cls):
 
 def test_recommended_preset_equals_the_defaults():
     assert load_loop('recommended') == DEFAULTS
-
-
-@pytest.mark.parametrize('node', NODES)
-def test_recommended_preset_lists_every_parameter(node):
-    sections = read(locate('recommended'))
-    listed = {
-        name for section in sections if section.matches(f'/{node}') for name in section.entries
-    }
-    assert listed >= {parameter.name for parameter in parameters(NODES[node])}
 
 
 def test_noisy_preset_changes_only_sensors_and_delay():

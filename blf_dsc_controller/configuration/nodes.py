@@ -48,8 +48,8 @@ _PREFACE = """\
 # Parameters
 
 All parameters of all nodes; the defaults are the recommended set. One parameter file serves all
-nodes ([config/recommended.yaml](../config/recommended.yaml) has all of them); a file needs only the
-parameters it changes. Values of type double need a decimal point: `1.0`, not `1`. Arrays have one
+nodes and needs only the parameters it changes; `blf_dsc run` writes one with all values into its
+folder, `config.yaml`. Values of type double need a decimal point: `1.0`, not `1`. Arrays have one
 entry per joint unless the range says otherwise.
 
 A dot under *live* marks a parameter that can change while the node runs (`ros2 param set`); the
