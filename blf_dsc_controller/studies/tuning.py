@@ -104,7 +104,7 @@ TASKS = {
 }
 
 
-def settings_of(task: Task, exponents: Floats) -> dict[str, object]:
+def parameters_at(task: Task, exponents: Floats) -> dict[str, object]:
     """Return the parameters of a point, whose coordinates are log10 of the gains."""
     chosen: dict[str, object] = dict(task.fixed)
     per_joint: dict[str, list[float]] = {}
@@ -134,7 +134,7 @@ def objective(exponents: Floats, task: Task, loops: Sequence[LoopConfig]) -> flo
     """Return the mean of `cost_of` over the plants."""
     values = []
     for loop in loops:
-        config = change(loop.controller, settings_of(task, exponents))
+        config = change(loop.controller, parameters_at(task, exponents))
         with np.errstate(all='ignore'):
             metrics = measure(simulate(config, loop.plant, supervised=False).run())
             values.append(cost_of(metrics, config.sample_time))
@@ -199,7 +199,7 @@ def preset(name: str, exponents: Floats, value: float, evaluations: int) -> str:
     changes = {key: entry for key, entry in base.items() if entry != defaults[key]}
     lines = ''.join(
         f'    {key}: {format_value(tuple(entry) if isinstance(entry, list) else entry)}\n'  # type: ignore[arg-type]
-        for key, entry in {**changes, **settings_of(task, exponents)}.items()
+        for key, entry in {**changes, **parameters_at(task, exponents)}.items()
     )
     return (
         f'# {task.title}.\n'
