@@ -28,7 +28,7 @@ from blf_dsc_controller.studies.laws import (
     load_laws,
     run,
 )
-from blf_dsc_controller.studies.tuning import HOPELESS, search
+from blf_dsc_controller.studies.tuning import bounded, search, value_at
 
 POPULATION = 16
 ROUGHEST = 0.05
@@ -86,7 +86,7 @@ def trial(name: str, seed: int) -> LoopConfig:
 def values_of(name: str, exponents: Floats) -> dict[str, float]:
     """Return the gains of a contender from their decimal logarithms."""
     pairs = zip(CONTENDERS[name].gains, exponents, strict=True)
-    return {gain.name: float(f'{10.0**exponent:.3g}') for gain, exponent in pairs}
+    return {gain.name: value_at(exponent) for gain, exponent in pairs}
 
 
 def cost_of(figures: Figures) -> float:
@@ -95,8 +95,7 @@ def cost_of(figures: Figures) -> float:
     Each decade of torque roughness beyond ROUGHEST adds ten.
     """
     rough = max(np.log10(figures.roughness / ROUGHEST), 0.0)
-    cost = float(np.mean(np.log10(1e3 * np.array(figures.errors))) + 10.0 * rough)
-    return min(cost, HOPELESS) if np.isfinite(cost) else HOPELESS
+    return bounded(np.mean(np.log10(1e3 * np.array(figures.errors))) + 10.0 * rough)
 
 
 def tuning_cost(exponents: Floats, name: str, loop: LoopConfig, unseen: Floats) -> float:
@@ -159,10 +158,10 @@ def compare(
             for name in names:
                 bar.set_description(f'{arm} {name}')
                 gains, cost = {}, None
-                if ranges := CONTENDERS[name].gains:
+                if tuned_gains := CONTENDERS[name].gains:
                     point, cost, _ = search(
                         partial(tuning_cost, name=name, loop=loops[arm][0], unseen=unseen),
-                        np.log10([(gain.least, gain.most) for gain in ranges]),
+                        tuned_gains,
                         POPULATION,
                         generations,
                         workers=computed,

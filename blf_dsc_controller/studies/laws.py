@@ -41,6 +41,7 @@ from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.simulation.metrics import torque_error
+from blf_dsc_controller.studies.tuning import Gain
 from sim_plant import kernels as plants
 from sim_plant.arm import Arm
 from sim_plant.plant import plant_of, steps_of
@@ -212,15 +213,6 @@ def simulate_with(
         *(law, known, motion.vector, rows.reshape(len(rows), -1)),
     )
     return rows[:, 6] - rows[:, 3], rows[:, 7]
-
-
-class Gain(NamedTuple):
-    """One tuned number: its name, its range, and whether it multiplies each joint's inertia m."""
-
-    name: str
-    least: float
-    most: float
-    inertial: bool = False
 
 
 class Contender(NamedTuple):

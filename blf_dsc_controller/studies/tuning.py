@@ -43,14 +43,15 @@ PLANTS = ('recommended', 'noisy')
 """Presets whose plants a law is tuned on."""
 
 
-class TunedGain(NamedTuple):
-    """One tuned number: the parameter it sets, its range, and its joint."""
+class Gain(NamedTuple):
+    """One tuned number: the parameter or gain it sets, and its range."""
 
     name: str
     least: float
     most: float
-    joint: int = -1  # 0 or 1; -1: both, or a scalar
-    length: int = 2  # entries of the parameter; 0: a scalar
+    inertial: bool = False  # multiplies the inertia m of each joint of an arm from a URDF
+    joint: int = -1  # 0 or 1, of the paper's arm; -1: both, or a scalar
+    length: int = 2  # entries of the parameter of the paper's arm; 0: a scalar
 
 
 class Task(NamedTuple):
@@ -59,28 +60,28 @@ class Task(NamedTuple):
     title: str
     preset: str
     fixed: Mapping[str, object]
-    gains: tuple[TunedGain, ...]
+    gains: tuple[Gain, ...]
 
 
 _SHARED = (
-    TunedGain('feedback.gain', 5.0, 200.0, joint=0),
-    TunedGain('feedback.gain', 2.0, 100.0, joint=1),
-    TunedGain('learning.adaptation_gain', 0.01, 30.0, length=3),
+    Gain('feedback.gain', 5.0, 200.0, joint=0),
+    Gain('feedback.gain', 2.0, 100.0, joint=1),
+    Gain('learning.adaptation_gain', 0.01, 30.0, length=3),
 )
-_SURFACE_OF_35 = TunedGain('comparison.surface_gain', 10.0, 300.0)
+_SURFACE_OF_35 = Gain('comparison.surface_gain', 10.0, 300.0)
 _PROPOSED = (
     *_SHARED,
-    TunedGain('surface.gain', 10.0, 600.0),
-    TunedGain('surface.mu', 1.0, 100.0),
-    TunedGain('disturbance.gain', 0.1, 300.0),
-    TunedGain('learning.weight', 0.1, 100.0, length=0),
+    Gain('surface.gain', 10.0, 600.0),
+    Gain('surface.mu', 1.0, 100.0),
+    Gain('disturbance.gain', 0.1, 300.0),
+    Gain('learning.weight', 0.1, 100.0, length=0),
 )
 _COMPARISON = (
     *_SHARED,
     _SURFACE_OF_35,
-    TunedGain('comparison.position_gain', 0.1, 1e4),
-    TunedGain('comparison.robust_gain', 1e-3, 5.0),
-    TunedGain('comparison.leakage', 1e-5, 1.0, length=0),
+    Gain('comparison.position_gain', 0.1, 1e4),
+    Gain('comparison.robust_gain', 1e-3, 5.0),
+    Gain('comparison.leakage', 1e-5, 1.0, length=0),
 )
 TASKS = {
     'proposed': Task(
@@ -104,12 +105,22 @@ TASKS = {
 }
 
 
+def value_at(exponent: float) -> float:
+    """Return a gain from its decimal logarithm, to three digits."""
+    return float(f'{10.0**exponent:.3g}')
+
+
+def bounded(cost: float) -> float:
+    """Return a cost that the search can compare, also of a run that diverged."""
+    return min(float(cost), HOPELESS) if np.isfinite(cost) else HOPELESS
+
+
 def parameters_at(task: Task, exponents: Floats) -> dict[str, object]:
     """Return the parameters of a point, whose coordinates are log10 of the gains."""
     chosen: dict[str, object] = dict(task.fixed)
     per_joint: dict[str, list[float]] = {}
     for gain, exponent in zip(task.gains, exponents, strict=True):
-        value = float(f'{10.0**exponent:.3g}')
+        value = value_at(exponent)
         if gain.joint >= 0:
             per_joint.setdefault(gain.name, [0.0, 0.0])[gain.joint] = value
         else:
@@ -138,7 +149,7 @@ def objective(exponents: Floats, task: Task, loops: Sequence[LoopConfig]) -> flo
         with np.errstate(all='ignore'):
             metrics = measure(simulate(config, loop.plant, supervised=False).run())
             values.append(cost_of(metrics, config.sample_time))
-    return min(float(np.mean(values)), HOPELESS)
+    return bounded(float(np.mean(values)))
 
 
 def loops_of(task: Task) -> list[LoopConfig]:
@@ -150,16 +161,17 @@ def loops_of(task: Task) -> list[LoopConfig]:
 
 def search(
     cost: Callable[[Floats], float],
-    ranges: Floats,
+    gains: Sequence[Gain],
     population: int,
     generations: int,
     **options: Any,
 ) -> tuple[Floats, float, int]:
-    """Return the best point within the ranges (k, 2), its cost, and the number of evaluations.
+    """Return the best point (log10 of the gains), its cost, and the number of evaluations.
 
     Differential evolution with a fixed seed from a Latin hypercube, of the same size for every
     law; `options` are passed to scipy.
     """
+    ranges = np.log10([(gain.least, gain.most) for gain in gains])
     points = qmc.LatinHypercube(len(ranges), seed=np.random.default_rng(SEED)).random(population)
     found = differential_evolution(
         cost,
@@ -177,14 +189,13 @@ def search(
 def tune(task: Task) -> tuple[Floats, float, int]:
     """Return the best exponents, their objective, and the number of evaluations."""
     loops = loops_of(task)
-    ranges = np.log10([(gain.least, gain.most) for gain in task.gains])
     with tqdm(total=EVALUATIONS, desc='tuning', unit='run') as bar:
 
         def cost(exponents: Floats) -> float:
             bar.update()
             return objective(exponents, task, loops)
 
-        return search(cost, ranges, POPULATION, GENERATIONS)
+        return search(cost, task.gains, POPULATION, GENERATIONS)
 
 
 def preset(name: str, exponents: Floats, value: float, evaluations: int) -> str:
