@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command `blf_dsc`, the aliases of its sub-commands, and the executables of the nodes.
+"""The command `blf_dsc`, and the executables of the nodes.
 
 Sub-commands are imported when they run, so `--help` is fast and needs neither ROS nor extras.
 """
@@ -112,6 +112,21 @@ def require_ros() -> None:
         ) from error
 
 
+def make_room(*paths: Path, force: bool) -> None:
+    """Prepare `paths` for writing; a symbolic link is replaced instead of followed.
+
+    Raises BlfDscError if one of them exists, unless `force` is set.
+    """
+    existing = [path for path in paths if os.path.lexists(path)]
+    if existing and not force:
+        names = ', '.join(str(path) for path in existing)
+        exist = 'exists' if len(existing) == 1 else 'exist'
+        raise BlfDscError(f'{names} {exist} already: choose another path, or use --force')
+    for path in existing:
+        if path.is_symlink():
+            path.unlink()
+
+
 def _node(module: str) -> int:
     _keep_to_one_thread()
     for number in (signal.SIGINT, signal.SIGTERM):  # until the node installs its own handlers
@@ -131,18 +146,3 @@ bag_recorder = partial(_node, 'blf_dsc_controller.nodes.recorder_node')
 arm_markers = partial(_node, 'blf_dsc_controller.nodes.markers_node')
 torque_watchdog = partial(_node, 'blf_dsc_controller.nodes.watchdog_node')
 arm_view = partial(_node, 'blf_dsc_controller.view.node')
-
-
-def make_room(*paths: Path, force: bool) -> None:
-    """Prepare `paths` for writing; a symbolic link is replaced instead of followed.
-
-    Raises BlfDscError if one of them exists, unless `force` is set.
-    """
-    existing = [path for path in paths if os.path.lexists(path)]
-    if existing and not force:
-        names = ', '.join(str(path) for path in existing)
-        exist = 'exists' if len(existing) == 1 else 'exist'
-        raise BlfDscError(f'{names} {exist} already: choose another path, or use --force')
-    for path in existing:
-        if path.is_symlink():
-            path.unlink()
