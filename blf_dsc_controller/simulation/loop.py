@@ -16,6 +16,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import kernel
+from blf_dsc_controller.compiled.layout import part, view
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
