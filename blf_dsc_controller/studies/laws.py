@@ -85,7 +85,7 @@ class Now(NamedTuple):
 class Law(Protocol):
     """A law: a `NamedTuple` of its gains (float), its memory and its scratch (arrays)."""
 
-    def command(self, arm: Known, now: Now, torque: Array) -> None:
+    def fill_torque(self, arm: Known, now: Now, torque: Array) -> None:
         """Write the torque (n,) [N m]; the loop cuts it at its limit afterwards."""
 
 
@@ -102,7 +102,7 @@ class ModelBased(NamedTuple):
     a: Array  # (n,) rad/s^2, acceleration of the model
     H: Array  # (n, p)
 
-    def command(self, arm: Known, now: Now, torque: Array) -> None:
+    def fill_torque(self, arm: Known, now: Now, torque: Array) -> None:
         """Write the torque."""
         n = now.q.size
         for i in range(n):
@@ -158,7 +158,7 @@ def _run(
         plants.draw_noise(plant, state, rng)
         plants.observe(plant, state, part(row, 0, (3 * n,)))
         reference.evaluate(view(motion), (k * plant.period_ns) * 1e-9, qr, dqr, ddqr)
-        law.command(known, Now(dt, q, dq, qr, dqr, ddqr), torque)
+        law.fill_torque(known, Now(dt, q, dq, qr, dqr, ddqr), torque)
         for i in range(n):
             row[6 * n + i] = state.x[i]
             torque[i] = min(max(torque[i], -known.limit[i]), known.limit[i])
@@ -168,7 +168,7 @@ def _run(
 @functools.cache
 def _loop_with(law: type) -> Callable[..., None]:
     """Return the loop compiled for a type of law, from its cache if its file has not changed."""
-    compile_methods(Law, ('command',), law)
+    compile_methods(Law, ('fill_torque',), law)
     return kernel(_run)
 
 
