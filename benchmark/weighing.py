@@ -27,7 +27,7 @@ from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.law.telemetry import columns_of
 from blf_dsc_controller.reference.limits import MotionError
 from blf_dsc_controller.run import Floats
-from blf_dsc_controller.simulation.loop import simulate_law
+from blf_dsc_controller.simulation.loop import simulate
 
 _LOAD = 2.0  # kg
 _AFTER = (1.0, 2.0, 3.0)  # s, from the pick-up to a reading
@@ -80,7 +80,7 @@ def _weighed(name: str, seed: int) -> Floats:
     while True:
         config = _random_loop(name, seed, begin, random)
         try:
-            record = simulate_law(config.controller, config.plant)
+            record = simulate(config.controller, config.plant, supervised=False)
         except MotionError:
             continue
         break
@@ -92,7 +92,7 @@ def _weighed(name: str, seed: int) -> Floats:
 def _times(name: str) -> str:
     """Return median times: the law; the weighing without a row, with one, and with a solution."""
     config = load_loop(locate(name), {PLANT: {'duration': 8.0}})
-    record = simulate_law(config.controller, config.plant)
+    record = simulate(config.controller, config.plant, supervised=False)
     controller, T = controller_of(config.controller), config.controller.sample_time
     n = controller.settings.n
     begin(controller, config.controller, *record.measurements[0, : 2 * n].reshape(2, n))

@@ -57,7 +57,7 @@ def run_loop(
     first: int,
     last: int,
     is_end: bool,
-    energies: bool,
+    observed: bool,
     measurements: np.ndarray,
     samples: np.ndarray,
     truths: np.ndarray,
@@ -65,7 +65,7 @@ def run_loop(
 ) -> bool:
     """Run the samples `first` to `last`; with `is_end`, the torque of the last is not applied.
 
-    The terms of (29) are computed with `energies`; they take 5 % of a run of two links.
+    What no torque depends on, the terms of (29) and the weighing, is computed with `observed`.
     With checks (`law.checks`), stop at the first invalid or suspect sample and return False.
     """
     law = settings_of(settings, sizes, model)
@@ -86,7 +86,7 @@ def run_loop(
             return False
         step(law, reference_view, law_state, law_signals, t, dt, measurement, sample)
         plants.truth(plant, now, true[k - first])
-        if energies:
+        if observed:
             fill_energies(law, law_state, law_signals, part(measurement, 0, (law.n,)), sample)
             add_row(law, law_state, law_signals, dt)
         if is_checked and check_sample(law, checks, law_state, law_signals, sample) & SUSPECT:
@@ -128,8 +128,8 @@ def simulate(
     return record
 
 
-def run_alone(record: Record, plant: Plant, *, energies: bool = True) -> None:
-    """Fill a record, with or without the terms of (29), by its law alone from the beginning.
+def run_alone(record: Record, plant: Plant, *, observed: bool = True) -> None:
+    """Fill a record, by its law alone from the beginning; `observed` as in `run_loop`.
 
     Raises StartError if the law cannot take over and approach.enabled is false, and MotionError if
     there is no approach within the limits.
@@ -137,7 +137,7 @@ def run_alone(record: Record, plant: Plant, *, energies: bool = True) -> None:
     q, dq, _ = plant.measure().reshape(3, -1)
     begin(record.controller, record.config, q, dq)
     arrays = record.measurements, record.samples, record.truths
-    samples = 0, record.stamps.size - 1, True, energies
+    samples = 0, record.stamps.size - 1, True, observed
     _run_samples(record.controller, plant, samples, arrays)
 
 
@@ -203,7 +203,7 @@ def _run_samples(
     samples: tuple[int, int, bool, bool],
     arrays: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> bool:
-    """Call `run_loop` on samples (first, last, is_end, energies), into measurements and so on."""
+    """Call `run_loop` on samples (first, last, is_end, observed), into measurements and so on."""
     return run_loop(
         plant.arm,
         plant.settings,

@@ -203,7 +203,7 @@ def _run(study: Study, index: int, records: dict[str, Record], unseen: Floats | 
         record.controller.reset()
         try:
             with np.errstate(all='ignore'):  # a run that diverges has figures too
-                run_alone(record, plant, energies=False)
+                run_alone(record, plant, observed=False)
                 found = figures_of(study, record, config, unseen)
         except (StartError, MotionError):
             plant.reset()
