@@ -6,6 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from blf_dsc_controller.analysis.summary import format_table, summarize
+from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop, locate
 from blf_dsc_controller.errors import ConfigurationError
@@ -13,7 +15,10 @@ from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.telemetry import columns_of, load_text
 from blf_dsc_controller.law.weighing import BEFORE, NEWER, describe, solve
 from blf_dsc_controller.law.window import add_products
+from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.view.bag import moments
+from blf_dsc_controller.view.tables import joint_table
 
 PICKED_UP, PUT_DOWN, END = 8.0, 12.0, 15.0  # s
 LOAD = 2.0  # kg
@@ -137,6 +142,22 @@ def test_weighing_what_cannot_be_weighed_is_rejected(given):
     with pytest.raises(ConfigurationError, match=r'weighing: got true with .*, but needs'):
         load_loop(locate('panda'), {CONTROLLER: {'learning.weighing': True, **given}})
     assert not ControllerConfig().learning.weighing
+
+
+def test_bag_tells_what_was_held_in_the_table_and_on_the_page(panda, tmp_path):
+    write_bag(tmp_path / 'bag', panda, panda.config, 'none')
+    run = read_run(tmp_path / 'bag')
+    summary = summarize(run)
+    until, masses = np.transpose(
+        [(load['until_s'], load['load mass']) for load in summary['loads']]
+    )
+    np.testing.assert_allclose(until, (PICKED_UP, PUT_DOWN, END), atol=0.2)
+    np.testing.assert_allclose(masses, (0.0, LOAD, 0.0), atol=0.05)
+    lines = [line for line in format_table(summary).splitlines() if line.startswith('held ')]
+    assert [' mm, until ' in line for line in lines] == [False, True, False]
+    shown = {round(moment.time): joint_table(run.joints, moment) for moment in moments(run, ())}
+    assert 'held' not in shown[3]
+    assert 'held: 2.0' in shown[11]
 
 
 def test_text_of_a_load_leaves_out_what_is_unknown():

@@ -35,12 +35,16 @@ def test_loop_with_such_a_driver_matches_the_offline_run_bit_for_bit(ros):
         'sensor.published_joints': ['gripper', *reversed(joints)],
     }
     law = ARM | {'learning.window': 1.0, 'telemetry.enabled': False, 'wait_for_subscribers': 1}
-    commands = ros.listen(topics.COMMANDS)
+    commands, diagnostics = ros.listen(topics.COMMANDS), ros.listen(topics.DIAGNOSTICS)
     node, controller = ros.loop(plant, law)
     ros.until(lambda: node.finished and len(commands) >= 2001)
     over_ros = torques(commands)
     np.testing.assert_array_equal(over_ros, simulated_torques(plant, law))
     assert controller.guard.supervisor.reason == 'none'
+    parts = [part for array in diagnostics for part in array.status]
+    (*_, load) = (part for part in parts if part.name.endswith('/load'))
+    assert load.message.startswith('held: ')
+    assert [pair.key for pair in load.values] == [*topics.LOAD]
 
 
 def test_first_states_may_be_incomplete(ros):
