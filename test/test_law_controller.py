@@ -42,7 +42,7 @@ from blf_dsc_controller.law.state import (
 )
 
 SHAPES = [(1, 1), (2, 3), (3, 4), (6, 30)]
-SIZES = ('n', 'p', 'm', 'tones', 'drive', 'drive_size', 'model')
+SIZES = ('n', 'p', 'm', 'tones', 'drive', 'drive_size', 'weighed', 'model')
 
 
 def distinct_settings(n, p):
