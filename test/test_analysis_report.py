@@ -142,3 +142,16 @@ def test_missing_bag_is_reported_as_one_message(tmp_path, capsys):
     assert main(['report', str(tmp_path / 'nowhere'), '--out', str(tmp_path / 'page.html')]) == 1
     assert capsys.readouterr().err.startswith('blf_dsc report: ')
     assert not (tmp_path / 'page.html').exists()
+
+
+@pytest.mark.usefixtures('blank_pictures')
+@pytest.mark.parametrize('value', [np.nan, np.inf, -1e308])
+def test_unknown_and_absurd_numbers_cause_no_warning(tmp_path, value):
+    """Warnings are errors here: numpy's would be seen beside the page."""
+    made = Synthetic(400)
+    made.position[50, 0] = made.error[60, 1] = made.reference[70, 0] = value
+    made.error[:, 0] = made.torque[:, 1] = made.estimate[:, 1] = value
+    made.disturbance[100:, 0] = made.latched[:] = value
+    bag = str(synthetic_bag.write(tmp_path / 'bag', made.messages(with_timing=True)))
+    for command, out in (('report', 'page.html'), ('plot', 'plots'), ('export', 'table.csv')):
+        assert main([command, bag, '--out', str(tmp_path / out)]) == 0

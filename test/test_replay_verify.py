@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import UnreadableMessageError
+from blf_dsc_controller.cli.bags import DIFFERENT, PARTIAL
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
@@ -89,29 +93,20 @@ def test_every_number_is_reproduced(bag):
         'bound': 4,
     }
     assert [item.left_out for item in result.comparisons if item.left_out] == ['compute_time']
+    # Otherwise this would not cover the composite learning.
+    assert read_run(bag).learning.column('latched')[-1] == 1.0
 
 
-@pytest.mark.parametrize('law', ['backstepping', 'slotine_li'])
-def test_other_laws_replay_from_compressed_bags(tmp_path, law):
-    path = recorded_run.record(tmp_path / law, 0.3, 'zstd', law=law)
-    assert verify(path).difference is None
-
-
-def test_narrowing_bound_replays(tmp_path):
+def test_other_laws_and_a_narrowing_bound_replay_from_compressed_bags(tmp_path):
     funnel = {'barrier.initial_bound': [0.02, 0.01], 'barrier.funnel_rate': 5.0}
-    result = verify(recorded_run.record(tmp_path / 'bag', 0.3, **funnel))
-    assert result.difference is None
-    assert ([item.type for item in result.events].count(EventType.PARAMETERS), result.remarks) == (
-        0,
-        (),
-    )
-
-
-def test_learning_has_started_in_the_bag(bag):
-    # Otherwise the replays above would not cover the composite learning.
-    content = read_content(bag)
-    latched = content.topics[LEARNING].joint_states(('latched',), ('position',))
-    assert latched.field(0)[-1, 0] == 1.0
+    for name, given in (
+        ('backstepping', {'law': 'backstepping'}),
+        ('slotine', {'law': 'slotine_li'}),
+        ('funnel', funnel),
+    ):
+        result = verify(recorded_run.record(tmp_path / name, 0.3, 'zstd', **given))
+        assert (result.difference, result.remarks) == (None, ())
+        assert EventType.PARAMETERS not in [item.type for item in result.events]
 
 
 @pytest.mark.parametrize(
@@ -120,38 +115,24 @@ def test_learning_has_started_in_the_bag(bag):
         (COMMANDS, -8, 'effort of joint2'),
         (TRACKING_ERROR, -8, 'effort of joint2'),
         (REFERENCE, -8 - 4, 'velocity of joint2'),  # followed by the empty effort
-        (LEARNING, -24, 'latched'),  # before model_changes, compute_time, velocity and effort
+        (LEARNING, -32, 'latched'),  # before model_changes, compute_time, velocity and effort
     ],
 )
-def test_flipped_bit_is_located_and_named(entries, rewritten, topic, at, field):
+def test_flipped_bit_is_located_and_named_and_the_earliest_counts(
+    entries, rewritten, topic, at, field
+):
     changed = [list(entry) for entry in entries]
-    raw = bytearray(of(changed, topic)[700][3])
-    at = at if topic is not LEARNING else at - 8
-    raw[at] ^= 1
-    of(changed, topic)[700][3] = bytes(raw)
+    for one, k, place in ((topic, 700, at), (COMMANDS, 800, -8), (LEARNING, 900, -40)):
+        raw = bytearray(of(changed, one)[k][3])
+        raw[place] ^= 1
+        of(changed, one)[k][3] = bytes(raw)
     difference = verify(rewritten(changed)).difference
-    assert difference.topic == topic.resolved
-    assert difference.field == field
+    assert (difference.topic, difference.field) == (topic.resolved, field)
     assert difference.stamp == START + 700 * MILLISECOND
     assert difference.time == pytest.approx(0.7)
     assert difference.recorded != difference.replayed
     assert difference.recorded == pytest.approx(difference.replayed, abs=1e-12)
     assert f'recorded {difference.recorded!r}, replayed {difference.replayed!r}' in str(difference)
-
-
-def test_earliest_of_several_differences_is_reported(entries, rewritten):
-    changed = [list(entry) for entry in entries]
-    for topic, k in ((COMMANDS, 500), (TRACKING_ERROR, 400), (LEARNING, 600)):
-        of(changed, topic)[k][3] = of(entries, topic)[k - 100][3][:20] + bytes(
-            len(of(entries, topic)[k][3]) - 20
-        )
-    for topic, k in ((TRACKING_ERROR, 400), (LEARNING, 600)):
-        of(changed, topic)[k][3] = of(entries, topic)[k][3][:-40] + bytes(40)
-    difference = verify(rewritten(changed)).difference
-    assert (difference.topic, difference.stamp) == (
-        TRACKING_ERROR.resolved,
-        START + 400 * MILLISECOND,
-    )
 
 
 def test_repeated_and_unused_states_are_skipped(entries, rewritten):
@@ -185,13 +166,6 @@ def test_recording_that_started_late_is_rejected(entries, rewritten):
     journal = of(entries, JOURNAL)
     with pytest.raises(BlfDscError, match=f'with the stamp {START} ns, .* start the recorder'):
         verify(rewritten([*journal, *late]))
-
-
-def test_messages_missed_by_the_recorder_are_remarked(entries, rewritten):
-    counts = '800 written, 0 missed, 201 sent before the recorder connected'
-    result = verify(rewritten(entries, **{'messages /joint_states': counts}))
-    lost = '/joint_states: 0 missed, 201 sent before the recorder connected'
-    assert result.remarks == (f'the recorder missed messages of {lost}',)
 
 
 @pytest.mark.parametrize('number', [0, 500])
@@ -299,35 +273,36 @@ def test_bag_without_a_controller_has_nothing_to_compare(entries, rewritten, top
         verify(rewritten(kept))
 
 
-def test_recording_by_another_version_is_remarked(bag, monkeypatch):
-    monkeypatch.setattr('blf_dsc_controller.replay.verify.__version__', '9.9.9')
-    result = verify(bag)
-    assert result.difference is None
-    assert any('recorded by version 0.1.0 and replayed by 9.9.9' in text for text in result.remarks)
-
-
-def test_bag_that_is_older_than_a_parameter_is_remarked(entries, rewritten):
+def test_what_limits_a_result_is_remarked(bag, entries, tmp_path, monkeypatch):
+    """Another version, processor or law, and messages that the recorder missed."""
     changed = [list(entry) for entry in entries]
     first = of(changed, JOURNAL)[0]
     event = decode(first[3])
+    event.content['machine'] |= {'tunables': 'glibc.cpu.hwcaps=-FMA', 'libc': 'glibc 2.99'}
     del event.content['parameters']['learning.compensation']
     first[3] = event.encode()
-    remarks = verify(rewritten(changed)).remarks
-    assert any('before the law had learning.compensation' in text for text in remarks)
-
-
-def test_recording_on_another_processor_is_remarked(entries, tmp_path):
-    first = of([list(entry) for entry in entries], JOURNAL)[0]
-    event = decode(first[3])
-    event.content['machine'] |= {'tunables': 'glibc.cpu.hwcaps=-FMA', 'libc': 'glibc 2.99'}
-    first[3] = event.encode()
-    others = [entry for entry in entries if entry[0] != JOURNAL.resolved]
-    path = recorded_run.write(
-        tmp_path / 'bag', [first, *of(entries, JOURNAL)[1:], *others], package_version=__version__
-    )
-    libc, tunables = verify(path).remarks
+    lost = '0 missed, 201 sent before the recorder connected'
+    facts = {'package_version': __version__, 'messages /joint_states': f'800 written, {lost}'}
+    path = recorded_run.write(tmp_path / 'bag', changed, **facts)
+    missed, newer, libc, tunables = verify(path).remarks
+    assert missed == f'the recorder missed messages of /joint_states: {lost}'
+    assert 'before the law had learning.compensation' in newer
     assert libc.startswith('recorded with libc glibc 2.99 and replayed with')
     assert tunables.startswith('recorded with tunables glibc.cpu.hwcaps=-FMA and replayed with')
+    monkeypatch.setattr('blf_dsc_controller.replay.verify.__version__', '9.9.9')
+    (remark,) = verify(bag).remarks
+    assert 'recorded by version 0.1.0 and replayed by 9.9.9' in remark
+
+
+def test_bag_of_an_earlier_version_is_read_and_its_replay_is_refused(capsys):
+    """Recorded at 31c6ec4, the version before its controller said which states it used."""
+    bag = Path(__file__).with_name('earlier_version.mcap')
+    run = read_run(bag)
+    assert run.stamp.size == 21
+    assert np.isfinite([run.position, run.error, run.torque, run.bound]).all()
+    assert main(['replay', str(bag)]) == 1
+    assert 'recorded by an earlier version, whose controller did not' in capsys.readouterr().err
+    assert main(['replay', str(bag), '--config', 'recommended']) == 0
 
 
 def test_configuration_of_another_version_is_rejected(entries, tmp_path, monkeypatch):
@@ -355,3 +330,81 @@ def test_bag_of_another_robot_is_rejected_by_its_joint_names(entries, rewritten)
         foreign.append([topic, type_name, at, renamed])
     with pytest.raises(UnreadableMessageError, match=r"'joint1' is not in .*names wheel, arm"):
         verify(rewritten([*of(entries, JOURNAL), *of(entries, TRACKING_ERROR), *foreign]))
+
+
+# The command.
+
+WITHOUT_ROS = """
+import sys
+sys.modules['rclpy'] = None  # any import of it fails
+from blf_dsc_controller.cli.main import main
+sys.exit(main(['replay', *sys.argv[1:]]))
+"""
+
+
+def test_identical_replay_exits_with_zero_and_a_verdict(bag):
+    command = [sys.executable, '-c', WITHOUT_ROS, str(bag)]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert '/blf_dsc_controller/commands: 2002 values bit-equal' in run.stdout
+    assert 'x real time' in run.stdout
+
+
+def test_difference_sets_the_exit_code_and_the_last_line(entries, rewritten, capsys):
+    changed = [list(entry) for entry in entries]
+    second = of(changed, COMMANDS)[1]
+    second[3] = second[3][:-1] + bytes([second[3][-1] ^ 0x80])  # the sign
+    assert main(['replay', str(rewritten(changed))]) == DIFFERENT
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith('DIFFERENT, first at 0.001000 s (stamp 1001000000 ns), /blf_dsc_c')
+    assert 'effort of joint2: recorded ' in last
+
+
+@pytest.mark.parametrize('topic', [JOINT_STATES, COMMANDS])
+def test_partial_comparison_has_a_verdict_of_its_own(entries, rewritten, capsys, topic):
+    """A lost state ends the replay after a third; a lost command leaves the others to compare."""
+    lost = of(entries, topic)[333]
+    assert main(['replay', str(rewritten([one for one in entries if one is not lost]))]) == PARTIAL
+    last = capsys.readouterr().out.splitlines()[-1]
+    percent = float(last.removeprefix('PARTLY COMPARED: ').split()[0])
+    # Two of the 24 numbers of a sample are commands.
+    assert percent == pytest.approx(33.2 if topic is JOINT_STATES else 91.4, abs=1.5)
+
+
+def test_replay_with_another_configuration_is_reported_as_open_loop(bag, capsys):
+    assert main(['replay', str(bag), '--config', 'recommended']) == 0
+    output = capsys.readouterr().out
+    assert 'OPEN LOOP' in output
+    assert 'joint2: torque differs from the recorded one by rms' in output
+
+
+def test_states_that_are_not_finite_are_left_out_of_an_open_loop(entries, tmp_path, capsys):
+    decoder, encoder = (
+        codec(('joint1', 'joint2')) for codec in (JointStateDecoder, JointStateEncoder)
+    )
+    states = [list(entry) for entry in of(entries, JOINT_STATES)]
+    for k, entry in enumerate(states):
+        stamp, values = decoder.decode(entry[3]), decoder.values.reshape(3, 2).copy()
+        values[0, 1] = np.nan if k == 200 else values[0, 1]
+        values[2] = np.nan if k < 40 else values[2]  # no torque yet
+        entry[3] = encoder.encode(stamp, *values)
+    path = recorded_run.write(tmp_path / 'bag', states)
+    assert main(['replay', str(path), '--config', 'recommended']) == 0
+    output = capsys.readouterr().out
+    assert 'note: 41 states left out: not finite' in output
+    assert 'nan' not in output
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['nowhere'], 'nowhere cannot be read as a bag: there is no such folder'),
+        (['nowhere', '--config', 'recomended'], 'recomended does not exist'),
+        (['nowhere', '--config', 'recommended', '--map', 'joint1'], 'one side is missing'),
+    ],
+)
+def test_error_is_reported_in_one_message(arguments, message, capsys):
+    assert main(['replay', *arguments]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith('blf_dsc replay: ')
+    assert message in error

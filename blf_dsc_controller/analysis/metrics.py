@@ -224,6 +224,7 @@ class Metrics:
         return None if math.isnan(self.max_error_ratio) else True
 
 
+@np.errstate(all='ignore')  # a bag may hold any number
 def measure(run: Run) -> Metrics:
     """Compute the metrics of a run."""
     step = float(run.time[1]) if run.stamp.size > 1 else math.nan
@@ -260,16 +261,14 @@ def measure(run: Run) -> Metrics:
 
 def _largest_ratio(run: Run) -> float:
     """Return the largest |xi1| / k_c; NaN if it is unknown."""
-    with np.errstate(invalid='ignore', divide='ignore'):
-        pairs = ((_known(run, 'error', i), _known(run, 'bound', i)) for i in range(len(run.joints)))
-        return float(np.fmax.reduce([_peak(error / bound) for error, bound in pairs]))
+    pairs = ((_known(run, 'error', i), _known(run, 'bound', i)) for i in range(len(run.joints)))
+    return float(np.fmax.reduce([_peak(error / bound) for error, bound in pairs]))
 
 
 def rms(values: Floats) -> float:
     """Return the root mean square of the known values."""
     known = values[np.isfinite(values)]
-    with np.errstate(over='ignore'):  # a bag may hold 1e308: the root is infinite then
-        return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
+    return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
 
 
 def _rms_change(values: Floats) -> float:

@@ -91,6 +91,7 @@ class Panel:
     span: float = 0.0  # limit of the axis in pictures, in both directions; 0: everything
 
 
+@np.errstate(over='ignore', invalid='ignore')  # a bag may hold any number
 def panels(runs: Sequence[Run]) -> list[Panel]:
     """Return every panel that any of the runs has data for, with several runs overlaid."""
     found: dict[tuple[str, str], Panel] = {}

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -110,11 +109,6 @@ class Content:
             if name.startswith(MESSAGES) and name.rsplit('/', 1)[-1] in _KEPT
         }
         return {topic: text for topic, text in texts.items() if text not in ('', _NOTHING_MISSED)}
-
-    def missed(self, topic: str) -> int:
-        """Return the number of messages of a topic that the recorder knows it missed."""
-        found = re.search(r'(\d+) missed', self.facts.get(f'{MESSAGES}{topic}', ''))
-        return int(found[1]) if found else 0
 
     @cached_property
     def events(self) -> list[tuple[int, Event]]:

@@ -7,7 +7,7 @@ import errno
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from math import inf
 from pathlib import Path
 from typing import IO, Any, cast
@@ -92,77 +92,8 @@ class _ReservedFile:
         self._file.close()
 
 
-@dataclass
-class _Topic:
-    """One topic of a bag."""
-
-    name: str
-    type: str
-    offered: list[dict[str, Any]]
-    definition: Definition
-    message_count: int = 0
-
-
-@dataclass
-class _File:
-    """One file of a bag; times in ns."""
-
-    path: str
-    starting_time: int = FOREVER  # if it is empty
-    ending_time: int = 0
-    message_count: int = 0
-
-
-@dataclass
-class _Bag:
-    """Contents of rosbag2's metadata, version 9 (that of Jazzy)."""
-
-    topics: list[_Topic] = field(default_factory=list)
-    files: list[_File] = field(default_factory=list)
-    facts: dict[str, str] = field(default_factory=lambda: {VERSION: __version__})
-
-    def information(self) -> dict[str, Any]:
-        """Return plain data in rosbag2's order.
-
-        The compression fields are those of rosbag2's own compression of whole files.
-        """
-        topics = [
-            {
-                'topic_metadata': {
-                    'name': topic.name,
-                    'type': topic.type,
-                    'serialization_format': 'cdr',
-                    'offered_qos_profiles': topic.offered,
-                    'type_description_hash': topic.definition.hash,
-                },
-                'message_count': topic.message_count,
-            }
-            for topic in self.topics
-        ]
-        files = [
-            {'path': file.path, **_period([file]), 'message_count': file.message_count}
-            for file in self.files
-        ]
-        period = _period(self.files)
-        return {
-            'version': 9,
-            'storage_identifier': 'mcap',
-            'duration': period['duration'],
-            'starting_time': period['starting_time'],
-            'message_count': sum(file.message_count for file in self.files),
-            'topics_with_message_count': topics,
-            'compression_format': '',
-            'compression_mode': '',
-            'relative_file_paths': [file.path for file in self.files],
-            'files': files,
-            'custom_data': self.facts,
-            'ros_distro': 'jazzy',
-        }
-
-
-def _period(files: Sequence[_File]) -> dict[str, dict[str, int]]:
-    start = min(file.starting_time for file in files)
-    end = max(file.ending_time for file in files)
+def _period(start: int, end: int) -> dict[str, Any]:
+    """Return the time from the first message to the last [ns], as rosbag2 writes it."""
     return {
         'starting_time': {'nanoseconds_since_epoch': start},
         'duration': {'nanoseconds': max(end - start, 0)},
@@ -209,7 +140,12 @@ class BagWriter:
         self._flush_interval = inf if flush_interval is None else flush_interval
         self._clock = clock
         self._split_size, self._split_duration = split_size, split_duration
-        self._bag = _Bag()
+        self._topics: list[dict[str, Any]] = []  # as in metadata.yaml, with definitions beside
+        self._definitions: list[Definition] = []
+        self._files: list[dict[str, Any]] = []
+        self._facts = {VERSION: __version__}
+        self._start = self._first = FOREVER  # ns, of all files, and of the last one
+        self._end = self._last = 0
         try:
             self.path.mkdir(parents=True)
         except FileExistsError:
@@ -238,8 +174,16 @@ class BagWriter:
         """
         found = definition(type_name) if known is None else known
         profiles = [_profile(one) if isinstance(one, Quality) else one for one in offered]
-        self._bag.topics.append(_Topic(name, type_name, profiles, found))
-        return self._add_channel(self._bag.topics[-1])
+        metadata = {
+            'name': name,
+            'type': type_name,
+            'serialization_format': 'cdr',
+            'offered_qos_profiles': profiles,
+            'type_description_hash': found.hash,
+        }
+        self._topics.append({'topic_metadata': metadata, 'message_count': 0})
+        self._definitions.append(found)
+        return self._add_channel(metadata, found)
 
     def write(
         self,
@@ -263,17 +207,15 @@ class BagWriter:
             self._begin_file()
         published = log_time if publish_time is None else publish_time
         self._writer.add_message(handle, log_time, raw, published, sequence)
-        self._bag.topics[handle - 1].message_count += 1
-        file = self._bag.files[-1]
-        file.message_count += 1
-        file.starting_time = min(file.starting_time, log_time)
-        file.ending_time = max(file.ending_time, log_time)
+        self._topics[handle - 1]['message_count'] += 1
+        self._files[-1]['message_count'] += 1
+        self._first, self._last = min(self._first, log_time), max(self._last, log_time)
         self.flush_if_due()
 
     def note(self, facts: Mapping[str, str]) -> None:
         """Store facts about the run by name."""
-        self._bag.facts.update(facts)
-        self._writer.add_metadata(RECORD, self._bag.facts)
+        self._facts.update(facts)
+        self._writer.add_metadata(RECORD, self._facts)
 
     def flush_if_due(self) -> None:
         """Flush if the flush interval has passed; DiskFullError as in `write`."""
@@ -293,7 +235,7 @@ class BagWriter:
         self.closed = True
         self._reserve.unlink(missing_ok=True)
         self._end_file()
-        text = _dump({'rosbag2_bagfile_information': self._bag.information()})
+        text = _dump({'rosbag2_bagfile_information': self._information()})
         (self.path / METADATA).write_text(text, encoding='utf-8')
 
     def _stop_if_full(self) -> None:
@@ -304,7 +246,7 @@ class BagWriter:
     @property
     def message_counts(self) -> dict[str, int]:
         """Messages written so far, by topic."""
-        return {topic.name: topic.message_count for topic in self._bag.topics}
+        return {one['topic_metadata']['name']: one['message_count'] for one in self._topics}
 
     def __enter__(self) -> BagWriter:
         return self
@@ -318,13 +260,14 @@ class BagWriter:
         is_long = self._flushed - self._began >= self._split_duration
         is_full = is_long or self._stream.tell() >= self._split_size
         is_full |= self._chunks >= _MOST_CHUNKS
-        return is_full and self._bag.files[-1].message_count > 0
+        return bool(is_full and self._files[-1]['message_count'] > 0)
 
     def _begin_file(self) -> None:
         """Begin the next file, with the topics of the previous one."""
-        file = _File(f'{self.path.name}_{len(self._bag.files)}.mcap')
-        self._bag.files.append(file)
-        self._stream = _ReservedFile(self.path / file.path, self._reserve)
+        name = f'{self.path.name}_{len(self._files)}.mcap'
+        self._first, self._last = FOREVER, 0
+        self._files.append({'path': name, **_period(FOREVER, 0), 'message_count': 0})
+        self._stream = _ReservedFile(self.path / name, self._reserve)
         self._writer = Writer(
             cast('IO[bytes]', self._stream), chunk_size=_CHUNK_SIZE, compression=self._compression
         )
@@ -332,25 +275,51 @@ class BagWriter:
         self._schemas: dict[str, int] = {}
         self._chunks = 0
         self._describe()
-        for topic in self._bag.topics:
-            self._add_channel(topic)
+        for topic, found in zip(self._topics, self._definitions, strict=True):
+            self._add_channel(topic['topic_metadata'], found)
         self.note({})
         self._began = self._clock()
 
     def _describe(self) -> None:
         """Store the metadata so far; rosbag2 reads the last such record of a file."""
-        text = _dump(self._bag.information())
+        text = _dump(self._information())
         self._writer.add_metadata('rosbag2', {'serialized_metadata': text})
 
-    def _add_channel(self, topic: _Topic) -> int:
+    def _information(self) -> dict[str, Any]:
+        """Return rosbag2's metadata, version 9 (that of Jazzy), in its order.
+
+        The compression fields are those of rosbag2's own compression of whole files.
+        """
+        self._files[-1].update(_period(self._first, self._last))
+        self._start, self._end = min(self._start, self._first), max(self._end, self._last)
+        period = _period(self._start, self._end)
+        return {
+            'version': 9,
+            'storage_identifier': 'mcap',
+            'duration': period['duration'],
+            'starting_time': period['starting_time'],
+            'message_count': sum(file['message_count'] for file in self._files),
+            'topics_with_message_count': self._topics,
+            'compression_format': '',
+            'compression_mode': '',
+            'relative_file_paths': [file['path'] for file in self._files],
+            'files': self._files,
+            'custom_data': self._facts,
+            'ros_distro': 'jazzy',
+        }
+
+    def _add_channel(self, topic: dict[str, Any], known: Definition) -> int:
         """Add a topic to the file and return its number, the same in each file."""
-        text, hash_, encoding = topic.definition
-        if topic.type not in self._schemas:
-            schema = self._writer.register_schema(topic.type, encoding, text.encode())
-            self._schemas[topic.type] = schema
-        metadata = {'offered_qos_profiles': _dump(topic.offered), 'topic_type_hash': hash_}
-        schema = self._schemas[topic.type]
-        return self._writer.register_channel(topic.name, 'cdr', schema, metadata)
+        type_name = topic['type']
+        if type_name not in self._schemas:
+            schema = self._writer.register_schema(type_name, known.encoding, known.text.encode())
+            self._schemas[type_name] = schema
+        metadata = {
+            'offered_qos_profiles': _dump(topic['offered_qos_profiles']),
+            'topic_type_hash': known.hash,
+        }
+        schema = self._schemas[type_name]
+        return self._writer.register_channel(topic['name'], 'cdr', schema, metadata)
 
     def _end_chunk(self) -> None:
         before = self._stream.tell()
