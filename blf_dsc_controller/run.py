@@ -36,10 +36,10 @@ class Series:
         """Return the values of one name, (m,)."""
         return self.select([name])[:, 0]
 
-    def held(self, stamp: Stamps) -> Floats:
+    def held(self, stamp: Stamps, columns: Rows = _ALL) -> Floats:
         """Return the last values at or before each stamp; the first values for earlier stamps."""
         index = np.searchsorted(self.stamp, stamp, side='right') - 1
-        return self.at(np.maximum(index, 0))
+        return self.at(np.maximum(index, 0), columns)
 
     def exact(self, stamp: Stamps) -> Floats:
         """Return the values at exactly these stamps, NaN where there are none."""

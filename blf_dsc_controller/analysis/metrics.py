@@ -99,7 +99,8 @@ def estimates_of(run: Run) -> Estimates | None:
     def true_of(names: Sequence[str]) -> Floats | None:
         if truth is None or run.learning is None or set(names) != set(theirs):
             return None
-        return truth.held(stamp)[:, [truth.names.index(name) for name in names]]
+        columns = np.array([truth.names.index(name) for name in names], np.intp)
+        return truth.held(stamp, columns)
 
     true, base = true_of(names), None
     if true is not None and torques is not None:

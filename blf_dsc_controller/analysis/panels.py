@@ -49,7 +49,7 @@ _LEAST = 1e-12  # J, the smallest value on a logarithmic axis
 _ROOM = 1.2  # limit of an axis as a multiple of the largest value
 _LEAST_ERROR = 1e-5  # %
 _PIECES = 300  # of a run, each with its largest error
-_LONG = 200_000  # samples
+_LONG = 80_000  # samples
 
 
 class Line(NamedTuple):
@@ -209,7 +209,9 @@ def _learning(run: Run) -> Iterator[Panel]:
     error = _relative_error(estimates)
     if run.arm is not None:
         of_inertias = _by_kind if run.arm.base else _of_links
-        yield from (*error, *of_inertias(run, run.arm, estimates), *_frictions(run, run.arm))
+        yield from error
+        yield from of_inertias(run, run.arm, estimates)
+        yield from _frictions(run, run.arm)
     else:
         for j, name in enumerate(estimates.names):
             lines = [Line('estimate', estimates.time, estimates.estimate[:, j])]
@@ -318,7 +320,8 @@ def _lyapunov(run: Run, monitor: Series) -> Iterator[Panel]:
     V = monitor.select(LYAPUNOV_TERMS).sum(axis=1)
     lines = [Line('V', run.time_of(monitor.stamp), np.maximum(V, _LEAST), INK)]
     note = ''
-    for line in _column(run, monitor, LYAPUNOV_BOUND, 'bound (32)', colour=MUTED, dashed=True):
+    style: Any = {'colour': MUTED, 'dashed': True, 'whole': True}
+    for line in _column(run, monitor, LYAPUNOV_BOUND, 'bound (32)', **style):
         known = np.isfinite(line.values)
         note = r'no bound, as $\kappa_e = 0$'
         if known.any():
@@ -337,13 +340,17 @@ def _timing(run: Run) -> Iterator[Panel]:
     ):
         times = [
             line._replace(values=1e6 * line.values)
-            for line in _column(run, series, name, 'samples')
+            for line in _column(run, series, name, 'samples', whole=True)
             if np.isfinite(line.values).any()
         ]
         yield Panel('Timing', title, 'µs', tuple(times), log=True, histogram=True)
 
 
-def _column(run: Run, series: Series | None, column: str, name: str, **style: Any) -> list[Line]:
+def _column(
+    run: Run, series: Series | None, column: str, name: str, *, whole: bool = False, **style: Any
+) -> list[Line]:
+    """Return a column as one line, if there is one; `whole`, or not too long."""
     if series is None or column not in series.names:
         return []
-    return [Line(name, run.time_of(series.stamp), series.column(column), **style)]
+    line = Line(name, run.time_of(series.stamp), series.column(column), **style)
+    return [line if whole else _thinned(line)]
