@@ -6,8 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
-from blf_dsc_controller.arms.two_link import PARAMETER_NAMES
-from blf_dsc_controller.arms.two_link_geometry import urdf
+from blf_dsc_controller.arms.two_link import PARAMETER_NAMES, urdf
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.nodes import PLANT

@@ -8,7 +8,7 @@ import pinocchio
 from plants import points
 from random_arm import configuration, pinocchio_model, random_urdf
 
-from blf_dsc_controller.arms.chain_geometry import skeleton, tip_radius
+from blf_dsc_controller.arms.geometry import skeleton, tip_radius
 from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.configuration.nodes import MarkersConfig
 

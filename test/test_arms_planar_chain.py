@@ -12,8 +12,7 @@ from plants import ARM
 import sim_plant.dynamics as physics
 from blf_dsc_controller.arms.model import arm_model
 from blf_dsc_controller.arms.planar_chain import PlanarChain
-from blf_dsc_controller.arms.two_link import TwoLink
-from blf_dsc_controller.arms.two_link_geometry import urdf
+from blf_dsc_controller.arms.two_link import TwoLink, urdf
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, flatten, parameters

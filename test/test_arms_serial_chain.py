@@ -13,7 +13,7 @@ from blf_dsc_controller.arms.batch import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.chain_kernels import ROTOR
 from blf_dsc_controller.arms.forms import TRUSTED, learned_parameters
 from blf_dsc_controller.arms.inertia import INERTIA_NAMES, inertia_of, pseudo_inertia
-from blf_dsc_controller.arms.prior import CENTRE, LINKS, ROTORS, prior_factor
+from blf_dsc_controller.arms.prior import CENTRE, ROTORS, prior_factor
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.compiled.jit import kernel
@@ -271,17 +271,16 @@ def test_prior_without_payload_is_tighter():
 
 RATED = 3.0  # kg
 ONE_JOINT = read_chain(random_urdf(1, 0)[0], 'base', 'tip', ('j1',))
-FORMS = ('payload', 'scale')
 
 
 class Learned:
-    """A chain with rotors, all its base parameters, and a form of it."""
+    """A chain with rotors, all its base parameters, and those of the form `payload`."""
 
-    def __init__(self, chain, form):
+    def __init__(self, chain):
         self.chain, self.n = chain, len(chain.joints)
         self.rotors = np.linspace(0.02, 0.2, self.n)
         self.base = base_parameters(chain, WALL)
-        self.form = learned_parameters(chain, self.base, form, RATED, self.rotors)
+        self.form = learned_parameters(chain, self.base, 'payload', RATED, self.rotors)
         self.names = self.form.model.parameter_names
 
     def assert_same_torques(self, P, inertias, rotors):
@@ -302,10 +301,9 @@ class Learned:
                 np.testing.assert_allclose(alone @ P, other @ expected, rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.parametrize('form', FORMS)
 @pytest.mark.parametrize('chain', [*CHAINS, ONE_JOINT])
-def test_initial_parameters_give_the_torques_of_the_base_parameters(chain, form):
-    case = Learned(chain, form)
+def test_initial_parameters_give_the_torques_of_the_base_parameters(chain):
+    case = Learned(chain)
     assert case.form.model.p == case.form.initial.size == len(case.form.model.parameter_units)
     case.assert_same_torques(case.form.initial, chain.inertias, case.rotors)
 
@@ -321,7 +319,7 @@ def load_at(chain):
 
 @pytest.mark.parametrize('chain', [c for c in CHAINS if len(c.joints) > 5])
 def test_parameters_represent_any_load(chain):
-    case = Learned(chain, 'payload')
+    case = Learned(chain)
     ten, inertias = load_at(chain)
     heavier = case.rotors.copy()
     heavier[-1] *= 1.3
@@ -333,7 +331,7 @@ def test_parameters_represent_any_load(chain):
 
 @pytest.mark.parametrize('chain', [ONE_JOINT, *(c for c in CHAINS if len(c.joints) < 6)])
 def test_short_arm_with_fewer_load_parameters_still_represents_any_load(chain):
-    case = Learned(chain, 'payload')
+    case = Learned(chain)
     assert len(case.names) < case.n + 11
     _, inertias = load_at(chain)
     known = case.base.of(inertias, case.rotors)
@@ -348,7 +346,7 @@ def test_short_arm_with_fewer_load_parameters_still_represents_any_load(chain):
 
 def test_load_parameters_agree_with_the_payload_of_the_plant():
     """The plant uses Newton-Euler, an independent algorithm, with a point mass at the tip."""
-    case = Learned(PANDA_CHAIN, 'payload')
+    case = Learned(PANDA_CHAIN)
     arm = rigid_arm(PANDA_CHAIN, WALL, PANDA_CHAIN.inertias, case.rotors, case.base)
     P = case.form.initial + 2.0 * case.form.load
     assert P[case.names.index('load m')] == 2.0
@@ -359,49 +357,21 @@ def test_load_parameters_agree_with_the_payload_of_the_plant():
         np.testing.assert_allclose(found, ddq, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize('chain', CHAINS)
-def test_parameters_represent_any_scale_factors_of_the_bodies(chain):
-    case = Learned(chain, 'scale')
-    kept = [i for i in range(case.n) if f'scale{i + 1}' in case.names]
-    assert len(kept) >= case.n - 1
-    factors = np.ones(case.n)
-    factors[kept] = np.random.default_rng(4).uniform(0.7, 1.3, len(kept))
-    P = case.form.initial.copy()
-    P[[case.names.index(f'scale{i + 1}') for i in kept]] = factors[kept]
-    case.assert_same_torques(P, factors[:, None] * chain.inertias, case.rotors)
-
-
-def test_first_body_of_an_arm_on_the_floor_is_learned_with_its_rotor():
-    base = base_parameters(PANDA_CHAIN)
-    learned = learned_parameters(PANDA_CHAIN, base, 'scale', RATED, np.full(7, 0.2))
-    assert learned.model.parameter_names[:2] == ('rotor1', 'rotor2')
-    assert 'scale1' not in learned.model.parameter_names
-    assert learned.initial[0] == pytest.approx(0.2 + PANDA_CHAIN.inertias[0, -1])
-    assert set(learned.initial[7:]) == {1.0}
-
-
 def test_prior_is_wide_for_what_the_form_learns_and_tight_elsewhere():
-    deviation = {}
-    for form in FORMS:
-        case = Learned(PANDA_CHAIN, form)
-        covariance = case.form.L @ case.form.L.T
-        assert np.linalg.eigvalsh(covariance)[0] > 0.0
-        deviation |= dict(zip(case.names, np.sqrt(np.diag(covariance)), strict=True))
-        assert deviation['rotor7'] == pytest.approx(ROTORS * case.rotors[-1])
+    case = Learned(PANDA_CHAIN)
+    covariance = case.form.L @ case.form.L.T
+    assert np.linalg.eigvalsh(covariance)[0] > 0.0
+    deviation = dict(zip(case.names, np.sqrt(np.diag(covariance)), strict=True))
+    assert deviation['rotor7'] == pytest.approx(ROTORS * case.rotors[-1])
     assert deviation['load m'] == pytest.approx(RATED)
     assert deviation['links'] == pytest.approx(TRUSTED)
-    assert deviation['scale3'] == pytest.approx(LINKS)
-    heaviest = PANDA_CHAIN.inertias[-1, 0] + RATED
-    assert deviation['scale7'] >= heaviest / PANDA_CHAIN.inertias[-1, 0] - 1.0
 
 
 def test_units_distinguish_prismatic_from_revolute_joints():
     for chain in CHAINS[2:]:
-        for form in FORMS:
-            model = Learned(chain, form).form.model
-            units = dict(zip(model.parameter_names, model.parameter_units, strict=True))
-            for i, joint in enumerate(chain.joints, 1):
-                prismatic = joint.kind == 'prismatic'
-                assert units[f'rotor{i}'] == ('kg' if prismatic else 'kg m^2')
-                assert units.get(f'scale{i}', '') == ''
-    assert Learned(PANDA_CHAIN, 'payload').form.model.parameter_units[7:9] == ('kg', 'kg m')
+        model = Learned(chain).form.model
+        units = dict(zip(model.parameter_names, model.parameter_units, strict=True))
+        for i, joint in enumerate(chain.joints, 1):
+            prismatic = joint.kind == 'prismatic'
+            assert units[f'rotor{i}'] == ('kg' if prismatic else 'kg m^2')
+    assert Learned(PANDA_CHAIN).form.model.parameter_units[7:9] == ('kg', 'kg m')

@@ -14,8 +14,8 @@ from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError, StartError
-from blf_dsc_controller.law.drive import added_torque
 from blf_dsc_controller.law.factory import controller_of, estimate_names
+from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.supervision.safe_torque import LastState, safe_torque

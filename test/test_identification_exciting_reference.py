@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from random_arm import random_urdf
 
+from blf_dsc_controller.arms.geometry import Clearance
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig, MotionLimits
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.identification.exciting_reference import ExcitationProblem, search
 from blf_dsc_controller.law.factory import estimate_names, settings_of_config
-from blf_dsc_controller.reference.clearance import Clearance
 from blf_dsc_controller.reference.limits import MotionError
 from blf_dsc_controller.simulation.loop import simulate
 

@@ -25,7 +25,7 @@ from plain_law import dynamics
 
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.errors import OutsideBarrierError
-from blf_dsc_controller.law import adaptation, prediction, projection, surface
+from blf_dsc_controller.law import adaptation, prediction, surface
 from blf_dsc_controller.law.settings import EFFORT, FILTERED, LAMBDA, PREDICTIONS
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.simulation.loop import simulate
@@ -400,9 +400,9 @@ def test_erratum_19_printed_projection_lets_the_estimate_leave_for_good():
         rate = outward if k < 10 else -printed
         printed = printed + dt * printed_projection(printed, rate, radius)
         rate = outward.copy() if k < 10 else -corrected
-        projection.project(corrected, rate, gain, radius)
+        adaptation.project(corrected, rate, gain, radius)
         corrected += dt * rate
-        projection.retract(corrected, gain, radius)
+        adaptation.retract(corrected, gain, radius)
         assert np.linalg.norm(corrected) <= radius * (1.0 + 1e-15)
     assert np.linalg.norm(printed) > 1.01 * radius
     assert np.linalg.norm(corrected) < 1e-6
@@ -415,7 +415,7 @@ def test_erratum_19_projection_is_taken_in_the_metric_of_gamma():
     w /= np.linalg.norm(w)
     v, true = np.array([1.0, 0.0]), np.array([0.9, -0.4])
     corrected = v.copy()
-    projection.project(w, corrected, gain, radius)
+    adaptation.project(w, corrected, gain, radius)
 
     unprojected, printed, taken = (
         -(true - w) @ (rate / gain) for rate in (v, printed_projection(w, v, radius), corrected)

@@ -9,9 +9,8 @@ from arbitrary_case import arbitrary
 from closed_loop_case import closed_loop, controller, plant, quick, recommended, record
 from plain_law import PlainLaw
 
-from blf_dsc_controller.law import drive
-from blf_dsc_controller.law.saturation import LEVEL_CUT, RATE_CUT, saturate
 from blf_dsc_controller.law.settings import COMPENSATIONS, EFFORT, UPDATES
+from blf_dsc_controller.law.torque import LEVEL_CUT, RATE_CUT, find_applied, saturate
 
 # The window is not a multiple of the interval, and learning lasts nearly a second. For so short
 # a window the condition number of Phi is 1e7; rho = 10 keeps the amplified rounding below 1e-12,
@@ -171,7 +170,7 @@ def test_applied_torque_has_the_mean_of_what_the_drive_adds_at_both_ends(source)
     base = state.torque.copy() if source == 'command' else measurement[6:]
     added = 0.0 if source == 'whole effort' else 0.5 * (state.added + signals.added)
     expected = base + added
-    drive.find_applied(settings, state, signals, measurement)
+    find_applied(settings, state, signals, measurement)
     np.testing.assert_array_equal(signals.applied, expected)
     np.testing.assert_array_equal(state.added, signals.added)
 

@@ -13,7 +13,6 @@ from random_arm import CONFIG, random_urdf
 from blf_dsc_controller import simulate
 from blf_dsc_controller.analysis.metrics import estimates_of
 from blf_dsc_controller.analysis.panels import panels
-from blf_dsc_controller.arms.prior import LINKS
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -115,19 +114,15 @@ def test_replay_without_ros_is_identical_bit_for_bit(out):
 
 
 def test_defaults_depend_on_the_learned_form():
-    base, payload, scale = (panda(robot__learn=form) for form in ('base', 'payload', 'scale'))
+    base, payload = (panda(robot__learn=form) for form in ('base', 'payload'))
     assert estimate_names(payload)[7:9] == ('load m', 'load m*cx')
     assert payload.learning.initial_estimate[7:] == (*(0.0,) * 10, 1.0)
-    assert scale.learning.initial_estimate[7:] == (1.0,) * 6
     assert payload.learning.window < base.learning.window
-    for config in (payload, scale):
-        p = model_of(config).p
-        assert len(config.learning.initial_estimate) == p == len(config.learning.adaptation_gain)
-        # The gains are derived from the same URDF.
-        np.testing.assert_allclose(config.barrier.weight, base.barrier.weight, rtol=2e-3)
-        assert config.learning.radius >= 10.0 * config.robot.payload
-    deviation = np.sqrt(np.diag(prior_covariance(scale)))[: len(scale.learning.initial_estimate)]
-    assert deviation[8] == pytest.approx(LINKS)
+    p = model_of(payload).p
+    assert len(payload.learning.initial_estimate) == p == len(payload.learning.adaptation_gain)
+    # The gains are derived from the same URDF.
+    np.testing.assert_allclose(payload.barrier.weight, base.barrier.weight, rtol=2e-3)
+    assert payload.learning.radius >= 10.0 * payload.robot.payload
 
 
 def test_two_controllers_do_not_share_working_memory():
@@ -140,7 +135,7 @@ def test_two_controllers_do_not_share_working_memory():
 @pytest.mark.parametrize(
     ('robot', 'message'),
     [
-        ({'learn': 'everything'}, "robot.learn: got 'everything', but it must be one of base"),
+        ({'learn': 'scale'}, "robot.learn: got 'scale', but it must be one of base, payload"),
         ({'payload': 0.0}, 'robot.payload: got 0 kg, but learn: payload needs the mass'),
     ],
 )
@@ -154,9 +149,9 @@ def test_problems_are_reported_with_their_line(tmp_path, robot, message):
 
 
 def test_arm_without_urdf_learns_base_parameters_only():
-    message = 'robot.learn: got scale, but model two_link learns base only'
+    message = 'robot.learn: got payload, but model two_link learns base only'
     with pytest.raises(ConfigurationError, match=message):
-        panda(model='two_link', robot__urdf='', robot__tip='', robot__learn='scale')
+        panda(model='two_link', robot__urdf='', robot__tip='', robot__learn='payload')
 
 
 ARM = {'model': 'urdf', 'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
@@ -290,7 +285,7 @@ def test_bound_holds_from_the_start_with_an_undeclared_rated_load(seed):
     assert run(**{'barrier.initial_bound': [0.0] * 7}).stops  # with a constant bound
 
 
-@pytest.mark.parametrize('learn', ['base', 'payload', 'scale'])
+@pytest.mark.parametrize('learn', ['base', 'payload'])
 def test_drives_with_unknown_effort_limit_get_a_finite_prior(learn):
     text = (CONFIG / 'panda.urdf').read_text().replace('effort="12"', 'effort="0"')
     config = panda(robot__urdf=text, robot__learn=learn)

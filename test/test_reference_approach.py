@@ -27,8 +27,7 @@ from blf_dsc_controller.errors import (
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.reference.approach import blend, plan_start, reference_of, stop
 from blf_dsc_controller.reference.limits import MotionError, worst_violation
-from blf_dsc_controller.reference.polynomials import minimum_jerk
-from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term, unpack
+from blf_dsc_controller.reference.terms import minimum_jerk, pack, sampled, sinusoids_term, unpack
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from random_arm import CONFIG, PANDA, UR5E
 
+from blf_dsc_controller.arms.geometry import Clearance, distance
 from blf_dsc_controller.arms.urdf import read_chain
-from blf_dsc_controller.reference.clearance import Clearance, distance
 
 PI = np.pi
 

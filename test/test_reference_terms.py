@@ -7,8 +7,15 @@ import numpy as np
 import pytest
 
 from blf_dsc_controller.reference import terms as reference
-from blf_dsc_controller.reference.polynomials import hermite, minimum_jerk
-from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term, spline_term, unpack
+from blf_dsc_controller.reference.terms import (
+    hermite,
+    minimum_jerk,
+    pack,
+    sampled,
+    sinusoids_term,
+    spline_term,
+    unpack,
+)
 
 OFFSET = (0.5, -1.0, 2.0)
 FREQUENCY, PHASE = (1.0, 2.7), (0.3, -1.1)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
 
-from blf_dsc_controller.arms.chain_geometry import frames
+from blf_dsc_controller.arms.geometry import frames
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import chain_of

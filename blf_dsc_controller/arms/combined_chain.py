@@ -49,21 +49,20 @@ class CombinedChain(NamedTuple):
 
     n: int
     p: int
-    loads: int  # 1: the last body has a load, 0: each body has a factor
     bodies: Array  # Bodies, with all inertias
     combination: Array  # Combination
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the entries of P."""
-        names = column_names(self.n, self.loads)
+        names = column_names(self.n)
         return tuple(names[int(k)] for k in combination_of(self.combination).column)
 
     @property
     def parameter_units(self) -> tuple[str, ...]:
         """Units of the entries of P: none for factors, kg for the rotor of a prismatic joint."""
         units = ['kg m^2' if axis[:3].any() else 'kg' for axis in bodies_of(self.bodies).axis]
-        units += [*INERTIA_UNITS, ''] if self.loads else [''] * self.n
+        units += [*INERTIA_UNITS, '']
         return tuple(units[int(k)] for k in combination_of(self.combination).column)
 
     def regressor(self, q: Array, dq: Array, v: Array, a: Array, H: Array) -> None:
@@ -102,15 +101,13 @@ def combine(c: Combination, Y: Array, out: Array) -> None:
             out[i, j] += Y[i, k] * value
 
 
-def column_names(n: int, loads: int) -> tuple[str, ...]:
-    """Return the names of all possible unknowns: rotors, then load and links, or body factors."""
+def column_names(n: int) -> tuple[str, ...]:
+    """Return the names of all possible unknowns: rotors, then load and links."""
     rotors = tuple(f'rotor{i + 1}' for i in range(n))
-    if loads:
-        return (*rotors, *(f'load {name}' for name in INERTIA_NAMES), 'links')
-    return (*rotors, *(f'scale{i + 1}' for i in range(n)))
+    return (*rotors, *(f'load {name}' for name in INERTIA_NAMES), 'links')
 
 
-def combined_chain(whole: SerialChain, loads: int, columns: Array, T: Array) -> CombinedChain:
+def combined_chain(whole: SerialChain, columns: Array, T: Array) -> CombinedChain:
     """Return the model of the unknowns `columns` (p,) of `column_names`; T (p, 11 n): inertias."""
     p, width = T.shape
     row, at = np.nonzero(T)
@@ -125,4 +122,4 @@ def combined_chain(whole: SerialChain, loads: int, columns: Array, T: Array) -> 
         value=T[row, at],
         Y=np.zeros((3, whole.n, width)),
     )
-    return CombinedChain(whole.n, p, loads, whole.vector, pack(combination))
+    return CombinedChain(whole.n, p, whole.vector, pack(combination))

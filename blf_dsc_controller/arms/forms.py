@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learned parameters of a chain: all base parameters, the load, or one factor for each body.
+"""Learned parameters of a chain: all base parameters, or the load.
 
-In the forms `payload` and `scale` the inertias of all bodies are phi = D c, where c starts with the
-rotor inertias, followed by
-
-    payload   the ten of a load in the tip frame, 0 in the URDF, and one factor for all bodies
-    scale     a factor for each body, 1 in the URDF
-
-Only an independent set of them is learned, P = K c; the others are grouped with it.
+In the form `payload` the inertias of all bodies are phi = D c, where c has the rotor inertias, the
+ten of a load in the tip frame, which are 0 in the URDF, and one factor for all bodies.  Only an
+independent set of them is learned, P = K c; the others are grouped with it.
 """
 
 from __future__ import annotations
@@ -25,7 +21,6 @@ from blf_dsc_controller.arms.chain_kernels import ROTOR, bodies_of
 from blf_dsc_controller.arms.combined_chain import CombinedChain, combined_chain
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.prior import (
-    LINKS,
     PAYLOAD_SIZE,
     ROTORS,
     UNKNOWN_ROTOR,
@@ -47,7 +42,7 @@ class LearnedParameters:
     Attributes:
         initial: (p,) P according to the URDF.
         L: (p, r) of P = initial + L theta, where theta has zero mean and unit covariance.
-        load: (p,) what 1 kg at the tip adds to P; approximate for `scale`.
+        load: (p,) what 1 kg at the tip adds to P.
     """
 
     model: SerialChain | CombinedChain
@@ -71,22 +66,13 @@ def learned_parameters(
         load = base.of(loaded, np.zeros(n))
         return LearnedParameters(base.model, base.of(chain.inertias, rotors), L, load)
     unit = np.eye(phi.size).reshape(n, ROTOR + 1, -1)
-    if form == 'payload':
-        D = np.vstack((ten @ unit[-1, :ROTOR], phi.ravel()))
-        start, spread = np.append(np.zeros(ROTOR), 1.0), np.full(ROTOR + 1, TRUSTED)
-        load = np.eye(n + ROTOR + 1)[n]
-    else:
-        D = np.einsum('ie,iek->ik', phi, unit)
-        start, spread = np.ones(n), np.full(n, LINKS)
-        spread[-1] = np.hypot(LINKS, payload / phi[-1, 0])
-        load = np.eye(2 * n)[-1] / phi[-1, 0]
-    D = np.vstack((unit[:, ROTOR], D))
-    L = np.diag(np.append(unsure, spread))
-    if form == 'payload':
-        L[n:-1, n:-1] = deviations(payload_inertia(payload), 1.0, PAYLOAD_SIZE)
+    D = np.vstack((unit[:, ROTOR], ten @ unit[-1, :ROTOR], phi.ravel()))
+    start, load = np.append(np.zeros(ROTOR), 1.0), np.eye(n + ROTOR + 1)[n]
+    L = np.diag(np.append(unsure, np.full(ROTOR + 1, TRUSTED)))
+    L[n:-1, n:-1] = deviations(payload_inertia(payload), 1.0, PAYLOAD_SIZE)
     size = np.linalg.norm(D, axis=1)
     whole = serial_chain(chain, tuple(bodies_of(base.model.vector).gravity))
     kept, K = independent(stacked_regressor(whole) @ (D.T / size), np.arange(size.size))
     K *= size / size[kept, None]
-    model = combined_chain(whole, int(form == 'payload'), kept, D[kept])
+    model = combined_chain(whole, kept, D[kept])
     return LearnedParameters(model, K @ np.append(rotors, start), K @ L, K @ load)

@@ -32,10 +32,10 @@ _SAG = 1.5  # sag over (standard deviation of gravity / m omega_b^2); measured: 
 _PHASE = 0.625  # rad, phase lost to the delay at omega_b
 _BOUND = 0.002  # rad
 _UNMODELLED = 0.01  # rms, fraction of the rated torque: ripple, noise, Stribeck
-_WINDOW = {'base': 5.0, 'payload': 2.0, 'scale': 5.0}  # s
+_WINDOW = {'base': 5.0, 'payload': 2.0}  # s
 # 1 / (independent rows in a window); more where few parameters cannot explain all rows.
-_PRIOR = {'base': 0.01, 'payload': 0.1, 'scale': 0.1}
-_REGULARISATION = {'base': 1e-5, 'payload': 1e-9, 'scale': 1e-9}  # pulls P (about 1) to 0
+_PRIOR = {'base': 0.01, 'payload': 0.1}
+_REGULARISATION = {'base': 1e-5, 'payload': 1e-9}  # pulls P (about 1) to 0
 _ANCHOR = 5.0  # times the mean square of the unmodelled torque
 _POSTURES = 20
 _ROWS, _CHECKS = 0.01, 0.05  # s, between rows of the window and between its checks

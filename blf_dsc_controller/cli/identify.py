@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 from tqdm import tqdm
 
+from blf_dsc_controller.arms.geometry import Clearance
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.cli.parser import PICK_UP
@@ -23,7 +24,6 @@ from blf_dsc_controller.identification.identify import Identified, identify_bag
 from blf_dsc_controller.identification.prior import JOINT_TERMS, columns_of
 from blf_dsc_controller.identification.recording import HOP
 from blf_dsc_controller.law.factory import estimate_names
-from blf_dsc_controller.reference.clearance import Clearance
 
 _TWO_SIDED = 1.96  # standard deviations of a 95 % interval
 _UNSEEN = 0.5  # of the prior's variance; parameters that keep more are not shown

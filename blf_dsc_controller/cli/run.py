@@ -34,7 +34,7 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import estimate_names, model_of
-from blf_dsc_controller.law.rejected_columns import rejected_columns
+from blf_dsc_controller.law.telemetry import rejected_columns
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import Record, simulate

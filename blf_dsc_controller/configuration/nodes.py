@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
-from blf_dsc_controller.arms.two_link_geometry import urdf
+from blf_dsc_controller.arms.two_link import urdf
 from blf_dsc_controller.arms.urdf import Chain, read_chain
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import Section, parse, read_text, share_folder

@@ -61,8 +61,8 @@ class Robot:
         at_least=0.0,
     )
     payload: float = _fixed(3.0, 'rated payload', 'kg', at_least=0.0)
-    learn: Literal['base', 'payload', 'scale'] = _fixed(
-        'base', 'what is learned: all base parameters, the load at the tip, or one factor per link'
+    learn: Literal['base', 'payload'] = _fixed(
+        'base', 'what is learned: all base parameters, or the load at the tip'
     )
     rotor_inertia: Annotated[tuple[float, ...], 'joints'] = _fixed(
         (),

@@ -17,11 +17,9 @@ from blf_dsc_controller.law import (
     apparent_inertia,
     barrier,
     consistency,
-    drive,
     excitation,
     friction,
     prediction,
-    saturation,
     surface,
     torque,
     window,
@@ -134,8 +132,8 @@ def step(
     n = settings.n
     q = part(measurement, 0, (n,))
     dq = part(measurement, n, (n,))
-    drive.find_added(settings, signals, q)
-    drive.find_applied(settings, state, signals, measurement)
+    torque.find_added(settings, signals, q)
+    torque.find_applied(settings, state, signals, measurement)
     reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
     torque.known_disturbance(settings, signals, t)
     barrier.update_bound(settings, signals, t)
@@ -147,7 +145,7 @@ def step(
         apparent_inertia.measure(settings, state, signals, dt, q, dq)
         apparent_inertia.correct_feedback(settings, state, signals)
     torque.compute_demand(settings, state, signals)
-    saturated = saturation.saturate(settings, state, signals, dt)
+    saturated = torque.saturate(settings, state, signals, dt)
     adaptation.adapt(settings, state, signals, dt, saturated)
     surface.filter_step(settings, state, signals, dt)
     for i in range(n):

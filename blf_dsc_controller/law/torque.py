@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torque demand before saturation: (28) of the proposed law and (35) of the comparison law.
+"""Torque: demand (28) of the proposed law or (35) of the comparison law, saturation, drives.
 
     tau = -dV/dxi1 - d2 |xi1| sat(xi2/b) - K_p xi2 + tau_m + d^3                                (28)
     tau = -w z1 - mu_bar sat(z2/b) - K_p z2 + H P^                                             (35)
 
 (28) prints the robust term with sgn; sat is its smooth replacement.  The paper's compensation is
 tau_m = H(q, dq, alpha2, alpha2') P^ (`compensation: state`).  alpha2' contains the feedback, which
-is thus multiplied by the learned inertia: an estimate of 2.65 times the inertia makes a loop at
-1 kHz unstable.  So what is learned acts along the reference only, and the feedback keeps the model
+is thus multiplied by the learned inertia: an estimate of 2.65 times the inertia makes a loop at 1
+kHz unstable.  So what is learned acts along the reference only, and the feedback keeps the model
 from before the start, as in the desired compensation law of Sadegh and Horowitz (1990):
 
     tau_m = H(q, dq, alpha2, alpha2' - omega_v xi2) P^(0) + H(qr, dqr, dqr, ddqr) (P^ - P^(0))
@@ -15,14 +15,40 @@ from before the start, as in the desired compensation law of Sadegh and Horowitz
 A wrong estimate is then a bounded disturbance, never a gain.  Where the inertias are roughly known,
 the damping can scale with them: - omega_v M(q, P^(0)) xi2, part of the first term, is added to
 - K_p xi2 and damps every direction at the same rate.
+
+*Drives.*  This is the one place where torques of the law become commands of the drive, and back.
+The law reckons with the whole torque of a joint.  A drive may add the torque that holds the arm
+against gravity itself, by its own model of the arm and of the payload it has been told of:
+
+    whole torque = command + G_d(q)
+
+`find_added` computes G_d(q); `saturate` subtracts it from what leaves, and `find_applied` adds it
+to what enters.  Friction that a drive compensates is not reckoned with on either side: the friction
+columns then describe what is left of it (`Robot.friction`).  A drive that adds nothing has no
+columns here, and all sums are with zero, which changes no bit.
+
+*Saturation* is in level and rate.  The level limit holds for the whole torque of the joint, which
+is what its motor bears, and for the command alone, which is what its driver may cut: the two differ
+by what the drive adds.  The rate is that of the command, and not limited at the first
+sample after a reset.  The level limit takes precedence, for example if it is lowered below the last
+torque.
 """
+
+from __future__ import annotations
 
 from math import sin
 
-from blf_dsc_controller.compiled.jit import inner
+import numpy as np
+
+from blf_dsc_controller.arms.chain_kernels import fill_regressor
+from blf_dsc_controller.compiled.jit import inner, kernel
+from blf_dsc_controller.compiled.layout import Array, part
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.settings import LINEAR, Settings
+from blf_dsc_controller.law.settings import EFFORT, LINEAR, Settings
 from blf_dsc_controller.law.state import Signals, State
+
+LEVEL_CUT = 1.0
+RATE_CUT = 2.0
 
 
 @inner
@@ -73,3 +99,90 @@ def compute_demand(settings: Settings, state: State, signals: Signals) -> None:
                 learned -= settings.initial_estimate[j]
             torque += signals.H[i, j] * learned
         signals.demand[i] = torque
+
+
+@inner
+def find_added(settings: Settings, signals: Signals, q: np.ndarray) -> None:
+    """Write G_d(q) to `signals.added` (n,) [N m]."""
+    if settings.drive == 0:
+        return
+    still = signals.still
+    fill_regressor(settings.drive_chain, q, still, still, still, signals.drive)
+    for i in range(settings.n):
+        signals.added[i] = 0.0
+        for j in range(settings.drive):
+            signals.added[i] += signals.drive[i, j] * settings.drive_inertias[j]
+
+
+@inner
+def find_applied(
+    settings: Settings, state: State, signals: Signals, measurement: np.ndarray
+) -> None:
+    """Write the mean whole torque of the last interval to `signals.applied` (n,) [N m].
+
+    It is the last command, or the measured effort, and the mean of G_d at both ends.
+    """
+    n = settings.n
+    effort = part(measurement, 2 * n, (n,))
+    for i in range(n):
+        if settings.torque_source != EFFORT:
+            signals.applied[i] = state.torque[i]
+        else:
+            signals.applied[i] = effort[i]
+        if settings.torque_source != EFFORT or settings.effort_is_whole == 0:
+            signals.applied[i] += 0.5 * (state.added[i] + signals.added[i])
+        state.added[i] = signals.added[i]
+
+
+def added_torque(settings: Settings, q: Array) -> Array:
+    """Return G_d(q) (n,) [N m] at a position q (n,)."""
+    added = np.zeros(settings.n)
+    if settings.drive:
+        H, still = np.zeros((settings.n, settings.drive)), np.zeros(settings.n)
+        _fill_gravity(settings.drive_chain, q, still, H)
+        added[:] = H @ settings.drive_inertias
+    return added
+
+
+@kernel
+def _fill_gravity(chain: Array, q: Array, still: Array, H: Array) -> None:
+    fill_regressor(chain, q, still, still, still, H)
+
+
+@inner
+def clip(x: float, low: float, high: float) -> float:
+    """Limit x to [low, high]; NaN passes through."""
+    if x < low:
+        return low
+    if x > high:
+        return high
+    return x
+
+
+@inner
+def saturate(settings: Settings, state: State, signals: Signals, dt: float) -> bool:
+    """Limit `signals.demand`, giving the command `signals.torque` [N m]; return whether it is cut.
+
+    `dt` [s] is the time since the last torque.
+    """
+    saturated = False
+    for i in range(settings.n):
+        top = settings.torque_limit[i]
+        added = signals.added[i]
+        low, high = max(-top, added - top), min(top, added + top)
+        torque = clip(signals.demand[i], low, high)
+        signals.cuts[i] = 0.0
+        if torque != signals.demand[i]:
+            signals.cuts[i] = LEVEL_CUT
+            state.level_cuts[i] += 1.0
+        if settings.rate_limit[i] > 0.0 and state.samples[0] > 0.0:
+            step = settings.rate_limit[i] * dt
+            last = state.torque[i] + added
+            slowed = clip(torque, last - step, last + step)
+            if slowed != torque:
+                signals.cuts[i] += RATE_CUT
+                state.rate_cuts[i] += 1.0
+            torque = clip(slowed, low, high)
+        signals.torque[i] = torque - added
+        saturated = saturated or signals.cuts[i] > 0.0
+    return saturated

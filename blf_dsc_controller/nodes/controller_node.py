@@ -15,8 +15,12 @@ import numpy as np
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law import factory
-from blf_dsc_controller.law.rejected_columns import rejected_columns
-from blf_dsc_controller.law.telemetry import DECIMATION, ControllerTelemetry, Monitor
+from blf_dsc_controller.law.telemetry import (
+    DECIMATION,
+    ControllerTelemetry,
+    Monitor,
+    rejected_columns,
+)
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder, MessageError
 from blf_dsc_controller.nodes import parameters, process

@@ -10,8 +10,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
-from blf_dsc_controller.law.rejected_columns import RejectedColumn
-from blf_dsc_controller.law.telemetry import load_text
+from blf_dsc_controller.law.telemetry import RejectedColumn, load_text
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.topics import LOAD, PHASE, REASON, REJECTED, STOPS
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher

@@ -15,7 +15,7 @@ from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from blf_dsc_controller.arms.chain_geometry import skeleton, tip_radius
+from blf_dsc_controller.arms.geometry import skeleton, tip_radius
 from blf_dsc_controller.configuration.nodes import MarkersConfig
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder, MessageError

@@ -17,10 +17,12 @@ import numpy as np
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import OutsideBarrierError, StartError, VelocityMismatchError
 from blf_dsc_controller.reference.limits import MotionError, Violation, check_times, worst_violation
-from blf_dsc_controller.reference.polynomials import at_rest, hermite, minimum_jerk
 from blf_dsc_controller.reference.terms import (
     Term,
+    at_rest,
     evaluate,
+    hermite,
+    minimum_jerk,
     pack,
     sinusoids_term,
     spline_term,

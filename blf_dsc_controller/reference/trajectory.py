@@ -27,17 +27,15 @@ import numpy as np
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.reference.approach import BlendedReference, blend, braking_time
 from blf_dsc_controller.reference.limits import MotionError, check_times, worst_violation
-from blf_dsc_controller.reference.polynomials import (
+from blf_dsc_controller.reference.terms import (
+    Term,
     cubics,
     ending_at_rest,
     hermite,
     minimum_jerk,
-    quintics,
-)
-from blf_dsc_controller.reference.terms import (
-    Term,
     pack,
     pieces_of,
+    quintics,
     sampled,
     spline_term,
     unpack,

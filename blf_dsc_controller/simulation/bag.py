@@ -14,7 +14,6 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.factory import estimate_names
-from blf_dsc_controller.law.rejected_columns import rejected_columns
 from blf_dsc_controller.law.telemetry import (
     DECIMATION,
     ControllerTelemetry,
@@ -22,6 +21,7 @@ from blf_dsc_controller.law.telemetry import (
     Monitor,
     PlantTelemetry,
     encode_rejected_columns,
+    rejected_columns,
 )
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import encode_change

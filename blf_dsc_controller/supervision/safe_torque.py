@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from blf_dsc_controller.arms.batch import regressors_at
 from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.drive import added_torque
-from blf_dsc_controller.law.saturation import RATE_CUT
 from blf_dsc_controller.law.settings import Settings
+from blf_dsc_controller.law.torque import RATE_CUT, added_torque
 
 Vector = NDArray[np.float64]
 

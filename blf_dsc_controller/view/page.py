@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from blf_dsc_controller.analysis.style import ALARM, COLOURS, GREEN, INK, MUTED, ORANGE
-from blf_dsc_controller.arms.chain_geometry import frames, skeleton, tip_radius
+from blf_dsc_controller.arms.geometry import frames, skeleton, tip_radius
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.address import free_port, require_viser, url_of
 from blf_dsc_controller.view.arm import ShownArm
