@@ -24,6 +24,7 @@ class Compensation(NamedTuple):
 
     friction: float  # share of viscous and Coulomb friction that they overcome
     effort_is_whole: int  # 1: the measured effort contains what they add
+    effort_scale: float  # of the measured effort: 1, or A/N m of a current
     jump: float  # N m from one command to the next at which they stop; 0: none
 
 

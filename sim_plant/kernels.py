@@ -163,6 +163,7 @@ def observe(plant: PlantSettings, now: PlantState, measurement: np.ndarray) -> N
         measurement[2 * n + i] = now.drives.applied[i]
         if plant.compensation.effort_is_whole == 1:
             measurement[2 * n + i] += now.compensation.added[i]
+        measurement[2 * n + i] *= plant.compensation.effort_scale
 
 
 @inner

@@ -32,6 +32,7 @@ from sim_plant.sensors import VELOCITY_SOURCES, Encoders, generator, is_noisy
 
 _RESOLVED = 1.5  # decay within a step; both integrators are stable up to 2.7
 _MOST_STEPS = 1000
+_CURRENT = 0.1  # A/N m, of motors with their gears, roughly that of cobots
 FASTEST = 1e3
 """Norm of the joint velocities [rad/s] beyond which the arm breaks and stops where it was."""
 
@@ -205,7 +206,8 @@ def settings_of(config: PlantConfig) -> PlantSettings:
         ),
         compensation=Compensation(
             drive.friction if robot.drive_compensates == 'gravity_and_friction' else 0.0,
-            int(robot.effort == 'whole'),
+            int(robot.effort != 'commanded'),
+            _CURRENT if robot.effort == 'current' else 1.0,
             actuator.reflex_rate * config.sample_time,
         ),
         drive_size=bodies.size,

@@ -104,7 +104,7 @@ def settings(
         drives=Drives(
             np.array(torque_limit), delay, *lag(time_constant, period_ns * 1e-9), torque_noise
         ),
-        compensation=Compensation(0.0, 1, 0.0),
+        compensation=Compensation(0.0, 1, 1.0, 0.0),
         drive_size=0,
         drive_memory=0,
         drive_bodies=np.zeros(0),

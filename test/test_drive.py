@@ -18,7 +18,9 @@ from blf_dsc_controller.law.factory import controller_of, estimate_names
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.supervision.safe_torque import LastState, safe_torque
+from blf_dsc_controller.supervision.first_torque import check_support
+from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.safe_torque import LastState, model_torque, safe_torque
 
 PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 HELD = {'robot.drive_compensates': 'gravity'}
@@ -171,6 +173,89 @@ def test_first_torque_beyond_what_the_drive_tolerates_is_refused():
     assert np.abs(run('panda', 0.01, relative, steps | unchecked, HELD).sample(0).torque[1]) > 30.0
 
 
+@pytest.mark.parametrize('preset', ['panda', 'ur5e'])
+@pytest.mark.parametrize('effort', ['unknown', 'commanded', 'whole', 'current'])
+@pytest.mark.parametrize('parameter', ['none', 'gravity'])
+def test_live_arm_gets_gravity_only_if_something_shows_what_holds_it(preset, effort, parameter):
+    """An effort of nothing shows brakes only if it would contain what the drives add."""
+    given = {'robot.effort': effort, 'robot.drive_compensates': parameter}
+    loop = loop_of(preset)
+    for steps, is_limited in (({}, False), ({'torque.first_step': [200.0] * 7}, True)):
+        steps = {name: value[: len(loop.controller.joints)] for name, value in steps.items()}
+        config = change(loop.controller, given | steps)
+        measurement = np.zeros(3 * len(config.joints))
+        measurement[: len(config.joints)] = loop.plant.initial.position
+        guard = Guard(config)
+        guard.activate()
+        guard.check_support(measurement)
+        is_shown = effort in ('whole', 'current')
+        assert (guard.start_error is None) == (is_shown or is_limited or parameter == 'gravity')
+        if guard.start_error is not None:
+            assert 'what holds the arm?' in str(guard.start_error)
+            assert guard.supervisor.reason == 'start rejected'
+        moving = measurement + 0.1
+        assert check_support(guard.controller, config, moving) is None
+
+
+def test_restart_on_a_drive_that_holds_a_torque():
+    """The first torque replaces the one held, if the effort never contains anything else."""
+    config = change(loop_of('panda').controller, {'robot.effort': 'commanded'})
+    law, q = controller_of(config), np.array(loop_of('panda').plant.initial.position)
+    gravity = model_torque(law.settings, law.settings.initial_estimate, q)
+    held = np.concatenate((q, np.zeros(7), gravity))
+    steps = {'torque.first_step': [5.0] * 7}
+    for given in (config, change(config, steps)):
+        guard = Guard(given)
+        guard.activate()
+        guard.check_support(held)
+        np.testing.assert_allclose(guard.update(10**9, held), gravity, atol=3.0)
+    guard = Guard(change(config, {'robot.effort': 'whole'}))
+    guard.activate()
+    assert guard.update(10**9, held) is None
+    assert 'of another or an earlier controller holds the arm' in guard.supervisor.text
+    guard = Guard(change(config, steps))
+    guard.activate()
+    assert guard.update(10**9, held * np.repeat([1.0, 0.0], [14, 7])) is None
+
+
+@pytest.mark.parametrize(('preset', 'rate'), [('ur5e_driver', 500.0)])
+def test_repeated_reading_with_a_new_stamp_does_not_make_the_torque_jump(preset, rate):
+    """Universal_Robots_ROS2_Driver with non_blocking_read; once 222 N m instead of 8 N m."""
+    steps = []
+    for every in (0, 100):
+        unlimited = {'torque.rate_limit': [0.0] * 6}
+        record = run(preset, 5.0, None, unlimited, {'sensor.repeat_every': every})
+        torques = np.array([record.sample(k).torque for k in range(record.stamps.size)])
+        steps.append(np.abs(np.diff(torques[round(rate) :], axis=0)).max())
+    assert steps[1] < 1.5 * steps[0]
+
+
+@pytest.mark.parametrize('effort', ['whole', 'commanded', 'current'])
+@pytest.mark.parametrize('drive', ['none', 'gravity'])
+def test_slow_drift_of_commands_without_effect_shows_in_the_effort(drive, effort):
+    """The law believes that the braked arm moves by 2 mrad/s: its torque drifts away from it.
+
+    Too slowly to be told from an arm that a hand holds, without a measured torque.
+    """
+    given = {'robot.effort': effort, 'robot.drive_compensates': drive, 'safety.error_ratio': 0.0}
+    config = change(loop_of('panda').controller, given | {'reference.type': 'hold'})
+    q = np.array(loop_of('panda').plant.initial.position)
+    added = added_torque(controller_of(config).settings, q)
+    for follows in (True, False):
+        guard = Guard(config)
+        guard.activate()
+        torque = braked = np.zeros(7)
+        for k in range(3200):
+            applied = (torque if follows else braked) + (added if effort != 'commanded' else 0.0)
+            measurement = np.concatenate((q, np.full(7, 2e-3), applied))
+            torque = guard.update((1000 + k) * 10**6, measurement).copy()
+            if k == 500:
+                braked = torque
+        is_seen = not follows and effort != 'current'
+        assert guard.supervisor.running != is_seen, guard.supervisor.text
+        assert ('lacks' in guard.supervisor.text) == is_seen
+
+
 def test_torque_of_another_controller_is_not_taken_for_a_missing_gravity_twice():
     """An effort that only contains commands, but holds the arm: its drives do not."""
     with pytest.raises(StartError, match=r'no gravity: .* rests with a commanded effort of'):
@@ -257,7 +342,11 @@ def test_friction_that_the_drive_compensates_is_not_fed_forward_a_second_time():
         ({'robot.drive_payload': -1.0} | HELD, 'drive_payload: got -1.0, but it must be at least'),
         (TOLD, 'robot.drive_payload: got 1.5 kg, but drive_compensates is none'),
         ({'robot.drive_payload_centre': [0.0]} | HELD, 'got 1 entry, but 3 are needed'),
-        ({'robot.effort': 'current'}, "robot.effort: got 'current', but it must be one of whole"),
+        ({'robot.effort': 'volts'}, "robot.effort: got 'volts', but it must be one of unknown"),
+        (
+            {'robot.effort': 'current', 'learning.torque_source': 'effort'},
+            'learning.torque_source: got effort, but robot.effort is current',
+        ),
         ({'torque.first_step': [-1.0] + 6 * [0.0]}, 'torque.first_step: got -1.0 at entry 1'),
         ({'safety.first_torque': 'ask'}, "got 'ask', but it must be one of check, send"),
     ],

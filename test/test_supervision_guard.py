@@ -474,6 +474,20 @@ def test_commands_without_effect_stop_the_arm_with_the_model_from_before():
     assert np.abs(rig.state().q - state.q).max() < 0.02
 
 
+@pytest.mark.parametrize(('effort', 'stops'), [('unknown', False), ('commanded', True)])
+def test_constant_command_that_does_not_reach_the_arm_shows_only_in_its_effort(effort, stops):
+    """An inactive effort controller, on an arm that its drives hold."""
+    hold = {'reference.type': 'hold', 'learning.initial_estimate': P.tolist()}
+    rig = Rig(hold | {'robot.effort': effort}, plant={'disturbance.amplitude': [0.0, 0.0]})
+    rig.step(100)
+    assert rig.supervisor.running
+    q = rig.state().q
+    rig.sense = lambda state: [state.raw(q=q, dq=np.zeros(2), effort=np.zeros(2))]
+    rig.step(300)
+    assert rig.supervisor.running != stops
+    assert ('lacks' in rig.supervisor.text) == stops
+
+
 def test_arm_that_stands_still_under_noise_is_not_taken_for_braked():
     """Coarse encoders make the torque chatter although nothing moves."""
     rig = Rig({'reference.type': 'hold', 'learning.initial_estimate': P.tolist()})

@@ -290,8 +290,10 @@ class ControllerConfig(Sampled):
         if learning.weighing and learned != ('urdf', 'base', 'filtered'):
             needs = 'model urdf, robot.learn base and learning.prediction filtered'
             return [f'learning.weighing: got true with {", ".join(learned)}, but needs {needs}']
+        by_current = self.robot.effort == 'current' and self.learning.torque_source == 'effort'
         return [
             *joint_problems(self.joints, f'model {self.model}', needed),
+            *(['learning.torque_source: got effort, but robot.effort is current'] * by_current),
             *(f'robot.{problem}' for problem in self.robot.problems()),
             *self.sample_time_problems(),
             *self.reference.problems(),

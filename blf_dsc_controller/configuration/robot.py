@@ -84,8 +84,10 @@ class Robot:
     drive_payload_centre: Annotated[tuple[float, ...], '3'] = _fixed(
         (0.0, 0.0, 0.0), 'centre of mass of that payload, in the frame of the tip', 'm'
     )
-    effort: Literal['whole', 'commanded'] = _fixed(
-        'whole', 'what `effort` in joint states contains: all torques, or without what drives add'
+    effort: Literal['unknown', 'whole', 'commanded', 'current'] = _fixed(
+        'unknown',
+        'what `effort` in joint states is: torques, whole or without what the drives add, or only '
+        'proportional to the whole, as currents are',
     )
     viscous: Annotated[tuple[float, ...], 'joints'] = _fixed(
         (),

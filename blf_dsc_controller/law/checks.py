@@ -44,6 +44,13 @@ class Checks(NamedTuple):
     moved: Annotated[Array, 'm + n']  # estimates and d^3 of then
     recent: Annotated[Array, 'n']  # N m, average of the commands over _RECENT
     before: Annotated[Array, 'n']  # N m, average of them over _BEFORE
+    compares: Cell  # 1: measured efforts are torques, to be compared with the commands
+    lack: Annotated[Array, 'n']  # N m, average of commands less efforts over _RECENT
+    known: Annotated[Array, 'n']  # N m, of it the error of the model of what the drives add
+    lacking: Cell  # s, since a lack has become too large
+    read: Annotated[Array, '2 * n']  # q and dq as last read
+    age: Cell  # s, since they were new
+    used: Annotated[Array, '3 * n']  # the measurement that the law uses
 
 
 _STILL = 0.02  # of the bound: a joint that stays within has not moved
@@ -51,6 +58,8 @@ _CHANGED = 0.1  # of the torque limit: a command that differs by more should hav
 _RECENT = 0.05  # s, past the chatter of encoders' steps in the velocities
 _BEFORE = 1.0  # s
 _CHATTERS = 0.5  # s
+_LASTING = 0.1  # s, for which the efforts have to differ from the commands
+_BRIDGED = 3.5  # samples, for which a reading may be repeated
 
 checks_of, checks_size = view_of(Checks), size_of(Checks)
 
@@ -65,6 +74,30 @@ def is_valid_state(settings: Settings, checks: Checks, measurement: np.ndarray) 
         if settings.torque_source == EFFORT and not isfinite(measurement[2 * n + i]):
             return False
     return True
+
+
+@inner
+def bridge_repeats(
+    settings: Settings, checks: Checks, state: State, dt: float, measurement: np.ndarray
+) -> None:
+    """Write the measurement (3 n,) that the law uses to `checks.used`.
+
+    Drivers that do not wait for their arm send a reading once more, with a new stamp: an arm in
+    motion that seems to stand still for a sample.  It is continued at its velocity.
+    """
+    n = settings.n
+    repeats = state.samples[0] > 0.0
+    for i in range(2 * n):
+        repeats = repeats and measurement[i] == checks.read[i]
+        checks.read[i] = measurement[i]
+    checks.age[0] = checks.age[0] + dt if repeats else 0.0
+    is_bridged = repeats and checks.age[0] < _BRIDGED * checks.sample_time[0]
+    for i in range(n):
+        checks.used[i] = measurement[i]
+        checks.used[n + i] = measurement[n + i]
+        checks.used[2 * n + i] = measurement[2 * n + i]
+        if is_bridged:
+            checks.used[i] += checks.age[0] * measurement[n + i]
 
 
 @inner
@@ -84,20 +117,22 @@ def check_error(settings: Settings, checks: Checks, xi1: np.ndarray, bound: np.n
 
 
 @inner
-def check_effect(settings: Settings, checks: Checks, state: State, sample: Sample) -> int:
+def check_effect(
+    settings: Settings, checks: Checks, state: State, signals: Signals, sample: Sample
+) -> int:
     """Return the flags for commands without effect; call it once the sample's values are kept.
 
     While no joint moves, gravity does not change: the commands should not either, except by what
     overcomes stiction. Otherwise brakes hold the arm, or its effort controller is not active, and
-    the law learns what its own commands say.
+    the law learns what its own commands say. Slower drifts show in the efforts, if they are torques.
     """
     begins = state.samples[0] <= 1.0
     moves = begins
     for i in range(settings.n):
         moved = abs(sample.qr[i] + sample.xi1[i] - checks.q[i])
         moves = moves or not moved < _STILL * sample.bound[i]
-    flags = 0
     T = checks.sample_time[0]
+    flags = compare_effort(settings, checks, signals, sample, begins, moves)
     checks.still[0] = 0.0 if moves else checks.still[0] + T
     for i in range(settings.n):
         smooth = 1.0 if begins else min(1.0, T / _RECENT)
@@ -110,10 +145,44 @@ def check_effect(settings: Settings, checks: Checks, state: State, sample: Sampl
         change = abs(checks.recent[i] - checks.before[i])
         if checks.still[0] > _RECENT and change > _CHANGED * settings.torque_limit[i]:
             flags |= NO_EFFECT | SUSPECT
-    if moves:
+    if moves and checks.lacking[0] == 0.0:
         for j in range(settings.m + settings.n):
             checks.moved[j] = checks.kept[j]
     return flags
+
+
+@inner
+def compare_effort(
+    settings: Settings,
+    checks: Checks,
+    signals: Signals,
+    sample: Sample,
+    begins: bool,
+    moves: bool,
+) -> int:
+    """Return the flags for efforts that do not follow the commands.
+
+    The drives' own model of what they add may differ from the law's: then what the efforts lack
+    must not change while no joint moves.
+    """
+    if checks.compares[0] == 0.0:
+        return 0
+    T, is_lacking = checks.sample_time[0], False
+    is_relative = settings.drive > 0 and settings.effort_is_whole == 1
+    for i in range(settings.n):
+        lack = sample.torque[i] - checks.used[2 * settings.n + i]
+        if is_relative:
+            lack += signals.added[i]
+        if begins:
+            checks.lack[i] = lack if is_relative else 0.0
+        elif isfinite(lack):
+            checks.lack[i] += min(1.0, T / _RECENT) * (lack - checks.lack[i])
+        if moves:
+            checks.known[i] = checks.lack[i] if is_relative else 0.0
+        excess = abs(checks.lack[i] - checks.known[i])
+        is_lacking = is_lacking or excess > _CHANGED * settings.torque_limit[i]
+    checks.lacking[0] = checks.lacking[0] + T if is_lacking else 0.0
+    return NO_EFFECT | SUSPECT if checks.lacking[0] > _LASTING else 0
 
 
 @inner
@@ -151,5 +220,5 @@ def check_sample(
             checks.kept[settings.m + i] = state.disturbance[i]
         if checks.sample_time[0] > 0.0:
             average_steps(settings, checks, state, sample)
-            flags |= check_effect(settings, checks, state, sample)
+            flags |= check_effect(settings, checks, state, signals, sample)
     return flags

@@ -11,6 +11,7 @@ from blf_dsc_controller.compiled.layout import pack, part, sizes_of
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.checks import (
     INVALID,
+    bridge_repeats,
     check_sample,
     checks_of,
     checks_size,
@@ -58,8 +59,11 @@ def update(
     is_checked = checks.velocity_limit[0] > 0.0
     if is_checked and not is_valid_state(settings, checks, measurement):
         return INVALID
-    step(settings, reference_vector, state, signals, t, dt, measurement, sample)
-    fill_energies(settings, state, signals, part(measurement, 0, (settings.n,)), sample)
+    if is_checked:
+        bridge_repeats(settings, checks, state, dt, measurement)
+    used = checks.used if is_checked else measurement
+    step(settings, reference_vector, state, signals, t, dt, used, sample)
+    fill_energies(settings, state, signals, part(used, 0, (settings.n,)), sample)
     return check_sample(settings, checks, state, signals, sample) if is_checked else 0
 
 
@@ -158,6 +162,15 @@ class Controller:
                 self.signals_vector,
                 dt,
             )
+
+    def trial(self, t: float, dt: float, measurement: np.ndarray) -> np.ndarray:
+        """Return the torque of an unchecked update that only changes `signals` and `sample`."""
+        saved, limit = self.save(), self.checks.velocity_limit[0]
+        self.checks.velocity_limit[0] = 0.0
+        torque: np.ndarray = self.update(t, dt, measurement).copy()
+        self.checks.velocity_limit[0] = limit
+        self.restore(saved)
+        return torque
 
     def save(self) -> np.ndarray:
         """Return a copy of the whole state."""

@@ -138,7 +138,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         latch=LATCHES.index(learning.latch),
         update=UPDATES.index(learning.update),
         torque_source=TORQUE_SOURCES.index(learning.torque_source),
-        effort_is_whole=int(config.robot.effort == 'whole'),
+        effort_is_whole=int(config.robot.effort != 'commanded'),
         drive=drive_inertias.size,
         drive_size=drive_chain.size,
         compensation=COMPENSATIONS.index(learning.compensation),

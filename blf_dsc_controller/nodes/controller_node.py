@@ -165,6 +165,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def reset(self) -> str:
         """Restart with the next joint state and the initial estimates."""
         if self.guard is not None:
+            if self.guard.start_error is not None:
+                self._arrivals = []
             self.guard.reset()
         self.failure = None
         self._report()
@@ -206,7 +208,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def _measures_rate(self, guard: Guard, raw: bytes) -> bool:
         """Measure the rate of live states before the start; return whether to wait for more.
 
-        At another rate than that of `sample_time` the gains are wrong, up to instability.
+        At another rate than that of `sample_time` the gains are wrong, up to instability. A live
+        arm whose support is not known is refused, too.
         """
         try:
             stamp = self._decoder.decode(raw)
@@ -235,7 +238,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
                     'sample_time to the period of the topic'
                 )
             )
-            self._report_if_changed(guard)
+        else:
+            guard.check_support(self._decoder.values)
+        self._report_if_changed(guard)
         return guard.start_error is not None
 
     def survive(self, error: Exception) -> bool:

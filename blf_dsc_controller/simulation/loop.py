@@ -20,7 +20,13 @@ from blf_dsc_controller.compiled.layout import part, view
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
-from blf_dsc_controller.law.checks import SUSPECT, check_sample, checks_of, is_valid_state
+from blf_dsc_controller.law.checks import (
+    SUSPECT,
+    bridge_repeats,
+    check_sample,
+    checks_of,
+    is_valid_state,
+)
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.law.lyapunov import fill_energies
@@ -84,10 +90,13 @@ def run_loop(
         plants.observe(plant, now, measurement)
         if is_checked and not is_valid_state(law, checks, measurement):
             return False
-        step(law, reference_view, law_state, law_signals, t, dt, measurement, sample)
+        if is_checked:
+            bridge_repeats(law, checks, law_state, dt, measurement)
+        used = checks.used if is_checked else measurement
+        step(law, reference_view, law_state, law_signals, t, dt, used, sample)
         plants.truth(plant, now, true[k - first])
         if observed:
-            fill_energies(law, law_state, law_signals, part(measurement, 0, (law.n,)), sample)
+            fill_energies(law, law_state, law_signals, part(used, 0, (law.n,)), sample)
             add_row(law, law_state, law_signals, dt)
         if is_checked and check_sample(law, checks, law_state, law_signals, sample) & SUSPECT:
             return False

@@ -12,7 +12,7 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.configuration.controller import Safety
+from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.law.checks import NO_EFFECT, OUTSIDE, SUSPECT
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import LINEAR
@@ -153,17 +153,16 @@ class SampleCheck:
         saturated: samples with a torque at its limit since the start.
     """
 
-    def __init__(
-        self, safety: Safety, joints: Sequence[str], controller: Controller, sample_time: float
-    ) -> None:
-        """Enable the checks of the controller, with a sample every `sample_time` [s]."""
-        controller.checks.sample_time[0] = sample_time
-        self._joints = tuple(joints)
+    def __init__(self, config: ControllerConfig, controller: Controller) -> None:
+        """Enable the checks of the controller."""
+        controller.checks.sample_time[0] = config.sample_time
+        controller.checks.compares[0] = float(config.robot.effort in ('whole', 'commanded'))
+        self._joints = config.joints
         self._controller = controller
         self.ratio = controller.checks.ratio
         self._kept = controller.checks.kept
         self._saturation = 0  # ns, times _RELIEF
-        self.set_limits(safety)
+        self.set_limits(config.safety)
         self.keep()
         self.restart()
 
@@ -237,11 +236,20 @@ class SampleCheck:
         return None
 
     def _without_effect(self) -> Fault:
-        """Return to the estimates from before the arm stood still."""
-        checks = self._controller.checks
+        """Return to the estimates from before the commands had no effect."""
+        checks, limit = self._controller.checks, self._controller.settings.torque_limit
         self._kept[:] = checks.moved
+        if checks.lacking[0] > 0.0:
+            lack = checks.lack - checks.known
+            worst = int(np.argmax(np.abs(lack) / limit))
+            text = (
+                f'the effort of joint {self._joints[worst]!r} lacks {lack[worst]:+.4g} N m of '
+                'what is commanded: release the brakes, and activate the effort controller; if the '
+                'effort is not a torque in N m, set robot.effort to current or unknown'
+            )
+            return Fault(Reason.NO_EFFECT, text)
         change = checks.recent - checks.before
-        worst = int(np.argmax(np.abs(change) / self._controller.settings.torque_limit))
+        worst = int(np.argmax(np.abs(change) / limit))
         text = (
             f'the torque of joint {self._joints[worst]!r} has changed by {change[worst]:+.4g} N m, '
             'but no joint has moved: release the brakes, and activate the effort controller'
@@ -297,13 +305,21 @@ class SampleCheck:
         return Fault(Reason.SATURATED, text)
 
 
+_MOVING = 3e-4  # rad in a sample: three counts of an encoder of 16 bits
+
+
 class Velocity:
-    """Replaces velocities with finite differences of positions."""
+    """Replaces velocities with finite differences of positions.
+
+    An arm in motion whose positions do not change for a sample has sent its last reading once more,
+    with a new stamp: it is continued at its velocity.
+    """
 
     def __init__(self, n: int) -> None:
-        self._stamp = -1
+        self._stamp = self._seen = -1  # ns, of the last new reading and of the last state
         self._q = np.zeros(n)
         self._dq = np.zeros(n)
+        self._repeated = False
 
     def reset(self) -> None:
         """Forget the last state: the arm is assumed to be at rest in the next one."""
@@ -314,8 +330,15 @@ class Velocity:
         q, dq, _ = measurement.reshape(3, -1)
         if self._stamp < 0 or stamp < self._stamp:
             self._dq[:] = 0.0
-        elif stamp > self._stamp:
-            self._dq[:] = (q - self._q) / ((stamp - self._stamp) * 1e-9)
-        self._stamp = stamp
+        elif stamp > self._seen:
+            step, self._seen = (stamp - self._stamp) * 1e-9, stamp
+            is_moving = float(np.abs(self._dq).max()) * step > _MOVING
+            self._repeated = is_moving and not self._repeated and bool((q == self._q).all())
+            if self._repeated:
+                q += step * self._dq
+                dq[:] = self._dq
+                return
+            self._dq[:] = (q - self._q) / step
+        self._stamp = self._seen = stamp
         self._q[:] = q
         dq[:] = self._dq

@@ -3,7 +3,9 @@
 
 Whether drives compensate gravity cannot be told from positions, but from the effort with which they
 hold a resting arm: gravity if they do, nothing if the brakes hold it.  Only its direction and order
-of magnitude are used, so it may also be a current.
+of magnitude are used, so it may also be a current.  An effort of nothing shows nothing if it may
+not be measured, or not contain what the drives add: then a live arm gets no torque of gravity
+without being told that its drives tolerate it.
 """
 
 from __future__ import annotations
@@ -34,13 +36,13 @@ def check_first_torque(
     """
     if config.safety.first_torque == 'send':
         return
-    saved = controller.save()
-    torque = controller.update(0.0, config.sample_time, measurement).copy()
-    controller.restore(saved)
+    torque = controller.trial(0.0, config.sample_time, measurement)
     if config.robot.urdf:
         _check_gravity(controller, config, measurement, torque)
     step = np.array(config.torque.first_step)
-    excess = np.where(step > 0.0, np.abs(torque) - step, 0.0)
+    # Of an effort that only contains commands, a torque is held that this one replaces.
+    held = measurement.reshape(3, -1)[2] if config.robot.effort == 'commanded' else 0.0
+    excess = np.where(step > 0.0, np.abs(torque - held) - step, 0.0)
     worst = int(np.argmax(excess))
     if excess[worst] > 0.0:
         raise StartError(
@@ -63,6 +65,36 @@ def _is_like(torque: Vector, gravity: Vector) -> bool:
     return sizes[0] > _NOTICED * sizes[1] and float(torque @ gravity) > _ALIKE * sizes[0] * sizes[1]
 
 
+def check_support(controller: Controller, config: ControllerConfig, measurement: Vector) -> None:
+    """Raise StartError if nothing shows what holds a live arm at rest, and nothing limits a step.
+
+    It may be brakes, or drives that compensate gravity, to which gravity would be added.
+    """
+    robot, limits = config.robot, np.array(config.torque.first_step)
+    if (
+        not robot.urdf
+        or robot.drive_compensates != 'none'
+        or robot.effort in ('whole', 'current')
+        or config.safety.first_torque == 'send'
+    ):
+        return
+    q, dq, effort = measurement.reshape(3, -1)
+    gravity = _gravity(controller, q)
+    worst = int(np.argmax(np.where(limits > 0.0, 0.0, np.abs(gravity))))
+    is_held = np.isfinite(effort).all() and _is_like(effort, gravity)  # which the check above sees
+    matters = (
+        limits[worst] == 0.0 and np.abs(gravity[worst]) > _MATTERS * config.torque.limit[worst]
+    )
+    if matters and not is_held and not np.abs(dq).max() > _AT_REST:
+        raise StartError(
+            f'what holds the arm? It rests, its gravity is {gravity[worst]:.4g} N m on joint '
+            f'{config.joints[worst]!r}, and its effort of {effort[worst]:.4g} N m does not show '
+            'whether brakes hold it or drives that compensate gravity. Set robot.drive_compensates '
+            'if they do; if not, set robot.effort to whole if the drives measure torques, or '
+            'torque.first_step to the torques that may be sent at once'
+        )
+
+
 def _check_gravity(
     controller: Controller, config: ControllerConfig, measurement: Vector, torque: Vector
 ) -> None:
@@ -74,20 +106,21 @@ def _check_gravity(
     if not (matters and np.abs(dq).max() <= _AT_REST and np.isfinite(effort).all()):
         return
     robot, joint = config.robot, config.joints[worst]
-    holds = _is_like(effort, gravity)
-    if robot.drive_compensates == 'none' and holds:
+    holds, is_commanded = _is_like(effort, gravity), robot.effort == 'commanded'
+    if robot.drive_compensates == 'none' and holds and not is_commanded:
         raise StartError(
             f'gravity twice: the first torque would be {torque[worst]:.4g} N m on joint {joint!r}, '
             f'but it rests with an effort of {effort[worst]:.4g} N m before any command: '
             'the drives compensate gravity (set robot.drive_compensates to gravity), or a torque '
-            f'of another controller holds the arm (set {_SEND})'
+            'of another or an earlier controller holds the arm (set robot.effort to commanded if '
+            f'the effort never contains anything else, or {_SEND})'
         )
     is_unloaded = np.linalg.norm(effort) <= _NOTICED * np.linalg.norm(gravity)
-    fits = not is_unloaded if robot.effort == 'whole' else not holds
+    fits = not holds if is_commanded else not is_unloaded
     if robot.drive_compensates == 'none' or fits:
         return
     drives = f'robot.drive_compensates is {robot.drive_compensates}'
-    if robot.effort == 'commanded':
+    if is_commanded:
         raise StartError(
             f'no gravity: {drives}, but joint {joint!r} rests with a commanded effort of '
             f'{effort[worst]:.4g} N m where none should be needed: set it to none, or '

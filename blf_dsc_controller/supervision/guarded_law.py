@@ -25,7 +25,7 @@ from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.reference.approach import check_takeover
 from blf_dsc_controller.reference.limits import MotionError
 from blf_dsc_controller.supervision.checks import SKIP, SampleCheck, StateCheck, Velocity
-from blf_dsc_controller.supervision.first_torque import check_first_torque
+from blf_dsc_controller.supervision.first_torque import check_first_torque, check_support
 from blf_dsc_controller.supervision.safe_torque import SafeTorque, limit_first_torque
 from blf_dsc_controller.supervision.supervisor import Phase, Reason, Supervisor
 from blf_dsc_controller.supervision.watchdog import PERIOD, Watchdog
@@ -76,9 +76,7 @@ class GuardedLaw:
         self.controller = controller_of(config)
         self.supervisor = Supervisor()
         self.states = StateCheck(config.joints, config.sample_time)
-        self.samples = SampleCheck(
-            config.safety, config.joints, self.controller, config.sample_time
-        )
+        self.samples = SampleCheck(config, self.controller)
         self.watchdog = Watchdog(steady, wall)
         self.journal = Journal()
         self.has_sample = False
@@ -213,6 +211,14 @@ class GuardedLaw:
         self.watchdog.switch(self.config.safety.watchdog, stamp)
         self.supervisor.enter(Phase.APPROACHING)
         return True
+
+    def check_support(self, measurement: Vector) -> None:
+        """Refuse to start if nothing shows what holds a live arm."""
+        if not self.commanding:
+            try:
+                check_support(self.controller, self.config, measurement)
+            except StartError as error:
+                self.refuse(error)
 
     def refuse(self, error: StartError | MotionError) -> None:
         """Stop before the start, for a reason."""

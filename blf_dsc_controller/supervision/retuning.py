@@ -54,9 +54,7 @@ def _trial(
     controller: Controller, t: float, dt: float, measurement: Vector
 ) -> tuple[Vector, Vector]:
     """Return beta2 and demanded torque of an update, leaving the state unchanged."""
-    saved = controller.save()
-    controller.update(t, dt, measurement)
-    controller.restore(saved)
+    controller.trial(t, dt, measurement)
     return controller.signals.beta2.copy(), controller.signals.demand.copy()
 
 
