@@ -24,6 +24,7 @@ from blf_dsc_controller.nodes.controller_node import ControllerNode
 
 ZERO = (0.0, 0.0)
 VELOCITY = (0.01, -0.02)  # rad/s
+NEXT = tuple(q + 1e-3 * dq for q, dq in zip(START, VELOCITY, strict=True))
 
 
 def law_torques(*measurements):
@@ -167,9 +168,9 @@ def test_gain_change_takes_effect_at_the_next_sample(ros):
     gain = [30.0, 10.0]
     arm.torque_for(0, START, VELOCITY)
     assert set_parameters(ros, node, feedback__gain=gain) == (True, [''])
-    torque = arm.torque_for(1, START, VELOCITY)
+    torque = arm.torque_for(1, NEXT, VELOCITY)
     np.testing.assert_array_equal(node.guard.controller.settings.Kp, gain)
-    assert not np.array_equal(torque, law_torques(*[(START, VELOCITY)] * 2)[1])
+    assert not np.array_equal(torque, law_torques((START, VELOCITY), (NEXT, VELOCITY))[1])
 
 
 def test_invalid_gain_changes_nothing_and_is_rejected_with_a_reason(ros):
@@ -179,8 +180,8 @@ def test_invalid_gain_changes_nothing_and_is_rejected_with_a_reason(ros):
     accepted, reasons = set_parameters(ros, node, feedback__gain=[30.0, -10.0])
     assert not accepted
     assert '-10.0' in reasons[0]
-    torque = arm.torque_for(1, START, VELOCITY)
-    np.testing.assert_array_equal(torque, law_torques(*[(START, VELOCITY)] * 2)[1])
+    torque = arm.torque_for(1, NEXT, VELOCITY)
+    np.testing.assert_array_equal(torque, law_torques((START, VELOCITY), (NEXT, VELOCITY))[1])
 
 
 def test_gain_with_a_configuration_warning_is_rejected_at_run_time(ros):
@@ -191,5 +192,5 @@ def test_gain_with_a_configuration_warning_is_rejected_at_run_time(ros):
     assert not accepted
     assert reasons[0].startswith('feedback.gain: K_p over the inertia is ')
     assert reasons[0].endswith('; to use it anyway, start the node with it')
-    torque = arm.torque_for(1, START, VELOCITY)
-    np.testing.assert_array_equal(torque, law_torques(*[(START, VELOCITY)] * 2)[1])
+    torque = arm.torque_for(1, NEXT, VELOCITY)
+    np.testing.assert_array_equal(torque, law_torques((START, VELOCITY), (NEXT, VELOCITY))[1])
