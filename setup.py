@@ -156,7 +156,6 @@ setup(
             'sim_plant = blf_dsc_controller.cli.main:sim_plant',
             'blf_dsc_controller = blf_dsc_controller.cli.main:blf_dsc_controller',
             'bag_recorder = blf_dsc_controller.cli.main:bag_recorder',
-            'arm_markers = blf_dsc_controller.cli.main:arm_markers',
             'torque_watchdog = blf_dsc_controller.cli.main:torque_watchdog',
             'arm_view = blf_dsc_controller.cli.main:arm_view',
         ],

@@ -85,16 +85,10 @@ def generate_launch_description() -> LaunchDescription:
                 description='folder to record into, which must not exist yet; empty: no recording',
             ),
             DeclareLaunchArgument(
-                'markers',
-                default_value='false',
-                choices=['false', 'true'],
-                description='publish reference, bound and torques for RViz and Foxglove',
-            ),
-            DeclareLaunchArgument(
                 'rviz',
                 default_value='false',
                 choices=['false', 'true'],
-                description='show the arm and its markers in RViz',
+                description='show the arm in RViz',
             ),
             OpaqueFunction(function=nodes),
         ]
@@ -103,10 +97,10 @@ def generate_launch_description() -> LaunchDescription:
 
 def nodes(context: LaunchContext) -> list[Node]:
     """Create the nodes once the arguments are known."""
-    config, mode, namespace, bag, markers, rviz, robot, simulated = (
+    config, mode, namespace, bag, rviz, robot, simulated = (
         LaunchConfiguration(name).perform(context)
         for name in (
-            *('config', 'mode', 'namespace', 'bag', 'markers', 'rviz'),
+            *('config', 'mode', 'namespace', 'bag', 'rviz'),
             *('driver', 'simulated'),
         )
     )
@@ -132,8 +126,6 @@ def nodes(context: LaunchContext) -> list[Node]:
 
     # Viewers come first: if they are not installed, nothing has been started yet.
     started = view(namespace, file) if rviz == 'true' else []
-    if 'true' in (markers, rviz):
-        started.append(node('arm_markers', {}, required=False))
     if bag:
         started.append(node('bag_recorder', {'output': bag}))
     started.append(node('torque_watchdog', {}, required=False))

@@ -14,7 +14,6 @@ from pathlib import Path
 from ros_rig import RosRig
 
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from blf_dsc_controller.nodes.markers_node import MarkersNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
@@ -51,7 +50,7 @@ def is_recording_all(ros):
     there = {name for name, _ in ros.tester.get_topic_names_and_types()}
     found = ros.tester.get_subscriber_names_and_types_by_node('_bag_recorder_subscriptions', '/')
     published = {name for name in there if ros.tester.count_publishers(name)}
-    return '/arm_markers/markers' in there and published <= {name for name, _ in found}
+    return published <= {name for name, _ in found}
 
 
 def live():
@@ -63,7 +62,6 @@ def live():
             # One thread serves all nodes: the arm must leave time for the others.
             ros.add(PlantNode, publish_clock=True, sample_time=0.02)
             ros.add(ControllerNode, sample_time=0.02)
-            ros.add(MarkersNode)
             ros.add(ViewNode)
             watchdog = ros.add(WatchdogNode)
             recorder = ros.add(BagRecorderNode, output=bag)
@@ -71,7 +69,6 @@ def live():
             nodes = {
                 'sim_plant': ['sim_plant'],
                 'blf_dsc_controller': ['blf_dsc_controller'],
-                'arm_markers': ['arm_markers', '_arm_markers_subscriptions'],
                 'torque_watchdog': ['torque_watchdog', '_torque_watchdog_subscriptions'],
                 'view': ['view', '_view_subscriptions'],
                 'bag_recorder': ['bag_recorder', '_bag_recorder_subscriptions'],

@@ -9,8 +9,12 @@ from plants import points
 from random_arm import configuration, pinocchio_model, random_urdf
 
 from blf_dsc_controller.arms.geometry import skeleton, tip_radius
+from blf_dsc_controller.arms.two_link import urdf
 from blf_dsc_controller.arms.urdf import read_chain
-from blf_dsc_controller.configuration.nodes import MarkersConfig
+
+JOINTS = ('joint1', 'joint2')
+TEXT = urdf('arm', JOINTS, (1.0, 0.8), (1.0, 1.0), (0.0, 0.0))
+TWO_LINK = read_chain(TEXT, 'base_link', 'tip', JOINTS)
 
 
 def test_corners_and_axes_agree_with_pinocchio():
@@ -43,13 +47,13 @@ def test_tip_radius_is_the_sum_of_what_each_joint_moves_the_tip():
 
 
 def test_straight_arm_attains_the_tip_radius():
-    chain = MarkersConfig().chain
+    chain = TWO_LINK
     straight, errors = np.array([0.4, 0.0]), np.array([1e-6, 2e-6])
     off = skeleton(chain, straight + errors)[0][-1] - skeleton(chain, straight)[0][-1]
     np.testing.assert_allclose(np.linalg.norm(off), tip_radius(chain, straight, errors), rtol=1e-5)
 
 
 def test_arm_drawn_without_a_urdf_is_that_of_section_iv():
-    corners, axes = skeleton(MarkersConfig().chain, np.array([0.7, -1.9]))
+    corners, axes = skeleton(TWO_LINK, np.array([0.7, -1.9]))
     np.testing.assert_allclose(corners[1:], points(1.0, 0.8, (0.7, -1.9)), atol=1e-15)
     np.testing.assert_allclose(axes, [[0.0, -1.0, 0.0]] * 2, atol=1e-15)

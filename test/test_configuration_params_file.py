@@ -248,7 +248,7 @@ def test_problem_shared_by_several_nodes_is_reported_once(file):
     with pytest.raises(ConfigurationError) as caught:
         load_loop(path)
     (problem,) = caught.value.problems
-    assert problem.startswith('sim_plant, blf_dsc_controller, arm_markers: line 2: robot.urdf: no ')
+    assert problem.startswith('sim_plant, blf_dsc_controller: line 2: robot.urdf: no ')
 
 
 def test_misspelt_preset_suggests_the_closest():

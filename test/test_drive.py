@@ -180,11 +180,10 @@ def test_live_arm_gets_gravity_only_if_something_shows_what_holds_it(preset, eff
     """An effort of nothing shows brakes only if it would contain what the drives add."""
     given = {'robot.effort': effort, 'robot.drive_compensates': parameter}
     loop = loop_of(preset)
-    for steps, is_limited in (({}, False), ({'torque.first_step': [200.0] * 7}, True)):
-        steps = {name: value[: len(loop.controller.joints)] for name, value in steps.items()}
+    n = len(loop.controller.joints)
+    for steps, is_limited in (({}, False), ({'torque.first_step': [200.0] * n}, True)):
         config = change(loop.controller, given | steps)
-        measurement = np.zeros(3 * len(config.joints))
-        measurement[: len(config.joints)] = loop.plant.initial.position
+        measurement = np.concatenate((loop.plant.initial.position, np.zeros(2 * n)))
         guard = Guard(config)
         guard.activate()
         guard.check_support(measurement)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""External interfaces of the nodes: namespaces, QoS, robot description, markers, policy."""
+"""External interfaces of the nodes: namespaces, QoS, robot description, frames, policy."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pinocchio
 import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import sros2_graph
 import yaml
+from geometry_msgs.msg import TransformStamped
+from random_arm import random_urdf
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_rig import deactivate
 from std_msgs.msg import String
-from visualization_msgs.msg import MarkerArray
 
+from blf_dsc_controller.arms.urdf import links_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
@@ -27,9 +29,9 @@ from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import message_class
-from blf_dsc_controller.nodes.markers_node import MarkersNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.simulation.loop import simulate
+from sim_plant.arms import urdf_of
 
 CONFIG = Path(__file__).parents[1] / 'config'
 
@@ -87,53 +89,32 @@ def test_late_subscribers_receive_the_robot_description(ros):
     assert 'length="0.6"' in received[0].data
 
 
-def test_markers_show_reference_bound_and_torque(ros):
-    received = []
-    ros.tester.create_subscription(MarkerArray, 'arm_markers/markers', received.append, 10)
-    ros.add(MarkersNode, period=0.02)
-    arm, law = ros.loop()
-    ros.run(arm, 300)
-    assert deactivate(ros, arm)  # stops the clock
-    ros.until(lambda: law.guard.journal.stamp == arm.stamp)
-    q = law.guard.controller.signals.qr
-    tip_x = np.cos(q[0]) + 0.8 * np.cos(q.sum())
-
-    def drawn():
-        """Whether the last markers show the last state."""
-        found = {marker.ns: marker for marker in received[-1].markers} if received else {}
-        return len(found) == 3 and abs(found['reference'].points[-1].x - tip_x) < 1e-12
-
-    ros.until(drawn)
-    count = len(received)
-    ros.until(lambda: len(received) > count + 1)
-    by_kind = {marker.ns: marker for marker in received[-1].markers}
-    # The arm leans back: negative torques about -y pull it forward, so the arrows point to +y.
-    arrows = [marker.points[1].y for marker in received[-1].markers if marker.ns == 'torque']
-    torque = arm.plant.measure()[4:]
-    assert torque.max() < -1.0
-    np.testing.assert_allclose(arrows, -0.05 * torque)
-    tip = by_kind['reference'].points[-1]
-    q = law.guard.controller.signals.qr
-    expected = (np.cos(q[0]) + 0.8 * np.cos(q.sum()), np.sin(q[0]) + 0.8 * np.sin(q.sum()))
-    np.testing.assert_allclose((tip.x, tip.z), expected)
-    assert by_kind['bound'].pose.position == tip
-    reach = np.sqrt(1.0 + 0.64 + 1.6 * np.cos(q[1])) + 0.8
-    assert by_kind['bound'].scale.x == pytest.approx(2 * 0.002 * reach, rel=1e-9)
-    assert {marker.header.frame_id for marker in received[-1].markers} == {'base_link'}
-
-
-def test_markers_of_a_urdf_use_its_frames(ros):
-    received = []
-    ros.tester.create_subscription(MarkerArray, 'arm_markers/markers', received.append, 10)
-    parameters = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
-    ros.add(MarkersNode, parameters, period=0.02)
-    ros.add(PlantNode, parameters, mode='lockstep')
-    ros.until(lambda: received)
-    arrows = [marker for marker in received[-1].markers if marker.ns == 'torque']
-    assert len(arrows) == 7
-    assert {arrow.header.frame_id for arrow in arrows} == {'panda_link0'}
-    shoulder = arrows[1].points[0]
-    np.testing.assert_allclose((shoulder.x, shoulder.y, shoulder.z), (0.0, 0.0, 0.333), atol=1e-9)
+@pytest.mark.parametrize('name', ['panda', 'ur5e', 'random', ''])
+def test_frames_place_every_link_as_pinocchio_does(ros, name):
+    received, tip = [], {'panda': 'panda_hand_tcp', 'ur5e': 'tool0', 'random': 'tip'}.get(name, '')
+    ros.tester.create_subscription(TransformStamped, 'sim_plant/frames', received.append, 100)
+    urdf = random_urdf(6, seed=3)[0] if name == 'random' else f'{name}.urdf'
+    arm = ros.add(PlantNode, {'robot.urdf': urdf, 'robot.tip': tip} if name else {})
+    ros.publisher(topics.COMMANDS)
+    text = urdf_of(arm.config)
+    model = pinocchio.buildModelFromXML(text)
+    ros.until(lambda: len(received) >= len(links_of(text)))
+    assert len({frame.child_frame_id for frame in received}) == len(links_of(text))
+    q, measured = pinocchio.neutral(model), arm.plant.measure()
+    for joint, position in zip(arm.config.joints, measured, strict=False):
+        own = model.joints[model.getJointId(joint)]
+        both = (np.cos(position), np.sin(position))  # of a continuous joint
+        q[own.idx_q : own.idx_q + own.nq] = both if own.nq == 2 else position
+    data = model.createData()
+    pinocchio.framesForwardKinematics(model, data, q)
+    for each in received:
+        parent, child = (
+            data.oMf[model.getFrameId(frame, pinocchio.BODY)]
+            for frame in (each.header.frame_id, each.child_frame_id)
+        )
+        at, by = each.transform.translation, each.transform.rotation
+        pose = pinocchio.XYZQUATToSE3(np.array([at.x, at.y, at.z, by.x, by.y, by.z, by.w]))
+        np.testing.assert_allclose((parent * pose).homogeneous, child.homogeneous, atol=1e-9)
 
 
 def test_sros2_policy_grants_each_node_exactly_what_it_uses(tmp_path):
@@ -147,9 +128,11 @@ def test_sros2_policy_grants_each_node_exactly_what_it_uses(tmp_path):
 def test_viewer_configurations_name_existing_topics():
     rviz = yaml.safe_load((CONFIG / 'arm.rviz').read_text())
     displays = rviz['Visualization Manager']['Displays']
-    assert {d['Topic']['Value'] for d in displays if 'Topic' in d} == {'arm_markers/markers'}
+    assert {d['Description Topic']['Value'] for d in displays if 'Description Topic' in d} == {
+        'robot_description'
+    }
     layout = json.loads((CONFIG / 'foxglove.json').read_text())
-    known = {t.resolved for t in topics.TOPICS} | {'/robot_description', '/arm_markers/markers'}
+    known = {t.resolved for t in topics.TOPICS} | {'/robot_description'}
     used = [
         path['value'].split('.')[0]
         for panel in layout['configById'].values()

@@ -25,7 +25,6 @@ from blf_dsc_controller.configuration.nodes import dump, locate
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.nodes.arguments import assigned
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from blf_dsc_controller.nodes.markers_node import MarkersNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
@@ -35,7 +34,6 @@ NODES = {
     'sim_plant': PlantNode,
     'blf_dsc_controller': ControllerNode,
     'bag_recorder': BagRecorderNode,
-    'arm_markers': MarkersNode,
     'torque_watchdog': WatchdogNode,
 }
 
@@ -113,7 +111,7 @@ def start(monkeypatch):
 def test_launch_arguments_override_the_parameter_file(launched, start, tmp_path, namespace):
     """A section `/**/NODE` of the preset takes precedence over one for any node."""
     bag = tmp_path / 'run1'
-    nodes = launched(mode='lockstep', bag=str(bag), namespace=namespace, markers='true')
+    nodes = launched(mode='lockstep', bag=str(bag), namespace=namespace)
     by_name = {node.name: node for node in nodes}
     assert by_name.keys() == NODES.keys()
     plant = start(*arguments_of(by_name['sim_plant'], tmp_path))

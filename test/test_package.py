@@ -29,7 +29,6 @@ EXECUTABLES = {
     'sim_plant',
     'blf_dsc_controller',
     'bag_recorder',
-    'arm_markers',
     'torque_watchdog',
     'arm_view',
 }

@@ -143,6 +143,5 @@ def _node(module: str) -> int:
 sim_plant = partial(_node, 'blf_dsc_controller.nodes.plant_node')
 blf_dsc_controller = partial(_node, 'blf_dsc_controller.nodes.controller_node')
 bag_recorder = partial(_node, 'blf_dsc_controller.nodes.recorder_node')
-arm_markers = partial(_node, 'blf_dsc_controller.nodes.markers_node')
 torque_watchdog = partial(_node, 'blf_dsc_controller.nodes.watchdog_node')
 arm_view = partial(_node, 'blf_dsc_controller.view.node')

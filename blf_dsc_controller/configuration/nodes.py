@@ -15,18 +15,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
-from blf_dsc_controller.arms.two_link import urdf
-from blf_dsc_controller.arms.urdf import Chain, read_chain
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import Section, parse, read_text, share_folder
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.robot import Robot, given_robot
 from blf_dsc_controller.configuration.schema import (
     Parameter,
     Value,
     build,
     flatten,
-    joint_problems,
     parameter,
     parameters,
     unknown,
@@ -36,13 +32,11 @@ from blf_dsc_controller.errors import ConfigurationError
 PLANT = 'sim_plant'
 CONTROLLER = 'blf_dsc_controller'
 RECORDER = 'bag_recorder'
-MARKERS = 'arm_markers'
 VIEW = 'view'
 WATCHDOG = 'torque_watchdog'
 
 _of_bag = partial(parameter, read_only='a bag is opened once, when the recorder starts')
 _of_view = partial(parameter, read_only='the page is served once, when the node starts')
-_of_markers = partial(parameter, read_only='it is read once, when the node starts')
 Config = TypeVar('Config')
 _PREFACE = """\
 # Parameters
@@ -95,50 +89,6 @@ class RecorderConfig:
 
 
 @dataclass(frozen=True)
-class MarkerArm:
-    """Link lengths of the drawn arm."""
-
-    l1: float = _of_markers(1.0, 'length of the first link', 'm', 'l1', above=0.0)
-    l2: float = _of_markers(0.8, 'length of the second link', 'm', 'l2', above=0.0)
-
-
-@dataclass(frozen=True)
-class MarkersConfig:
-    """Parameters of the node `arm_markers`."""
-
-    joints: tuple[str, ...] = _of_markers(
-        ('joint1', 'joint2'), 'names of the joints, from the base'
-    )
-    frame: str = _of_markers('base_link', 'frame of the markers')
-    period: float = _of_markers(0.1, 'time between two updates of the markers', 's', above=0.0)
-    torque_scale: float = _of_markers(0.05, 'arrow length per torque', 'm/(N m)', above=0.0)
-    arm: MarkerArm = MarkerArm()
-    robot: Robot = Robot()
-
-    @classmethod
-    def defaults(cls, given: Mapping[str, Any]) -> dict[str, Value]:
-        """Return the joints of a URDF, and its base as the frame."""
-        if not given.get('robot.urdf'):
-            return {}
-        chain = given_robot(given, given.get('joints'))[1]
-        return {'joints': tuple(joint.name for joint in chain.joints), 'frame': chain.base}
-
-    @property
-    def chain(self) -> Chain:
-        """The arm to draw."""
-        if self.robot.urdf:
-            return self.robot.chain(self.joints)
-        lengths = self.arm.l1, self.arm.l2
-        text = urdf(MARKERS, self.joints, lengths, (1.0, 1.0), (0.0, 0.0))
-        return read_chain(text, 'base_link', 'tip', self.joints)
-
-    def problems(self) -> list[str]:
-        """Check the joints."""
-        needed = None if self.robot.urdf else 2
-        return joint_problems(self.joints, 'the arm of the markers', needed)
-
-
-@dataclass(frozen=True)
 class WatchdogConfig:
     """Parameters of the node `torque_watchdog`."""
 
@@ -164,19 +114,11 @@ class ViewConfig:
 
 NODES: Mapping[
     str,
-    type[
-        PlantConfig
-        | ControllerConfig
-        | RecorderConfig
-        | MarkersConfig
-        | ViewConfig
-        | WatchdogConfig
-    ],
+    type[PlantConfig | ControllerConfig | RecorderConfig | ViewConfig | WatchdogConfig],
 ] = {
     PLANT: PlantConfig,
     CONTROLLER: ControllerConfig,
     RECORDER: RecorderConfig,
-    MARKERS: MarkersConfig,
     VIEW: ViewConfig,
     WATCHDOG: WatchdogConfig,
 }

@@ -124,7 +124,7 @@ def check_effect(
 
     While no joint moves, gravity does not change: the commands should not either, except by what
     overcomes stiction. Otherwise brakes hold the arm, or its effort controller is not active, and
-    the law learns what its own commands say. Slower drifts show in the efforts, if they are torques.
+    the law learns what its own commands say. Slower drifts show in efforts that are torques.
     """
     begins = state.samples[0] <= 1.0
     moves = begins

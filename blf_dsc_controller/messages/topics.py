@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 CONTROLLER = 'blf_dsc_controller'
 PLANT = 'sim_plant'
-MARKERS_NODE = 'arm_markers'
 WATCHDOG_NODE = 'torque_watchdog'
 
 FOREVER = 2**63 - 1  # ns
@@ -106,8 +105,8 @@ JOINT_TRAJECTORY = Topic(
     DIAGNOSTIC,
 )
 """Published by other nodes for the controller."""
-MARKERS = Topic(MARKERS_NODE, '~/markers', 'visualization_msgs/msg/MarkerArray', LATEST, LATEST)
-"""For RViz and Foxglove."""
+FRAMES = Topic(PLANT, '~/frames', 'geometry_msgs/msg/TransformStamped', STREAM, STREAM)
+"""Of all links, for viewers without robot_state_publisher, such as Foxglove; not in TOPICS."""
 JOURNAL = Topic(CONTROLLER, '~/journal', 'std_msgs/msg/String', HISTORY, HISTORY)
 """Every event of the controller, also for late recorders: see messages.journal."""
 

@@ -32,6 +32,7 @@ from blf_dsc_controller.messages.journal import encode_change
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import create_publisher, create_steady_timer
+from blf_dsc_controller.nodes.frames import Frames
 from blf_dsc_controller.nodes.handshake import Handshake
 from blf_dsc_controller.nodes.lifecycle import LoopNode
 from sim_plant.arms import parameter_names_of, urdf_of
@@ -44,6 +45,7 @@ LOCKSTEP_START = 1_000_000_000
 _STALE = {'zero': ': not applied', 'brake': ': the brakes hold', 'hold': ', and still applied'}
 _REPEAT_PERIOD = 3.0  # s, until a state without a torque is sent again
 _IN_FLIGHT = 1000  # samples in lock-step on their way to a subscriber: a fifth of its queue
+_FRAMES_PERIOD = 0.04  # s, for viewers
 _EARLY = 0.05  # fraction of a sample by which a timer may fire early
 _BETWEEN_RUNS = 1_000_000_000  # ns from the last stamp before a reset to the first after it
 
@@ -73,6 +75,8 @@ class PlantNode(LoopNode[PlantConfig]):
         self._changes = create_publisher(self, topics.CHANGES)
         self._tell_parameters()
         self._handshake = Handshake(self, self._now)
+        self._frames: Frames
+        self._frames_interval = max(1, round(_FRAMES_PERIOD / self.config.sample_time))
         self.plant: Plant
         self.deactivate()
         self.start()
@@ -90,12 +94,13 @@ class PlantNode(LoopNode[PlantConfig]):
         self._changed.clear()
         self.plant.compile()
         self.deactivate()
-        outputs = [topics.JOINT_STATES, topics.TRUTH]
+        outputs = [topics.JOINT_STATES, topics.TRUTH, topics.FRAMES]
         outputs += [] if self._lockstep else [topics.TIMING]
         outputs += [topics.CLOCK] if self.config.publish_clock else []
         if self.connect(outputs, topics.COMMANDS, self._on_command):
             description = String(data=urdf_of(self.config))
             create_publisher(self, topics.ROBOT_DESCRIPTION).publish(description)
+            self._frames = Frames(description.data, self.config.joints)
 
     def activate(self) -> None:
         """Send the present state once a controller subscribes, and continue with its torque."""
@@ -265,6 +270,9 @@ class PlantNode(LoopNode[PlantConfig]):
         self._publish(self._telemetry.joint_states(stamp, measurement))
         if self.plant.sample % DECIMATION == 0:
             self._publish(self._telemetry.truth(stamp, self.plant.truth()))
+        if self.plant.sample % self._frames_interval == 0:
+            for frame in self._frames.at(stamp, measurement[: self.plant.joints]):
+                self._outputs[topics.FRAMES].publish(frame)
         if self.config.publish_clock:
             self._publish(self._telemetry.clock(stamp))
 
