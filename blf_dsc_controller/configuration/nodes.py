@@ -35,6 +35,7 @@ RECORDER = 'bag_recorder'
 VIEW = 'view'
 WATCHDOG = 'torque_watchdog'
 
+_AT_START = 'it is read once, when the node starts'
 _of_bag = partial(parameter, read_only='a bag is opened once, when the recorder starts')
 _of_view = partial(parameter, read_only='the page is served once, when the node starts')
 Config = TypeVar('Config')
@@ -98,7 +99,13 @@ class WatchdogConfig:
         's',
         at_least=0.005,
         at_most=10.0,
-        read_only='it is read once, when the node starts',
+        read_only=_AT_START,
+    )
+    armed: bool = parameter(
+        False,
+        'do not wait for a first command: for a restart after the controller died, with its '
+        'parameter file',
+        read_only=_AT_START,
     )
 
 

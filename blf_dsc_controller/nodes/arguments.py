@@ -26,11 +26,15 @@ def refuse_unknown(argv: Sequence[str]) -> None:
 
 def check_sections(argv: Sequence[str], node: str) -> None:
     """Raise ConfigurationError if a section meant for `node` (a full name) does not match it."""
-    for option, path in _ros_options(argv):
-        if option == '--params-file':
-            problems = list(unmatched_sections(read(path), [node]))
-            if problems:
-                raise ConfigurationError(problems, path)
+    for path in parameter_files(argv):
+        problems = list(unmatched_sections(read(path), [node]))
+        if problems:
+            raise ConfigurationError(problems, path)
+
+
+def parameter_files(argv: Sequence[str]) -> list[str]:
+    """Return the parameter files that the arguments name."""
+    return [path for option, path in _ros_options(argv) if option == '--params-file']
 
 
 def assigned(argv: Sequence[str]) -> dict[str, object]:

@@ -3,7 +3,8 @@
 
 Effort controllers hold the last torque for ever. When commands stop while joint states go on, this
 node commands the safe torque of the controller's configuration until the controller is back. It
-reads that configuration from the running controller, so it needs no parameters of the arm.
+reads that configuration from the running controller, so it needs no parameters of the arm; only if
+it is `armed`, to take over from a controller that has died before, it needs the parameter file.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import WatchdogConfig
+from blf_dsc_controller.configuration.nodes import WatchdogConfig, load
 from blf_dsc_controller.configuration.schema import build, parameters
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages import topics
@@ -27,6 +28,7 @@ from blf_dsc_controller.messages.codecs import (
     JointStateDecoder,
     MessageError,
 )
+from blf_dsc_controller.nodes import arguments
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import create_steady_timer, message_class, qos_profile
 from blf_dsc_controller.nodes.parameter_client import ParameterClient, Values
@@ -67,10 +69,14 @@ class WatchdogNode(PlainNode):
         self._diagnostics = DiagnosticsPublisher(self, ())
         self._client = ParameterClient(self._on_parameters)
         self._controller = f'{self.get_namespace().rstrip("/")}/{topics.CONTROLLER}'
-        self._client.request(self._raw_subscriptions.node, self._controller)
-        create_steady_timer(self, _PERIOD, self._poll)
+        self._timer = create_steady_timer(self, _PERIOD, self._poll)
         create_steady_timer(self, _REPORT_PERIOD, self._report)
-        self.get_logger().info(f'waiting for {self._controller}')
+        if self._config.armed:
+            files = arguments.parameter_files(sys.argv) or ['recommended']
+            self._watch(load(files[-1], self._controller, ControllerConfig))
+        else:
+            self._client.request(self._raw_subscriptions.node, self._controller)
+            self.get_logger().info(f'waiting for {self._controller}')
 
     def close(self) -> None:
         """Leave the torque that a driver may hold, if this node was the one to command it."""
@@ -87,13 +93,16 @@ class WatchdogNode(PlainNode):
         except ConfigurationError as error:
             self.failure, self.finished = error, True
             return
+        self._watch(config)
+
+    def _watch(self, config: ControllerConfig) -> None:
         count = len(config.joints)
         self._states = JointStateDecoder(config.joints, required=('position',))
         self._commands = Float64MultiArrayDecoder(count)
         self._encoder = Float64MultiArrayEncoder(count)
-        self.line = SecondLine(config, self._config.timeout)
+        self.line = SecondLine(config, self._config.timeout, armed=self._config.armed)
         self.get_logger().info(
-            f'ready: {config.safety.torque} torque once {node} is silent for '
+            f'ready: {config.safety.torque} torque once {self._controller} is silent for '
             f'{self._config.timeout:g} s'
         )
 
@@ -107,6 +116,8 @@ class WatchdogNode(PlainNode):
         self._publish(self.line.poll(now))
         if self.line.active != self._was_active:
             self._was_active = self.line.active
+            fast = min(_PERIOD, self.line.config.sample_time)  # at the limit of the torque's rate
+            self._timer.timer_period_ns = round(1e9 * (fast if self.line.active else _PERIOD))
             self._log(self.line)
             self._report()
 

@@ -126,6 +126,8 @@ def safe_torque(
 class SafeTorque:
     """The torque without the law: a ramp from the last torque to the safe torque.
 
+    It obeys the rate limit, except for the last torque of all.
+
     What holds the arm besides the model's gravity is observed from its motion, in the stop, too:
 
         load' = L (tau - H(q, dq, dq, ddq) P^ - friction - load),   |load| <= half the torque limit
@@ -138,6 +140,7 @@ class SafeTorque:
         load: torque (n,) [N m] that the model lacks; initially the disturbance estimate of the law.
         commanded: the last torque (n,) [N m], from the law or this ramp.
         last: the last usable joint state.
+        longest_step: time [s] for which one torque may change at the rate limit.
         scale: factor (n,) on the damping: measured inertia of the joints over the assumed.
     """
 
@@ -145,6 +148,7 @@ class SafeTorque:
         self.commanded = np.zeros(n)
         self.load = np.zeros(n)
         self.scale = np.ones(n)
+        self.longest_step = inf
         self.last = LastState(n)
         self._start = np.zeros(n)
         self._duration = self._elapsed = 0.0
@@ -183,6 +187,10 @@ class SafeTorque:
         self._elapsed += dt
         if self._elapsed < self._duration:
             goal = self._start + self._elapsed / self._duration * (goal - self._start)
+        if dt > 0.0:  # drives that stop when commands jump would brake
+            step = settings.rate_limit * min(dt, self.longest_step)
+            step = np.where(settings.rate_limit > 0.0, step, inf)
+            goal = np.clip(goal, self.commanded - step, self.commanded + step)
         limit = settings.torque_limit
         self.commanded[:] = np.clip(goal, -limit, limit)
         return self.commanded

@@ -33,8 +33,11 @@ class SecondLine:
         silence: time [s] without a torque of the controller at the last takeover.
     """
 
-    def __init__(self, config: ControllerConfig, timeout: float) -> None:
-        """Compile the model of a controller's configuration."""
+    def __init__(self, config: ControllerConfig, timeout: float, *, armed: bool = False) -> None:
+        """Compile the model of a controller's configuration.
+
+        With `armed` it does not wait for a first torque: the controller has died before.
+        """
         self.config = config
         self.active = False
         self.takeovers = 0
@@ -42,9 +45,12 @@ class SecondLine:
         self._timeout = timeout
         self._settings = settings_of_config(config)
         self._safe = SafeTorque(self._settings.n)
+        self._safe.longest_step = config.sample_time
         self._stamp = self._commanded_stamp = -1  # ns, of the last state, and before a torque
         self._seen_at = self._polled_at = -inf
         self._commanded_at = inf  # no takeover before the first torque
+        self._knows_torque = False
+        self._armed = armed
         model_torque(self._settings, self._estimate, np.zeros(self._settings.n))
 
     @property
@@ -58,10 +64,13 @@ class SecondLine:
         if stamp > self._stamp or self._stamp < 0:
             self._seen_at = now
         self._stamp = stamp
+        if self._armed:
+            self._armed, self._commanded_at, self._commanded_stamp = False, now, stamp
 
     def torque_of_controller(self, torque: Vector, now: float) -> None:
         """Take a torque (n,) [N m] that the controller has commanded, and hand over to it."""
         self._safe.commanded[:] = np.nan_to_num(torque)
+        self._knows_torque = True
         self._commanded_at, self._commanded_stamp = now, self._stamp
         self.active = False
 
@@ -72,7 +81,8 @@ class SecondLine:
         if now - self._seen_at > self.config.sample_time + safety.state_timeout:
             safe.last.miss(dt)
         if not self.active:
-            safe.observe(self._settings, self._estimate, dt)
+            if self._knows_torque:
+                safe.observe(self._settings, self._estimate, dt)
             self._begin_if_due(now)
         if not self.active:
             return None
@@ -94,3 +104,5 @@ class SecondLine:
             self.active, self.silence = True, silence
             self.takeovers += 1
             self._safe.begin_ramp(0.0, self._safe.load)
+            if not self._knows_torque:  # as if the torque that the drive holds were the model's
+                self._safe.leave(self.config.safety, self._settings, self._estimate)
