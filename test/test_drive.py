@@ -217,18 +217,6 @@ def test_restart_on_a_drive_that_holds_a_torque():
     assert guard.update(10**9, held * np.repeat([1.0, 0.0], [14, 7])) is None
 
 
-@pytest.mark.parametrize(('preset', 'rate'), [('ur5e_driver', 500.0)])
-def test_repeated_reading_with_a_new_stamp_does_not_make_the_torque_jump(preset, rate):
-    """Universal_Robots_ROS2_Driver with non_blocking_read; once 222 N m instead of 8 N m."""
-    steps = []
-    for every in (0, 100):
-        unlimited = {'torque.rate_limit': [0.0] * 6}
-        record = run(preset, 5.0, None, unlimited, {'sensor.repeat_every': every})
-        torques = np.array([record.sample(k).torque for k in range(record.stamps.size)])
-        steps.append(np.abs(np.diff(torques[round(rate) :], axis=0)).max())
-    assert steps[1] < 1.5 * steps[0]
-
-
 @pytest.mark.parametrize('effort', ['whole', 'commanded', 'current'])
 @pytest.mark.parametrize('drive', ['none', 'gravity'])
 def test_slow_drift_of_commands_without_effect_shows_in_the_effort(drive, effort):

@@ -6,10 +6,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fault_rig import MILLISECOND, Rig
+from random_arm import CONFIG
 
+from blf_dsc_controller import load_loop
+from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.second_line import SecondLine
+from sim_plant.plant import plant_of
 
 TIMEOUT = 0.05  # s
+START = 1_000_000_000  # ns
 HOLDING = {'safety.torque': 'hold_gravity'}
 AT_REST = HOLDING | {'reference.type': 'hold'}
 ARM = {'disturbance.amplitude': [0.0, 0.0]}
@@ -58,6 +63,37 @@ def test_arm_of_a_dead_controller_comes_to_rest(given, angle, period):
     assert rig.line.silence == pytest.approx(TIMEOUT, abs=0.005)
     assert np.abs(rig.state().q - start).max() < angle
     assert np.abs(rig.state().dq).max() < 0.01
+
+
+@pytest.mark.parametrize(('preset', 'angle'), [('fr3', 0.2), ('ur5e_driver', 0.15)])
+@pytest.mark.parametrize('armed', [False, True], ids=['watching', 'restarted afterwards'])
+def test_named_arm_of_a_dead_controller_comes_to_rest(preset, angle, armed):
+    """In motion; drives of an FR3 brake when commands jump by more than 1 N m in a cycle."""
+    loop = load_loop(CONFIG / f'{preset}.yaml')
+    guard, plant = Guard(loop.controller), plant_of(loop.plant)
+    guard.activate()
+    line = SecondLine(loop.controller, TIMEOUT, armed=armed)
+    T, n = loop.controller.sample_time, len(loop.controller.joints)
+    death = round(1.1 / T)
+    for k in range(death + round(3.0 / T)):
+        now, measurement = k * T, plant.measure().copy()
+        if k == death:
+            start = measurement[:n]
+            assert np.abs(measurement[n : 2 * n]).max() > 0.3
+        if k < death:
+            torque = guard.update(START + k * loop.controller.sample_time_ns, measurement).copy()
+            if not armed:
+                line.torque_of_controller(torque, now)
+        if k >= death or not armed:
+            line.state(START + k * loop.controller.sample_time_ns, measurement, now)
+            taken = line.poll(now)
+            torque = torque if taken is None else taken.copy()
+        plant.step(torque)
+    assert line.takeovers == 1
+    # Which torque its drives hold, a restarted one cannot know.
+    assert plant.is_stopped == (armed and preset == 'fr3')
+    assert np.abs(plant.measure()[n : 2 * n]).max() < 0.01
+    assert np.abs(plant.measure()[:n] - start).max() < angle
 
 
 def test_drive_that_holds_the_last_torque_moves_the_arm_far():

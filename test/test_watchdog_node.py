@@ -7,22 +7,43 @@ import os
 import signal
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
+from random_arm import CONFIG
 
+from blf_dsc_controller import load_loop
+from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
+from sim_plant.plant import plant_of
 
-HELD_FOR_EVER = {'actuator.without_command': 'hold'}
-CONTROLLER = {
-    'safety.torque': 'hold_gravity',
+SLOW = {  # a loop that a busy computer can keep up with
+    'sample_time': 0.02,
     'reference.type': 'hold',
+    'barrier.bound': [1.0, 1.0],
+    'barrier.weight': [1.0, 1.0],
+    'surface.gain': [4.0, 4.0],
+    'surface.mu': [2.0, 2.0],
+    'surface.time_constant': 0.05,
+    'feedback.gain': [3.0, 1.2],
+    'disturbance.gain': [1.0, 0.5],
+    'learning.weight': 0.0,
+    'learning.initial_estimate': [1.0, 0.32, 0.4],
+    'safety.torque': 'hold_gravity',
     'safety.velocity_limit': 9.0,
+    'safety.state_timeout': 10.0,
+    'safety.overrun_fraction': 1.0,
 }
+FR3 = CONFIG / 'fr3.yaml'
+HELD_FOR_EVER = {'actuator.without_command': 'hold', 'sample_time': 0.02}
 CRASH = """
 import ctypes, sys
 from blf_dsc_controller.nodes import controller_node
@@ -30,7 +51,7 @@ from blf_dsc_controller.nodes import controller_node
 class Crashing(controller_node.ControllerNode):
     def _on_second(self):
         super()._on_second()
-        if self.guard.controller.samples > 1500:
+        if self.guard.controller.samples > 100:
             ctypes.string_at(0)
 
 controller_node.process.run(Crashing)
@@ -49,7 +70,7 @@ def controller(ros):
 
     def start(*code):
         domain = str(ros.context.get_domain_id())
-        parameters = [f'{name}:={value}' for name, value in CONTROLLER.items()]
+        parameters = [f'{name}:={value}' for name, value in SLOW.items()]
         arguments = [word for one in parameters for word in ('-p', one)]
         code = code or ('-m', 'blf_dsc_controller.nodes.controller_node')
         command = [sys.executable, *code, '--ros-args', *arguments]
@@ -65,9 +86,9 @@ def controller(ros):
 @pytest.mark.parametrize('end', ENDS)
 def test_second_line_holds_the_arm_until_the_controller_is_back(ros, controller, end):
     arm = ros.add(PlantNode, HELD_FOR_EVER)
-    watchdog = ros.add(WatchdogNode, {'timeout': 0.5})
+    watchdog = ros.add(WatchdogNode, {'timeout': 1.0})
     process = controller(*(('-c', CRASH) if end == 'crashed' else ()))
-    ros.until(lambda: watchdog.line is not None and arm.plant.sample > 500)
+    ros.until(lambda: watchdog.line is not None and arm.plant.sample > 50)
     if end != 'crashed':
         ENDS[end](process)
     ros.until(lambda: watchdog.line.active)
@@ -81,3 +102,72 @@ def test_second_line_holds_the_arm_until_the_controller_is_back(ros, controller,
     else:
         controller()
     ros.until(lambda: not watchdog.line.active)
+
+
+class Driver:
+    """A driver that holds the last command for ever, in the time of a clock that it advances."""
+
+    def __init__(self, ros, config):
+        self.ros, self.plant, self.period = ros, plant_of(config), config.sample_time_ns
+        self.now, self.torque = 0, np.zeros(len(config.joints))
+        self.received, self.states = ros.listen(topics.COMMANDS), ros.publisher(topics.JOINT_STATES)
+        self.encoder = JointStateEncoder(config.joints)
+
+    def send(self):
+        """Publish the state of the next sample; return its stamp."""
+        stamp = 1_000_000_000 + self.plant.elapsed_ns
+        self.states.publish(self.encoder.encode(stamp, *self.plant.measure().reshape(3, -1)))
+        self.now += self.period
+        return stamp
+
+    def move(self):
+        """Advance by a sample, with the last command."""
+        self.torque = np.array(self.received[-1].data)
+        self.plant.step(self.torque)
+
+
+@pytest.mark.parametrize(('preset', 'angle'), [('fr3', 0.25), ('ur5e_driver', 0.2)])
+def test_named_arm_in_motion_comes_to_rest_once_its_controller_is_dead(ros, preset, angle):
+    """Over ROS, in the time of the states: a busy computer changes nothing."""
+    loop = load_loop(CONFIG / f'{preset}.yaml')
+    driver = Driver(ros, loop.plant)
+    n, steady = len(loop.controller.joints), lambda: driver.now
+    given = {name: value for name, value in flatten(loop.controller).items() if value != ()}
+    controller = ros.add(ControllerNode, given, clock=steady)
+    watchdog = ros.add(partial(WatchdogNode, steady=steady))
+    ros.until(lambda: watchdog.line is not None and driver.states.get_subscription_count() > 1)
+    for _ in range(round(1.1 / loop.controller.sample_time)):
+        count = len(driver.received)
+        driver.send()
+        ros.until(lambda count=count: len(driver.received) > count)
+        driver.move()
+    start = driver.plant.measure().copy()
+    assert np.abs(start[n : 2 * n]).max() > 0.3
+    ros.kill(controller)
+    for _ in range(round(2.0 / loop.controller.sample_time)):
+        count, stamp = len(driver.received), driver.send()
+        ros.until(lambda stamp=stamp: watchdog.line.stamp == stamp)
+        if watchdog.line.active:
+            ros.until(lambda count=count: len(driver.received) > count)
+        driver.move()
+    assert watchdog.line.takeovers == 1
+    assert not driver.plant.is_stopped
+    assert np.abs(driver.plant.measure()[n : 2 * n]).max() < 0.02
+    assert np.abs(driver.plant.measure()[:n] - start[:n]).max() < angle
+
+
+def test_restarted_watchdog_holds_the_arm_of_a_controller_that_died_before(ros, monkeypatch):
+    """Which torque it held before, it cannot know: that of the model is sent at once."""
+    monkeypatch.setattr(sys, 'argv', ['node', '--ros-args', '--params-file', str(FR3)])
+    config = load_loop(FR3).plant
+    driver = Driver(ros, config)
+    watchdog = ros.add(partial(WatchdogNode, steady=lambda: driver.now), {'armed': True})
+    ros.until(lambda: driver.states.get_subscription_count() > 0)
+    for _ in range(100):
+        stamp = driver.send()
+        ros.until(lambda stamp=stamp: watchdog.line.stamp == stamp)
+        driver.plant.step(driver.torque)
+    ros.until(lambda: driver.received)
+    assert watchdog.line.active
+    assert watchdog.line.silence == pytest.approx(0.05, abs=0.01)
+    np.testing.assert_allclose(driver.received[0].data, np.zeros(7), atol=0.1)

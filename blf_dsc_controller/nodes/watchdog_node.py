@@ -12,6 +12,7 @@ from __future__ import annotations
 import sys
 import time
 from collections import deque
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -46,11 +47,13 @@ _STATES, _COMMANDS = range(2)
 class WatchdogNode(PlainNode):
     """Publishes the safe torque on the controller's `~/commands` while the controller cannot.
 
-    `line` decides when; None until the controller's parameters have been read.
+    `line` decides when, None until the controller's parameters have been read; `steady` is its
+    clock [ns].
     """
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, *, steady: Callable[[], int] = time.monotonic_ns, **options: Any) -> None:
         super().__init__(topics.WATCHDOG_NODE, **options)
+        self._steady = steady
         self._config = declare(self, WatchdogConfig)
         self.line: SecondLine | None = None
         self._states: JointStateDecoder
@@ -107,7 +110,7 @@ class WatchdogNode(PlainNode):
         )
 
     def _poll(self) -> None:
-        messages, now = self._raw_subscriptions.take(), time.monotonic()
+        messages, now = self._raw_subscriptions.take(), self._steady() * 1e-9
         if self.line is None:
             self._client.poll()
             return

@@ -30,6 +30,7 @@ class SecondLine:
         config: configuration of the controller.
         active: whether it commands now.
         takeovers: how often it began to.
+        stamp: of the last joint state [ns]; -1 before the first.
         silence: time [s] without a torque of the controller at the last takeover.
     """
 
@@ -46,7 +47,7 @@ class SecondLine:
         self._settings = settings_of_config(config)
         self._safe = SafeTorque(self._settings.n)
         self._safe.longest_step = config.sample_time
-        self._stamp = self._commanded_stamp = -1  # ns, of the last state, and before a torque
+        self.stamp = self._commanded_stamp = -1  # the second: before the last torque
         self._seen_at = self._polled_at = -inf
         self._commanded_at = inf  # no takeover before the first torque
         self._knows_torque = False
@@ -61,9 +62,9 @@ class SecondLine:
         """Take a joint state with its stamp [ns]; `measurement` is [q, dq, effort] (3 n,)."""
         limit = self.config.safety.velocity_limit
         self._safe.last.salvage(stamp, measurement, limit, self.config.sample_time)
-        if stamp > self._stamp or self._stamp < 0:
+        if stamp > self.stamp or self.stamp < 0:
             self._seen_at = now
-        self._stamp = stamp
+        self.stamp = stamp
         if self._armed:
             self._armed, self._commanded_at, self._commanded_stamp = False, now, stamp
 
@@ -71,7 +72,7 @@ class SecondLine:
         """Take a torque (n,) [N m] that the controller has commanded, and hand over to it."""
         self._safe.commanded[:] = np.nan_to_num(torque)
         self._knows_torque = True
-        self._commanded_at, self._commanded_stamp = now, self._stamp
+        self._commanded_at, self._commanded_stamp = now, self.stamp
         self.active = False
 
     def poll(self, now: float) -> Vector | None:
@@ -99,7 +100,7 @@ class SecondLine:
 
     def _begin_if_due(self, now: float) -> None:
         silence = now - self._commanded_at
-        gone_on = (self._stamp - self._commanded_stamp) * 1e-9
+        gone_on = (self.stamp - self._commanded_stamp) * 1e-9
         if silence > self._timeout and gone_on > 0.5 * self._timeout:
             self.active, self.silence = True, silence
             self.takeovers += 1
