@@ -20,8 +20,7 @@ from std_msgs.msg import Float64MultiArray
 from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import STREAMS
-from blf_dsc_controller.nodes.endpoints import qos_profile
-from blf_dsc_controller.nodes.raw_subscriptions import compatible_profile
+from blf_dsc_controller.nodes.endpoints import compatible_profile, qos_profile
 
 
 def echo(node: Any) -> None:

@@ -15,7 +15,7 @@ from launch_ros.actions import Node
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import PLANT, load, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
-from sim_plant.arms import urdf_of
+from sim_plant.plant import urdf_of
 
 PACKAGE = 'blf_dsc_controller'
 

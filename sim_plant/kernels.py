@@ -12,14 +12,32 @@ import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array, Cell, part, size_of, view, view_of
-from sim_plant.actuator import Drives, DriveState, actuate
 from sim_plant.arm import Arm
-from sim_plant.compensation import Compensation, CompensationState, compensate, jumps
-from sim_plant.contact import Contact, SloshSettings, TipState, WallSettings, locate_tip
-from sim_plant.disturbance import JointDisturbance
-from sim_plant.events import Acting, EventSettings, LoadSettings, update_acting
-from sim_plant.integrator import Stages, integrate
-from sim_plant.motion import Motion, disturbing_torque
+from sim_plant.drives import (
+    Compensation,
+    CompensationState,
+    Drives,
+    DriveState,
+    actuate,
+    compensate,
+    jumps,
+)
+from sim_plant.motion import (
+    Acting,
+    Contact,
+    EventSettings,
+    JointDisturbance,
+    LoadSettings,
+    Motion,
+    SloshSettings,
+    Stages,
+    TipState,
+    WallSettings,
+    disturbing_torque,
+    integrate,
+    locate_tip,
+    update_acting,
+)
 from sim_plant.sensors import EncoderReading, Encoders, draw, is_noisy, sense
 
 

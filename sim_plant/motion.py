@@ -1,15 +1,252 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Equation of motion of an arm under a torque, a disturbance, and a force at its tip."""
+"""Equation of motion of an arm under a torque, a disturbance, events, and forces at its tip.
 
-from typing import NamedTuple
+Vectors are in the base frame: x to the right, z up.  A force f at the tip loads the joints with
+J^T f, where J is the Jacobian of the tip position.  The sloshing load is a point mass m on a damped
+spring at the tip. With its position y and velocity v, those of the tip x and dx, and
+a = omega^2 (y - x) + 2 zeta omega (v - dx),
+
+    y' = v,   v' = g - a,   force on the tip: m a,
+
+so its motion does not depend on m, which may be ramped.  Loads and events are held over a sample.
+
+A step is fixed, with the torque held and the disturbance varying: the classic Runge-Kutta method of
+order 4, or the fifth-order solution of Dormand and Prince (1980), which MATLAB calls ode5.  Stage i
+is evaluated at t + c_i h and x + h sum_j a_ij k_j; the step ends at x + h sum_i b_i k_i.
+"""
+
+from math import exp, sin, tanh
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.layout import part
+from blf_dsc_controller.compiled.layout import Array, Cell, part
 from sim_plant.arm import Arm
-from sim_plant.contact import Contact, subtract_contact_torque
-from sim_plant.disturbance import JointDisturbance, disturbance_torque
+
+
+class JointDisturbance(NamedTuple):
+    """Disturbance of each joint."""
+
+    constant: Annotated[Array, 'n']  # N m
+    amplitude: Annotated[Array, 'n']  # N m
+    frequency: Annotated[Array, 'n']  # rad/s
+    phase: Annotated[Array, 'n']  # rad
+    viscous: Annotated[Array, 'n']  # N m s/rad
+    coulomb: Annotated[Array, 'n']  # N m
+    coulomb_velocity: Annotated[Array, 'n']  # rad/s, at which tanh reaches three quarters
+    stribeck: float  # additional friction near rest, relative to Coulomb friction
+    stribeck_velocity: float  # rad/s
+    ripple: Annotated[Array, 'n']  # N m
+    ripple_frequency: float  # rad/rad
+
+
+@inner
+def disturbance_torque(
+    disturbance: JointDisturbance, t: float, q: np.ndarray, dq: np.ndarray, out: np.ndarray
+) -> None:
+    """Write tau_dist (n,) [N m] at time t [s].
+
+    Friction has the sign of the velocity; Coulomb friction is smoothed by tanh, so that the
+    fixed-step integrator keeps its order.
+    """
+    for i in range(dq.size):
+        angle = disturbance.frequency[i] * t + disturbance.phase[i]
+        torque = disturbance.constant[i] + disturbance.amplitude[i] * sin(angle)
+        torque += disturbance.viscous[i] * dq[i]
+        if disturbance.coulomb[i] != 0.0:
+            level = disturbance.coulomb[i]
+            if disturbance.stribeck != 0.0:
+                speed = dq[i] / disturbance.stribeck_velocity
+                level *= 1.0 + disturbance.stribeck * exp(-speed * speed)
+            torque += level * tanh(dq[i] / disturbance.coulomb_velocity[i])
+        if disturbance.ripple[i] != 0.0:
+            torque += disturbance.ripple[i] * sin(disturbance.ripple_frequency * q[i])
+        out[i] = torque
+
+
+class WallSettings(NamedTuple):
+    """A plane that pushes the tip along its unit normal."""
+
+    point: Annotated[Array, '3']  # m
+    normal: Annotated[Array, '3']
+    stiffness: float  # N/m; 0: no wall
+    damping: float  # N s/m
+
+
+class SloshSettings(NamedTuple):
+    """Spring and damper of the sloshing load, per kg."""
+
+    stiffness: float  # omega^2, 1/s^2
+    damping: float  # 2 zeta omega, 1/s
+    gravity: Annotated[Array, '3']  # g, m/s^2
+
+
+class TipState(NamedTuple):
+    """Working memory for the tip of the arm."""
+
+    position: Annotated[Array, '3']  # x, m
+    velocity: Annotated[Array, '3']  # dx, m/s
+    jacobian: Annotated[Array, '3', 'n']  # m/rad
+    force: Annotated[Array, '3']  # N
+    pull: Annotated[Array, '3']  # a, m/s^2
+
+
+class Contact(NamedTuple):
+    """Sources of the force at the tip."""
+
+    push: np.ndarray  # (3,) N
+    wall: WallSettings
+    slosh: SloshSettings
+    mass: float  # m of the sloshing load, kg; 0: none
+    tip: TipState
+
+
+@inner
+def wall_force(wall: WallSettings, position: np.ndarray, velocity: np.ndarray) -> float:
+    """Return the normal force [N], >= 0, on a tip with position (3,) [m] and velocity (3,) [m/s].
+
+    Kelvin-Voigt model: k depth + d d(depth)/dt inside the wall, 0 outside.
+    """
+    depth = 0.0
+    speed = 0.0
+    for i in range(3):
+        depth += wall.normal[i] * (wall.point[i] - position[i])
+        speed -= wall.normal[i] * velocity[i]
+    if depth <= 0.0:
+        return 0.0
+    return max(0.0, wall.stiffness * depth + wall.damping * speed)
+
+
+@inner
+def locate_tip(arm: Arm, q: np.ndarray, dq: np.ndarray, tip: TipState) -> None:
+    """Write position, velocity and Jacobian of the tip."""
+    arm.fill_tip(q, tip.position, tip.jacobian)
+    for i in range(3):
+        tip.velocity[i] = 0.0
+        for j in range(dq.size):
+            tip.velocity[i] += tip.jacobian[i, j] * dq[j]
+
+
+@inner
+def subtract_contact_torque(arm: Arm, contact: Contact, x: np.ndarray, torque: np.ndarray) -> None:
+    """Subtract the contact torque J^T f (n,) [N m] from `torque`, in place.
+
+    `x` (2n + 6,) is [q, dq, y, v]; the last two are those of the sloshing load.
+    """
+    push, wall, slosh, mass, tip = contact
+    n = torque.size
+    is_pushed = push[0] != 0.0 or push[1] != 0.0 or push[2] != 0.0
+    if not is_pushed and wall.stiffness == 0.0 and mass == 0.0:
+        return
+    locate_tip(arm, part(x, 0, (n,)), part(x, n, (n,)), tip)
+    size = wall_force(wall, tip.position, tip.velocity) if wall.stiffness > 0.0 else 0.0
+    for i in range(3):
+        tip.force[i] = push[i] + size * wall.normal[i]
+        if mass > 0.0:
+            tip.pull[i] = slosh.stiffness * (x[2 * n + i] - tip.position[i])
+            tip.pull[i] += slosh.damping * (x[2 * n + 3 + i] - tip.velocity[i])
+            tip.force[i] += mass * tip.pull[i]
+    for j in range(n):
+        for i in range(3):
+            torque[j] -= tip.jacobian[i, j] * tip.force[i]
+
+
+class LoadSettings(NamedTuple):
+    """Load that acts all the time."""
+
+    payload: float  # kg, point mass at the tip
+    torque: Annotated[Array, 'n']  # N m, pushes the joints
+    force: Annotated[Array, '3']  # N, pushes the tip, in the frame of the base
+    offset: Annotated[Array, 'n']  # rad, measured minus true position
+
+
+class EventSettings(NamedTuple):
+    """Contribution of each event to load and friction; times are in samples."""
+
+    begin: Annotated[Array, 'events']
+    end: Annotated[Array, 'events']  # infinite: permanent
+    ramp: Annotated[Array, 'events']
+    payload: Annotated[Array, 'events']
+    sloshing: Annotated[Array, 'events']
+    torque: Annotated[Array, 'events', 'n']
+    force: Annotated[Array, 'events', '3']
+    viscous: Annotated[Array, 'events', 'n']
+    coulomb: Annotated[Array, 'events', 'n']
+    offset: Annotated[Array, 'events', 'n']
+
+
+class Acting(NamedTuple):
+    """Sum of load and events in one sample."""
+
+    sample: Cell  # of the sum; -1: none yet
+    payload: Cell  # kg
+    sloshing: Cell  # kg
+    force: Annotated[Array, '3']  # N
+    offset: Annotated[Array, 'n']  # rad
+    constant: Annotated[Array, 'n']  # N m, of the disturbance, less torques that push the joints
+    viscous: Annotated[Array, 'n']  # N m s/rad, not below zero
+    coulomb: Annotated[Array, 'n']  # N m, not below zero
+
+
+@inner
+def come(sample: float, at: float, ramp: float) -> float:
+    """Return the fraction, from 0 to 1, of a ramp of `ramp` samples that begins at sample `at`."""
+    if sample < at:
+        return 0.0
+    if sample >= at + ramp:
+        return 1.0
+    return (sample - at) / ramp
+
+
+@inner
+def add(total: np.ndarray, fraction: float, one: np.ndarray) -> None:
+    """Add a fraction of one vector to another."""
+    for i in range(total.size):
+        total[i] += fraction * one[i]
+
+
+@inner
+def put(target: np.ndarray, values: np.ndarray) -> None:
+    """Copy a vector; `target[:] = values` compiles ten functions just for a shape error."""
+    for i in range(target.size):
+        target[i] = values[i]
+
+
+@inner
+def update_acting(
+    disturbance: JointDisturbance,
+    load: LoadSettings,
+    events: EventSettings,
+    sample: float,
+    acting: Acting,
+) -> None:
+    """Sum load and events of a sample, unless already done."""
+    if acting.sample[0] == sample:
+        return
+    acting.sample[0] = sample
+    acting.payload[0] = load.payload
+    acting.sloshing[0] = 0.0
+    put(acting.force, load.force)
+    put(acting.offset, load.offset)
+    put(acting.constant, disturbance.constant)
+    put(acting.viscous, disturbance.viscous)
+    put(acting.coulomb, disturbance.coulomb)
+    add(acting.constant, -1.0, load.torque)
+    for e in range(events.begin.size):
+        fraction = come(sample, events.begin[e], events.ramp[e])
+        fraction -= come(sample, events.end[e], events.ramp[e])
+        if fraction != 0.0:
+            acting.payload[0] += fraction * events.payload[e]
+            acting.sloshing[0] += fraction * events.sloshing[e]
+            add(acting.force, fraction, events.force[e])
+            add(acting.offset, fraction, events.offset[e])
+            add(acting.constant, -fraction, events.torque[e])
+            add(acting.viscous, fraction, events.viscous[e])
+            add(acting.coulomb, fraction, events.coulomb[e])
+    for i in range(acting.viscous.size):
+        acting.viscous[i] = max(acting.viscous[i], 0.0)
+        acting.coulomb[i] = max(acting.coulomb[i], 0.0)
 
 
 class Motion(NamedTuple):
@@ -47,3 +284,79 @@ def state_derivative(
         for i in range(3):
             dx[2 * n + i] = x[2 * n + 3 + i]
             dx[2 * n + 3 + i] = contact.slosh.gravity[i] - contact.tip.pull[i]
+
+
+RK4 = 0
+DOPRI5 = 1
+INTEGRATORS = {'rk4': RK4, 'dopri5': DOPRI5}
+
+_RK4_C = np.array([0, 1 / 2, 1 / 2, 1])
+_RK4_A = np.array([[0, 0, 0, 0], [1 / 2, 0, 0, 0], [0, 1 / 2, 0, 0], [0, 0, 1, 0]])
+_RK4_B = np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6])
+
+_DOPRI5_C = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1])
+_DOPRI5_A = np.array(
+    [
+        [0, 0, 0, 0, 0, 0],
+        [1 / 5, 0, 0, 0, 0, 0],
+        [3 / 40, 9 / 40, 0, 0, 0, 0],
+        [44 / 45, -56 / 15, 32 / 9, 0, 0, 0],
+        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
+        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
+    ]
+)
+_DOPRI5_B = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
+
+
+class Stages(NamedTuple):
+    """Working memory of a step."""
+
+    point: Annotated[Array, '2 * n + 6']
+    k: Annotated[Array, '6', '2 * n + 6']
+
+
+@inner
+def _explicit_step(
+    a: np.ndarray,
+    b: np.ndarray,
+    c: np.ndarray,
+    motion: Motion,
+    t: float,
+    h: float,
+    torque: np.ndarray,
+    x: np.ndarray,
+    stages: Stages,
+) -> None:
+    point, k = stages.point, stages.k
+    for stage in range(b.size):
+        for i in range(x.size):
+            slope = 0.0
+            for j in range(stage):
+                slope += a[stage, j] * k[j, i]
+            point[i] = x[i] + h * slope
+        state_derivative(motion, t + c[stage] * h, point, torque, k[stage])
+    for i in range(x.size):
+        slope = 0.0
+        for j in range(b.size):
+            slope += b[j] * k[j, i]
+        x[i] += h * slope
+
+
+@inner
+def integrate(
+    method: int,
+    motion: Motion,
+    t: float,
+    h: float,
+    torque: np.ndarray,
+    x: np.ndarray,
+    stages: Stages,
+) -> None:
+    """Advance x in place from t to t + h [s] under a held torque (n,) [N m].
+
+    `x` is [q, dq] (2n,), or [q, dq, y, v] (2n + 6,) while a load sloshes.
+    """
+    if method == RK4:
+        _explicit_step(_RK4_A, _RK4_B, _RK4_C, motion, t, h, torque, x, stages)
+    else:
+        _explicit_step(_DOPRI5_A, _DOPRI5_B, _DOPRI5_C, motion, t, h, torque, x, stages)

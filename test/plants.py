@@ -3,15 +3,20 @@
 
 import numpy as np
 
-from sim_plant.actuator import Drives, lag
-from sim_plant.compensation import Compensation
-from sim_plant.contact import Contact, SloshSettings, TipState, WallSettings
-from sim_plant.disturbance import JointDisturbance
-from sim_plant.dynamics import PointMassArm
-from sim_plant.events import EventSettings, LoadSettings
-from sim_plant.integrator import DOPRI5
+from sim_plant.arm import PointMassArm
+from sim_plant.drives import Compensation, Drives, lag
 from sim_plant.kernels import PlantSettings
-from sim_plant.motion import Motion
+from sim_plant.motion import (
+    DOPRI5,
+    Contact,
+    EventSettings,
+    JointDisturbance,
+    LoadSettings,
+    Motion,
+    SloshSettings,
+    TipState,
+    WallSettings,
+)
 from sim_plant.plant import Plant
 from sim_plant.sensors import MEASURED, Encoders
 

@@ -15,8 +15,7 @@ from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE
-from sim_plant.rigid_arm import motion_of, motion_size
-from sim_plant.rigid_body import acceleration, locate, rigid_bodies
+from sim_plant.rigid_body import acceleration, locate, motion_of, motion_size, rigid_bodies
 
 PANDA_TEXT = (CONFIG / 'panda.urdf').read_text()
 PANDA_CHAIN = read_chain(PANDA_TEXT, 'panda_link0', 'panda_hand_tcp', PANDA)

@@ -9,7 +9,7 @@ from closed_loop_case import MODEL, P, R, plant
 from plain_law import dynamics
 from plants import ARM
 
-import sim_plant.dynamics as physics
+import sim_plant.arm as physics
 from blf_dsc_controller.arms.model import arm_model
 from blf_dsc_controller.arms.planar_chain import PlanarChain
 from blf_dsc_controller.arms.two_link import TwoLink, urdf

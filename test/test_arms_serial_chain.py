@@ -17,7 +17,7 @@ from blf_dsc_controller.arms.prior import CENTRE, ROTORS, prior_factor
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.compiled.jit import kernel
-from sim_plant.rigid_arm import rigid_arm
+from sim_plant.rigid_body import rigid_arm
 
 # The base stands on the floor, is mounted on a wall, or is tilted.
 ARMS = {

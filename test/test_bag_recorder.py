@@ -29,7 +29,7 @@ from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import FOREVER, JOINT_STATES, Quality
 from blf_dsc_controller.messages.types import definition
 from blf_dsc_controller.nodes import recorder_node
-from blf_dsc_controller.nodes.raw_subscriptions import quality_of
+from blf_dsc_controller.nodes.endpoints import quality_of
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 
 PATIENCE = 300.0  # s, timeout of waits that normally take a moment

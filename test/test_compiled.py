@@ -31,7 +31,7 @@ from sim_plant.kernels import step_plant
 
 PACKAGE = Path(blf_dsc_controller.__file__).resolve().parent
 LAW = {f'{PACKAGE.name}/law/{name}.py' for name in ('barrier', 'prediction', 'step', 'settings')}
-PLANT = {f'sim_plant/{name}.py' for name in ('actuator', 'dynamics', 'integrator', 'kernels')}
+PLANT = {f'sim_plant/{name}.py' for name in ('arm', 'drives', 'kernels', 'motion')}
 REFERENCE = {f'{PACKAGE.name}/reference/terms.py'}
 ALWAYS = {f'{PACKAGE.name}/{name}.py' for name in ('compiled/layout', 'arms/two_link')}
 

@@ -31,7 +31,7 @@ from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import message_class
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.simulation.loop import simulate
-from sim_plant.arms import urdf_of
+from sim_plant.plant import urdf_of
 
 CONFIG = Path(__file__).parents[1] / 'config'
 

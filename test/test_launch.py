@@ -23,9 +23,9 @@ from rcl_interfaces.srv import GetParameters, ListParameters
 
 from blf_dsc_controller.configuration.nodes import dump, locate
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.nodes.arguments import assigned
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
+from blf_dsc_controller.nodes.process import assigned
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 

@@ -15,7 +15,7 @@ from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.topics import Quality
-from blf_dsc_controller.nodes import description
+from blf_dsc_controller.nodes import parameters
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import qos_profile
 from blf_dsc_controller.nodes.plant_node import PlantNode
@@ -49,7 +49,7 @@ def test_topic_is_in_the_namespace_of_the_node_unless_it_begins_with_a_slash(ros
     ('publishers', 'hint'), [(0, 'nobody publishes there'), (1, 'may not be latched')]
 )
 def test_missing_urdf_is_reported_with_a_hint(ros, monkeypatch, publishers, hint):
-    monkeypatch.setattr(description, 'TIMEOUT', 1.0)
+    monkeypatch.setattr(parameters, 'TIMEOUT', 1.0)
     if publishers:
         publish(ros, 'robot_description', Quality(1, 'reliable', 'volatile'))
         ros.until(lambda: ros.tester.count_publishers('/robot_description') == 1)

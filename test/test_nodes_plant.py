@@ -17,8 +17,7 @@ from blf_dsc_controller.law.telemetry import disturbance_names
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from sim_plant.arms import parameter_names_of
-from sim_plant.plant import plant_of
+from sim_plant.plant import parameter_names_of, plant_of
 
 TORQUE = (5.0, 3.0)  # N m
 

@@ -14,7 +14,7 @@ BROKEN = """
 import rclpy
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.nodes.process import PlainNode, run
-from blf_dsc_controller.nodes.rclpy_internals import RCLError
+from blf_dsc_controller.nodes.endpoints import RCLError
 
 class Broken(PlainNode):
     finished = True

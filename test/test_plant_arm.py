@@ -6,7 +6,7 @@ import pytest
 from plants import ARM, ODD_ARM, energies
 
 from blf_dsc_controller.arms.two_link import TwoLink
-from sim_plant.dynamics import acceleration, parameters
+from sim_plant.arm import acceleration, parameters
 
 ARMS = pytest.mark.parametrize('arm', [ARM, ODD_ARM], ids=['paper', 'odd'])
 STEP = 1e-5  # rad; a central difference errs by STEP^2 and eps / STEP, some 1e-10 of the value

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from plants import disturbance, plant, rough_disturbance
 
-from sim_plant.disturbance import disturbance_torque
+from sim_plant.motion import disturbance_torque
 
 
 def torque(vector, t, dq, q=(0.3, -0.4)):

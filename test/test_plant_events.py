@@ -12,11 +12,9 @@ from scipy.integrate import cumulative_simpson
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.errors import ConfigurationError
-from sim_plant.arms import urdf_of
-from sim_plant.contact import wall_force
-from sim_plant.dynamics import tip
-from sim_plant.motion import disturbing_torque
-from sim_plant.plant import plant_of, settings_of
+from sim_plant.arm import tip
+from sim_plant.motion import disturbing_torque, wall_force
+from sim_plant.plant import plant_of, settings_of, urdf_of
 
 SAMPLES = 40
 AT = 13  # sample at which the arm changes

@@ -6,8 +6,7 @@ import pytest
 from plants import ARM, PERIOD, START, commands, disturbance, energies, motion, rough_disturbance
 from scipy.integrate import RK45, simpson, solve_ivp
 
-from sim_plant.integrator import DOPRI5, RK4, Stages, integrate
-from sim_plant.motion import state_derivative
+from sim_plant.motion import DOPRI5, RK4, Stages, integrate, state_derivative
 
 STAGES = Stages(np.empty(4), np.empty((6, 4)))
 INITIAL = np.array([*START, 0.5, -1.0])

@@ -12,8 +12,7 @@ from random_arm import CONFIG, PANDA, UR5E, configuration, pinocchio_model, rand
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.compiled.jit import kernel
-from sim_plant.rigid_arm import motion_of, motion_size
-from sim_plant.rigid_body import acceleration, locate, rigid_bodies, tip
+from sim_plant.rigid_body import acceleration, locate, motion_of, motion_size, rigid_bodies, tip
 
 TILTED_GRAVITY = (1.0, -3.0, 5.0)
 ARMS = {

@@ -14,8 +14,8 @@ from numba.core.runtime import _nrt_python, rtsys
 from plants import START, commands, motion, plant, rough_disturbance, run
 
 from blf_dsc_controller.compiled.jit import kernel
-from sim_plant.integrator import DOPRI5, RK4, Stages, integrate
 from sim_plant.kernels import draw_noise, observe, plant_views, step
+from sim_plant.motion import DOPRI5, RK4, Stages, integrate
 from sim_plant.sensors import DIFFERENCED, MEASURED
 
 IMPERFECTIONS = {

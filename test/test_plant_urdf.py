@@ -14,8 +14,7 @@ from blf_dsc_controller.arms.inertia import pseudo_inertia
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError
-from sim_plant.arms import true_inertias
-from sim_plant.plant import parameters_of, plant_of
+from sim_plant.plant import parameters_of, plant_of, true_inertias
 
 PANDA_CONFIG = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 FRICTIONLESS = {'disturbance.viscous': [0.0] * 7, 'disturbance.coulomb': [0.0] * 7}

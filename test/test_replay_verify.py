@@ -37,7 +37,7 @@ from blf_dsc_controller.messages.topics import (
 )
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.replay.what_if import what_if
-from blf_dsc_controller.supervision.retuning import apply_bumpless
+from blf_dsc_controller.supervision.handover import apply_bumpless
 
 START = 1_000_000_000  # ns
 MILLISECOND = 1_000_000  # ns

@@ -10,7 +10,7 @@ from random_arm import CONFIG
 
 from blf_dsc_controller import load_loop
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.second_line import SecondLine
+from blf_dsc_controller.supervision.safe_torque import SecondLine
 from sim_plant.plant import plant_of
 
 TIMEOUT = 0.05  # s

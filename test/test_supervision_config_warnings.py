@@ -17,7 +17,7 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
-from blf_dsc_controller.supervision.reference_load import reference_load, windows_along
+from blf_dsc_controller.supervision.linear_loop import reference_load, windows_along
 
 BOUND = 0.002  # rad
 

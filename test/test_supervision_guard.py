@@ -13,12 +13,11 @@ from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
-from blf_dsc_controller.supervision.checks import StateCheck
+from blf_dsc_controller.supervision.checks import StateCheck, Watchdog
 from blf_dsc_controller.supervision.guard import LatePlanError
-from blf_dsc_controller.supervision.retuning import apply_bumpless
+from blf_dsc_controller.supervision.handover import apply_bumpless
 from blf_dsc_controller.supervision.safe_torque import LastState, SafeTorque, safe_torque
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
-from blf_dsc_controller.supervision.watchdog import Watchdog
 
 Q, DQ = np.array([0.3, -0.4]), np.array([0.5, -2.0])
 P = np.array([1.0, 0.32, 0.4])
@@ -499,7 +498,7 @@ def test_arm_that_stands_still_under_noise_is_not_taken_for_braked():
 
 
 def test_torque_that_chatters_is_measured_and_named():
-    status = pytest.importorskip('blf_dsc_controller.nodes.controller_status')
+    status = pytest.importorskip('blf_dsc_controller.nodes.diagnostics')
     hold = {'reference.type': 'hold', 'learning.initial_estimate': P.tolist()}
     rig, quiet = Rig(hold), Rig(hold)
     rng = np.random.default_rng(0)

@@ -242,8 +242,8 @@ def play(options: Namespace) -> None:
     """
     import rclpy
 
+    from blf_dsc_controller.nodes.endpoints import RCLError
     from blf_dsc_controller.nodes.player_node import PlayerNode
-    from blf_dsc_controller.nodes.rclpy_internals import RCLError
 
     _check_play(options)
     words = [word for remap in options.remap for word in ('--remap', remap)]

@@ -24,15 +24,15 @@ from blf_dsc_controller.law.telemetry import (
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder, MessageError
 from blf_dsc_controller.nodes import parameters, process
-from blf_dsc_controller.nodes.controller_status import ControllerStatus
+from blf_dsc_controller.nodes.diagnostics import ControllerStatus
+from blf_dsc_controller.nodes.endpoints import subscription_count
 from blf_dsc_controller.nodes.lifecycle import POLL_PERIOD, LoopNode
-from blf_dsc_controller.nodes.rclpy_internals import subscription_count
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
+from blf_dsc_controller.supervision.checks import SAME_CLOCK
 from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
+from blf_dsc_controller.supervision.linear_loop import ReferenceLoad, reference_load
 from blf_dsc_controller.supervision.supervisor import Phase
-from blf_dsc_controller.supervision.watchdog import SAME_CLOCK
 
 OUTPUTS = (
     topics.COMMANDS,

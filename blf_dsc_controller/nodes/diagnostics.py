@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The diagnostics of a node on `/diagnostics`: once a second and immediately after a change.
+"""`/diagnostics` of a node, once a second and on a change, and the controller's state and journal.
 
 Names are paths (`left/blf_dsc_controller/loop`), which rqt_robot_monitor shows as a tree; the
 hardware is named by its joints.
@@ -10,11 +10,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from blf_dsc_controller.law.telemetry import RejectedColumn, load_text
 from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.topics import LOAD, PHASE, REASON, REJECTED, STOPS
 from blf_dsc_controller.nodes.endpoints import create_publisher, qos_profile
+from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
+from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.supervisor import Phase, Supervisor
 
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
@@ -58,3 +64,165 @@ class DiagnosticsPublisher:
         """Publish the latched state, which late subscribers also receive."""
         if self._state is not None:
             self._state.publish(status)
+
+
+_PHASES = {
+    Phase.INACTIVE: (STALE, 'not in command'),
+    Phase.STARTING: (WARN, 'waiting for a joint state to start from'),
+    Phase.APPROACHING: (OK, 'approaching the reference'),
+    Phase.TRACKING: (OK, 'tracking'),
+    Phase.SAFE_STOP: (ERROR, 'stopped'),
+}
+
+
+_CHATTER = 0.11  # of the torque limit; 20 bits leave a Panda 0.01, 16 bits 0.13
+
+
+class ControllerStatus:
+    """Publishes the state of the controller.
+
+    Attributes:
+        journal: publisher of `~/journal`.
+        rejected: disturbance columns that are not estimated, and why.
+        trajectories: accepted and rejected trajectories.
+    """
+
+    def __init__(self, node: Node, joints: Sequence[str]) -> None:
+        """Create the publishers of a node that controls `joints`."""
+        self.journal = create_publisher(node, topics.JOURNAL)
+        self.rejected: tuple[RejectedColumn, ...] = ()
+        self.trajectories: TrajectoryInput | None = None
+        self._joints = tuple(joints)
+        self._diagnostics = DiagnosticsPublisher(node, joints, topics.STATE)
+        self._revision = -1
+        self._published: tuple[str, str, int] | None = None
+        self._logger = node.get_logger()
+        self._has_warned = False
+
+    def has_news(self, guard: Guard) -> bool:
+        """Whether there are events or a state to publish."""
+        return bool(guard.journal.pending) or guard.supervisor.revision != self._revision
+
+    def report(self, life: str, guard: Guard | None, rivals: int) -> None:
+        """Publish diagnostics, new events and, if it has changed, the state.
+
+        Args:
+            life: lifecycle state of the node.
+            guard: None while the node is not configured.
+            rivals: other publishers of torques.
+        """
+        if guard is not None:
+            self.publish_events(guard)
+        state = self._state(life, guard)
+        parts = [state]
+        if guard is not None:
+            parts += [self._loop(guard, rivals), self._learning(guard)]
+            if guard.controller.settings.weighed:
+                parts.append(self._load(guard))
+        self._diagnostics.publish(parts)
+        stops = guard.supervisor.stops if guard else 0
+        if (state.message, life, stops) != self._published:
+            self._diagnostics.publish_state(state)
+            self._published = (state.message, life, stops)
+        self._revision = guard.supervisor.revision if guard else -1
+
+    def publish_events(self, guard: Guard) -> None:
+        """Publish the new events."""
+        while guard.journal.pending:
+            self.journal.publish(guard.journal.pending.popleft().encode())
+
+    def _state(self, life: str, guard: Guard | None) -> DiagnosticStatus:
+        supervisor = guard.supervisor if guard else Supervisor()
+        level, message = _PHASES[supervisor.phase]
+        values: dict[str, Any] = {PHASE: supervisor.phase, REASON: supervisor.reason}
+        values['lifecycle'] = life
+        if guard is None:
+            message = 'not configured'
+        else:
+            values[STOPS] = supervisor.stops
+            values['safe torque'] = guard.config.safety.torque
+        if supervisor.text:
+            message += f': {supervisor.text}'
+        return self._diagnostics.status('state', level, message, values)
+
+    def _loop(self, guard: Guard, rivals: int) -> DiagnosticStatus:
+        states, samples = guard.states, guard.samples
+        values = {
+            'samples': guard.controller.samples,
+            'repeated states ignored': states.repeated,
+            'samples outside the bound': samples.outside,
+            'largest error against the bound': f'{samples.ratio.max():.3g}',
+            'states missed': states.missed,
+            'samples with a torque at its limit': samples.saturated,
+            'messages for other joints': guard.foreign,
+            'watchdog on the steady clock': _watchdog(guard),
+            **self._cuts(guard),
+            **(self.trajectories.values if self.trajectories else {}),
+        }
+        level, message = WARN, 'torque{} at its limit: adaptation by the tracking error is frozen'
+        if rivals:
+            level, message = ERROR, 'another node commands torques, too'
+        elif samples.outside:
+            message = 'the error has left its bound'
+        elif samples.saturated_time > 0.0:
+            message = message.format('')
+        elif guard.has_sample and guard.controller.sample.cuts.any():
+            message = message.format(' rate')
+        elif chatter := chatter_of(guard, self._joints):
+            message = chatter
+            if not self._has_warned:
+                self._has_warned = True
+                self._logger.warning(chatter)
+        else:
+            level, message = OK, _PHASES[guard.supervisor.phase][1]
+        return self._diagnostics.status('loop', level, message, values)
+
+    def _cuts(self, guard: Guard) -> dict[str, int]:
+        """Return in how many samples the law's torque was cut, by joint and cause."""
+        state = guard.controller.state
+        causes = {'torque limit': state.level_cuts, 'torque rate limit': state.rate_cuts}
+        return {
+            f'samples cut by the {cause}, {joint}': int(count)
+            for cause, counts in causes.items()
+            for joint, count in zip(self._joints, counts, strict=True)
+        }
+
+    def _learning(self, guard: Guard) -> DiagnosticStatus:
+        state = guard.controller.state
+        learning = 'latched' if state.latched[0] else 'not yet excited'
+        values = {'lambda_min': f'{state.lambda_min[0]:.3g}', 'learning': learning}
+        values['model changes'] = f'{state.changes[0]:.0f}'
+        if state.changes[0]:
+            residual = state.contradiction[0] ** 0.5
+            values['last model change'] = (
+                f'{state.change_time[0]:.3f} s after the start, by {residual:.3g} N m'
+            )
+        values |= {f'{REJECTED}{one.column}': f'{one}' for one in self.rejected}
+        if self.rejected:
+            columns = ', '.join(one.column for one in self.rejected)
+            return self._diagnostics.status('learning', WARN, f'not estimated: {columns}', values)
+        return self._diagnostics.status('learning', OK, learning, values)
+
+    def _load(self, guard: Guard) -> DiagnosticStatus:
+        load = guard.controller.sample.load.tolist()
+        values = {name: f'{value:.6g}' for name, value in zip(LOAD, load, strict=True)}
+        return self._diagnostics.status('load', OK, f'held: {load_text(load)}', values)
+
+
+def chatter_of(guard: Guard, joints: Sequence[str]) -> str:
+    """Return the warning about a torque that chatters, as with coarse encoders; empty if none."""
+    steps = np.sqrt(guard.controller.checks.chatter)
+    worst = int(np.argmax(steps / guard.controller.settings.torque_limit))
+    if steps[worst] <= _CHATTER * guard.controller.settings.torque_limit[worst]:
+        return ''
+    return (
+        f'the torque of {joints[worst]} changes by {steps[worst]:.2g} N m rms each sample: its '
+        'measured velocity is coarse or noisy. Lower the pole of the velocity filter and add '
+        'its lag to robot.lag, whose gains are softer'
+    )
+
+
+def _watchdog(guard: Guard) -> str:
+    why_off = guard.watchdog.why_off
+    off = f'off: {why_off}' if why_off else 'off'
+    return 'on' if guard.watchdog.on else off

@@ -1,22 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Message types, qualities of service, publishers, subscriptions and timers."""
+"""Message types, qualities of service, publishers, subscriptions, timers, and what rclpy hides.
+
+`RawSubscriptions` are for messages that are taken in batches, serialised. An executor would run a
+callback for each message. Here the messages of all topics are taken from the middleware's queues
+at the owner's pace, which costs a third less, and each carries the middleware's metadata: when it
+was sent and received, and its sequence number, which reveals losses. The subscriptions therefore
+belong to a separate node that no executor spins.
+"""
 
 from __future__ import annotations
 
 import importlib
 import re
 import sysconfig
-from collections.abc import Callable, Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ament_index_python.packages import get_package_share_directory
+from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
+from rclpy.client import Client
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
+from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_msg
@@ -117,3 +131,151 @@ def create_subscription(node: Node, topic: Topic, callback: Callable[[bytes], No
 def create_steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
     """Create a timer [s] on the steady clock, which also runs while simulated time is paused."""
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+__all__ = ['RCLError', 'UnknownROSArgsError']  # re-exported
+
+
+def parameter_overrides(node: Node) -> Mapping[str, Parameter]:
+    """Return the parameters in a node's start files and arguments, declared or not."""
+    return node._parameter_overrides  # noqa: SLF001
+
+
+def raw_publish(publisher: Publisher) -> Callable[[bytes], None]:
+    """Return a function that publishes raw messages in half the time while the node exists."""
+    publish: Callable[[bytes], None] = publisher.handle.publish_raw
+    return publish
+
+
+def subscription_count(publisher: Publisher) -> Callable[[], int]:
+    """Return a function that counts subscribers in a fifth of the time while the node exists."""
+    count: Callable[[], int] = publisher.handle.get_subscription_count
+    return count
+
+
+def take_messages(
+    subscription: Subscription, limit: int
+) -> Iterator[tuple[bytes, Mapping[str, int | None]]]:
+    """Take up to `limit` waiting messages from a subscription that no executor spins.
+
+    Each is serialised and comes with `source_timestamp` [ns], `received_timestamp` [ns] and
+    `publication_sequence_number`, which are None where the middleware does not know them.
+    """
+    take, type_ = subscription.handle.take_message, subscription.msg_type
+    for _ in range(limit):
+        taken = take(type_, True)  # noqa: FBT003 - serialised; positional in rclpy
+        if taken is None:
+            return
+        yield taken
+
+
+def take_response(client: Client) -> Any:
+    """Take a response from a client that no executor spins; None if there is none yet."""
+    type_: Any = client.srv_type
+    _, response = client.handle.take_response(type_.Response)
+    return response
+
+
+def lifecycle_state(node: LifecycleNode) -> str:
+    """Return the state of a lifecycle node: unconfigured, inactive, active or finalized."""
+    return str(node._state_machine.current_state[1])  # noqa: SLF001
+
+
+def destroy_state_machine(node: LifecycleNode) -> None:
+    """Destroy the state machine, which rclpy forgets when it destroys the node.
+
+    It would keep the middleware's threads alive until the process exits: a known cause of crashes.
+    """
+    node._state_machine.destroy_when_not_in_use()  # noqa: SLF001
+
+
+def wrap_change_state(
+    node: LifecycleNode, wrap: Callable[[Callable[[Any, Any], Any]], Callable[[Any, Any], Any]]
+) -> None:
+    """Replace the callback of the service `~/change_state` with `wrap(callback)`."""
+    service = node._service_change_state  # noqa: SLF001
+    service.callback = wrap(service.callback)
+
+
+_BATCH = 1000  # messages taken from one topic before the next one's turn
+
+
+class RawMessage(NamedTuple):
+    """A serialised message with the middleware's metadata."""
+
+    handle: int
+    raw: bytes
+    received: int  # ns, system time
+    published: int  # ns, system time of the publisher
+    sequence: int  # assigned by the publisher, 0 if unknown
+
+
+class RawSubscriptions:
+    """Subscriptions to any number of topics, each with a queue of `depth`.
+
+    They belong to `node`, a hidden node separate from their owner.
+    """
+
+    def __init__(self, owner: Node, depth: int) -> None:
+        self.node = Node(
+            f'_{owner.get_name()}_subscriptions',
+            context=owner.context,
+            use_global_arguments=False,
+            enable_rosout=False,
+            start_parameter_services=False,
+        )
+        self._depth = depth
+        self._subscriptions: list[tuple[int, Subscription]] = []
+
+    def subscribe(
+        self, topic: str, type_name: str, offered: Sequence[Quality], handle: int
+    ) -> None:
+        """Subscribe to a topic; its messages carry `handle`. Raises what `message_class` raises."""
+        subscription = self.node.create_subscription(
+            message_class(type_name),
+            topic,
+            lambda _: None,  # rclpy requires a callback; the messages are taken, not delivered
+            compatible_profile(offered, self._depth),
+            raw=True,
+        )
+        self._subscriptions.append((handle, subscription))
+
+    def take(self) -> list[RawMessage]:
+        """Take the waiting messages, in the order in which they were received."""
+        messages: list[RawMessage] = []
+        for handle, subscription in self._subscriptions:
+            for raw, info in take_messages(subscription, _BATCH):
+                received = info['received_timestamp'] or time.time_ns()
+                published = info['source_timestamp'] or received
+                sequence = info['publication_sequence_number'] or 0
+                messages.append(RawMessage(handle, raw, received, published, sequence))
+        messages.sort(key=attrgetter('received'))
+        return messages
+
+    def close(self) -> None:
+        """End all subscriptions."""
+        self._subscriptions.clear()
+        self.node.destroy_node()
+
+
+def compatible_profile(offered: Sequence[Quality], depth: int) -> QoSProfile:
+    """Return the strictest quality of service that is compatible with all publishers."""
+    reliable = all(quality.reliability == 'reliable' for quality in offered)
+    latched = all(quality.durability == 'transient_local' for quality in offered)
+    reliability = 'reliable' if reliable else 'best_effort'
+    durability = 'transient_local' if latched else 'volatile'
+    return qos_profile(Quality(depth, reliability, durability))
+
+
+def quality_of(profile: QoSProfile) -> Quality:
+    """Return a publisher's quality of service; the ROS graph omits history and depth."""
+    return Quality(
+        depth=profile.depth,
+        reliability=profile.reliability.name.lower(),
+        durability=profile.durability.name.lower(),
+        history=profile.history.name.lower(),
+        deadline=profile.deadline.nanoseconds,
+        lifespan=profile.lifespan.nanoseconds,
+        liveliness=profile.liveliness.name.lower(),
+        liveliness_lease_duration=profile.liveliness_lease_duration.nanoseconds,
+    )

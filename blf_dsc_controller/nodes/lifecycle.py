@@ -22,12 +22,10 @@ from blf_dsc_controller.law.telemetry import Message
 from blf_dsc_controller.messages.topics import WATCHDOG_NODE, Topic
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.endpoints import (
+    RCLError,
     create_publisher,
     create_steady_timer,
     create_subscription,
-)
-from blf_dsc_controller.nodes.rclpy_internals import (
-    RCLError,
     destroy_state_machine,
     lifecycle_state,
     raw_publish,

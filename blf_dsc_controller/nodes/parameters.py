@@ -1,21 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Configurations as parameters of ROS 2 nodes: declared, read, and changed while the node runs."""
+"""Configurations as parameters: declared, read, changed at run time, and those of other nodes.
+
+The clients that read other nodes' parameters belong to a node that no executor spins, and the
+owner polls for responses: the EventsExecutor of these releases crashes when clients are created
+and destroyed.
+"""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from typing import Any, TypeVar
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
     ParameterDescriptor,
+    ParameterType,
     SetParametersResult,
 )
+from rcl_interfaces.srv import GetParameters, ListParameters
+from rclpy.client import Client
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
+from rclpy.parameter import parameter_value_to_python
+from rclpy.serialization import deserialize_message
+from std_msgs.msg import String
 
 from blf_dsc_controller.configuration.nodes import is_builtin, known_names
 from blf_dsc_controller.configuration.robot import TOPIC
@@ -28,9 +40,13 @@ from blf_dsc_controller.configuration.schema import (
     parameters,
 )
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.nodes import arguments
-from blf_dsc_controller.nodes.description import wait_for_description
-from blf_dsc_controller.nodes.rclpy_internals import parameter_overrides
+from blf_dsc_controller.messages.topics import ROBOT_DESCRIPTION
+from blf_dsc_controller.nodes import process
+from blf_dsc_controller.nodes.endpoints import RawSubscriptions, parameter_overrides, take_response
+from blf_dsc_controller.nodes.process import assigned, check_sections
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
 Config = TypeVar('Config')
 
@@ -171,11 +187,128 @@ def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
     """
     own = {one.name: one.kind for one in parameters(cls)}
     others = known_names() - own.keys()
-    arguments.check_sections(sys.argv, node.get_fully_qualified_name())
+    check_sections(sys.argv, node.get_fully_qualified_name())
     given = {name: one.value for name, one in parameter_overrides(node).items()}
-    given |= arguments.assigned(sys.argv)
+    given |= assigned(sys.argv)
     return {
         name: [] if value is None and name in own and own[name].is_array else value
         for name, value in given.items()
         if name not in others and not is_builtin(name)
     }
+
+
+Values = Mapping[str, Any]
+
+_WITHOUT_YAML = (ParameterType.PARAMETER_NOT_SET, ParameterType.PARAMETER_BYTE_ARRAY)
+
+
+class ParameterClient:
+    """Reads the parameters of each requested node once, as soon as its services are available.
+
+    `callback` is called with the full name of the node and the values of its parameters.
+    """
+
+    def __init__(self, callback: Callable[[str, Values], None]) -> None:
+        self._callback = callback
+        self._requests: dict[str, Iterator[Values | None]] = {}
+        self._known: set[str] = set()
+
+    @property
+    def pending(self) -> tuple[str, ...]:
+        """Nodes that have not responded yet."""
+        return tuple(self._requests)
+
+    def request(self, node: Node, name: str) -> None:
+        """Request the parameters of node `name` (full name) via `node`, which must not be spun."""
+        if name not in self._known:
+            self._known.add(name)
+            self._requests[name] = _values_of(node, name)
+
+    def poll(self) -> None:
+        """Send the requests that are possible now, and call `callback` for complete responses."""
+        for name in self.pending:
+            values = next(self._requests[name])
+            if values is not None:
+                del self._requests[name]
+                self._callback(name, values)
+
+
+def _values_of(node: Node, name: str) -> Iterator[Values | None]:
+    """List the names, then get their values; yield None until the values have arrived.
+
+    If a parameter is declared but not set, rclpy's response is empty: the names are then requested
+    in halves, down to the unset one.
+    """
+    listing = node.create_client(ListParameters, f'{name}/list_parameters')
+    getting = node.create_client(GetParameters, f'{name}/get_parameters')
+    while not (listing.service_is_ready() and getting.service_is_ready()):
+        yield None
+    listed = yield from _call(listing, ListParameters.Request())
+    batches = [list(listed.result.names)]
+    found = {}
+    while batches:
+        names = batches.pop()
+        got = yield from _call(getting, GetParameters.Request(names=names))
+        if len(got.values) == len(names):
+            for parameter, value in zip(names, got.values, strict=True):
+                if value.type not in _WITHOUT_YAML:
+                    found[parameter] = _plain(value)
+        elif len(names) > 1:
+            middle = len(names) // 2
+            batches += [names[:middle], names[middle:]]
+    yield dict(sorted(found.items()))
+
+
+def _call(client: Client, request: Any) -> Any:
+    client.call_async(request)
+    while (response := take_response(client)) is None:
+        yield None
+    return response
+
+
+def _plain(value: Any) -> Any:
+    """Return the value as configurations hold it, with sequences as tuples."""
+    content = parameter_value_to_python(value)
+    return content if isinstance(content, (bool, int, float, str)) else tuple(content)
+
+
+TIMEOUT = 60.0  # s
+_POLL = 0.05  # s
+_SILENCE = 5.0  # s between two log lines
+
+
+def wait_for_description(node: Node, name: str) -> str:
+    """Return the URDF from a topic, resolving its name for the node; a signal ends the process.
+
+    Raises ConfigurationError if none is received within a minute.
+    """
+    topic = node.resolve_topic_name(name)
+    hidden = RawSubscriptions(node, depth=1)
+    hidden.subscribe(topic, ROBOT_DESCRIPTION.type, [ROBOT_DESCRIPTION.offered], 0)
+    begin = time.monotonic()
+    try:
+        while not (messages := hidden.take()):
+            if process.interrupted():
+                raise SystemExit(0)
+            if time.monotonic() > begin + TIMEOUT:
+                raise ConfigurationError([_nothing(topic, hidden.node.count_publishers(topic))])
+            node.get_logger().info(
+                f'waiting for the URDF on {topic}', throttle_duration_sec=_SILENCE
+            )
+            time.sleep(_POLL)
+    finally:
+        hidden.close()
+    text: str = deserialize_message(messages[-1].raw, String).data
+    if not text.strip():
+        raise ConfigurationError([f'robot.urdf: the URDF on {topic} is empty: did xacro fail?'])
+    return text
+
+
+def _nothing(topic: str, publishers: int) -> str:
+    found = 'nobody publishes there'
+    if publishers:
+        found = f'its {publishers} publisher(s) may not be latched (transient local)'
+    return (
+        f'robot.urdf: no URDF was received on {topic} within {TIMEOUT:g} s, and {found}: start '
+        'robot_state_publisher, correct the name, or give a file'
+    )

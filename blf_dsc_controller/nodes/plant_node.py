@@ -17,12 +17,20 @@ end of its duration.
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from math import cos, sin
 from typing import Any
 
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
+from rclpy.lifecycle import LifecycleNode
 from rclpy.timer import Timer
-from std_msgs.msg import String
+from std_msgs.msg import Header, String
+from std_srvs.srv import Trigger
 
+from blf_dsc_controller.arms.urdf import links_of
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import Value, differences, flatten
 from blf_dsc_controller.law.telemetry import DECIMATION, PlantTelemetry
@@ -32,12 +40,17 @@ from blf_dsc_controller.messages.journal import encode_change
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import create_publisher, create_steady_timer
-from blf_dsc_controller.nodes.frames import Frames
-from blf_dsc_controller.nodes.handshake import Handshake
 from blf_dsc_controller.nodes.lifecycle import LoopNode
-from sim_plant.arms import parameter_names_of, urdf_of
 from sim_plant.command_input import Latency, TorqueInput
-from sim_plant.plant import FASTEST, Plant, plant_of, settings_of, steps_of
+from sim_plant.plant import (
+    FASTEST,
+    Plant,
+    parameter_names_of,
+    plant_of,
+    settings_of,
+    steps_of,
+    urdf_of,
+)
 
 LOCKSTEP_START = 1_000_000_000
 """First stamp in lock-step [ns]: a zero stamp means 'not set' in ROS."""
@@ -329,7 +342,118 @@ class PlantNode(LoopNode[PlantConfig]):
         self._diagnostics.publish([self._diagnostics.status('torque', level, message, values)])
 
 
+_SETTLING_TIME = 0.2  # s from the discovery of all peers until they have discovered this node
+_RESET_TIMEOUT = 2.0  # s for the controller to respond
+
+
+class Handshake:
+    """Handshake that ends when the first state can be sent.
+
+    After a reset of the plant, the wait also lets torques of the previous run expire, and the
+    controller is reset if it offers the service; any other controller must be reset by hand.
+    `clock` returns a steady time [s].
+    """
+
+    def __init__(self, node: LifecycleNode, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._log = node.get_logger()
+        self._client = node.create_client(Trigger, f'{topics.CONTROLLER}/reset')
+        self.begin(reset=False)
+
+    def begin(self, *, reset: bool) -> None:
+        """Start waiting; with `reset`, reset the controller once all peers are present."""
+        self._complete_since: float | None = None
+        self._to_reset = reset
+        self._response: Any = None
+        self._requested = 0.0
+
+    def reset_controller(self) -> Any:
+        """Request a reset of the controller; return the future, or None without such a service."""
+        ready = self._client.service_is_ready()
+        return self._client.call_async(Trigger.Request()) if ready else None
+
+    def is_done(self, *, observed: bool) -> bool:
+        """Return whether to send the state; `observed`: whether all topics have subscribers."""
+        now = self._clock()
+        if not observed:
+            self._complete_since = None
+            return False
+        if self._complete_since is None:
+            self._complete_since = now
+        if now - self._complete_since < _SETTLING_TIME:
+            return False
+        if self._to_reset:
+            self._to_reset = False
+            self._response = self.reset_controller()
+            self._requested = now
+        if self._response is None:
+            return True
+        if self._response.done():
+            result = self._response.result()
+            if not result.success:
+                self._log.warning(f'the controller was not reset: {result.message}')
+            return True
+        if now - self._requested < _RESET_TIMEOUT:
+            return False
+        self._log.warning('the controller did not respond to the reset request: starting anyway')
+        return True
+
+
+Quaternions = tuple[float, float, float, float]  # x, y, z, w
+_AXES = np.eye(3)
+
+
+class Frames:
+    """Frames of the links of a URDF while its `joints` move; all others stay at 0."""
+
+    def __init__(self, text: str, joints: Sequence[str]) -> None:
+        self._links = links_of(text)
+        self._places = [joints.index(e.joint) if e.joint in joints else -1 for e in self._links]
+        self._rest = [_origin(link.rpy) for link in self._links]
+
+    def at(self, stamp: int, q: np.ndarray) -> Iterator[TransformStamped]:
+        """Yield the frame of each link in its parent at q (n,) [rad, or m] and a stamp [ns]."""
+        time = Time(sec=stamp // 10**9, nanosec=stamp % 10**9)
+        for link, place, rest in zip(self._links, self._places, self._rest, strict=True):
+            position = float(q[place]) if place >= 0 else 0.0
+            slides = position if link.kind == 'prismatic' else 0.0
+            turned = _product(rest, _about(link.axis, position - slides))
+            x, y, z = (link.xyz + slides * _rotated(rest, link.axis)).tolist()
+            yield TransformStamped(
+                header=Header(stamp=time, frame_id=link.parent),
+                child_frame_id=link.name,
+                transform=Transform(
+                    translation=Vector3(x=x, y=y, z=z),
+                    rotation=Quaternion(x=turned[0], y=turned[1], z=turned[2], w=turned[3]),
+                ),
+            )
+
+
+def _about(axis: np.ndarray, angle: float) -> Quaternions:
+    x, y, z = (sin(0.5 * angle) * axis).tolist()
+    return x, y, z, cos(0.5 * angle)
+
+
+def _origin(rpy: np.ndarray) -> Quaternions:
+    """Return the rotation by roll, pitch and yaw about fixed axes, in this order."""
+    roll, pitch, yaw = (_about(axis, angle) for axis, angle in zip(_AXES, rpy, strict=True))
+    return _product(yaw, _product(pitch, roll))
+
+
+def _product(a: Quaternions, b: Quaternions) -> Quaternions:
+    u, v = np.array(a[:3]), np.array(b[:3])
+    x, y, z = (a[3] * v + b[3] * u + np.cross(u, v)).tolist()
+    return x, y, z, a[3] * b[3] - float(u @ v)
+
+
+def _rotated(by: Quaternions, vector: np.ndarray) -> np.ndarray:
+    u = np.array(by[:3])
+    turned: np.ndarray = vector + 2.0 * np.cross(u, np.cross(u, vector) + by[3] * vector)
+    return turned
+
+
 main = partial(process.run, PlantNode)
+
 
 if __name__ == '__main__':
     sys.exit(main())

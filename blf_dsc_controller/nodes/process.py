@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Running nodes as a process: scheduling, spinning, and shutdown with the right exit code."""
+"""Running nodes as a process: arguments, scheduling, spinning, and the right exit code.
+
+Arguments are checked for mistakes that ROS ignores, and `-p` is put before files: of all sections
+that match a node, ROS uses the last in the order in which their names first appear, so a section
+`/**/sim_plant` of a file would override `-p`, which belongs to `/**`.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +14,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -21,11 +26,13 @@ from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.utilities import remove_ros_args
 
+from blf_dsc_controller.configuration.files import parse
+from blf_dsc_controller.configuration.nodes import read, unmatched_sections
 from blf_dsc_controller.configuration.schema import Realtime
-from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.nodes.arguments import refuse_unknown
-from blf_dsc_controller.nodes.rclpy_internals import RCLError, UnknownROSArgsError
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.nodes.endpoints import RCLError, UnknownROSArgsError
 
 _POLL = 0.1  # s; EventsExecutor has no usable spin()
 _DRAIN_TIMEOUT = 10.0  # s for all topics; a recorder on a busy machine has been seen 2 s behind
@@ -177,3 +184,46 @@ def _schedule(priority: int) -> None:
     for thread in _THREADS.iterdir():
         with suppress(ProcessLookupError):  # it has ended in the meantime
             os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
+
+
+def refuse_unknown(argv: Sequence[str]) -> None:
+    """Raise BlfDscError if there are arguments that ROS does not handle itself."""
+    foreign = remove_ros_args(args=list(argv))[1:]
+    if foreign:
+        remedy = 'ROS reads only those after --ros-args'
+        raise BlfDscError(f'unknown arguments {" ".join(foreign)}: {remedy}')
+
+
+def check_sections(argv: Sequence[str], node: str) -> None:
+    """Raise ConfigurationError if a section meant for `node` (a full name) does not match it."""
+    for path in parameter_files(argv):
+        problems = list(unmatched_sections(read(path), [node]))
+        if problems:
+            raise ConfigurationError(problems, path)
+
+
+def parameter_files(argv: Sequence[str]) -> list[str]:
+    """Return the parameter files that the arguments name."""
+    return [path for option, path in _ros_options(argv) if option == '--params-file']
+
+
+def assigned(argv: Sequence[str]) -> dict[str, object]:
+    """Return the values of `-p name:=value`; those prefixed with a node name are left to ROS."""
+    given: dict[str, object] = {}
+    for option, rule in _ros_options(argv):
+        name, _, value = rule.partition(':=')
+        if option != '--params-file' and ':' not in name:
+            (section,) = parse(f'/**:\n  ros__parameters:\n    {name}: {value}\n')
+            given |= {one: entry.value for one, entry in section.entries.items()}
+    return given
+
+
+def _ros_options(argv: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield each parameter option with its value."""
+    for_ros = False
+    words = iter(argv)
+    for word in words:
+        if word in ('--ros-args', '--'):
+            for_ros = word == '--ros-args'
+        elif for_ros and word in ('-p', '--param', '--params-file'):
+            yield word, next(words, '')

@@ -17,13 +17,15 @@ from blf_dsc_controller.messages.codecs import MessageError, joint_state_stamp
 from blf_dsc_controller.messages.topics import JOINT_STATES, Quality
 from blf_dsc_controller.messages.types import UnknownTypeError
 from blf_dsc_controller.nodes.endpoints import (
+    RawMessage,
+    RawSubscriptions,
     create_steady_timer,
     message_class,
+    quality_of,
     register_definition,
 )
 from blf_dsc_controller.nodes.parameters import declare
 from blf_dsc_controller.nodes.process import PlainNode, run
-from blf_dsc_controller.nodes.raw_subscriptions import RawMessage, RawSubscriptions, quality_of
 
 _DISCOVERY_PERIOD = 0.1  # s
 _TAKE_PERIOD = 0.01  # s

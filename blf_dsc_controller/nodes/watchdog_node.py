@@ -29,14 +29,17 @@ from blf_dsc_controller.messages.codecs import (
     JointStateDecoder,
     MessageError,
 )
-from blf_dsc_controller.nodes import arguments
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher
-from blf_dsc_controller.nodes.endpoints import create_steady_timer, message_class, qos_profile
-from blf_dsc_controller.nodes.parameter_client import ParameterClient, Values
-from blf_dsc_controller.nodes.parameters import declare
-from blf_dsc_controller.nodes.process import PlainNode, drain, run
-from blf_dsc_controller.nodes.raw_subscriptions import RawMessage, RawSubscriptions
-from blf_dsc_controller.supervision.second_line import SecondLine
+from blf_dsc_controller.nodes.endpoints import (
+    RawMessage,
+    RawSubscriptions,
+    create_steady_timer,
+    message_class,
+    qos_profile,
+)
+from blf_dsc_controller.nodes.parameters import ParameterClient, Values, declare
+from blf_dsc_controller.nodes.process import PlainNode, drain, parameter_files, run
+from blf_dsc_controller.supervision.safe_torque import SecondLine
 
 _PERIOD = 0.004  # s, of the checks and of the torques
 _REPORT_PERIOD = 1.0  # s
@@ -75,7 +78,7 @@ class WatchdogNode(PlainNode):
         self._timer = create_steady_timer(self, _PERIOD, self._poll)
         create_steady_timer(self, _REPORT_PERIOD, self._report)
         if self._config.armed:
-            files = arguments.parameter_files(sys.argv) or ['recommended']
+            files = parameter_files(sys.argv) or ['recommended']
             self._watch(load(files[-1], self._controller, ControllerConfig))
         else:
             self._client.request(self._raw_subscriptions.node, self._controller)

@@ -40,8 +40,7 @@ from blf_dsc_controller.run import Run, Series, Stop
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant import kernels as plants
 from sim_plant.arm import Arm
-from sim_plant.arms import parameter_names_of
-from sim_plant.plant import Plant, plant_of, steps_of
+from sim_plant.plant import Plant, parameter_names_of, plant_of, steps_of
 
 _CHUNK = 1000  # samples; the guard takes about 20 ms for them
 START = 1_000_000_000

@@ -22,9 +22,10 @@ from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.settings import FILTERED, LINEAR, NEWTON, Settings
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
-from blf_dsc_controller.supervision.linear_loop import ExpectedErrors, expected_errors
-from blf_dsc_controller.supervision.reference_load import (
+from blf_dsc_controller.supervision.linear_loop import (
+    ExpectedErrors,
     ReferenceLoad,
+    expected_errors,
     reference_load,
     windows_along,
 )

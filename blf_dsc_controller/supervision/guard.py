@@ -1,20 +1,341 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The guarded law in operation: activation, reset, trajectories and changes of gains."""
+"""The law between its checks: a torque that is safe to apply for every joint state.
+
+joint state -> StateCheck -> law -> SampleCheck -> torque
+                   |                     |
+                   +---- safe torque <---+    until the next reset or activation
+"""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import differences
-from blf_dsc_controller.messages.journal import EventType
-from blf_dsc_controller.reference.approach import BlendedReference
+from blf_dsc_controller.configuration.schema import differences, flatten
+from blf_dsc_controller.errors import BlfDscError, StartError
+from blf_dsc_controller.law.checks import INVALID, is_valid_state
+from blf_dsc_controller.law.factory import begin, controller_of
+from blf_dsc_controller.messages import codecs
+from blf_dsc_controller.messages.journal import EventType, Journal
+from blf_dsc_controller.reference.approach import BlendedReference, check_takeover
+from blf_dsc_controller.reference.limits import MotionError
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, plan_trajectory
-from blf_dsc_controller.supervision import retuning
-from blf_dsc_controller.supervision.guarded_law import GuardedLaw, Vector
-from blf_dsc_controller.supervision.supervisor import Phase
+from blf_dsc_controller.supervision import handover
+from blf_dsc_controller.supervision.checks import (
+    PERIOD,
+    SKIP,
+    SampleCheck,
+    StateCheck,
+    Velocity,
+    Watchdog,
+)
+from blf_dsc_controller.supervision.handover import check_first_torque, check_support
+from blf_dsc_controller.supervision.safe_torque import SafeTorque, limit_first_torque
+from blf_dsc_controller.supervision.supervisor import Phase, Reason, Supervisor
+
+Vector = NDArray[np.float64]
+_NANO = 1e-9
+_LONG_SILENCE = 2.0  # s
+
+_REASONS: dict[type[codecs.MessageError], Reason] = {
+    codecs.MissingJointError: Reason.JOINT_MISSING,
+    codecs.DuplicatedJointError: Reason.JOINT_DUPLICATED,
+    codecs.ShortArrayError: Reason.FIELD_MISSING,
+}
+
+
+class GuardedLaw:
+    """The law with its checks and safe torque; it records every start and stop in its journal.
+
+    `update`, `reject`, `watch` and `fail` return the torque (n,) [N m] to command, or None.
+
+    Attributes:
+        config: configuration in force.
+        controller: the law.
+        supervisor: phase, and the reason of a stop.
+        states, samples: the checks before and after the law.
+        watchdog: the check for missing states.
+        journal: events, and counts of what has been processed so far.
+        has_sample: whether the law used the last message, so that there is new telemetry.
+        start_error: why the law could not start; None if it could.
+        waiting_for: what is wrong with the last state that the law could not start from; or empty.
+        silenced: whether nothing is commanded until the next reset or activation.
+        foreign: messages ignored because they name none of the joints.
+        start_stamp: stamp of t = 0 [ns]; -1 before the first start.
+        last_stamp: stamp of the law's last sample [ns].
+        settled: end of the approach or of the blend into a trajectory [s].
+        compute_time: computation time of the last sample [s].
+    """
+
+    def __init__(
+        self,
+        config: ControllerConfig,
+        steady: Callable[[], int] = time.monotonic_ns,
+        wall: Callable[[], int] = time.time_ns,
+    ) -> None:
+        """Compile the law; `steady` and `wall` are the clocks [ns]."""
+        n = len(config.joints)
+        self.config = config
+        self.controller = controller_of(config)
+        self.supervisor = Supervisor()
+        self.states = StateCheck(config.joints, config.sample_time)
+        self.samples = SampleCheck(config, self.controller)
+        self.watchdog = Watchdog(steady, wall)
+        self.journal = Journal()
+        self.has_sample = False
+        self.start_error: BlfDscError | None = None
+        self.waiting_for = ''
+        self.silenced = False
+        self.foreign = 0
+        self.start_stamp = self.last_stamp = -1
+        self.settled = self.compute_time = 0.0
+        self._velocity = Velocity(n) if config.safety.velocity == 'estimated' else None
+        self._safe_torque = SafeTorque(n)
+        self._safe_torque.scale = self.controller.state.gain_scale
+        self._clean = True  # whether the window holds valid samples only
+        self._resumable = False  # whether the law may continue along its reference
+        self.journal.note(EventType.CONFIGURE, parameters=flatten(config))
+
+    @property
+    def commanding(self) -> bool:
+        """Whether a torque has been commanded since the controller was configured."""
+        return self.journal.commands > 0
+
+    @property
+    def time(self) -> float:
+        """Time of the last sample of the law [s]."""
+        return self._time_of(self.last_stamp)
+
+    def update(self, stamp: int, measurement: Vector) -> Vector | None:
+        """Return the torque for a joint state with its stamp [ns], None to command nothing.
+
+        `measurement` is [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
+        """
+        self._begin_message()
+        gap, self.journal.stamp = (stamp - self.journal.stamp) * _NANO, stamp
+        self.watchdog.restart()
+        if self._velocity is not None:
+            self._velocity.replace(stamp, measurement)
+        if self.supervisor.uses_states:
+            fault = self.states.check(self.config.safety, stamp)
+            if fault is SKIP:
+                return None
+            if fault is None:
+                return self._use(stamp, measurement)
+            if self.supervisor.phase is Phase.STARTING:
+                self._wait(fault.text)
+            else:
+                self._stop(*fault)
+        elif self._is_silenced(gap):
+            return None
+        return self._safe_at(stamp, measurement)
+
+    def _is_silenced(self, gap: float) -> bool:
+        """Whether to stay silent out of command: once the states are back after a long silence.
+
+        By then the safe torque has faded to zero, and whoever restarted the driver may not expect
+        another. `gap` [s] is the time since the state before.
+        """
+        faded = self._safe_torque.last.age >= self.config.safety.fade_time
+        if not self.silenced and faded and self.commanding and gap > _LONG_SILENCE:
+            self.silenced = True
+            self.supervisor.add(
+                f'joint states are back after {gap:.3g} s, and no torque is commanded until the '
+                'next reset or activation'
+            )
+        return self.silenced
+
+    def _use(self, stamp: int, measurement: Vector) -> Vector | None:
+        """Pass a state to the law, or stop if the law finds it invalid."""
+        law, last = self.controller, self._safe_torque.last
+        is_first = self.supervisor.phase is Phase.STARTING
+        if is_first:
+            if not is_valid_state(law.settings, law.checks, measurement):
+                self._wait(self.states.invalid(self.config.safety, measurement).text)
+                return self._safe_at(stamp, measurement)
+            last.take(stamp, measurement)
+            if not self._start(stamp, measurement):
+                return self._safe(self.config.sample_time)
+        dt = (stamp - self.last_stamp) * _NANO
+        before = perf_counter()
+        torque = law.update(self._time_of(stamp), dt, measurement)
+        self.compute_time = perf_counter() - before
+        if law.flags & INVALID:
+            return self._reject(stamp, measurement)
+        last.take(stamp, measurement)
+        self._advance_to(stamp)
+        if is_first and self.commanding:
+            limit_first_torque(law, self._safe_torque.commanded, dt)
+        fault = self.samples.check(dt)
+        if fault is not None:
+            self._stop(*fault)
+            return self._safe(self.config.sample_time)
+        self._safe_torque.commanded[:] = torque
+        self.has_sample = True
+        self.journal.commands += 1
+        return torque
+
+    def weigh(self) -> None:
+        """Weigh what the tip holds by the last state, after its torque has been sent."""
+        if self.has_sample:
+            self.controller.weigh(self.config.sample_time)
+
+    def _wait(self, problem: str) -> None:
+        """Go on waiting for a state to start from."""
+        self.waiting_for = problem
+        self.states.restart()
+
+    def _reject(self, stamp: int, measurement: Vector) -> Vector | None:
+        """Stop because of an invalid state."""
+        self._stop(*self.states.invalid(self.config.safety, measurement))
+        return self._safe_at(stamp, measurement)
+
+    def _safe_at(self, stamp: int, measurement: Vector) -> Vector | None:
+        """Return the safe torque for a state that the law has not used."""
+        limit, dt = self.config.safety.velocity_limit, self.config.sample_time
+        self._safe_torque.last.salvage(stamp, measurement, limit, dt)
+        return self._safe(dt)
+
+    def _start(self, stamp: int, measurement: Vector) -> bool:
+        """Resume along the running reference if the law can take over, or else start at t = 0."""
+        q, dq, _ = measurement.reshape(3, -1)
+        resumed = self._resumes(stamp, q, dq)
+        if not resumed:
+            try:
+                self.settled = begin(self.controller, self.config, q, dq)
+                if not self.commanding:
+                    check_first_torque(self.controller, self.config, measurement)
+            except (StartError, MotionError) as error:
+                self.refuse(error)
+                return False
+            self.start_stamp = stamp
+        self.journal.note(EventType.START, resumed=resumed)
+        self.last_stamp = stamp - self.config.sample_time_ns
+        self.watchdog.switch(self.config.safety.watchdog, stamp)
+        self.supervisor.enter(Phase.APPROACHING)
+        return True
+
+    def check_support(self, measurement: Vector) -> None:
+        """Refuse to start if nothing shows what holds a live arm."""
+        if not self.commanding:
+            try:
+                check_support(self.controller, self.config, measurement)
+            except StartError as error:
+                self.refuse(error)
+
+    def refuse(self, error: StartError | MotionError) -> None:
+        """Stop before the start, for a reason."""
+        self.start_error = error
+        self._stop(Reason.START_REJECTED, str(error))
+
+    def _resumes(self, stamp: int, q: Vector, dq: Vector) -> bool:
+        controller, t = self.controller, self._time_of(stamp)
+        if not self._resumable or stamp <= self.last_stamp:
+            return False
+        bound = controller.bound_at(t)
+        try:
+            check_takeover(self.config, bound, q, dq, controller.reference_vector, t)
+        except StartError:
+            return False
+        return True
+
+    def _advance_to(self, stamp: int) -> None:
+        self.last_stamp = stamp
+        if self.supervisor.phase is Phase.APPROACHING and self.time >= self.settled:
+            self.supervisor.enter(Phase.TRACKING)
+
+    def advance(self, stamp: int, measurement: Vector, count: int) -> None:
+        """Advance to the state of a stamp [ns], the last of `count` that the law has used.
+
+        All checks passed, and `samples.ratio` and the kept estimates are up to date.
+        """
+        self.journal.stamp = stamp
+        self.journal.messages += count
+        self.journal.commands += count
+        self.has_sample = True
+        self._safe_torque.last.take(stamp, measurement)
+        self._safe_torque.commanded[:] = self.controller.state.torque
+        self.states.advance(stamp)
+        self.samples.relax((stamp - self.last_stamp) * _NANO)
+        self._advance_to(stamp)
+
+    def reject(self, error: codecs.MessageError) -> Vector | None:
+        """Return the torque for an unreadable message, None if it is for another arm."""
+        self._begin_message()
+        if isinstance(error, codecs.MissingJointError) and error.is_foreign(self.config.joints):
+            self.foreign += 1
+            return None
+        self.watchdog.restart()
+        if self.supervisor.phase is Phase.STARTING:
+            self._wait(str(error))
+        else:
+            self._stop(_REASONS.get(type(error), Reason.BAD_MESSAGE), str(error))
+        return self._safe_without_state(self.config.sample_time)
+
+    def watch(self) -> Vector | None:
+        """Return a torque during a silence, else None; call it after `watchdog.next_check` [s]."""
+        limit = self.config.sample_time + self.config.safety.state_timeout
+        silent = self.watchdog.silence(limit)
+        if silent == 0.0 or not (self.watchdog.on and self.commanding):
+            return None
+        return self.time_out(f'no joint state received for {silent:.3g} s')
+
+    def time_out(self, text: str) -> Vector | None:
+        """Return the torque of one watchdog period without a joint state."""
+        if self.supervisor.phase is not Phase.STARTING:  # which is waiting for a state
+            self._stop(Reason.STATE_TIMEOUT, text)
+        self.watchdog.torques += 1
+        return self._safe_without_state(PERIOD)
+
+    def end_silence(self) -> None:
+        """Record in the journal how many torques the watchdog has commanded."""
+        if self.watchdog.torques:
+            self.journal.note(EventType.SILENCE, torques=self.watchdog.torques)
+            self.watchdog.torques = 0
+
+    def fail(self, text: str) -> Vector | None:
+        """Return the torque after an unexpected error."""
+        self._stop(Reason.FAILED, text)
+        return self._safe_without_state(self.config.sample_time)
+
+    def _begin_message(self) -> None:
+        self.end_silence()
+        self.waiting_for = ''
+        self.has_sample = False
+        self.journal.messages += 1
+
+    def _time_of(self, stamp: int) -> float:
+        return (stamp - self.start_stamp) * _NANO
+
+    def _stop(self, reason: Reason, text: str) -> None:
+        if self.supervisor.stop(reason, text):
+            self.journal.note(EventType.STOP, reason=reason, text=text)
+            self._clean = self._resumable = False
+            self._safe_torque.begin_ramp(self.config.safety.stop_ramp, self.samples.disturbance)
+
+    def _safe_without_state(self, dt: float) -> Vector | None:
+        self.has_sample = False
+        self._safe_torque.last.miss(dt)
+        return self._safe(dt)
+
+    def _safe(self, dt: float) -> Vector | None:
+        """Return the safe torque, `dt` [s] further along the ramp.
+
+        None before the law has commanded any: a controller that never started stays silent.
+        """
+        if not self.commanding:
+            return None
+        torque = self._safe_torque.advance(
+            self.config.safety, self.controller.settings, self.samples.estimate, dt
+        )
+        self.journal.commands += torque is not None
+        return torque
 
 
 class LatePlanError(TrajectoryError):
@@ -105,9 +426,9 @@ class Guard(GuardedLaw):
         self._note(EventType.PARAMETERS, parameters=differences(self.config, config))
         if self.supervisor.running:
             last = self._safe_torque.last.measurement
-            retuning.apply_bumpless(self.controller, config, self.time, last)
+            handover.apply_bumpless(self.controller, config, self.time, last)
         else:
-            retuning.apply(self.controller, config)
+            handover.apply(self.controller, config)
         self.config = config
         self.samples.set_limits(config.safety)
 
@@ -115,7 +436,7 @@ class Guard(GuardedLaw):
         """Return why a configuration cannot be applied now; empty if it can."""
         if not self.supervisor.running:
             return []
-        return list(retuning.problems(self.controller, config, self.time))
+        return list(handover.problems(self.controller, config, self.time))
 
     @property
     def is_settled(self) -> bool:

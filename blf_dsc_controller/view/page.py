@@ -24,8 +24,8 @@ from blf_dsc_controller.arms.geometry import frames, skeleton, tip_radius
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.address import free_port, require_viser, url_of
 from blf_dsc_controller.view.arm import ShownArm
+from blf_dsc_controller.view.controls import estimate_table, event_table, joint_table
 from blf_dsc_controller.view.moment import Moment
-from blf_dsc_controller.view.tables import estimate_table, event_table, joint_table
 
 PAST = 20.0
 """Time span of the plots [s]."""

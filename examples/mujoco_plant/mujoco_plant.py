@@ -23,7 +23,7 @@ from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.nodes import parameters
-from sim_plant.actuator import DriveState, actuate
+from sim_plant.drives import DriveState, actuate
 from sim_plant.plant import settings_of
 from sim_plant.sensors import EncoderReading, generator, is_noisy, sense
 

@@ -1,22 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The check of the first torque, before it is sent to an arm that nobody has commanded yet.
+"""Torques without surprises: the first one, and those after a change of gains.
 
-Whether drives compensate gravity cannot be told from positions, but from the effort with which they
-hold a resting arm: gravity if they do, nothing if the brakes hold it.  Only its direction and order
-of magnitude are used, so it may also be a current.  An effort of nothing shows nothing if it may
-not be measured, or not contain what the drives add: then a live arm gets no torque of gravity
-without being told that its drives tolerate it.
+The first torque is checked before it is sent to an arm that nobody has commanded yet. Whether
+drives compensate gravity cannot be told from positions, but from the effort with which they hold a
+resting arm: gravity if they do, nothing if the brakes hold it.  Only its direction and order of
+magnitude are used, so it may also be a current.  An effort of nothing shows nothing if it may not
+be measured, or not contain what the drives add: then a live arm gets no torque of gravity without
+being told that its drives tolerate it.
+
+A jump of the gains at unchanged errors would make the torque jump. Two states of the law absorb
+the difference: the surface filter is shifted with the virtual control, so that alpha2' does not
+change, and the disturbance estimate, the integrator of the law, absorbs the rest; it then returns
+to its own value at the rate of its gain. A joint whose disturbance gain is 0 has no integrator, so
+its torque steps.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.batch import regressors_at
+from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
+from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.law.settings import LINEAR
 
 Vector = NDArray[np.float64]
 
@@ -148,3 +161,72 @@ def _gravity_of(
         ': it is the gravity of the URDF; if the drives compensate it themselves, set '
         'robot.drive_compensates to gravity, or to gravity_and_friction'
     )
+
+
+_STABLE = 2.0  # x += -a x diverges for a >= 2
+_ROUNDED = 1.0 + 1e-9  # times the radius, on which the projection may hold an estimate
+
+
+def apply(controller: Controller, config: ControllerConfig) -> None:
+    """Replace the settings of a law."""
+    controller.settings_vector[:] = pack(settings_of_config(config))
+
+
+def apply_bumpless(
+    controller: Controller, config: ControllerConfig, t: float, measurement: Vector
+) -> None:
+    """Replace the settings of a running law without a jump of its torque.
+
+    `t` [s] and `measurement` (3 n,) are those of the last sample.
+    """
+    before_beta2, before = _trial(controller, t, config.sample_time, measurement)
+    apply(controller, config)
+    state = controller.state
+    if controller.settings.surface != LINEAR:
+        after_beta2, _ = _trial(controller, t, config.sample_time, measurement)
+        state.alpha2[:] += after_beta2 - before_beta2
+    step = _trial(controller, t, config.sample_time, measurement)[1] - before
+    integrates = controller.settings.gamma > 0.0
+    state.disturbance[integrates] -= step[integrates]
+
+
+def _trial(
+    controller: Controller, t: float, dt: float, measurement: Vector
+) -> tuple[Vector, Vector]:
+    """Return beta2 and demanded torque of an update, leaving the state unchanged."""
+    controller.trial(t, dt, measurement)
+    return controller.signals.beta2.copy(), controller.signals.demand.copy()
+
+
+def problems(controller: Controller, config: ControllerConfig, t: float) -> Iterator[str]:
+    """Yield reasons why a running law cannot accept a valid configuration at time t [s]."""
+    state, p, learning = controller.state, controller.settings.p, config.learning
+    errors, torques = np.abs(controller.sample.xi1), np.abs(controller.sample.torque)
+    barrier.update_bound(settings_of_config(config), controller.signals, t)
+    for joint, error, bound in zip(config.joints, errors, controller.signals.bound, strict=True):
+        if not error < bound:
+            yield (
+                f'barrier.bound: {joint} is {error:.6g} rad from its reference now, outside of a '
+                f'bound of {bound:g} rad: choose a wider one, or try again with a smaller error'
+            )
+    for joint, torque, limit in zip(config.joints, torques, config.torque.limit, strict=True):
+        if torque > limit:
+            yield (
+                f'torque.limit: {joint} is held with {torque:.4g} N m now, more than a limit of '
+                f'{limit:g} N m: choose a higher one'
+            )
+    norm = float(np.linalg.norm(state.estimate[:p]))
+    if norm > _ROUNDED * learning.radius:
+        yield (
+            f'learning.radius: the norm of the estimate is {norm:.4g} kg m^2 now, above a '
+            f'radius of {learning.radius:g} kg m^2: choose a larger one'
+        )
+    gain = max(*learning.adaptation_gain, learning.column_gain if len(state.estimate) > p else 0.0)
+    stretch = 1.0 if learning.update == 'newton' else float(np.linalg.norm(state.Phi, 2))
+    step = learning.weight * gain * stretch * config.sample_time
+    if state.latched[0] and step >= _STABLE:
+        yield (
+            f'learning.weight: with the update {learning.update}, each sample would correct the '
+            f'estimates by {step:.3g} times their error, which diverges at {_STABLE:g} or more: '
+            'lower learning.weight or learning.adaptation_gain'
+        )
