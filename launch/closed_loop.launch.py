@@ -124,12 +124,14 @@ def nodes(context: LaunchContext) -> list[Node]:
             on_exit=Shutdown(reason=f'{executable} has ended') if required else None,
         )
 
+    is_simulated = driver is None or simulated == 'true'
     # Viewers come first: if they are not installed, nothing has been started yet.
     started = view(namespace, file) if rviz == 'true' else []
     if bag:
-        started.append(node('bag_recorder', {'output': bag}))
+        plant_mode = mode or load(file, f'{namespace}/{PLANT}', PlantConfig).mode
+        clock = 'plant' if is_simulated and plant_mode == 'lockstep' else 'wall'
+        started.append(node('bag_recorder', {'output': bag, 'clock': clock}))
     started.append(node('torque_watchdog', {}, required=False))
-    is_simulated = driver is None or simulated == 'true'
     # On an arm, the watchdog outlives a controller that crashes: it holds the arm.
     started.append(node('blf_dsc_controller', of_loop, required=is_simulated))
     if is_simulated:

@@ -15,17 +15,19 @@ from mcap.opcode import Opcode
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from synthetic_bag import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 
-from blf_dsc_controller.bags.content import NameMap
+from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import UnreadableMessageError
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import JointStateDecoder, JointStateEncoder
+from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
     DIAGNOSTICS,
     JOINT_STATES,
+    JOURNAL,
     LEARNING,
     REFERENCE,
     TRACKING_ERROR,
@@ -82,6 +84,24 @@ def test_topics_under_other_names_are_found(tmp_path, made, messages, rename):
     np.testing.assert_array_equal(run.torque, made.torque)
     assert run.truth is not None
     assert run.bound is not None
+
+
+def test_journal_tells_which_joint_states_the_controller_used(tmp_path, messages):
+    """An FR3 also publishes them at 30 Hz, under the usual name."""
+    used, journal = '/franka/joint_states', Journal()
+    journal.note(EventType.CONFIGURE, parameters={}, topics={'joint_states': used})
+    with BagWriter(tmp_path / 'bag') as bag:
+        told = bag.add_topic(JOURNAL.resolved, JOURNAL.type, [])
+        handles = [bag.add_topic(name, JOINT_STATES.type, []) for name in ('/joint_states', used)]
+        stamp = messages[0][1]
+        bag.write(told, journal.pending[0].encode(), stamp)
+        states = [one for one in messages if one[0] is JOINT_STATES]
+        for number, (_, stamp, raw) in enumerate(states):
+            for handle in handles if number % 30 == 0 else handles[1:]:
+                bag.write(handle, raw, stamp)
+    content = read_content(tmp_path / 'bag')
+    assert content.topics[JOINT_STATES].name == used
+    assert content.topics[JOINT_STATES].size == len(states)
 
 
 def test_topic_of_another_type_is_ignored(tmp_path, messages):

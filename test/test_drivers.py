@@ -156,6 +156,8 @@ def test_launched_nodes_use_the_topics_of_the_driver(launched, start, tmp_path, 
         verdict, reason = qos_check_compatible(quality(offered), quality(requested))
         assert verdict == QoSCompatibility.OK, reason
     assert controller.config.sample_time == 1.0 / facts.rate
+    connected = {'joint_states': facts.joint_states, 'commands': facts.commands}
+    assert controller.guard.journal.pending[0].content['topics'] == connected
     if simulated == 'true':
         plant = started['sim_plant']
         (states,) = plant.get_publishers_info_by_topic(facts.joint_states)

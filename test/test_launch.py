@@ -117,8 +117,10 @@ def test_launch_arguments_override_the_parameter_file(launched, start, tmp_path,
     plant = start(*arguments_of(by_name['sim_plant'], tmp_path))
     assert (plant.config.mode, plant.config.wait_for_subscribers) == ('lockstep', 1)
     assert plant.get_namespace() == f'/{namespace}'
-    start(*arguments_of(by_name['bag_recorder'], tmp_path))
+    recorder = start(*arguments_of(by_name['bag_recorder'], tmp_path))
     assert bag.is_dir()
+    assert recorder._config.clock == 'plant'
+    assert {'output': 'run1', 'clock': 'wall'} in launched(bag='run1')[0].parameters
 
 
 def test_loop_shuts_down_with_any_of_its_nodes_but_not_with_a_viewer(launched):

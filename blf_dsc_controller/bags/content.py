@@ -169,6 +169,7 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
         BagError: there is no bag, it is damaged, it lacks the joint states or a topic of `names`,
             or it holds the topics of several robots.
     """
+    names = _recorded_names(path, namespace, names)
     with open_bag(path) as bag:
         found = {topic: _find(topic, bag.held, namespace, names) for topic in _OF_INTEREST}
         if not bag.held or not any(bag.counts.values()):
@@ -190,6 +191,24 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
         raise BagError(f'{path} is empty: it holds no message of {found[JOINT_STATES]}')
     held = {topic: one for topic, one in topics.items() if one.size}
     return Content(path, held, bag.counts, bag.facts)
+
+
+def _recorded_names(path: Path, namespace: str, names: NameMap) -> NameMap:
+    """Add the topics that the controller was connected to, where several have the same last part.
+
+    So it is with a driver whose joint states also come at a lower rate, as those of an FR3 do.
+    """
+    recorded: dict[str, str] = {}
+    with open_bag(path) as bag:
+        journal = _find(JOURNAL, bag.held, namespace, names)
+        alike = [name for name, _ in bag.held if name.endswith(f'/{JOINT_STATES.leaf}')]
+        for message in bag.messages([journal]) if journal and len(alike) > 1 else ():
+            with suppress(BlfDscError):
+                recorded = decode(message.raw).content.get('topics', {})
+                break
+        held = {name for name, _ in bag.held}
+    own = {leaf: name for leaf, name in recorded.items() if name in held}
+    return NameMap({**own, **names.topics}, names.joints)
 
 
 def _find(topic: Topic, held: list[tuple[str, str]], namespace: str, names: NameMap) -> str | None:

@@ -100,6 +100,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def configure(self) -> None:
         """Compile the law; create the topics of the loop on the first call."""
         self.guard = Guard(self.config, self._steady, self._wall)
+        self.guard.journal.pending[-1].content['topics'] = {
+            topic.leaf: self.resolve_topic_name(topic.relative)
+            for topic in (topics.JOINT_STATES, topics.COMMANDS)
+        }
         self._load = reference_load(self.config, self.guard.controller.settings)
         for warning in config_warnings(self.config, load=self._load):
             self.get_logger().warning(warning)
