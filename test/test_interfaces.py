@@ -95,7 +95,7 @@ def test_frames_place_every_link_as_pinocchio_does(ros, name):
     ros.tester.create_subscription(TransformStamped, 'sim_plant/frames', received.append, 100)
     urdf = random_urdf(6, seed=3)[0] if name == 'random' else f'{name}.urdf'
     arm = ros.add(PlantNode, {'robot.urdf': urdf, 'robot.tip': tip} if name else {})
-    ros.publisher(topics.COMMANDS)
+    ros.listen(topics.JOINT_STATES)
     text = urdf_of(arm.config)
     model = pinocchio.buildModelFromXML(text)
     ros.until(lambda: len(received) >= len(links_of(text)))
