@@ -22,7 +22,11 @@ from blf_dsc_controller.law.telemetry import (
     rejected_columns,
 )
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import JointStateDecoder, MessageError
+from blf_dsc_controller.messages.codecs import (
+    Float64MultiArrayEncoder,
+    JointStateDecoder,
+    MessageError,
+)
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.endpoints import subscription_count
@@ -82,6 +86,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._learning_events = (0.0, 0.0, 0.0)  # columns checked, columns in use, model changes
         self._published_bound = b''  # bytes of the array, to detect changes
         self._decoder = JointStateDecoder(joints, required=('position',))
+        self._encoder = Float64MultiArrayEncoder(len(joints))
         self._pending: bytes | None = None
         self._arrivals: list[int] | None = []  # stamps before the start [ns]; None: measured
         self._checks = 0  # of the timer since the last of them
@@ -189,8 +194,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 return
         if self._arrivals is not None and self._measures_rate(guard, raw):
             return
-        if self._status.trajectories is not None:
-            self._status.trajectories.poll(guard)
+        trajectories = self._status.trajectories
+        if trajectories is not None and trajectories.job is not None:
+            trajectories.poll(guard)
         try:
             torque = self._torque_for(guard, raw)
         except Exception as error:  # noqa: BLE001 - the arm needs a torque after any error
@@ -319,7 +325,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _command(self, torque: np.ndarray | None) -> None:
         if torque is not None:
-            self._publish(self._telemetry.command(torque))
+            self._senders[topics.COMMANDS](self._encoder.encode(torque))
 
     def _publish_bound(self, guard: Guard, stamp: int, bound: np.ndarray) -> None:
         self._published_bound = bound.tobytes()

@@ -47,6 +47,7 @@ class TrajectoryInput:
         accepted: number of trajectories that are or were followed.
         rejected: number of trajectories that are not.
         reason: why the last one was rejected.
+        job: the trajectory that is being planned, if any.
     """
 
     def __init__(self, node: Node, joints: int, guard: Callable[[], Guard | None]) -> None:
@@ -58,7 +59,7 @@ class TrajectoryInput:
         self._largest = MOST_POINTS * _POINT_SIZE * (joints + 2)
         self._guard = guard
         self._thread = ThreadPoolExecutor(1, 'trajectories')
-        self._job: _Job | None = None
+        self.job: _Job | None = None
         sys.setswitchinterval(_SWITCH_INTERVAL)
         name, quality = JOINT_TRAJECTORY.name, qos_profile(JOINT_TRAJECTORY.requested)
         node.create_subscription(JointTrajectory, name, self._on_trajectory, quality, raw=True)
@@ -74,10 +75,10 @@ class TrajectoryInput:
 
     def poll(self, guard: Guard) -> None:
         """Follow the trajectory whose plan is ready, if there is one."""
-        job = self._job
+        job = self.job
         if job is None or not job.plan.done():
             return
-        self._job = None
+        self.job = None
         try:
             self._adopt(guard, job.plan.result())
         except LatePlanError as error:
@@ -104,7 +105,7 @@ class TrajectoryInput:
         if not guard.watchdog.on:
             self._adopt(guard, guard.plan(_trajectory(raw, guard.start_stamp)))
             return
-        if self._job is not None:
+        if self.job is not None:
             self._reject(TrajectoryError(['a newer one arrived while it was being planned']))
         self._submit(guard, raw, _LEAD)
 
@@ -114,7 +115,7 @@ class TrajectoryInput:
         def plan() -> Plan:
             return guard.plan(_trajectory(raw, start), at)
 
-        self._job = _Job(raw, lead, self._thread.submit(plan))
+        self.job = _Job(raw, lead, self._thread.submit(plan))
 
     def _adopt(self, guard: Guard, plan: Plan) -> None:
         guard.adopt(plan)
