@@ -473,7 +473,7 @@ PREFACE = """\
 # Faults
 
 What the controller does when something breaks. Each row is run by
-`test/test_supervision_faults.py` in a 1 kHz loop with the recommended settings; the page is written
+`test/test_supervision_checks.py` in a 1 kHz loop with the recommended settings; the page is written
 by `python test/fault_table.py doc/faults.md`. *Detected* counts the samples from the fault to the
 safe stop; a tolerated fault does no harm: tracking continues within the bound. *Torque* is the
 largest commanded from then on. A stop lasts until `~/reset`, after which the loop runs again.

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio
 import pytest
+from plants import PERIOD, START, commands, plant, run
 from random_arm import CONFIG
 
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -14,6 +15,7 @@ from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.telemetry import PlantTelemetry
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from sim_plant.plant import plant_of
+from sim_plant.sensors import DIFFERENCED, MEASURED, draw, generator
 
 PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 HELD = {'robot.drive_compensates': 'gravity'}
@@ -96,11 +98,11 @@ def test_repeated_reading_has_all_values_of_the_last_one_and_a_new_stamp():
     noisy = {'sensor.position_noise': 1e-5, 'sensor.velocity': 'differenced'}
     usual, repeating = panda(noisy), panda(noisy, {'sensor.repeat_every': 3})
     rows = []
-    for plant in (usual, repeating):
+    for each in (usual, repeating):
         rows.append([])
         for _ in range(10):
-            rows[-1].append(plant.measure()[:14].copy())
-            plant.step(np.zeros(7))
+            rows[-1].append(each.measure()[:14].copy())
+            each.step(np.zeros(7))
     every = np.array(rows[1])
     for k in range(1, 10):
         assert np.array_equal(every[k], every[k - 1]) == (k % 3 == 0)
@@ -154,3 +156,167 @@ def test_mistakes_give_one_line(given, problem):
     with pytest.raises(ConfigurationError, match=problem) as raised:
         build(PlantConfig, PANDA | given)
     assert len(raised.value.problems) == 1
+
+
+SAMPLES = 40
+
+
+@pytest.mark.parametrize('delay', [0, 1, 3, SAMPLES + 1])
+def test_command_is_applied_exactly_delay_samples_later(delay):
+    torques = commands(SAMPLES)
+    late, prompt = plant(delay=delay), plant()
+    shifted = np.vstack([np.zeros((delay, 2)), torques])[:SAMPLES]
+    assert (run(late, torques) == run(prompt, shifted)).all()
+    assert (late.truth() == prompt.truth()).all()
+
+
+@pytest.mark.parametrize('delay', [0, 2])
+def test_effort_is_the_torque_of_the_last_interval(delay):
+    torques = commands(SAMPLES)
+    effort = run(plant(delay=delay), torques)[:, 4:]
+    assert (effort[: delay + 1] == 0).all()
+    assert (effort[delay + 1 :] == torques[: SAMPLES - delay - 1]).all()
+
+
+@pytest.mark.parametrize('delay', [0, 2])
+def test_torque_beyond_the_limit_of_its_joint_is_cut(delay):
+    torques, limit = commands(SAMPLES), np.array([5.0, 1.5])
+    cut = np.clip(torques, -limit, limit)
+    assert (cut != torques).any(axis=0).all()
+    limited = run(plant(delay=delay, torque_limit=limit), torques)
+    assert (limited == run(plant(delay=delay), cut)).all()
+
+
+def test_zero_torque_limit_means_no_limit():
+    torques = 1e3 * commands(3)
+    effort = run(plant(torque_limit=(0.0, 7.0)), torques)[1:, 4:]
+    assert (effort[:, 0] == torques[:-1, 0]).all()
+    assert (np.abs(effort[:, 1]) == 7.0).all()
+
+
+def test_lagging_drive_has_a_first_order_step_response():
+    """The lag follows the limit; a sample reports the mean torque of its interval."""
+    tau, step = 2e-3, np.array([4.0, -9.0])
+    effort = run(plant(time_constant=tau, torque_limit=(0.0, 6.0)), np.tile(step, (20, 1)))[1:, 4:]
+    t = 1e-3 * np.arange(20)
+    mean = np.diff(t + tau * np.exp(-t / tau)) / 1e-3
+    np.testing.assert_allclose(effort, mean[:, None] * [4.0, -6.0], rtol=1e-12)
+
+
+def test_drive_noise_is_proportional_to_the_torque_and_repeatable():
+    torques = np.tile([5.0, -2.0], (4000, 1))
+    effort = run(plant(torque_noise=0.01, seed=4), torques)
+    error = effort[1:, 4:] / torques[1:] - 1.0
+    np.testing.assert_allclose(error.std(axis=0), 0.01, rtol=0.05)
+    assert abs(np.corrcoef(error.T)[0, 1]) < 0.07
+    np.testing.assert_array_equal(effort, run(plant(torque_noise=0.01, seed=4), torques))
+
+
+def test_drive_noise_does_not_change_the_order_of_encoder_noise():
+    """Both come from one generator: first the encoders, then the drives."""
+    arm = plant(position_noise=1e-5, torque_noise=0.01, seed=4)
+    arm.measure()
+    drawn = np.random.Generator(np.random.PCG64(np.random.SeedSequence(4))).standard_normal(6)
+    np.testing.assert_array_equal(arm.measure()[:2], np.array(START) + 1e-5 * drawn[:2])
+    arm.step(np.array([1.0, 2.0]))
+    np.testing.assert_array_equal(arm.measure()[4:], [1.0, 2.0] * (1.0 + 0.01 * drawn[4:]))
+
+
+def true_states(samples, **changes):
+    """Noise-free states (samples, 4) under the usual torques."""
+    arm = plant(**changes)
+    rows = np.empty((samples, 4))
+    for row, torque in zip(rows, commands(samples), strict=True):
+        row[:] = arm.truth()[5:]
+        arm.step(torque)
+    return rows
+
+
+def test_ideal_sensor_measures_the_true_state_without_random_numbers():
+    arm = plant()
+    before = arm.rng.bit_generator.state
+    assert (run(arm, commands(50))[:, :4] == true_states(50)).all()
+    assert arm.rng.bit_generator.state == before
+
+
+def test_noise_has_the_configured_standard_deviation():
+    samples = 2000
+    read = run(plant(position_noise=1e-5, velocity_noise=1e-3), commands(samples))
+    noise = read[:, :4] - true_states(samples)
+    error = 1 / np.sqrt(2 * samples)  # standard error of a sample deviation, relative
+    assert noise.std(axis=0) == pytest.approx([1e-5, 1e-5, 1e-3, 1e-3], rel=4 * error)
+    assert np.abs(noise.mean(axis=0) / noise.std(axis=0)).max() < 4 / np.sqrt(samples)
+    off_diagonal = np.corrcoef(noise.T) - np.eye(4)
+    assert np.abs(off_diagonal).max() < 4 / np.sqrt(samples)
+
+
+def test_noise_does_not_move_the_arm():
+    noisy, ideal = plant(position_noise=1e-3), plant()
+    run(noisy, commands(50))
+    run(ideal, commands(50))
+    assert (noisy.truth() == ideal.truth()).all()
+
+
+def test_seed_determines_the_noise():
+    def read(seed):
+        return run(plant(seed=seed, position_noise=1e-5), commands(50))
+
+    assert (read(3) == read(3)).all()
+    assert (read(3) != read(4))[:, :2].all()
+
+
+def test_compiled_draws_match_numpy():
+    numbers = np.empty(1000)
+    draw(generator(8), numbers)
+    assert (numbers == generator(8).standard_normal(1000)).all()
+
+
+def test_quantised_position_is_the_nearest_multiple_of_the_resolution():
+    resolution = 2 * np.pi / 2**14
+    read = run(plant(resolution=resolution), commands(200))[:, :2]
+    counts = read / resolution
+    assert counts == pytest.approx(np.rint(counts), abs=1e-9)
+    # half a count, and the rounding of the division
+    error = np.abs(read - true_states(200)[:, :2])
+    assert error.max() <= resolution / 2 * (1 + 1e-9)
+    assert error.max() > resolution / 4
+
+
+def test_differenced_velocity_is_that_of_the_measured_positions():
+    arm = plant(
+        position_noise=1e-5, resolution=1e-5, velocity_source=DIFFERENCED, velocity=(0.4, -0.3)
+    )
+    read = run(arm, commands(50))
+    assert read[0, 2:4].tolist() == [0.4, -0.3]
+    assert read[1:, 2:4] == pytest.approx(np.diff(read[:, :2], axis=0) / PERIOD, rel=1e-13)
+
+
+@pytest.mark.parametrize('source', [MEASURED, DIFFERENCED])
+def test_velocity_is_low_pass_filtered_with_its_pole(source):
+    options = {'velocity_source': source, 'position_noise': 1e-5, 'velocity_noise': 1e-3}
+    raw = run(plant(**options), commands(30))[:, 2:4]
+    read = run(plant(velocity_pole=400.0, **options), commands(30))[:, 2:4]
+    expected = raw.copy()
+    for k in range(1, 30):
+        expected[k] = raw[k] + np.exp(-0.4) * (expected[k - 1] - raw[k])
+    np.testing.assert_allclose(read, expected, rtol=1e-13)
+
+
+def test_differenced_velocity_spans_skipped_samples():
+    arm = plant(velocity_source=DIFFERENCED)
+    first = arm.measure().copy()
+    for torque in commands(7):
+        arm.step(torque)
+    second = arm.measure()
+    assert second[2:4] == pytest.approx((second[:2] - first[:2]) / (7 * PERIOD), rel=1e-13)
+
+
+@pytest.mark.parametrize('source', [0, DIFFERENCED])
+def test_reading_a_sample_twice_gives_the_same_values(source):
+    once = plant(position_noise=1e-5, velocity_source=source)
+    twice = plant(position_noise=1e-5, velocity_source=source)
+    for torque in commands(20):
+        twice.measure()
+        assert (once.measure() == twice.measure()).all()
+        once.step(torque)
+        twice.step(torque)

@@ -4,17 +4,19 @@
 from __future__ import annotations
 
 from math import inf, nan
+from pathlib import Path
 
 import numpy as np
 import pytest
 from closed_loop_case import controller, plant, recommended
+from fault_table import FAULTS, page, run
 from hypothesis import given
 from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.law.checks import INVALID, OUTSIDE, SUSPECT, check_sample
 from blf_dsc_controller.law.settings import EFFORT
-from blf_dsc_controller.supervision.checks import SampleCheck, StateCheck
+from blf_dsc_controller.supervision.checks import SampleCheck, StateCheck, Velocity
 from blf_dsc_controller.supervision.supervisor import Reason
 
 DT = 1e-3
@@ -138,3 +140,80 @@ def test_short_stamp_check_agrees_with_the_full_one(steps):
         faults = [states.check(SAFETY, stamp) for states in (short, full)]
         assert faults[0] == faults[1]
         assert vars(short) == vars(full)
+
+
+MILLISECOND = 1_000_000  # ns
+
+
+def estimated(*states):
+    """Estimated velocity (rad/s) of joint 1 at each (stamp in ms, position in rad)."""
+    velocity, found = Velocity(2), []
+    for stamp, position in states:
+        measurement = np.array([position, 0.0, 7.0, 7.0, 8.0, 8.0])
+        velocity.replace(stamp * MILLISECOND, measurement)
+        found.append(measurement[2])
+        assert (measurement[4:] == 8.0).all()
+    return found
+
+
+def test_velocity_is_the_difference_quotient_of_two_states():
+    np.testing.assert_allclose(estimated((1, 0.5), (2, 0.502), (4, 0.501)), [0.0, 2.0, -0.5])
+
+
+def test_repeated_stamp_keeps_the_velocity_and_the_next_one_counts_from_it():
+    found = estimated((1, 0.5), (2, 0.502), (2, 0.502), (2, 0.502), (3, 0.503))
+    np.testing.assert_allclose(found, [0.0, 2.0, 2.0, 2.0, 1.0])
+
+
+def test_velocity_is_zero_where_the_stamps_restart():
+    np.testing.assert_allclose(estimated((5, 0.5), (6, 0.502), (1, 0.1), (2, 0.1)), [0, 2, 0, 0])
+
+
+def test_repeated_reading_with_a_new_stamp_is_continued_at_its_velocity():
+    """Once; an arm that really stands still is at rest in the sample after."""
+    moving = (1, 0.5), (2, 0.502)
+    found = estimated(*moving, (3, 0.502), (3, 0.504), (4, 0.506), (5, 0.508))
+    np.testing.assert_allclose(found, [0.0, 2.0, 2.0, 2.0, 2.0, 2.0])
+    np.testing.assert_allclose(estimated(*moving, (3, 0.502), (4, 0.502)), [0.0, 2.0, 2.0, 0.0])
+    coarse = (1, 0.5), (2, 0.5002), (3, 0.5002)  # less than three counts of 16 bits
+    np.testing.assert_allclose(estimated(*coarse), [0.0, 0.2, 0.0])
+
+
+LIMIT = 20.0  # N m, the default torque limit
+
+
+@pytest.mark.parametrize('fault', FAULTS, ids=lambda fault: fault.name)
+def test_fault_is_detected_and_named_and_the_loop_recovers(fault):
+    outcome = run(fault)
+
+    assert outcome.reason is fault.reason, outcome.text
+    for commands in (outcome.before, outcome.after):
+        assert np.isfinite(commands).all()
+        assert (np.abs(commands) <= LIMIT).all()
+    # A controller that never started stays silent.
+    assert bool(len(outcome.after)) == (fault.reason is not Reason.START_REJECTED)
+    if fault.reason is Reason.NONE:
+        assert outcome.noticed == -1
+        assert outcome.error < 1.0
+    else:
+        assert 1 <= outcome.noticed <= fault.within
+        assert outcome.text
+        # The default safe torque is zero; above all, the last torque is not repeated.
+        assert not outcome.after.any()
+        assert outcome.last.all()
+    assert outcome.recovered
+
+
+def test_invalid_command_is_counted_and_does_no_harm():
+    invalid = [fault for fault in FAULTS if fault.name.startswith('one command')]
+    assert [run(fault).rejected for fault in invalid] == [1] * 4
+
+
+def test_at_least_thirty_distinct_faults_cover_the_reasons():
+    assert len({fault.name for fault in FAULTS}) == len(FAULTS) >= 30
+    assert {fault.reason for fault in FAULTS} == set(Reason) - {Reason.FAILED}
+
+
+def test_faults_page_is_up_to_date():
+    path = Path(__file__).parents[1] / 'doc/faults.md'
+    assert path.read_text() == page(), 'run: python test/fault_table.py doc/faults.md'
