@@ -13,7 +13,8 @@ from fault_table import FAULTS, page, run
 from hypothesis import given
 from hypothesis import strategies as st
 
-from blf_dsc_controller.configuration.controller import Safety
+from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.law.checks import INVALID, OUTSIDE, SUSPECT, check_sample
 from blf_dsc_controller.law.settings import EFFORT
 from blf_dsc_controller.supervision.checks import SampleCheck, StateCheck, Velocity
@@ -60,7 +61,7 @@ def test_non_finite_values_are_suspect_and_not_kept(law, part, name, i, bad):
 
 @pytest.mark.parametrize(('every', 'stops'), [(4, True), (6, False)])
 def test_cuts_add_up_if_they_take_more_than_a_fifth_of_the_time(law, every, stops):
-    check = SampleCheck(Safety(saturation_time=0.05), ('joint1', 'joint2'), law, DT)
+    check = SampleCheck(build(ControllerConfig, {'safety.saturation_time': 0.05}), law)
     faults = []
     for k in range(2000):
         law.signals.demand[1] = 21.0 * (k % every == 0)

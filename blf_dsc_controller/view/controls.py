@@ -10,9 +10,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from blf_dsc_controller.analysis.style import GREEN, MUTED
-from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import Kind, Parameter, Value, flatten, parameters
+from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.moment import Moment
 
