@@ -199,11 +199,13 @@ def test_rate_limit_applies_from_the_torque_before_an_activation(again):
     rig = Rig({'torque.rate_limit': rate.tolist(), 'safety.deactivation_ramp': 0.0})
     rig.step(200)
     rig.guard.deactivate()
-    rig.step(1)
+    rig.step(12)
     assert not rig.commands[-1].any()
+    steps = np.abs(np.diff(rig.commands[-13:], axis=0))
+    assert (steps <= rate * 1e-3 * (1.0 + 1e-12)).all()
     rig.guard.activate() if again == 'activate' else rig.guard.reset()
-    rig.step(20)
-    steps = np.abs(np.diff(rig.commands[-21:], axis=0))
+    rig.step(12)
+    steps = np.abs(np.diff(rig.commands[-13:], axis=0))
     assert (steps <= rate * 1e-3 * (1.0 + 1e-12)).all()
     np.testing.assert_allclose(steps[0], rate * 1e-3)
     assert rig.guard.controller.state.rate_cuts.min() >= 1.0
@@ -342,9 +344,9 @@ def jump(given, *, bumpless, samples=1):
         assert rig.guard.problems(candidate) == []
         rig.guard.retune(candidate)
     else:
-        from blf_dsc_controller.supervision import retuning
+        from blf_dsc_controller.supervision import handover
 
-        retuning.apply(rig.guard.controller, candidate)
+        handover.apply(rig.guard.controller, candidate)
     rig.step(samples)
     return np.abs(np.array(rig.commands[-samples:]) - rig.commands[-samples - 1]).max()
 
