@@ -18,7 +18,7 @@ from blf_dsc_controller.law.window import add_products
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.view.bag import moments
-from blf_dsc_controller.view.tables import joint_table
+from blf_dsc_controller.view.controls import joint_table
 
 PICKED_UP, PUT_DOWN, END = 8.0, 12.0, 15.0  # s
 LOAD = 2.0  # kg
