@@ -86,6 +86,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self._start_stamp = LOCKSTEP_START
         self._changed: dict[str, Value] = {}
         self._changes = create_publisher(self, topics.CHANGES)
+        self._frame_publisher = create_publisher(self, topics.FRAMES)
         self._tell_parameters()
         self._handshake = Handshake(self, self._now)
         self._frames: Frames
@@ -107,7 +108,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self._changed.clear()
         self.plant.compile()
         self.deactivate()
-        outputs = [topics.JOINT_STATES, topics.TRUTH, topics.FRAMES]
+        outputs = [topics.JOINT_STATES, topics.TRUTH]
         outputs += [] if self._lockstep else [topics.TIMING]
         outputs += [topics.CLOCK] if self.config.publish_clock else []
         if self.connect(outputs, topics.COMMANDS, self._on_command):
@@ -285,7 +286,7 @@ class PlantNode(LoopNode[PlantConfig]):
             self._publish(self._telemetry.truth(stamp, self.plant.truth()))
         if self.plant.sample % self._frames_interval == 0:
             for frame in self._frames.at(stamp, measurement[: self.plant.joints]):
-                self._outputs[topics.FRAMES].publish(frame)
+                self._frame_publisher.publish(frame)
         if self.config.publish_clock:
             self._publish(self._telemetry.clock(stamp))
 
