@@ -25,6 +25,10 @@ from rclpy.qos import (
     ReliabilityPolicy,
     qos_check_compatible,
 )
+from rclpy.serialization import serialize_message
+from rclpy.wait_for_message import wait_for_message
+from ros_rig import PATIENCE
+from std_msgs.msg import String
 from test_launch import NODES, arguments_of, launched, start  # noqa: F401 - fixtures
 
 from blf_dsc_controller.bags.reader import read_run
@@ -32,6 +36,9 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load, load_loop
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.journal import decode
+from blf_dsc_controller.nodes.endpoints import qos_profile
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -157,7 +164,15 @@ def test_launched_nodes_use_the_topics_of_the_driver(launched, start, tmp_path, 
         assert verdict == QoSCompatibility.OK, reason
     assert controller.config.sample_time == 1.0 / facts.rate
     connected = {'joint_states': facts.joint_states, 'commands': facts.commands}
-    assert controller.guard.journal.pending[0].content['topics'] == connected
+    told, configured = wait_for_message(
+        String,
+        controller,
+        topics.JOURNAL.relative,
+        qos_profile=qos_profile(topics.JOURNAL.requested),
+        time_to_wait=PATIENCE,
+    )
+    assert told
+    assert decode(serialize_message(configured)).content['topics'] == connected
     if simulated == 'true':
         plant = started['sim_plant']
         (states,) = plant.get_publishers_info_by_topic(facts.joint_states)
