@@ -17,10 +17,10 @@ end of its duration.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from math import cos, sin
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -401,56 +401,95 @@ class Handshake:
 
 
 Quaternions = tuple[float, float, float, float]  # x, y, z, w
-_AXES = np.eye(3)
+Vector = tuple[float, float, float]
+_AXES: tuple[Vector, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Frames:
-    """Frames of the links of a URDF while its `joints` move; all others stay at 0."""
+    """Frames of the links of a URDF while its `joints` move; all others stay at 0.
+
+    The messages are reused: the loop waits while they are published.
+    """
 
     def __init__(self, text: str, joints: Sequence[str]) -> None:
-        self._links = links_of(text)
-        self._places = [joints.index(e.joint) if e.joint in joints else -1 for e in self._links]
-        self._rest = [_origin(link.rpy) for link in self._links]
-
-    def at(self, stamp: int, q: np.ndarray) -> Iterator[TransformStamped]:
-        """Yield the frame of each link in its parent at q (n,) [rad, or m] and a stamp [ns]."""
-        time = Time(sec=stamp // 10**9, nanosec=stamp % 10**9)
-        for link, place, rest in zip(self._links, self._places, self._rest, strict=True):
-            position = float(q[place]) if place >= 0 else 0.0
-            slides = position if link.kind == 'prismatic' else 0.0
-            turned = _product(rest, _about(link.axis, position - slides))
-            x, y, z = (link.xyz + slides * _rotated(rest, link.axis)).tolist()
-            yield TransformStamped(
-                header=Header(stamp=time, frame_id=link.parent),
+        self._header_time = Time()
+        self._messages: list[TransformStamped] = []
+        self._moving: list[_MovingLink] = []
+        for link in links_of(text):
+            rest, origin = _origin(link.rpy), (*link.xyz.tolist(),)
+            axis = (*link.axis.tolist(),)
+            message = TransformStamped(
+                header=Header(stamp=self._header_time, frame_id=link.parent),
                 child_frame_id=link.name,
-                transform=Transform(
-                    translation=Vector3(x=x, y=y, z=z),
-                    rotation=Quaternion(x=turned[0], y=turned[1], z=turned[2], w=turned[3]),
-                ),
+                transform=Transform(translation=Vector3(), rotation=Quaternion()),
             )
+            _place(message.transform, origin, rest)
+            self._messages.append(message)
+            if link.joint in joints:
+                slide = _rotated(rest, axis) if link.kind == 'prismatic' else None
+                place = joints.index(link.joint)
+                moving = _MovingLink(message.transform, place, origin, rest, axis, slide)
+                self._moving.append(moving)
+
+    def at(self, stamp: int, q: np.ndarray) -> list[TransformStamped]:
+        """Return the frame of each link in its parent at q (n,) [rad, or m] and a stamp [ns]."""
+        self._header_time.sec, self._header_time.nanosec = divmod(stamp, 10**9)
+        for link in self._moving:
+            position = float(q[link.place])
+            if link.slide is None:
+                _place(
+                    link.transform, link.origin, _product(link.rest, _about(link.axis, position))
+                )
+            else:
+                x, y, z = (a + position * b for a, b in zip(link.origin, link.slide, strict=True))
+                _place(link.transform, (x, y, z), link.rest)
+        return self._messages
 
 
-def _about(axis: np.ndarray, angle: float) -> Quaternions:
-    x, y, z = (sin(0.5 * angle) * axis).tolist()
-    return x, y, z, cos(0.5 * angle)
+class _MovingLink(NamedTuple):
+    """A link whose joint moves; at 0, its frame is at `origin` and turned by `rest`."""
+
+    transform: Transform
+    place: int  # of the joint in q
+    origin: Vector
+    rest: Quaternions
+    axis: Vector
+    slide: Vector | None  # direction in the parent's frame; None if the link turns
+
+
+def _place(transform: Transform, origin: Vector, by: Quaternions) -> None:
+    at, turned = transform.translation, transform.rotation
+    at.x, at.y, at.z = origin
+    turned.x, turned.y, turned.z, turned.w = by
+
+
+def _about(axis: Vector, angle: float) -> Quaternions:
+    s = sin(0.5 * angle)
+    return s * axis[0], s * axis[1], s * axis[2], cos(0.5 * angle)
 
 
 def _origin(rpy: np.ndarray) -> Quaternions:
     """Return the rotation by roll, pitch and yaw about fixed axes, in this order."""
-    roll, pitch, yaw = (_about(axis, angle) for axis, angle in zip(_AXES, rpy, strict=True))
+    roll, pitch, yaw = (
+        _about(axis, angle) for axis, angle in zip(_AXES, rpy.tolist(), strict=True)
+    )
     return _product(yaw, _product(pitch, roll))
 
 
 def _product(a: Quaternions, b: Quaternions) -> Quaternions:
-    u, v = np.array(a[:3]), np.array(b[:3])
-    x, y, z = (a[3] * v + b[3] * u + np.cross(u, v)).tolist()
-    return x, y, z, a[3] * b[3] - float(u @ v)
+    (ax, ay, az, aw), (bx, by, bz, bw) = a, b
+    return (
+        aw * bx + bw * ax + ay * bz - az * by,
+        aw * by + bw * ay + az * bx - ax * bz,
+        aw * bz + bw * az + ax * by - ay * bx,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
 
 
-def _rotated(by: Quaternions, vector: np.ndarray) -> np.ndarray:
-    u = np.array(by[:3])
-    turned: np.ndarray = vector + 2.0 * np.cross(u, np.cross(u, vector) + by[3] * vector)
-    return turned
+def _rotated(by: Quaternions, vector: Vector) -> Vector:
+    x, y, z, w = by
+    turned = _product(_product(by, (*vector, 0.0)), (-x, -y, -z, w))
+    return turned[:3]
 
 
 main = partial(process.run, PlantNode)
