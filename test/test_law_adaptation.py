@@ -52,43 +52,31 @@ def estimates_after(settings, state, signals, *, saturated=False):
     return state.estimate.copy(), state.disturbance.copy()
 
 
-@pytest.mark.parametrize('seed', range(5))
 @pytest.mark.parametrize(('n', 'p'), SHAPES)
 @pytest.mark.parametrize('update', UPDATES)
-def test_update_is_the_written_law(seed, n, p, update):
-    settings, state, signals = random_case = case(seed, n, p, update=update)
-    rate = tracking_part(settings, signals) + prediction_part(settings, state)
-    expected = state.estimate + DT * rate
-    d3_rate = -state.gain_scale * settings.gamma * (signals.xi2 + settings.eta * state.disturbance)
-    d3 = state.disturbance + DT * d3_rate
+@pytest.mark.parametrize('mode', ['learning', 'not latched', 'saturated'])
+def test_update_is_the_written_law(n, p, update, mode):
+    """Before the latch only the tracking error adapts, at a torque limit only the prediction's.
 
-    estimate, disturbance = estimates_after(*random_case)
-
-    np.testing.assert_allclose(estimate, expected, rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(signals.rate, rate, rtol=0.0, atol=1e-10)
-    np.testing.assert_allclose(disturbance, d3, rtol=0.0, atol=1e-15)
-
-
-@pytest.mark.parametrize(('n', 'p'), SHAPES)
-def test_only_the_tracking_error_adapts_before_the_latch(n, p):
-    settings, state, signals = random_case = case(1, n, p, latched=False)
-    expected = state.estimate + DT * tracking_part(settings, signals)
-
-    estimate, _ = estimates_after(*random_case)
-
-    np.testing.assert_allclose(estimate, expected, rtol=0.0, atol=1e-14)
-
-
-@pytest.mark.parametrize(('n', 'p'), SHAPES)
-def test_only_the_prediction_error_adapts_at_a_torque_limit(n, p):
-    settings, state, _ = random_case = case(2, n, p)
-    expected = state.estimate + DT * prediction_part(settings, state)
+    The tracking error adapts each parameter in its own scale, the variance of its prior.
+    """
+    scale = np.random.default_rng(0).uniform(0.01, 3.0, p + n)
+    latched, saturated = mode != 'not latched', mode == 'saturated'
+    settings, state, signals = case(n, n, p, latched=latched, update=update, variance=scale)
+    rate = np.zeros(settings.m)
     d3 = state.disturbance.copy()
+    if latched:
+        rate += prediction_part(settings, state)
+    if not saturated:
+        rate += scale * tracking_part(settings, signals)
+        d3 -= DT * state.gain_scale * settings.gamma * (signals.xi2 + settings.eta * d3)
+    expected = state.estimate + DT * rate
 
-    estimate, disturbance = estimates_after(*random_case, saturated=True)
+    adaptation.adapt(settings, state, signals, DT, saturated)
 
-    np.testing.assert_allclose(estimate, expected, rtol=0.0, atol=1e-12)
-    np.testing.assert_array_equal(disturbance, d3)
+    np.testing.assert_allclose(state.estimate, expected, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(signals.rate, rate, rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(state.disturbance, d3, rtol=0.0, atol=1e-15)
 
 
 @pytest.mark.parametrize('most', [np.inf, 1e-3])
@@ -111,26 +99,6 @@ def test_learning_does_not_change_the_torque(saturated, most):
     assert (estimate[-1] == most) == np.isfinite(most)
 
 
-def test_newton_converges_at_the_same_rate_in_all_directions_unlike_gradient():
-    """theta~ shrinks by 1 - Gamma kappa T per step for eigenvalues of Phi from 1e-2 to 1e2."""
-    shrunk = {}
-    for update in UPDATES:
-        settings, state, signals = case(
-            3, 2, 3, update=update, rho=1e-12, Gamma=np.full(5, 2.0), kappa=2.0
-        )
-        state.Phi[:] = np.diag([1e-2, 0.1, 1.0, 10.0, 100.0])
-        state.factor[:] = state.Phi + settings.rho * np.eye(settings.m)
-        cholesky.factor(state.factor)
-        state.b[:] = 0.0  # the truth is zero
-        state.estimate[:] = 1.0
-        signals.xi2[:] = 0.0
-        shrunk[update] = estimates_after(settings, state, signals)[0]
-    np.testing.assert_allclose(shrunk['newton'], 1.0 - 2.0 * 2.0 * DT, rtol=1e-9)
-    np.testing.assert_allclose(
-        shrunk['gradient'], 1.0 - 2.0 * 2.0 * DT * np.array([1e-2, 0.1, 1.0, 10.0, 100.0])
-    )
-
-
 def test_parameters_are_projected_and_columns_are_not():
     settings, state, signals = case(4, 2, 3, latched=False, radius=1.0)
     p = settings.p
@@ -146,17 +114,6 @@ def test_parameters_are_projected_and_columns_are_not():
     np.testing.assert_allclose(signals.rate[:p], tangential, atol=1e-12)
     assert np.linalg.norm(estimate[:p]) <= 1.0 + 1e-15
     np.testing.assert_array_equal(estimate[p:], 50.0)
-
-
-def test_latched_window_has_no_effect_without_weight():
-    """kappa = 0 is the law without learning, bit for bit."""
-    latched, never = controller(quick(kappa=0.0)), controller(quick(sigma=np.inf))
-    with_latch, without = (record(law, plant(), 1.5) for law in (latched, never))
-
-    assert latched.state.latched[0] == 1.0
-    assert never.state.latched[0] == 0.0
-    np.testing.assert_array_equal(with_latch.torque, without.torque)
-    np.testing.assert_array_equal(with_latch.estimate, without.estimate)
 
 
 def test_disturbance_estimate_takes_nothing_over_before_the_latch():
@@ -206,30 +163,14 @@ def test_no_step_leaves_the_ball(seed, size, speed, radius):
         assert np.linalg.norm(estimate) <= radius * (1.0 + 1e-15)
 
 
-def test_nothing_is_changed_inside_the_ball():
-    estimate, rate = np.array([1.0, -2.0, 1.9]), np.array([1e3, -5.0, 7.0])
-    np.testing.assert_array_equal(projected(estimate, rate), rate)
-    before = estimate.copy()
-    adaptation.retract(estimate, GAIN, RADIUS)
-    np.testing.assert_array_equal(estimate, before)
-
-
-def test_inward_and_tangential_rates_are_kept_on_the_sphere():
-    estimate = np.array([RADIUS, 0.0, 0.0])
-    for rate in (np.array([-1.0, 4.0, 2.0]), np.array([0.0, 4.0, 2.0])):
-        np.testing.assert_array_equal(projected(estimate, rate), rate)
-
-
-def test_outward_part_of_the_rate_is_removed_on_the_sphere():
+def test_only_the_outward_part_of_the_rate_is_removed_and_only_on_the_sphere():
     for random in map(np.random.default_rng, range(10)):
-        w = on_sphere(random)
-        v = random.normal(size=3)
+        w, v = on_sphere(random), random.normal(size=3)
         v *= np.sign(w @ v)
-
+        np.testing.assert_array_equal(projected(0.99 * w, v), v)
+        np.testing.assert_array_equal(projected(w, -v), -v)
         rate = projected(w, v)
-
-        metric = w @ (GAIN * w)
-        np.testing.assert_allclose(rate, v - GAIN * w * (w @ v) / metric, atol=1e-13)
+        np.testing.assert_allclose(rate, v - GAIN * w * (w @ v) / (w @ (GAIN * w)), atol=1e-13)
         assert w @ rate == pytest.approx(0.0, abs=1e-13)
 
 
@@ -243,15 +184,6 @@ def test_retracted_estimate_counts_as_on_the_sphere():
         v *= np.sign(w @ v)
 
         assert w @ projected(w, v) == pytest.approx(0.0, abs=1e-12)
-
-
-def test_projection_never_slows_the_decrease_of_the_lyapunov_function():
-    """d/dt (1/2 P~^T Gamma^-1 P~) = -P~^T Gamma^-1 P^', for any true P inside the ball."""
-    for random in map(np.random.default_rng, range(200)):
-        w, v = on_sphere(random), random.normal(size=3)
-        true = on_sphere(random) * random.uniform()
-        slope = [-(true - w) @ (rate / GAIN) for rate in (projected(w, v), v)]
-        assert slope[0] <= slope[1] + 1e-12
 
 
 def test_retracted_estimate_is_the_nearest_in_the_ball_in_the_metric_of_gamma():
@@ -274,17 +206,11 @@ def test_retracted_estimate_is_the_nearest_in_the_ball_in_the_metric_of_gamma():
         assert np.all(after <= before * (1.0 + 1e-9))
 
 
-def test_uniform_gamma_retracts_along_the_radius():
-    estimate = np.array([3.0, 4.0])
-    adaptation.retract(estimate, np.array([0.5, 0.5]), 2.5)
-    np.testing.assert_allclose(estimate, [1.5, 2.0], rtol=1e-15)
-
-
-@pytest.mark.parametrize('bad', [np.nan, np.inf])
-def test_non_finite_estimates_are_left_for_the_supervisor(bad):
-    estimate = np.array([bad, 1.0, 1.0])
-    adaptation.retract(estimate, GAIN, RADIUS)
-    assert not np.isfinite(estimate[0])
+def test_non_finite_estimates_are_left_for_the_supervisor():
+    for bad in (np.nan, np.inf):
+        estimate = np.array([bad, 1.0, 1.0])
+        adaptation.retract(estimate, GAIN, RADIUS)
+        assert not np.isfinite(estimate[0])
 
 
 SCALE = np.array([1e-3, 5.0, 0.2, 30.0, 1.0, 1e-2, 4.0])  # of theta: p = 4 and 3 columns
@@ -303,15 +229,14 @@ def window_case(seed, **changes):
     return settings, state, signals, state.running[:7, :7] / 8.0, state.running[:7, 7] / 8.0
 
 
-@pytest.mark.parametrize('seed', range(3))
-def test_excitation_is_the_minimum_eigenvalue_relative_to_the_information(seed):
-    settings, state, signals, Phi, _ = window_case(seed, prior_weight=0.0)
-    found = window.excitation(settings, state, signals, 200)
-
-    values, vectors = eigh(Phi, settings.information)
-    assert found == pytest.approx(values[0], rel=1e-8)
-    direction = state.min_eigenvector / state.min_eigenvector[0] * vectors[0, 0]
-    np.testing.assert_allclose(direction, vectors[:, 0], rtol=1e-5)
+def test_excitation_is_the_minimum_eigenvalue_relative_to_the_information():
+    for seed in range(3):
+        settings, state, signals, Phi, _ = window_case(seed, prior_weight=0.0)
+        found = window.excitation(settings, state, signals, 200)
+        values, vectors = eigh(Phi, settings.information)
+        assert found == pytest.approx(values[0], rel=1e-8)
+        direction = state.min_eigenvector / state.min_eigenvector[0] * vectors[0, 0]
+        np.testing.assert_allclose(direction, vectors[:, 0], rtol=1e-5)
 
 
 def test_prior_pulls_the_solution_to_the_initial_estimate_in_its_own_metric():
@@ -321,16 +246,6 @@ def test_prior_pulls_the_solution_to_the_initial_estimate_in_its_own_metric():
 
     np.testing.assert_allclose(signals.Phi, Phi + 0.5 * R, rtol=1e-12)
     np.testing.assert_allclose(signals.b, b + 0.5 * R @ settings.initial_estimate, rtol=1e-12)
-
-
-def test_tracking_error_adapts_each_parameter_in_its_scale():
-    settings, state, signals = arbitrary(1, variance=SCALE**2, kappa=0.0)
-    state.latched[0] = 0.0
-    before = state.estimate.copy()
-    adaptation.adapt(settings, state, signals, 1e-3, saturated=False)
-    H, xi2 = signals.H[:, :4], signals.xi2
-    expected = -1e-3 * settings.Gamma[:4] * SCALE[:4] ** 2 * (H.T @ xi2)
-    np.testing.assert_allclose((state.estimate - before)[:4], expected, rtol=1e-9, atol=1e-15)
 
 
 @pytest.mark.parametrize('compensation', range(len(COMPENSATIONS)))

@@ -15,11 +15,9 @@ from arbitrary_case import arbitrary_settings
 from closed_loop_case import (
     REFERENCE,
     START,
-    closed_loop,
     controller,
     plant,
     quick,
-    recommended,
     record,
 )
 from numba.core.runtime import _nrt_python, rtsys
@@ -31,7 +29,7 @@ from blf_dsc_controller.configuration.controller import LAWS, ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.factory import column_names, controller_of, settings_of_config
-from blf_dsc_controller.law.settings import Settings, settings_of
+from blf_dsc_controller.law.settings import settings_of
 from blf_dsc_controller.law.state import (
     sample_of,
     sample_size,
@@ -41,56 +39,37 @@ from blf_dsc_controller.law.state import (
     state_size,
 )
 
-SHAPES = [(1, 1), (2, 3), (3, 4), (6, 30)]
-SIZES = ('n', 'p', 'm', 'tones', 'drive', 'drive_size', 'weighed', 'model')
-
-
-def distinct_settings(n, p):
-    """Settings whose numbers are all distinct, except for the sizes."""
-    settings = arbitrary_settings(np.random.default_rng(0), n, p)
-    number = iter(range(1000, 10_000))
-    values = {}
-    for name, value in settings._asdict().items():
-        if name in SIZES:
-            continue
-        if isinstance(value, np.ndarray):
-            values[name] = np.reshape([float(next(number)) for _ in range(value.size)], value.shape)
-        else:
-            values[name] = next(number) + (0 if isinstance(value, int) else 0.5)
-    return settings._replace(**values)
+SHAPES = [(1, 1), (2, 3), (6, 30)]
 
 
 @pytest.mark.parametrize(('n', 'p'), SHAPES)
-def test_settings_survive_packing_and_unpacking(n, p):
-    settings = distinct_settings(n, p)
-
+def test_vectors_are_laid_out_without_gap_or_overlap(n, p):
+    """Every setting survives packing; views of state, signals and sample cover their vectors."""
+    settings = arbitrary_settings(np.random.default_rng(0), n, p)
+    numbers = iter(range(1000, 10_000))
+    sizes = ('n', 'p', 'm', 'tones', 'drive', 'drive_size', 'weighed', 'model')
+    distinct = {
+        name: np.reshape([float(next(numbers)) for _ in range(value.size)], value.shape)
+        if isinstance(value, np.ndarray)
+        else next(numbers) + (0 if isinstance(value, int) else 0.5)
+        for name, value in settings._asdict().items()
+        if name not in sizes
+    }
+    settings = settings._replace(**distinct)
     unpacked = settings_of(pack(settings), sizes_of(settings), settings.model)
+    for name, value in settings._asdict().items():
+        np.testing.assert_array_equal(getattr(unpacked, name), value, err_msg=name)
+        assert isinstance(getattr(unpacked, name), type(value)), name
 
-    for name in Settings._fields:
-        np.testing.assert_array_equal(
-            getattr(unpacked, name), getattr(settings, name), err_msg=name
-        )
-        assert isinstance(getattr(unpacked, name), type(getattr(settings, name))), name
-
-
-@pytest.mark.parametrize(('n', 'p'), SHAPES)
-def test_views_cover_their_vectors_exactly_once(n, p):
     settings = arbitrary_settings(np.random.default_rng(0), n, p)
-    sizes = state_size(settings), signals_size(settings), sample_size(settings)
-    state, signals, sample = (np.arange(float(size)) for size in sizes)
-
-    for views, size in zip(
-        (
-            state_of(state, settings),
-            signals_of(signals, settings),
-            sample_of(sample, settings),
-        ),
-        sizes,
-        strict=True,
+    for views, size in (
+        (state_of, state_size(settings)),
+        (signals_of, signals_size(settings)),
+        (sample_of, sample_size(settings)),
     ):
-        np.testing.assert_array_equal(
-            np.sort(np.concatenate([part.ravel() for part in views])), np.arange(size)
-        )
+        parts = views(np.arange(float(size)), settings)
+        covered = np.concatenate([part.ravel() for part in parts])
+        np.testing.assert_array_equal(np.sort(covered), np.arange(size))
 
 
 def test_sample_contains_what_the_update_computed():
@@ -105,28 +84,29 @@ def test_sample_contains_what_the_update_computed():
         assert np.all(getattr(law.sample, name) != 0.0), name
 
 
-def test_restored_loop_continues_bit_for_bit():
+def test_loop_continues_bit_for_bit_from_a_saved_state_and_begins_anew_after_a_reset():
     """The state vector is the complete state, so another controller can continue from it too."""
     law, arm = controller(quick()), plant(noise=1e-5, differenced=True, delay=2)
-    record(law, arm, 1.337)
-    saved, saved_arm = law.save(), arm.save()
+    begun = arm.save()
 
-    def rest_of(law):
+    def torques(law, first, last, saved_arm):
         arm.restore(saved_arm)
-        torques = []
-        for k in range(1337, 2000):
-            torques.append(law.update(k * 1e-3, 1e-3, arm.measure()).copy())
-            arm.step(torques[-1])
-        return np.array(torques)
+        found = []
+        for k in range(first, last):
+            found.append(law.update(k * 1e-3, 1e-3, arm.measure()).copy())
+            arm.step(found[-1])
+        return np.array(found)
 
-    first = rest_of(law)
-    law.restore(saved)
-    other = controller(quick())
-    other.restore(saved)
-
-    np.testing.assert_array_equal(rest_of(law), first)
-    np.testing.assert_array_equal(rest_of(other), first)
+    start = torques(law, 0, 1337, begun)
+    saved, saved_arm = law.save(), arm.save()
+    after = torques(law, 1337, 2000, saved_arm)
     assert np.any(saved != law.state_vector)
+    other = controller(quick())
+    for same in (law, other):
+        same.restore(saved)
+        np.testing.assert_array_equal(torques(same, 1337, 2000, saved_arm), after)
+    law.reset()
+    np.testing.assert_array_equal(torques(law, 0, 1337, begun), start)
 
 
 @numba.njit
@@ -193,14 +173,6 @@ def test_interpreted_kernels_compute_the_same_torque():
     np.testing.assert_allclose(np.array(run.stdout.split(), dtype=float), torque, rtol=1e-9)
 
 
-def test_first_update_starts_the_filter_at_the_virtual_control():
-    """alpha2(0) = beta2(0) is set by the first sample, not by the constructor's warm-up."""
-    law = controller(recommended())
-    next(closed_loop(law, plant(), 1.0))
-    np.testing.assert_array_equal(law.signals.dalpha2, 0.0)
-    assert law.state.samples[0] == 1.0
-
-
 ROUNDING = 1e-10
 R = 9.8  # 1/s^2, g / l1
 UNEVEN = {
@@ -211,6 +183,9 @@ UNEVEN = {
     'comparison.position_gain': [30.0, 11.0],
     'comparison.robust_gain': [0.4, 0.2],
     'comparison.leakage': 0.05,
+    'learning.window': 0.4,  # which they must not learn from
+    'learning.settling_time': 0.1,
+    'learning.excitation_threshold': 1e-9,
 }
 
 
@@ -257,22 +232,7 @@ def test_comparison_laws_follow_their_equations_in_a_closed_loop(law):
         np.testing.assert_allclose(controller.state.estimate[:3], plain.P, atol=ROUNDING)
         arm.step(controller.signals.torque)
     assert np.abs(controller.state.estimate[:3] - [0.5, 0.16, 0.2]).max() > 0.05  # it did adapt
-
-
-def test_comparison_laws_do_not_use_the_barrier_or_composite_learning():
-    """Gains of the proposed law do not affect them: the runs are the same bit for bit."""
-    changed = {
-        'barrier.weight': [5.0, 7.0],
-        'surface.gain': [3.0, 3.0],
-        'surface.time_constant': 0.5,
-        'feedback.damping': [9.0, 9.0],
-        'disturbance.gain': [7.0, 7.0],
-        'learning.weight': 3.0,
-    }
-    for law in ('backstepping', 'slotine_li'):
-        runs = [run(configured('recommended', 8.0, {'law': law} | more)) for more in ({}, changed)]
-        np.testing.assert_array_equal(runs[0].torque, runs[1].torque)
-        assert runs[0].latched[-1] == 1.0  # there was something to learn from
+    assert controller.state.latched[0] == 1.0
 
 
 def test_zero_weight_of_the_prediction_error_equals_no_learning_bit_for_bit():
@@ -339,14 +299,9 @@ def error_floor(changes):
     return np.abs(loop.xi1[loop.t >= 1.0]).max(axis=0)
 
 
-def test_error_of_the_oracle_stays_below_twenty_microradians():
-    assert error_floor({}).max() < 2e-5
-
-
-@pytest.mark.parametrize('time_constant', [0.002, 0.004, 0.008, 0.016])
+@pytest.mark.parametrize('time_constant', [0.002, 0.016])
 @pytest.mark.parametrize(
-    ('gain', 'mu', 'weight'),
-    [(150.0, 20.0, 1000.0), (60.0, 20.0, 1000.0), (60.0, 60.0, 1.0), (0.0, 40.0, 500.0)],
+    ('gain', 'mu', 'weight'), [(150.0, 20.0, 1000.0), (60.0, 60.0, 1.0), (0.0, 40.0, 500.0)]
 )
 def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(time_constant, gain, mu, weight):
     """alpha2 lags beta2 by lambda alpha2', which xi1 compensates.
@@ -376,30 +331,19 @@ def test_lyapunov_function_of_the_oracle_decreases_to_the_floor_of_the_lag():
     assert V[0] > 1e4 * V[loop.t >= 1.0].max()
 
 
-def test_parameter_error_without_disturbance():
-    """Without disturbance and with exact measurements, learning finds P."""
-    loop = run(configured('recommended', 20.0, {}, NO_DISTURBANCE))
-    assert loop.parameter_error[-1] < 1e-3
+def test_learning_finds_the_parameters():
+    """With exact measurements, and a sinusoid in the disturbance that no column describes."""
+    assert run(configured('recommended', 20.0, {}, NO_DISTURBANCE)).parameter_error[-1] < 1e-3
+    assert run(configured('recommended', 60.0)).parameter_error[-1] < 5e-4
 
 
-def test_parameter_error_with_the_disturbance_unknown():
-    loop = run(configured('recommended', 60.0))
-    assert loop.parameter_error[-1] < 5e-4
-
-
-def settings(**given):
-    return settings_of_config(build(ControllerConfig, given))
-
-
-def test_learning_waits_for_the_window_and_the_filters_to_settle():
-    """tau_d + T_a of (26)."""
-    learning = {'learning.window': 0.75, 'learning.settling_time': 0.25}
-    assert settings(**learning).learning_start == 1.0
-    assert settings(**learning).window == 750
-
-
-def test_parameters_and_columns_have_separate_gains():
-    config = {'learning.adaptation_gain': [1.0, 2.0, 3.0], 'learning.column_gain': 5.0}
-    columns = len(column_names(build(ControllerConfig, config)))
+def test_settings_follow_the_configuration():
+    """Learning waits for window and filters, tau_d + T_a of (26); columns have their own gain."""
+    given = {'learning.window': 0.75, 'learning.settling_time': 0.25}
+    given |= {'learning.adaptation_gain': [1.0, 2.0, 3.0], 'learning.column_gain': 5.0}
+    config = build(ControllerConfig, given)
+    settings, columns = settings_of_config(config), len(column_names(config))
+    assert settings.learning_start == 1.0
+    assert settings.window == 750
     assert columns > 0
-    assert settings(**config).Gamma.tolist() == [1.0, 2.0, 3.0, *[5.0] * columns]
+    assert settings.Gamma.tolist() == [1.0, 2.0, 3.0, *[5.0] * columns]

@@ -70,18 +70,16 @@ def test_erratum_5_arm_starts_inside_its_bound():
     assert abs(refusal.value.error) / refusal.value.bound == pytest.approx(763.0, abs=0.5)
 
 
-@pytest.mark.parametrize('mu', [0.02, 20.0, 1e4])
-@pytest.mark.parametrize('time_constant', [2e-4, 2e-3, 0.1])
-def test_erratum_12_switched_virtual_control_cannot_meet_its_own_condition(mu, time_constant):
+def test_erratum_12_switched_virtual_control_cannot_meet_its_own_condition():
     """(14) asks for mu >= sup |beta2 - alpha2|, but each sign change makes that 2 mu."""
-    gain = surface.filter_gain(time_constant, 1e-3)
-    alpha2 = 0.0
-    gap = []
-    for k in range(4000):
-        beta2 = -mu if k < 2000 else mu  # -mu sgn(xi1), xi1 > 0 and then xi1 < 0
-        gap.append(abs(beta2 - alpha2))
-        alpha2 += gain * (beta2 - alpha2)
-    assert max(gap) == pytest.approx(2.0 * mu)
+    for mu in (0.02, 20.0):
+        for time_constant in (2e-4, 0.1):
+            gain, alpha2, gap = surface.filter_gain(time_constant, 1e-3), 0.0, []
+            for k in range(4000):
+                beta2 = -mu if k < 2000 else mu  # -mu sgn(xi1), xi1 > 0 and then xi1 < 0
+                gap.append(abs(beta2 - alpha2))
+                alpha2 += gain * (beta2 - alpha2)
+            assert max(gap) == pytest.approx(2.0 * mu)
 
 
 def test_erratum_12_linear_virtual_control_crosses_zero_without_a_jump():
@@ -116,28 +114,19 @@ def damping_torque(d2, xi1, xi2):
     return demands[1] - demands[0]
 
 
-@pytest.mark.parametrize('seed', range(10))
-def test_erratum_15_robust_term_dominates_disturbances_bounded_joint_by_joint(seed):
+def test_erratum_15_robust_term_dominates_disturbances_bounded_joint_by_joint():
     """With (5) as |tau_dist_i| <= d2_i |xi1_i|; the printed (5) bounds norms, which is weaker."""
-    random = np.random.default_rng(seed)
-    d2 = np.array([300.0, 200.0])
-    xi1 = random.uniform(-0.0015, 0.0015, 2)
-    xi2 = random.choice([-1.0, 1.0], 2) * random.uniform(0.01, 1.0, 2)  # outside the layer b
-
-    power = damping_torque(d2, xi1, xi2) @ xi2
-
-    assert power + np.sum(d2 * np.abs(xi1) * np.abs(xi2)) == pytest.approx(0.0, abs=1e-10)
-    d = 300.0
-    of_norms = d * np.linalg.norm(xi1) * np.linalg.norm(xi2)
-    assert of_norms - d * np.abs(xi1) @ np.abs(xi2) > 0.0  # xi3 as printed leaves this power
-    assert (
-        of_norms - d * np.linalg.norm(xi1) * np.sum(np.abs(xi2)) <= 0.0
-    )  # |xi1| as a norm does not
-
-
-def test_erratum_15_printed_term_vanishes_if_the_errors_are_on_different_joints():
-    d2 = np.full(2, 300.0)
-    torque = damping_torque(d2, np.array([0.001, 0.0]), np.array([0.0, 1.0]))
+    d2, d = np.array([300.0, 200.0]), 300.0
+    for random in map(np.random.default_rng, range(3)):
+        xi1 = random.uniform(-0.0015, 0.0015, 2)
+        xi2 = random.choice([-1.0, 1.0], 2) * random.uniform(0.01, 1.0, 2)  # outside the layer b
+        power = damping_torque(d2, xi1, xi2) @ xi2
+        assert power + np.sum(d2 * np.abs(xi1) * np.abs(xi2)) == pytest.approx(0.0, abs=1e-10)
+        of_norms = d * np.linalg.norm(xi1) * np.linalg.norm(xi2)
+        assert of_norms > d * np.abs(xi1) @ np.abs(xi2)  # xi3 as printed leaves this power
+        assert of_norms <= d * np.linalg.norm(xi1) * np.sum(np.abs(xi2))  # |xi1| as a norm does not
+    # As printed it vanishes if the errors are on different joints.
+    torque = damping_torque(np.full(2, d), np.array([0.001, 0.0]), np.array([0.0, 1.0]))
     np.testing.assert_allclose(torque, 0.0, atol=1e-12)
 
 
@@ -343,7 +332,7 @@ def run_loop(law, arm, duration, *, subtract):
         arm.step(law.signals.torque)
 
 
-@pytest.mark.parametrize('guess', [P / 2.0, 1.5 * P, np.array([0.5, 0.6, 0.1])])
+@pytest.mark.parametrize('guess', [P / 2.0, np.array([0.5, 0.6, 0.1])])
 def test_erratum_8_subtracting_the_disturbance_estimate_hides_any_parameter_error(guess):
     """By (28) tau - d^3 = H P^ up to the errors of tracking, so eps of (24) vanishes for every P^.
 
@@ -388,7 +377,7 @@ def printed_projection(estimate, rate, radius):
 
 
 def test_erratum_19_printed_projection_lets_the_estimate_leave_for_good():
-    """Ten outward steps cross the sphere; the printed form then blocks ten thousand inward ones.
+    """Ten outward steps cross the sphere; the printed form then blocks inward ones for ever.
 
     Outside, 'otherwise' removes the radial part of any direction, inward ones included.
     """
@@ -396,7 +385,7 @@ def test_erratum_19_printed_projection_lets_the_estimate_leave_for_good():
     printed, corrected = np.array([[0.85, 0.1], [0.85, 0.1]])
     outward = np.array([1.0, 0.3])
     gain = np.ones(2)
-    for k in range(10_010):
+    for k in range(1000):
         rate = outward if k < 10 else -printed
         printed = printed + dt * printed_projection(printed, rate, radius)
         rate = outward.copy() if k < 10 else -corrected

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from arbitrary_case import arbitrary
-from closed_loop_case import closed_loop, controller, plant, quick, recommended, record
+from closed_loop_case import closed_loop, controller, plant, quick, recommended
 from plain_law import PlainLaw
 
 from blf_dsc_controller.law.settings import COMPENSATIONS, EFFORT, UPDATES
@@ -43,70 +43,23 @@ CASES = {
 }
 
 
-def differences(settings, arm, duration=1.5):
-    """Largest difference of torque, estimate and d^3 between law and oracle in closed loop."""
-    law, plain = controller(settings), PlainLaw(settings)
-    worst, dt = np.zeros(3), arm.period_ns * 1e-9
-    for sample in closed_loop(law, arm, duration):
+@pytest.mark.parametrize(('gains', 'arm'), CASES.values(), ids=CASES)
+def test_law_matches_the_plain_one_in_closed_loop(gains, arm):
+    """Torque, estimate and d^3 agree with the oracle in every sample."""
+    law, arm = controller(quick(**SHORT | gains)), plant(**arm)
+    plain = PlainLaw(law.settings)
+    for sample in closed_loop(law, arm, 1.5):
         reference = law.signals.qr, law.signals.dqr, law.signals.ddqr
-        torque = plain.update(sample.t, dt, *reference, sample.measurement)
+        torque = plain.update(sample.t, arm.period_ns * 1e-9, *reference, sample.measurement)
         plain.tau = law.signals.torque.copy()
-        pairs = (
+        for ours, theirs in (
             (law.signals.torque, torque),
             (law.state.estimate, plain.theta),
             (law.state.disturbance, plain.d3),
-        )
-        worst = np.maximum(worst, [np.abs(actual - expected).max() for actual, expected in pairs])
+        ):
+            np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=ROUNDING)
     assert law.state.latched[0] == 1.0
     assert plain.latched is not None
-    return worst
-
-
-@pytest.mark.parametrize(('gains', 'arm'), CASES.values(), ids=CASES)
-def test_torque_and_estimates_match_the_plain_law_in_closed_loop(gains, arm):
-    np.testing.assert_array_less(differences(quick(**SHORT | gains), plant(**arm)), ROUNDING)
-
-
-def test_recommended_gains_match_the_plain_law_up_to_conditioning():
-    """With rho = 1e-5 the rounding of 1e-16 in the window's terms is amplified by 1e7."""
-    np.testing.assert_array_less(
-        differences(quick(**SHORT | {'rho': 1e-5, 'sigma': 5e-6}), plant()), 1e-8
-    )
-
-
-def test_torque_never_exceeds_its_limit_and_the_demand_is_reported():
-    limit = np.array([8.0, 5.0])
-    law = controller(quick(torque_limit=limit))
-    saturated = 0
-    for _ in closed_loop(law, plant(), 1.0):
-        np.testing.assert_array_equal(
-            law.signals.torque, np.clip(law.signals.demand, -limit, limit)
-        )
-        saturated += np.any(law.signals.torque != law.signals.demand)
-    assert saturated > 0
-
-
-def test_saturated_torque_stops_learning_from_the_tracking_error():
-    """One joint at its limit freezes d^3 and, without a latched window, all parameters."""
-    law = controller(quick(torque_limit=np.array([1e-3, 20.0])))
-    estimate = law.state.estimate.copy()
-    for _ in closed_loop(law, plant(), 0.5):
-        assert abs(law.signals.demand[0]) > 1e-3
-    np.testing.assert_array_equal(law.state.estimate, estimate)
-    np.testing.assert_array_equal(law.state.disturbance, 0.0)
-
-
-def test_repeated_run_is_identical_bit_for_bit():
-    runs = [record(controller(quick()), plant(noise=1e-5, seed=3), 1.5) for _ in range(2)]
-    np.testing.assert_array_equal(runs[0].torque, runs[1].torque)
-
-
-def test_reset_clears_everything():
-    law = controller(quick())
-    first = record(law, plant(), 1.5)
-    law.reset()
-    second = record(law, plant(), 1.5)
-    np.testing.assert_array_equal(first.torque, second.torque)
 
 
 DT = 2e-3  # s: with 500 N m/s, 1 N m from sample to sample
@@ -175,18 +128,11 @@ def test_applied_torque_has_the_mean_of_what_the_drive_adds_at_both_ends(source)
     np.testing.assert_array_equal(state.added, signals.added)
 
 
-def test_any_change_is_allowed_without_a_rate_limit():
+def test_rate_limit_is_off_at_zero_and_for_the_first_torque():
     assert cut(9.0, -9.0, rate=0.0)[:2] == (9.0, 0.0)
-
-
-def test_rate_limit_does_not_apply_to_the_first_torque():
     assert cut(9.0, 0.0, samples=0.0)[:2] == (9.0, 0.0)
-
-
-def test_nan_demand_stays_nan():
-    """It must not turn into a torque that looks valid."""
-    assert np.isnan(cut(np.nan, 3.0)[0])
-    assert np.isnan(cut(np.nan, 3.0, rate=0.0)[0])
+    for rate in (500.0, 0.0):  # NaN must not turn into a torque that looks valid
+        assert np.isnan(cut(np.nan, 3.0, rate=rate)[0])
 
 
 def test_loop_keeps_the_rate_limit_and_counts_every_cut_by_joint():
@@ -203,27 +149,3 @@ def test_loop_keeps_the_rate_limit_and_counts_every_cut_by_joint():
     np.testing.assert_array_equal(law.state.rate_cuts, np.sum(np.array(cuts) == RATE_CUT, axis=0))
     assert law.state.rate_cuts.min() > 0.0
     np.testing.assert_array_equal(law.state.level_cuts, 0.0)
-
-
-def test_tracking_error_does_not_adapt_while_one_joint_is_saturated():
-    law = controller(quick(rate_limit=np.array([0.1, 0.0])))
-    loop = closed_loop(law, plant(), 0.3)
-    next(loop)
-    estimate, disturbance = law.state.estimate.copy(), law.state.disturbance.copy()
-    for _ in loop:
-        assert law.sample.cuts[0] >= RATE_CUT
-    np.testing.assert_array_equal(law.state.estimate, estimate)
-    np.testing.assert_array_equal(law.state.disturbance, disturbance)
-
-
-@pytest.mark.parametrize(
-    'changes',
-    [{'rate_limit': np.array([400.0, 150.0])}, {'torque_limit': np.array([10.5, 4.0])}],
-    ids=['rate', 'level'],
-)
-def test_learning_uses_the_applied_torque(changes):
-    """Many samples are cut; learning from their demanded torque would make P^ wrong."""
-    law = controller(recommended(**changes))
-    run = record(law, plant(), 12.0)
-    assert np.maximum(law.state.level_cuts, law.state.rate_cuts).max() > 30.0
-    assert run.parameter_error[-1] < 0.01

@@ -98,84 +98,50 @@ def test_window_is_split_into_exact_parts_and_goes_on_with_the_newer_one(length)
         np.testing.assert_allclose(newer, sum(map(terms, sliding.history[-rows:])), atol=1e-12)
 
 
-def test_sum_equals_that_of_the_ring_exactly_at_every_wrap():
-    """At each wrap every bit is that of a new sum over the ring, so nothing can drift."""
+def test_sum_does_not_drift():
+    """At each wrap every bit is that of a new sum over the ring, also after a large transient.
+
+    Terms of 1e16 round at 1; a running sum keeps that error forever, the window for one wrap.
+    """
     random = np.random.default_rng(3)
     sliding = Window(2, 3, 25)
-    for push in range(1, 200 * 25 + 1):
-        sliding.push(random.normal(size=(2, 4)))
+    for push in range(1, 20 * 25 + 1):
+        sliding.push(random.normal(size=(2, 4)) * (1e8 if push < 30 else 1.0))
         if push % 25 == 0:
             np.testing.assert_array_equal(sliding.running, sliding.direct())
             np.testing.assert_array_equal(sliding.fresh, 0.0)
-    assert not np.array_equal(sliding.naive, sliding.direct())
+    assert np.abs(sliding.naive - sliding.direct()).max() > 1.0
 
 
-def test_large_transient_leaves_no_trace_after_a_wrap():
-    """Terms of 1e16 round at 1; a running sum keeps that error forever, the window for one wrap."""
-    random = np.random.default_rng(4)
-    sliding = Window(2, 3, 10)
-    for push in range(60):
-        sliding.push(random.normal(size=(2, 4)) * (1e8 if push < 15 else 1.0))
-    exact = sliding.direct()
-
-    assert np.abs(sliding.naive - exact).max() > 1.0
-    np.testing.assert_array_equal(sliding.running, exact)
-
-
-@pytest.mark.parametrize('length', [1, 7])
-def test_constant_rows_average_to_themselves_from_the_first_row_on(length):
-    row = np.array([[1.0, 2.0, 5.0], [0.5, -1.0, 3.0]])
-    sliding = Window(2, 2, length)
-    for _ in range(3 * length):
-        sliding.push(row)
-        Phi, b = sliding.average()
-        np.testing.assert_allclose(Phi, row[:, :2].T @ row[:, :2], rtol=1e-14)
-        np.testing.assert_allclose(b, row[:, :2].T @ row[:, 2], rtol=1e-14)
-
-
-def excitation_matrix(random, m, rank):
-    rows = random.normal(size=(rank, m))
-    return rows.T @ rows
-
-
-@pytest.mark.parametrize(('m', 'rank'), [(1, 1), (13, 30), (5, 12), (5, 5), (5, 2), (7, 1), (6, 0)])
+@pytest.mark.parametrize(('m', 'rank'), [(1, 1), (13, 30), (5, 5), (5, 2), (6, 0)])
 @pytest.mark.parametrize('shift', [1e-5, 1.0])
 def test_factor_matches_numpy_and_solves(m, rank, shift):
     """Singular matrices included: the factor is of Phi + rho I."""
     random = np.random.default_rng(m)
-    A = excitation_matrix(random, m, rank)
-    x = random.normal(size=m)
-    U, y = np.triu(A + shift * np.eye(m)), x.copy()
+    rows, x = random.normal(size=(rank, m)), random.normal(size=m)
+    shifted = rows.T @ rows + shift * np.eye(m)
+    U, y = np.triu(shifted), x.copy()
 
     assert cholesky.factor(U)
     cholesky.solve(U, y)
 
     np.fill_diagonal(U, 1.0 / np.diag(U))  # kept inverted
     # Backward stable: the residual, and not the solution, is at the level of rounding.
-    shifted = A + shift * np.eye(m)
-    np.testing.assert_allclose(U.T @ U, shifted, atol=1e-14 * np.linalg.norm(shifted))
-    np.testing.assert_allclose(U.T, np.linalg.cholesky(shifted), rtol=1e-5, atol=1e-9)
-    np.testing.assert_allclose(
-        shifted @ y, x, atol=1e-14 * np.linalg.norm(shifted) * np.linalg.norm(y)
-    )
+    rounding = 1e-14 * np.linalg.norm(shifted)
+    np.testing.assert_allclose(np.triu(U).T @ np.triu(U), shifted, atol=rounding)
+    np.testing.assert_allclose(shifted @ y, x, atol=rounding * np.linalg.norm(y))
 
 
-def test_factor_is_finite_when_rounding_destroys_a_pivot():
-    """Rank one at 1e12 rounds at 1e-4, so the other two pivots of Phi + 1e-5 I are noise."""
-    for seed in range(20):
-        row = 1e6 * np.random.default_rng(seed).normal(size=3)
-        U = np.triu(np.outer(row, row) + 1e-5 * np.eye(3))
-        cholesky.factor(U)
-        assert np.all(np.isfinite(U))
-        assert np.diag(U).max() <= 1e7 / np.abs(row).min() * (1.0 + 1e-9)
-
-
-def test_factor_shows_whether_a_matrix_is_positive_definite():
-    random = np.random.default_rng(1)
-    for _ in range(20):
+def test_factor_shows_whether_a_matrix_is_positive_definite_and_stays_finite():
+    for random in map(np.random.default_rng, range(20)):
         A = random.normal(size=(4, 4)) + np.diag(random.uniform(0.0, 3.0, 4))
         A = A + A.T
         assert cholesky.factor(np.triu(A)) == (np.linalg.eigvalsh(A)[0] > 0.0)
+        # Rank one at 1e12 rounds at 1e-4, so the other two pivots of Phi + 1e-5 I are noise.
+        row = 1e6 * random.normal(size=3)
+        U = np.triu(np.outer(row, row) + 1e-5 * np.eye(3))
+        cholesky.factor(U)
+        assert np.all(np.isfinite(U))
 
 
 def excited_case(seed):
@@ -194,26 +160,19 @@ def excited_case(seed):
     return case
 
 
-@pytest.fixture
-def excited():
-    return excited_case(2)
-
-
 def evaluate_until_settled(case, t):
     """Evaluate the window often: the first evaluation starts from an arbitrary direction."""
     for _ in range(50):
         excitation.update_excitation(*case, t, 1e-3, np.zeros(case[0].n))
 
 
-@pytest.mark.parametrize('seed', range(5))
-def test_inverse_iteration_finds_the_minimum_eigenvalue_and_eigenvector(seed):
-    case = excited_case(seed)
-    evaluate_until_settled(case, 0.0)
-
-    values, vectors = np.linalg.eigh(case.signals.Phi)
-    assert case.state.lambda_min[0] == pytest.approx(values[0], rel=1e-10)
-    assert abs(vectors[:, 0] @ case.state.min_eigenvector) == pytest.approx(1.0, rel=1e-10)
-    assert np.linalg.norm(case.state.min_eigenvector) == pytest.approx(1.0, rel=1e-14)
+def test_inverse_iteration_finds_the_minimum_eigenvalue_and_eigenvector():
+    for case in map(excited_case, range(3)):
+        evaluate_until_settled(case, 0.0)
+        values, vectors = np.linalg.eigh(case.signals.Phi)
+        assert case.state.lambda_min[0] == pytest.approx(values[0], rel=1e-10)
+        assert abs(vectors[:, 0] @ case.state.min_eigenvector) == pytest.approx(1.0, rel=1e-10)
+        assert np.linalg.norm(case.state.min_eigenvector) == pytest.approx(1.0, rel=1e-14)
 
 
 def test_warm_started_iteration_tracks_the_minimum_eigenvalue_in_a_loop():
@@ -233,10 +192,18 @@ def test_warm_started_iteration_tracks_the_minimum_eigenvalue_in_a_loop():
     assert np.median(found[filled] / exact[filled] - 1.0) < 1e-6
 
 
-def test_latch_keeps_the_whole_window_when_time_and_excitation_suffice(excited):
-    settings, state, _ = excited
-    evaluate_until_settled(excited, settings.learning_start)
+def test_latch_keeps_the_whole_window_when_time_and_excitation_suffice():
+    excited = settings, state, signals = excited_case(2)
+    before = state.Phi.copy(), state.b.copy()
+    early = excited, settings.learning_start - 1e-9
+    weak = (settings._replace(sigma=1e3), state, signals), settings.learning_start
+    for case, t in (early, weak):
+        evaluate_until_settled(case, t)
+        assert state.latched[0] == 0.0
+        np.testing.assert_array_equal(state.Phi, before[0])
+        np.testing.assert_array_equal(state.b, before[1])
 
+    evaluate_until_settled(excited, settings.learning_start)
     rows = state.ring
     Phi = np.einsum('kia,kib->ab', rows[:, :, :-1], rows[:, :, :-1]) / settings.window
     b = np.einsum('kia,ki->a', rows[:, :, :-1], rows[:, :, -1]) / settings.window
@@ -247,29 +214,9 @@ def test_latch_keeps_the_whole_window_when_time_and_excitation_suffice(excited):
     np.testing.assert_allclose(state.b, b, atol=1e-14)
     np.testing.assert_allclose(np.triu(state.factor), factor.T, atol=1e-13)
 
-
-@pytest.mark.parametrize('early', [True, False])
-def test_latch_stays_open_before_learning_starts_or_without_excitation(excited, early):
-    settings, state, signals = excited
-    if not early:
-        excited = (settings._replace(sigma=1e3), state, signals)
-    before = state.Phi.copy(), state.b.copy()
-
-    evaluate_until_settled(excited, settings.learning_start - (1e-9 if early else 0.0))
-
-    assert state.latched[0] == 0.0
-    np.testing.assert_array_equal(state.Phi, before[0])
-    np.testing.assert_array_equal(state.b, before[1])
-
-
-def test_latched_window_is_kept_after_excitation_ends(excited):
-    settings, state, signals = excited
-    evaluate_until_settled(excited, settings.learning_start)
-    kept = state.Phi.copy()
-
+    kept = state.Phi.copy()  # after excitation ends
     state.running[:] = 0.0
     evaluate_until_settled(excited, settings.learning_start + 1.0)
-
     assert state.lambda_min[0] == 0.0
     assert (state.latched[0], state.latch_time[0]) == (1.0, settings.learning_start)
     np.testing.assert_array_equal(state.Phi, kept)
@@ -306,18 +253,6 @@ def basis(first, second):
     """Orthonormal columns, the first two in the span of these directions."""
     rest = np.random.default_rng(0).normal(size=(len(first), len(first) - 2))
     return np.linalg.qr(np.column_stack((first, second, rest)))[0]
-
-
-def test_each_evaluation_refines_the_direction_by_four_iterations():
-    """tan of the angle to the minimum eigenvector falls by lambda_1 / lambda_2 in each."""
-    eye = np.eye(7)
-    vectors = basis(eye[0] + eye[5], eye[1] - eye[2])
-    case = window_of([1.0, 2.0, *[9.0] * 5], vectors, learning_start=1e9)
-    case.state.min_eigenvector[:] = (vectors[:, 0] + vectors[:, 1]) / np.sqrt(2.0)
-    excitation.update_excitation(*case, 0.0, 1e-3, np.zeros(case.settings.n))
-    tangent = ((1.0 + case.settings.rho) / (2.0 + case.settings.rho)) ** 4
-    expected = 1.0 + tangent**2 / (1.0 + tangent**2)
-    assert case.state.lambda_min[0] == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize('missing', [1e-6, -1e-6])
