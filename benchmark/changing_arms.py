@@ -13,9 +13,8 @@ from pathlib import Path
 
 from blf_dsc_controller.cli.main import main as blf_dsc
 from blf_dsc_controller.studies.monte_carlo import Study
-from blf_dsc_controller.studies.report import exceptions
+from blf_dsc_controller.studies.report import Summary, draw_pairs, exceptions, summarize
 from blf_dsc_controller.studies.runs import Columns, Store
-from blf_dsc_controller.studies.statistics import Summary, draw_pairs, summarize
 
 STUDIES = {
     'monte_carlo_events': 'two links',

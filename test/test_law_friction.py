@@ -14,8 +14,8 @@ from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.law import friction
 from blf_dsc_controller.law.factory import controller_of, estimate_names
 from blf_dsc_controller.studies.monte_carlo import load_study
+from blf_dsc_controller.studies.report import compare
 from blf_dsc_controller.studies.runs import run_chunk
-from blf_dsc_controller.studies.statistics import compare
 
 TONE = 3.7699111843077517  # rad/s, last of the preset ur5e
 BROKEN_BY_FRICTION = (51, 179, 200, 274)

@@ -9,8 +9,7 @@ import subprocess
 import sys
 import time
 import uuid
-from concurrent.futures import BrokenExecutor, Executor
-from contextlib import contextmanager, nullcontext
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,6 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.studies import runs as engines
 from blf_dsc_controller.studies import runs as stores
 from blf_dsc_controller.studies.runs import (
-    RETRIES,
     Span,
     Store,
     chunk_size,
@@ -56,12 +54,6 @@ def joined(parts):
     return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
 
 
-def results_of(a_study, engine, size, warn=pytest.fail):
-    parts = {}
-    compute(a_study, spans(size), engine, parts.__setitem__, warn)
-    return joined(parts)
-
-
 def local_dask():
     pytest.importorskip('distributed', reason='the extra dask is not installed')
     return engines.dask(2)
@@ -70,69 +62,38 @@ def local_dask():
 @pytest.mark.parametrize(
     ('make', 'size'),
     [
-        (lambda: engines.threads(3), 1),
-        (lambda: engines.threads(1), 5),
+        (lambda: ThreadPoolExecutor(3), 1),
         (lambda: engines.processes(1), RUNS),
         (lambda: engines.processes(2), 4),
         (local_dask, 5),
     ],
-    ids=['threads', 'thread', 'process', 'processes', 'dask'],
+    ids=['threads', 'process', 'processes', 'dask'],
 )
-def test_every_engine_gives_the_same_results(a_study, undisturbed, make, size):
-    assert same(results_of(a_study, make(), size), undisturbed)
-
-
-def losing_workers(engine, kills):
-    """Let the engine lose a worker to SIGKILL when the first chunk of each pool is done."""
-    pools, hit = [], []
-
-    @contextmanager
-    def start():
-        with engine.open() as executor:
-            pools.append(executor)
-            yield executor
-
-    def kill():
-        if len(pools) <= kills and pools[-1] not in hit:
-            hit.append(pools[-1])
-            os.kill(next(iter(pools[-1]._processes)), signal.SIGKILL)
-
-    return engine._replace(open=start), kill
-
-
-def test_killed_worker_loses_no_results(a_study, undisturbed):
-    engine, kill = losing_workers(engines.processes(2), kills=1)
-    parts, warnings = {}, []
-
-    def keep(span, columns):
-        assert span not in parts
-        parts[span] = columns
-        kill()
-
-    compute(a_study, spans(1), engine, keep, warnings.append)
+def test_every_executor_gives_the_same_results(a_study, undisturbed, make, size):
+    parts = {}
+    with make() as executor:
+        compute(a_study, spans(size), executor, 3, parts.__setitem__)
     assert same(joined(parts), undisturbed)
-    assert len(warnings) == 1
-    assert 'a worker was lost' in warnings[0]
 
 
-class Broken(Executor):
-    """Workers that cannot even be started."""
+def test_killed_worker_is_named_and_what_was_kept_is_complete(a_study, undisturbed):
+    parts = {}
+    with engines.processes(2) as executor:
 
-    def submit(self, *_args, **_keywords):
-        raise BrokenExecutor('out of memory')
+        def keep(span, columns):
+            parts[span] = columns
+            os.kill(next(iter(executor._processes)), signal.SIGKILL)
 
-
-def test_study_is_given_up_when_workers_are_always_lost(a_study):
-    warnings = []
-    engine = engines.Engine(lambda: nullcontext(Broken()), 2)
-    with pytest.raises(BlfDscError, match=r'out of memory.* 24 chunks are left'):
-        compute(a_study, spans(1), engine, pytest.fail, warnings.append)
-    assert len(warnings) == RETRIES
+        with pytest.raises(BlfDscError, match=r'a worker was lost .* The same command resumes'):
+            compute(a_study, spans(1), executor, 4, keep)
+    assert 1 <= len(parts) < RUNS
+    for span, columns in parts.items():
+        assert columns['rms_error_rad.joint1'] == undisturbed['rms_error_rad.joint1'][span.first]
 
 
 def test_error_in_a_run_is_not_taken_for_a_lost_worker(a_study):
-    with pytest.raises(ZeroDivisionError):
-        compute(a_study, spans(1), engines.threads(2), lambda *_: 1 / 0, pytest.fail)
+    with ThreadPoolExecutor(2) as executor, pytest.raises(ZeroDivisionError):
+        compute(a_study, spans(1), executor, 6, lambda *_: 1 / 0)
 
 
 @pytest.mark.parametrize(('runs', 'workers'), [(1, 8), (10_000, 2), (10**8, 64)])
@@ -218,7 +179,7 @@ def test_killed_study_resumes(tmp_path):
 
 def test_complete_study_is_not_recomputed(tmp_path, capsys):
     path, out = write(tmp_path), tmp_path / 'out'
-    command = ['monte-carlo', '--config', str(path), '--out', str(out), '--engine', 'threads']
+    command = ['monte-carlo', '--config', str(path), '--out', str(out), '--workers', '1']
     assert main(command) == 0
     before = stamps(out)
     assert main(command) == 0

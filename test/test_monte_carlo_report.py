@@ -20,9 +20,15 @@ from blf_dsc_controller.cli.run import make_folder
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.studies.report import plant_of_run, reproduce, write_report
+from blf_dsc_controller.studies.report import (
+    influence,
+    plant_of_run,
+    reproduce,
+    summarize,
+    worst_first,
+    write_report,
+)
 from blf_dsc_controller.studies.runs import Span, Store
-from blf_dsc_controller.studies.statistics import influence, summarize, worst_first
 
 
 @pytest.fixture(scope='module')

@@ -25,8 +25,8 @@ from blf_dsc_controller.studies.monte_carlo import (
     random_numbers,
     write_study,
 )
+from blf_dsc_controller.studies.report import compare
 from blf_dsc_controller.studies.runs import run_chunk
-from blf_dsc_controller.studies.statistics import compare
 
 FRACTIONS = st.floats(0.0, 1.0, exclude_max=True)
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from dataclasses import replace
@@ -16,11 +15,10 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.nodes import load_loop, locate
 from blf_dsc_controller.run import Run, Series
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.studies import paper_claims as claims
+from blf_dsc_controller.studies import paper as claims
 from blf_dsc_controller.studies import tuning as tune
-from blf_dsc_controller.studies.paper import kept_bounds
-from blf_dsc_controller.studies.paper_cases import CASES, SIDE_BY_SIDE, SWEEPS, Results, case_name
-from blf_dsc_controller.studies.paper_claims import FAILS, HOLDS, ONLY_IF, verdict
+from blf_dsc_controller.studies.paper import FAILS, HOLDS, ONLY_IF, verdict
+from blf_dsc_controller.studies.paper_cases import CASES, SIDE_BY_SIDE, case_name
 
 BOUND = np.array([0.002, 0.004])
 TRUE = np.array([3.0, 4.0])
@@ -112,71 +110,48 @@ def report(tmp_path_factory):
     return out
 
 
-def rows(path):
-    with path.open(encoding='utf-8', newline='') as file:
-        return list(csv.DictReader(file))
+@pytest.fixture(scope='module')
+def found(report):
+    return json.loads((report / 'results.json').read_text(encoding='utf-8'))
 
 
-def test_report_is_one_self_contained_page(report):
+def test_report_is_one_self_contained_page(report, found):
     page = (report / 'index.html').read_text(encoding='utf-8')
     pictures = sorted(report.glob('*.png'))
     assert len(pictures) == 8
     assert page.count('src="data:image/png;base64,') == len(pictures)
     assert not re.search(r'(?:src|href)="(?!data:)', page)
-    for claim in rows(report / 'claims.csv'):
+    for claim in found['claims']:
         assert claim['says'].split("'")[0] in page
 
 
-def test_tables_list_every_run(report):
-    assert len(rows(report / 'side_by_side.csv')) == len(SIDE_BY_SIDE)
-    sweeps = rows(report / 'robustness.csv')
-    assert len(sweeps) == sum(len(sweep.values) * len(sweep.laws) for sweep in SWEEPS)
-    assert {row['bound'] for row in sweeps} == {'kept', 'left'}
-
-
-def test_kept_bounds_are_listed_by_condition_and_law():
-    bounds = (np.full((1001, 2), k) for k in (0.004, 0.001))
-    held, left = (measure(fake_run(bound=bound)) for bound in bounds)
-    metrics = {
-        case.name: left if case.name.endswith((' 10', ' 0')) else held
-        for sweep in SWEEPS
-        for case in sweep.cases()
-    }
-    header, *table = kept_bounds(Results(metrics, {}))
-    rows = {row[0]: row[1:] for row in table}
-    assert len(header) == 5
-    assert rows['delay of the torque [samples]'] == ['1, 2, 3, 4, 5, 6, 8'] * 4
-    assert rows['encoder [bits a turn]'] == ['all'] * 4
-    assert rows['excitation window [s]'][2:] == ['-', '-']
-
-
-def test_verdicts_follow_from_the_runs_of_the_report(report):
+def test_verdicts_follow_from_the_runs_of_the_report(found):
     """Those verdicts about which the mathematics leaves no doubt."""
-    verdicts = {row['says']: row['verdict'] for row in rows(report / 'claims.csv')}
+    verdicts = {row['says']: row['verdict'] for row in found['claims']}
     assert len(verdicts) >= 11
     assert verdicts['The reference does not fully excite the system.'] == FAILS
     assert verdicts['With everything known V decreases for all time.'] == ONLY_IF
     assert verdicts['It is superior in tracking and in estimation.'] == ONLY_IF
     assert verdicts['The proposed controller always stays within the boundaries.'] == HOLDS
-    for row in rows(report / 'claims.csv'):
+    for row in found['claims']:
         assert row['command'].startswith('blf_dsc ')
         assert bool(row['condition']) or row['verdict'] != ONLY_IF
 
 
-def test_saved_configurations_are_those_that_ran(report):
+def test_saved_configurations_are_those_that_ran(report, found):
     """Running one case of a sweep again from its file reproduces the number in the report."""
     name = case_name('delay', 'comparison', 1.0)
     loop = load_loop(report / 'configurations' / f'{name.replace(" ", "_")}.yaml')
     again = measure(simulate(loop.controller, loop.plant, supervised=False).run())
-    metrics = json.loads((report / 'metrics.json').read_text(encoding='utf-8'))
+    metrics = found['metrics']
     assert metrics[name]['max_error_ratio'] == again.max_error_ratio
     assert loop.plant.actuator.delay == 1
     assert len(list((report / 'configurations').iterdir())) == len(metrics) == len(CASES)
 
 
-def test_papers_barrier_is_too_weak_to_hold_the_bound_against_a_push(report):
+def test_papers_barrier_is_too_weak_to_hold_the_bound_against_a_push(found):
     """w = 1 N m/rad is a spring with 2 mN m at 2 mrad, and the push is 8 N m."""
-    metrics = json.loads((report / 'metrics.json').read_text(encoding='utf-8'))
+    metrics = found['metrics']
     assert metrics['paper_pushed']['max_error_ratio'] > 1.0
     assert metrics['recommended_pushed']['max_error_ratio'] < 0.5
 

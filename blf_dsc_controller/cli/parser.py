@@ -352,7 +352,7 @@ def _monte_carlo_options(parser: argparse.ArgumentParser) -> None:
     option('--seed', type=int, help='seed of the study (as configured)')
     option(
         '--engine',
-        choices=('processes', 'threads', 'dask'),
+        choices=('processes', 'dask'),
         default='processes',
         help='engine that computes the runs (processes)',
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import sys
 from argparse import Namespace
+from concurrent.futures import Executor
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from blf_dsc_controller.compiled.jit import announced_compilation
 from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.studies import runs
-from blf_dsc_controller.studies.arms import chosen_laws
+from blf_dsc_controller.studies.arms import COLUMNS, chosen_laws, label_of
 from blf_dsc_controller.studies.arms import compare as compare_arms
 from blf_dsc_controller.studies.monte_carlo import load_study
 from blf_dsc_controller.studies.paper import compare
@@ -29,6 +30,7 @@ from blf_dsc_controller.studies.report import (
 from blf_dsc_controller.studies.runs import KEPT, Columns, Span, Store, require_pyarrow, warm_up
 
 _PAUSE_IN_A_LOG = 10.0  # s between two updates of the bar
+_AHEAD = 3  # chunks submitted for each worker
 
 
 def paper(options: Namespace) -> None:
@@ -39,15 +41,18 @@ def paper(options: Namespace) -> None:
 
 
 def arms(options: Namespace) -> None:
-    """Tune and run every law on URDF arms, write the page and print the best law of each figure."""
+    """Tune and run every law on URDF arms, write the page and print the worst of each figure."""
     chosen_laws(options.laws)  # before there is a folder
     folder = make_folder(options.out)
     with announced_compilation(print_notice):
-        rows = compare_arms(
+        found = compare_arms(
             folder, options.config, options.laws, options.truths, options.generations
         )
-    for arm, figure, best, least, *ours in rows:
-        print(f'{arm:<6} {figure:<36} {best}: {least} (proposed {ours[0]}, tuned {ours[1]})')
+    for arm, results in found.items():
+        print(f'{arm}: worst of {options.truths} runs: {", ".join(COLUMNS)}, in mrad and %')
+        for name, result in results.items():
+            worst = ' '.join(f'{value:8.3g}' for value in result.columns().max(axis=1))
+            print(f'{label_of(name):<45}{worst}')
     print(f'wrote {options.out / "index.html"}')
 
 
@@ -66,23 +71,21 @@ def _run_study(options: Namespace) -> None:
     overrides = {name: value for name, value in given.items() if value is not None}
     study = load_study(locate(options.config), overrides)
     require_pyarrow()
-    workers = options.workers or runs.cores()
-    if options.engine == 'dask':
-        engine = runs.dask(workers, options.address)
-    else:
-        engine = getattr(runs, options.engine)(workers)
     store = Store.create_or_open(options.out or Path('monte_carlo'), study)
     with store.locked():
-        size = options.chunk or runs.chunk_size(study.settings.runs, engine.workers)
-        spans = store.missing(size)
+        workers = options.workers or runs.cores()
+        spans = store.missing(options.chunk or runs.chunk_size(study.settings.runs, workers))
         if spans:
             with announced_compilation(print_notice):
                 warm_up(study)
-            _compute(store, spans, engine)
+            is_dask = options.engine == 'dask'
+            engine = runs.dask(workers, options.address) if is_dask else runs.processes(workers)
+            with engine as executor:
+                _compute(store, spans, executor, _AHEAD * workers)
         _report(store)
 
 
-def _compute(store: Store, spans: list[Span], engine: runs.Engine) -> None:
+def _compute(store: Store, spans: list[Span], executor: Executor, most: int) -> None:
     total = store.study.settings.runs
     done = total - sum(span.runs for span in spans)
     if done:
@@ -98,7 +101,7 @@ def _compute(store: Store, spans: list[Span], engine: runs.Engine) -> None:
             bar.set_postfix_str(f'{lost} did not keep the bound', refresh=False)
             bar.update(span.runs)
 
-        runs.compute(store.study, spans, engine, keep, bar.write)
+        runs.compute(store.study, spans, executor, most, keep)
 
 
 def _report(store: Store) -> None:

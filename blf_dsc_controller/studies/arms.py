@@ -35,8 +35,7 @@ ROUGHEST = 0.05
 """rms change of a torque per sample, relative to its limit, beyond which it is penalised."""
 
 _UNSEEN = 1000  # seed of a motion that is never run
-_COLUMNS = (*INTERVALS, 'torque error before the pick-up', 'at the end')
-_OURS = ('proposed', 'proposed_tuned')
+COLUMNS = (*INTERVALS, 'torque error before the pick-up', 'at the end')
 
 
 class Result(NamedTuple):
@@ -47,9 +46,9 @@ class Result(NamedTuple):
     runs: list[Figures]
 
     def columns(self) -> Floats:
-        """Return the values of all runs for each of _COLUMNS, in mrad or %; NaN without a model."""
+        """Return the values of all runs for each of COLUMNS, in mrad or %; NaN without a model."""
         rows = [(*figures.errors, *(figures.model or (np.nan, np.nan))) for figures in self.runs]
-        units = np.where(np.arange(len(_COLUMNS)) < len(INTERVALS), 1e3, 1e2)
+        units = np.where(np.arange(len(COLUMNS)) < len(INTERVALS), 1e3, 1e2)
         return np.asarray((np.array(rows) * units).T)
 
 
@@ -125,8 +124,8 @@ def chosen_laws(given: Sequence[str]) -> list[str]:
 
 def compare(
     folder: Path, arms: Sequence[str], laws: Sequence[str], truths: int, generations: int
-) -> list[list[str]]:
-    """Tune and run everything, write the page into an empty folder; return `least_errors`.
+) -> Results:
+    """Tune and run everything, and write the page into an empty folder.
 
     `laws` are as in `chosen_laws`.
     """
@@ -173,25 +172,12 @@ def compare(
                 bar.update(truths)
                 results[arm][name] = Result(gains, cost, figures)
     _write(folder, results, truths, generations)
-    return least_errors(results)
+    return results
 
 
 def _load_all(files: Sequence[Path]) -> None:
     for file in files:
         load_laws(file)
-
-
-def least_errors(results: Results) -> list[list[str]]:
-    """Return rows of arm, column, law with the best worst run, its value, and those of _OURS."""
-    rows = []
-    for arm, laws in results.items():
-        worst = {name: result.columns().max(axis=1) for name, result in laws.items()}
-        best = np.nanargmin(list(worst.values()), axis=0)
-        for k, title in enumerate(_titles()):
-            name = list(worst)[best[k]]
-            shown = [f'{worst[law][k]:.3g}' if law in worst else '-' for law in (name, *_OURS)]
-            rows.append([arm, title, label_of(name), *shown])
-    return rows
 
 
 def label_of(name: str) -> str:
@@ -220,7 +206,7 @@ def table_of(laws: dict[str, Result]) -> list[list[str | Cell]]:
 
 
 def _titles() -> list[str]:
-    return [f'{name} [{"mrad" if name in INTERVALS else "%"}]' for name in _COLUMNS]
+    return [f'{name} [{"mrad" if name in INTERVALS else "%"}]' for name in COLUMNS]
 
 
 def _write(folder: Path, results: Results, truths: int, generations: int) -> None:
@@ -237,7 +223,6 @@ def _write(folder: Path, results: Results, truths: int, generations: int) -> Non
         'arms.html',
         'Arms from a URDF, laws side by side',
         tables={arm: table_of(laws) for arm, laws in results.items()},
-        least=least_errors(results),
         truths=truths,
         evaluations=POPULATION * (generations + 1),
         roughest=100.0 * ROUGHEST,

@@ -26,7 +26,7 @@ import itertools
 import math
 import operator
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
@@ -64,30 +64,23 @@ WITHOUT = 'without.'
 
 _NODE = 'monte_carlo'
 _VARY = 'vary.'
-_ONE_STUDY = 'a study has one configuration from its first run to its last'
 
 
 @dataclass(frozen=True)
 class MonteCarloConfig:
     """Section `monte_carlo` of a study file: number of runs, and what is measured in each."""
 
-    runs: int = parameter(
-        1000, 'closed loops to run', at_least=1, at_most=100_000_000, read_only=_ONE_STUDY
-    )
-    seed: int = parameter(
-        0, 'run i is determined by this seed and i alone', at_least=0, read_only=_ONE_STUDY
-    )
+    runs: int = parameter(1000, 'closed loops to run', at_least=1, at_most=100_000_000)
+    seed: int = parameter(0, 'run i is determined by this seed and i alone', at_least=0)
     pairs: bool = parameter(
         default=False,
         description='run each plant with learning and without it (learning.weight: 0)',
-        read_only=_ONE_STUDY,
     )
     settled_after: float = parameter(
         0.0,
         'time from which the rms and the largest settled error are computed, and pairs compared',
         unit='s',
         at_least=0.0,
-        read_only=_ONE_STUDY,
     )
     moments: tuple[float, ...] = parameter(
         (),
@@ -95,7 +88,6 @@ class MonteCarloConfig:
         unit='s',
         at_least=0.0,
         may_be_empty=True,
-        read_only=_ONE_STUDY,
     )
 
     def duration_problems(self, duration: float) -> list[str]:
@@ -281,25 +273,34 @@ def plant_with(study: Study, numbers: RandomNumbers, origin: Origin) -> PlantCon
 
 Value = float | int | str
 
-DISTRIBUTIONS = {
-    Kind.DOUBLE: (
-        'uniform(low, high)',
-        'loguniform(low, high)',
-        'normal(mean, deviation)',
-        'maybe(probability, low, high)',
-        'choice(a, b, ...)',
-    ),
-    Kind.INTEGER: ('integers(low, high)', 'choice(a, b, ...)'),
-    Kind.STRING: ('choice(a, b, ...)',),
-}
-"""Distributions for each kind of parameter."""
-
 TAIL = 4.0
 """Standard deviations from the mean at which a normal distribution is cut off."""
 
-_CALL = re.compile(r'\s*(\w+)\s*\((.*)\)\s*')
-_NAMES = {Kind.DOUBLE: 'a number', Kind.INTEGER: 'an integer', Kind.STRING: 'a word'}
 _NORMAL = NormalDist()
+_CUT = _NORMAL.cdf(-TAIL)
+_INVERSES: dict[str, Callable[..., Value]] = {
+    'uniform(low, high)': lambda u, low, high: low + u * (high - low),
+    'loguniform(low, high)': lambda u, low, high: min(
+        high, low * math.exp(u * math.log(high / low))
+    ),
+    'normal(mean, deviation)': lambda u, mean, deviation: (
+        mean + deviation * _NORMAL.inv_cdf(_CUT + u * (1.0 - 2.0 * _CUT))
+    ),
+    'maybe(probability, low, high)': lambda u, probability, low, high: (
+        low + u / probability * (high - low) if u < probability else 0.0
+    ),
+    'integers(low, high)': lambda u, low, high: low + min(int(u * (high - low + 1)), high - low),
+    'choice(a, b, ...)': lambda u, *values: values[int(u * len(values))],
+}
+_UNIFORM, _LOGUNIFORM, _NORMALLY, _MAYBE, _INTEGERS, _CHOICE = _INVERSES
+_EXPECTED = {
+    Kind.DOUBLE: ('a number', (_UNIFORM, _LOGUNIFORM, _NORMALLY, _MAYBE, _CHOICE)),
+    Kind.INTEGER: ('an integer', (_INTEGERS, _CHOICE)),
+    Kind.STRING: ('a word', (_CHOICE,)),
+}
+"""What arguments are, and the distributions, for each kind of parameter."""
+
+_CALL = re.compile(r'\s*(\w+)\s*\((.*)\)\s*')
 _GROUPS = (
     'arm.',
     'truth.',
@@ -317,32 +318,24 @@ _REALTIME = ('actuator.command_timeout', 'actuator.without_command')
 class Distribution:
     """A distribution of values of one kind."""
 
-    name: str
+    written: str  # a key of _INVERSES
     arguments: tuple[Value, ...]
+
+    @property
+    def name(self) -> str:
+        """Name before the parenthesis."""
+        return self.written.partition('(')[0]
 
     def at(self, u: float) -> Value:
         """Return the value below which the fraction `u`, in [0, 1), of all draws lies."""
-        if self.name == 'choice':
-            return self.arguments[int(u * len(self.arguments))]
-        if self.name == 'maybe':
-            probability, low, high = cast('tuple[float, float, float]', self.arguments)
-            return low + u / probability * (high - low) if u < probability else 0.0
-        low, high = cast('tuple[float, float]', self.arguments)
-        if self.name == 'uniform':
-            return low + u * (high - low)
-        if self.name == 'loguniform':
-            return min(high, low * math.exp(u * math.log(high / low)))
-        if self.name == 'integers':
-            return low + min(int(u * (high - low + 1)), high - low)
-        tail = _NORMAL.cdf(-TAIL)
-        return low + high * _NORMAL.inv_cdf(tail + u * (1.0 - 2.0 * tail))
+        return _INVERSES[self.written](u, *self.arguments)
 
     @property
     def extremes(self) -> tuple[Value, ...]:
         """Lowest and highest value, or all values of a choice."""
-        if self.name == 'maybe':
+        if self.written == _MAYBE:
             return (0.0, *self.arguments[1:])
-        if self.name != 'normal':
+        if self.written != _NORMALLY:
             return self.arguments
         mean, deviation = cast('tuple[float, float]', self.arguments)
         return (mean - TAIL * deviation, mean + TAIL * deviation)
@@ -354,29 +347,35 @@ class Distribution:
 def parse(text: object, kind: Kind) -> Distribution:
     """Parse a distribution of a scalar kind; raises ValueError naming what is expected."""
     call = _CALL.fullmatch(text) if isinstance(text, str) else None
-    forms = DISTRIBUTIONS[kind]
-    if call is None or call[1] not in (form.partition('(')[0] for form in forms):
-        raise ValueError(f'got {text!r}, but one of these is expected: {", ".join(forms)}')
-    name = call[1]
+    argument, known = _EXPECTED[kind]
+    written = next((each for each in known if call and each.startswith(f'{call[1]}(')), None)
+    if call is None or written is None:
+        raise ValueError(f'got {text!r}, but one of these is expected: {", ".join(known)}')
     try:
         arguments = tuple(_argument(word.strip(), kind) for word in call[2].split(','))
     except ValueError:
-        raise ValueError(f'got {text!r}, but {_NAMES[kind]} is expected between commas') from None
-    if name == 'choice':
-        return Distribution(name, arguments)
-    form = next(form for form in forms if form.startswith(f'{name}('))
-    if len(arguments) != form.count(',') + 1:
-        raise ValueError(f'got {text!r} with {len(arguments)} values, but {form} is expected')
-    first, second = cast('tuple[float, float]', arguments[-2:])
-    if name == 'maybe' and not 0.0 <= cast('float', arguments[0]) <= 1.0:
-        raise ValueError(f'got {text!r}, but a probability is from 0 to 1')
-    if name == 'normal' and second < 0.0:
-        raise ValueError(f'got {text!r}, but a deviation cannot be below 0')
-    if name != 'normal' and first > second:
-        raise ValueError(f'got {text!r}, but the first value must not be above the second')
-    if name == 'loguniform' and first <= 0.0:
-        raise ValueError(f'got {text!r}, but a loguniform distribution begins above 0')
-    return Distribution(name, arguments)
+        raise ValueError(f'got {text!r}, but {argument} is expected between commas') from None
+    if written != _CHOICE:
+        if len(arguments) != written.count(',') + 1:
+            raise ValueError(
+                f'got {text!r} with {len(arguments)} values, but {written} is expected'
+            )
+        if problem := _problem(written, cast('tuple[float, ...]', arguments)):
+            raise ValueError(f'got {text!r}, but {problem}')
+    return Distribution(written, arguments)
+
+
+def _problem(written: str, arguments: tuple[float, ...]) -> str:
+    first, second = arguments[-2:]
+    if written == _MAYBE and not 0.0 <= arguments[0] <= 1.0:
+        return 'a probability is from 0 to 1'
+    if written == _NORMALLY:
+        return 'a deviation cannot be below 0' if second < 0.0 else ''
+    if first > second:
+        return 'the first value must not be above the second'
+    if written == _LOGUNIFORM and first <= 0.0:
+        return 'a loguniform distribution begins above 0'
+    return ''
 
 
 def _argument(word: str, kind: Kind) -> Value:
@@ -428,7 +427,7 @@ def variable_parameters() -> Mapping[str, Parameter]:
     return {
         param.name: param
         for param in found
-        if param.name not in _REALTIME and param.kind.element in DISTRIBUTIONS
+        if param.name not in _REALTIME and param.kind.element in _EXPECTED
     }
 
 
@@ -436,20 +435,11 @@ def entries(param: Parameter, plant: PlantConfig) -> tuple[str, ...]:
     """Return the names of the entries of a list parameter, by joint or number; else ()."""
     if not param.kind.is_array:
         return ()
-    if not param.length:
-        return _numbers(len(operator.attrgetter(param.name)(plant)))
-    each: list[Sequence[str]] = []
-    for name in param.length:
-        if name == 'joints':
-            each.append(plant.joints)
-        else:
-            count = int(name) if name.isdigit() else len(operator.attrgetter(name)(plant))
-            each.append(_numbers(count))
+    each = []
+    for name in param.length or (param.name,):
+        count = int(name) if name.isdigit() else len(operator.attrgetter(name)(plant))
+        each.append(plant.joints if name == 'joints' else tuple(map(str, range(1, count + 1))))
     return tuple('.'.join(names) for names in itertools.product(*each))
-
-
-def _numbers(count: int) -> tuple[str, ...]:
-    return tuple(f'{number}' for number in range(1, count + 1))
 
 
 def read_variations(

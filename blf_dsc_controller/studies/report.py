@@ -1,13 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Report of a study in its folder, and reproduction of one run with every sample recorded."""
+"""Report of a study in its folder: statistics of all runs, pictures, a page; and one run again."""
 
 from __future__ import annotations
 
+import math
 import shlex
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from scipy.stats import binomtest, rankdata
 
 from blf_dsc_controller.analysis.figures import draw as draw_run
 from blf_dsc_controller.analysis.page import Cell, write_page
+from blf_dsc_controller.analysis.style import (
+    ALARM,
+    BLUE,
+    COLOURS,
+    INK,
+    MUTED,
+    ORANGE,
+    Picture,
+    head,
+)
 from blf_dsc_controller.analysis.summary import summarize as summarize_run
 from blf_dsc_controller.analysis.summary import write_summary
 from blf_dsc_controller.bags.reader import read_run
@@ -15,19 +32,334 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, dump
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.studies.monte_carlo import Study, origin_of, plant_with, random_numbers
+from blf_dsc_controller.studies.monte_carlo import (
+    WITHOUT,
+    Study,
+    origin_of,
+    plant_with,
+    random_numbers,
+)
 from blf_dsc_controller.studies.runs import (
+    DIVERGED,
+    KEPT,
     OUTCOMES,
+    Columns,
     Store,
     differences,
+    error_columns,
     figures_of,
     rows_of_another_motion,
 )
-from blf_dsc_controller.studies.statistics import ALLOWED, Summary, draw_study, summarize
 
-_QUANTILES = ('min', 'median', 'p95', 'p99', 'max')
+Summary = dict[str, Any]
+
+_CONFIDENCE = 0.95
+_WORST = 10
+_GROUPS = 10
+_QUANTILES = {'min': 0.0, 'p5': 0.05, 'median': 0.5, 'p95': 0.95, 'p99': 0.99, 'max': 1.0}
+_FACTORS = {'median': 0.5, 'p99': 0.99, 'p99.9': 0.999, 'max': 1.0}
+_DRAWN = 'plant.'
+
+ALLOWED = 1.3
+"""Largest error with learning that is called no larger than that without, as a factor."""
+
+LAWS = {'': 'with', WITHOUT: 'without'}
+"""The laws of a study of pairs: what they are called, by the prefix of their columns."""
+
+_PANELS_OF_INFLUENCE = 6
+_MOST_DOTS = 20_000
+_SHOWN = (0.03, 2.0)  # |xi1| / k_c; what is beyond is drawn at these
+_RATIO = r'max $|\xi_1| \; / \; k_c$'
+_PERCENT = FuncFormatter(lambda value, _: f'{100 * value:g} %')
+
+
+def summarize(study: Study, results: Columns) -> Summary:
+    """Return a summary of the results as plain data for JSON; unknown values are None.
+
+    The Wilson interval, unlike p +- z sqrt(p (1 - p) / n), does not shrink to a point if all runs
+    kept the bound, and never leaves [0, 1].
+    """
+    outcomes = results['outcome']
+    runs = outcomes.size
+    kept = int((outcomes == KEPT).sum())
+    interval = binomtest(kept, runs).proportion_ci(_CONFIDENCE, method='wilson')
+    others = ('run', 'seed', 'outcome', f'{WITHOUT}outcome')
+    figures = [name for name in results if name not in others and not name.startswith(_DRAWN)]
+    return {
+        'runs': runs,
+        'planned': study.settings.runs,
+        'seed': study.settings.seed,
+        'duration_s': study.plant.duration,
+        'outcomes': {outcome: int((outcomes == outcome).sum()) for outcome in OUTCOMES},
+        'kept': {
+            'fraction': kept / runs,
+            'low': float(interval.low),
+            'high': float(interval.high),
+            'confidence': _CONFIDENCE,
+            'interval': 'Wilson',
+        },
+        'pairs': compare(study, results) if study.settings.pairs else None,
+        'figures': {name: _quantiles(results[name]) for name in figures},
+        'influence': influence(study, results),
+        'worst': [_one_run(study, results, row) for row in worst_first(study, results)[:_WORST]],
+    }
+
+
+def compare(study: Study, results: Columns) -> Summary:
+    """Compare the runs of a study of pairs, with learning and without it.
+
+    `factor` is the largest settled error with learning over that without; None: infinite. It and
+    the medians are of the runs that keep the bound without.
+    """
+    kept, without = (results[f'{law}outcome'] == KEPT for law in LAWS)
+    factors = error_factor(study, results)[without]
+    above = np.flatnonzero(~(factors <= ALLOWED))
+    quantiles = np.quantile(factors, list(_FACTORS.values()), method='higher')
+    return {
+        'kept': {'with': int(kept.sum()), 'without': int(without.sum())},
+        'broken_only_with': results['run'][without & ~kept].tolist(),
+        'broken_only_without': results['run'][kept & ~without].tolist(),
+        'factor': {
+            name: factor if math.isfinite(factor) else None
+            for name, factor in zip(_FACTORS, quantiles.tolist(), strict=True)
+        },
+        'allowed': ALLOWED,
+        'above': results['run'][without][above[np.argsort(-factors[above])]].tolist(),
+        'median': {
+            'rms_error_rad': {
+                label: _median(worst_of(study, results, 'rms_error_rad', law)[without])
+                for law, label in LAWS.items()
+            },
+            'torque_error': {
+                label: _median(results[f'{law}torque_error.end'][without])
+                for law, label in LAWS.items()
+            },
+        },
+    }
+
+
+def error_factor(study: Study, results: Columns) -> Floats:
+    """Return the largest settled error of each run with learning over that without."""
+    name = 'settled_error_ratio'
+    return worst_of(study, results, name) / worst_of(study, results, name, WITHOUT)
+
+
+def worst_of(study: Study, results: Columns, name: str, law: str = '') -> Floats:
+    """Return a figure of the worst joint in each run; infinite if the run diverged."""
+    each = [results[f'{law}{name}.{joint}'] for joint in study.plant.joints]
+    return np.where(results[f'{law}outcome'] == DIVERGED, np.inf, np.max(each, axis=0))
+
+
+def worst_first(study: Study, results: Columns) -> np.ndarray:
+    """Return the rows of the results, largest |xi1| / k_c first; ties in the order of the runs."""
+    return np.argsort(-worst_of(study, results, 'max_error_ratio'), kind='stable')
+
+
+def influence(study: Study, results: Columns) -> dict[str, float]:
+    """Return the fraction of the variance of the largest |xi1| / k_c due to each drawn number.
+
+    This is the correlation ratio of the ranks over groups of equal size, corrected for chance:
+    unlike a correlation, it also shows if both ends of a range are bad. Strongest first; numbers
+    that are the same in all runs are left out.
+    """
+    ranks = rankdata(worst_of(study, results, 'max_error_ratio'))
+    found = {
+        variation.column.removeprefix(_DRAWN): _explained(results[variation.column], ranks)
+        for variation in study.variations
+        if np.unique(results[variation.column]).size > 1
+    }
+    return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+def _explained(values: np.ndarray, ranks: Floats) -> float:
+    groups = np.unique(values, return_inverse=True)[1]
+    if groups.max() >= _GROUPS:
+        groups = np.minimum(_GROUPS * rankdata(values) / (values.size + 1), _GROUPS - 1).astype(int)
+    counts = np.bincount(groups)
+    within = ranks.var() * ranks.size
+    within -= float((np.bincount(groups, ranks) ** 2 / np.maximum(counts, 1)).sum())
+    within += ranks.size * ranks.mean() ** 2
+    freedom = ranks.size - np.count_nonzero(counts)
+    if freedom <= 0 or ranks.var() == 0.0:
+        return 0.0
+    return max(0.0, float(1.0 - (within / freedom) / ranks.var(ddof=1)))
+
+
+def _median(values: np.ndarray) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else None
+
+
+def _quantiles(values: np.ndarray) -> Summary | None:
+    known = values[np.isfinite(values)]
+    if known.size == 0:
+        return None
+    quantiles = {name: float(np.quantile(known, q)) for name, q in _QUANTILES.items()}
+    return {**quantiles, 'known': int(known.size)}
+
+
+def _one_run(study: Study, results: Columns, row: int) -> Summary:
+    run = {name: np.asarray(values[row]).item() for name, values in results.items()}
+    known = {name: None if value != value else value for name, value in run.items()}  # noqa: PLR0124
+    return {
+        'run': run['run'],
+        'outcome': run['outcome'],
+        'max_error_ratio': {
+            joint: known[f'max_error_ratio.{joint}'] for joint in study.plant.joints
+        },
+        'first_violation_s': known['first_violation_s'],
+    }
+
+
+def draw_study(study: Study, results: Columns, folder: Path) -> list[Path]:
+    """Draw distributions.png, pairs.png of pairs, influence.png if anything varies."""
+    paths = [folder / 'distributions.png']
+    _draw_distributions(study, results, paths[0])
+    if study.settings.pairs:
+        paths.append(folder / 'pairs.png')
+        draw_pairs({'': (study, results)}, paths[-1])
+    strongest = influence(study, results)
+    if strongest:
+        paths.append(folder / 'influence.png')
+        _draw_influence(study, results, strongest, paths[-1])
+    return paths
+
+
+def _draw_distributions(study: Study, results: Columns, path: Path) -> None:
+    runs, kept = results['outcome'].size, int((results['outcome'] == KEPT).sum())
+    title = f'{runs} runs: {100 * kept / runs:.4g} % kept the bound'
+    picture = Picture(1, 3, title, (5.2, 3.6), share_time=False)
+    ratio, rms, error = picture.axes[0]
+    joints = study.plant.joints
+    _histogram(
+        ratio,
+        {joint: np.minimum(results[f'max_error_ratio.{joint}'], _SHOWN[1]) for joint in joints},
+    )
+    ratio.axvline(1.0, color=ALARM, lw=1.4, label='bound')
+    ratio.set_xlabel(_RATIO)
+    head(ratio, 'largest error')
+    _histogram(rms, {joint: 1e3 * results[f'rms_error_rad.{joint}'] for joint in joints})
+    rms.set_xlabel(r'rms $\xi_1$ [mrad]')
+    head(rms, f'error from {study.settings.settled_after:g} s on')
+    labels = [*(f'{moment:g} s' for moment in study.settings.moments), 'end']
+    columns = zip(labels, error_columns(study), strict=True)
+    _histogram(error, {label: 1e2 * results[name] for label, name in columns})
+    error.set_xlabel(r'$\|\hat P - P\| \;/\; \|P\|$ [%]')
+    head(error, 'relative parameter error')
+    picture.save(path)
+
+
+def draw_pairs(studies: dict[str, tuple[Study, Columns]], path: Path) -> None:
+    """Compare studies of pairs, by their titles: errors and learned models, with and without."""
+    picture = Picture(
+        1, 3, 'The same random runs with learning and without it', (5.2, 4.2), share_time=False
+    )
+    largest, rms, model = picture.axes[0]
+    for (title, (study, results)), colour in zip(studies.items(), COLOURS, strict=False):
+        x, y = (worst_of(study, results, 'settled_error_ratio', law) for law in (WITHOUT, ''))
+        lost = (results['outcome'] != KEPT) & (results[f'{WITHOUT}outcome'] == KEPT)
+        x, y = (np.clip(values, *_SHOWN) for values in (x, y))
+        chosen = np.flatnonzero(~lost)[:_MOST_DOTS]
+        largest.plot(x[chosen], y[chosen], '.', ms=3, color=colour, alpha=0.6, mew=0, label=title)
+        largest.plot(x[lost], y[lost], 'o', ms=5, color=ALARM, mew=0)
+    ends = np.array(_SHOWN)
+    largest.loglog(ends, ends, color=MUTED, lw=1.0, label='equal')
+    largest.loglog(ends, ALLOWED * ends, color=MUTED, lw=1.0, ls=':', label=f'{ALLOWED:g} times')
+    _logarithmic(largest)
+    largest.axhline(1.0, color=INK, ls='--', lw=1.0, label='bound')
+    largest.axvline(1.0, color=INK, ls='--', lw=1.0)
+    largest.set_xlabel(f'{_RATIO} without learning')
+    largest.set_ylabel('with learning')
+    head(largest, 'largest error of each run')
+    figures = {
+        'rms_error_rad': (rms, 1e3, r'rms $\xi_1$ of the worst joint [mrad]', 'rms error'),
+        'torque_error.end': (model, 1e2, 'of the torque [%]', 'model error on the next motion'),
+    }
+    for name, (axes, unit, label, title) in figures.items():
+        _boxes(axes, name, unit, studies)
+        axes.set_xlabel(label)
+        head(axes, title)
+    picture.save(path)
+
+
+def _boxes(axes: Axes, name: str, unit: float, studies: dict[str, tuple[Study, Columns]]) -> None:
+    """Draw the quartiles, and the 1 % and 99 % quantiles, of a figure with and without learning.
+
+    Of the runs that keep the bound without.
+    """
+    labels: list[str] = []
+    for title, (study, results) in studies.items():
+        for (law, label), colour in zip(LAWS.items(), (BLUE, ORANGE), strict=True):
+            column = f'{law}{name}'
+            values = results[column] if column in results else worst_of(study, results, name, law)
+            kept = results[f'{WITHOUT}outcome'] == KEPT
+            known = unit * values[kept & np.isfinite(values)]
+            y = 2 * [-len(labels)]
+            if known.size:
+                least, *quartiles, most = np.quantile(known, (0.01, 0.25, 0.5, 0.75, 0.99))
+                axes.plot([least, most], y, color=colour, lw=1.2)
+                axes.plot([quartiles[0], quartiles[2]], y, color=colour, lw=7, alpha=0.6)
+                axes.plot(quartiles[1:2], y[:1], 'o', color=INK, ms=4)
+            labels.append(f'{title}, {label}'.removeprefix(', '))
+    axes.set_yticks(-np.arange(len(labels)), labels)
+    _logarithmic(axes)
+
+
+def _logarithmic(axes: Axes) -> None:
+    """Make an axis logarithmic, with plain numbers at 1, 2 and 5 of each decade."""
+    axes.set_xscale('log')
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _histogram(axes: Axes, columns: dict[str, Floats]) -> None:
+    """Draw several distributions over common bins, logarithmic if all values are positive."""
+    known = {label: values[np.isfinite(values)] for label, values in columns.items()}
+    everything = np.concatenate(list(known.values()))
+    if everything.size == 0:
+        return
+    low, high = float(everything.min()), float(everything.max())
+    spaced = np.geomspace if low > 0.0 else np.linspace
+    edges = spaced(low, max(1.01 * high, low + 1e-9), 11 + min(50, everything.size // 40))
+    if low > 0.0:
+        _logarithmic(axes)
+    for (label, values), colour in zip(known.items(), COLOURS, strict=False):
+        shares = np.histogram(values, edges)[0] / max(1, values.size)
+        axes.stairs(shares, edges, fill=True, color=colour, alpha=0.22)
+        axes.stairs(shares, edges, color=colour, lw=1.4, label=label)
+    axes.yaxis.set_major_formatter(_PERCENT)
+    axes.set_ylabel('fraction of runs')
+
+
+def _draw_influence(
+    study: Study, results: Columns, influences: dict[str, float], path: Path
+) -> None:
+    strongest = list(influences.items())[:_PANELS_OF_INFLUENCE]
+    columns = min(3, len(strongest))
+    rows = -(-len(strongest) // columns)
+    title = 'What the largest error depends on most'
+    picture = Picture(rows, columns, title, (4.4, 3.2), share_time=False)
+    ratios = np.minimum(worst_of(study, results, 'max_error_ratio'), _SHOWN[1])
+    is_kept = results['outcome'] == KEPT
+    kept, lost = np.flatnonzero(is_kept)[:_MOST_DOTS], np.flatnonzero(~is_kept)
+    logarithmic = [v.column for v in study.variations if v.distribution.name == 'loguniform']
+    for axes, (name, fraction) in zip(picture.axes.flat, strongest, strict=False):
+        values = results[f'{_DRAWN}{name}']
+        axes.plot(values[kept], ratios[kept], '.', ms=4, color=BLUE, alpha=0.5, mew=0)
+        axes.plot(values[lost], ratios[lost], '.', ms=6, color=ALARM, mew=0)
+        if f'{_DRAWN}{name}' in logarithmic:
+            _logarithmic(axes)
+        axes.axhline(1.0, color=INK, lw=1.0, ls='--')
+        axes.set_xlabel(name, color=MUTED)
+        axes.set_ylabel(_RATIO)
+        head(axes, f'explains {100 * fraction:.0f} %')
+    for axes in picture.axes.flat[len(strongest) :]:
+        axes.set_visible(False)
+    picture.save(path)
 
 
 def write_report(store: Store) -> tuple[Summary, list[Path]]:
@@ -112,13 +444,17 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
 
 
 def _write_page(path: Path, study: Study, summary: Summary, figures: list[Path]) -> None:
-    varied = [
+    folder = path.parent
+    varied = [(each.column.removeprefix(_DRAWN), each.distribution) for each in study.variations]
+    worst = [
         (
-            Cell(variation.column.removeprefix('plant.'), 'code'),
-            Cell(str(variation.distribution), 'code'),
-            _explained(summary['influence'].get(variation.column.removeprefix('plant.'))),
+            f'{run["run"]}',
+            run['outcome'],
+            ', '.join(_number(ratio) for ratio in run['max_error_ratio'].values()),
+            _number(run['first_violation_s']),
+            Cell(reproduce_command(folder, run['run']), 'code'),
         )
-        for variation in study.variations
+        for run in summary['worst']
     ]
     write_page(
         path,
@@ -136,23 +472,19 @@ def _write_page(path: Path, study: Study, summary: Summary, figures: list[Path])
                 if values is not None
             ),
         ],
-        worst=[_worst_row(run, path.parent) for run in summary['worst']],
+        worst=worst,
         exceptions=[
             (run, what, Cell(command, 'code'))
-            for run, what, command in exceptions(summary['pairs'], path.parent)
+            for run, what, command in exceptions(summary['pairs'], folder)
         ],
-        varied=varied,
-    )
-
-
-def _worst_row(run: Summary, folder: Path) -> tuple[str | Cell, ...]:
-    first = run['first_violation_s']
-    return (
-        f'{run["run"]}',
-        run['outcome'],
-        ', '.join(_number(ratio) for ratio in run['max_error_ratio'].values()),
-        '-' if first is None else f'{first:.3f} s',
-        Cell(reproduce_command(folder, run['run']), 'code'),
+        varied=[
+            (
+                Cell(name, 'code'),
+                Cell(str(distribution), 'code'),
+                _percent(summary['influence'].get(name, 0.0)),
+            )
+            for name, distribution in varied
+        ],
     )
 
 
@@ -168,10 +500,6 @@ def exceptions(pairs: Summary | None, folder: Path) -> list[tuple[str, str, str]
         for runs, words in ((broken, 'breaks the bound only with learning'), (above, what))
         for run in runs
     ]
-
-
-def _explained(fraction: float | None) -> str:
-    return '-' if fraction is None else f'{100 * fraction:.0f} %'
 
 
 def _number(value: float | None) -> str:

@@ -8,20 +8,16 @@ The folder of a study:
     runs/            Parquet files, named after the first and the last run in them
 
 Files of results are written atomically, so a study that was killed resumes with the runs that have
-none. The workers are any `concurrent.futures.Executor`:
-
-    processes   processes of this machine (default)
-    threads     threads of this process: the kernels release the GIL
-    dask        a dask.distributed cluster: a running one, by its address, or a local one
-
-All of them give the same results.  Chunks of runs are submitted one after the other, a few ahead of
-the workers, so the memory needed does not grow with the number of runs.
+none. The workers are any `concurrent.futures.Executor`: processes of this machine, or a
+dask.distributed cluster. Both give the same results. Chunks of runs are submitted one after the
+other, a few ahead of the workers, so the memory needed does not grow with the number of runs.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import fcntl
+import itertools
 import json
 import multiprocessing
 import os
@@ -29,7 +25,6 @@ import re
 import shutil
 import signal
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -37,11 +32,9 @@ from concurrent.futures import (
     Executor,
     Future,
     ProcessPoolExecutor,
-    ThreadPoolExecutor,
     wait,
 )
-from contextlib import AbstractContextManager, contextmanager
-from itertools import pairwise
+from contextlib import contextmanager
 from math import nan
 from multiprocessing import connection
 from pathlib import Path
@@ -93,10 +86,10 @@ _STUDY = 'study.yaml'
 _VERSIONS = 'versions.json'
 _RUNS = 'runs'
 _PART = re.compile(r'runs-(\d+)-(\d+)\.parquet')
-RETRIES = 3
-"""Consecutive losses of all workers that are tolerated before any has finished a chunk."""
-
-_AHEAD = 3  # chunks submitted for each worker
+_LOST = (
+    'a worker was lost ({}): is there enough memory? The same command resumes the study, since '
+    'finished runs are kept'
+)
 
 
 def run_chunk(study: Study, first: int, count: int) -> Columns:
@@ -337,7 +330,7 @@ class Store:
         edges = [Span(0, 0), *self.done(), Span(self.study.settings.runs, 0)]
         return [
             Span(first, min(size, after.first - first))
-            for before, after in pairwise(edges)
+            for before, after in itertools.pairwise(edges)
             for first in range(before.first + before.runs, after.first, size)
         ]
 
@@ -354,18 +347,13 @@ class Store:
             raise BlfDscError(f'{self.folder} has no results yet')
         tables = []
         for path in paths:
-            problem = ''
             try:
                 tables.append(pa.parquet.read_table(path))
-                if tables[-1].column_names != tables[0].column_names:
-                    problem = f'its columns are not those of {paths[0].name}'
             except (OSError, pa.ArrowException) as error:
-                problem = str(error)
-            if problem:
                 raise BlfDscError(
-                    f'{path} cannot be read ({problem}): remove it and start the study again '
+                    f'{path} cannot be read ({error}): remove it and start the study again '
                     'to recompute these runs'
-                )
+                ) from None
         whole = pa.concat_tables(tables).sort_by('run')
         return {name: np.asarray(whole[name].to_numpy()) for name in whole.column_names}
 
@@ -381,31 +369,20 @@ def _create(folder: Path, study: Study) -> None:
     unfinished.rename(folder)
 
 
-class Engine(NamedTuple):
-    """Workers: `open` starts a new executor, which raises BrokenExecutor if they are lost."""
-
-    open: Callable[[], AbstractContextManager[Executor]]
-    workers: int
-
-
 def cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
 
 
-def processes(workers: int) -> Engine:
-    """Use processes of this machine, each of which ends with this one."""
+def processes(workers: int) -> Executor:
+    """Return processes of this machine, each of which ends with this one."""
     context = multiprocessing.get_context('forkserver')
     context.set_forkserver_preload([run_chunk.__module__])  # imported once, for all workers
-    return Engine(lambda: ProcessPoolExecutor(workers, context, _end_with_parent), workers)
+    return ProcessPoolExecutor(workers, context, _end_with_parent)
 
 
-def threads(workers: int) -> Engine:
-    """Use threads of this process."""
-    return Engine(lambda: ThreadPoolExecutor(workers), workers)
-
-
-def dask(workers: int, address: str = '') -> Engine:
+@contextmanager
+def dask(workers: int, address: str = '') -> Iterator[Executor]:
     """Start a dask.distributed cluster on this machine, or use the one at a scheduler's address.
 
     Dask itself repeats the work of a lost worker, unless it fails repeatedly.
@@ -414,24 +391,12 @@ def dask(workers: int, address: str = '') -> Engine:
         import distributed
     except ImportError:
         raise MissingExtraError('dask.distributed', 'dask', 'the engine dask') from None
-
-    def client() -> Any:
-        if address:
-            return distributed.Client(address)
-        return distributed.Client(n_workers=workers, threads_per_worker=1, dashboard_address=None)
-
-    @contextmanager
-    def start() -> Iterator[Executor]:
-        with client() as connected:
-            try:
-                yield connected.get_executor(pure=False)
-            except distributed.KilledWorker as error:
-                raise BrokenExecutor(str(error)) from error
-
-    if address:
-        with client() as connected:
-            workers = max(1, sum(connected.nthreads().values()))
-    return Engine(start, workers)
+    local = {'n_workers': workers, 'threads_per_worker': 1, 'dashboard_address': None}
+    with distributed.Client(address) if address else distributed.Client(**local) as client:
+        try:
+            yield client.get_executor(pure=False)
+        except distributed.KilledWorker as error:
+            raise BlfDscError(_LOST.format(error)) from error
 
 
 def chunk_size(runs: int, workers: int) -> int:
@@ -443,55 +408,28 @@ def chunk_size(runs: int, workers: int) -> int:
 def compute(
     study: Study,
     spans: Iterable[Span],
-    engine: Engine,
-    keep: Callable[[Span, Columns], None],
-    warn: Callable[[str], None],
-) -> None:
-    """Compute all `spans` and pass each with its results to `keep` as soon as it is done.
-
-    The chunk of a lost worker is repeated, after a warning; raises BlfDscError if workers are lost
-    repeatedly.
-    """
-    waiting = deque(spans)
-    in_a_row = 0
-    while waiting:
-        before = len(waiting)
-        try:
-            with engine.open() as executor:
-                _hand_out(study, waiting, executor, engine.workers * _AHEAD, keep)
-        except BrokenExecutor as error:
-            in_a_row = in_a_row + 1 if len(waiting) == before else 1
-            if in_a_row > RETRIES:
-                raise BlfDscError(
-                    f'{in_a_row} times in a row all workers were lost before any finished a chunk '
-                    f'({error}); {len(waiting)} chunks are left. Is there enough memory? Start the '
-                    'same command again to resume: finished runs are kept'
-                ) from error
-            warn(f'a worker was lost: the {len(waiting)} chunks left go to new workers')
-
-
-def _hand_out(
-    study: Study,
-    waiting: deque[Span],
     executor: Executor,
     most: int,
     keep: Callable[[Span, Columns], None],
 ) -> None:
-    """Submit all of `waiting`; on an error, put back the spans that were not kept."""
-    handed: dict[Future[Columns], Span] = {}
+    """Compute all `spans` and pass each with its results to `keep` as soon as it is done.
+
+    At most `most` are submitted at a time.  Raises BlfDscError if a worker is lost.
+    """
+    waiting, handed = iter(spans), dict[Future[Columns], Span]()
     try:
-        while waiting or handed:
-            while waiting and len(handed) < most:
-                span = waiting[0]
+        while True:
+            for span in itertools.islice(waiting, most - len(handed)):
                 handed[executor.submit(run_chunk, study, *span)] = span
-                waiting.popleft()
+            if not handed:
+                return
             for future in wait(handed, return_when=FIRST_COMPLETED).done:
-                keep(handed[future], future.result())
-                del handed[future]
+                keep(handed.pop(future), future.result())
+    except BrokenExecutor as error:
+        raise BlfDscError(_LOST.format(error)) from error
     finally:
         for future in handed:
             future.cancel()
-        waiting.extendleft(sorted(handed.values(), reverse=True))
 
 
 def _end_with_parent() -> None:
