@@ -227,7 +227,7 @@ def test_lost_chunk_is_an_error_of_every_reader(tmp_path, messages):
         footer = data[-37:-28] + begin + bytes(12) + data[-8:]
         changed = (data[:-37] + footer).replace(chunk, times * chunk, 1)
         (path / 'bag_0.mcap').write_bytes(changed)
-        with pytest.raises(BagError, match=r'messages of .*, but its statistics count'):
+        with pytest.raises(BagError, match=r'messages of .*, but counts'):
             read_run(path)
 
 

@@ -132,7 +132,7 @@ def test_corrupted_chunk_is_skipped_and_its_messages_are_counted(whole, tmp_path
     assert main(['recover', str(folder), '--out', str(tmp_path / 'clean')]) == 0
     output = capsys.readouterr().out
     assert f'bag_0.mcap: {end - at} bytes at byte {at} (' in output
-    assert 'after 1734000000.009000001 s (2024-12-12 10:40:00 UTC)' in output
+    assert 'after 1734000000.009000 s' in output
     assert 'LOST bag_0.mcap: 5 of 30 messages of /joint_states' in output
     assert '/joint_states: 25 messages' in output
     assert 'none of the recorded' not in output
@@ -160,7 +160,7 @@ def test_recording_that_was_not_closed_is_reported_and_keeps_its_topics(plain, t
     folder = damaged(tmp_path / 'bag', content)
     assert main(['recover', str(folder)]) == 0
     output, clean = capsys.readouterr().out, tmp_path / 'bag_recovered'
-    assert 'bag_0.mcap: the recording was not closed; it ends at 1734000000.024000001 s' in output
+    assert 'bag_0.mcap: the recording was not closed; it ends at 1734000000.024000 s' in output
     assert f'wrote {clean}' in output
     with open_bag(clean) as opened:
         assert list(opened.messages(())) == []

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All kinds of bags as topics and CDR messages.
+"""All kinds of bags as topics and CDR messages, of which none is lost without an error.
 
-The library rosbags opens them. It also reads the messages of sqlite3, ROS 1 and compressed ones;
-those of plain MCAP files are read by `mcap_file`, which is faster and checks every chunk.
+The library rosbags opens them. It also reads the messages of sqlite3, ROS 1 and compressed ones.
+Plain MCAP files are read here, which is faster, from begin to end, with each chunk's checksum. What
+no checksum covers, such as a chunk whose opcode has flipped, shows in the number of messages.
 """
 
 from __future__ import annotations
@@ -11,14 +12,19 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from struct import Struct
+from typing import Any, BinaryIO, NamedTuple, TypeAlias
 
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.stream_reader import get_chunk_data_stream
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader
 
-from blf_dsc_controller.bags.mcap_file import Allowance, McapFile
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import HISTORY, STREAM, Quality
 from blf_dsc_controller.messages.types import typestore
@@ -31,9 +37,27 @@ VERSION = 'package_version'
 MESSAGES = 'messages '
 """Prefix of the names of facts that count the written and lost messages of a topic."""
 
+MAGIC_SIZE = 8
+HEAD = Struct('<BQ')  # opcode and content length, at the start of each record
+_MESSAGE = Struct('<HIQQ')
+_LARGEST_CHUNK = 1 << 29  # bytes, unpacked
+_KINDS: dict[int, Any] = {
+    Opcode.CHUNK: Chunk,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.METADATA: Metadata,
+}
+
+StoredMessage: TypeAlias = tuple[int, int, int, int, bytes]
+"""Channel number, sequence number, log time [ns], publish time [ns], content."""
+
 
 class BagError(BlfDscError):
     """A bag that cannot be read or written."""
+
+
+class DamageError(ValueError):
+    """A damaged file."""
 
 
 class BagMessage(NamedTuple):
@@ -60,65 +84,110 @@ class OpenBag:
     """
 
     def __init__(self, reader: Any, path: Path) -> None:
-        self._reader = reader
+        self._reader, self._files = reader, list[Path]()
         every = reader.connections
-        types = ((one.topic, one.msgtype.replace('__schemaless__', '')) for one in every)
+        types = ((each.topic, each.msgtype.replace('__schemaless__', '')) for each in every)
         self.held = list(dict.fromkeys(types))
         self.counts: Counter[str] = Counter()
-        for one in every:
-            self.counts[one.topic] += one.msgcount
-        self.offered = {one.topic: _quality(one.ext) for one in every}
+        for each in every:
+            self.counts[each.topic] += each.msgcount
+        self.offered = {each.topic: _quality(each.ext) for each in every}
         self.times: tuple[int, int] = reader.start_time, reader.end_time
         self.facts: dict[str, str] = {}
-        self._allowance = Allowance(path)
-        self._files: list[McapFile] = []
         if isinstance(reader, Reader) and reader.compression_mode != 'message':
             storage: Any = reader.storage
             parts: list[Any] = storage.storages if path.is_dir() else [storage]
-            paths = [part.path for part in parts if part.path.suffix == '.mcap']
-            self._files = [McapFile(one, self._allowance) for one in paths]
+            self._files = [part.path for part in parts if part.path.suffix == '.mcap']
 
     def messages(self, topics: Collection[str], start: int = 0) -> Messages:
         """Yield the messages of `topics` from `start` [ns] on, nearly in order of reception.
 
         Raises:
-            BagError: their number is not the one that the bag states.
+            DamageError: their number is not the one that the bag states.
         """
         found: Counter[str] = Counter()
-        for one in (self._of_files if self._files else self._of_library)(topics, start):
-            found[one.topic] += 1
-            if one.received >= start:
-                yield one
-        for file in self._files:
-            self.facts |= file.metadata.get(RECORD, {})
-            for number, count in file.found.items():
-                if file.channels[number].topic not in topics:
-                    found[file.channels[number].topic] += count
+        yield from (self._of_files if self._files else self._of_library)(topics, start, found)
         for topic in (found | self.counts if self._files else topics) if start == 0 else ():
             if found[topic] != self.counts[topic]:
-                raise ValueError(
+                raise DamageError(
                     f'it holds {found[topic]} messages of {topic}, but counts {self.counts[topic]}'
                 )
 
-    def _of_files(self, topics: Collection[str], start: int) -> Messages:
-        for file in self._files:
-            for number, sequence, log_time, _, raw in file.messages(topics, start):
-                yield BagMessage(file.channels[number].topic, log_time, raw, sequence)
+    def _of_files(self, topics: Collection[str], start: int, found: Counter[str]) -> Messages:
+        for path in self._files:
+            names: dict[int, str] = {}
+            with path.open('rb') as stream:
+                for record in _records(stream, start):
+                    if isinstance(record, tuple):
+                        number, sequence, received, _, raw = record
+                        topic = names[number]
+                        found[topic] += 1
+                        if topic in topics and received >= start:
+                            yield BagMessage(topic, received, raw, sequence)
+                    elif isinstance(record, Channel):
+                        names[record.id] = record.topic
+                    elif isinstance(record, Metadata) and record.name == RECORD:
+                        self.facts |= record.metadata
 
-    def _of_library(self, topics: Collection[str], start: int) -> Messages:
-        chosen = [one for one in self._reader.connections if one.topic in topics]
-        for one, received, raw in self._reader.messages(chosen, start or None) if chosen else ():
-            self._allowance.take(len(raw))
+    def _of_library(self, topics: Collection[str], start: int, found: Counter[str]) -> Messages:
+        chosen = [each for each in self._reader.connections if each.topic in topics]
+        for each, received, raw in self._reader.messages(chosen, start or None) if chosen else ():
+            found[each.topic] += 1
             if isinstance(self._reader, Ros1Reader):
                 # ROS 1 and 2 serialise the common types alike, except for padding and `seq`.
-                raw = typestore().ros1_to_cdr(raw, one.msgtype)  # noqa: PLW2901
-            yield BagMessage(one.topic, received, bytes(raw))
+                raw = typestore().ros1_to_cdr(raw, each.msgtype)  # noqa: PLW2901
+            yield BagMessage(each.topic, received, bytes(raw))
+
+
+def _records(stream: BinaryIO, start: int) -> Iterator[StoredMessage | Schema | Channel | Metadata]:
+    """Yield the records of a file, without chunks that end before `start` [ns]."""
+    stream.seek(MAGIC_SIZE)
+    while len(head := stream.read(HEAD.size)) == HEAD.size:
+        opcode, length = HEAD.unpack(head)
+        if opcode == Opcode.MESSAGE:
+            yield message_of(stream.read(length))
+        elif opcode not in _KINDS:
+            stream.seek(length, 1)
+        else:
+            record = _KINDS[opcode].read(ReadDataStream(BytesIO(stream.read(length))))
+            if not isinstance(record, Chunk):
+                yield record
+            elif record.message_end_time >= start:
+                yield from records_in(record)
+
+
+def records_in(chunk: Chunk) -> Iterator[StoredMessage | Schema | Channel]:
+    """Yield the content of a chunk; ValueError if it differs from what was written."""
+    if chunk.uncompressed_size > _LARGEST_CHUNK:
+        raise DamageError(f'a chunk would unpack to {chunk.uncompressed_size} bytes')
+    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    if size != chunk.uncompressed_size:
+        raise DamageError(f'a chunk of {chunk.uncompressed_size} bytes unpacks to {size}')
+    records, at = stream.read(size), 0
+    while at < size:
+        opcode, length = HEAD.unpack_from(records, at)
+        content = records[at + HEAD.size : at + HEAD.size + length]
+        if len(content) < length:
+            raise DamageError('a record does not match its length')
+        if opcode == Opcode.MESSAGE:
+            yield message_of(content)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            yield _KINDS[opcode].read(ReadDataStream(BytesIO(content)))
+        else:
+            raise DamageError(f'unknown record type {opcode} in a chunk')
+        at += HEAD.size + length
+
+
+def message_of(content: bytes) -> StoredMessage:
+    """Return a message from the content of its record; struct.error if that is too short."""
+    number, sequence, received, published = _MESSAGE.unpack_from(content)
+    return number, sequence, received, published, content[_MESSAGE.size :]
 
 
 def _quality(ext: Any) -> Quality:
     """Return a reliable quality of service, latched as deep as the recorded publishers were."""
-    offered = getattr(ext, 'offered_qos_profiles', ())
-    latched = [one.depth for one in offered if one.durability is QosDurability.TRANSIENT_LOCAL]
+    offered: Any = getattr(ext, 'offered_qos_profiles', ())
+    latched = [each.depth for each in offered if each.durability is QosDurability.TRANSIENT_LOCAL]
     if bool(latched) or bool(getattr(ext, 'latching', 0)):
         return replace(HISTORY, depth=max(latched, default=0) or HISTORY.depth)
     return STREAM
@@ -130,10 +199,8 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
 
     Raises:
         BagError: there is no bag, or it is damaged; also raised while it is read.
-        BlfDscError: it unpacks to more than the limit.
     """
     try:
-        checked_files(path)
         reader: Any = Ros1Reader(path) if path.suffix == '.bag' else Reader(path)
         with reader:
             yield OpenBag(reader, path)
@@ -141,17 +208,6 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
         raise
     except Exception as error:  # libraries raise nearly anything on damaged files
         raise BagError(f'{path} cannot be read as a bag: {_reason(path, error)}') from error
-
-
-def checked_files(path: Path) -> list[Path]:
-    """Return the files of a folder, or the one file; OSError for a pipe or a link out of it."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    for file in files:
-        if path.is_dir() and not file.resolve().is_relative_to(path.resolve()):
-            raise OSError(f'its file {file} is outside of the folder: copy it if you trust it')
-        if file.exists() and not (file.is_file() or file.is_dir()):
-            raise OSError(f'{file} is not a regular file')
-    return files
 
 
 def _reason(path: Path, error: Exception) -> str:

@@ -8,9 +8,10 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from io import BufferedWriter, FileIO
 from math import inf
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import Any
 
 import yaml
 from mcap.writer import CompressionType, Writer
@@ -40,56 +41,27 @@ class DiskFullError(BagError):
         )
 
 
-class _ReservedFile:
-    """File, buffered until `flush`, that can still be completed when its disk is full.
+class _ReservedFile(FileIO):
+    """File that can still be completed when its disk is full.
 
     The file `reserve` keeps room for what is not written yet. It is removed when the disk is full;
     `is_full` then means: complete the file.
     """
 
     def __init__(self, path: Path, reserve: Path) -> None:
-        self.is_full = False
-        self._file = path.open('xb', buffering=0)
-        self._buffer = bytearray()
-        self._written = 0
-        self._reserve = reserve
+        super().__init__(path, 'xb')
+        self._reserve, self.is_full = reserve, False
 
-    def write(self, data: bytes) -> int:
-        """Buffer bytes."""
-        self._buffer += data
-        if len(self._buffer) >= _CHUNK_SIZE:
-            self.flush()
-        return len(data)
-
-    @property
-    def closed(self) -> bool:
-        """Whether the file is closed."""
-        return self._file.closed
-
-    def tell(self) -> int:
-        """Return the number of bytes received so far."""
-        return self._written + len(self._buffer)
-
-    def flush(self) -> None:
-        """Pass all bytes to the operating system, giving up the reserve if needed."""
-        waiting = bytes(self._buffer)
-        self._buffer = bytearray()
-        while waiting:
-            try:
-                count = self._file.write(waiting) or 0
-            except OSError as error:
-                if error.errno not in _FULL or self.is_full:
-                    raise
-                self.is_full = True
-                self._reserve.unlink(missing_ok=True)
-                continue
-            self._written += count
-            waiting = waiting[count:]
-
-    def close(self) -> None:
-        """Flush and close the file."""
-        self.flush()
-        self._file.close()
+    def write(self, data: Any) -> int:
+        """Write bytes, giving up the reserve if needed."""
+        try:
+            return super().write(data)
+        except OSError as error:
+            if error.errno not in _FULL or self.is_full:
+                raise
+        self.is_full = True
+        self._reserve.unlink(missing_ok=True)
+        return super().write(data)
 
 
 def _period(start: int, end: int) -> dict[str, Any]:
@@ -219,7 +191,7 @@ class BagWriter:
 
     def flush_if_due(self) -> None:
         """Flush if the flush interval has passed; DiskFullError as in `write`."""
-        if self._stream.is_full or self._clock() - self._flushed >= self._flush_interval:
+        if self._file.is_full or self._clock() - self._flushed >= self._flush_interval:
             self.flush()
 
     def flush(self) -> None:
@@ -239,7 +211,7 @@ class BagWriter:
         (self.path / METADATA).write_text(text, encoding='utf-8')
 
     def _stop_if_full(self) -> None:
-        if self._stream.is_full:
+        if self._file.is_full:
             self.close()
             raise DiskFullError(self.path, sum(self.message_counts.values()))
 
@@ -267,10 +239,9 @@ class BagWriter:
         name = f'{self.path.name}_{len(self._files)}.mcap'
         self._first, self._last = FOREVER, 0
         self._files.append({'path': name, **_period(FOREVER, 0), 'message_count': 0})
-        self._stream = _ReservedFile(self.path / name, self._reserve)
-        self._writer = Writer(
-            cast('IO[bytes]', self._stream), chunk_size=_CHUNK_SIZE, compression=self._compression
-        )
+        self._file = _ReservedFile(self.path / name, self._reserve)
+        self._stream = BufferedWriter(self._file)
+        self._writer = Writer(self._stream, chunk_size=_CHUNK_SIZE, compression=self._compression)
         self._writer.start(profile='ros2', library=f'blf_dsc_controller {__version__}')
         self._schemas: dict[str, int] = {}
         self._chunks = 0

@@ -52,9 +52,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _handle(options: argparse.Namespace) -> int | None:
-    if 'max_unpacked' in options:
-        files = importlib.import_module('blf_dsc_controller.bags.mcap_file')
-        files.MAX_UNPACKED.set(options.max_unpacked * 1e9)
     if options.command == 'run' and not options.offline:
         require_ros()  # before what takes a second to import
     module, function = options.handler

@@ -124,8 +124,6 @@ def make_parser() -> argparse.ArgumentParser:
     for command_parser in (report, view, export, plot):
         _map(command_parser)
         _namespace(command_parser)
-    for command_parser in (report, view, recover, export, plot):
-        _max_unpacked(command_parser)
     for command_parser in (report, export, plot):
         _force(command_parser)
     _excite_options(
@@ -205,16 +203,6 @@ def _force(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--force', action='store_true', help='overwrite existing files')
 
 
-def _max_unpacked(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        '--max-unpacked',
-        type=float,
-        default=1.0,
-        metavar='GB',
-        help='size that a bag may unpack to, or 100 times its size if that is more (1)',
-    )
-
-
 def _map(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--map',
@@ -246,7 +234,6 @@ def _replay_options(parser: argparse.ArgumentParser) -> None:
     )
     _map(parser)
     _namespace(parser)
-    _max_unpacked(parser)
     option = parser.add_argument_group('playing over ROS').add_argument
     option('--play', action='store_true', help='publish the recorded topics')
     option('--rate', type=float, default=1.0, help='speed; 0: as fast as possible (1)')
@@ -342,7 +329,6 @@ def _identify_options(parser: argparse.ArgumentParser) -> None:
     )
     _map(parser)
     _namespace(parser)
-    _max_unpacked(parser)
 
 
 def _monte_carlo_options(parser: argparse.ArgumentParser) -> None:
