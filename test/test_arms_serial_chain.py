@@ -73,61 +73,22 @@ class Case:
         return M, C, G
 
 
-@pytest.fixture(params=ARMS)
-def case(request):
-    return Case(request.param)
-
-
-def test_torque_agrees_with_pinocchio(case):
+@pytest.mark.parametrize('name', ARMS)
+def test_regressors_agree_with_pinocchio(name):
     """Property III with the Christoffel C, where v and a are not the derivatives of q."""
+    case = Case(name)
     M, C, G = case.matrices()
-    ours = case.H(case.q, case.dq, case.v, case.a) @ case.phi
-    np.testing.assert_allclose(ours, M @ case.a + C @ case.v + G, atol=1e-10)
-
-
-def test_inverse_dynamics_agree_with_pinocchio(case):
-    torque = pinocchio.rnea(case.model, case.data, case.theirs, case.dq, case.a)
-    np.testing.assert_allclose(
-        case.H(case.q, case.dq, case.dq, case.a) @ case.phi, torque, atol=1e-10
-    )
-
-
-def test_columns_agree_with_the_joint_torque_regressor_of_pinocchio(case):
+    torque = case.H(case.q, case.dq, case.v, case.a) @ case.phi
+    np.testing.assert_allclose(torque, M @ case.a + C @ case.v + G, atol=1e-10)
+    Yp, Yr = case.momentum(case.q, case.dq)
+    np.testing.assert_allclose(Yp @ case.phi, M @ case.dq, atol=1e-10)
+    np.testing.assert_allclose(Yr @ case.phi, G - C.T @ case.dq, atol=1e-10)
     theirs = pinocchio.computeJointTorqueRegressor(
         case.model, case.data, case.theirs, case.dq, case.a
     )
     ours = case.H(case.q, case.dq, case.dq, case.a).reshape(case.n, case.n, ROTOR + 1)
     np.testing.assert_allclose(ours[:, :, :ROTOR].ravel(), theirs.ravel(), atol=1e-10)
     np.testing.assert_array_equal(ours[:, :, ROTOR], np.diag(case.a))
-
-
-def test_momentum_and_rest_agree_with_pinocchio(case):
-    M, C, G = case.matrices()
-    Yp, Yr = case.momentum(case.q, case.dq)
-    np.testing.assert_allclose(Yp @ case.phi, M @ case.dq, atol=1e-10)
-    np.testing.assert_allclose(Yr @ case.phi, G - C.T @ case.dq, atol=1e-10)
-
-
-def test_coriolis_is_in_christoffel_form(case):
-    """xi^T (dM/dt - 2 C) xi = 0 (Property I), M' by a central difference."""
-    h, zero = 1e-5, np.zeros(case.n)
-    ahead, behind = (case.momentum(case.q + s * case.dq, case.v)[0] for s in (h, -h))
-    rate = (ahead - behind) @ case.phi / (2.0 * h)  # M' xi, with xi = v
-    C_xi = (case.H(case.q, case.dq, case.v, zero) - case.H(case.q, zero, zero, zero)) @ case.phi
-    scale = np.linalg.norm(case.v) * np.linalg.norm(rate)
-    assert abs(case.v @ (rate - 2.0 * C_xi)) < 1e-7 * max(1.0, scale)
-
-
-def test_torque_is_the_rate_of_momentum_plus_the_rest(case):
-    """d/dt(Yp P) + Yr P = H(q, dq, dq, ddq) P, column by column, along a motion."""
-    h = 1e-5
-    ahead, behind = (
-        case.momentum(case.q + s * case.dq + 0.5 * s * s * case.a, case.dq + s * case.a)[0]
-        for s in (h, -h)
-    )
-    ours = (ahead - behind) / (2.0 * h) + case.momentum(case.q, case.dq)[1]
-    expected = case.H(case.q, case.dq, case.dq, case.a)
-    np.testing.assert_allclose(ours, expected, atol=1e-7 * max(1.0, np.abs(expected).max()))
 
 
 @kernel
@@ -137,13 +98,18 @@ def all_three(model, q, dq, v, a, separate, together):
     model.regressors(q, dq, v, a, together[0], together[1], together[2])
 
 
-def test_kernels_agree_with_python_together_and_apart():
+def test_compiled_and_batched_kernels_agree_with_those_from_python():
     case = Case('six')
     separate, together = np.full((2, 3, case.n, case.arm.p), np.nan)
     all_three(case.arm, case.q, case.dq, case.v, case.a, separate, together)
     np.testing.assert_array_equal(separate[0], case.H(case.q, case.dq, case.v, case.a))
     np.testing.assert_array_equal(separate[1:], case.momentum(case.q, case.dq))
     np.testing.assert_array_equal(together, separate)
+    states = case.random.normal(size=(5, 4, case.n))
+    H = regressors_at(case.arm, *np.moveaxis(states, 1, 0))
+    np.testing.assert_array_equal(H, [case.H(*state) for state in states])
+    M = inertia_matrices(case.arm, case.phi, np.stack((case.q + 0.5, case.q)))[1]
+    np.testing.assert_allclose(M, case.matrices()[0], atol=1e-11)
 
 
 def test_chosen_columns_keep_their_values_names_and_units():
@@ -161,20 +127,6 @@ def test_chosen_columns_keep_their_values_names_and_units():
     rotor = 'kg' if whole.chain.joints[0].kind == 'prismatic' else 'kg m^2'
     assert part.parameter_units == (rotor, 'kg', 'kg m', 'kg m^2')
     assert {joint.kind for joint in whole.chain.joints} > {'prismatic'}
-
-
-def test_many_states_at_once_give_the_regressors_of_each():
-    case = Case('six')
-    states = case.random.normal(size=(5, 4, case.n))
-    H = regressors_at(case.arm, *np.moveaxis(states, 1, 0))
-    np.testing.assert_array_equal(H, [case.H(*state) for state in states])
-
-
-def test_inertia_matrices_match_pinocchio():
-    case = Case('six')
-    q = np.stack((case.q + 0.5, case.q))
-    M = inertia_matrices(case.arm, case.phi, q)[1]
-    np.testing.assert_allclose(M, case.matrices()[0], atol=1e-11)
 
 
 WALL = (0.0, 9.81, 0.0)
@@ -207,14 +159,11 @@ def test_base_parameters_are_the_smallest_set_that_gives_the_same_torques(chain,
     assert p == len(shown) or singular[p] < 1e-7  # pi / 2 has ten digits in the UR5e's file
 
 
-def test_number_of_base_parameters_on_the_floor_agrees_with_the_literature():
+def test_base_parameters_agree_with_the_literature():
     """43 for a Panda (Gaz et al., 2019), 36 for an arm like the UR; rotors except at the base."""
     for chain, inertial, rotors in ((PANDA_CHAIN, 43, 5), (UR5E_CHAIN, 36, 4)):
         assert base_parameters(chain, rotors=False).model.p == inertial
         assert base_parameters(chain).model.p == inertial + rotors
-
-
-def test_combinations_have_the_usual_grouping():
     base = base_parameters(PANDA_CHAIN, rotors=False)
     sums = dict(zip(base.model.parameter_names, base.combinations, strict=True))
     assert sums['Ixx7'] == 'Ixx7 - Iyy7'
