@@ -39,26 +39,19 @@ def at(terms, t):
     return out
 
 
-@pytest.mark.parametrize('t', [0.0, 1.234, 60.0])
-def test_sinusoids_are_the_sum_of_their_tones(t):
-    qr, _, _ = at([SINUSOIDS], t)
-    expected = [
-        offset
-        + sum(a * np.cos(w * t + phase) for a, w, phase in zip(row, FREQUENCY, PHASE, strict=True))
-        for offset, row in zip(OFFSET, AMPLITUDE, strict=True)
-    ]
-    np.testing.assert_allclose(qr, expected, atol=1e-15)
-
-
-@pytest.mark.parametrize(('piece', 't'), [(0, 0.4), (0, 0.9), (1, 1.0), (2, 1.5), (3, 3.0), (3, 5)])
-def test_spline_is_the_polynomial_of_the_current_piece(piece, t):
-    qr, _, _ = at([SPLINE], t)
-    expected = [np.polynomial.polynomial.polyval(t - KNOTS[piece], c) for c in COEFFICIENTS[piece]]
-    np.testing.assert_allclose(qr, expected, rtol=1e-13)
-
-
-def test_spline_rests_at_its_first_point_before_it_begins():
-    np.testing.assert_array_equal(at([SPLINE], 0.39), [COEFFICIENTS[0, :, 0], [0] * 3, [0] * 3])
+def test_terms_are_sums_of_tones_or_polynomials_of_the_current_piece():
+    for t in (0.0, 1.234, 60.0):
+        expected = [
+            offset + np.sum(row * np.cos(np.array(FREQUENCY) * t + PHASE))
+            for offset, row in zip(OFFSET, AMPLITUDE, strict=True)
+        ]
+        np.testing.assert_allclose(at([SINUSOIDS], t)[0], expected, atol=1e-15)
+    for piece, t in ((0, 0.4), (0, 0.9), (1, 1.0), (2, 1.5), (3, 3.0), (3, 5)):
+        x = t - KNOTS[piece]
+        expected = [np.polynomial.polynomial.polyval(x, c) for c in COEFFICIENTS[piece]]
+        np.testing.assert_allclose(at([SPLINE], t)[0], expected, rtol=1e-13)
+    before = at([SPLINE], 0.39)  # at rest at its first point
+    np.testing.assert_array_equal(before, [COEFFICIENTS[0, :, 0], [0] * 3, [0] * 3])
 
 
 @pytest.mark.parametrize('terms', KINDS.values(), ids=KINDS)
@@ -74,54 +67,33 @@ def test_velocity_and_acceleration_are_the_derivatives_of_the_reference(terms, t
     np.testing.assert_allclose(ddqr, rate[1], atol=1e-9)
 
 
-@pytest.mark.parametrize(('t', 's'), [(0.5, 0.0), (1.3, 0.5), (2.1, 1.0)])
-def test_terms_are_blended_by_the_minimum_jerk_step(t, s):
-    old, new = at([SINUSOIDS], t)[0], at([SPLINE], t)[0]
-    expected = (1.0 - s) * old + s * new
-    np.testing.assert_allclose(at([SINUSOIDS, LATER], t)[0], expected, rtol=1e-13)
-
-
-def test_before_and_after_blending_only_one_term_counts_to_the_last_bit():
+def test_terms_are_blended_by_the_minimum_jerk_step():
+    both = [SINUSOIDS, LATER]
+    for t, s in ((0.5, 0.0), (1.3, 0.5), (2.1, 1.0)):
+        expected = (1.0 - s) * at([SINUSOIDS], t)[0] + s * at([SPLINE], t)[0]
+        np.testing.assert_allclose(at(both, t)[0], expected, rtol=1e-13)
+    # Before and after only one of them counts, to the last bit.
     for t in (0.0, 0.49, 0.5):
-        np.testing.assert_array_equal(at([SINUSOIDS, LATER], t), at([SINUSOIDS], t))
+        np.testing.assert_array_equal(at(both, t), at([SINUSOIDS], t))
     for t in (2.1, 2.2, 50.0):
-        np.testing.assert_array_equal(at([SINUSOIDS, LATER], t), at([SPLINE], t))
+        np.testing.assert_array_equal(at(both, t), at([SPLINE], t))
+    for t in (0.5, 2.1):  # over 2e-9 s the jerk, below 1e4 here, moves the acceleration by 2e-5
+        before, after = (at(both, t + side) for side in (-1e-9, 1e-9))
+        np.testing.assert_allclose(before, after, atol=1e-4)
+    without_fade = [SINUSOIDS, SPLINE._replace(begin=1.5)]
+    np.testing.assert_array_equal(at(without_fade, 1.4999), at([SINUSOIDS], 1.4999))
+    np.testing.assert_array_equal(at(without_fade, 1.5), at([SPLINE], 1.5))
 
 
-@pytest.mark.parametrize('t', [0.5, 2.1])
-def test_blending_begins_and_ends_without_a_jump(t):
-    # Over 2e-9 s the jerk, below 1e4 here, moves the acceleration by 2e-5.
-    before, after = (at([SINUSOIDS, LATER], t + side) for side in (-1e-9, 1e-9))
-    np.testing.assert_allclose(before, after, atol=1e-4)
-
-
-def test_term_without_a_fade_takes_over_at_once():
-    terms = [SINUSOIDS, SPLINE._replace(begin=1.5)]
-    np.testing.assert_array_equal(at(terms, 1.4999), at([SINUSOIDS], 1.4999))
-    np.testing.assert_array_equal(at(terms, 1.5), at([SPLINE], 1.5))
-
-
-def test_packing_and_unpacking_preserves_the_terms():
+def test_terms_survive_packing_and_are_evaluated_at_many_times_at_once():
     terms = [SINUSOIDS, LATER, SPLINE]
     for term, unpacked in zip(terms, unpack(pack(3, terms)), strict=True):
         assert (term.code, term.begin, term.fade) == (unpacked.code, unpacked.begin, unpacked.fade)
         np.testing.assert_array_equal(term.content, unpacked.content)
-
-
-def test_many_times_at_once_match_single_evaluations():
     times = np.linspace(0.0, 4.0, 9)
     together = reference.sampled(pack(3, [SINUSOIDS, LATER]), times)
     apart = np.array([at([SINUSOIDS, LATER], t) for t in times])
     np.testing.assert_allclose(together, apart, rtol=1e-14, atol=1e-14)  # cosines of two libraries
-
-
-def test_papers_reference_is_at_rest_at_the_start():
-    vector = pack(2, [sinusoids_term((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))])
-    qr, dqr, ddqr = np.full((3, 2), np.nan)
-    reference.evaluate(vector, 0.0, qr, dqr, ddqr)
-    np.testing.assert_allclose(qr, [2.2935, 1.6961], rtol=1e-15)
-    np.testing.assert_array_equal(dqr, 0.0)
-    np.testing.assert_allclose(ddqr, -0.3, rtol=1e-15)
 
 
 TIMES = np.array([0.5, 1.0, 1.2, 2.5, 4.0])
