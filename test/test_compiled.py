@@ -6,10 +6,8 @@ from __future__ import annotations
 import os
 import platform
 import shutil
-import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Annotated, NamedTuple
 
 import numba
@@ -22,7 +20,6 @@ from shaken_arm import _shake
 import blf_dsc_controller
 from blf_dsc_controller.arms import batch
 from blf_dsc_controller.arms.two_link import TwoLink
-from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.compiled import jit
 from blf_dsc_controller.compiled.layout import Array, Cell, Fixed, pack, size_of, sizes_of, view_of
 from blf_dsc_controller.law.controller import update
@@ -40,28 +37,18 @@ def names(kernel):
     return {str(path.relative_to(PACKAGE.parent)) for path in jit.dependencies(kernel)[0]}
 
 
-def test_kernel_depends_on_the_files_it_is_compiled_from():
+def test_kernel_depends_on_the_files_and_constants_it_is_compiled_from():
+    """Changing the plant does not recompile the law; changing the configuration, no kernel."""
     assert names(update) >= LAW | REFERENCE | ALWAYS
     assert names(run_loop) >= LAW | REFERENCE | PLANT | ALWAYS
     assert names(step_plant) >= PLANT | ALWAYS
-
-
-def test_kernel_outside_the_package_depends_on_what_it_uses_of_it():
-    files = jit.dependencies(_shake)[0]
-    assert {path.name for path in files} >= {'shaken_arm.py', 'rigid_body.py', 'cholesky.py'}
-    assert 'step.py' not in {path.name for path in files}
-
-
-def test_kernel_does_not_depend_on_other_files():
-    """Changing the plant does not recompile the law; changing the configuration, no kernel."""
     assert not names(update) & PLANT
     assert not names(step_plant) & (LAW | REFERENCE)
     assert not any('configuration' in name for name in names(run_loop))
-
-
-def test_kernel_depends_on_its_constants():
-    constants = jit.dependencies(update)[1]
-    assert {'SUSPECT=1', 'OUTSIDE=2', 'LINEAR=1'} <= constants
+    assert {'SUSPECT=1', 'OUTSIDE=2', 'LINEAR=1'} <= jit.dependencies(update)[1]
+    outside = {path.name for path in jit.dependencies(_shake)[0]}  # a kernel of these tests
+    assert outside >= {'shaken_arm.py', 'rigid_body.py', 'cholesky.py'}
+    assert 'step.py' not in outside
 
 
 @pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is cached')
@@ -229,22 +216,6 @@ def total(settings_vector, state_vector):
     return settings.gains.sum() + settings.motor.limit.sum()
 
 
-def test_view_is_the_inverse_of_pack():
-    settings = settings_of(pack(SETTINGS))
-    assert (settings.n, settings.period, settings.motor.delay) == (3, 0.5, 4)
-    np.testing.assert_array_equal(settings.motor.limit, SETTINGS.motor.limit)
-    np.testing.assert_array_equal(settings.gains, SETTINGS.gains)
-
-
-def test_views_cover_the_whole_vector_once():
-    sizes = SimpleNamespace(n=2, motor=SimpleNamespace(delay=3))
-    vector = np.arange(float(state_size(sizes)))
-    assert vector.size == 1 + 6 + 3
-    state = state_of(vector, sizes)
-    assert state.ring.shape == (3, 2)
-    np.testing.assert_array_equal(pack(state), vector)
-
-
 def test_kernels_and_python_agree():
     vector = pack(SETTINGS)
     results = []
@@ -297,29 +268,26 @@ def test_kernels_are_compiled_for_their_fixed_numbers():
 
 
 SHOW = """
-import sys
-from blf_dsc_controller.cli import run as precompile
+from blf_dsc_controller.cli import run
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.reference.terms import _sample
 from sim_plant.kernels import KERNELS
 
-config = load_loop('recommended')
-precompile._compile_law(config.controller)
-precompile._compile_plant(config.plant)
-for kernel in (update, _sample, *KERNELS):
-    print(kernel.__name__, len(kernel.signatures))
+if __name__ == '__main__':  # the command has processes of its own
+    config = load_loop('recommended')
+    run._compile_law(config.controller)
+    run._compile_plant(config.plant)
+    for kernel in (update, _sample, *KERNELS):
+        print(kernel.__name__, len(kernel.signatures))
+    assert main(['precompile', '--config', 'recommended']) == 0
 """
 
 
 @pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
-def test_every_kernel_called_by_a_node_is_compiled():
-    run = subprocess.run([sys.executable, '-c', SHOW], capture_output=True, text=True, check=True)
-    kernels = dict(line.split() for line in run.stdout.splitlines())
+def test_command_compiles_every_kernel_that_a_node_calls():
+    *kernels, said = finished(sys.executable, '-c', SHOW).stdout.splitlines()
     assert len(kernels) == 5
-    assert all(int(count) >= 1 for count in kernels.values()), kernels
-
-
-def test_command_reports_that_kernels_are_compiled(capsys):
-    assert main(['precompile', '--config', 'recommended']) == 0
-    assert 'recommended: the kernels are compiled' in capsys.readouterr().out
+    assert all(int(line.split()[1]) >= 1 for line in kernels), kernels
+    assert 'recommended: the kernels are compiled' in said

@@ -72,7 +72,7 @@ def test_same_sections_apply(context, tmp_path, name):
 WORDS = """
 1e-5 1E3 .5 5. +5 0x1F -0x10 017 08 0x1p3 1e400 1e-400 1e-310 0e5 1.2.3 1e 0x 1d3 12abc 0b11 0o17
 9223372036854775807 9223372036854775808 yes No y N on OFF true TRUE tRue 1_000 1:30 2020-01-01 null
-.inf -.inf +.Inf inf -inf INF infinity "1.0" 'yes' ~ '' ""
+.inf -.inf +.Inf inf -inf INF infinity nan .NaN -nan NAN 5. 1_000.5 e5 . -7 12 "1.0" 'yes' ~ '' ""
 """
 
 

@@ -77,13 +77,8 @@ def test_build_without_values_gives_defaults_and_flatten_inverts_build():
     assert built.motor.gain == (3.0, 0.0)
     assert flatten(built).items() >= given.items()
     assert build(Machine, flatten(built)) == built
-
-
-@pytest.mark.parametrize(
-    'entries', [[3.0, 4.0], (3.0, 4.0), array.array('d', [3.0, 4.0])], ids=['list', 'tuple', 'ROS']
-)
-def test_arrays_are_stored_as_tuples(entries):
-    assert build(Machine, {'motor.gain': entries}).motor.gain == (3.0, 4.0)
+    for entries in ([3.0, 4.0], array.array('d', [3.0, 4.0])):  # as ROS gives them
+        assert build(Machine, {'motor.gain': entries}).motor.gain == (3.0, 4.0)
 
 
 def test_unknown_name_suggests_the_closest():
@@ -176,9 +171,6 @@ def test_all_problems_are_reported_at_once():
         'steps',
         'motor.table',
     ]
-
-
-def test_problems_between_parameters_are_reported_along_with_unknown_names():
     assert problems_of({'mode': 'fast', 'bogus': 1}) == [
         'bogus: unknown parameter',
         'mode: fast needs armed',

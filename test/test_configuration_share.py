@@ -8,7 +8,6 @@ import pytest
 
 from blf_dsc_controller.configuration import files as share
 from blf_dsc_controller.configuration.files import share_folder
-from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.errors import BlfDscError
 
 
@@ -84,17 +83,3 @@ def test_current_folder_is_never_used():
     with pytest.raises(BlfDscError, match='install the package again') as error:
         share_folder()
     assert str(Path.cwd()) not in str(error.value)
-
-
-@pytest.mark.parametrize('name', ['recommended', './recommended.yaml'])
-def test_preset_name_refers_to_the_installed_preset(tmp_path, name):
-    folder = installed(data_folder(tmp_path, sysconfig.get_default_scheme()))
-    found = locate(name)
-    assert (found == folder / 'config' / 'recommended.yaml') == (name == 'recommended')
-
-
-def test_unknown_preset_error_lists_the_presets(tmp_path):
-    folder = installed(data_folder(tmp_path, sysconfig.get_default_scheme()))
-    (folder / 'config' / 'paper.yaml').touch()
-    with pytest.raises(BlfDscError, match=r'papre does not exist: .* preset: paper, recommended'):
-        locate('papre')
