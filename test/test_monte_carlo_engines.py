@@ -173,18 +173,11 @@ def test_killed_study_resumes(tmp_path):
     kept = {name: stamp for name, stamp in before.items() if name.startswith('r')}
     assert kept.items() <= after.items()
     assert len(after) == RUNS
+    finished = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert stamps(out) == after  # nothing is computed again
+    assert 'of the runs kept the bound' in finished.stdout
     opened = Store(out)
     assert same(opened.results(), whole(opened.study))
-
-
-def test_complete_study_is_not_recomputed(tmp_path, capsys):
-    path, out = write(tmp_path), tmp_path / 'out'
-    command = ['monte-carlo', '--config', str(path), '--out', str(out), '--workers', '1']
-    assert main(command) == 0
-    before = stamps(out)
-    assert main(command) == 0
-    assert stamps(out) == before
-    assert 'of the runs kept the bound' in capsys.readouterr().out
 
 
 def test_missing_runs_are_found_between_completed_ones(store):
@@ -207,26 +200,20 @@ def test_results_can_be_read_with_pyarrow_alone(store):
     assert same(store.results(), expected)
 
 
-@pytest.mark.parametrize(
-    ('before', 'after', 'difference'),
-    [
+def test_other_study_or_version_is_rejected_and_the_difference_is_named(
+    tmp_path, store, monkeypatch
+):
+    for before, after, difference in (
         ('runs: 24', 'runs: 25', r'monte_carlo.runs: there 24, here 25'),
         ('m2: uniform(0.3', 'm2: uniform(0.2', r'arm.m2: there uniform\(0.3, 0.7\), here uniform'),
         ('arm.m2', 'arm.m1', r'arm.m2: there uniform\(0.3, 0.7\), here nothing'),
         ('duration: 0.3', 'duration: 0.4', r'sim_plant.duration: there 0.3, here 0.4'),
         ('window: 0.1', 'window: 0.12', r'learning.window: there 0.1, here 0.12'),
-    ],
-)
-def test_other_study_is_rejected_and_the_difference_is_named(
-    tmp_path, store, before, after, difference
-):
-    other = study(tmp_path, (LOOP + STUDY).replace(before, after, 1))
-    with pytest.raises(BlfDscError, match=difference):
-        Store.create_or_open(store.folder, other)
+    ):
+        other = study(tmp_path, (LOOP + STUDY).replace(before, after, 1))
+        with pytest.raises(BlfDscError, match=difference):
+            Store.create_or_open(store.folder, other)
     assert Store(store.folder).study == store.study
-
-
-def test_other_version_is_rejected(store, monkeypatch):
     now = stores.versions()
     monkeypatch.setattr(stores, 'versions', lambda: now | {'kernels': 'of tomorrow'})
     with pytest.raises(BlfDscError, match=r'kernels: there .*, here of tomorrow'):
@@ -244,7 +231,7 @@ def test_folder_without_a_study_is_left_alone(tmp_path, capsys):
     assert [path.name for path in out.iterdir()] == ['chapter1.txt']
 
 
-def test_two_processes_cannot_write_into_one_folder(store):
+def test_folder_is_locked_and_a_damaged_file_in_it_is_named(store):
     with (
         store.locked(),
         pytest.raises(BlfDscError, match='another monte-carlo is running'),
@@ -252,11 +239,7 @@ def test_two_processes_cannot_write_into_one_folder(store):
     ):
         pass
     with Store(store.folder).locked():
-        pass
-
-
-def test_damaged_file_is_named(store):
-    filled(store, (0, 2))
+        filled(store, (0, 2))
     (part,) = (store.folder / 'runs').iterdir()
     part.write_bytes(part.read_bytes()[:-20])
     with pytest.raises(BlfDscError, match=f'{part.name} cannot be read .*remove it'):

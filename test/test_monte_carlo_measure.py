@@ -119,7 +119,6 @@ def test_start_rejected_by_the_controller_has_its_own_outcome(tmp_path):
 
 def test_state_of_one_run_does_not_leak_into_the_next(tmp_path):
     a_study = study(tmp_path, runs=4)
-    together = whole(a_study)
     alone = run_chunk(a_study, 3, 1)
-    for name, values in together.items():
+    for name, values in whole(a_study).items():
         np.testing.assert_array_equal(values[3:], alone[name], err_msg=name)

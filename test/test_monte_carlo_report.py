@@ -10,7 +10,6 @@ import shlex
 
 import matplotlib.image
 import numpy as np
-import pyarrow.parquet
 import pytest
 from monte_carlo_case import LOOP, RUNS, STUDY, study, whole
 
@@ -170,13 +169,3 @@ def test_missing_run_is_reported(store, tmp_path, capsys):
     out = str(tmp_path / 'run')
     assert main(['monte-carlo', '--reproduce', str(store.folder), '24', '--out', out]) == 1
     assert 'has no run 24' in capsys.readouterr().err
-
-
-def test_columns_contain_the_drawn_values(store):
-    table = pyarrow.parquet.read_table(store.folder / 'runs')
-    plant = plant_of_run(store.study, 9)
-    row = table.slice(9, 1).to_pylist()[0]
-    assert row['seed'] == plant.seed
-    assert row['plant.arm.m2'] == plant.arm.m2
-    assert row['plant.sensor.velocity'] == plant.sensor.velocity
-    assert row['plant.actuator.delay'] == plant.actuator.delay

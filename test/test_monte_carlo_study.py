@@ -55,32 +55,19 @@ def test_distributions_match_scipy(text, reference, u):
     assert low <= distribution.at(u) <= high
 
 
-@pytest.mark.parametrize('text', ['integers(-1, 3)', 'choice(-1, 0, 1, 2, 3)'])
-def test_integers_are_equally_frequent(text):
-    distribution = parse(text, Kind.INTEGER)
-    values = [distribution.at(u) for u in np.arange(1000) / 1000]
-    assert [values.count(i) for i in range(-1, 4)] == [200] * 5
-
-
-def test_maybe_is_zero_as_often_as_it_says():
-    distribution = parse('maybe(0.3, 1, 2)', Kind.DOUBLE)
-    values = np.array([distribution.at(u) for u in np.arange(1000) / 1000])
+def test_values_are_as_frequent_as_stated():
+    draws = np.arange(1000) / 1000
+    for text in ('integers(-1, 3)', 'choice(-1, 0, 1, 2, 3)'):
+        values = [parse(text, Kind.INTEGER).at(u) for u in draws]
+        assert [values.count(i) for i in range(-1, 4)] == [200] * 5
+    maybe = parse('maybe(0.3, 1, 2)', Kind.DOUBLE)
+    values = np.array([maybe.at(u) for u in draws])
     assert (values == 0.0).sum() == 700
-    assert values[values > 0.0].min() >= 1.0
-    assert values.max() < 2.0
+    assert 1.0 <= values[values > 0.0].min() < values.max() < 2.0
     assert values[values > 0.0].mean() == pytest.approx(1.5, abs=0.01)
-    assert 0.0 in distribution.extremes
-
-
-def test_distribution_of_a_single_value_is_allowed():
+    assert 0.0 in maybe.extremes
     assert parse('uniform(0.5, 0.5)', Kind.DOUBLE).at(0.9) == 0.5
     assert parse('choice(brake)', Kind.STRING).at(0.9) == 'brake'
-
-
-def test_preset_is_a_study_of_ten_thousand_runs():
-    preset = load_study(locate('monte_carlo'))
-    assert preset.settings.runs == 10_000
-    assert preset.plant.duration == 10.0
 
 
 @pytest.mark.parametrize(
@@ -165,15 +152,16 @@ def test_run_depends_on_seed_and_index_alone(tmp_path):
     assert random_numbers(a_study, 5) != random_numbers(a_study, 6)
     assert random_numbers(a_study, 5).seed != random_numbers(a_study, 6).seed
     assert random_numbers(a_study, 5) != random_numbers(study(tmp_path, seed=8), 5)
-
-
-def test_draw_does_not_depend_on_other_variations(tmp_path):
-    """Two studies that differ in an earlier line of the file draw the same arms."""
+    # Nor does a draw depend on the other variations, or the number of events.
     more = 'arm.l2: uniform(0.5, 1.0)\n      arm.m2'
-    before = drawn_values(study(tmp_path), 3)
+    before = drawn_values(a_study, 3)
     after = drawn_values(study(tmp_path, LOOP + STUDY.replace('arm.m2', more)), 3)
     assert after.pop('plant.arm.l2') > 0.0
     assert before == after
+    without = '\n'.join(line for line in (LOOP + STUDY).splitlines() if 'events' not in line)
+    fewer = drawn_values(study(tmp_path, without), 3)
+    assert len(fewer) == 10
+    assert fewer.items() <= before.items()
 
 
 def test_drawn_values_are_used_in_the_plant_of_the_run(tmp_path):
@@ -194,19 +182,17 @@ def test_drawn_values_are_used_in_the_plant_of_the_run(tmp_path):
     np.testing.assert_allclose(plant.initial.position, start, rtol=1e-12)
     velocity = [values[f'plant.initial.velocity_error.joint{i}'] for i in (1, 2)]
     np.testing.assert_allclose(plant.initial.velocity, velocity, atol=1e-15)
-
-
-def test_events_are_drawn_entry_by_entry(tmp_path):
-    a_study = study(tmp_path)
-    values = drawn_values(a_study, 3)
-    origin = origin_of(controller_of(a_study.controller))
-    events = plant_with(a_study, random_numbers(a_study, 3), origin).events
+    events = plant.events  # drawn entry by entry
     assert events.begin == (values['plant.events.begin.1'], 0.2)
     assert events.duration == (0.1, 0.0)
     assert events.payload == (values['plant.events.payload.1'], values['plant.events.payload.2'])
     assert events.torque[0] == values['plant.events.torque.1.joint1'] != 0.0
     assert events.torque[2] == values['plant.events.torque.2.joint1'] != events.torque[0]
     assert (events.torque[1], events.torque[3]) == (0.0, 0.0)
+    # The start is as configured if it does not vary.
+    text = '\n'.join(line for line in STUDY.splitlines() if 'initial' not in line) + '\n'
+    same = study(tmp_path, LOOP + text)
+    assert plant_with(same, random_numbers(same, 0), origin).initial == same.plant.initial
 
 
 def test_events_may_follow_each_other_by_gaps(tmp_path):
@@ -218,11 +204,14 @@ def test_events_may_follow_each_other_by_gaps(tmp_path):
     assert begin == (first, first + 0.15)
 
 
-def test_one_row_of_joints_serves_all_events(tmp_path):
+def test_one_row_of_joints_serves_all_events_and_needs_some(tmp_path):
     rows = '["uniform(-0.5, 0.5)", "choice(0.0)", "uniform(-0.5, 0.5)", "choice(0.0)"]'
     assert rows in STUDY
     text = STUDY.replace(rows, '["uniform(-0.5, 0.5)", "choice(0.0)"]')
     assert study(tmp_path, LOOP + text) == study(tmp_path)
+    text = '\n'.join(line for line in LOOP.splitlines() if 'events' not in line)
+    with pytest.raises(ConfigurationError, match=r'events.payload: .* no events: give events.beg'):
+        study(tmp_path, f'{text}\n{STUDY}')
 
 
 def test_study_may_be_based_on_a_preset(tmp_path):
@@ -238,30 +227,6 @@ def test_study_may_be_based_on_a_preset(tmp_path):
     assert derived.plant == original.plant
     with pytest.raises(ConfigurationError, match=r'base: .*study.yaml. leads back to a file'):
         study(tmp_path, text.replace(str(base), str(tmp_path / 'study.yaml')))
-
-
-def test_events_do_not_change_the_other_draws(tmp_path):
-    without = [line for line in (LOOP + STUDY).splitlines() if 'events' not in line]
-    before = drawn_values(study(tmp_path, '\n'.join(without)), 3)
-    assert len(before) == 10
-    assert before.items() <= drawn_values(study(tmp_path), 3).items()
-
-
-def test_variations_of_events_require_events(tmp_path):
-    text = '\n'.join(line for line in LOOP.splitlines() if 'events' not in line)
-    with pytest.raises(ConfigurationError, match=r'events.payload: .* no events: give events.beg'):
-        study(tmp_path, f'{text}\n{STUDY}')
-
-
-def test_start_is_as_configured_if_it_does_not_vary(tmp_path):
-    text = '\n'.join(line for line in STUDY.splitlines() if 'initial' not in line) + '\n'
-    a_study = study(tmp_path, LOOP + text)
-    origin = origin_of(controller_of(a_study.controller))
-    assert plant_with(a_study, random_numbers(a_study, 0), origin).initial == a_study.plant.initial
-
-
-def test_overrides_take_precedence_over_the_file(tmp_path):
-    assert load_study(write(tmp_path), {'runs': 3}).settings.runs == 3
 
 
 FIRST = {'monte_carlo_events': 16, 'monte_carlo_panda': 6, 'monte_carlo_ur5e': 6}
