@@ -52,22 +52,15 @@ def test_predicted_excitation_matches_the_loop(name):
     assert excitation(name).lambda_min == pytest.approx(measured, rel=0.01)
 
 
-def test_chosen_reference_excites_far_more_than_that_of_the_paper():
-    paper, chosen = excitation('recommended').lambda_min, excitation('excitation').lambda_min
-    assert SIGMA < paper < 2.0 * SIGMA
+def test_chosen_reference_excites_far_more_than_that_of_the_paper_within_the_limits():
+    paper, chosen = excitation('recommended'), excitation('excitation')
+    assert SIGMA < paper.lambda_min < 2.0 * SIGMA
     # A bias column alone has an eigenvalue of 1: with these columns no more is possible.
-    assert 0.99 < chosen <= 1.0
-
-
-def test_chosen_reference_keeps_the_limits_and_is_tracked_within_the_bound():
-    assert excitation('excitation').ratios.max() <= 1.0
-    record = run('excitation')
-    xi1, bound = record.samples[:, 4:6], record.samples[:, 12:14]
-    assert np.abs(xi1 / bound).max() < 1.0
-
-
-def test_chosen_reference_separates_the_worst_disturbance_from_the_parameters():
-    """On the paper's reference, a cosine of its frequency looks like one of the parameters."""
+    assert 0.99 < chosen.lambda_min <= 1.0
+    assert chosen.ratios.max() <= 1.0
+    found = run('excitation').run()
+    assert np.abs(found.error / found.bound).max() < 1.0
+    # On the paper's, a cosine of its frequency looks like one of the parameters.
     quarter = 0.5 * np.pi
     assert parameter_error(run('recommended', quarter)) > 0.1
     assert parameter_error(run('excitation', quarter)) < 0.01

@@ -88,16 +88,13 @@ def test_cosine_columns_are_rejected_on_the_reference_of_the_paper():
 
 
 def test_same_columns_are_accepted_on_a_two_tone_reference():
+    """Bias and sine are the whole disturbance: only the trapezoid's T^2 and the leakage remain."""
     estimate, active = learned('two_tone', 9.0, {}, {})
     assert all(active.values())
     for joint in ('joint1', 'joint2'):
         assert estimate[f'bias {joint}'] == pytest.approx(0.1, abs=1e-3)
         assert estimate[f'sin 1 rad/s {joint}'] == pytest.approx(0.1, abs=1e-3)
         assert estimate[f'cos 1 rad/s {joint}'] == pytest.approx(0.0, abs=1e-3)
-
-
-def test_parameters_are_exact_if_the_columns_model_the_whole_disturbance():
-    """Bias and sine on two tones: only the trapezoid's T^2 and the leakage of rho remain."""
     assert run(configured('two_tone', 60.0)).parameter_error[-1] < 1e-4
 
 

@@ -11,7 +11,6 @@ import sys
 import tarfile
 import xml.etree.ElementTree as ET
 import zipfile
-from collections import Counter
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -150,47 +149,28 @@ def test_continuous_integration_runs_every_supported_python(metadata):
         subprocess.run(['/bin/bash', '-n', ROOT / '.ci' / script], check=True)
 
 
-def test_manifest_describes_an_ament_python_package():
+def test_colcon_and_ros2_run_find_the_package():
     root = manifest()
     assert root.get('format') == '3'
     assert root.findtext('name') == NAME
     assert root.findtext('export/build_type') == 'ament_python'
     # colcon silently treats a package with an invalid address as plain Python.
     assert re.fullmatch(r'[\w.+-]+@([\w-]+\.)+[a-zA-Z]{2,}', root.find('maintainer').get('email'))
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / 'setup.cfg')
+    assert setup['develop']['script_dir'] == f'$base/lib/{NAME}'
+    assert setup['install']['install_scripts'] == f'$base/lib/{NAME}'
 
 
-def test_wheel_contains_every_module_and_no_tests(wheel):
-    installed = [name for name in wheel.namelist() if '.data/' not in name]
+def test_wheel_contains_every_module_with_its_types_and_no_tests(wheel, sdist):
+    installed = {name for name in wheel.namelist() if '.data/' not in name}
     modules = {name for name in installed if name.endswith('.py')}
     assert modules == {path.relative_to(ROOT).as_posix() for path in sources()}
-
-
-def test_every_folder_of_modules_is_a_package():
-    assert {path.parent for path in sources()} == {
-        path.parent for path in sources() if path.name == '__init__.py'
-    }
-
-
-def test_no_two_classes_have_the_same_name():
-    classes = Counter(
-        node.name
-        for package in PACKAGES
-        for path in (ROOT / package).rglob('*.py')
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.ClassDef)
-    )
-    assert [name for name, count in classes.items() if count > 1] == []
-
-
-def test_source_distribution_has_no_tests(sdist):
+    assert {f'{package}/py.typed' for package in PACKAGES} <= installed
     with tarfile.open(sdist) as archive:
         folders = {name.split('/')[1] for name in archive.getnames() if '/' in name}
     assert {*PACKAGES, 'config', 'launch', 'resource', 'setup.py', 'package.xml'} <= folders
     assert 'test' not in folders
-
-
-def test_wheel_is_marked_as_typed(wheel):
-    assert {f'{package}/py.typed' for package in PACKAGES} <= set(wheel.namelist())
 
 
 def test_wheel_installs_the_share_files_that_ros_expects(wheel):
@@ -223,22 +203,6 @@ def test_setup_runs_in_the_links_of_a_colcon_symlink_install(tmp_path):
     assert output.split()[-1] == blf_dsc_controller.__version__
 
 
-def test_executables_are_installed_where_ros2_run_looks():
-    setup = configparser.ConfigParser()
-    setup.read(ROOT / 'setup.cfg')
-    assert setup['develop']['script_dir'] == f'$base/lib/{NAME}'
-    assert setup['install']['install_scripts'] == f'$base/lib/{NAME}'
-
-
-def test_ros_wheels_are_an_extra(metadata):
-    assert not any(name.startswith('ros-') for name in requirements(metadata))
-    assert {'ros-jazzy-rclpy', 'ros-jazzy-rmw-fastrtps-cpp'} <= requirements(metadata, 'ros')
-
-
-def test_colcon_finds_pytest(metadata):
-    assert 'pytest' in requirements(metadata, 'test')
-
-
 def imports(path):
     """Top-level names of the packages that a source file imports, anywhere in it."""
     for node in ast.walk(ast.parse(path.read_text())):
@@ -261,3 +225,5 @@ def test_every_import_is_a_declared_dependency(metadata):
 def test_rosdep_and_pip_install_the_same_dependencies(metadata):
     assert requirements(metadata) == set(ROSDEP_KEYS)
     assert set(ROSDEP_KEYS.values()) <= depends('exec_depend')
+    assert {'ros-jazzy-rclpy', 'ros-jazzy-rmw-fastrtps-cpp'} <= requirements(metadata, 'ros')
+    assert 'pytest' in requirements(metadata, 'test')  # where colcon looks
