@@ -3,7 +3,7 @@
 
 Drives of cobots hold the arm against gravity, and overcome part of their friction, by a model of
 their own, right or wrong, with the payload that they have been told of.  Some brake when the
-commands jump (a reflex stop), until the plant is reset.
+torque jumps (a reflex stop), until the plant is reset; their driver may limit its rate before.
 """
 
 from __future__ import annotations
@@ -85,14 +85,15 @@ class Compensation(NamedTuple):
     friction: float  # share of viscous and Coulomb friction that they overcome
     effort_is_whole: int  # 1: the measured effort contains what they add
     effort_scale: float  # of the measured effort: 1, or A/N m of a current
-    jump: float  # N m from one command to the next at which they stop; 0: none
+    step: float  # N m from one command to the next that their driver lets pass; 0: any
+    jump: float  # N m from one torque to the next at which they stop; 0: none
 
 
 class CompensationState(NamedTuple):
     """What the drives added in the last sample, and whether they have stopped."""
 
     stopped: Cell
-    command: Annotated[Array, 'n']  # the last one, N m
+    command: Annotated[Array, 'n']  # the last one that the driver let pass, N m
     added: Annotated[Array, 'n']  # N m
     whole: Annotated[Array, 'n']  # torque at the joints, N m
     still: Annotated[Array, 'n']  # zeros
@@ -132,12 +133,13 @@ def compensate(
 
 
 @inner
-def jumps(compensation: Compensation, command: np.ndarray, state: CompensationState) -> bool:
-    """Return whether a command (n,) [N m] makes the drives stop, and remember it."""
-    if compensation.jump > 0.0:
-        for i in range(command.size):
-            # 1e-9: a command at the limit of its rate may be rounded beyond it.
-            if abs(command[i] - state.command[i]) > compensation.jump * (1.0 + 1e-9):
-                state.stopped[0] = 1.0
-            state.command[i] = command[i]
+def let_pass(compensation: Compensation, command: np.ndarray, state: CompensationState) -> bool:
+    """Store what the driver lets pass of a command (n,); return whether the drives have stopped."""
+    for i in range(command.size):
+        last = state.command[i]
+        change = limited(command[i] - last, compensation.step)
+        state.command[i] = command[i] if change == command[i] - last else last + change
+        # 1e-9: a command at the limit of its rate may be rounded beyond it.
+        if compensation.jump > 0.0 and abs(change) > compensation.jump * (1.0 + 1e-9):
+            state.stopped[0] = 1.0
     return bool(state.stopped[0] == 1.0)

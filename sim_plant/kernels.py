@@ -20,7 +20,7 @@ from sim_plant.drives import (
     DriveState,
     actuate,
     compensate,
-    jumps,
+    let_pass,
 )
 from sim_plant.motion import (
     Acting,
@@ -188,12 +188,12 @@ def observe(plant: PlantSettings, now: PlantState, measurement: np.ndarray) -> N
 def step(plant: PlantSettings, now: PlantState, command: np.ndarray) -> None:
     """Apply the commanded torque (n,) [N m] of this sample and advance to the next one."""
     own = now.compensation
-    if jumps(plant.compensation, command, own):
+    if let_pass(plant.compensation, command, own):
         for i in range(plant.n):
             now.x[plant.n + i] = now.drives.applied[i] = now.drives.motor[i] = 0.0
         now.sample[0] += 1.0
         return
-    actuate(plant.drives, int(now.sample[0]), command, now.drives)
+    actuate(plant.drives, int(now.sample[0]), own.command, now.drives)
     motion = update_motion(plant, now)
     add_compensation(plant, now)
     for i in range(plant.n):

@@ -216,6 +216,7 @@ def settings_of(config: PlantConfig) -> PlantSettings:
             drive.friction if robot.drive_compensates == 'gravity_and_friction' else 0.0,
             int(robot.effort != 'commanded'),
             _CURRENT if robot.effort == 'current' else 1.0,
+            actuator.rate_limit * config.sample_time,
             actuator.reflex_rate * config.sample_time,
         ),
         drive_size=bodies.size,

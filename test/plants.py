@@ -92,6 +92,7 @@ def settings(
     delay=0,
     time_constant=0.0,
     torque_noise=0.0,
+    step=0.0,
 ):
     """Return settings of the arm of Section IV, by default at 1 kHz."""
     return PlantSettings(
@@ -109,7 +110,7 @@ def settings(
         drives=Drives(
             np.array(torque_limit), delay, *lag(time_constant, period_ns * 1e-9), torque_noise
         ),
-        compensation=Compensation(0.0, 1, 1.0, 0.0),
+        compensation=Compensation(0.0, 1, 1.0, step, 0.0),
         drive_size=0,
         drive_memory=0,
         drive_bodies=np.zeros(0),

@@ -40,7 +40,9 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.nodes.endpoints import qos_profile
 from blf_dsc_controller.replay.verify import verify
-from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.loop import START, simulate
+from blf_dsc_controller.supervision.guard import Guard
+from sim_plant.plant import plant_of
 
 
 class Facts(NamedTuple):
@@ -216,6 +218,39 @@ def test_repeated_reading_does_not_make_the_torque_of_the_ur5e_jump():
         torques = simulate(law, plant).run().torque[500:]
         steps.append(np.abs(np.diff(torques, axis=0)).max())
     assert steps[1] < 1.5 * steps[0]
+
+
+@ROBOTS
+@pytest.mark.parametrize('lost', [1, 3])
+def test_lost_commands_neither_stop_the_drives_nor_cost_the_bound(robot, lost):
+    """In a row, twenty times a second or more; 2 kg are picked up at 4 s, and put down at 7 s."""
+    loop = load_loop(FACTS[robot].preset)
+    events = {'events.begin': [4.0], 'events.duration': [3.0]}
+    guard, plant = Guard(loop.controller), plant_of(change(loop.plant, events))
+    guard.activate()
+    ratio, random, left = 0.0, np.random.default_rng(0), 0
+    for k in range(round(9.0 / loop.plant.sample_time)):
+        torque = guard.update(START + k * loop.plant.sample_time_ns, plant.measure())
+        if left == 0:
+            applied, left = torque.copy(), lost if random.random() < 0.05 else 0
+        else:
+            left -= 1
+        plant.step(applied)
+        sample = guard.controller.sample
+        ratio = max(ratio, np.max(np.abs(sample.xi1) / sample.bound))
+    assert guard.supervisor.phase == 'tracking'
+    assert not plant.is_stopped
+    assert ratio < 0.5
+
+
+def test_arm_at_100_hz_stops_with_the_rate_as_the_reason():
+    """controller_manager's default; an arm that sends states before is refused at the start."""
+    loop = load_loop('fr3')
+    guard, plant = Guard(loop.controller), plant_of(change(loop.plant, {'sample_time': 0.01}))
+    guard.activate()
+    for k in range(20):
+        plant.step(guard.update(START + k * 10_000_000, plant.measure()))
+    assert 'states come every 0.01 s, but sample_time is 0.001 s' in guard.supervisor.text
 
 
 OF_OTHERS = ('franka_bringup', 'ur_robot_driver', 'controller_manager', 'control')

@@ -114,4 +114,4 @@ def test_joint_states_at_too_high_a_rate_are_reported(ros):
     log = listen(ros, Log, '/rosout', LATCHED)
     ros.add(ControllerNode, namespace='often')
     ros.add(PlantNode, mode='lockstep', sample_time=0.0005, namespace='often')
-    ros.until(lambda: any('joint states arrive every 0.0005 s, but' in line.msg for line in log))
+    ros.until(lambda: any('joint states come every 0.0005 s, but' in line.msg for line in log))

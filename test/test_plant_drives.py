@@ -77,10 +77,13 @@ def test_drives_overcome_their_share_of_friction():
     assert slowed[1.0] == pytest.approx(0.2 - frictionless.measure()[13], abs=0.05 * slowed[0.0])
 
 
-@pytest.mark.parametrize(('step', 'stops'), [(0.99, False), (1.01, True)])
-def test_reflex_stops_the_arm_after_a_jump_of_the_command_until_a_reset(step, stops):
-    """1000 N m/s at 1 kHz: 1 N m from command to command, the first from none."""
-    plant = panda(HELD, NO_FRICTION, {'actuator.reflex_rate': 1000.0})
+@pytest.mark.parametrize(
+    ('step', 'rate', 'stops'), [(0.99, 0.0, False), (1.01, 0.0, True), (1.01, 1000.0, False)]
+)
+def test_reflex_stops_the_arm_after_a_jump_of_the_torque_until_a_reset(step, rate, stops):
+    """1000 N m/s at 1 kHz: 1 N m from torque to torque, the first from none."""
+    given = {'actuator.reflex_rate': 1000.0, 'actuator.rate_limit': rate}
+    plant = panda(HELD, NO_FRICTION, given)
     for k in range(1, 6):
         plant.measure()
         plant.step(np.full(7, k * step))
@@ -185,6 +188,13 @@ def test_torque_beyond_the_limit_of_its_joint_is_cut(delay):
     assert (cut != torques).any(axis=0).all()
     limited = run(plant(delay=delay, torque_limit=limit), torques)
     assert (limited == run(plant(delay=delay), cut)).all()
+
+
+def test_driver_lets_a_command_change_at_its_rate_only():
+    torques, passed = commands(SAMPLES), [np.zeros(2)]
+    for torque in torques[:-1]:
+        passed.append(passed[-1] + np.clip(torque - passed[-1], -0.3, 0.3))
+    np.testing.assert_allclose(run(plant(step=0.3), torques)[:, 4:], passed, rtol=1e-12)
 
 
 def test_zero_torque_limit_means_no_limit():

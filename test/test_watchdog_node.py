@@ -17,7 +17,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from random_arm import CONFIG
 
 from blf_dsc_controller import load_loop
-from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.configuration.schema import change, flatten
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
@@ -130,7 +130,7 @@ class Driver:
 def test_named_arm_in_motion_comes_to_rest_once_its_controller_is_dead(ros, preset, angle):
     """Over ROS, in the time of the states: a busy computer changes nothing."""
     loop = load_loop(CONFIG / f'{preset}.yaml')
-    driver = Driver(ros, loop.plant)
+    driver = Driver(ros, change(loop.plant, {'actuator.rate_limit': 0.0}))
     n, steady = len(loop.controller.joints), lambda: driver.now
     given = {name: value for name, value in flatten(loop.controller).items() if value != ()}
     controller = ros.add(ControllerNode, given, clock=steady)

@@ -230,9 +230,15 @@ class Actuator:
         'zero',
         'without a command: zero torque, the brakes hold the joints, or the last command goes on',
     )
+    rate_limit: float = _fixed(
+        0.0,
+        'rate at which the driver lets commands change, as franka_ros2 does; 0: any',
+        'N m/s',
+        at_least=0.0,
+    )
     reflex_rate: float = _fixed(
         0.0,
-        'rate of the commanded torque above which the drives brake until a reset; 0: never',
+        'rate of the torque that they get above which the drives brake until a reset; 0: never',
         'N m/s',
         at_least=0.0,
     )

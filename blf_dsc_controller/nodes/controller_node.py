@@ -32,7 +32,7 @@ from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.endpoints import subscription_count
 from blf_dsc_controller.nodes.lifecycle import POLL_PERIOD, LoopNode
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
-from blf_dsc_controller.supervision.checks import SAME_CLOCK
+from blf_dsc_controller.supervision.checks import SAME_CLOCK, rate_mismatch
 from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.linear_loop import ReferenceLoad, reference_load
@@ -241,13 +241,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._arrivals, self._pending = None, None
         T = self.config.sample_time
         if not T / _ALIKE < period < T * _ALIKE:
-            guard.refuse(
-                StartError(
-                    f'joint states come every {period:.3g} s, but sample_time is {T:g} s: set '
-                    f'update_rate of controller_manager (100 Hz by default) to {1.0 / T:.6g}, or '
-                    'sample_time to the period of the topic'
-                )
-            )
+            guard.refuse(StartError(rate_mismatch(period, T)))
         else:
             guard.check_support(self._decoder.values)
         self._report_if_changed(guard)
@@ -298,10 +292,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         samples = guard.controller.samples
         period, expected = guard.time / max(samples - 1, 1), self.config.sample_time
         if samples == _RATE_SAMPLES and period < _FAST * expected:
-            self.get_logger().warning(
-                f'joint states arrive every {period:.3g} s, but sample_time is {expected:g} s: set '
-                'it to that of the arm, since gains and windows depend on it'
-            )
+            self.get_logger().warning(rate_mismatch(period, expected))
 
     def _report_learning(self, guard: Guard) -> None:
         """Report columns that were rejected or taken back, and changes of the arm."""

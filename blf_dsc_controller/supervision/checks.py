@@ -26,6 +26,15 @@ SKIP = Fault(Reason.NONE, '')
 """Returned for a state to ignore."""
 
 
+def rate_mismatch(period: float, sample_time: float) -> str:
+    """Return what to do about joint states that come every `period` [s]."""
+    return (
+        f'joint states come every {period:.3g} s, but sample_time is {sample_time:g} s: set '
+        f'update_rate of controller_manager (100 Hz by default) to {1.0 / sample_time:.6g}, or '
+        'sample_time to the period of the topic'
+    )
+
+
 class StateCheck:
     """Checks joint states, one after the other.
 

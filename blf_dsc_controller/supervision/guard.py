@@ -34,6 +34,7 @@ from blf_dsc_controller.supervision.checks import (
     StateCheck,
     Velocity,
     Watchdog,
+    rate_mismatch,
 )
 from blf_dsc_controller.supervision.handover import check_first_torque, check_support
 from blf_dsc_controller.supervision.safe_torque import SafeTorque, limit_first_torque
@@ -42,6 +43,7 @@ from blf_dsc_controller.supervision.supervisor import Phase, Reason, Supervisor
 Vector = NDArray[np.float64]
 _NANO = 1e-9
 _LONG_SILENCE = 2.0  # s
+_MANY = 0.5  # states missed for each that came
 
 _REASONS: dict[type[codecs.MessageError], Reason] = {
     codecs.MissingJointError: Reason.JOINT_MISSING,
@@ -314,6 +316,10 @@ class GuardedLaw:
         return (stamp - self.start_stamp) * _NANO
 
     def _stop(self, reason: Reason, text: str) -> None:
+        missed = self.states.missed / max(self.controller.samples - 1, 1)  # for each that came
+        if missed > _MANY and reason is not Reason.OVERRUN:
+            T = self.config.sample_time
+            text += f'; {rate_mismatch((1.0 + missed) * T, T)}'
         if self.supervisor.stop(reason, text):
             self.journal.note(EventType.STOP, reason=reason, text=text)
             self._clean = self._resumable = False
