@@ -7,13 +7,14 @@ On a shared machine only interleaved measurements can be compared.
 from __future__ import annotations
 
 import gc
+import itertools
 import os
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -63,6 +64,12 @@ def interleaved(contestants: Mapping[str, Callable[[], int]], rounds: int) -> di
             if counted >= 0:
                 seconds[name].append(elapsed / units)
     return {name: np.array(values) for name, values in seconds.items()}
+
+
+def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a Markdown table, each row as soon as it is known."""
+    for row in itertools.chain([heads, ['---'] * len(heads)], rows):
+        print(f'| {" | ".join(row)} |', flush=True)
 
 
 class ContestantError(BlfDscError):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The offline loop and a Monte Carlo study against the same in C, numpy, MuJoCo and pinocchio.
+"""Offline loop and study against the same in C, numpy, MuJoCo, pinocchio; replay against a reader.
 
 The C reference is compiled on demand and called through ctypes. The peers run the recommended
 configuration: all hold the torque over the sample and apply the disturbance, only the integration
@@ -26,11 +26,15 @@ from typing import Any
 
 import numpy as np
 from harness import Ratio, interleaved, ratio
+from mcap.reader import make_reader
 
+from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.law.factory import controller_of, settings_of_config
+from blf_dsc_controller.replay.verify import verify
+from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies import runs
 from blf_dsc_controller.studies.monte_carlo import (
@@ -54,11 +58,11 @@ _AGREEMENT = 10.0  # s
 _ROUNDS = 5
 _DURATION = 10.0  # s
 _RUNS = 50  # per round against C
-_CHUNKS = 100  # per round of the engine
+_CHUNKS = 50  # per round on processes
 _CHUNK = 4  # runs; few, so that the first to finish waits for at most one chunk
-_STUDY_ROUNDS = 9
 _C_LOOP = 'C -O3, in a loop'
 _CHUNKED = 'run_chunk'
+_READER = 'mcap reader, messages as bytes'
 _ERRORS = ('max_error_ratio', 'rms_error_rad')
 SOURCE = Path(__file__).with_name('reference.c')
 # The package's kernels are compiled for the native processor too; contraction would change the
@@ -305,10 +309,6 @@ def _package(duration: float) -> Callable[[], int]:
     return lambda: simulate(CONTROLLER, plant, supervised=False).stamps.size
 
 
-def _peer(loop: Callable[[float], np.ndarray]) -> int:
-    return len(loop(_SHORT))
-
-
 def _beside_c() -> Iterator[Ratio]:
     reference = Reference()
     plant = replace(PLANT, duration=_LONG)
@@ -316,7 +316,7 @@ def _beside_c() -> Iterator[Ratio]:
         PACKAGE: _package(_LONG),
         C: lambda: len(reference.rows(CONTROLLER, plant)),
     }
-    times = interleaved(contestants, 4 * _ROUNDS)
+    times = interleaved(contestants, 4 * _ROUNDS)  # short rounds
     yield ratio(
         'closed loop offline',
         PACKAGE,
@@ -332,7 +332,7 @@ def _beside_peers() -> Iterator[Ratio]:
     notes = {}
     for name, (module, loop, note) in _PEERS.items():
         if importlib.util.find_spec(module) is not None:
-            contestants[name] = partial(_peer, loop)
+            contestants[name] = partial(lambda loop: len(loop(_SHORT)), loop)
             notes[name] = note
     times = interleaved(contestants, _ROUNDS)
     for name, note in notes.items():
@@ -378,7 +378,7 @@ def _study_beside_c(study: Study) -> Iterator[Ratio]:
         _CHUNKED: lambda: run_chunk(study, 0, _RUNS)['run'].size,
         _C_LOOP: lambda: len(reference()),
     }
-    rates = {name: 1.0 / times for name, times in interleaved(contestants, _STUDY_ROUNDS).items()}
+    rates = {name: 1.0 / times for name, times in interleaved(contestants, _ROUNDS).items()}
     note = (
         f'{np.median(rates[_CHUNKED]):.0f} runs of {_DURATION:g} s a second here; '
         f'errors differ by at most {study_disagreement(study):.0e} of themselves'
@@ -393,7 +393,7 @@ def _processes(study: Study) -> Iterator[Ratio]:
             'one': partial(_computed, study, one_process),
             'two': partial(_computed, study, two_processes),
         }
-        single, double = interleaved(contestants, _STUDY_ROUNDS).values()
+        single, double = interleaved(contestants, _ROUNDS).values()
     note = f'{np.median(1.0 / double):.0f} runs a second here; the pools were started before'
     what = 'two processes: runs a second'
     yield ratio('monte carlo', what, 'one process', 1.0 / double, 1.0 / single, note)
@@ -403,3 +403,36 @@ def _computed(study: Study, executor: Executor) -> int:
     spans = [Span(k * _CHUNK, _CHUNK) for k in range(_CHUNKS)]
     runs.compute(study, spans, executor, 6, lambda *_: None)
     return _CHUNK * _CHUNKS
+
+
+def measure_replay() -> Iterator[Ratio]:
+    """Measure messages per second relative to the mcap reader alone, on a bag of all topics."""
+    plant = replace(PLANT, duration=_LONG)
+    with tempfile.TemporaryDirectory() as folder:
+        bag = Path(folder, 'bag')
+        write_bag(bag, simulate(CONTROLLER, plant), CONTROLLER, 'none', plant)
+        messages = _iterated(bag)
+
+        def replayed() -> int:
+            found = verify(bag)
+            if found.difference is not None:
+                raise ValueError(f'{bag}: {found.difference}')
+            return messages
+
+        contestants = {
+            _READER: lambda: _iterated(bag),
+            'messages read and decoded': lambda: sum(read_content(bag).message_counts.values()),
+            'bag replayed through the law and compared': replayed,
+        }
+        times = interleaved(contestants, _ROUNDS)
+    for name in [*contestants][1:]:
+        note = f'{1e-3 / np.median(times[name]):.0f} thousand messages a second here'
+        what = f'{name}: messages a second'
+        yield ratio('replay', what, _READER, 1.0 / times[name], 1.0 / times[_READER], note)
+
+
+def _iterated(bag: Path) -> int:
+    """Iterate over the messages of a bag of one file and return their number."""
+    (file,) = bag.glob('*.mcap')
+    with file.open('rb') as stream:
+        return sum(1 for _ in make_reader(stream).iter_messages(log_time_order=False))

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from harness import print_table
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.inertia import pseudo_inertia
@@ -83,22 +84,26 @@ def main() -> None:
     parser.add_argument('--urdf', default='', help='of bags in folders without a URDF')
     options = parser.parse_args()
     heads = ('URDF', 'published', 'least squares', 'semidefinite', 'identify', 'its URDF')
-    print(f'| recording | {" | ".join(heads)} | physical | friction found |')
-    print('| --- |' + ' --- |' * 8)
-    weighed = []
+    weighed: list[str] = []
     with tempfile.TemporaryDirectory() as bags:
-        for folder in options.folders:
-            read = next((read for file, read in _SOURCES.items() if (folder / file).exists()), None)
-            found = read(folder, Path(bags)) if read else _bags(folder, options.urdf)
-            for taken in found:
-                recording = read_recording(taken.bag, taken.robot.text, taken.joints)
-                print(_row(taken, recording), flush=True)
-                if taken.loaded:
-                    weighed.append(_weigh(taken, recording))
+        rows = _rows(options.folders, options.urdf, Path(bags), weighed)
+        print_table(('recording', *heads, 'physical', 'friction found'), rows)
     print('\n'.join(['', *weighed]))
 
 
-def _row(taken: Taken, recording: Recording) -> str:
+def _rows(
+    folders: list[Path], urdf: str, bags: Path, weighed: list[str]
+) -> Iterator[tuple[str, ...]]:
+    for folder in folders:
+        read = next((read for file, read in _SOURCES.items() if (folder / file).exists()), None)
+        for taken in read(folder, bags) if read else _bags(folder, urdf):
+            recording = read_recording(taken.bag, taken.robot.text, taken.joints)
+            yield _row(taken, recording)
+            if taken.loaded:
+                weighed.append(_weigh(taken, recording))
+
+
+def _row(taken: Taken, recording: Recording) -> tuple[str, ...]:
     found = identify_arm(recording, taken.robot)
     errors = [_percent(e, found.torque) for e in found.errors]
     rows, test, baselines = _baselines(taken, recording)
@@ -109,7 +114,7 @@ def _row(taken: Taken, recording: Recording) -> str:
         published = _percent(error, found.torque)
     physical = min(np.linalg.eigvalsh(pseudo_inertia(body))[0] for body in found.inertias) > 0.0
     cells = (taken.name, errors[0], published, *baselines, errors[2], errors[1])
-    return f'| {" | ".join(cells)} | {"yes" if physical else "no"} | {_terms(found)} |'
+    return *cells, 'yes' if physical else 'no', _terms(found)
 
 
 def _terms(found: Identified) -> str:

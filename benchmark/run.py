@@ -22,10 +22,10 @@ _GROUPS = {  # module and function of each
     'offline': ('offline', 'measure'),
     'montecarlo': ('offline', 'measure_study'),
     'growth': ('growth', 'measure'),
-    'node': ('node', 'measure'),
-    'recording': ('bags', 'measure'),
-    'replay': ('bags', 'measure_replay'),
-    'startup': ('node', 'measure_start'),
+    'replay': ('offline', 'measure_replay'),
+    'node': ('nodes', 'measure'),
+    'recording': ('nodes', 'measure_recording'),
+    'startup': ('nodes', 'measure_start'),
 }
 _HERE = Path(__file__).parent
 _PACKAGES = ('numpy', 'numba', 'scipy', 'mujoco', 'pin', 'ros-jazzy-rclpy')

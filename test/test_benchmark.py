@@ -79,7 +79,7 @@ def test_c_reference_gives_the_same_trajectory():
 
 @pytest.mark.skipif(shutil.which('cc') is None, reason='there is no C compiler')
 def test_study_compared_with_c_and_on_two_processes(monkeypatch):
-    sizes = {'_DURATION': 0.05, '_RUNS': 2, '_CHUNKS': 2, '_CHUNK': 1, '_STUDY_ROUNDS': 1}
+    sizes = {'_DURATION': 0.05, '_RUNS': 2, '_CHUNKS': 2, '_CHUNK': 1}
     study = tiny(monkeypatch, 'offline', **sizes)
     assert len(contestants(list(study.measure_study()))) == 2
 
@@ -94,25 +94,25 @@ def test_c_reference_runs_the_same_study(monkeypatch):
 
 
 def test_node_compared_with_null_node(monkeypatch):
-    node = tiny(monkeypatch, 'node', _STEPS=20, _WARM_UP=2, _SETTLING=0.05)
-    monkeypatch.setattr(node, '_PROCESSES', (node._NULL, node._QUIET))
-    monkeypatch.setattr(node, '_PRESETS', {'recommended': 'node'})
-    assert contestants(list(node.measure())) == [
-        'controller, telemetry off: median latency',
-        'controller, telemetry off: p99.9 latency',
-        'controller, telemetry off: CPU',
-        'controller, telemetry off: steps a second',
+    nodes = tiny(monkeypatch, 'nodes', _STEPS=20, _WARM_UP=2, _SETTLING=0.05)
+    monkeypatch.setattr(
+        nodes, '_GROUPS', {'recommended': ('node', (nodes._NULL, nodes._QUIET, nodes._HEARD))}
+    )
+    assert contestants(list(nodes.measure())) == [
+        f'{name}: {what}'
+        for what in ('median latency', 'p99.9 latency', 'CPU', 'steps a second')
+        for name in (nodes._QUIET, nodes._HEARD)
     ]
 
 
 def test_recorder_compared_with_raw_subscriber(monkeypatch):
-    sizes = {'_TOPICS': 2, '_MESSAGES': 20, '_SETTLING': 0.0, '_RECORDERS': {'recorder': 'none'}}
-    recording = tiny(monkeypatch, 'bags', **sizes)
-    assert contestants(list(recording.measure())) == ['recorder: CPU']
+    sizes = {'_TOPICS': 2, '_MESSAGES': 20, '_SETTLING': 0.1, '_RECORDERS': {'recorder': 'none'}}
+    nodes = tiny(monkeypatch, 'nodes', **sizes)
+    assert contestants(list(nodes.measure_recording())) == ['recorder: CPU']
 
 
 def test_replay_compared_with_mcap_reader(monkeypatch):
-    replay = tiny(monkeypatch, 'bags', _DURATION=0.1)
+    replay = tiny(monkeypatch, 'offline', _LONG=0.1)
     units = []
 
     def counting(each, rounds):
@@ -128,11 +128,11 @@ def test_replay_compared_with_mcap_reader(monkeypatch):
 
 
 def test_dead_contestant_aborts_the_measurement(monkeypatch):
-    recording = tiny(monkeypatch, 'bags')
-    monkeypatch.setattr(recording, '_command', lambda *_: ['-c', 'raise SystemExit("no disk")'])
+    nodes = tiny(monkeypatch, 'nodes')
+    monkeypatch.setattr(nodes, '_recording', lambda *_: ['-c', 'raise SystemExit("no disk")'])
     error = importlib.import_module('harness').ContestantError
     with pytest.raises(error, match=r'raw subscriber.* ended with exit code 1:\nno disk'):
-        list(recording.measure())
+        list(nodes.measure_recording())
 
 
 def test_waiting_for_a_silent_contestant_times_out():

@@ -1,0 +1,286 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identification, weighing and excitation on random simulated arms, each in one table.
+
+    .venv/bin/python benchmark/identification.py arms --runs 100
+    .venv/bin/python benchmark/identification.py weighing --runs 100
+    .venv/bin/python benchmark/identification.py excitation --runs 2
+
+arms        Panda, UR5e and random chains of six joints, with links, centres of mass, rotors and
+            friction drawn at random, identified from positions and efforts alone: encoders of 20
+            bits and 1 % noise of torque, for half a minute at 1 kHz and at 100 Hz.
+weighing    What arms hold, weighed while they move. Each run has links up to 30 % heavier or
+            lighter than the URDF's, centres of mass 1 cm off, drives and friction of its own, and a
+            random motion of three tones that does not repeat. 2 kg are picked up after 10 to 14 s.
+            The drives of `fr3` compensate gravity and friction by a wrong model.
+excitation  The search of `blf_dsc excite` with so many starts against random finite Fourier series
+            in the same time, with the same harmonics, limits and clearance. A random series is
+            scaled down by 10 % up to 20 times, until it keeps them; the best of all is kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+sys.path.append(str(Path(__file__).parents[1] / 'test'))
+
+import time
+from typing import Any
+
+import numpy as np
+from harness import print_table
+from random_arm import CONFIG, random_urdf
+from shaken_arm import PERIOD, Truth, measured, reference_of, shake, truth_of
+
+from blf_dsc_controller.arms.inertia import pseudo_inertia
+from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.cli.identify import clearance_of, guess_of
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, load_loop
+from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.identification.exciting_reference import ExcitationProblem, search
+from blf_dsc_controller.identification.identify import Identified, identify_arm
+from blf_dsc_controller.identification.prior import columns_of as identified_columns
+from blf_dsc_controller.identification.recording import Recording, rows_of
+from blf_dsc_controller.law.factory import begin, controller_of
+from blf_dsc_controller.law.telemetry import columns_of
+from blf_dsc_controller.reference.limits import MotionError
+from blf_dsc_controller.run import Floats
+from blf_dsc_controller.simulation.loop import simulate
+
+_DURATION, _UNSEEN = 30.0, 10.0  # s
+_EVERY = (1, 10)  # samples of 1 ms from state to state
+_LOAD = 2.0  # kg
+_AFTER = (1.0, 2.0, 3.0)  # s, from the pick-up to a reading
+_HARMONICS, _TORQUE, _SPEED, _RADIUS = 3, 0.8, 0.95, 0.07
+_SHRINK, _SHRINKS = 0.9, 20  # to an eighth
+_HEADS = {
+    'arms': ('rate', 'torque error on unseen motion: URDF', 'identified', '95 % intervals', 'time'),
+    'weighing': (
+        *('arm', 'nothing held [g]', *(f'2 kg after {t:g} s [g]' for t in _AFTER)),
+        *('centre after 3 s [mm]', 'within 95 % intervals: mass', 'centre'),
+        *('law [us]', 'weighing: of 100 samples 90, 9, 1 [us]'),
+    ),
+    'excitation': (
+        *('arm', 'time', 'log-determinant (smallest eigenvalue): excite', 'random'),
+        'series tried',
+    ),
+}
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('what', choices=_HEADS)
+    parser.add_argument('--config', nargs='+', default=['panda', 'ur5e', 'fr3'])
+    parser.add_argument('--runs', type=int, default=100, help='arms, runs of each arm, or starts')
+    options = parser.parse_args()
+    if options.what == 'arms':
+        rows: Iterable[tuple[str, ...]] = _identified(options.runs)
+    else:
+        row = _weighed if options.what == 'weighing' else _excited
+        rows = (row(name, options.runs) for name in options.config)
+    print_table(_HEADS[options.what], rows)
+
+
+def _identified(arms: int) -> list[tuple[str, ...]]:
+    results = np.array([_of_arm(seed) for seed in range(arms)])  # (arms, rates, columns)
+    print(f'{arms} arms, {np.sum(results[:, :, 4] == 0.0)} results with unphysical bodies')
+    rows: list[tuple[str, ...]] = []
+    for every, rate in zip(_EVERY, np.swapaxes(results, 0, 1), strict=True):
+        before, after = (
+            f'{np.median(e):.2f} % (95 of 100: {np.percentile(e, 95):.2f})' for e in rate.T[:2]
+        )
+        inside = f'{100.0 * rate[:, 2].mean():.1f} % hold the truth'
+        seconds = f'{np.median(rate[:, 3]):.2f} s'
+        rows.append((f'{1.0 / (every * PERIOD):.0f} Hz', before, after, inside, seconds))
+    return rows
+
+
+def _robot(seed: int) -> Robot:
+    if seed % 3 == 0:
+        return Robot(urdf=(CONFIG / 'panda.urdf').read_text(), tip='panda_hand_tcp')
+    if seed % 3 == 1:
+        return Robot(urdf=(CONFIG / 'ur5e.urdf').read_text(), tip='tool0')
+    return Robot(urdf=random_urdf(6, seed)[0], tip='tip', payload=1.0)
+
+
+def _of_arm(seed: int) -> list[tuple[float, ...]]:
+    """Return for each rate the errors [%] before and after, coverage, time and whether physical."""
+    robot = _robot(seed)
+    chain = robot.chain(())
+    truth = truth_of(chain, seed)
+    motion = measured(shake(chain, truth, reference_of(chain, 2 * seed), _DURATION), seed)
+    unseen = shake(chain, truth, reference_of(chain, 2 * seed + 1), _UNSEEN)
+    rows: list[tuple[float, ...]] = []
+    for every in _EVERY:
+        begin = time.perf_counter()
+        found = identify_arm(_recording(chain, motion[::every], every), robot)
+        seconds = time.perf_counter() - begin
+        physical = min(np.linalg.eigvalsh(pseudo_inertia(body))[0] for body in found.inertias) > 0.0
+        errors = _errors(found, _recording(chain, unseen, 1))
+        rows.append((*errors, _coverage(found, truth), seconds, float(physical)))
+    return rows
+
+
+def _recording(chain: Chain, states: Floats, every: int) -> Recording:
+    joints = tuple(joint.name for joint in chain.joints)
+    gap = np.zeros(len(states), dtype=bool)
+    return Recording(joints, every * PERIOD, states[:, 0], states[:, 2], gap, 'simulated')
+
+
+def _errors(found: Identified, unseen: Recording) -> tuple[float, float]:
+    rows = rows_of(unseen, found.parameters.model)
+    G = identified_columns(found.parameters, len(unseen.joints))
+    u = rows.u(0.5 * PERIOD)  # torques are held for a period
+    errors = []
+    for values in (found.prior, found.values):
+        rows.set_load((G @ values)[: found.parameters.model.p])
+        left = rows.X @ (G @ values)[:-1] - u
+        errors.append(100.0 * float(np.linalg.norm(left) / np.linalg.norm(u)))
+    return errors[0], errors[1]
+
+
+def _coverage(found: Identified, truth: Truth) -> float:
+    """Return the share of the base parameters and friction within their 95 % intervals."""
+    true = np.concatenate((truth.inertias.ravel(), truth.rotors, truth.viscous, truth.coulomb))
+    at, n = slice(0, true.size), len(found.chain.joints)
+    G = identified_columns(found.parameters, n)[: found.parameters.model.p + 2 * n, at]
+    deviation = np.sqrt(np.diag(G @ found.covariance[at, at] @ G.T))
+    return float(np.mean(np.abs(G @ (found.values[at] - true)) < 1.96 * deviation))
+
+
+def _weighed(name: str, runs: int) -> tuple[str, ...]:
+    """Return the row of an arm."""
+    loads = np.array([_weigh(name, seed) for seed in range(runs)])  # (runs, readings, 8)
+    true = np.array((0.0, *(_LOAD,) * len(_AFTER)))
+    off = loads[:, :, 0] - true
+    known = np.isfinite(off)
+    cells = []
+    for k in range(true.size):
+        errors = 1e3 * np.abs(off[known[:, k], k])
+        unknown = f', {np.sum(~known[:, k])} unknown' if not known[:, k].all() else ''
+        half = 1e3 * np.median(loads[known[:, k], k, 4])
+        cells.append(
+            f'{np.median(errors):.0f}, {np.percentile(errors, 95):.0f}, {errors.max():.0f} '
+            f'(± {half:.0f}{unknown})'
+        )
+    centre = loads[:, -1, 1:4]
+    found = np.isfinite(centre[:, 0])
+    middle, half = (1e3 * np.median(np.abs(x)) for x in (centre[found], loads[found, -1, 5:]))
+    cells.append(f'{middle:.1f} (± {half:.1f})')
+    inside = np.abs(off[known]) < loads[:, :, 4][known]
+    inside_centre = np.abs(centre[found]) < loads[found, -1, 5:]
+    cells += [f'{100.0 * np.mean(part):.1f} %' for part in (inside, inside_centre)]
+    return name, *cells, *_times(name)
+
+
+def _weigh(name: str, seed: int) -> Floats:
+    """Return what is held (readings, 8) before the pick-up and after it."""
+    random = np.random.default_rng(seed)
+    begin = round(random.uniform(10.0, 14.0), 3)
+    while True:
+        config = _random_loop(name, seed, begin, random)
+        try:
+            record = simulate(config.controller, config.plant, supervised=False)
+        except MotionError:
+            continue
+        break
+    load = columns_of(record.samples, record.controller.settings).load
+    times = np.array((begin, *(begin + t for t in _AFTER)))
+    return np.asarray(load[np.round(times / config.controller.sample_time).astype(int)])
+
+
+def _times(name: str) -> tuple[str, str]:
+    """Return median times: the law; the weighing without a row, with one, and with a solution."""
+    config = load_loop(name, {PLANT: {'duration': 8.0}})
+    record = simulate(config.controller, config.plant, supervised=False)
+    controller, T = controller_of(config.controller), config.controller.sample_time
+    n = controller.settings.n
+    begin(controller, config.controller, *record.measurements[0, : 2 * n].reshape(2, n))
+    times = np.zeros((len(record.stamps), 2))
+    for k, measurement in enumerate(record.measurements):
+        before = time.perf_counter()
+        controller.update(k * T, T, measurement)
+        between = time.perf_counter()
+        controller.weigh(T)
+        times[k] = between - before, time.perf_counter() - between
+    law, weighing = 1e6 * times.T
+    each = ', '.join(f'{value:.1f}' for value in np.percentile(weighing, (50.0, 95.0, 99.5)))
+    return f'{np.median(law):.1f}', each
+
+
+def _random_loop(name: str, seed: int, begin: float, random: np.random.Generator) -> LoopConfig:
+    preset = load_loop(name)
+    friction, reference = preset.plant.disturbance, preset.controller.reference
+    n = len(preset.controller.joints)
+    tones = len(reference.frequency)
+
+    def varied(values: tuple[float, ...], least: float, most: float) -> list[float]:
+        return [float(v) for v in np.array(values) * random.uniform(least, most, len(values))]
+
+    amplitude = np.array(reference.amplitude).reshape(n, tones)
+    amplitude = np.array([random.permutation(row) for row in amplitude])
+    plant: dict[str, Any] = {
+        'duration': begin + _AFTER[-1] + 0.1,
+        'seed': seed,
+        'truth.seed': int(random.integers(100_000)),
+        'truth.mass_deviation': 0.3,
+        'truth.centre_deviation': 0.01,
+        'truth.rotor_factor': float(random.uniform(0.5, 1.3)),
+        'disturbance.viscous': varied(friction.viscous, 0.5, 1.5),
+        'disturbance.coulomb': varied(friction.coulomb, 0.5, 1.5),
+        'sensor.incomplete_states': 0,
+        'events.begin': [begin],
+        'events.duration': [60.0],
+        'events.payload': [_LOAD],
+    }
+    if name == 'fr3':
+        plant['drive.seed'] = int(random.integers(100_000))
+    controller = {
+        'reference.amplitude': varied(tuple(amplitude.ravel()), -1.0, 1.0),
+        'reference.frequency': varied(reference.frequency, 0.6, 1.2),
+        'reference.phase': random.uniform(0.0, 6.0, tones).tolist(),
+    }
+    return load_loop(name, {PLANT: plant, CONTROLLER: controller})
+
+
+def _excited(name: str, starts: int) -> tuple[str, ...]:
+    """Return the row of an arm."""
+    config = load_loop(name).controller
+    clearance = clearance_of(config, _RADIUS, 0.0)
+    problem = ExcitationProblem(
+        config, guess_of(config, None), _TORQUE, _HARMONICS, clearance, _SPEED
+    )
+    problem.evaluate(problem.parameters(problem.start(np.random.default_rng(0))))  # compiles
+    begin = time.perf_counter()
+    best = problem.evaluate(problem.parameters(search(problem, 0, starts))).gain
+    seconds = time.perf_counter() - begin
+    other, tried = _random(problem, seconds)
+    return name, f'{seconds:.0f} s', f'{best:.4g}', f'{other:.4g}', f'{tried}'
+
+
+def _random(problem: ExcitationProblem, seconds: float) -> tuple[float, int]:
+    """Return the best gain within the time [s], and the number of series."""
+    random = np.random.default_rng(0)
+    best, tried = -np.inf, 0
+    end = time.perf_counter() + seconds
+    while time.perf_counter() < end:
+        x = problem.start(random)
+        tried += 1
+        for _ in range(_SHRINKS):
+            reached = problem.evaluate(problem.parameters(x))
+            if reached.is_allowed:
+                best = max(best, reached.gain)
+                break
+            x[problem.n :] *= _SHRINK
+    return best, tried
+
+
+if __name__ == '__main__':
+    main()
