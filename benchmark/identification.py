@@ -43,10 +43,10 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.exciting_reference import ExcitationProblem, search
 from blf_dsc_controller.identification.identify import Identified, identify_arm
-from blf_dsc_controller.identification.prior import columns_of as identified_columns
+from blf_dsc_controller.identification.prior import base_matrix
 from blf_dsc_controller.identification.recording import Recording, rows_of
 from blf_dsc_controller.law.factory import begin, controller_of
-from blf_dsc_controller.law.telemetry import columns_of
+from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.reference.limits import MotionError
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate
@@ -136,7 +136,7 @@ def _recording(chain: Chain, states: Floats, every: int) -> Recording:
 
 def _errors(found: Identified, unseen: Recording) -> tuple[float, float]:
     rows = rows_of(unseen, found.parameters.model)
-    G = identified_columns(found.parameters, len(unseen.joints))
+    G = base_matrix(found.parameters, len(unseen.joints))
     u = rows.u(0.5 * PERIOD)  # torques are held for a period
     errors = []
     for values in (found.prior, found.values):
@@ -150,7 +150,7 @@ def _coverage(found: Identified, truth: Truth) -> float:
     """Return the share of the base parameters and friction within their 95 % intervals."""
     true = np.concatenate((truth.inertias.ravel(), truth.rotors, truth.viscous, truth.coulomb))
     at, n = slice(0, true.size), len(found.chain.joints)
-    G = identified_columns(found.parameters, n)[: found.parameters.model.p + 2 * n, at]
+    G = base_matrix(found.parameters, n)[: found.parameters.model.p + 2 * n, at]
     deviation = np.sqrt(np.diag(G @ found.covariance[at, at] @ G.T))
     return float(np.mean(np.abs(G @ (found.values[at] - true)) < 1.96 * deviation))
 
@@ -191,7 +191,7 @@ def _weigh(name: str, seed: int) -> Floats:
         except MotionError:
             continue
         break
-    load = columns_of(record.samples, record.controller.settings).load
+    load = sample_columns(record.samples, record.controller.settings).load
     times = np.array((begin, *(begin + t for t in _AFTER)))
     return np.asarray(load[np.round(times / config.controller.sample_time).astype(int)])
 

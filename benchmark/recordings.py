@@ -35,7 +35,7 @@ from blf_dsc_controller.identification.identify import (
     regression,
     windows_of,
 )
-from blf_dsc_controller.identification.prior import Prior, columns_of, prior_of, solve
+from blf_dsc_controller.identification.prior import Prior, base_matrix, prior_of, solve
 from blf_dsc_controller.identification.recording import (
     Recording,
     Rows,
@@ -155,7 +155,7 @@ def _baselines(taken: Taken, recording: Recording) -> tuple[Rows, NDArray[np.int
     largest = np.abs(recording.torque).max(axis=0)
     prior = prior_of(robot, chain, held, largest, np.maximum(rows.speed, 0.02), load=False)
     prior = _weakened(prior.only([]))
-    G = columns_of(parameters, n)
+    G = base_matrix(parameters, n)
     found = regression(rows, fit, G, prior)
     values = prior.mean + prior.D @ solve(found.A, found.b, prior.cones, prior.start)
     w = rows.u(values[-1])[test]

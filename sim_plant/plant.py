@@ -181,10 +181,10 @@ def parameter_order(names: Sequence[str], config: PlantConfig) -> np.ndarray:
 def plant_of(config: PlantConfig) -> Plant:
     """Return the plant of a configuration, at sample 0."""
     start = config.initial
-    return Plant(settings_of(config), start.position, start.velocity, config.seed)
+    return Plant(plant_settings(config), start.position, start.velocity, config.seed)
 
 
-def settings_of(config: PlantConfig) -> PlantSettings:
+def plant_settings(config: PlantConfig) -> PlantSettings:
     """Return the settings of a configured plant."""
     arm, n = arm_of(config), len(config.joints)
     sensor, actuator, load, wall = config.sensor, config.actuator, config.load, config.wall

@@ -33,7 +33,7 @@ from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.identify import identify_arm, identify_bag
-from blf_dsc_controller.identification.prior import columns_of
+from blf_dsc_controller.identification.prior import base_matrix
 from blf_dsc_controller.identification.recording import Recording, read_recording
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE
@@ -138,7 +138,7 @@ def test_confidence_intervals_contain_the_truth_as_often_as_stated():
         found = identify_arm(recording_of(measured(motion, seed)), ROBOT)
         true = np.concatenate((truth.inertias.ravel(), truth.rotors, truth.viscous, truth.coulomb))
         at = slice(0, true.size)
-        G = columns_of(found.parameters, 7)[: found.parameters.K.shape[0] + 14, at]
+        G = base_matrix(found.parameters, 7)[: found.parameters.K.shape[0] + 14, at]
         deviation = np.sqrt(np.diag(G @ found.covariance[at, at] @ G.T))
         inside.append(np.abs(G @ (found.values[at] - true)) < 1.96 * deviation)
         masses = np.arange(0, 70, 10)
@@ -179,7 +179,7 @@ def test_small_motion_of_two_joints_leaves_other_parameters_at_the_prior():
     states = shake(PANDA_CHAIN, TRUTH, reference._replace(amplitude=amplitude), 20.0)
     found = identify_arm(recording_of(measured(states, 3)), ROBOT)
     assert is_physical(corrected(found))
-    G = columns_of(found.parameters, 7)
+    G = base_matrix(found.parameters, 7)
     prior, posterior = (np.diag(G @ C @ G.T) for C in (found.prior_covariance, found.covariance))
     shown = dict(zip(found.parameters.combinations, posterior < 0.5 * prior, strict=False))
     assert not any(shown[name] for name in ('Izz7', 'Ixx7 - Iyy7', 'rotor7'))
@@ -302,7 +302,7 @@ def test_arm_of_the_paper_is_identified_from_its_urdf(tmp_path, capsys):
     write_bag(tmp_path / 'bag', run, config.controller, 'none', config.plant)
     robot = Robot(urdf='two_link.urdf', gravity=(0.0, 0.0, -9.8))
     found = identify_bag(tmp_path / 'bag', robot)
-    K = columns_of(found.parameters, 2)[: len(found.parameters.combinations)]
+    K = base_matrix(found.parameters, 2)[: len(found.parameters.combinations)]
     shown = dict(zip(found.parameters.combinations, K @ found.values, strict=True))
     assert shown['m*cx2'] == pytest.approx(0.7 * 0.8, rel=0.02)
     assert shown['m*cx1 + m2'] == pytest.approx(0.5 + 0.7, rel=0.05)

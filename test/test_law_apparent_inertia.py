@@ -11,7 +11,7 @@ from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.law.factory import controller_of, settings_of_config
 from blf_dsc_controller.supervision.config_warnings import expectation
-from sim_plant.plant import settings_of
+from sim_plant.plant import plant_settings
 
 BITS_16 = 2.0 * np.pi / 2**16  # rad
 NOISY = {'sensor.velocity': 'measured', 'sensor.velocity_noise': 0.005}
@@ -100,7 +100,7 @@ def test_measured_inertia_is_that_of_the_arm_where_the_loop_was_unstable():
 
 def test_integrator_takes_as_many_steps_as_friction_on_a_light_joint_needs():
     steps = [
-        settings_of(load_loop('ur5e', {'sim_plant': {'truth.rotor_factor': factor}}).plant).steps
+        plant_settings(load_loop('ur5e', {'sim_plant': {'truth.rotor_factor': factor}}).plant).steps
         for factor in (1.3, 0.1)
     ]
     assert steps[0] == 1

@@ -14,7 +14,7 @@ from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.errors import ConfigurationError
 from sim_plant.arm import tip
 from sim_plant.motion import disturbing_torque, wall_force
-from sim_plant.plant import plant_of, settings_of, urdf_of
+from sim_plant.plant import plant_of, plant_settings, urdf_of
 
 SAMPLES = 40
 AT = 13  # sample at which the arm changes
@@ -65,7 +65,7 @@ def test_event_is_equivalent_to_changing_the_plant_at_its_time(events, lasting):
     scheduled, changed = plant_of(config), plant_of(PlantConfig())
     torques = commands(SAMPLES)
     before = measurements(scheduled, torques[:AT]), measurements(changed, torques[:AT])
-    changed.change(settings_of(change(PlantConfig(), lasting)))
+    changed.change(plant_settings(change(PlantConfig(), lasting)))
     after = measurements(scheduled, torques[AT:]), measurements(changed, torques[AT:])
 
     np.testing.assert_array_equal(*before)

@@ -77,7 +77,7 @@ def _by_joint(content: Content, commands: TopicMessages, joints: tuple[str, ...]
     if size == len(joints):
         return commands.arrays(range(size))
     if size == len(states.names):
-        return commands.arrays(states.columns_of(joints))
+        return commands.arrays(states.indices_of(joints))
     raise TorqueError(
         f'{commands.name} has {size} values, but there are {len(joints)} joints, and '
         f'{len(states.names)} in the joint states ({", ".join(states.names)}): their order is '

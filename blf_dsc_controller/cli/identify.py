@@ -21,7 +21,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification import exciting_reference
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.identify import Identified, identify_bag
-from blf_dsc_controller.identification.prior import JOINT_TERMS, columns_of
+from blf_dsc_controller.identification.prior import JOINT_TERMS, base_matrix
 from blf_dsc_controller.identification.recording import HOP
 from blf_dsc_controller.law.factory import estimate_names
 
@@ -146,7 +146,7 @@ def _joints(found: Identified) -> Iterator[str]:
 def _base(found: Identified) -> Iterator[str]:
     P = found.parameters
     n = len(found.chain.joints)
-    K = columns_of(P, n)[: len(P.combinations)]
+    K = base_matrix(P, n)[: len(P.combinations)]
     before, after = K @ found.prior, K @ found.values
     prior, posterior = (
         np.einsum('ia,ab,ib->i', K, C, K) for C in (found.prior_covariance, found.covariance)

@@ -25,7 +25,7 @@ from blf_dsc_controller.arms.urdf import Chain, attached
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.identification.prior import JOINT_TERMS, Prior, columns_of, prior_of, solve
+from blf_dsc_controller.identification.prior import JOINT_TERMS, Prior, base_matrix, prior_of, solve
 from blf_dsc_controller.identification.recording import (
     COUPLING,
     HOP,
@@ -170,7 +170,7 @@ def identify_arm(
     largest = np.maximum(np.abs(rows.torque).max(axis=0), 1e-6)
     speed = np.maximum(rows.speed, _STILL)
     full = prior_of(robot, chain, held, largest, speed, load=picked_up is not None)
-    G = columns_of(parameters, n)
+    G = base_matrix(parameters, n)
     if picked_up is not None:
         K = parameters.K[:, -(ROTOR + 1) : -1]
         loaded = rows.X[:, :, : parameters.model.p] @ K

@@ -166,7 +166,7 @@ def _inside(J: Floats, mass: float) -> Floats:
     return np.asarray(L @ L.T)
 
 
-def columns_of(parameters: BaseParameters, n: int) -> Floats:
+def base_matrix(parameters: BaseParameters, n: int) -> Floats:
     """Return the matrix (p + 6 n + 14, 17 n + 14) to [P; COLUMNS; COUPLING; LOAD; delay]."""
     K = parameters.K.reshape(-1, n, ROTOR + 1)
     p = K.shape[0]

@@ -24,6 +24,7 @@ from blf_dsc_controller.arms.prior import PAYLOAD_SIZE, deviations, payload_iner
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import drive_model, learned_of, parameters_of
+from blf_dsc_controller.configuration.schema import parameters
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import (
@@ -115,7 +116,10 @@ def column_limits(config: ControllerConfig) -> tuple[tuple[float, ...], tuple[fl
 
 
 def settings_of_config(config: ControllerConfig) -> Settings:
-    """Return the settings of a configuration, in the paper's symbols."""
+    """Return the settings of a configuration, in the paper's symbols.
+
+    A gain that is not computed here is the parameter of the same symbol, or of the same name.
+    """
     model = model_of(config)
     learning = config.learning
     p, columns = model.p, len(column_names(config))
@@ -128,79 +132,70 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     covariance = prior_covariance(config)
     drive_chain, drive_inertias = drive_model(config.robot, config.joints)
     friction = column_limits(config)
-    settings = Settings(
-        model=model,
-        n=model.n,
-        p=p,
-        m=p + columns,
-        surface=SURFACES.index('filtered'),
-        prediction=PREDICTIONS.index(learning.prediction),
-        latch=LATCHES.index(learning.latch),
-        update=UPDATES.index(learning.update),
-        torque_source=TORQUE_SOURCES.index(learning.torque_source),
-        effort_is_whole=int(config.robot.effort != 'commanded'),
-        drive=drive_inertias.size,
-        drive_size=drive_chain.size,
-        compensation=COMPENSATIONS.index(learning.compensation),
-        window=round(learning.window / (config.sample_time * learning.row_interval)),
-        row_interval=learning.row_interval,
-        interval=learning.interval,
-        bias=int(learning.bias),
-        viscous=int(learning.viscous),
-        coulomb=int(learning.coulomb),
-        tones=len(learning.frequencies),
-        truth_known=int(bool(truth.parameters)),
-        feed_forward=int(truth.feed_forward),
-        bumpless=int(learning.bumpless),
+    computed = {
+        'model': model,
+        'n': model.n,
+        'p': p,
+        'm': p + columns,
+        'surface': SURFACES.index('filtered'),
+        'prediction': PREDICTIONS.index(learning.prediction),
+        'latch': LATCHES.index(learning.latch),
+        'update': UPDATES.index(learning.update),
+        'torque_source': TORQUE_SOURCES.index(learning.torque_source),
+        'effort_is_whole': int(config.robot.effort != 'commanded'),
+        'drive': drive_inertias.size,
+        'drive_size': drive_chain.size,
+        'compensation': COMPENSATIONS.index(learning.compensation),
+        'window': round(learning.window / (config.sample_time * learning.row_interval)),
+        'tones': len(learning.frequencies),
+        'truth_known': int(bool(truth.parameters)),
+        'feed_forward': int(truth.feed_forward),
         # Lambda is a heuristic: its rows contradict each other on any arm.
-        change_detection=int(learning.change_detection and learning.prediction != 'lambda'),
-        time_constant=config.surface.time_constant,
-        boundary_layer=config.feedback.boundary_layer,
-        eta=config.disturbance.leakage,
-        kappa=learning.weight,
-        rho=learning.regularization,
-        sigma=learning.excitation_threshold,
-        learning_start=learning.window + learning.settling_time,
-        residual_floor=model.n * least * least,
-        anchor_weight=learning.anchor_weight,
-        prior_weight=learning.prior_weight * least * least,
-        motion_scale=learning.motion_scale,
-        damping_rate=config.feedback.damping_rate,
-        pole=learning.filter_pole,
-        omega=learning.derivative_filter,
-        coulomb_velocity=learning.coulomb_velocity,
-        radius=learning.radius,
-        Wc=0.0,
-        funnel_rate=config.barrier.funnel_rate,
-        bound=np.array(config.barrier.bound),
-        initial_bound=np.array(config.barrier.widest),
-        weight=np.array(config.barrier.weight),
-        slope_limit=np.array(config.barrier.slope_limit),
-        knee=np.array([barrier.knee(*joint) for joint in per_joint]),
-        K=np.array(config.surface.gain),
-        mu=np.array(config.surface.mu),
-        Kp=np.array(config.feedback.gain),
-        d2=np.array(config.feedback.damping),
-        mu_bar=np.zeros(model.n),
-        gamma=np.array(config.disturbance.gain),
-        row_weight=least / floor,
-        torque_limit=np.array(config.torque.limit),
-        rate_limit=np.array(config.torque.rate_limit),
-        true_disturbance=np.array((truth.constant, truth.amplitude, truth.frequency, truth.phase)),
-        Gamma=np.array(learning.adaptation_gain + (learning.column_gain,) * columns),
-        initial_estimate=np.array(learning.initial_estimate + initial_columns(config)),
-        information=np.linalg.inv(covariance),
-        variance=np.diag(covariance).copy(),
+        'change_detection': int(learning.change_detection and learning.prediction != 'lambda'),
+        'learning_start': learning.window + learning.settling_time,
+        'residual_floor': model.n * least * least,
+        'prior_weight': learning.prior_weight * least * least,
+        'pole': learning.filter_pole,
+        'Wc': 0.0,
+        'initial_bound': np.array(config.barrier.widest),
+        'knee': np.array([barrier.knee(*joint) for joint in per_joint]),
+        'Kp': np.array(config.feedback.gain),
+        'mu_bar': np.zeros(model.n),
+        'row_weight': least / floor,
+        'torque_limit': np.array(config.torque.limit),
+        'true_disturbance': np.array(
+            (truth.constant, truth.amplitude, truth.frequency, truth.phase)
+        ),
+        'Gamma': np.array(learning.adaptation_gain + (learning.column_gain,) * columns),
+        'initial_estimate': np.array(learning.initial_estimate + initial_columns(config)),
+        'information': np.linalg.inv(covariance),
+        'variance': np.diag(covariance).copy(),
         **_rotors(config, model.n),
         **_load(config, p + columns),
-        least=np.array((-np.inf,) * p + friction[0]),
-        most=np.array((np.inf,) * p + friction[1]),
-        true_parameters=np.array(truth.parameters or (0.0,) * p),
-        frequencies=np.array(learning.frequencies),
-        drive_chain=drive_chain,
-        drive_inertias=drive_inertias,
-    )
+        'least': np.array((-np.inf,) * p + friction[0]),
+        'most': np.array((np.inf,) * p + friction[1]),
+        'true_parameters': np.array(truth.parameters or (0.0,) * p),
+        'drive_chain': drive_chain,
+        'drive_inertias': drive_inertias,
+    }
+    settings = Settings(**(_gains(config) | computed))
     return settings._replace(**_of_law(config, settings))
+
+
+def _gains(config: ControllerConfig) -> dict[str, Any]:
+    """Return the parameters that are settings, under the name of the field."""
+    groups = (config.barrier, config.surface, config.feedback, config.disturbance, config.torque)
+    found: dict[str, Any] = {}
+    for group in (*groups, config.learning):
+        for param in parameters(type(group)):
+            name = param.symbol if param.symbol in Settings._fields else param.name
+            if name in Settings._fields:
+                value = getattr(group, param.name)
+                is_flag = isinstance(value, bool)
+                found[name] = (
+                    int(value) if is_flag else np.array(value) if param.kind.is_array else value
+                )
+    return found
 
 
 def _rotors(config: ControllerConfig, n: int) -> dict[str, Any]:
@@ -217,10 +212,10 @@ def _rotors(config: ControllerConfig, n: int) -> dict[str, Any]:
     robot, limits = config.robot, (config.limits.position_lower, config.limits.position_upper)
     chain = robot.chain(config.joints)
     rotors = robot.rotors(chain)
-    parameters = parameters_of(robot, chain)
+    base = parameters_of(robot, chain)
     links, joints = (
-        over_postures(chain, parameters, robot.payload, tuple(P), *limits)[0]
-        for P in (parameters.of(chain.inertias, J) for J in (np.zeros(n), rotors))
+        over_postures(chain, base, robot.payload, tuple(P), *limits)[0]
+        for P in (base.of(chain.inertias, J) for J in (np.zeros(n), rotors))
     )
     return settings | {
         'rotors_unsure': 1,

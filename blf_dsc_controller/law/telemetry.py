@@ -229,7 +229,7 @@ def encode_rejected_columns(stamp: int, columns: Sequence[RejectedColumn]) -> by
     return bytes(typestore().serialize_cdr(message, topics.DIAGNOSTICS.type))
 
 
-def columns_of(rows: Floats, settings: Settings) -> Sample:
+def sample_columns(rows: Floats, settings: Settings) -> Sample:
     """Split packed samples (N, s) into columns by name, located by unpacking a row of indices."""
     places = sample_of(np.arange(rows.shape[1], dtype=np.float64), settings)
     return Sample(*(rows[:, part.astype(np.intp)] for part in places))
@@ -272,7 +272,7 @@ def run_of(
 
     Rows of states that the law did not use are NaN except for bound and torque.
     """
-    samples = columns_of(rows, controller.settings)
+    samples = sample_columns(rows, controller.settings)
     used = ~np.isnan(samples.qr[:, 0])
     position, velocity, _ = np.split(measurements, 3, axis=1)
     monitor = Series(LYAPUNOV_TERMS, stamps[used], samples.lyapunov[used])

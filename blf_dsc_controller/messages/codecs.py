@@ -83,7 +83,7 @@ class Layout(NamedTuple):
     names: tuple[str, ...]
     arrays: tuple[Doubles, ...]
 
-    def columns_of(self, joints: Sequence[str]) -> list[int]:
+    def indices_of(self, joints: Sequence[str]) -> list[int]:
         """Return the index of each joint among the names.
 
         Raises:
@@ -210,10 +210,10 @@ def joint_state_places(
     A field that is not `required` and is empty has -1.
 
     Raises:
-        MissingJointError, DuplicatedJointError: as in `columns_of`.
+        MissingJointError, DuplicatedJointError: as in `indices_of`.
         ShortArrayError: an array differs in length from the names.
     """
-    columns = np.array(layout.columns_of(joints), dtype=np.intp)
+    columns = np.array(layout.indices_of(joints), dtype=np.intp)
     places = np.full((3, columns.size), -1)
     for row, field, array in zip(places, JOINT_STATE_FIELDS, layout.arrays, strict=True):
         if array.size == len(layout.names):

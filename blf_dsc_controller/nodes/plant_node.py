@@ -47,7 +47,7 @@ from sim_plant.plant import (
     Plant,
     parameter_names_of,
     plant_of,
-    settings_of,
+    plant_settings,
     steps_of,
     urdf_of,
 )
@@ -309,7 +309,7 @@ class PlantNode(LoopNode[PlantConfig]):
         """Apply changed parameters at the present sample, which is not published yet."""
         if not self._changed:
             return
-        self.plant.change(settings_of(self.config))
+        self.plant.change(plant_settings(self.config))
         self._changes.publish(encode_change(self.stamp, self._changed))
         self._changed = {}
 

@@ -20,7 +20,7 @@ from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.bags.torque import applied_torque
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import begin, controller_of
-from blf_dsc_controller.law.telemetry import columns_of, run_of
+from blf_dsc_controller.law.telemetry import run_of, sample_columns
 from blf_dsc_controller.messages.topics import JOINT_STATES, TRACKING_ERROR
 from blf_dsc_controller.run import Floats, Run
 from blf_dsc_controller.supervision.checks import Velocity
@@ -141,6 +141,6 @@ def run_over(recorded_states: RecordedStates, config: ControllerConfig) -> WhatI
         controller.weigh(config.sample_time)
         last = stamp
     run = run_of(config, controller, states.stamp, recorded, samples)
-    columns = columns_of(samples, controller.settings)
+    columns = sample_columns(samples, controller.settings)
     ratio = (np.abs(columns.xi1) / columns.bound).max(axis=0)
     return WhatIf(run, applied, source, left_out, ratio)

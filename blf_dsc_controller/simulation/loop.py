@@ -33,7 +33,7 @@ from blf_dsc_controller.law.lyapunov import fill_energies
 from blf_dsc_controller.law.settings import settings_of
 from blf_dsc_controller.law.state import Sample, sample_of, signals_of, state_of
 from blf_dsc_controller.law.step import step
-from blf_dsc_controller.law.telemetry import columns_of, disturbance_names, run_of
+from blf_dsc_controller.law.telemetry import disturbance_names, run_of, sample_columns
 from blf_dsc_controller.law.weighing import add_row
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.run import Run, Series, Stop
@@ -249,7 +249,7 @@ class Record:
     def true_errors(self) -> np.ndarray:
         """Return the errors (k, n) [rad] of the true positions, not of the measured ones."""
         n, p = len(self.config.joints), len(self.parameters)
-        qr = columns_of(self.samples, self.controller.settings).qr
+        qr = sample_columns(self.samples, self.controller.settings).qr
         return np.asarray(self.truths[:, p + n : p + 2 * n] - qr)
 
     def run(self) -> Run:

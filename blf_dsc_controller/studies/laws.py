@@ -36,7 +36,7 @@ from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import model_of
-from blf_dsc_controller.law.telemetry import columns_of
+from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.loop import simulate
@@ -333,7 +333,7 @@ def _simulate_named(
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, ...]]:
     config = change(loop.controller, law_changes(contender, loop.controller, values))
     record = simulate(config, loop.plant, supervised=False)
-    samples = columns_of(record.samples, record.controller.settings)
+    samples = sample_columns(record.samples, record.controller.settings)
     p = record.controller.settings.p
     model = tuple(
         torque_error(unseen, samples.estimate[row, :p], record.truths[row, :p])

@@ -24,7 +24,7 @@ from std_msgs.msg import Float64MultiArray
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.nodes import parameters
 from sim_plant.drives import DriveState, actuate
-from sim_plant.plant import settings_of
+from sim_plant.plant import plant_settings
 from sim_plant.sensors import EncoderReading, generator, is_noisy, sense
 
 FIRST_STAMP = 1.0  # s
@@ -86,7 +86,7 @@ class MujocoArm:
         self._mass = self._tip.mass[0]
         self._sample = 0
         self._noise = generator(config.seed)
-        self._settings = settings_of(config)
+        self._settings = plant_settings(config)
         self._reading = EncoderReading(-np.ones(1), *np.zeros((1, 2 * self.n)), *self._zeros(2))
         ring = self._zeros(config.actuator.delay)
         self._drives = DriveState(*self._zeros(3), ring)
