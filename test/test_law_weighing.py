@@ -12,7 +12,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop, locate
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import controller_of
-from blf_dsc_controller.law.telemetry import sample_columns, load_text
+from blf_dsc_controller.law.telemetry import load_text, sample_columns
 from blf_dsc_controller.law.weighing import BEFORE, NEWER, describe, solve
 from blf_dsc_controller.law.window import add_products
 from blf_dsc_controller.simulation.bag import write_bag
@@ -81,7 +81,8 @@ def test_no_torque_depends_on_it(panda):
     config = loop('panda', **{'learning.weighing': False})
     without = simulate(config.controller, config.plant)
     torque, other = (
-        sample_columns(record.samples, record.controller.settings).torque for record in (panda, without)
+        sample_columns(record.samples, record.controller.settings).torque
+        for record in (panda, without)
     )
     np.testing.assert_array_equal(torque, other)
     assert not np.isfinite(weighed(without)[0]).any()
