@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of parameters: as ROS reads them, written back, and the page that documents them."""
+"""Parameter files: as ROS reads them, written back, documented; which section applies; mistakes."""
 
 from __future__ import annotations
 
 import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -23,7 +24,9 @@ from blf_dsc_controller.configuration.nodes import (
     known_names,
     load,
     load_loop,
+    locate,
     parameter_page,
+    read,
 )
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
@@ -116,3 +119,235 @@ def test_topic_page_lists_every_topic_with_its_type():
         if isinstance(topic, topics.Topic):
             name = topic.resolved if topic.name.startswith('/') else topic.relative
             assert f'| `{name}` | {topic.type.replace("/msg/", "/")} |' in page
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / 'arm.yaml'
+
+    def write(text):
+        path.write_text(text, encoding='utf-8')
+        return path
+
+    return write
+
+
+def section(pattern, content):
+    return f'{pattern}:\n  ros__parameters: {{{content}}}\n'
+
+
+def seed_of(path, node='sim_plant'):
+    return load(path, node, PlantConfig).seed
+
+
+def problems_of(path, node='sim_plant', cls=PlantConfig):
+    with pytest.raises(ConfigurationError) as caught:
+        load(path, node, cls)
+    assert str(path) in str(caught.value)
+    return caught.value.problems
+
+
+def test_sections_match_as_in_ros(file):
+    """test_configuration_against_ros.py compares more of them with ROS itself."""
+    for pattern, node in (
+        ('/sim_plant', 'sim_plant'),
+        ('/**', '/left/sim_plant'),
+        ('/**/sim_plant', '/lab/left/sim_plant'),
+        ('left/sim_plant', '/left/sim_plant'),
+    ):
+        assert seed_of(file(section(pattern, 'seed: 7')), node) == 7
+    nested = 'left:\n  sim_plant:\n    ros__parameters: {arm: {l1: 2.0}, arm.l2: 3.0}\n'
+    arm = load(file(nested), '/left/sim_plant', PlantConfig).arm
+    assert (arm.l1, arm.l2) == (2.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ('pattern', 'node'),
+    [
+        ('sim_plant', '/left/sim_plant'),
+        ('/*', '/left/sim_plant'),
+        ('/*/sim_plant', '/sim_plant'),
+        ('/left/*', '/left/arm/sim_plant'),
+        ('/left/**', '/right/sim_plant'),
+        ('other', '/sim_plant'),
+    ],
+)
+def test_section_that_does_not_match_is_ignored_or_rejected(file, pattern, node):
+    path, own = file(section(pattern, 'seed: 7')), pattern.endswith('sim_plant')
+    if own:  # meant for the node, but would silently be ignored
+        remedy = f'does not match {node}: write /**/sim_plant for the node in any namespace'
+        assert problems_of(path, node) == [f'line 2: /{pattern.removeprefix("/")} {remedy}']
+        path = file(section(pattern, 'seed: 7') + section(f'{node}', 'duration: 2.0'))
+    assert seed_of(path, node) == 0
+
+
+def test_later_section_wins_regardless_of_specificity(file):
+    wild, own = section('/**', 'seed: 1, duration: 2.0'), section('sim_plant', 'seed: 3')
+    assert seed_of(file(wild + own)) == 3
+    assert seed_of(file(own + wild)) == 1
+    assert load(file(wild + own), 'sim_plant', PlantConfig).duration == 2.0
+
+
+def test_integer_for_a_double_is_rejected_with_its_line(file):
+    path = file('sim_plant:\n  ros__parameters:\n    seed: 3\n    arm:\n      l1: 1\n')
+    assert problems_of(path) == [
+        'line 5: arm.l1: got 1, but a double is expected: write 1.0 instead of 1'
+    ]
+
+
+def test_overrides_take_precedence_over_the_file(file):
+    path = file(section('sim_plant', 'seed: 3, duration: -1.0'))
+    plant = load(path, 'sim_plant', PlantConfig, {'duration': 5.0})
+    assert (plant.seed, plant.duration) == (3, 5.0)
+    with pytest.raises(ConfigurationError) as caught:
+        load(path, 'sim_plant', PlantConfig, {'duration': -2.0})
+    assert caught.value.problems == [
+        'duration: got -2.0, but it must be at least 0 s (given as an override)'
+    ]
+
+
+def test_unknown_name_in_the_section_of_a_node_is_rejected(file):
+    path = file(section('sim_plant', 'barrier.bound: [1.0, 1.0], sed: 1'))
+    assert problems_of(path) == [
+        'line 2: barrier.bound: unknown parameter',
+        'line 2: sed: unknown parameter, did you mean seed?',
+    ]
+
+
+def test_shared_section_may_have_parameters_of_other_nodes(file):
+    path = file(section('/**', 'barrier.bound: [1.0, 1.0], seed: 4'))
+    assert seed_of(path) == 4
+    assert load(path, 'blf_dsc_controller', ControllerConfig).barrier.bound == (1.0, 1.0)
+    path = file(section('/**', 'barrier.bond: [1.0, 1.0], seed: 4'))
+    assert problems_of(path) == [
+        'line 2: barrier.bond: unknown parameter, did you mean barrier.bound?'
+    ]
+
+
+def test_parameters_of_ros_itself_are_accepted(file):
+    content = 'use_sim_time: true, qos_overrides: {/clock: {subscription: {depth: 1}}}, seed: 2'
+    assert seed_of(file(section('sim_plant', content))) == 2
+    assert seed_of(file(section('/**', content))) == 2
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('', 'line 1: the file is empty'),
+        ('# a comment\n', 'line 1: the file is empty'),
+        ('- 1\n', 'line 1: expected node names or ros__parameters at the top'),
+        ('a: [1\n', 'line 2: not valid YAML'),
+        ('a:\n\tb: 1\n', 'line 2: not valid YAML'),
+        ('sim_plant:\n  seed: 1\n', 'line 2: seed has a value, but is outside of ros__para'),
+        ('sim_plant:\n', 'line 1: sim_plant has a value, but is outside of ros__parameters'),
+        ('sim_plant:\n  ros_parameters: {seed: 1}\n', 'line 2: ros_parameters should be ros__par'),
+        ('sim_plant:\n  ros__parameters:\n', 'line 2: ros__parameters of /sim_plant has no'),
+        ('sim_plant:\n  ros__parameters:\n    seed:\n', 'line 3: seed has no value'),
+        (
+            'n:\n  ros__parameters:\n    a: 1\n    a: 2\n',
+            'line 4: a is repeated, first given on line 3',
+        ),
+        ('n:\n  ros__parameters:\n    a.b: 1\n    a:\n      b: 2\n', 'line 5: a.b is repeated, f'),
+        ('n:\n  ros__parameters: {a: 1}\nn:\n  ros__parameters: {b: 1}\n', 'line 3: n is repeated'),
+        ('n:\n  ros__parameters: {a: [1, 2.0]}\n', 'line 2: a mixes types'),
+        ('n:\n  ros__parameters: {a: [[1]]}\n', 'line 2: a has a list in a list'),
+        ('n:\n  ros__parameters: {a: &x 1, b: *x}\n', 'line 2: ROS does not support the alias'),
+        ('n-1:\n  ros__parameters: {a: 1}\n', 'line 2: /n-1 is not a valid node name'),
+        ('n:\n  ros__parameters: {a: 1}\n  m: {}\n', 'line 3: m cannot be next to ros__para'),
+        ('n:\n  ros__parameters: {a: {}}\n', 'line 2: a has no parameters'),
+        ('n:\n  ros__parameters: {a: 1}\n---\nm: {}\n', 'line 3: not valid YAML'),
+    ],
+)
+def test_malformed_file_is_rejected_with_its_line(file, text, message):
+    (problem,) = problems_of(file(text))
+    assert problem.startswith(message)
+
+
+def test_binary_file_is_rejected(tmp_path):
+    path = tmp_path / 'arm.yaml'
+    path.write_bytes(b'\xff\xfe\x00')
+    with pytest.raises(ConfigurationError, match=r'arm\.yaml'):
+        read(path)
+
+
+def test_missing_file_error_lists_the_presets(tmp_path):
+    assert locate('recommended') == locate('recommended.yaml')
+    assert locate('recommended').is_file()
+    for name in ('recomended', tmp_path / 'absent.yaml', tmp_path):
+        with pytest.raises(ConfigurationError) as caught:
+            locate(name)
+        assert str(name) in str(caught.value)
+        assert re.search('a preset: .*noisy.* recommended', str(caught.value))
+    with pytest.raises(ConfigurationError, match=r'absent\.yaml'):
+        read(tmp_path / 'absent.yaml')
+
+
+def test_preset_name_takes_precedence_over_files_in_the_folder(tmp_path, monkeypatch):
+    preset = locate('recommended')
+    monkeypatch.chdir(tmp_path)
+    for name in ('recommended', 'recommended.yaml'):
+        (tmp_path / name).write_text('', encoding='utf-8')
+    assert locate('recommended') == preset
+    for path in ('./recommended', 'recommended.yaml', tmp_path / 'recommended'):
+        assert locate(path).samefile(tmp_path / path)
+
+
+def test_load_loop_collects_problems_of_all_nodes(file):
+    path = file(
+        section('/**', 'sample_time: 1')
+        + section('sim_plant', 'seed: -1')
+        + section('bag_recorder', 'compression: zip')
+    )
+    with pytest.raises(ConfigurationError) as caught:
+        load_loop(path)
+    assert [problem.split(', but')[0] for problem in caught.value.problems] == [
+        'sim_plant, blf_dsc_controller: line 2: sample_time: got 1',
+        'sim_plant: line 4: seed: got -1',
+        "bag_recorder: line 6: compression: got 'zip'",
+    ]
+
+
+def test_load_loop_rejects_disagreeing_nodes_and_applies_overrides(file):
+    path = file(section('sim_plant', 'sample_time: 0.002'))
+    with pytest.raises(ConfigurationError, match=r'sim_plant has 0\.002 s, but'):
+        load_loop(path)
+    loop = load_loop(
+        path, {'blf_dsc_controller': {'sample_time': 0.002}, 'sim_plant': {'mode': 'lockstep'}}
+    )
+    assert (loop.controller.sample_time, loop.plant.mode) == (0.002, 'lockstep')
+
+
+def test_misspelt_node_name_is_reported(file):
+    with pytest.raises(ConfigurationError) as caught:
+        load_loop(file(section('sim_plnat', 'seed: 1')))
+    assert caught.value.problems == ['line 2: unknown node sim_plnat, did you mean sim_plant?']
+    loop = load_loop(file(section('sim_plant', 'seed: 1') + section('sim_plant2', 'seed: 2')))
+    assert loop.plant.seed == 1
+    with pytest.raises(ConfigurationError, match='/left/bag_recorder does not match /bag_rec'):
+        load_loop(file(section('/left/bag_recorder', 'output: here')))
+    assert load_loop(file(section('robot_state_publisher', 'a: 1'))).plant == PlantConfig()
+
+
+def test_problem_shared_by_several_nodes_is_reported_once(file):
+    path = file(section('/**', 'robot: {urdf: panda.urdf, tip: tol}'))
+    with pytest.raises(ConfigurationError) as caught:
+        load_loop(path)
+    (problem,) = caught.value.problems
+    assert problem.startswith('sim_plant, blf_dsc_controller: line 2: robot.urdf: no ')
+
+
+def test_misspelt_preset_suggests_the_closest():
+    with pytest.raises(ConfigurationError, match=r'did you mean recommended\? give a parameter'):
+        load_loop('recomended')
+
+
+def test_documented_file_for_a_real_arm_is_valid(file):
+    page = (Path(__file__).parents[1] / 'doc/real_arm.md').read_text()
+    blocks = re.findall(r'```yaml\n(.*?)```', page, re.DOTALL)
+    (at,) = (k for k, block in enumerate(blocks) if 'effort_controller:\n' in block)
+    of_ros2_control, own = blocks[at : at + 2]
+    path = file(own.replace('topic://robot_description', 'ur5e.urdf'))
+    config = load(path, 'blf_dsc_controller', ControllerConfig)
+    effort_controller = yaml.safe_load(of_ros2_control)['effort_controller']
+    assert list(config.joints) == effort_controller['ros__parameters']['joints']
+    assert config.safety.torque == 'hold_gravity'

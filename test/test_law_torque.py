@@ -1,16 +1,207 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The torque of the laws, term by term, and its limits: cuts, and their effect on learning."""
+"""The torque: barrier, bound that narrows, surface; the law against a plain one; its limits."""
 
 from __future__ import annotations
+
+from cmath import cos, tan
+from functools import partial
+from math import exp, pi, sin
 
 import numpy as np
 import pytest
 from arbitrary_case import arbitrary
-from closed_loop_case import closed_loop, controller, plant, quick, recommended
-from plain_law import PlainLaw
+from closed_loop_case import REFERENCE, P, R, closed_loop, controller, plant, quick, recommended
+from plain_law import PlainLaw, dynamics
 
+from blf_dsc_controller.law import barrier, surface
 from blf_dsc_controller.law.settings import COMPENSATIONS, EFFORT, UPDATES
 from blf_dsc_controller.law.torque import LEVEL_CUT, RATE_CUT, find_applied, saturate
+from blf_dsc_controller.reference import terms as reference
+
+BOUND, WEIGHT, LIMIT = 0.002, 1000.0, 2e4
+KNEE = barrier.knee(BOUND, WEIGHT, LIMIT)
+RECOMMENDED = (BOUND, WEIGHT, LIMIT, KNEE)
+
+
+def printed_potential(xi, bound):
+    """Equation (3); takes complex xi."""
+    return bound**2 / pi * tan(pi * xi * xi / (2.0 * bound**2))
+
+
+def printed_torque(xi, bound):
+    """The entries of -tau_c below (16); takes complex xi."""
+    return xi / cos(pi * xi * xi / (2.0 * bound**2)) ** 2
+
+
+def each(function, errors, *arguments):
+    """Values of a function of one error at many."""
+    return np.array([function(xi, *arguments) for xi in errors])
+
+
+def test_barrier_inside_the_knee_is_that_of_the_paper_times_the_weight():
+    inside = np.linspace(-0.99, 0.99, 51) * KNEE  # 0 among them
+    for ours, printed in (
+        (barrier.potential, printed_potential),
+        (barrier.gradient, printed_torque),
+    ):
+        expected = WEIGHT * each(printed, inside, BOUND).real
+        np.testing.assert_allclose(each(ours, inside, *RECOMMENDED), expected, rtol=1e-12)
+    # A complex step is exact to rounding.
+    slope = [partial(printed_torque, bound=BOUND)(xi + 1e-30j).imag / 1e-30 for xi in inside]
+    np.testing.assert_allclose(
+        each(barrier.slope, inside, BOUND, WEIGHT), WEIGHT * np.array(slope), rtol=1e-12
+    )
+
+
+def test_barrier_continues_past_the_knee_at_the_largest_slope():
+    for weight in (1.0, 1000.0, 2e4):
+        knee = barrier.knee(BOUND, weight, LIMIT)
+        assert 0.0 <= knee < BOUND
+        assert barrier.slope(knee, BOUND, weight) == pytest.approx(LIMIT, rel=1e-9)
+    xi = np.linspace(-3.0 * BOUND, 3.0 * BOUND, 4001)
+    slope = np.diff(each(barrier.gradient, xi, *RECOMMENDED)) / np.diff(xi)
+    past = np.minimum(np.abs(xi[1:]), np.abs(xi[:-1])) >= KNEE
+    assert slope.min() >= WEIGHT * (1.0 - 1e-9)
+    assert slope.max() <= LIMIT * (1.0 + 1e-9)
+    np.testing.assert_allclose(slope[past], LIMIT, rtol=1e-9)
+    # The potential is its integral: with h = 1e-8 rad the third derivative (below 1e11 N m/rad^3)
+    # adds 1e-6 N m to ~10.
+    h, errors = 1e-8, np.append(np.linspace(-3.0, 3.0, 51) * BOUND, [-KNEE, KNEE])
+    below, above = (each(barrier.potential, errors + side, *RECOMMENDED) for side in (-h, h))
+    gradient = each(barrier.gradient, errors, *RECOMMENDED)
+    np.testing.assert_allclose((above - below) / (2.0 * h), gradient, rtol=1e-6, atol=1e-6)
+
+
+K0, K, RATE = 0.02, 0.0015, 2.0
+NARROWING = {'bound': np.full(2, K), 'initial_bound': np.full(2, K0), 'funnel_rate': RATE}
+START = (2.2935 + 0.015, 1.6961 - 0.012)
+
+
+def bound(t):
+    return K + (K0 - K) * exp(-RATE * t)
+
+
+def narrowing(t):
+    return -RATE * (K0 - K) * exp(-RATE * t) / bound(t)
+
+
+def test_bound_narrows_at_its_rate_and_the_knee_with_it():
+    changes = {'bound': np.full(3, K), 'initial_bound': np.full(3, K0), 'funnel_rate': RATE}
+    settings, _, signals = arbitrary(0, knee=np.full(3, barrier.knee(K, WEIGHT, LIMIT)), **changes)
+    for t in (0.0, 0.3, 2.0):
+        barrier.update_bound(settings, signals, t)
+        np.testing.assert_allclose(signals.bound, bound(t), rtol=1e-14)
+        np.testing.assert_allclose(signals.narrowing, narrowing(t), rtol=1e-13)
+        slope = barrier.slope(signals.knee[0], signals.bound[0], WEIGHT)
+        assert slope == pytest.approx(LIMIT, rel=1e-9)
+
+
+@pytest.mark.parametrize('rate', [0.0, 3.0])
+def test_constant_bound_equals_the_given_one_bit_for_bit(rate):
+    final = arbitrary(0).settings.bound
+    settings, _, signals = arbitrary(0, funnel_rate=rate, initial_bound=final)
+    barrier.update_bound(settings, signals, 1.234)
+    np.testing.assert_array_equal(signals.bound, settings.bound)
+    np.testing.assert_array_equal(signals.knee, settings.knee)
+    np.testing.assert_array_equal(signals.narrowing, 0.0)
+
+
+def test_rate_of_the_potential_accounts_for_the_narrowing_bound():
+    """V' = dV/dxi (xi' - xi k'/k) + 2 (k'/k) V, inside the knee and past it, for a share of k."""
+    knee = barrier.knee(K, WEIGHT, LIMIT) / K
+
+    def at(t, share):
+        xi, k = share * bound(t) * (1.0 + 0.1 * np.sin(5.0 * t)), bound(t)
+        return xi, barrier.potential(xi, k, WEIGHT, LIMIT, knee * k)
+
+    h = 1e-6
+    for share in (0.1, 0.5, 0.75, 1.3, -0.6, -2.0):
+        for t in (0.0, 0.4, 1.5):
+            before, after = (at(t + side, share) for side in (-h, h))
+            dxi, rate = np.subtract(after, before) / (2.0 * h)
+            xi, V = at(t, share)
+            gradient = barrier.gradient(xi, bound(t), WEIGHT, LIMIT, knee * bound(t))
+            expected = gradient * (dxi - xi * narrowing(t)) + 2.0 * narrowing(t) * V
+            assert rate == pytest.approx(expected, rel=1e-6)
+
+
+def test_loop_stays_within_the_narrowing_bound():
+    law, arm = controller(recommended(**NARROWING)), plant(start=START)
+    ratios = []
+    for sample in closed_loop(law, arm, 10.0):
+        np.testing.assert_allclose(law.sample.bound, bound(sample.t), rtol=1e-12)
+        ratios.append(np.abs(law.sample.xi1) / law.sample.bound)
+    assert np.max(ratios[0]) == pytest.approx(0.75, rel=1e-3)  # 15 of 20 mrad
+    assert np.max(ratios) < 0.8
+
+
+def test_lyapunov_function_decreases_while_the_bound_narrows():
+    """(31) for the moving bound, with a known model and no disturbance."""
+    model_known = {'initial_estimate': np.array([*P, 0.0, 0.0]), 'Gamma': np.zeros(5)}
+    quiet = {'gamma': np.zeros(2), 'truth_known': 1, 'true_parameters': P}
+    law = controller(recommended(**NARROWING | model_known | quiet))
+    arm = plant(start=START, constant=(0.0, 0.0), amplitude=(0.0, 0.0))
+    V = []
+    for sample in closed_loop(law, arm, 2.0):
+        M, _, _ = dynamics(P, R, sample.measurement[:2], sample.measurement[2:4])
+        V.append(law.sample.lyapunov[0] + 0.5 * law.signals.xi2 @ M @ law.signals.xi2)
+    # At the first sample alpha2 jumps to the virtual control: V2 starts there.
+    assert np.diff(V).max() < 1e-6 * V[0]
+    assert V[-1] < 1e-3 * V[0]
+
+
+def test_virtual_control_is_that_of_the_paper_without_its_singularity():
+    gain, mu, dqr = 150.0, 20.0, -0.3
+
+    def ours(xi1, dqr=dqr):
+        return surface.virtual_control(xi1, BOUND, gain, mu, dqr)
+
+    assert ours(0.0) == dqr
+    for xi1 in BOUND * np.linspace(0.01, 0.999, 18) * np.tile([1.0, -1.0], 9):
+        s = pi * xi1**2 / (2.0 * BOUND**2)
+        tau_aux = -gain * BOUND**2 / (xi1 * pi) * np.sin(s) * np.cos(s)
+        assert ours(xi1) == pytest.approx(tau_aux - mu * xi1 + dqr, rel=1e-13)
+    for xi1 in (1e-12, -1e-9, 1e-7):  # linear: the next term is 1e-17 at 1e-7 rad
+        assert ours(xi1, 0.0) == pytest.approx(-(gain / 2.0 + mu) * xi1, rel=1e-14)
+    # At the bound only mu is left: sinc(pi (1 - e)^2) = 2 e to first order.
+    e = 1e-9
+    part = dqr - mu * BOUND * (1.0 - e) - ours(BOUND * (1.0 - e))
+    assert part == pytest.approx(gain / 2.0 * BOUND * 2.0 * e, abs=1e-15)
+    for xi1 in (BOUND, -1.1 * BOUND, 10.0 * BOUND):
+        assert ours(xi1) == dqr - mu * xi1
+    for x in (1e-6, -5e-5, np.nextafter(1e-4, 0.0), 1e-4, 0.1, -2.0):
+        assert surface.sinc(x) == pytest.approx(sin(x) / x, abs=3e-16)
+
+
+def test_law_follows_the_filter_from_the_first_virtual_control():
+    """alpha2(0) = beta2(0), then the solution for held beta2, at the mean rate alpha2'.
+
+    The virtual control scales the error with the bound: it adds xi1 k'/k.
+    """
+    settings = recommended(**NARROWING)
+    law = controller(settings)
+    qr, dqr, ddqr = np.zeros((3, 2))
+    random = np.random.default_rng(1)
+    alpha2 = None
+    for k in range(200):
+        t = k * 1e-3
+        reference.evaluate(REFERENCE, t, qr, dqr, ddqr)
+        xi1 = random.uniform(-0.0015, 0.0015, 2)
+        dq = dqr + random.normal(size=2)
+        law.update(t, 1e-3, np.concatenate([qr + xi1, dq, np.zeros(2)]))
+
+        s = pi * xi1**2 / (2.0 * bound(t) ** 2)
+        beta2 = -settings.K * bound(t) ** 2 / (xi1 * pi) * np.sin(s) * np.cos(s)
+        beta2 += dqr - settings.mu * xi1 + narrowing(t) * xi1
+        alpha2 = beta2 if alpha2 is None else alpha2
+
+        np.testing.assert_allclose(law.signals.beta2, beta2, atol=1e-12)
+        np.testing.assert_allclose(law.signals.xi2, dq - alpha2, atol=1e-12)
+        next_alpha2 = beta2 + (alpha2 - beta2) * exp(-1e-3 / settings.time_constant)
+        np.testing.assert_allclose(law.signals.dalpha2, (next_alpha2 - alpha2) / 1e-3, atol=1e-9)
+        alpha2 = next_alpha2
+        np.testing.assert_allclose(law.state.alpha2, alpha2, atol=1e-12)
+
 
 # The window is not a multiple of the interval, and learning lasts nearly a second. For so short
 # a window the condition number of Phi is 1e7; rho = 10 keeps the amplified rounding below 1e-12,

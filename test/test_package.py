@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The package as pip, colcon and ROS see it: what is installed, and that its metadata agree."""
+"""The package as pip, colcon, ROS and Python see it: what is installed, and that it agrees."""
+
+from __future__ import annotations
 
 import ast
 import configparser
+import copy
 import json
 import re
 import shutil
@@ -18,6 +21,8 @@ import pytest
 import yaml
 
 import blf_dsc_controller
+import blf_dsc_controller as blf
+from blf_dsc_controller.errors import ConfigurationError, MissingExtraError, OutsideBarrierError
 
 ROOT = Path(__file__).resolve().parents[1]
 NAME = 'blf_dsc_controller'
@@ -227,3 +232,33 @@ def test_rosdep_and_pip_install_the_same_dependencies(metadata):
     assert set(ROSDEP_KEYS.values()) <= depends('exec_depend')
     assert {'ros-jazzy-rclpy', 'ros-jazzy-rmw-fastrtps-cpp'} <= requirements(metadata, 'ros')
     assert 'pytest' in requirements(metadata, 'test')  # where colcon looks
+
+
+def run_python(*arguments, folder):
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
+
+
+def test_every_public_name_is_documented():
+    for name in blf.__all__:
+        assert getattr(blf, name).__doc__, name
+
+
+def test_importing_the_package_does_not_import_numpy(tmp_path):
+    program = 'import sys, blf_dsc_controller; print("numpy" in sys.modules)'
+    assert run_python('-c', program, folder=tmp_path).strip() == 'False'
+
+
+@pytest.mark.parametrize(
+    'error',
+    [
+        ConfigurationError(['a: got 1', 'b: got 2'], 'my.yaml'),
+        OutsideBarrierError('joint1', 0.1, 0.002),
+        MissingExtraError('dask', 'dask', 'a cluster'),
+    ],
+)
+def test_errors_can_be_passed_between_processes(error):
+    copied = copy.copy(error)  # as pickle does
+    assert type(copied) is type(error)
+    assert str(copied) == str(error)
+    assert vars(copied) == vars(error)
