@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.sources import MESSAGES, VERSION, BagError, open_bag
+from blf_dsc_controller.bags.sources import MESSAGES, VERSION, BagError, OpenBag, open_bag
 from blf_dsc_controller.bags.topic_messages import TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
@@ -33,7 +33,6 @@ from blf_dsc_controller.messages.topics import (
 from blf_dsc_controller.messages.types import typestore
 
 _OF_INTEREST = (*(topic for topic in TOPICS if topic is not CLOCK), CHANGES)
-_NOTHING_MISSED = '0 missed'
 _KEPT = frozenset(topic.leaf for topic in TOPICS if topic.offered.depth > 1)
 
 
@@ -51,17 +50,16 @@ class NameMap:
         Raises:
             BlfDscError: an entry lacks a side, or one side appears twice.
         """
-        leaves = [topic.leaf for topic in TOPICS]
-        topics: dict[str, str] = {}
-        joints: dict[str, str] = {}
+        sides: tuple[dict[str, str], dict[str, str]] = {}, {}
         for entry in entries:
             ours, _, theirs = (side.strip() for side in entry.partition('='))
+            side = sides[ours not in {topic.leaf for topic in TOPICS}]
             if not ours or not theirs:
                 raise _bad_entry(entry, 'one side is missing')
-            side = topics if ours in leaves else joints
             if ours in side or theirs in side.values():
                 raise _bad_entry(entry, 'a name is given twice')
             side[ours] = theirs
+        topics, joints = sides
         return cls({leaf: '/' + name.lstrip('/') for leaf, name in topics.items()}, joints)
 
     def joints_of(self, joints: Sequence[str]) -> tuple[str, ...]:
@@ -103,12 +101,13 @@ class Content:
 
         Topics that keep only their last message are left out.
         """
-        texts = {
+        return {
             name.removeprefix(MESSAGES): text.partition(', ')[2]
             for name, text in self.facts.items()
-            if name.startswith(MESSAGES) and name.rsplit('/', 1)[-1] in _KEPT
+            if name.startswith(MESSAGES)
+            and name.rsplit('/', 1)[-1] in _KEPT
+            and text.partition(', ')[2] not in ('', '0 missed')
         }
-        return {topic: text for topic, text in texts.items() if text not in ('', _NOTHING_MISSED)}
 
     @cached_property
     def events(self) -> list[tuple[int, Event]]:
@@ -169,11 +168,11 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
         BagError: there is no bag, it is damaged, it lacks the joint states or a topic of `names`,
             or it holds the topics of several robots.
     """
-    names = _recorded_names(path, namespace, names)
     with open_bag(path) as bag:
-        found = {topic: _find(topic, bag.held, namespace, names) for topic in _OF_INTEREST}
         if not bag.held or not any(bag.counts.values()):
             raise BagError(f'{path} is empty: it holds no message')
+        names = _recorded_names(bag, namespace, names)
+        found = {topic: _find(topic, bag.held, namespace, names) for topic in _OF_INTEREST}
         if found[JOINT_STATES] is None:
             raise _missing_topic(JOINT_STATES.name, JOINT_STATES.type, bag.held)
         types = dict(bag.held)
@@ -182,31 +181,29 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
             for topic, name in found.items()
             if name is not None
         }
-        adds = {one.name: one.add for one in topics.values()}
+        adds = {messages.name: messages.add for messages in topics.values()}
         for message in bag.messages(adds):
             adds[message.topic](message)
-        for one in topics.values():
-            one.decode()
+    for messages in topics.values():
+        messages.decode()
     if not topics[JOINT_STATES].size:
         raise BagError(f'{path} is empty: it holds no message of {found[JOINT_STATES]}')
-    held = {topic: one for topic, one in topics.items() if one.size}
+    held = {topic: messages for topic, messages in topics.items() if messages.size}
     return Content(path, held, bag.counts, bag.facts)
 
 
-def _recorded_names(path: Path, namespace: str, names: NameMap) -> NameMap:
+def _recorded_names(bag: OpenBag, namespace: str, names: NameMap) -> NameMap:
     """Add the topics that the controller was connected to, where several have the same last part.
 
     So it is with a driver whose joint states also come at a lower rate, as those of an FR3 do.
     """
+    journal = _find(JOURNAL, bag.held, namespace, names)
+    held = {name for name, _ in bag.held}
+    if journal is None or sum(name.endswith(f'/{JOINT_STATES.leaf}') for name in held) < 2:  # noqa: PLR2004
+        return names
     recorded: dict[str, str] = {}
-    with open_bag(path) as bag:
-        journal = _find(JOURNAL, bag.held, namespace, names)
-        alike = [name for name, _ in bag.held if name.endswith(f'/{JOINT_STATES.leaf}')]
-        for message in bag.messages([journal]) if journal and len(alike) > 1 else ():
-            with suppress(BlfDscError):
-                recorded = decode(message.raw).content.get('topics', {})
-                break
-        held = {name for name, _ in bag.held}
+    with suppress(BlfDscError, StopIteration):
+        recorded = decode(next(bag.messages([journal])).raw).content.get('topics', {})
     own = {leaf: name for leaf, name in recorded.items() if name in held}
     return NameMap({**own, **names.topics}, names.joints)
 
@@ -228,16 +225,15 @@ def _find(topic: Topic, held: list[tuple[str, str]], namespace: str, names: Name
     prefix = f'/{namespace.strip("/")}/' if namespace.strip('/') else '/'
     candidates = [name for name, type_ in held if type_ == topic.type and name.startswith(prefix)]
     for ending in (topic.resolved, f'/{topic.leaf}'):
-        if prefix + ending[1:] in candidates:
-            return prefix + ending[1:]
         fitting = sorted(name for name in candidates if name.endswith(ending))
-        if len(fitting) > 1:
+        exact = [name for name in fitting if name == prefix + ending[1:]]
+        if len(fitting) > 1 and not exact:
             raise BagError(
                 f'the bag has {len(fitting)} topics that could be {topic.relative!r}: '
                 f'{", ".join(fitting)}; select the robot by its namespace'
             )
         if fitting:
-            return fitting[0]
+            return (exact or fitting)[0]
     return None
 
 

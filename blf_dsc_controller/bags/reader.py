@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reader of a bag as one run: decoded, joints matched by name, samples by stamp."""
+"""Reader of a bag as one run: joints matched by name, samples by stamp, torques by order."""
 
 from __future__ import annotations
 
@@ -7,18 +7,28 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.bags.topic_messages import ALL, JointStates
-from blf_dsc_controller.bags.torque import TorqueError, applied_torque, next_effort
+from blf_dsc_controller.bags.topic_messages import (
+    ALL,
+    JointStates,
+    StoredSeries,
+    TopicMessages,
+)
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import Event, EventType
-from blf_dsc_controller.messages.topics import CONTROLLER
+from blf_dsc_controller.messages.topics import (
+    COMMANDS,
+    CONTROLLER,
+    JOINT_STATE,
+    JOINT_STATES,
+    TRACKING_ERROR,
+)
 from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Floats, LearnedArm, Rows, Run, Series, Stop
 
@@ -30,15 +40,18 @@ _FEW = 100  # states
 class RecordedRun(Run):
     """Run whose arrays are read from its bag's tables each time that they are asked for."""
 
-    _stored: Mapping[str, tuple[JointStates | None, int]]
-    _is_decimated: bool
+    def __init__(
+        self,
+        stored: Mapping[str, tuple[JointStates | None, int]],
+        *,
+        is_decimated: bool,
+        **values: Any,
+    ) -> None:
+        """Take states and field of each array, and the values that are in memory.
 
-    def __init__(self, **values: Any) -> None:
-        """Take what is in memory, and in `_stored` states and field of each other array.
-
-        `_is_decimated`: the reference was published for some samples only.
+        `is_decimated`: the reference was published for some samples only.
         """
-        for name, value in values.items():
+        for name, value in {**values, '_stored': stored, '_is_decimated': is_decimated}.items():
             object.__setattr__(self, name, value)
 
     def __getattribute__(self, name: str) -> Any:
@@ -88,7 +101,7 @@ def read_run(path: str | Path, namespace: str = '', names: NameMap = NO_NAMES) -
 def recorded_run(content: Content, names: NameMap = NO_NAMES, namespace: str = '') -> RecordedRun:
     """Return the run of a bag; errors as for `read_run`."""
     joints = _joints(content, names)
-    states, notes, span = one_run(content, names.joints_of(joints))
+    states, notes, span = single_run(content, names.joints_of(joints))
     stamp = states.stamp
 
     def within(topic: topics.Topic, names: Sequence[str] = ()) -> JointStates | None:
@@ -103,12 +116,13 @@ def recorded_run(content: Content, names: NameMap = NO_NAMES, namespace: str = '
 
     def series(topic: topics.Topic) -> Series | None:
         found = within(topic)
-        return None if found is None else found.series()
+        return None if found is None else StoredSeries(found)
 
-    errors, references = within(topics.TRACKING_ERROR, joints), within(topics.REFERENCE, joints)
+    errors, references = (
+        None if found is None else found.at_stamps(stamp)
+        for found in (within(TRACKING_ERROR, joints), within(topics.REFERENCE, joints))
+    )
     bounds = within(topics.BOUND, joints)
-    exact_errors = None if errors is None else errors.at_stamps(stamp)
-    exact_references = None if references is None else references.at_stamps(stamp)
     held_bounds = None if bounds is None else bounds.held(stamp)
     events = [event for at, event in content.events if span[0] <= at < span[1]]
     settings = [event.content.get('parameters', {}) for event in events]
@@ -118,6 +132,20 @@ def recorded_run(content: Content, names: NameMap = NO_NAMES, namespace: str = '
     except TorqueError:
         torque = next_effort(states)
     return RecordedRun(
+        stored={
+            'position': (states, 0),
+            'velocity': (states, 1),
+            'effort': (states, 2),
+            'torque': (torque.efforts, 2),
+            'error': (errors, 0),
+            'reference': (references, 0),
+            'xi2': (errors, 1),
+            'reference_velocity': (references, 1),
+            'bound': (held_bounds, 0),
+            'torque_limit': (held_bounds, 2),
+        },
+        is_decimated=errors is not None
+        and any(values.get('telemetry.decimation', 1) > 1 for values in settings),
         joints=joints,
         stamp=stamp,
         received=states.received,
@@ -131,24 +159,10 @@ def recorded_run(content: Content, names: NameMap = NO_NAMES, namespace: str = '
         arm=_arm(content),
         learns=_learns(settings),
         notes=notes,
-        _stored={
-            'position': (states, 0),
-            'velocity': (states, 1),
-            'effort': (states, 2),
-            'torque': (torque.efforts, 2),
-            'error': (exact_errors, 0),
-            'reference': (exact_references, 0),
-            'xi2': (exact_errors, 1),
-            'reference_velocity': (exact_references, 1),
-            'bound': (held_bounds, 0),
-            'torque_limit': (held_bounds, 2),
-        },
-        _is_decimated=errors is not None
-        and any(one.get('telemetry.decimation', 1) > 1 for one in settings),
     )
 
 
-def one_run(
+def single_run(
     content: Content, joints: Sequence[str], required: Sequence[str] = ('position',)
 ) -> tuple[JointStates, tuple[str, ...], tuple[int, int]]:
     """Return the states of one run of one arm, what is left out, and when it was received [ns].
@@ -159,7 +173,7 @@ def one_run(
     Raises:
         BagError: all stamps are the same, or several publishers share the topic.
     """
-    messages = content.topics[topics.JOINT_STATES]
+    messages = content.topics[JOINT_STATES]
     states = messages.joint_states(joints, required)
     stamp, received, notes = states.stamp, states.received, []
     if states.size > 1 and (stamp == stamp[0]).all():
@@ -209,17 +223,17 @@ def _alternates(states: JointStates) -> bool:
     intervals = np.diff(states.stamp)
     if intervals.size < _FEW:
         return False
-    turns = sorted(float(np.median(intervals[k::2])) for k in (0, 1))
-    return turns[0] < _ALTERNATING * turns[1]
+    pauses = sorted(float(np.median(intervals[k::2])) for k in (0, 1))
+    return pauses[0] < _ALTERNATING * pauses[1]
 
 
 def _joints(content: Content, names: NameMap) -> tuple[str, ...]:
     """Return the controller's joints in its order; without it, those of `names`, or all."""
-    sources = (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
+    sources = (TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
     of_controller = [content.topics[topic] for topic in sources if topic in content.topics]
     if not of_controller and names.joints:
         return tuple(names.joints)
-    return (*of_controller, content.topics[topics.JOINT_STATES])[0].joint_names()
+    return (*of_controller, content.topics[JOINT_STATES])[0].joint_names()
 
 
 def _rejected_columns(content: Content, learning: Series | None, namespace: str) -> dict[str, str]:
@@ -269,6 +283,77 @@ def _stops(events: Iterable[Event], first: int) -> Iterator[Stop]:
 
 def _learns(settings: Sequence[Mapping[str, Any]]) -> bool:
     """Return whether the law ever used the prediction error; true if the journal does not say."""
-    laws = {one['law'] for one in settings if 'law' in one}
-    weights = [one['learning.weight'] for one in settings if 'learning.weight' in one]
+    laws = {values['law'] for values in settings if 'law' in values}
+    weights = [each['learning.weight'] for each in settings if 'learning.weight' in each]
     return laws <= {'blf_dsc'} and any(weights or [1.0])
+
+
+class TorqueError(BlfDscError):
+    """The torques of a bag are unknown."""
+
+
+class AppliedTorque(NamedTuple):
+    """The torque from each of N states to the next, as efforts."""
+
+    source: str  # topic
+    efforts: JointStates  # (N,)
+
+    def at(self, rows: Rows = ALL) -> Floats:
+        """Return the torque after these states (m, n) [N m]; NaN where unknown."""
+        return self.efforts.field(2, rows)
+
+
+def applied_torque(content: Content, states: JointStates) -> AppliedTorque:
+    """Return the first available of these, for states that are ordered by stamp.
+
+    Commands, if there is one for each state; the saturated torque of the controller's telemetry;
+    commands; the effort of the next state.
+
+    Raises:
+        TorqueError: the bag holds none of them, or commands in an unknown order.
+    """
+    commands, errors = content.topics.get(COMMANDS), content.topics.get(TRACKING_ERROR)
+    if commands is not None and (errors is None or commands.size == states.size):
+        return _commanded(content, commands, states)
+    if errors is not None:
+        telemetry = errors.joint_states(states.names, ('effort',)).by_stamp()
+        return AppliedTorque(f'effort of {errors.name}', telemetry.at_stamps(states.stamp))
+    found = next_effort(states, f'effort of {content.topics[JOINT_STATES].name}')
+    if np.isnan(found.at(slice(0, 1000))).all():
+        raise TorqueError(
+            f'{content.path} does not hold the torques: there is no command topic (map it: '
+            '--map commands=/its/name) and the effort of the joint states is empty'
+        )
+    return found
+
+
+def next_effort(states: JointStates, source: str = '') -> AppliedTorque:
+    """Return the effort measured with the next state; unknown for the last one."""
+    return AppliedTorque(source, states.select(np.append(np.arange(1, states.size), -1)))
+
+
+def _commanded(content: Content, commands: TopicMessages, states: JointStates) -> AppliedTorque:
+    """Return the command after each state: k-th, or last before the next if counts differ."""
+    efforts = _by_joint(content, commands, states.names)
+    if efforts.size != states.size:
+        until = np.append(states.received[1:], np.iinfo(np.int64).max)
+        index = np.searchsorted(np.maximum.accumulate(efforts.received), until) - 1
+        efforts = efforts.select(index)
+    return AppliedTorque(commands.name, efforts)
+
+
+def _by_joint(content: Content, commands: TopicMessages, joints: tuple[str, ...]) -> JointStates:
+    """Return commands by name; without names, in the order of `joints` or of the joint states."""
+    if commands.type == JOINT_STATE:
+        return commands.joint_states(joints, ('effort',))
+    size = commands.layout().arrays[0].size
+    states = content.topics[JOINT_STATES].layout()
+    if size == len(joints):
+        return commands.arrays(range(size))
+    if size == len(states.names):
+        return commands.arrays(states.indices_of(joints))
+    raise TorqueError(
+        f'{commands.name} has {size} values, but there are {len(joints)} joints, and '
+        f'{len(states.names)} in the joint states ({", ".join(states.names)}): their order is '
+        'not known'
+    )

@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of one topic of a bag, decoded block by block while it is read."""
+"""Messages of one topic of a bag, decoded block by block while it is read.
+
+Their numbers are in a temporary file, of which only what is asked for comes into memory.
+"""
 
 from __future__ import annotations
 
+import os
+import tempfile
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.bags.columns import Columns
 from blf_dsc_controller.bags.sources import BagError, BagMessage
 from blf_dsc_controller.messages.codecs import (
     NANOSECONDS,
@@ -20,14 +24,14 @@ from blf_dsc_controller.messages.codecs import (
     MissingJointError,
     Pattern,
     array_layout,
+    joint_state_columns,
     joint_state_layout,
-    joint_state_places,
 )
 from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
 from blf_dsc_controller.run import Floats, Rows, Series, Stamps
 
 _WAITING = 512  # messages decoded at once
-_MOST_LAYOUTS = 100
+_BLOCK = 4096  # rows that are written at once, each column in one piece
 _NUMBER, _RECEIVED, _SEQUENCE, _STAMP, _VALUES = range(5)  # columns of a layout
 ALL = slice(None)
 
@@ -45,6 +49,51 @@ class UnreadableMessageError(BagError):
         super().__init__(f'message {index + 1} of {topic} cannot be read: {reason}')
 
 
+class Columns:
+    """Append-only table of `width` columns of 64-bit numbers."""
+
+    def __init__(self, width: int) -> None:
+        self.width = width
+        self._pending = np.empty((width, _BLOCK), np.int64)
+        self._blocks = self._filled = 0
+        self._file: Any = None
+
+    def __len__(self) -> int:
+        return _BLOCK * self._blocks + self._filled
+
+    def __del__(self) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def append(self, rows: NDArray[np.int64]) -> None:
+        """Append rows (m, width)."""
+        while rows.shape[0]:
+            taken = rows[: _BLOCK - self._filled]
+            self._pending[:, self._filled : self._filled + taken.shape[0]] = taken.T
+            self._filled += taken.shape[0]
+            rows = rows[taken.shape[0] :]
+            if self._filled == _BLOCK:
+                if self._file is None:
+                    self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - its owner's
+                self._file.write(self._pending)
+                self._blocks, self._filled = self._blocks + 1, 0
+
+    def read(self, column: int, rows: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Return some rows of a column, as an array of its own."""
+        if not rows.size:
+            return np.empty(0, np.int64)
+        first, last = (int(row) // _BLOCK for row in (rows.min(), rows.max()))
+        found = np.empty((last + 1 - first, _BLOCK), np.int64)
+        for number in range(first, min(last + 1, self._blocks)):
+            offset = 8 * _BLOCK * (number * self.width + column)
+            found[number - first] = np.frombuffer(
+                os.pread(self._file.fileno(), 8 * _BLOCK, offset), np.int64
+            )
+        if last == self._blocks:
+            found[-1] = self._pending[column]
+        return np.asarray(found.ravel()[rows - first * _BLOCK])
+
+
 class JointStates:
     """N states of n joints, or N vectors of n named values in `position`.
 
@@ -58,34 +107,35 @@ class JointStates:
         places: NDArray[np.intp],
         rows: NDArray[np.int32] | None = None,
     ) -> None:
-        """Take the columns `places` (3, n) and some rows of a table; -1 is unknown."""
+        """Take the values `places` (3, n) and some rows of a table; -1 is unknown."""
         self.names = tuple(names)
         self._table, self._places = table, places
         self._rows = np.arange(len(table), dtype=np.int32) if rows is None else rows
         self.size = self._rows.size
 
-    def _integers(self, column: int) -> Stamps:
+    def head(self, column: int) -> Stamps:
+        """Return one of the first columns (N,): number, reception, sequence, stamp."""
         return self._table.read(column, self._rows)
 
     @property
     def number(self) -> Stamps:
         """Number of each among the messages of the topic (N,)."""
-        return self._integers(_NUMBER)
+        return self.head(_NUMBER)
 
     @property
     def received(self) -> Stamps:
         """When each was received (N,) [ns]."""
-        return self._integers(_RECEIVED)
+        return self.head(_RECEIVED)
 
     @property
     def sequence(self) -> Stamps:
         """Number given by the publisher (N,); 0 if unknown."""
-        return self._integers(_SEQUENCE)
+        return self.head(_SEQUENCE)
 
     @property
     def stamp(self) -> Stamps:
         """Stamps (N,) [ns]."""
-        return self._integers(_STAMP)
+        return self.head(_STAMP)
 
     def field(self, k: int, rows: Rows = ALL, columns: Rows = ALL) -> Floats:
         """Return positions (0), velocities (1) or efforts (2), (m, n); NaN where unknown."""
@@ -93,7 +143,7 @@ class JointStates:
         values = np.full((len(places), chosen.size), np.nan)
         for row, place in zip(values, places, strict=True):
             if place >= 0:
-                row[:] = self._table.read(place, np.maximum(chosen, 0)).view(np.float64)
+                row[:] = self._table.read(_VALUES + place, np.maximum(chosen, 0)).view(np.float64)
         values[:, chosen < 0] = np.nan
         return np.asarray(values.T)
 
@@ -127,49 +177,42 @@ class JointStates:
         """Return the last states at or before these stamps, else the first."""
         return self.select(np.maximum(np.searchsorted(self.stamp, stamp, side='right') - 1, 0))
 
-    def series(self, k: int = 0) -> Series:
-        """Return one field, ordered by stamp."""
-        return StoredSeries(self.by_stamp(), k)
-
     @classmethod
-    def merged(
-        cls, names: Sequence[str], parts: Sequence[tuple[Columns, NDArray[np.intp]]]
-    ) -> JointStates:
-        """Return the states of several tables (with their places) in order of reception."""
+    def merged(cls, names: Sequence[str], parts: Sequence[JointStates]) -> JointStates:
+        """Return the states of several tables in order of reception."""
         if len(parts) == 1:
-            return cls(names, *parts[0])
-        n, rows = len(names), []
-        for table, places in parts:
-            part = cls(names, table, places)
-            heads = [part._integers(column) for column in range(_VALUES)]
-            values = np.hstack([part.field(k) for k in range(3)])
-            rows.append(np.column_stack((*heads, values.view(np.int64))))
-        together = np.concatenate(rows)
+            return parts[0]
+        rows = [
+            np.column_stack((
+                *(part.head(column) for column in range(_VALUES)),
+                *(part.field(k).view(np.int64) for k in range(3)),
+            ))
+            for part in parts
+        ]  # fmt: skip
+        together, n = np.concatenate(rows), len(names)
         table = Columns(_VALUES + 3 * n)
         table.append(together[np.argsort(together[:, _NUMBER])])
-        return cls(names, table, _VALUES + np.arange(3 * n).reshape(3, n))
+        return cls(names, table, np.arange(3 * n).reshape(3, n))
 
 
 class StoredSeries(Series):
     """Series whose values are read from a bag's table when they are asked for."""
 
-    _states: JointStates
-    _k: int
+    _of: JointStates
 
-    def __init__(self, states: JointStates, k: int) -> None:
-        for name, value in {
-            'names': states.names, 'stamp': states.stamp, '_states': states, '_k': k
-        }.items():  # fmt: skip
+    def __init__(self, states: JointStates) -> None:
+        """Take the positions of states that are ordered by stamp."""
+        for name, value in (('names', states.names), ('stamp', states.stamp), ('_of', states)):
             object.__setattr__(self, name, value)
 
     @property
     def values(self) -> Floats:
         """All values (m, number of names), read from the table."""
-        return self._states.field(self._k)
+        return self.at(ALL)
 
     def at(self, rows: Rows, columns: Rows = ALL) -> Floats:
         """Return some rows and columns."""
-        return self._states.field(self._k, rows, columns)
+        return self._of.field(0, rows, columns)
 
 
 class _LikeMessages:
@@ -177,30 +220,24 @@ class _LikeMessages:
 
     def __init__(self, raw: bytes, layout: Layout, *, is_stamped: bool) -> None:
         self.layout, self.pattern, self._is_stamped = layout, Pattern(raw, layout), is_stamped
-        self._places = np.concatenate([one.place + np.arange(one.size) for one in layout.arrays])
-        self.table = Columns(_VALUES + self._places.size)
+        self._grid = layout.grid
+        self.table = Columns(_VALUES + self._grid.size)
 
     def add(self, first: int, messages: Sequence[BagMessage]) -> None:
         """Decode messages of this layout with the numbers from `first` on."""
         count, size, double = len(messages), self.pattern.size, self.pattern.double
         rows = np.zeros((count, self.table.width), np.int64)
         rows[:, _NUMBER] = first + np.arange(count)
-        rows[:, _RECEIVED] = [one.received for one in messages]
-        rows[:, _SEQUENCE] = [one.sequence for one in messages]
-        joined = b''.join([one.raw for one in messages])
+        rows[:, _RECEIVED] = [each.received for each in messages]
+        rows[:, _SEQUENCE] = [each.sequence for each in messages]
+        joined = b''.join([each.raw for each in messages])
         if self._is_stamped:
             kind = np.dtype([('s', 'i4'), ('ns', 'u4')]).newbyteorder(double.byteorder)
             stamp = np.ndarray(count, kind, joined, STAMP_OFFSET, (size,))
             rows[:, _STAMP] = stamp['s'].astype(np.int64) * NANOSECONDS + stamp['ns']
         grid = np.ndarray((count, (size - ORIGIN) // 8), double, joined, ORIGIN, (size, 8))
-        rows[:, _VALUES:] = grid[:, self._places].astype(np.float64).view(np.int64)
+        rows[:, _VALUES:] = grid[:, self._grid].astype(np.float64).view(np.int64)
         self.table.append(rows)
-
-    def columns_of(self, places: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Return the columns of values at these places in the grid; -1 stays."""
-        found = {place: _VALUES + k for k, place in enumerate(self._places.tolist())}
-        columns = [found.get(place, -1) for place in places.ravel().tolist()]
-        return np.array(columns, dtype=np.intp).reshape(places.shape)
 
 
 class TopicMessages:
@@ -230,7 +267,7 @@ class TopicMessages:
                 self.decode()
 
     def decode(self) -> None:
-        """Decode the messages added last; BagError if they have too many layouts."""
+        """Decode the messages added last."""
         waiting, self._waiting = self._waiting, []
         begin, first = 0, self.size - len(waiting)
         while begin < len(waiting):
@@ -251,10 +288,6 @@ class TopicMessages:
         except MessageError as error:
             self._unreadable[number] = error
             return None
-        if len(self._likes) == _MOST_LAYOUTS:
-            raise BagError(
-                f'{self.name} holds messages with more than {_MOST_LAYOUTS} lists of names'
-            )
         self._likes.append(_LikeMessages(raw, layout, is_stamped=self.type == JOINT_STATE))
         return self._likes[-1]
 
@@ -274,7 +307,7 @@ class TopicMessages:
         unreadable, parts, foreign = dict(self._unreadable), [], None
         for like in self._likes:
             try:
-                places = joint_state_places(like.layout, names, required)
+                places = joint_state_columns(like.layout, names, required)
             except MessageError as error:
                 if isinstance(error, MissingJointError) and error.is_foreign(names):
                     foreign = foreign or error
@@ -282,7 +315,7 @@ class TopicMessages:
                     numbers = JointStates((), like.table, np.empty((3, 0), np.intp)).number
                     unreadable.update(dict.fromkeys(numbers.tolist(), error))
             else:
-                parts.append((like.table, like.columns_of(places)))
+                parts.append(JointStates(names, like.table, places))
         if not parts and foreign is not None and not unreadable:
             unreadable[0] = foreign
         if unreadable and (errors is None or not parts):
@@ -307,7 +340,7 @@ class TopicMessages:
             error = MessageError(f'not every message holds the same {size} values')
             raise UnreadableMessageError(self.name, *min([*self._unreadable.items(), (0, error)]))
         places = np.full((3, len(columns)), -1)
-        places[2] = _VALUES + np.array(columns)
+        places[2] = columns
         names = [f'{k}' for k in columns]
         return JointStates(names, self._likes[0].table, places)
 

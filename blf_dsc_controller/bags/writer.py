@@ -89,8 +89,7 @@ class BagWriter:
 
     Data leaves the process within `flush_interval` [s] plus the time to the next call of `write` or
     `flush_if_due`, and then survives a kill of the process. Without an interval it leaves when a
-    chunk is full. The compression of chunks is `none` or `zstd`. The first message after
-    `split_size` [bytes] or `split_duration` [s] starts the next file, so no file is empty.
+    chunk is full. The compression of chunks is `none` or `zstd`. A file ends after 10,000 chunks.
 
     Raises:
         BagError: `path` exists already.
@@ -103,15 +102,12 @@ class BagWriter:
         compression: str = 'none',
         flush_interval: float | None = 0.1,
         clock: Callable[[], float] = time.monotonic,
-        split_size: float = inf,
-        split_duration: float = inf,
     ) -> None:
         self.path = Path(path)
         self.closed = False
         self._compression = _COMPRESSIONS[compression]
         self._flush_interval = inf if flush_interval is None else flush_interval
         self._clock = clock
-        self._split_size, self._split_duration = split_size, split_duration
         self._topics: list[dict[str, Any]] = []  # as in metadata.yaml, with definitions beside
         self._definitions: list[Definition] = []
         self._files: list[dict[str, Any]] = []
@@ -127,8 +123,8 @@ class BagWriter:
         self._reserve = self.path / '.reserve'
         with self._reserve.open('xb') as reserve:
             os.posix_fallocate(reserve.fileno(), 0, _RESERVE)
+        self._flushed = self._clock()
         self._begin_file()
-        self._flushed = self._began
 
     def add_topic(
         self,
@@ -145,7 +141,7 @@ class BagWriter:
             UnknownTypeError: no definition is given and the type is not one of Jazzy's common ones.
         """
         found = definition(type_name) if known is None else known
-        profiles = [_profile(one) if isinstance(one, Quality) else one for one in offered]
+        profiles = [_profile(each) if isinstance(each, Quality) else each for each in offered]
         metadata = {
             'name': name,
             'type': type_name,
@@ -173,7 +169,7 @@ class BagWriter:
         Raises:
             DiskFullError: there is no room left; the bag is complete and closed.
         """
-        if self._is_due:
+        if self._chunks >= _MOST_CHUNKS:
             self._end_file()
             self._stop_if_full()
             self._begin_file()
@@ -218,21 +214,13 @@ class BagWriter:
     @property
     def message_counts(self) -> dict[str, int]:
         """Messages written so far, by topic."""
-        return {one['topic_metadata']['name']: one['message_count'] for one in self._topics}
+        return {topic['topic_metadata']['name']: topic['message_count'] for topic in self._topics}
 
     def __enter__(self) -> BagWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    @property
-    def _is_due(self) -> bool:
-        """Whether the next message starts a new file."""
-        is_long = self._flushed - self._began >= self._split_duration
-        is_full = is_long or self._stream.tell() >= self._split_size
-        is_full |= self._chunks >= _MOST_CHUNKS
-        return bool(is_full and self._files[-1]['message_count'] > 0)
 
     def _begin_file(self) -> None:
         """Begin the next file, with the topics of the previous one."""
@@ -249,7 +237,6 @@ class BagWriter:
         for topic, found in zip(self._topics, self._definitions, strict=True):
             self._add_channel(topic['topic_metadata'], found)
         self.note({})
-        self._began = self._clock()
 
     def _describe(self) -> None:
         """Store the metadata so far; rosbag2 reads the last such record of a file."""

@@ -72,12 +72,6 @@ class RecorderConfig:
         'messages',
         at_least=1,
     )
-    split_size: float = _of_bag(
-        0.0, 'size at which the bag continues in a new file; 0: never', 'MB', at_least=0.0
-    )
-    split_duration: float = _of_bag(
-        0.0, 'duration at which the bag continues in a new file; 0: never', 's', at_least=0.0
-    )
     clock: Literal['wall', 'plant'] = _of_bag(
         'wall',
         'log times: as received, or (lock-step) the stamp of the last joint state, so that the bag '

@@ -32,9 +32,8 @@ from blf_dsc_controller.arms.batch import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.arms.urdf import chain_joints, moving_joints
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap, read_content
-from blf_dsc_controller.bags.reader import one_run
+from blf_dsc_controller.bags.reader import applied_torque, single_run
 from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.bags.torque import applied_torque
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.run import Floats, Stamps
@@ -77,7 +76,7 @@ def read_recording(
     named = content.topics[JOINT_STATES].name_lists()
     joints = tuple(joints) or _arm_joints(text, set().union(*named), names)
     theirs = names.joints_of(joints)
-    states, _, _ = one_run(content, theirs)
+    states, _, _ = single_run(content, theirs)
     torque, source = states.field(2), f'effort of {content.topics[JOINT_STATES].name}'
     if commanded or not np.nan_to_num(torque).any():
         applied = applied_torque(content, states)

@@ -69,11 +69,6 @@ class Doubles(NamedTuple):
     offset: int
     size: int
 
-    @property
-    def place(self) -> int:
-        """Index of the first value in a grid of doubles that starts at ORIGIN."""
-        return (self.offset - ORIGIN) // 8
-
 
 class Layout(NamedTuple):
     """Byte order of a message, names in it, and positions of its arrays."""
@@ -82,6 +77,13 @@ class Layout(NamedTuple):
     begin: int  # offset of what follows the stamp
     names: tuple[str, ...]
     arrays: tuple[Doubles, ...]
+
+    @property
+    def grid(self) -> NDArray[np.intp]:
+        """Indices of the values of all arrays in a grid of doubles that starts at ORIGIN."""
+        return np.concatenate([
+            (array.offset - ORIGIN) // 8 + np.arange(array.size) for array in self.arrays
+        ])  # fmt: skip
 
     def indices_of(self, joints: Sequence[str]) -> list[int]:
         """Return the index of each joint among the names.
@@ -202,10 +204,10 @@ def array_layout(raw: bytes | bytearray) -> Layout:
     return Layout(cursor.byte_order, ORIGIN, (), (cursor.doubles(),))
 
 
-def joint_state_places(
+def joint_state_columns(
     layout: Layout, joints: Sequence[str], required: Collection[str]
 ) -> NDArray[np.intp]:
-    """Return where position, velocity and effort of n `joints` are, (3, n) in a grid of doubles.
+    """Return which of all values are position, velocity and effort of n `joints`, (3, n).
 
     A field that is not `required` and is empty has -1.
 
@@ -213,16 +215,17 @@ def joint_state_places(
         MissingJointError, DuplicatedJointError: as in `indices_of`.
         ShortArrayError: an array differs in length from the names.
     """
-    columns = np.array(layout.indices_of(joints), dtype=np.intp)
+    columns, begin = np.array(layout.indices_of(joints), dtype=np.intp), 0
     places = np.full((3, columns.size), -1)
     for row, field, array in zip(places, JOINT_STATE_FIELDS, layout.arrays, strict=True):
         if array.size == len(layout.names):
-            row[:] = columns + array.place
+            row[:] = begin + columns
         elif array.size or field in required:
             raise ShortArrayError(
                 f'`{field}` of the message holds {array.size} values for {len(layout.names)} '
                 'names: publish one value for each name'
             )
+        begin += array.size
     return places
 
 
@@ -322,12 +325,12 @@ class _Decoder:
         self.values = np.full(size, np.nan)
         self._pattern: Pattern | None = None
 
-    def _learn(self, raw: bytes, layout: Layout, places: NDArray[np.intp]) -> None:
-        """Store a layout, with the values' `places` in a grid of doubles; -1 for NaN."""
+    def _learn(self, raw: bytes, layout: Layout, columns: NDArray[np.intp]) -> None:
+        """Store a layout, and which of its values are read; -1 for NaN."""
         self._pattern = Pattern(raw, layout)
         self._count = (len(raw) - ORIGIN) // 8
-        self._known = np.flatnonzero(places >= 0)
-        self._places = places[self._known]
+        self._known = np.flatnonzero(columns >= 0)
+        self._places = layout.grid[columns[self._known]]
         self._stamp = Struct(layout.byte_order + 'iI')
         self.values[:] = np.nan
 
@@ -358,12 +361,12 @@ class JointStateDecoder(_Decoder):
         """Fill the arrays from a serialised message and return its stamp [ns].
 
         Raises:
-            MessageError: as `joint_state_layout` and `joint_state_places`.
+            MessageError: as `joint_state_layout` and `joint_state_columns`.
         """
         if self._pattern is None or not self._pattern.fits(raw):
             layout = joint_state_layout(raw)
-            places = joint_state_places(layout, self._joints, self._required)
-            self._learn(raw, layout, places.ravel())
+            columns = joint_state_columns(layout, self._joints, self._required)
+            self._learn(raw, layout, columns.ravel())
         self._fill(raw)
         seconds, nanoseconds = self._stamp.unpack_from(raw, STAMP_OFFSET)
         return int(seconds * NANOSECONDS + nanoseconds)
@@ -387,6 +390,6 @@ class Float64MultiArrayDecoder(_Decoder):
             (array,) = layout.arrays
             if array.size != self.values.size:
                 return array.size
-            self._learn(raw, layout, np.arange(array.size) + array.place)
+            self._learn(raw, layout, np.arange(array.size))
         self._fill(raw)
         return self.values.size

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
-from math import inf
 from typing import Any
 
 from blf_dsc_controller.bags.sources import BagError
@@ -31,7 +30,6 @@ _DISCOVERY_PERIOD = 0.1  # s
 _TAKE_PERIOD = 0.01  # s
 _FLUSH_INTERVAL = 0.05  # s; below 0.1 s including _TAKE_PERIOD, unless overloaded
 _REPEAT = 60.0  # s between repeats of a warning
-_MEGABYTE = 1_000_000
 
 
 class BagRecorderNode(PlainNode):
@@ -59,8 +57,6 @@ class BagRecorderNode(PlainNode):
             self._config.output,
             compression=self._config.compression,
             flush_interval=_FLUSH_INTERVAL,
-            split_size=self._config.split_size * _MEGABYTE or inf,
-            split_duration=self._config.split_duration or inf,
         )
         self.get_logger().info(f'recording into {self._bag.path}')
 

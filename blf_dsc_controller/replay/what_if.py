@@ -14,10 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
-from blf_dsc_controller.bags.reader import one_run
+from blf_dsc_controller.bags.reader import applied_torque, single_run
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import JointStates
-from blf_dsc_controller.bags.torque import applied_torque
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.law.telemetry import run_of, sample_columns
@@ -88,9 +87,9 @@ def read_states(
 def law_states(content: Content, joints: Sequence[str]) -> JointStates:
     """Return the states that the law used, according to its telemetry; all if there is none.
 
-    `joints` are the names in the bag. Raises BagError as `one_run`.
+    `joints` are the names in the bag. Raises BagError as `single_run`.
     """
-    states, _, _ = one_run(content, joints, ('position', 'velocity'))
+    states, _, _ = single_run(content, joints, ('position', 'velocity'))
     errors = content.topics.get(TRACKING_ERROR)
     if errors is None:
         return states
