@@ -199,7 +199,7 @@ def _recorded_names(bag: OpenBag, namespace: str, names: NameMap) -> NameMap:
     """
     journal = _find(JOURNAL, bag.held, namespace, names)
     held = {name for name, _ in bag.held}
-    if journal is None or sum(name.endswith(f'/{JOINT_STATES.leaf}') for name in held) < 2:  # noqa: PLR2004
+    if journal is None or sum(name.endswith(f'/{JOINT_STATES.leaf}') for name in held) < 2:
         return names
     recorded: dict[str, str] = {}
     with suppress(BlfDscError, StopIteration):

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -58,12 +58,16 @@ class RecordedRun(Run):
         stored = object.__getattribute__(self, '__dict__').get('_stored', ())
         return self.at(name) if name in stored else object.__getattribute__(self, name)
 
+    def holds(self, name: str) -> bool:
+        """Return whether some of an array is known."""
+        states, k = self._stored[name]
+        return (name == 'error' and self.holds('reference')) if states is None else states.has(k)
+
     def at(self, name: str, rows: Rows = ALL, columns: Rows = ALL) -> Floats | None:
         """Return some rows and joints of an array; None if it is unknown."""
         states, k = self._stored[name]
         if states is None:
-            is_known = name == 'error' and self._stored['reference'][0] is not None
-            return self._difference('reference', rows, columns) if is_known else None
+            return self._difference('reference', rows, columns) if self.holds(name) else None
         values: Floats = states.field(k, rows, columns)
         if name == 'reference' and self._is_decimated:
             lost = np.isnan(values)
@@ -128,7 +132,7 @@ def recorded_run(content: Content, names: NameMap = NO_NAMES, namespace: str = '
     settings = [event.content.get('parameters', {}) for event in events]
     learning = series(topics.LEARNING)
     try:
-        torque = applied_torque(content, states)
+        _, torque = applied_torque(content, states)
     except TorqueError:
         torque = next_effort(states)
     return RecordedRun(
@@ -136,7 +140,7 @@ def recorded_run(content: Content, names: NameMap = NO_NAMES, namespace: str = '
             'position': (states, 0),
             'velocity': (states, 1),
             'effort': (states, 2),
-            'torque': (torque.efforts, 2),
+            'torque': (torque, 2),
             'error': (errors, 0),
             'reference': (references, 0),
             'xi2': (errors, 1),
@@ -175,44 +179,41 @@ def single_run(
     """
     messages = content.topics[JOINT_STATES]
     states = messages.joint_states(joints, required)
-    stamp, received, notes = states.stamp, states.received, []
-    if states.size > 1 and (stamp == stamp[0]).all():
+    stamp, received = states.stamp, states.received
+    if stamp.size > 1 and (stamp == stamp[0]).all():
         raise BagError(
             f'all {stamp.size} messages of {messages.name} have the stamp {stamp[0]} ns: each '
             'needs a unique stamp, so the driver has to set header.stamp'
         )
-    if messages.size > states.size:
-        count = messages.size - states.size
-        notes.append(f'{count} of {messages.size} joint states left out: they name other joints')
     falls = np.flatnonzero(np.diff(stamp) < 0)
     if falls.size > _MOST_FALLS or _alternates(states):
         where = ''
         if falls.size:
-            before, after = (stamp[falls[0] + k] * 1e-9 for k in (0, 1))
+            before, after = stamp[falls[0] : falls[0] + 2] * 1e-9
             where = f': its stamps fall {falls.size} times, the first time '
             where += f'from {before:.9g} s to {after:.9g} s'
         raise BagError(
             f'several publishers share {messages.name}, or its clock runs backwards{where}; '
             'record one arm for each topic'
         )
-    begin, end = np.iinfo(np.int64).min, np.iinfo(np.int64).max
-    if falls.size:
-        edges = np.concatenate([[0], falls + 1, [states.size]])
-        longest = int(np.argmax(np.diff(edges)))
-        first, last = (int(edge) for edge in edges[longest : longest + 2])
-        begin = int(received[first]) if first else begin
-        end = int(received[last]) if last < states.size else end
-        states = states.select(slice(first, last))
-        notes.append(
-            f'{stamp.size - states.size} of {stamp.size} joint states left out: their stamps fall '
-            f'{falls.size} times, so that {falls.size + 1} runs are in the bag; run '
-            f'{longest + 1}, the longest, is shown'
-        )
-        stamp = states.stamp
-    repeated = int((np.diff(stamp) == 0).sum())
-    if repeated:
-        notes.append(f'{repeated} joint states left out: they repeat the stamp before')
-    return states.by_stamp(), tuple(notes), (begin, end)
+    edges = np.concatenate([[0], falls + 1, [stamp.size]])
+    longest = int(np.diff(edges).argmax())
+    first, last = edges[longest : longest + 2].tolist()
+    span = (
+        int(received[first]) if first else np.iinfo(np.int64).min,
+        int(received[last]) if last < stamp.size else np.iinfo(np.int64).max,
+    )
+    run = states.select(slice(first, last)).by_stamp()
+    foreign, others = messages.size - stamp.size, stamp.size - (last - first)
+    repeated = last - first - run.size
+    notes = {
+        f'{foreign} of {messages.size} joint states left out: they name other joints': foreign,
+        f'{others} of {stamp.size} joint states left out: their stamps fall {falls.size} times, '
+        f'so that {falls.size + 1} runs are in the bag; run {longest + 1}, the longest, is '
+        'shown': others,
+        f'{repeated} joint states left out: they repeat the stamp before': repeated,
+    }
+    return run, tuple(text for text, count in notes.items() if count), span
 
 
 def _alternates(states: JointStates) -> bool:
@@ -241,23 +242,18 @@ def _rejected_columns(content: Content, learning: Series | None, namespace: str)
     if learning is None:
         return {}
     values = learning.at(np.array([learning.stamp.size - 1]))[0]
-    last = dict(zip(learning.names, values, strict=True))
-    columns = [
-        name for name, value in last.items() if name != topics.COMPUTE_TIME and np.isnan(value)
-    ]
+    columns = [learning.names[j] for j in np.flatnonzero(np.isnan(values))]
+    columns = [name for name in columns if name != topics.COMPUTE_TIME]
     reasons: dict[str, str] = {}
     diagnostics = content.topics.get(topics.DIAGNOSTICS)
-    for raw in reversed(diagnostics.raw if columns and diagnostics is not None else []):
+    for raw in diagnostics.raw if columns and diagnostics is not None else ():
         message: Any = typestore().deserialize_cdr(raw, topics.DIAGNOSTICS.type)
-        reasons = {
+        reasons |= {
             pair.key.removeprefix(topics.REJECTED): pair.value
             for status in message.status
             if status.name.startswith(namespace.strip('/'))
             for pair in status.values
-            if pair.key.startswith(topics.REJECTED)
         }
-        if reasons:
-            break
     return {column: reasons.get(column, '') for column in columns}
 
 
@@ -292,54 +288,43 @@ class TorqueError(BlfDscError):
     """The torques of a bag are unknown."""
 
 
-class AppliedTorque(NamedTuple):
-    """The torque from each of N states to the next, as efforts."""
+def applied_torque(content: Content, states: JointStates) -> tuple[str, JointStates]:
+    """Return the torque from each state to the next as efforts, and its source.
 
-    source: str  # topic
-    efforts: JointStates  # (N,)
-
-    def at(self, rows: Rows = ALL) -> Floats:
-        """Return the torque after these states (m, n) [N m]; NaN where unknown."""
-        return self.efforts.field(2, rows)
-
-
-def applied_torque(content: Content, states: JointStates) -> AppliedTorque:
-    """Return the first available of these, for states that are ordered by stamp.
-
-    Commands, if there is one for each state; the saturated torque of the controller's telemetry;
-    commands; the effort of the next state.
+    The states are ordered by stamp. It is the first available of these: commands, if there is one
+    for each state; the saturated torque of the controller's telemetry; commands; the effort of the
+    next state.
 
     Raises:
         TorqueError: the bag holds none of them, or commands in an unknown order.
     """
     commands, errors = content.topics.get(COMMANDS), content.topics.get(TRACKING_ERROR)
     if commands is not None and (errors is None or commands.size == states.size):
-        return _commanded(content, commands, states)
+        return commands.name, _commanded(content, commands, states)
     if errors is not None:
         telemetry = errors.joint_states(states.names, ('effort',)).by_stamp()
-        return AppliedTorque(f'effort of {errors.name}', telemetry.at_stamps(states.stamp))
-    found = next_effort(states, f'effort of {content.topics[JOINT_STATES].name}')
-    if np.isnan(found.at(slice(0, 1000))).all():
+        return f'effort of {errors.name}', telemetry.at_stamps(states.stamp)
+    found = next_effort(states)
+    if np.isnan(found.field(2, slice(0, 1000))).all():
         raise TorqueError(
             f'{content.path} does not hold the torques: there is no command topic (map it: '
             '--map commands=/its/name) and the effort of the joint states is empty'
         )
-    return found
+    return f'effort of {content.topics[JOINT_STATES].name}', found
 
 
-def next_effort(states: JointStates, source: str = '') -> AppliedTorque:
+def next_effort(states: JointStates) -> JointStates:
     """Return the effort measured with the next state; unknown for the last one."""
-    return AppliedTorque(source, states.select(np.append(np.arange(1, states.size), -1)))
+    return states.select(np.append(np.arange(1, states.size), -1))
 
 
-def _commanded(content: Content, commands: TopicMessages, states: JointStates) -> AppliedTorque:
+def _commanded(content: Content, commands: TopicMessages, states: JointStates) -> JointStates:
     """Return the command after each state: k-th, or last before the next if counts differ."""
     efforts = _by_joint(content, commands, states.names)
-    if efforts.size != states.size:
-        until = np.append(states.received[1:], np.iinfo(np.int64).max)
-        index = np.searchsorted(np.maximum.accumulate(efforts.received), until) - 1
-        efforts = efforts.select(index)
-    return AppliedTorque(commands.name, efforts)
+    if efforts.size == states.size:
+        return efforts
+    until = np.append(states.received[1:], np.iinfo(np.int64).max)
+    return efforts.select(np.searchsorted(np.maximum.accumulate(efforts.received), until) - 1)
 
 
 def _by_joint(content: Content, commands: TopicMessages, joints: tuple[str, ...]) -> JointStates:

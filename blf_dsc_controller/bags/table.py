@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterable
-from contextlib import ExitStack
+from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.reader import RecordedRun
@@ -31,15 +30,13 @@ _FIELDS = {  # fields of a run with a column per joint: unit
     'torque_limit': 'N m',
 }
 _VALUES = {  # prefix of names in the vectors: unit
-    topics.DISTURBANCE: 'N m',
+    **dict.fromkeys((topics.DISTURBANCE, 'bias ', 'coulomb ', 'sin ', 'cos '), 'N m'),
     'viscous ': 'N m s/rad',
-    **dict.fromkeys(('bias ', 'coulomb ', 'sin ', 'cos '), 'N m'),
     topics.POSITION: 'rad',
     topics.VELOCITY: 'rad/s',
-    topics.RATIO: '1',
     topics.DISTANCE: 'rad',
     topics.LYAPUNOV: 'J',
-    **dict.fromkeys((topics.LATCHED, topics.MODEL_CHANGES, topics.LATE_STEPS), '1'),
+    **dict.fromkeys((topics.RATIO, topics.LATCHED, topics.MODEL_CHANGES, topics.LATE_STEPS), '1'),
     **dict.fromkeys((topics.COMPUTE_TIME, topics.LATENCY, topics.LATENESS), 's'),
 }
 _ROWS = 1 << 14
@@ -67,7 +64,7 @@ def table(run: RecordedRun, rows: slice = slice(None)) -> dict[str, Column]:
         'time': Column(run.time_of(stamp), 's'),
     }
     for field, unit in _FIELDS.items():
-        values = run.at(field, rows)
+        values = run.at(field, rows) if run.holds(field) else None
         if values is not None:
             for i, joint in enumerate(run.joints):
                 columns[f'{field} {joint}'] = Column(values[:, i], unit)
@@ -105,21 +102,9 @@ def export(run: RecordedRun, path: Path) -> int:
         raise BlfDscError(
             f'{path} ends in neither .csv nor .parquet: the file extension selects the format'
         )
-    blocks = [slice(begin, begin + _ROWS) for begin in range(0, run.stamp.size, _ROWS)]
-    unknown = tuple(f'{field} ' for field in _FIELDS if not _is_known(run, field, blocks))
-    tables = (
-        {name: one for name, one in table(run, rows).items() if not name.startswith(unknown)}
-        for rows in blocks
-    )
+    blocks = (slice(begin, begin + _ROWS) for begin in range(0, run.stamp.size, _ROWS))
+    tables = (table(run, rows) for rows in blocks)
     return (_write_csv if path.suffix == '.csv' else _write_parquet)(tables, path)
-
-
-def _is_known(run: RecordedRun, field: str, blocks: Iterable[slice]) -> bool:
-    """Return whether any value of a field is known."""
-    return any(
-        values is not None and not np.isnan(values).all()
-        for values in (run.at(field, rows) for rows in blocks)
-    )
 
 
 def described(path: Path) -> Path:
@@ -127,23 +112,17 @@ def described(path: Path) -> Path:
     return path.with_suffix('.datapackage.json')
 
 
-def _write_csv(tables: Iterable[dict[str, Column]], path: Path) -> int:
-    columns: dict[str, Column] = {}
+def _write_csv(tables: Iterator[dict[str, Column]], path: Path) -> int:
+    fields: list[dict[str, str]] = []
     with path.open('w', encoding='utf-8', newline='') as stream:
         writer = csv.writer(stream)
         for block in tables:
-            if not columns:
+            if not fields:
                 writer.writerow(block)
-            columns = block
-            writer.writerows(zip(*(one.values.tolist() for one in block.values()), strict=True))
-    fields = [
-        {
-            'name': name,
-            'type': 'integer' if one.values.dtype.kind == 'i' else 'number',
-            **({'unit': one.unit} if one.unit else {}),
-        }
-        for name, one in columns.items()
-    ]
+                for name, (values, unit) in block.items():
+                    type_ = 'integer' if values.dtype.kind == 'i' else 'number'
+                    fields.append({'name': name, 'type': type_} | ({'unit': unit} if unit else {}))
+            writer.writerows(zip(*(values.tolist() for values, _ in block.values()), strict=True))
     resource = {
         'name': 'run',
         'path': path.name,
@@ -152,28 +131,22 @@ def _write_csv(tables: Iterable[dict[str, Column]], path: Path) -> int:
     }
     text = json.dumps({'profile': 'tabular-data-package', 'resources': [resource]}, indent=1)
     described(path).write_text(text + '\n', encoding='utf-8')
-    return len(columns)
+    return len(fields)
 
 
-def _write_parquet(tables: Iterable[dict[str, Column]], path: Path) -> int:
+def _write_parquet(tables: Iterator[dict[str, Column]], path: Path) -> int:
     try:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError:
         raise MissingExtraError('pyarrow', 'parquet', 'writing Parquet') from None
-    with ExitStack() as stack:
-        schema = writer = None
-        for block in tables:
-            if writer is None:
-                schema = pa.schema(
-                    pa.field(
-                        name,
-                        pa.from_numpy_dtype(one.values.dtype),
-                        metadata={'unit': one.unit} if one.unit else None,
-                    )
-                    for name, one in block.items()
-                )
-                writer = stack.enter_context(parquet.ParquetWriter(path, schema))
-            arrays = [pa.array(one.values) for one in block.values()]
+    first = next(tables)
+    schema = pa.schema(
+        pa.field(name, pa.from_numpy_dtype(values.dtype), metadata={'unit': unit} if unit else None)
+        for name, (values, unit) in first.items()
+    )
+    with parquet.ParquetWriter(path, schema) as writer:
+        for block in chain([first], tables):
+            arrays = [pa.array(values) for values, _ in block.values()]
             writer.write_table(pa.table(arrays, schema=schema))
-        return 0 if schema is None else len(schema)
+    return len(schema)

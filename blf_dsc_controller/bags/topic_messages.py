@@ -137,6 +137,10 @@ class JointStates:
         """Stamps (N,) [ns]."""
         return self.head(_STAMP)
 
+    def has(self, k: int) -> bool:
+        """Return whether any of the positions (0), velocities (1) or efforts (2) is known."""
+        return bool((self._places[k] >= 0).any())
+
     def field(self, k: int, rows: Rows = ALL, columns: Rows = ALL) -> Floats:
         """Return positions (0), velocities (1) or efforts (2), (m, n); NaN where unknown."""
         chosen, places = self._rows[rows], self._places[k][columns].tolist()

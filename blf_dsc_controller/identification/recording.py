@@ -79,8 +79,8 @@ def read_recording(
     states, _, _ = single_run(content, theirs)
     torque, source = states.field(2), f'effort of {content.topics[JOINT_STATES].name}'
     if commanded or not np.nan_to_num(torque).any():
-        applied = applied_torque(content, states)
-        torque, source = applied.at(), applied.source
+        source, applied = applied_torque(content, states)
+        torque = applied.field(2)
         if not np.nan_to_num(torque).any():
             raise BagError(f'{path}: all torques in the {source} are zero: record measured efforts')
     return _resampled(joints, states.stamp, states.field(0), torque, source)

@@ -71,17 +71,15 @@ def read_states(
         for rows in (slice(k, k + _BLOCK) for k in range(0, every.size, _BLOCK))
     ])  # fmt: skip
     states = every.select(np.flatnonzero(finite))
-    torque = applied_torque(content, states)
-    applied = torque.at()
+    source, torque = applied_torque(content, states)
+    applied = torque.field(2)
     before = np.concatenate((applied[:1], applied[:-1]))
     known = np.flatnonzero(np.isfinite(before).all(axis=1))
     if not known.size:
         raise BagError(f'{path} holds no joint state that is finite and has a known torque')
     left_out = every.size - known.size
-    is_measured = torque.source == f'effort of {content.topics[JOINT_STATES].name}'
-    return RecordedStates(
-        states.select(known), applied[known], torque.source, left_out, is_measured
-    )
+    is_measured = source == f'effort of {content.topics[JOINT_STATES].name}'
+    return RecordedStates(states.select(known), applied[known], source, left_out, is_measured)
 
 
 def law_states(content: Content, joints: Sequence[str]) -> JointStates:
