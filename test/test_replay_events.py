@@ -79,7 +79,7 @@ def test_every_fault_replays_with_identical_torques(fault, tmp_path):
         return  # the replay ends where the controller was killed
     assert compared(result)['commands'] == 2 * len(of(rig.entries, COMMANDS))
     assert compared(result)['tracking_error'] == 6 * len(of(rig.entries, TRACKING_ERROR))
-    assert ('safe stop' in ' '.join(result.turns)) == (outcome.noticed >= 0)
+    assert ('safe stop' in ' '.join(result.transitions)) == (outcome.noticed >= 0)
     assert [item for item in result.comparisons if 'torques' in item.left_out] == []
 
 
@@ -114,7 +114,7 @@ def test_watchdog_torques_replay(tmp_path):
     rig.guard.release()
     result = rig.verify(tmp_path)
     assert (result.difference, result.remarks) == (None, ())
-    assert result.turns == [
+    assert result.transitions == [
         'activate',
         'deactivate',
         'activate',
@@ -160,7 +160,7 @@ def test_unexpected_error_replays_as_a_stop(tmp_path):
     rig.step(30)
     result = rig.verify(tmp_path, clock='lockstep')
     assert result.difference is None
-    assert result.turns == ['activate', 'safe stop (failed)', 'reset']
+    assert result.transitions == ['activate', 'safe stop (failed)', 'reset']
     assert compared(result)['commands'] >= 2 * (50 + 30)
 
 

@@ -218,7 +218,7 @@ def test_stops_ramps_and_activations_replay_with_identical_torques(stopped):
     assert result.difference is None
     assert result.remarks == ()
     assert [event.type for event in result.events].count(EventType.PARAMETERS) == 1
-    assert ', '.join(result.turns) == (
+    assert ', '.join(result.transitions) == (
         'activate, deactivate, activate, safe stop (stamp jump), deactivate, '
         'activate, reset, safe stop (joint missing)'
     )
@@ -285,7 +285,7 @@ def test_state_timeout_replays_with_its_torques(tmp_path):
     bag = run.end()
     result = verify(bag)
     assert result.difference is None
-    assert result.turns == ['activate', 'safe stop (state timeout)', 'deactivate', 'activate']
+    assert result.transitions == ['activate', 'safe stop (state timeout)', 'deactivate', 'activate']
     errors = read_content(bag).topics[TRACKING_ERROR].joint_states(JOINTS, ())
     used = errors.stamp[np.isfinite(errors.field(0)[:, 0])]
     assert result.samples == used.size

@@ -39,7 +39,7 @@ def test_bag_replays_bit_for_bit_without_its_urdf_file(recorded):
     urdf.unlink()
     verified = verify(bag)
     assert verified.difference is None
-    assert verified.turns == ['activate']
+    assert verified.transitions == ['activate']
     assert read_run(bag).arm is not None
 
 

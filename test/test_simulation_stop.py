@@ -62,7 +62,7 @@ def test_bag_of_a_stopped_run_replays_with_its_stop(tmp_path, reason):
     write_bag(tmp_path / 'bag', record, record.config, 'none')
     result = verify(tmp_path / 'bag')
     assert (result.difference, result.remarks) == (None, ())
-    assert result.turns == ['activate', f'safe stop ({reason})']
+    assert result.transitions == ['activate', f'safe stop ({reason})']
     recorded = read_run(tmp_path / 'bag')
     (stop,) = recorded.stops
     assert stop.reason == reason

@@ -192,6 +192,8 @@ class BagWriter:
 
     def flush(self) -> None:
         """Pass everything written so far to the operating system; DiskFullError as in `write`."""
+        if self.closed:  # a timer may fire once more
+            return
         self._end_chunk()
         self._flushed = self._clock()
         self._stop_if_full()

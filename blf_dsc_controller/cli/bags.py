@@ -178,8 +178,8 @@ def _events(result: Verification) -> Iterator[str]:
     ):
         if type_ in types:
             yield f'{types.count(type_)} {what} replayed where they took effect'
-    if len(result.turns) > 1:
-        yield f'replayed in order: {", ".join(result.turns)}'
+    if len(result.transitions) > 1:
+        yield f'replayed in order: {", ".join(result.transitions)}'
     if result.safe_torques:
         yield f'{result.safe_torques} of the commands are safe torques, or on the ramp to one'
     if result.passed_over:

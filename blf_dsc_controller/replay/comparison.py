@@ -19,7 +19,7 @@ from blf_dsc_controller.bags.topic_messages import (
 )
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.telemetry import DECIMATION, ControllerTelemetry, Message, Monitor
-from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS, JointStateEncoder
+from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS
 from blf_dsc_controller.messages.topics import (
     BOUND,
     COMMANDS,
@@ -106,7 +106,6 @@ class ReplayedMessages:
         self._guard, self._joints = guard, guard.config.joints
         self._estimates = estimate_names(guard.config)
         self._telemetry = ControllerTelemetry(self._joints, self._estimates, 1)
-        self._error = JointStateEncoder(self._joints)
         self.count = self.safe_torques = 0
         self.first = self.last = -1
         self._bound = b''
@@ -132,8 +131,7 @@ class ReplayedMessages:
         if sample.bound.tobytes() != self._bound:
             self.add_bound(stamp, sample.bound)
         for message in self._telemetry.sample(stamp, sample, 0.0):
-            if message[0] is not TRACKING_ERROR:
-                self._add(stamp, message)
+            self._add(stamp, message)
         if (controller.samples - 1) % DECIMATION == 0:
             ratio = guard.samples.ratio
             self._add(stamp, self._monitor.message(stamp, sample, ratio, sample.bound))
@@ -151,14 +149,12 @@ class ReplayedMessages:
         """
         guard = self._guard
         self.safe_torques += not guard.has_sample
-        self._sent[TRACKING_ERROR] += is_answer and not is_certain
-        if not is_certain:
-            return
-        self._add(stamp, self._telemetry.command(torque), guard.journal.commands)
-        if is_answer:
-            n, sample = torque.size, guard.controller.sample
-            pair = (sample.xi1, sample.xi2) if guard.has_sample else (np.full(n, np.nan),) * 2
-            self._add(stamp, (TRACKING_ERROR, self._error.encode(stamp, *pair, torque)))
+        if is_answer and not guard.has_sample:
+            self._sent[TRACKING_ERROR] += not is_certain
+            if is_certain:
+                self._add(stamp, self._telemetry.answer(stamp, torque))
+        if is_certain:
+            self._add(stamp, self._telemetry.command(torque), guard.journal.commands)
 
     @property
     def duration(self) -> float:
@@ -168,40 +164,40 @@ class ReplayedMessages:
     def compare(self, content: Content, answers: JointStates) -> Iterator[Comparison]:
         """Yield the comparison with each topic in a bag; `answers` are those of tracking errors."""
         for topic, fields in _COMPARED.items():
-            messages, own = content.topics.get(topic), self.topics[topic]
-            own.decode()
+            messages = content.topics.get(topic)
+            self.topics[topic].decode()
             if messages is not None and topic in (LEARNING, MONITOR):
-                yield self._compare_vectors(messages, own)
+                yield self._compare_vectors(messages, self.topics[topic])
             elif messages is not None:
-                yield self._compare_joints(topic, messages, answers, fields)
+                result = Comparison(messages.name, messages.size * len(self._joints) * len(fields))
+                try:
+                    self._compare_joints(topic, messages, answers, result)
+                except UnreadableMessageError as error:
+                    result.left_out = f'{error}'
+                yield result
 
     def _compare_vectors(self, messages: TopicMessages, own: TopicMessages) -> Comparison:
         """Compare values of the same name and stamp."""
         recorded = messages.vectors().by_stamp()
         replayed = own.vectors().by_stamp() if own.size else recorded.select(slice(0))
-        both = dict.fromkeys((*replayed.names, *recorded.names))
-        shared = {*replayed.names}.intersection(recorded.names) - {COMPUTE_TIME}
+        shared = [name for name in replayed.names if name in recorded.names]
+        shared = [name for name in shared if name != COMPUTE_TIME]
         result = Comparison(messages.name, recorded.size * len(shared))
+        both = dict.fromkeys((*replayed.names, *recorded.names))
         result.left_out = ', '.join(name for name in both if name not in shared)
-        names = [name for name in replayed.names if name in shared]
-        pair = recorded.of(names), replayed.of(names)
-        self._compare(result, names, *pair, (0,), (recorded.stamp, replayed.stamp))
+        pair = recorded.of(shared), replayed.of(shared)
+        self._compare(result, shared, *pair, (0,), (recorded.stamp, replayed.stamp))
         return result
 
     def _compare_joints(
-        self, topic: Topic, messages: TopicMessages, answers: JointStates, fields: Sequence[int]
-    ) -> Comparison:
-        own, n = self.topics[topic], len(self._joints)
-        result = Comparison(messages.name, messages.size * n * len(fields))
-        names = [f'{JOINT_STATE_FIELDS[k]} of {joint}' for k in fields for joint in self._joints]
-        try:
-            recorded = answers if topic is TRACKING_ERROR else _of_joints(messages, self._joints)
-        except UnreadableMessageError as error:
-            result.left_out = f'{error}'
-            return result
-        if not own.size:
-            return result
-        replayed = _of_joints(own, self._joints)
+        self, topic: Topic, messages: TopicMessages, answers: JointStates, result: Comparison
+    ) -> None:
+        """Compare values of the same joints: by stamp, by sequence, or by order."""
+        fields, joints = _COMPARED[topic], self._joints
+        recorded = answers if topic is TRACKING_ERROR else _of_joints(messages, joints)
+        if not self.topics[topic].size:
+            return
+        replayed = _of_joints(self.topics[topic], joints)
         keys = np.arange(1, recorded.size + 1), replayed.sequence
         if topic is REFERENCE:
             recorded, replayed = recorded.by_stamp(), replayed.by_stamp()
@@ -210,19 +206,19 @@ class ReplayedMessages:
             keys = recorded.sequence, replayed.sequence
             if (np.diff(keys[0]) <= 0).any():
                 result.left_out = 'they are of several publishers'
+                return
         elif topic is COMMANDS and recorded.size < answers.size:  # of another recorder
             result.left_out = 'some are missing, and they have neither stamps nor numbers'
-        if result.left_out:
-            return result
+            return
+        names = [f'{JOINT_STATE_FIELDS[k]} of {joint}' for k in fields for joint in joints]
         self._compare(result, names, recorded, replayed, fields, keys)
-        rest = (result.recorded - result.values) // n
+        rest = (result.recorded - result.values) // len(joints)
         if topic is COMMANDS and rest:
             # The last command of a node that shuts down normally is zero and belongs to no state.
             if rest == 1 and not recorded.field(2, slice(-1, None)).any():
-                result.recorded -= n
+                result.recorded -= len(joints)
             else:
                 result.left_out = f'{rest} torques that the replay does not reach'
-        return result
 
     def _compare(
         self,
@@ -237,8 +233,7 @@ class ReplayedMessages:
         index = np.minimum(np.searchsorted(*keys), keys[0].size - 1)
         known = np.flatnonzero(keys[0][index] == keys[1])
         recorded, replayed = recorded.select(index[known]), replayed.select(known)
-        stamp = replayed.received
-        has_moved = recorded.stamp != replayed.stamp
+        stamp, has_moved = replayed.received, recorded.stamp != replayed.stamp
         for begin in range(0, known.size, _BLOCK):
             rows = slice(begin, begin + _BLOCK)
             theirs, own = (

@@ -128,12 +128,13 @@ class Rerun:
         return True
 
     def _find(self, stamp: int) -> int:
-        """Return the next message with a stamp; if it is the last one's, an unreadable one will do.
+        """Return the next message with a stamp, -1 if there is none.
 
-        Returns -1 if there is none.
+        Unreadable ones have the stamp -1; after the last message, one with its stamp may be one.
         """
+        wanted = (stamp, -1) if stamp == self._last else (stamp,)
         for k in range(self._position + 1, self._stamp.size):
-            if self._stamp[k] == stamp or (stamp == self._last and self._stamp[k] < 0):
+            if self._stamp[k] in wanted:
                 return k
         return -1
 
@@ -159,16 +160,9 @@ class Rerun:
         if self._answered[self._answer :][:1].tolist() == [event.stamp]:
             self._next()  # it was answered, at least with a safe torque
         else:
-            k = self._find_error() if _reason(event) in _UNREADABLE else self._find(event.stamp)
+            k = self._find(-1 if _reason(event) in _UNREADABLE else event.stamp)
             if k >= 0:
                 self._process(k)
-
-    def _find_error(self) -> int:
-        """Return the next unreadable message, -1 if there is none."""
-        for k in range(self._position + 1, self._stamp.size):
-            if self._stamp[k] < 0:
-                return k
-        return -1
 
     def _process(self, k: int) -> None:
         guard, outputs, stamp = self._guard, self.outputs, int(self._stamp[k])
@@ -206,7 +200,7 @@ class Rerun:
     def _repeat(self, event: Event) -> None:
         """Repeat an event, or check that the controller has produced it itself."""
         pending = self._guard.journal.pending
-        if not _is_own(event) and pending:
+        if pending and not _is_own(event):
             self._report_departure(pending[0], event)
             return
         try:
@@ -214,14 +208,13 @@ class Rerun:
         except TrajectoryError as error:
             self._depart(f'trajectory accepted ({error})', event.stamp)
             return
-        if not pending or _key(pending[0]) != _key(event):
-            if pending and _is_own(event):
-                self._report_departure(pending[0], event)
-                return
+        if pending and _key(pending[0]) == _key(event):
+            pending.popleft()
+        elif pending and _is_own(event):
+            self._report_departure(pending[0], event)
+        else:
             is_stop = event.type is EventType.STOP
             self._depart(f'{event.type}: {_reason(event)}' if is_stop else event.type, event.stamp)
-            return
-        pending.popleft()
 
     def _act(self, event: Event) -> None:
         guard, content = self._guard, event.content
@@ -263,7 +256,8 @@ class Rerun:
     def _report_departure(self, own: Event, event: Event | None) -> None:
         """Note that the controller started or stopped differently from the recorded one."""
         text = own.content['text'] if own.type is EventType.STOP else own.type
-        what = f'stop: {_reason(event)}' if _stops_at(event, own.stamp) else 'used by the law'
+        is_stop = event is not None and event.type is EventType.STOP and event.stamp == own.stamp
+        what = f'stop: {_reason(event)}' if is_stop else 'used by the law'
         self._depart(f'{what} ({text})', own.stamp)
 
     def _depart(self, what: str, stamp: int) -> None:
@@ -292,7 +286,3 @@ def _reason(event: Event | None) -> Reason:
 
 def _key(event: Event | None) -> tuple[EventType, int, Reason] | None:
     return (event.type, event.stamp, _reason(event)) if event else None
-
-
-def _stops_at(event: Event | None, stamp: int) -> bool:
-    return event is not None and event.type is EventType.STOP and event.stamp == stamp

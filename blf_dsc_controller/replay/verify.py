@@ -27,7 +27,7 @@ from blf_dsc_controller.messages.topics import (
 from blf_dsc_controller.replay.comparison import Comparison, Difference
 from blf_dsc_controller.replay.rerun import Rerun
 
-_TURNS = (EventType.ACTIVATE, EventType.DEACTIVATE, EventType.RESET, EventType.STOP)
+_TRANSITIONS = (EventType.ACTIVATE, EventType.DEACTIVATE, EventType.RESET, EventType.STOP)
 
 
 class Verification(NamedTuple):
@@ -50,12 +50,12 @@ class Verification(NamedTuple):
         return sum(found.values for found in self.comparisons) / recorded if recorded else 0.0
 
     @property
-    def turns(self) -> list[str]:
+    def transitions(self) -> list[str]:
         """Activations, deactivations, resets and safe stops in order."""
         return [
             f'safe stop ({event.content["reason"]})' if event.type is EventType.STOP else event.type
             for event in self.events
-            if event.type in _TURNS
+            if event.type in _TRANSITIONS
         ]
 
 
@@ -75,33 +75,33 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
     config = content.controller_config()
     newer = sorted(flatten(config).keys() - events[0].content['parameters'].keys())
     errors: dict[int, MessageError] = {}
-    recorded = content.topics[JOINT_STATES]
-    states = recorded.joint_states(names.joints_of(config.joints), ('position',), errors)
+    states = content.topics[JOINT_STATES].joint_states(
+        names.joints_of(config.joints), ('position',), errors
+    )
     start = next((event.stamp for event in events if event.type is EventType.START), None)
     if start is not None and start not in states.stamp:
-        reason = (
+        raise BlfDscError(
             f'{path} does not hold the first state that the controller used, with the stamp '
             f'{start} ns, so its outputs cannot be reproduced: start the recorder first'
         )
-        raise BlfDscError(reason)
-    answers = content.topics[TRACKING_ERROR].joint_states(config.joints, ())
-    answers = _before(answers, until)
+    answers = _before(content.topics[TRACKING_ERROR].joint_states(config.joints, ()), until)
     run = Rerun(config, _before(states, until), errors, answers)
     run.run(events[1:])
-    comparisons = tuple(run.outputs.compare(content, answers))
+    outputs = run.outputs
+    comparisons = tuple(outputs.compare(content, answers))
     if not (run.departure or any(found.values for found in comparisons)):
         raise _nothing_to_compare(content)
     differences = [run.departure, *(found.difference for found in comparisons)]
     return Verification(
-        run.outputs.count,
-        run.outputs.duration,
+        outputs.count,
+        outputs.duration,
         run.passed_over,
         comparisons,
         tuple(
             content.topics[topic].name for topic in (STATE, DIAGNOSTICS) if topic in content.topics
         ),
         tuple(run.events),
-        run.outputs.safe_torques,
+        outputs.safe_torques,
         (*_remarks(content, run.end or end, newer), *_other_machine(events[0])),
         min((found for found in differences if found), key=lambda found: found.stamp, default=None),
     )
@@ -111,14 +111,9 @@ def _events(content: Content) -> tuple[list[Event], int, str]:
     """Return the events of a bag's first controller, when the next begins [ns], and a remark."""
     if not {JOURNAL, TRACKING_ERROR} <= content.topics.keys():
         raise _nothing_to_compare(content)
-    events: list[Event] = []
-    until, end = FOREVER, ''
-    for received, event in content.events:
-        if events and event.type is EventType.CONFIGURE:
-            until, end = received, 'another controller was started'
-            break
-        events.append(event)
-    if not events or events[0].type is not EventType.CONFIGURE:
+    begins = [k for k, (_, event) in enumerate(content.events) if event.type is EventType.CONFIGURE]
+    events = [event for _, event in content.events]
+    if not begins or begins[0] > 0:
         raise BlfDscError(
             f'{content.path} does not hold the beginning of {content.topics[JOURNAL].name}: start '
             'the recorder first'
@@ -129,7 +124,9 @@ def _events(content: Content) -> tuple[list[Event], int, str]:
             'which states it used, so that it cannot be replayed; report, plot, export and '
             'replay --config read it'
         )
-    return events, until, end
+    if len(begins) > 1:
+        return events[: begins[1]], content.events[begins[1]][0], 'another controller was started'
+    return events, FOREVER, ''
 
 
 def _before(states: JointStates, until: int) -> JointStates:

@@ -19,7 +19,7 @@ from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import begin, controller_of
-from blf_dsc_controller.law.telemetry import run_of, sample_columns
+from blf_dsc_controller.law.telemetry import run_of
 from blf_dsc_controller.messages.topics import JOINT_STATES, TRACKING_ERROR
 from blf_dsc_controller.run import Floats, Run
 from blf_dsc_controller.supervision.checks import Velocity
@@ -34,7 +34,7 @@ class WhatIf(NamedTuple):
     run: Run  # over the states that the law used, with its own torques
     applied: Floats  # torque from each state to the next (N, n), N m; NaN where unknown
     source: str  # topic of the applied torque
-    left_out: int  # number of states, as in `RecordedStates`
+    left_out: int  # number of states that are not finite or follow an unknown torque
     error_ratio: Floats  # largest |xi1| / k_c of each joint (n,), with this reference
 
     @property
@@ -43,29 +43,21 @@ class WhatIf(NamedTuple):
         return np.asarray(self.run.torque - self.applied)
 
 
-class RecordedStates(NamedTuple):
-    """The states that the law used, with the torques that acted."""
-
-    states: JointStates  # (N,)
-    applied: Floats  # torque from each state to the next (N, n), N m; NaN for the last if unknown
-    source: str  # topic of the applied torque
-    left_out: int  # number of states that are not finite or follow an unknown torque
-    is_measured: bool  # the torques are measured efforts, not commands
-
-
-def read_states(
+def what_if(
     path: Path, config: ControllerConfig, namespace: str = '', names: NameMap = NO_NAMES
-) -> RecordedStates:
-    """Read states and torques of any bag (folder, storage file, or ROS 1 `.bag`).
+) -> WhatIf:
+    """Run a configuration over the states of any bag (folder, storage file, or ROS 1 `.bag`).
 
     `namespace` is that of the robot, if the bag holds several; `names` maps topics and joints that
     have other names in the bag.
 
     Raises:
         BlfDscError: the bag cannot be read, or does not hold the applied torques.
+        StartError: the law cannot take over in the first state, and approaches are disabled.
+        MotionError: there is no approach within the limits.
     """
     content = read_content(path, namespace, names)
-    every = law_states(content, names.joints_of(config.joints))
+    every = _law_states(content, names.joints_of(config.joints))
     finite = np.concatenate([
         np.isfinite(every.field(0, rows) + every.field(1, rows)).all(axis=1)
         for rows in (slice(k, k + _BLOCK) for k in range(0, every.size, _BLOCK))
@@ -77,12 +69,16 @@ def read_states(
     known = np.flatnonzero(np.isfinite(before).all(axis=1))
     if not known.size:
         raise BagError(f'{path} holds no joint state that is finite and has a known torque')
-    left_out = every.size - known.size
-    is_measured = source == f'effort of {content.topics[JOINT_STATES].name}'
-    return RecordedStates(states.select(known), applied[known], source, left_out, is_measured)
+    states, applied = states.select(known), applied[known]
+    config = replace(config, learning=replace(config.learning, torque_source='effort'))
+    if source != f'effort of {content.topics[JOINT_STATES].name}':
+        config = replace(config, robot=replace(config.robot, effort='commanded'))
+    run = _run_over(states, applied, config)
+    ratio = np.abs(np.asarray(run.error) / np.asarray(run.bound)).max(axis=0)
+    return WhatIf(run, applied, source, every.size - known.size, ratio)
 
 
-def law_states(content: Content, joints: Sequence[str]) -> JointStates:
+def _law_states(content: Content, joints: Sequence[str]) -> JointStates:
     """Return the states that the law used, according to its telemetry; all if there is none.
 
     `joints` are the names in the bag. Raises BagError as `single_run`.
@@ -101,24 +97,8 @@ def law_states(content: Content, joints: Sequence[str]) -> JointStates:
     return states.select(np.flatnonzero(kept))
 
 
-def what_if(
-    path: Path, config: ControllerConfig, namespace: str = '', names: NameMap = NO_NAMES
-) -> WhatIf:
-    """Run a configuration over the states of any bag; arguments and errors as for `read_states`.
-
-    Raises:
-        StartError: the law cannot take over in the first state, and approaches are disabled.
-        MotionError: there is no approach within the limits.
-    """
-    return run_over(read_states(path, config, namespace, names), config)
-
-
-def run_over(recorded_states: RecordedStates, config: ControllerConfig) -> WhatIf:
-    """Run a configuration over recorded states; errors as for `what_if`."""
-    states, applied, source, left_out, is_measured = recorded_states
-    config = replace(config, learning=replace(config.learning, torque_source='effort'))
-    if not is_measured:
-        config = replace(config, robot=replace(config.robot, effort='commanded'))
+def _run_over(states: JointStates, applied: Floats, config: ControllerConfig) -> Run:
+    """Run a configuration over states, between which the applied torques (N, n) acted."""
     controller = controller_of(config)
     n = len(states.names)
     stamps = states.stamp.tolist()
@@ -137,7 +117,4 @@ def run_over(recorded_states: RecordedStates, config: ControllerConfig) -> WhatI
         samples[k] = controller.sample_vector
         controller.weigh(config.sample_time)
         last = stamp
-    run = run_of(config, controller, states.stamp, recorded, samples)
-    columns = sample_columns(samples, controller.settings)
-    ratio = (np.abs(columns.xi1) / columns.bound).max(axis=0)
-    return WhatIf(run, applied, source, left_out, ratio)
+    return run_of(config, controller, states.stamp, recorded, samples)
