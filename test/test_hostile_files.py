@@ -62,7 +62,11 @@ def test_named_pipe_is_rejected_as_parameter_file_and_urdf(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ('text', 'words'),
-    [('[' * 100_000, 'nested more than 50 levels'), (BOMB, 'does not support the alias')],
+    [
+        ('[' * 100_000, 'nested more than 50 levels'),
+        ('a:\n' + '- 1\n' * 100_000, 'more than 50000 entries'),
+        (BOMB, 'does not support the alias'),
+    ],
 )
 def test_unreasonable_yaml_is_rejected(tmp_path, text, words):
     path = tmp_path / 'given.yaml'
