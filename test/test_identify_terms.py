@@ -182,8 +182,14 @@ def is_the_load(found):
     assert off[0] < 0.05 * LOAD
     assert (off[1:] < 0.005).all()
     assert (off < 4.0 * deviation).all()
-    ball = pseudo_inertia(found.values[-11:-1])
-    assert np.linalg.eigvalsh(ball)[0] > 0.0
+    assert np.linalg.eigvalsh(pseudo_inertia(found.values[-11:-1]))[0] > 0.0
+    # Deviations as of many draws of mass and moments, each with its centre in the tip.
+    at, T = slice(-11, -7), found.chain.tip_placement
+    draws = np.random.default_rng(0).multivariate_normal(
+        found.values[at], found.covariance[at, at], 20_000
+    )
+    centres = (draws[:, 1:] / draws[:, :1] - T[:3, 3]) @ T[:3, :3]
+    np.testing.assert_allclose(deviation, [draws[:, 0].std(), *centres.std(axis=0)], rtol=0.03)
 
 
 @pytest.fixture(scope='module')

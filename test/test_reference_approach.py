@@ -81,23 +81,19 @@ def test_each_joint_keeps_its_own_limits():
     assert np.abs(ddqr[:, 1]).max() <= 1.001
 
 
-def test_reference_beyond_the_limits_is_rejected_with_the_name_of_the_joint():
+def test_motion_beyond_the_limits_is_rejected_with_the_name_of_the_joint():
     with pytest.raises(MotionError) as rejection:
         approach_to(PAPER, AT_REST, limits(velocity=(1.0, 0.25)))
-
     violation = rejection.value.violation
     assert (violation.joint, violation.quantity) == ('elbow', 'velocity')
     assert abs(violation.value) == pytest.approx(0.3, rel=1e-4)  # 0.3 sin t
     assert abs(violation.limit) == 0.25
     assert 'limits.velocity' in str(rejection.value)
 
-
-def test_arm_that_is_already_too_fast_is_rejected_with_the_name_of_the_joint():
     start = MOVING.copy()
-    start[1, 0] = -1.7
+    start[1, 0] = -1.7  # too fast already
     with pytest.raises(MotionError) as rejection:
         approach_to(PAPER, start, limits())
-
     violation = rejection.value.violation
     assert (violation.joint, violation.quantity, violation.limit) == ('shoulder', 'velocity', -1.5)
     assert violation.value <= -1.7
@@ -207,8 +203,11 @@ def test_start_that_is_too_slow_is_rejected_if_approaches_are_disabled():
         begin(law, config, offset + 0.11 * BOUND, slower)
 
 
-def test_moving_arm_is_stopped_before_it_is_held():
+def test_hold_reference_stays_where_the_arm_is_or_where_it_comes_to_rest():
     config = build(ControllerConfig, {'reference.type': 'hold'})
+    record = run(config, FIRST - 0.7, 1.0)
+    np.testing.assert_array_equal(record.samples[:, :2], np.tile(FIRST - 0.7, (1001, 1)))
+    assert np.abs(record.samples[:, 4:6]).max() < BOUND
     record = run(config, FIRST, 6.0, velocity=(0.5, -0.5))
     np.testing.assert_array_equal(record.samples[-1, :2], FIRST)
     assert np.abs(record.samples[:, 4:6]).max() < 0.5 * BOUND
@@ -247,14 +246,6 @@ def test_reference_continues_after_a_deactivation_but_begins_anew_after_a_stop()
     rig.step(1)
     assert rig.supervisor.running
     assert rig.guard.time == 0.0
-
-
-def test_hold_reference_stays_where_the_arm_is():
-    config = replace(CONFIG, reference=Reference(type='hold'))
-    start = FIRST - 0.7
-    record = run(config, start, 1.0)
-    np.testing.assert_array_equal(record.samples[:, :2], np.broadcast_to(start, (1001, 2)))
-    assert np.abs(record.samples[:, 4:6]).max() < BOUND
 
 
 def test_waypoints_are_passed_at_their_times_and_the_last_is_held():
