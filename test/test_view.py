@@ -17,7 +17,6 @@ pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_control
 
 from blf_dsc_controller.arms.geometry import frames
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import chain_of
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages.topics import JOINT_STATES
@@ -30,8 +29,7 @@ from blf_dsc_controller.view.arm import (
     with_known_meshes,
 )
 from blf_dsc_controller.view.bag import BagPlayer
-from blf_dsc_controller.view.moment import Confidence, Moment, plant_events
-from blf_dsc_controller.view.page import Page, bodies_of
+from blf_dsc_controller.view.page import Page, bodies_of, plant_events
 
 HOST = '127.0.0.1'
 PORT = 18080
@@ -59,26 +57,26 @@ def test_bag_plays_and_stops_at_its_end(player):
     player.update(0.5)
     assert player.slider.value == 1.0
     shown = player._page._table.content
-    now = max(moment.time for moment in player.moments if moment.time <= 1.0)
+    now = max(each.time for each in player.snapshots if each.time <= 1.0)
     assert f't = {now:.2f} s' in shown
     player.speed.value = '10'
     player.update(0.05)
     assert player.slider.value == 1.5
     player.update(0.5)
-    assert player.slider.value == player.moments[-1].time == pytest.approx(2.0, abs=1e-3)
+    assert player.slider.value == player.snapshots[-1].time == pytest.approx(2.0, abs=1e-3)
     view_rig.click(player.button)
     assert player.slider.value == 0.0  # back to the start
 
 
-def test_moments_hold_the_values_of_the_bag(player):
-    assert len(player.moments) == 60
-    last = player.moments[-1]
+def test_snapshots_hold_the_values_of_the_bag(player):
+    assert len(player.snapshots) == 60
+    last = player.snapshots[-1]
     assert np.abs(last.error).max() < 0.002
     assert last.bound == pytest.approx([0.002, 0.002])
     assert last.truth[:3] == pytest.approx([1.0, 0.32, 0.4])
     assert np.isnan(last.truth[3:]).all()  # the true bias is unknown
     assert last.estimate[:3] == pytest.approx(last.truth[:3], rel=0.3)  # starts at half of it
-    assert player.moments[0].estimate[:3] == pytest.approx([0.5, 0.16, 0.2], rel=0.1)
+    assert player.snapshots[0].estimate[:3] == pytest.approx([0.5, 0.16, 0.2], rel=0.1)
 
 
 def test_arm_ghost_bound_and_path_are_drawn(player):
@@ -205,22 +203,6 @@ def test_planar_chain_of_any_length_is_drawn():
     chain = chain_of(planar_urdf(joints, (1.0, 0.8, 0.5)), '', 'tip', joints)
     for q, tip in (([0.0, 0.0, 0.0], [2.3, 0.0, 0.0]), ([np.pi / 2, 0.0, 0.0], [0.0, 0.0, 2.3])):
         assert frames(chain, np.array(q))[-1][:3, 3] == pytest.approx(tip)
-
-
-def moments_of(motion):
-    times = np.arange(0.0, 7.0, 1 / 30)
-    zero, unknown = np.zeros(2), np.full(5, np.nan)
-    return [Moment(t, motion(t), zero, zero, zero, zero, unknown, unknown, 0.0) for t in times]
-
-
-def test_only_a_moving_arm_is_identified():
-    confidence = Confidence(ControllerConfig())
-    moving = confidence.deviations(moments_of(lambda t: 2.0 + 0.3 * np.cos([t, t])))
-    still = confidence.deviations(moments_of(lambda _: np.array([2.0, 1.4])))
-    parameters = slice(0, 3)
-    assert (moving[parameters] < 0.2 * confidence.prior[parameters]).all()
-    assert still.max() > 0.9 * confidence.prior.max()
-    assert (moving[parameters] < still[parameters]).all()
 
 
 def test_port_in_use_is_skipped(player):

@@ -67,7 +67,7 @@ def test_bag_is_played_in_the_browser(browser, tmp_path):
         wait_until(browser, lambda: player._playing)
         player.update(0.5)
         browser.wait(f"{TEXT}.includes('t = 3.4') || {TEXT}.includes('t = 3.5')")
-        for tab, word in (('Estimates', 'known'), ('Events', 'learning')):
+        for tab, word in (('Estimates', 'truth'), ('Events', 'learning')):
             browser.click(tab)
             browser.wait(f'{TEXT}.includes({word!r})')
             browser.screenshot(SHOTS / f'view_{tab.lower()}.png')

@@ -15,11 +15,17 @@ from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.messages.topics import LAMBDA_MIN, LOAD
 from blf_dsc_controller.run import Floats, Run, Series, Stamps
 from blf_dsc_controller.view.arm import arm_of
-from blf_dsc_controller.view.moment import Confidence, Moment, estimates_of, plant_events
-from blf_dsc_controller.view.page import PAST, Page
+from blf_dsc_controller.view.page import (
+    PAST,
+    Page,
+    Snapshot,
+    plant_events,
+    prior_deviations,
+    units_of,
+)
 
-_RATE = 30.0  # moments per second
-_MOST = 20_000  # moments per bag
+_RATE = 30.0  # snapshots per second
+_MOST = 20_000  # snapshots per bag
 _PERIOD = 1.0 / 30.0  # s
 _PLOTTED = 6  # frames between updates of the plots
 _PLANT = 'sim_plant: '  # before the names of its parameters
@@ -40,9 +46,9 @@ class BagPlayer:
         (bag,) = read_bags([path], namespace, names)
         config = bag.content.controller_config()
         run = bag.run
-        estimates = estimates_of(config)
-        self.moments = moments(run, tuple(estimates))
-        self._page, self._times = page, np.array([one.time for one in self.moments])
+        units = units_of(config)
+        self.snapshots = snapshots(run, tuple(units))
+        self._page, self._times = page, np.array([each.time for each in self.snapshots])
         plant = {
             name.removeprefix(_PLANT): json.loads(value)
             for name, value in bag.parameters.items()
@@ -51,11 +57,10 @@ class BagPlayer:
         self._events = [(*event,) for event in bag.events]
         self._events += [(at, 'plant', text) for at, text, _ in plant_events(plant)]
         self._events.sort()
-        self._confidence = Confidence(config)
         self._playing, self._drawn = False, -1
         keys = (f'{_PLANT}arm.l1', f'{_PLANT}arm.l2')
         lengths = [float(bag.parameters[key]) for key in keys if key in bag.parameters]
-        page.draw_arm(arm_of(config, lengths), estimates)
+        page.draw_arm(arm_of(config, lengths), units, prior_deviations(config))
         gui = page.server.gui
         end = float(self._times[-1])
         self.slider = gui.add_slider('time [s]', 0.0, end, 1e-3, 0.0, order=-2.0)
@@ -71,7 +76,7 @@ class BagPlayer:
             self.slider.value = 0.0
 
     def update(self, elapsed: float) -> None:
-        """Advance by the elapsed time [s] while playing, and draw the moment at the slider."""
+        """Advance by the elapsed time [s] while playing, and draw the snapshot at the slider."""
         if self._playing:
             goal = self.slider.value + elapsed * float(self.speed.value)
             self._playing = goal < self._times[-1]
@@ -81,13 +86,11 @@ class BagPlayer:
             return
         plots = not self._playing or k // _PLOTTED != self._drawn // _PLOTTED
         self._drawn = k
-        longest = max(PAST, self._confidence.window)
-        first = int(np.searchsorted(self._times, self._times[k] - longest))
-        past = self.moments[first : k + 1]
+        first = int(np.searchsorted(self._times, self._times[k] - PAST))
+        past = self.snapshots[first : k + 1]
         self._page.events([event for event in self._events if event[0] <= self._times[k]])
         self._page.move(past)
         if plots:
-            self._page.learned(self._confidence.prior, self._confidence.deviations(past))
             self._page.plot(past)
 
     def play(self) -> NoReturn:
@@ -100,8 +103,8 @@ class BagPlayer:
             time.sleep(_PERIOD)
 
 
-def moments(run: Run, estimates: tuple[str, ...]) -> list[Moment]:
-    """Return about thirty moments per second of a run, each with the last known values."""
+def snapshots(run: Run, estimates: tuple[str, ...]) -> list[Snapshot]:
+    """Return about thirty snapshots per second of a run, each with the last known values."""
     count = int(min(_MOST, max(2.0, _RATE * run.duration)))
     rows = np.unique(np.searchsorted(run.time, np.linspace(0.0, run.duration, count)))
     rows = rows[rows < run.time.size]
@@ -118,7 +121,7 @@ def moments(run: Run, estimates: tuple[str, ...]) -> list[Moment]:
     columns = (run.time[rows].tolist(), *map(at, arrays), figures[:, :-1], truth)
     load = _held(run.monitor, stamps, LOAD)
     each = zip(*columns, figures[:, -1].tolist(), load, loaded.tolist(), strict=True)
-    return [Moment(*one) for one in each]
+    return [Snapshot(*values) for values in each]
 
 
 def _held(series: Series | None, stamps: Stamps, names: tuple[str, ...]) -> Floats:

@@ -1,44 +1,144 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Buttons and sliders of the live page; the node implements their actions."""
+"""Buttons and sliders of the live page, and what they ask of the nodes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from html import escape
-from typing import Any, Protocol
+from functools import partial
+from math import inf
+from queue import SimpleQueue
+from typing import Any
 
-import numpy as np
+from rcl_interfaces.srv import SetParameters
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from blf_dsc_controller.analysis.style import GREEN, MUTED
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import Kind, Parameter, Value, flatten, parameters
-from blf_dsc_controller.law.telemetry import load_text
-from blf_dsc_controller.run import Floats
-from blf_dsc_controller.view.moment import Moment
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.nodes.endpoints import qos_profile, take_response
 
 _GAINS = ('barrier', 'surface', 'feedback', 'disturbance', 'torque', 'learning')
 _OF_OTHER_LAWS = ('comparison',)
+_OWN = ('blf_dsc', 'model_based')
 _HEADROOM = 4.0  # end of a slider without a limit, as a multiple of the current value
 _STEPS = 400
+_PUSH = 0.5  # s
 
 
-class Actions(Protocol):
-    """Actions of the controls, called in threads of the page's server."""
+class Requests:
+    """What the controls ask of the nodes: queued in the page's threads, sent by `update`."""
+
+    def __init__(
+        self,
+        node: Node,
+        waiting: Node,
+        prefix: str,
+        notify: Callable[[str, str], None],
+        restore: Callable[[], None],
+    ) -> None:
+        """Create the publisher and the clients.
+
+        `node` publishes; `waiting` is in no executor, so that its responses are taken here.
+        `prefix` precedes the names of controller and plant. `notify` shows a title and a text;
+        `restore` shows the parameters in force after a request was rejected.
+        """
+        self._names = {name: f'{prefix}/{name}' for name in (topics.CONTROLLER, topics.PLANT)}
+        self._clients: dict[str, Any] = {
+            f'{name}/{service}': waiting.create_client(type_, f'{name}/{service}')
+            for name in self._names.values()
+            for service, type_ in (('reset', Trigger), ('set_parameters', SetParameters))
+        }
+        trajectory = topics.JOINT_TRAJECTORY
+        self._trajectories = node.create_publisher(
+            JointTrajectory, trajectory.relative, qos_profile(trajectory.offered)
+        )
+        self._notify, self._restore = notify, restore
+        self._queue: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._gains: dict[str, Value] = {}  # moved but not yet sent
+        self._pending: list[tuple[Any, Callable[[Any], None]]] = []
+        self._has_plant = False
+        self._torque: Value = ()  # without a push [N m]
+        self._time, self._push_ends = 0.0, inf
+
+    def meet_plant(self, values: Mapping[str, Value]) -> None:
+        """Store the parameters of the simulated arm, once it has responded."""
+        self._has_plant, self._torque = True, values.get('load.torque', ())
 
     def reset(self) -> None:
-        """Reset the arm and its controller."""
+        """Reset the simulated plant, which resets the controller; without one, the controller."""
+
+        def done(response: Trigger.Response) -> None:
+            if not response.success:
+                self._notify('reset', response.message)
+
+        name = self._names[topics.PLANT if self._has_plant else topics.CONTROLLER]
+        self._queue.put(partial(self._call, f'{name}/reset', Trigger.Request(), done))
 
     def push(self, torque: Sequence[float]) -> None:
-        """Push the joints briefly by these torques [N m]."""
+        """Push the joints by these torques [N m] for half a second of plant time."""
+
+        def begin() -> None:
+            self._push_ends = self._time + _PUSH
+            self._set(topics.PLANT, 'load.torque', tuple(torque))
+
+        self._queue.put(begin)
 
     def payload(self, mass: float) -> None:
-        """Attach a mass [kg] to the tip."""
+        """Attach a mass [kg] to the tip of the simulated arm."""
+        self._queue.put(partial(self._set, topics.PLANT, 'load.payload', mass))
 
     def go_to(self, position: Mapping[str, float], duration: float) -> None:
-        """Send a reference to a position of each joint [rad], reached after `duration` [s]."""
+        """Send a trajectory of one point: joint positions [rad] reached after `duration` [s]."""
+        point = JointTrajectoryPoint(positions=list(position.values()))
+        point.time_from_start.sec = int(duration)
+        point.time_from_start.nanosec = int(1e9 * (duration % 1.0))
+        message = JointTrajectory(joint_names=list(position), points=[point])
+        self._queue.put(partial(self._trajectories.publish, message))
 
     def set_gain(self, name: str, value: Value) -> None:
-        """Set a parameter of the controller."""
+        """Set a parameter of the controller; the next update sends the last value."""
+        self._gains[name] = value
+
+    def update(self, time: float) -> None:
+        """Send the queued requests at a plant time [s], and process the responses."""
+        self._time = time
+        while not self._queue.empty():
+            self._queue.get()()
+        for name in list(self._gains):
+            self._set(topics.CONTROLLER, name, self._gains.pop(name))
+        if time >= self._push_ends:
+            self._push_ends = inf
+            self._set(topics.PLANT, 'load.torque', self._torque)
+        for waiting in list(self._pending):
+            client, done = waiting
+            response = take_response(client)
+            if response is not None:
+                self._pending.remove(waiting)
+                done(response)
+
+    def _set(self, node: str, name: str, value: Value) -> None:
+        content = list(value) if isinstance(value, tuple) else value
+        message = [RosParameter(name, value=content).to_parameter_msg()]
+
+        def done(response: Any) -> None:
+            (result,) = response.results
+            if not result.successful:
+                self._notify(f'{name} was rejected', result.reason)
+                self._restore()
+
+        service = f'{self._names[node]}/set_parameters'
+        self._call(service, SetParameters.Request(parameters=message), done)
+
+    def _call(self, service: str, request: Any, done: Callable[[Any], None]) -> None:
+        client = self._clients[service]
+        if client.service_is_ready():
+            client.call_async(request)
+            self._pending.append((client, done))
+        else:
+            self._notify(service, 'this service is not available: has the node exited?')
 
 
 class Controls:
@@ -50,7 +150,7 @@ class Controls:
     """
 
     def __init__(
-        self, gui: Any, tabs: Any, config: ControllerConfig, actions: Actions, *, simulated: bool
+        self, gui: Any, tabs: Any, config: ControllerConfig, actions: Requests, *, simulated: bool
     ) -> None:
         self._gui, self._actions = gui, actions
         self.buttons: dict[str, Any] = {}
@@ -63,10 +163,10 @@ class Controls:
         values = flatten(config)
         with tabs.add_tab('Gains'):
             for group in (*_GAINS, *(_OF_OTHER_LAWS if config.law not in _OWN else ())):
-                shown = [one for one in live_gains() if one.name.startswith(f'{group}.')]
+                gains = [gain for gain in live_gains() if gain.name.startswith(f'{group}.')]
                 with gui.add_folder(group, expand_by_default=group == 'feedback'):
-                    for one in shown:
-                        self._add_gain(one, values[one.name], config.joints)
+                    for gain in gains:
+                        self._add_gain(gain, values[gain.name], config.joints)
 
     def show(self, changed: Mapping[str, Value]) -> None:
         """Move the sliders of these parameters to the values in force."""
@@ -84,7 +184,7 @@ class Controls:
         torque = self._gui.add_slider('push [N m]', -10.0, 10.0, 0.1, 2.0)
         self._button(
             'Push',
-            lambda: self._actions.push([torque.value * (one == joint.value) for one in joints]),
+            lambda: self._actions.push([torque.value * (name == joint.value) for name in joints]),
             'push this joint with this torque for half a second',
         )
         mass = self._gui.add_slider('payload [kg]', 0.0, 5.0, 0.05, 0.5)
@@ -102,23 +202,23 @@ class Controls:
         self._button(
             'Go there',
             lambda: self._actions.go_to(
-                {joint: one.value for joint, one in sliders.items()}, duration.value
+                {joint: slider.value for joint, slider in sliders.items()}, duration.value
             ),
             'move there and stay; Reset returns to the configured reference',
         )
 
-    def _add_gain(self, one: Parameter, value: Value, joints: Sequence[str]) -> None:
+    def _add_gain(self, gain: Parameter, value: Value, joints: Sequence[str]) -> None:
         entries = _entries(value)
-        names = joints if one.kind.is_array else ('',)
-        low = one.above if one.at_least is None else one.at_least
-        high = one.below if one.at_most is None else one.at_most
+        names = joints if gain.kind.is_array else ('',)
+        low = gain.above if gain.at_least is None else gain.at_least
+        high = gain.below if gain.at_most is None else gain.at_most
         top = high or _HEADROOM * max((*entries, 0.0)) or 1.0
         step = top / _STEPS
-        bottom = step if one.above is not None else low or 0.0
-        unit = f' [{one.unit}]' if one.unit else ''
-        label = one.name.rsplit('.', 1)[-1]
-        limit = f'; {one.allowed}' if one.allowed else ''
-        sliders = self.sliders[one.name] = []
+        bottom = step if gain.above is not None else low or 0.0
+        unit = f' [{gain.unit}]' if gain.unit else ''
+        label = gain.name.rsplit('.', 1)[-1]
+        limit = f'; {gain.allowed}' if gain.allowed else ''
+        sliders = self.sliders[gain.name] = []
         for name, entry in zip(names, entries, strict=True):
             slider = self._gui.add_slider(
                 f'{label} {name}{unit}',
@@ -126,14 +226,14 @@ class Controls:
                 top,
                 step,
                 entry,
-                hint=f'{one.symbol or one.name}: {one.description}{limit}',
+                hint=f'{gain.symbol or gain.name}: {gain.description}{limit}',
             )
             sliders.append(slider)
 
         def changed(event: Any) -> None:
             if event.client is not None:  # moved by hand, not by `show`
                 given = tuple(float(slider.value) for slider in sliders)
-                self._actions.set_gain(one.name, given if one.kind.is_array else given[0])
+                self._actions.set_gain(gain.name, given if gain.kind.is_array else given[0])
 
         for slider in sliders:
             slider.on_update(changed)
@@ -141,68 +241,11 @@ class Controls:
 
 def live_gains() -> Iterable[Parameter]:
     """Yield the controller's gains, scalar or per joint, that can change while it runs."""
-    for one in parameters(ControllerConfig):
-        scalar = one.kind is Kind.DOUBLE
-        if not one.read_only and (scalar or one.length == ('joints',)):
-            yield one
+    for gain in parameters(ControllerConfig):
+        scalar = gain.kind is Kind.DOUBLE
+        if not gain.read_only and (scalar or gain.length == ('joints',)):
+            yield gain
 
 
 def _entries(value: Any) -> tuple[float, ...]:
     return tuple(value) if isinstance(value, tuple) else (value,)
-
-
-_OWN = ('blf_dsc', 'model_based')
-
-_NOT_SHOWN = 0.5  # share of the prior's deviation above which an estimate is not identified
-_CELL = 'padding:1px 4px;text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums'
-
-
-def joint_table(joints: Sequence[str], now: Moment) -> str:
-    """Return the table of error, bound, torque and limit by joint."""
-    head = _row('th', f't = {now.time:.2f} s', 'error [mrad]', 'bound', 'torque [N m]', 'limit')
-    columns = 1e3 * now.error, 1e3 * now.bound, now.torque, now.torque_limit
-    rows = zip(joints, *columns, strict=True)
-    table = _in_table([head, *(_row('td', escape(n), *map(_figure, row)) for n, *row in rows)])
-    known = np.isfinite(now.load[0])
-    return table + (f'<div style="{_CELL}">held: {load_text(now.load)}</div>' if known else '')
-
-
-def estimate_table(units: Mapping[str, str], now: Moment, prior: Floats, deviation: Floats) -> str:
-    """Return the table of estimates; `prior` and `deviation` are standard deviations (m,)."""
-    rows = [_row('th', 'estimate', '', '±', 'truth', 'known')]
-    columns = now.estimate, deviation, now.truth, deviation / prior
-    for name, unit, value, spread, truth, left in zip(units, units.values(), *columns, strict=True):
-        figures = (f'{x:.3g}' if np.isfinite(x) else '-' for x in (value, spread, truth))
-        label = f'{escape(name)} <span style="opacity:0.6">{unit}</span>'
-        rejected = not np.isfinite(value)
-        bar = 'rejected' if rejected else _bar(1.0 - left)
-        rows.append(_row('td', label, *figures, bar, pale=rejected or left > _NOT_SHOWN))
-    return _in_table(rows)
-
-
-def event_table(events: Iterable[tuple[float, str, str]]) -> str:
-    """Return the table of events: time [s], kind and text."""
-    return _in_table(
-        f'<tr><td style="{_CELL}">{t:.2f} s</td><td><b>{escape(k)}</b> {escape(e)}</td></tr>'
-        for t, k, e in events
-    )
-
-
-def _figure(value: float) -> str:
-    return f'{value:.4g}' if np.isfinite(value) else '-'
-
-
-def _row(tag: str, *cells: str, pale: bool = False) -> str:
-    style = _CELL + (';opacity:0.55' if pale else '')
-    return '<tr>' + ''.join(f'<{tag} style="{style}">{cell}</{tag}>' for cell in cells) + '</tr>'
-
-
-def _bar(share: float) -> str:
-    percent = 100.0 * min(max(float(np.nan_to_num(share)), 0.0), 1.0)
-    colour = GREEN if share > 1.0 - _NOT_SHOWN else MUTED
-    fill = f'linear-gradient(to right,{colour} {percent:.0f}%,transparent 0)'
-    return f'<div style="width:40px;border:1px solid #bbb;background:{fill}">&nbsp;</div>'
-
-
-def _in_table(rows: Iterable[str]) -> str:
-    return f'<table style="font-size:11px;margin:4px">{"".join(rows)}</table>'

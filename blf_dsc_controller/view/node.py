@@ -11,24 +11,15 @@ import json
 import os
 import sys
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
-from math import inf
-from queue import SimpleQueue
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from rcl_interfaces.srv import SetParameters
-from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
-from std_srvs.srv import Trigger
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import VIEW, ViewConfig, is_builtin
-from blf_dsc_controller.configuration.schema import Value, build, change, flatten
+from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder, MessageError, joint_state_layout
 from blf_dsc_controller.messages.journal import Event, EventType, decode
@@ -38,21 +29,24 @@ from blf_dsc_controller.nodes.endpoints import (
     RawSubscriptions,
     create_steady_timer,
     message_class,
-    qos_profile,
-    take_response,
 )
 from blf_dsc_controller.nodes.parameters import declare
 from blf_dsc_controller.nodes.process import PlainNode, run
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.address import LOCAL, open_to_others
 from blf_dsc_controller.view.arm import arm_of
-from blf_dsc_controller.view.controls import Controls
-from blf_dsc_controller.view.moment import Confidence, Moment, estimates_of, plant_events
-from blf_dsc_controller.view.page import PAST, Page
+from blf_dsc_controller.view.controls import Controls, Requests
+from blf_dsc_controller.view.page import (
+    PAST,
+    Page,
+    Snapshot,
+    plant_events,
+    prior_deviations,
+    units_of,
+)
 
 _PERIOD = 1.0 / 30.0  # s
 _PLOTTED = 6  # frames between updates of the plots
-_CHECKED = 30  # frames between updates of the deviations
 _SILENCE = 30  # frames without a joint state before the page reports it
 _OUTDATED = 500_000_000  # ns
 _NICE = 10  # lower priority than the loop
@@ -76,7 +70,7 @@ class ViewNode(PlainNode):
         config = declare(self, ViewConfig)
         self.page = Page(config.host, config.port)
         self.controls: Controls | None = None
-        self.past: deque[Moment] = deque()
+        self.past: deque[Snapshot] = deque()
         self._config: ControllerConfig | None = None
         self._plant: dict[str, Any] = {}  # parameters of the simulated plant
         self._noted = -1.0  # s, time up to which its events are on the page
@@ -85,8 +79,6 @@ class ViewNode(PlainNode):
         self._pictures = self._silent = 0
         self._clients_seen: frozenset[int] = frozenset()
         self._rejected = -1  # number of trajectories; -1: unknown
-        self._worker = ThreadPoolExecutor(1, 'confidence')
-        self._check: Future[tuple[Floats, Floats]] | None = None
         self._newest = self._subscribe(_STREAMS, _NEWEST)
         self._kept = self._subscribe(_EVENTS)
         prefix = self.get_namespace().rstrip('/')
@@ -105,7 +97,6 @@ class ViewNode(PlainNode):
 
     def close(self) -> None:
         """Close the page and the subscriptions."""
-        self._worker.shutdown(wait=False, cancel_futures=True)
         self.page.close()
         self._newest.close()
         self._kept.close()
@@ -121,7 +112,7 @@ class ViewNode(PlainNode):
         self.page.state(*self._health())
         clients = frozenset(self.page.server.get_clients())
         if config is not None and self.past and (has_state or clients != self._clients_seen):
-            self._draw(config, clients)
+            self._draw(clients)
 
     def _health(self) -> tuple[str, str]:
         """Return the state of the controller, or that it or the arm has gone silent."""
@@ -177,14 +168,12 @@ class ViewNode(PlainNode):
 
     def _configure(self, config: ControllerConfig) -> None:
         self._config = config
-        self._estimates = estimates_of(config)
-        self._longest = 1.0 + max(PAST, config.learning.window)
+        self._estimates = units_of(config)
         self._decoders = {
             topic: JointStateDecoder(config.joints, ('position',)) for topic in _STREAMS[:3]
         }
         self._learned = np.full(len(self._estimates) + len(topics.LOAD) + 2, np.nan)
         self._truth = np.full(len(self._estimates), np.nan)
-        self._confidence: Confidence | None = None
         self._draw_all()
 
     def _meet_plant(self, values: Mapping[str, Any]) -> None:
@@ -196,7 +185,9 @@ class ViewNode(PlainNode):
         if self._config is not None:
             self.page.clear()
             lengths = [self._plant[name] for name in ('arm.l1', 'arm.l2') if name in self._plant]
-            tabs = self.page.draw_arm(arm_of(self._config, lengths), self._estimates)
+            tabs = self.page.draw_arm(
+                arm_of(self._config, lengths), self._estimates, prior_deviations(self._config)
+            )
             self.controls = Controls(
                 self.page.server.gui,
                 tabs,
@@ -250,13 +241,13 @@ class ViewNode(PlainNode):
         state, error, bound = self._decoders.values()
         torque = state.effort if np.isnan(error.effort).any() else error.effort
         arrays = (state.position, error.position, bound.position, torque, bound.effort)
-        q, xi1, k_c, tau, limit = (one.copy() for one in arrays)
+        q, xi1, k_c, tau, limit = (values.copy() for values in arrays)
         m = len(self._estimates)
         load, (lambda_min, _) = self._learned[m:-2], self._learned[-2:]
         loaded = self._payload(time) > 0.0
         learned = self._learned[:m], self._truth, float(lambda_min), load.tolist(), loaded
-        self.past.append(Moment(time, q, xi1, k_c, tau, limit, *learned))
-        while self.past[0].time < time - self._longest:
+        self.past.append(Snapshot(time, q, xi1, k_c, tau, limit, *learned))
+        while self.past[0].time < time - PAST - 1.0:
             self.past.popleft()
 
     def _payload(self, time: float) -> float:
@@ -269,24 +260,14 @@ class ViewNode(PlainNode):
         self._noted = time
         return payload
 
-    def _draw(self, config: ControllerConfig, clients: frozenset[int]) -> None:
+    def _draw(self, clients: frozenset[int]) -> None:
         self._pictures += 1
         past = list(self.past)
-        if self._check is not None and self._check.done():
-            self.page.learned(*self._check.result())
-            self._check = None
-        if self._check is None and self._pictures % _CHECKED == 0:
-            self._check = self._worker.submit(self._deviations, config, past)
         if clients:
             self.page.move(past)
             if self._pictures % _PLOTTED == 0 or clients != self._clients_seen:
                 self.page.plot(past)
         self._clients_seen = clients
-
-    def _deviations(self, config: ControllerConfig, past: list[Moment]) -> tuple[Floats, Floats]:
-        """Return the deviations before and after a window; compiles at first, off the page."""
-        confidence = self._confidence = self._confidence or Confidence(config)
-        return confidence.prior, confidence.deviations(past)
 
 
 def _named(raw: bytes, names: Sequence[str]) -> Floats:
@@ -301,122 +282,6 @@ def main() -> int:
     """Run the node at low priority."""
     os.nice(_NICE)
     return run(ViewNode)
-
-
-_PUSH = 0.5  # s
-
-
-class Requests:
-    """The `Actions` of the controls: queued in the page's threads, carried out by `update`."""
-
-    def __init__(
-        self,
-        node: Node,
-        waiting: Node,
-        prefix: str,
-        notify: Callable[[str, str], None],
-        restore: Callable[[], None],
-    ) -> None:
-        """Create the publisher and the clients.
-
-        `node` publishes; `waiting` is in no executor, so that its responses are taken here.
-        `prefix` precedes the names of controller and plant. `notify` shows a title and a text;
-        `restore` shows the parameters in force after a request was rejected.
-        """
-        self._names = {name: f'{prefix}/{name}' for name in (topics.CONTROLLER, topics.PLANT)}
-        self._clients: dict[str, Any] = {
-            f'{name}/{service}': waiting.create_client(type_, f'{name}/{service}')
-            for name in self._names.values()
-            for service, type_ in (('reset', Trigger), ('set_parameters', SetParameters))
-        }
-        trajectory = topics.JOINT_TRAJECTORY
-        self._trajectories = node.create_publisher(
-            JointTrajectory, trajectory.relative, qos_profile(trajectory.offered)
-        )
-        self._notify, self._restore = notify, restore
-        self._queue: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self._gains: dict[str, Value] = {}  # moved but not yet sent
-        self._pending: list[tuple[Any, Callable[[Any], None]]] = []
-        self._has_plant = False
-        self._torque: Value = ()  # without a push [N m]
-        self._time, self._push_ends = 0.0, inf
-
-    def meet_plant(self, values: Mapping[str, Value]) -> None:
-        """Store the parameters of the simulated arm, once it has responded."""
-        self._has_plant, self._torque = True, values.get('load.torque', ())
-
-    def reset(self) -> None:
-        """Reset the simulated plant, which resets the controller; without one, the controller."""
-
-        def done(response: Trigger.Response) -> None:
-            if not response.success:
-                self._notify('reset', response.message)
-
-        name = self._names[topics.PLANT if self._has_plant else topics.CONTROLLER]
-        self._queue.put(partial(self._call, f'{name}/reset', Trigger.Request(), done))
-
-    def push(self, torque: Sequence[float]) -> None:
-        """Push the joints by these torques [N m] for half a second of plant time."""
-
-        def begin() -> None:
-            self._push_ends = self._time + _PUSH
-            self._set(topics.PLANT, 'load.torque', tuple(torque))
-
-        self._queue.put(begin)
-
-    def payload(self, mass: float) -> None:
-        """Attach a mass [kg] to the tip of the simulated arm."""
-        self._queue.put(partial(self._set, topics.PLANT, 'load.payload', mass))
-
-    def go_to(self, position: Mapping[str, float], duration: float) -> None:
-        """Send a trajectory of one point: joint positions [rad] reached after `duration` [s]."""
-        point = JointTrajectoryPoint(positions=list(position.values()))
-        point.time_from_start.sec = int(duration)
-        point.time_from_start.nanosec = int(1e9 * (duration % 1.0))
-        message = JointTrajectory(joint_names=list(position), points=[point])
-        self._queue.put(partial(self._trajectories.publish, message))
-
-    def set_gain(self, name: str, value: Value) -> None:
-        """Set a parameter of the controller; the next update sends the last value."""
-        self._gains[name] = value
-
-    def update(self, time: float) -> None:
-        """Send the queued requests at a plant time [s], and process the responses."""
-        self._time = time
-        while not self._queue.empty():
-            self._queue.get()()
-        for name in list(self._gains):
-            self._set(topics.CONTROLLER, name, self._gains.pop(name))
-        if time >= self._push_ends:
-            self._push_ends = inf
-            self._set(topics.PLANT, 'load.torque', self._torque)
-        for waiting in list(self._pending):
-            client, done = waiting
-            response = take_response(client)
-            if response is not None:
-                self._pending.remove(waiting)
-                done(response)
-
-    def _set(self, node: str, name: str, value: Value) -> None:
-        content = list(value) if isinstance(value, tuple) else value
-        parameters = [Parameter(name, value=content).to_parameter_msg()]
-
-        def done(response: Any) -> None:
-            (result,) = response.results
-            if not result.successful:
-                self._notify(f'{name} was rejected', result.reason)
-                self._restore()
-
-        service = f'{self._names[node]}/set_parameters'
-        self._call(service, SetParameters.Request(parameters=parameters), done)
-
-    def _call(self, service: str, request: Any, done: Callable[[Any], None]) -> None:
-        client = self._clients[service]
-        if client.service_is_ready():
-            client.call_async(request)
-            self._pending.append((client, done))
-        else:
-            self._notify(service, 'this service is not available: has the node exited?')
 
 
 if __name__ == '__main__':

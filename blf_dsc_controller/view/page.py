@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page: 3D view of the arm, plots, tables and events, drawn from moments of any source.
+"""The page: 3D view of the arm, plots, tables and events, drawn from snapshots of any source.
 
 viser serves the page with everything that the browser needs: nothing is loaded from elsewhere.
 """
@@ -12,20 +12,21 @@ import os
 import re
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from math import inf
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.analysis.style import ALARM, COLOURS, GREEN, INK, MUTED, ORANGE
 from blf_dsc_controller.arms.geometry import frames, skeleton, tip_radius
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.factory import column_names, model_of, prior_covariance
+from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.address import free_port, require_viser, url_of
 from blf_dsc_controller.view.arm import ShownArm
-from blf_dsc_controller.view.controls import estimate_table, event_table, joint_table
-from blf_dsc_controller.view.moment import Moment
 
 PAST = 20.0
 """Time span of the plots [s]."""
@@ -37,7 +38,7 @@ _SHOWN = 3.0  # s that an event is named beside the arm
 _PLAIN = (86, 110, 150)  # colour of an arm without any
 _GHOST = (0, 200, 120, 0.35)
 _APART = 0.01  # rad, error from which on the reference is drawn beside the arm
-_PEAK = 30  # moments, a second, of which the largest error is plotted
+_PEAK = 30  # snapshots, a second, of which the largest error is plotted
 _LEAST, _MOST = 0.1, 300.0  # % of the bound, the ends of its axis
 _FEW = 8  # estimates that are plotted one by one
 _HEIGHT = 130  # px of a plot: three fit below the state at 900 px
@@ -52,7 +53,50 @@ _SHEET = (
     '<style>@media (max-width:36em){[style*="width: 20em"]'
     '{width:100%!important;max-height:50vh!important}}</style>'
 )
+_CELL = 'padding:1px 4px;text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums'
 _LEVELS = {'OK': GREEN, 'WARN': ORANGE, 'ERROR': ALARM, 'STALE': MUTED, 'BAG': MUTED}
+
+
+class Snapshot(NamedTuple):
+    """Values of n joints and m estimates at one time; NaN where unknown."""
+
+    time: float  # s
+    position: Floats  # (n,) rad, q
+    error: Floats  # (n,) rad, xi1
+    bound: Floats  # (n,) rad, k_c
+    torque: Floats  # (n,) N m
+    torque_limit: Floats  # (n,) N m
+    estimate: Floats  # (m,) theta^; NaN: a rejected column
+    truth: Floats  # (m,)
+    lambda_min: float
+    load: Sequence[float] = (np.nan,) * 8  # of topics.LOAD
+    loaded: bool = False  # the true parameters differ from those at the start
+
+
+def units_of(config: ControllerConfig) -> dict[str, str]:
+    """Return the units of a controller's estimates by name, in their order."""
+    friction = {name: 'N m s/rad' if 'viscous' in name else 'N m' for name in column_names(config)}
+    model = model_of(config)
+    return dict(zip(model.parameter_names, model.parameter_units, strict=True)) | friction
+
+
+def prior_deviations(config: ControllerConfig) -> Floats:
+    """Return the standard deviations (m,) of a controller's estimates at first."""
+    return np.asarray(np.sqrt(np.diag(prior_covariance(config))))
+
+
+def plant_events(values: Mapping[str, Any]) -> list[tuple[float, str, float]]:
+    """Return time [s], text and change of payload [kg] of what a simulated arm undergoes."""
+    begin = values.get('events.begin', ())
+    nothing = (0.0,) * len(begin)
+    duration, masses = (values.get(f'events.{k}') or nothing for k in ('duration', 'payload'))
+    found = []
+    for k, (at, lasts, mass) in enumerate(zip(begin, duration, masses, strict=False), 1):
+        texts = (f'{mass:g} kg picked up', f'{mass:g} kg put down')
+        first, last = texts if mass else (f'event {k} begins', f'event {k} ends')
+        found.append((at, first, mass))
+        found += [(at + lasts, last, -mass)] if lasts else []
+    return sorted(found)
 
 
 class Page:
@@ -92,8 +136,11 @@ class Page:
         self._header = gui.add_html('')
         self.state(*self._state)
 
-    def draw_arm(self, arm: ShownArm, estimates: Mapping[str, str]) -> Any:
-        """Draw an arm, given the units of its estimates by name; return the page's tabs."""
+    def draw_arm(self, arm: ShownArm, estimates: Mapping[str, str], prior: Floats) -> Any:
+        """Draw an arm; return the page's tabs.
+
+        Its estimates have these units by name, and these standard deviations (m,) at first.
+        """
         from viser.extras import ViserUrdf
 
         self._arm = arm
@@ -101,7 +148,7 @@ class Page:
         prefix, names = _shortened(self._joints)
         self._units = {name.replace(f' {prefix}', ' '): unit for name, unit in estimates.items()}
         self._bodies = bodies_of(tuple(estimates))
-        self._deviation = self._prior = np.full(len(estimates), np.nan)
+        self._prior = prior
         server, gui, reach = self.server, self.server.gui, arm.reach
         model = arm.model()
         self._held = dict.fromkeys(model.actuated_joint_names, 0.0)
@@ -186,12 +233,8 @@ class Page:
             self._events.extend(events)
             self.event(np.nan, '', '')
 
-    def learned(self, prior: Floats, deviation: Floats) -> None:
-        """Set the standard deviations (m,) of the estimates before and after the window."""
-        self._prior, self._deviation = prior, deviation
-
-    def move(self, past: Sequence[Moment]) -> None:
-        """Move the arm to the last of these moments."""
+    def move(self, past: Sequence[Snapshot]) -> None:
+        """Move the arm to the last of these snapshots."""
         now = past[-1]
         chain, reach, scene = self._arm.chain, self._arm.reach, self.server.scene
         with self.server.atomic():
@@ -217,7 +260,7 @@ class Page:
             _, kind, text = happened[-1] if happened else (0.0, '', '')
             above = tip + np.array((0.0, 0.0, 0.1 * reach))
             scene.add_label('/event', f'{kind}: {text}', position=above, visible=bool(kind))
-            recent = np.array([one.position for one in past if one.time > now.time - _TRAIL])
+            recent = np.array([each.position for each in past if each.time > now.time - _TRAIL])
             if len(recent) > 1:
                 path = self._at(frames(chain, recent)[-1])
                 points = np.stack((path[:-1], path[1:]), axis=1)
@@ -225,14 +268,14 @@ class Page:
                     '/path', points, (0, 114, 178), thickness=3.0, thickness_units='screen'
                 )
 
-    def plot(self, past: Sequence[Moment]) -> None:
-        """Draw these moments in the plots, and the last one in the tables."""
+    def plot(self, past: Sequence[Snapshot]) -> None:
+        """Draw these snapshots in the plots, and the last one in the tables."""
         now = past[-1]
-        shown = [one for one in past if one.time > now.time - PAST]
-        t = np.array([one.time for one in shown])
-        error = np.array([100.0 * moment.error / moment.bound for moment in shown]).T
-        torque = np.array([moment.torque for moment in shown]).T
-        excitation = np.array([[moment.lambda_min for moment in shown]])
+        shown = [each for each in past if each.time > now.time - PAST]
+        t = np.array([each.time for each in shown])
+        error = np.array([100.0 * each.error / each.bound for each in shown]).T
+        torque = np.array([each.torque for each in shown]).T
+        excitation = np.array([[each.lambda_min for each in shown]])
         with np.errstate(divide='ignore', invalid='ignore'):
             curves = (
                 np.vstack((_peaks(np.abs(error)), np.full(t.size, 100.0))),
@@ -245,17 +288,16 @@ class Page:
             for plot, values in zip(self._plots, curves, strict=True):
                 plot.data = with_marks(t, values, marks)
             self._table.content = joint_table(self._joints, now)
-            deviations = self._prior, self._deviation
-            self._estimates.content = estimate_table(self._units, now, *deviations)
+            self._estimates.content = estimate_table(self._units, now)
 
-    def _off(self, shown: Sequence[Moment]) -> Floats:
+    def _off(self, shown: Sequence[Snapshot]) -> Floats:
         """Return how far the estimates of each body (b, k) are off, rms [% of the prior].
 
         Off the truth or, where none is known, off what they were at the left end of the plot.
         """
-        estimate = np.array([moment.estimate for moment in shown])
+        estimate = np.array([each.estimate for each in shown])
         truth = shown[-1].truth if np.isfinite(shown[-1].truth).any() else estimate[0]
-        truth = np.array([moment.truth for moment in shown]) if truth is not estimate[0] else truth
+        truth = np.array([each.truth for each in shown]) if truth is not estimate[0] else truth
         square = (100.0 * (estimate - truth) / self._prior) ** 2
         rms = [
             np.sqrt(np.nanmean(square[:, members], axis=1))
@@ -343,3 +385,47 @@ def with_marks(t: Floats, curves: Floats, marks: Sequence[float]) -> tuple[Float
 def _hangs(arm: ShownArm) -> bool:
     """Return whether the links turn in a vertical plane, also below their base."""
     return not any(joint.placement[2, 3] for joint in arm.chain.joints)
+
+
+def joint_table(joints: Sequence[str], now: Snapshot) -> str:
+    """Return the table of error, bound, torque and limit by joint."""
+    head = _row('th', f't = {now.time:.2f} s', 'error [mrad]', 'bound', 'torque [N m]', 'limit')
+    columns = 1e3 * now.error, 1e3 * now.bound, now.torque, now.torque_limit
+    rows = zip(joints, *columns, strict=True)
+    table = _in_table([head, *(_row('td', escape(n), *map(_figure, row)) for n, *row in rows)])
+    known = np.isfinite(now.load[0])
+    return table + (f'<div style="{_CELL}">held: {load_text(now.load)}</div>' if known else '')
+
+
+def estimate_table(units: Mapping[str, str], now: Snapshot) -> str:
+    """Return the table of estimates; rejected ones are pale."""
+    rows = [_row('th', 'estimate', '', 'truth')]
+    for name, unit, value, truth in zip(
+        units, units.values(), now.estimate, now.truth, strict=True
+    ):
+        label = f'{escape(name)} <span style="opacity:0.6">{unit}</span>'
+        shown = f'{value:.3g}' if np.isfinite(value) else 'rejected'
+        true = f'{truth:.3g}' if np.isfinite(truth) else '-'
+        rows.append(_row('td', label, shown, true, pale=shown == 'rejected'))
+    return _in_table(rows)
+
+
+def event_table(events: Iterable[tuple[float, str, str]]) -> str:
+    """Return the table of events: time [s], kind and text."""
+    return _in_table(
+        f'<tr><td style="{_CELL}">{t:.2f} s</td><td><b>{escape(k)}</b> {escape(e)}</td></tr>'
+        for t, k, e in events
+    )
+
+
+def _figure(value: float) -> str:
+    return f'{value:.4g}' if np.isfinite(value) else '-'
+
+
+def _row(tag: str, *cells: str, pale: bool = False) -> str:
+    style = _CELL + (';opacity:0.55' if pale else '')
+    return '<tr>' + ''.join(f'<{tag} style="{style}">{cell}</{tag}>' for cell in cells) + '</tr>'
+
+
+def _in_table(rows: Iterable[str]) -> str:
+    return f'<table style="font-size:11px;margin:4px">{"".join(rows)}</table>'
