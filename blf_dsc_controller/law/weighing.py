@@ -29,7 +29,7 @@ from blf_dsc_controller.law.settings import Settings, settings_of
 from blf_dsc_controller.law.state import Signals, State, signals_of, state_of
 
 _PERIOD = 0.1  # s, from one solution to the next
-_LASTING = 0.4  # s, correlation length of the residual
+_LASTING = 0.2  # s, correlation length of the residual
 _MEMORY = 0.3  # s, averaging time of the last rows
 _FEWEST = 0.5  # s of motion, before which they are not compared with the solution
 _ALARM = 8.0  # times the mean square residual of the first window: something else is held
