@@ -51,7 +51,6 @@ class PlantSettings(NamedTuple):
     n: int
     p: int  # parameters of the arm
     period_ns: int
-    integrator: int  # RK4 or DOPRI5
     steps: int  # of the integrator in a sample
     events: int  # number of events
     encoders: Encoders
@@ -202,7 +201,7 @@ def step(plant: PlantSettings, now: PlantState, command: np.ndarray) -> None:
     x, h = part(now.x, 0, (size,)), plant.period_ns * 1e-9 / plant.steps
     for k in range(plant.steps):
         t = now.sample[0] * plant.period_ns * 1e-9 + k * h
-        integrate(plant.integrator, motion, t, h, own.whole, x, now.stages)
+        integrate(motion, t, h, own.whole, x, now.stages)
     now.sample[0] += 1.0
 
 

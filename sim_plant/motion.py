@@ -10,9 +10,9 @@ a = omega^2 (y - x) + 2 zeta omega (v - dx),
 
 so its motion does not depend on m, which may be ramped.  Loads and events are held over a sample.
 
-A step is fixed, with the torque held and the disturbance varying: the classic Runge-Kutta method of
-order 4, or the fifth-order solution of Dormand and Prince (1980), which MATLAB calls ode5.  Stage i
-is evaluated at t + c_i h and x + h sum_j a_ij k_j; the step ends at x + h sum_i b_i k_i.
+A step is fixed, with the torque held and the disturbance varying: the fifth-order solution of
+Dormand and Prince (1980), which MATLAB calls ode5.  Stage i is evaluated at t + c_i h and
+x + h sum_j a_ij k_j; the step ends at x + h sum_i b_i k_i.
 """
 
 from math import exp, sin, tanh
@@ -286,16 +286,8 @@ def state_derivative(
             dx[2 * n + 3 + i] = contact.slosh.gravity[i] - contact.tip.pull[i]
 
 
-RK4 = 0
-DOPRI5 = 1
-INTEGRATORS = {'rk4': RK4, 'dopri5': DOPRI5}
-
-_RK4_C = np.array([0, 1 / 2, 1 / 2, 1])
-_RK4_A = np.array([[0, 0, 0, 0], [1 / 2, 0, 0, 0], [0, 1 / 2, 0, 0], [0, 0, 1, 0]])
-_RK4_B = np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6])
-
-_DOPRI5_C = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1])
-_DOPRI5_A = np.array(
+_C = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1])
+_A = np.array(
     [
         [0, 0, 0, 0, 0, 0],
         [1 / 5, 0, 0, 0, 0, 0],
@@ -305,7 +297,7 @@ _DOPRI5_A = np.array(
         [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
     ]
 )
-_DOPRI5_B = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
+_B = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
 
 
 class Stages(NamedTuple):
@@ -316,47 +308,23 @@ class Stages(NamedTuple):
 
 
 @inner
-def _explicit_step(
-    a: np.ndarray,
-    b: np.ndarray,
-    c: np.ndarray,
-    motion: Motion,
-    t: float,
-    h: float,
-    torque: np.ndarray,
-    x: np.ndarray,
-    stages: Stages,
-) -> None:
-    point, k = stages.point, stages.k
-    for stage in range(b.size):
-        for i in range(x.size):
-            slope = 0.0
-            for j in range(stage):
-                slope += a[stage, j] * k[j, i]
-            point[i] = x[i] + h * slope
-        state_derivative(motion, t + c[stage] * h, point, torque, k[stage])
-    for i in range(x.size):
-        slope = 0.0
-        for j in range(b.size):
-            slope += b[j] * k[j, i]
-        x[i] += h * slope
-
-
-@inner
 def integrate(
-    method: int,
-    motion: Motion,
-    t: float,
-    h: float,
-    torque: np.ndarray,
-    x: np.ndarray,
-    stages: Stages,
+    motion: Motion, t: float, h: float, torque: np.ndarray, x: np.ndarray, stages: Stages
 ) -> None:
     """Advance x in place from t to t + h [s] under a held torque (n,) [N m].
 
     `x` is [q, dq] (2n,), or [q, dq, y, v] (2n + 6,) while a load sloshes.
     """
-    if method == RK4:
-        _explicit_step(_RK4_A, _RK4_B, _RK4_C, motion, t, h, torque, x, stages)
-    else:
-        _explicit_step(_DOPRI5_A, _DOPRI5_B, _DOPRI5_C, motion, t, h, torque, x, stages)
+    point, k = stages.point, stages.k
+    for stage in range(_B.size):
+        for i in range(x.size):
+            slope = 0.0
+            for j in range(stage):
+                slope += _A[stage, j] * k[j, i]
+            point[i] = x[i] + h * slope
+        state_derivative(motion, t + _C[stage] * h, point, torque, k[stage])
+    for i in range(x.size):
+        slope = 0.0
+        for j in range(_B.size):
+            slope += _B[j] * k[j, i]
+        x[i] += h * slope

@@ -28,7 +28,6 @@ from sim_plant.kernels import (
     step_plant,
 )
 from sim_plant.motion import (
-    INTEGRATORS,
     EventSettings,
     JointDisturbance,
     LoadSettings,
@@ -38,7 +37,7 @@ from sim_plant.motion import (
 from sim_plant.rigid_body import rigid_arm, rigid_bodies
 from sim_plant.sensors import VELOCITY_SOURCES, Encoders, generator, is_noisy
 
-_RESOLVED = 1.5  # decay within a step; both integrators are stable up to 2.7
+_RESOLVED = 1.5  # decay within a step; the integrator is stable up to 3.3
 _MOST_STEPS = 1000
 _CURRENT = 0.1  # A/N m, of motors with their gears, roughly that of cobots
 FASTEST = 1e3
@@ -194,7 +193,6 @@ def plant_settings(config: PlantConfig) -> PlantSettings:
         n=n,
         p=arm.p,
         period_ns=config.sample_time_ns,
-        integrator=INTEGRATORS[config.integrator],
         steps=_steps_of(config, arm),
         events=len(config.events.begin),
         encoders=Encoders(

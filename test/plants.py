@@ -7,7 +7,6 @@ from sim_plant.arm import PointMassArm
 from sim_plant.drives import Compensation, Drives, lag
 from sim_plant.kernels import PlantSettings
 from sim_plant.motion import (
-    DOPRI5,
     Contact,
     EventSettings,
     JointDisturbance,
@@ -81,7 +80,6 @@ def motion(arm=ARM, load=None, force=(0.0, 0.0, 0.0), wall=NOWHERE):
 def settings(
     *,
     period_ns=1_000_000,
-    integrator=DOPRI5,
     load=None,
     position_noise=0.0,
     velocity_noise=0.0,
@@ -100,7 +98,6 @@ def settings(
         n=2,
         p=3,
         period_ns=period_ns,
-        integrator=integrator,
         steps=1,
         events=0,
         encoders=Encoders(

@@ -271,8 +271,6 @@ def test_every_command_reads_a_shared_topic_under_any_name(shared, entries, tmp_
     assert main(['plot', str(renamed), '--out', str(tmp_path / 'none')]) == 1
     assert main(['replay', str(shared), '--map', 'joint7=x']) == 1
     assert 'joint7 is neither a topic nor one of the joints' in capsys.readouterr().err
-    assert main(['replay', str(shared), '--play', '--map', 'joint1=x']) == 1
-    assert '--map has no effect on --play' in capsys.readouterr().err
 
 
 def test_states_without_stamps_are_rejected_with_the_reason(tmp_path):

@@ -87,12 +87,12 @@ def test_stamps_that_disable_the_watchdog_cause_one_warning_except_in_lockstep(r
 
 @pytest.mark.parametrize('kind', [ControllerNode, PlantNode])
 def test_second_publisher_on_the_same_topic_is_reported(ros, kind):
-    space = f'rivals_{kind.__name__}'
+    space = f'others_{kind.__name__}'
     log = listen(ros, Log, '/rosout', LATCHED)
     diagnostics = listen(ros, DiagnosticArray, '/diagnostics')
     first = ros.add(kind, namespace=space)
     second = ros.add(kind, namespace=space)
-    ros.until(lambda: first.rivals == second.rivals == 1)
+    ros.until(lambda: first.others == second.others == 1)
     is_plant = kind is PlantNode
     name = 'joint_states' if is_plant else 'blf_dsc_controller/commands'
     does = 'publishes joint states' if is_plant else 'commands torques'
@@ -107,7 +107,7 @@ def test_second_publisher_on_the_same_topic_is_reported(ros, kind):
         )
     )
     ros.kill(second)
-    ros.until(lambda: first.rivals == 0)
+    ros.until(lambda: first.others == 0)
 
 
 def test_joint_states_at_too_high_a_rate_are_reported(ros):

@@ -99,13 +99,13 @@ def test_empty_list_stays_empty(start):
 
 
 def test_all_problems_are_reported_at_once_and_nothing_is_declared(start):
-    content = 'arm: {l1: 1}, seed: -1, integrator: euler, sensr.resolution: 1.0, initial: {v: x}'
+    content = 'arm: {l1: 1}, seed: -1, mode: offline, sensr.resolution: 1.0, initial: {v: x}'
     node = start(text=f'sim_plant:\n  ros__parameters: {{{content}}}\n')
     assert problems_of(node, PlantConfig) == [
         'sensr.resolution: unknown parameter, did you mean sensor.resolution?',
         'initial.v: unknown parameter, did you mean initial.velocity?',
+        "mode: got 'offline', but it must be one of realtime, lockstep",
         'seed: got -1, but it must be at least 0',
-        "integrator: got 'euler', but it must be one of dopri5, rk4",
         'arm.l1: got 1, but a double is expected: write 1.0 instead of 1',
     ]
     assert not node.has_parameter('seed')

@@ -3,12 +3,10 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import time
 from argparse import Namespace
 from collections.abc import Iterator
-from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,11 +17,9 @@ from blf_dsc_controller.bags.reader import RecordedRun, recorded_run
 from blf_dsc_controller.cli.main import make_room, require_ros
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.journal import EventType
 
 if TYPE_CHECKING:
-    from blf_dsc_controller.nodes.player_node import PlayerNode
     from blf_dsc_controller.replay.verify import Verification
     from blf_dsc_controller.replay.what_if import WhatIf
 
@@ -32,11 +28,6 @@ DIFFERENT = 3
 
 PARTIAL = 4
 """Exit code if all compared outputs are equal, but some outputs could not be compared."""
-
-_LONGEST_WAIT = 0.01  # s
-_RATES = (1e-3, 1e6)
-_NAME = r'(?:~?/)?[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*'
-_REMAP = re.compile(rf'(?:\w+:)?{_NAME}:=(?:{_NAME}|/)')
 
 
 def report(options: Namespace) -> None:
@@ -109,12 +100,6 @@ def recover(options: Namespace) -> int:
 
 def replay(options: Namespace) -> int:
     """Replay a bag in the mode selected by the options, and print the result."""
-    if options.play and options.map:
-        raise BlfDscError('--map has no effect on --play: rename topics with --remap')
-    if options.play:
-        require_ros()
-        play(options)
-        return 0
     config = None
     if options.config is not None:
         config = load(locate(options.config), CONTROLLER, ControllerConfig)
@@ -232,95 +217,3 @@ def view(options: Namespace) -> int:
     finally:
         page.close()
     return 0
-
-
-def play(options: Namespace) -> None:
-    """Play a bag with PlayerNode, after `delay` [s] for the discovery of subscribers.
-
-    Raises:
-        BlfDscError: an option is out of range, or PlayerNode rejects the bag.
-    """
-    import rclpy
-
-    from blf_dsc_controller.nodes.endpoints import RCLError
-    from blf_dsc_controller.nodes.player_node import PlayerNode
-
-    _check_play(options)
-    words = [word for remap in options.remap for word in ('--remap', remap)]
-    try:
-        rclpy.init(
-            args=['blf_dsc', '--ros-args', *words] if words else [],
-            signal_handler_options=rclpy.SignalHandlerOptions.NO,
-        )
-        node = PlayerNode(
-            options.bag,
-            options.rate,
-            loop=options.loop,
-            clock=options.clock,
-            topics=options.topics,
-            offset=options.start_offset,
-            duration=options.playback_duration,
-        )
-        _announce(node, options)
-        _play_node(node, options)
-    except RCLError as error:
-        raise BlfDscError(f'{error}') from error
-    except KeyboardInterrupt:
-        pass
-    finally:
-        rclpy.try_shutdown()
-
-
-def _check_play(options: Namespace) -> None:
-    slowest, fastest = _RATES
-    if options.rate != 0.0 and not slowest <= options.rate <= fastest:
-        raise BlfDscError(
-            f'--rate {options.rate:g}: expected a speed from {slowest:g} to {fastest:g}, or 0 for '
-            'as fast as possible'
-        )
-    for name in ('delay', 'start_offset', 'playback_duration'):
-        value = getattr(options, name)
-        if not 0.0 <= value < inf and (name, value) != ('playback_duration', inf):
-            option = name.replace('_', '-')
-            raise BlfDscError(f'--{option} {value:g}: expected a time in seconds, 0 or more')
-    for remap in options.remap:
-        if not _REMAP.fullmatch(remap):
-            raise BlfDscError(
-                f'--remap {remap}: expected FROM:=TO with names of topics, as in '
-                'joint_states:=recorded_states'
-            )
-
-
-def _announce(node: PlayerNode, options: Namespace) -> None:
-    rate = f'at rate {options.rate:g}' if options.rate else 'as fast as possible'
-    again = ', in a loop' if options.loop else ''
-    name, seconds = node.get_fully_qualified_name(), (node.end - node.begin) * 1e-9
-    print(f'{name} plays {seconds:.3f} s of {options.bag} {rate}{again}:')
-    for output in node.outputs:
-        print(f'  {output.topic_name}')
-    if options.start_paused:
-        print(f'paused: ros2 service call {name}/resume std_srvs/srv/Trigger', flush=True)
-
-
-def _play_node(node: PlayerNode, options: Namespace) -> None:
-    from rclpy.experimental import EventsExecutor
-
-    from blf_dsc_controller.cli.run import Progress
-    from blf_dsc_controller.nodes.process import drain
-
-    with EventsExecutor() as executor:
-        executor.add_node(node)
-        begin = time.monotonic()
-        while time.monotonic() - begin < options.delay:
-            executor.spin_once(timeout_sec=_LONGEST_WAIT)
-        if not options.start_paused:
-            node.resume()
-        progress = Progress('played', (node.end - node.begin) * 1e-9)
-        try:
-            while not node.is_over:
-                wait = node.play()
-                progress.show(node.elapsed, 'paused' if node.timeline.paused else '')
-                executor.spin_once(timeout_sec=min(wait, _LONGEST_WAIT))
-            drain(node.outputs)
-        finally:
-            progress.close()

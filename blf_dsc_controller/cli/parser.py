@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 import textwrap
-from math import inf
 from pathlib import Path
 
 _BAG = 'folder of the bag, or its .mcap, .db3 or .bag file'
@@ -234,17 +233,6 @@ def _replay_options(parser: argparse.ArgumentParser) -> None:
     )
     _map(parser)
     _namespace(parser)
-    option = parser.add_argument_group('playing over ROS').add_argument
-    option('--play', action='store_true', help='publish the recorded topics')
-    option('--rate', type=float, default=1.0, help='speed; 0: as fast as possible (1)')
-    option('--clock', action='store_true', help="publish the bag's time on /clock")
-    option('--loop', action='store_true', help='start again at the end')
-    option('--start-paused', action='store_true', help='wait for ~/resume')
-    option('--delay', type=float, default=1.0, help='time for discovery [s] (1)')
-    option('--topics', nargs='+', default=[], metavar='TOPIC', help='topics to play (all)')
-    option('--start-offset', type=float, default=0.0, help='time in the bag to start at [s] (0)')
-    option('--playback-duration', type=float, default=inf, help='time to play [s] (to the end)')
-    option('--remap', action='append', default=[], metavar='FROM:=TO', help='remap, as in ROS')
 
 
 def _excite_options(parser: argparse.ArgumentParser) -> None:

@@ -290,9 +290,6 @@ class PlantConfig(Sampled):
         at_least=0,
     )
     autostart: bool = autostart()
-    integrator: Literal['dopri5', 'rk4'] = _fixed(
-        'dopri5', 'fixed-step method for one sample: Dormand-Prince 5 or Runge-Kutta 4'
-    )
     arm: PlantArm = PlantArm()
     robot: Robot = Robot()
     truth: Truth = Truth()

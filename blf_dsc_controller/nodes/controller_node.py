@@ -404,7 +404,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         return f'{self.get_fully_qualified_name()}/reset starts again from where the arm is'
 
     def _report(self) -> None:
-        self._status.report(self.state_label, self.guard, self.rivals)
+        self._status.report(self.state_label, self.guard, self.others)
 
 
 main = partial(process.run, ControllerNode)

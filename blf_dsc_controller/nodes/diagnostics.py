@@ -103,20 +103,20 @@ class ControllerStatus:
         """Whether there are events or a state to publish."""
         return bool(guard.journal.pending) or guard.supervisor.revision != self._revision
 
-    def report(self, life: str, guard: Guard | None, rivals: int) -> None:
+    def report(self, life: str, guard: Guard | None, others: int) -> None:
         """Publish diagnostics, new events and, if it has changed, the state.
 
         Args:
             life: lifecycle state of the node.
             guard: None while the node is not configured.
-            rivals: other publishers of torques.
+            others: other publishers of torques.
         """
         if guard is not None:
             self.publish_events(guard)
         state = self._state(life, guard)
         parts = [state]
         if guard is not None:
-            parts += [self._loop(guard, rivals), self._learning(guard)]
+            parts += [self._loop(guard, others), self._learning(guard)]
             if guard.controller.settings.weighed:
                 parts.append(self._load(guard))
         self._diagnostics.publish(parts)
@@ -145,7 +145,7 @@ class ControllerStatus:
             message += f': {supervisor.text}'
         return self._diagnostics.status('state', level, message, values)
 
-    def _loop(self, guard: Guard, rivals: int) -> DiagnosticStatus:
+    def _loop(self, guard: Guard, others: int) -> DiagnosticStatus:
         states, samples = guard.states, guard.samples
         values = {
             'samples': guard.controller.samples,
@@ -160,7 +160,7 @@ class ControllerStatus:
             **(self.trajectories.values if self.trajectories else {}),
         }
         level, message = WARN, 'torque{} at its limit: adaptation by the tracking error is frozen'
-        if rivals:
+        if others:
             level, message = ERROR, 'another node commands torques, too'
         elif samples.outside:
             message = 'the error has left its bound'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Managed (lifecycle) nodes: a general base class, and that of the control loop's two nodes."""
+"""The base of the control loop's two nodes: a managed (lifecycle) node."""
 
 from __future__ import annotations
 
@@ -39,33 +39,55 @@ _DIAGNOSTICS_PERIOD = 1.0  # s
 _RECORDER = 'record'  # in the names bag_recorder and rosbag2_recorder
 
 
-class ManagedNode(LifecycleNode, process.PlainNode):
-    """A lifecycle node that can start by itself and survives invalid requests.
+class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
+    """A node that can configure and activate itself, and survives invalid requests.
 
     Override `configure`, `activate`, `deactivate` and `release`. Topics, services and parameters
-    exist for the life of the node; everything it computes with is created when it is configured and
-    released when it is cleaned up.
+    exist as long as the node; everything it computes with is created when it is configured and
+    released when it is cleaned up. `steady` [ns] is the clock for timeouts and real time, `wall`
+    [ns] the one for live stamps. Raises ConfigurationError if a parameter is invalid.
+
+    Attributes:
+        config: configuration in force.
+        others: number of other publishers of the output to the other node of the loop.
     """
 
-    def __init__(self, name: str, **options: Any) -> None:
+    def __init__(
+        self,
+        name: str,
+        cls: type[Config],
+        *,
+        steady: Callable[[], int] = time.monotonic_ns,
+        wall: Callable[[], int] = time.time_ns,
+        **options: Any,
+    ) -> None:
         self._transition_error: Exception | None = None
         super().__init__(name, **options)
         wrap_change_state(self, self._rejecting)
+        self._steady, self._wall = steady, wall
+        self.config: Config = parameters.declare(self, cls)
+        self._outputs: dict[Topic, Publisher] = {}
+        self._senders: dict[Topic, Callable[[bytes], None]] = {}
+        self.others = 0
 
     def destroy_node(self) -> None:
         """Destroy the node with its state machine."""
         super().destroy_node()
         destroy_state_machine(self)
 
+    @abstractmethod
     def configure(self) -> None:
         """Create everything the node computes with."""
 
+    @abstractmethod
     def activate(self) -> None:
         """Start working."""
 
+    @abstractmethod
     def deactivate(self) -> None:
         """Stop working."""
 
+    @abstractmethod
     def release(self) -> None:
         """Release what `configure` created, if anything; also called after an error."""
 
@@ -136,34 +158,6 @@ class ManagedNode(LifecycleNode, process.PlainNode):
 
         return callback
 
-
-class LoopNode(ManagedNode, Generic[Config]):
-    """Base of the control loop's two nodes: configuration, topics, diagnostics, `~/reset`.
-
-    `steady` [ns] is the clock for timeouts and real time, `wall` [ns] the one for live stamps.
-    Raises ConfigurationError if a parameter is invalid.
-
-    Attributes:
-        config: configuration in force.
-        rivals: number of other publishers of the output to the other node of the loop.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        cls: type[Config],
-        *,
-        steady: Callable[[], int] = time.monotonic_ns,
-        wall: Callable[[], int] = time.time_ns,
-        **options: Any,
-    ) -> None:
-        super().__init__(name, **options)
-        self._steady, self._wall = steady, wall
-        self.config: Config = parameters.declare(self, cls)
-        self._outputs: dict[Topic, Publisher] = {}
-        self._senders: dict[Topic, Callable[[bytes], None]] = {}
-        self.rivals = 0
-
     def start(self) -> None:
         """Start timers and services, and the node itself if `autostart` is set."""
         self._poll_timer = create_steady_timer(self, POLL_PERIOD, self._on_poll)
@@ -196,21 +190,18 @@ class LoopNode(ManagedNode, Generic[Config]):
         """Publish diagnostics."""
 
     def _on_second(self) -> None:
-        self._check_rivals()
+        self._check_others()
         self._report()
 
-    def _check_rivals(self) -> None:
+    def _check_others(self) -> None:
         """Warn of other publishers of the output that only this node should publish."""
         if not self._outputs:
             return
         publisher = next(iter(self._outputs.values()))
-        others = [
-            one.node_name
-            for one in self.get_publishers_info_by_topic(publisher.topic_name)
-            if one.node_name != WATCHDOG_NODE
-        ]
-        before, self.rivals = self.rivals, len(others) - 1
-        if self.rivals > before:
+        found = self.get_publishers_info_by_topic(publisher.topic_name)
+        before = self.others
+        self.others = sum(each.node_name != WATCHDOG_NODE for each in found) - 1
+        if self.others > before:
             self.get_logger().warning(
                 f'another node publishes on {publisher.topic_name}, too: stop one of the two '
                 '(a killed node stays visible for 20 s)'

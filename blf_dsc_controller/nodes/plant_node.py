@@ -325,7 +325,7 @@ class PlantNode(LoopNode[PlantConfig]):
         level, message = OK, 'running'
         if self.state_label != 'active':
             level, message = STALE, self.state_label
-        elif self.rivals:
+        elif self.others:
             level, message = ERROR, 'another node publishes joint states, too'
         elif not self._running:
             level, message = WARN, 'braked: waiting for the first torque'
