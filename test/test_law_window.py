@@ -199,15 +199,21 @@ def test_warm_started_iteration_tracks_the_minimum_eigenvalue_in_a_loop():
 def test_latch_keeps_the_whole_window_when_time_and_excitation_suffice():
     excited = settings, state, signals = excited_case(2)
     before = state.Phi.copy(), state.b.copy()
-    early = excited, settings.learning_start - 1e-9
-    weak = (settings._replace(sigma=1e3), state, signals), settings.learning_start
-    for case, t in (early, weak):
+    weak = settings._replace(sigma=1e3), state, signals
+    start, whole = settings.learning_start, settings.window
+    for case, t, rows in (
+        (excited, start - 1e-9, whole),
+        (weak, start, whole),
+        (excited, start, 5.0),  # which do not span T_a
+    ):
+        state.rows[0] = rows
         evaluate_until_settled(case, t)
         assert state.latched[0] == 0.0
         np.testing.assert_array_equal(state.Phi, before[0])
         np.testing.assert_array_equal(state.b, before[1])
 
-    evaluate_until_settled(excited, settings.learning_start)
+    state.rows[0] = whole
+    evaluate_until_settled(excited, start)
     rows = state.ring
     Phi = np.einsum('kia,kib->ab', rows[:, :, :-1], rows[:, :, :-1]) / settings.window
     b = np.einsum('kia,ki->a', rows[:, :, :-1], rows[:, :, -1]) / settings.window
