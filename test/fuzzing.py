@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import io
 import itertools
 import os
@@ -45,7 +46,9 @@ MOST_MEMORY = 3 << 30  # bytes on top of what the process had before
 ASIDE = 'elsewhere'
 
 tried: Counter[str] = Counter()
-_folder = Path(tempfile.mkdtemp(prefix='fuzzing_'))
+# The suite removes its folder of logs at the end; a folder of our own goes with the process.
+_made = tempfile.TemporaryDirectory(prefix='fuzzing_', dir=os.environ.get('ROS_LOG_DIR'))
+_folder = Path(_made.name)
 _opened: list[str] = []
 
 
@@ -127,38 +130,26 @@ def names(name):
 # Bags.
 
 
-def _once(make):
-    """Cache the result of the first call, made in the folder of this process."""
-    kept = []
-
-    def get():
-        if not kept:
-            kept.append(make())
-        return kept[0]
-
-    return get
-
-
-@_once
+@functools.cache
 def base():
     """Return the bag of a short run, from which all others are derived."""
     return recorded_run.record(_folder / 'base', 0.1)
 
 
-@_once
+@functools.cache
 def entries():
     """Return its messages."""
     return recorded_run.messages(base())
 
 
-@_once
+@functools.cache
 def pieces():
     """Return the records of its file."""
     (file,) = base().glob('*.mcap')
     return [raw for _, raw in raw_records(file.read_bytes())]
 
 
-@_once
+@functools.cache
 def secret():
     """Create a file that no bag may lead to; return its folder."""
     folder = _folder / ASIDE

@@ -179,11 +179,11 @@ FAULTS = (
 
 def soak(samples, seed=0):
     """Run and return the report."""
-    one = Soak(seed)
+    running = Soak(seed)
     try:
-        return one.run(samples)
+        return running.run(samples)
     finally:
-        one.close()
+        running.close()
 
 
 def main():

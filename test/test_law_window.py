@@ -394,6 +394,15 @@ def test_columns_are_not_checked_before_the_parameters_alone_are_excited():
     assert all(active.values())
 
 
+def test_much_weaker_window_does_not_replace_the_latched_one():
+    """As when the reference stops; the paper, without change detection, takes any above sigma."""
+    for detection, expected in ((1, [False, True]), (0, [True, True])):
+        settings, state, _ = arbitrary(0, change_detection=detection, latch=LATCHES.index('last'))
+        state.best_lambda[0] = 1.0
+        weaker = [bool(excitation.is_preferred(settings, state, value)) for value in (0.9, 1.0)]
+        assert weaker == expected
+
+
 @pytest.mark.parametrize('latch', LATCHES)
 def test_latch_keeps_the_last_or_the_best_excited_window(latch):
     """As the excitation decays, `last` follows it down to sigma and `max` does not."""
