@@ -41,7 +41,12 @@ from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.cli.identify import clearance_of, guess_of
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, load_loop
 from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.identification.exciting_reference import ExcitationProblem, search
+from blf_dsc_controller.identification.exciting_reference import (
+    SPEED,
+    TORQUE,
+    ExcitationProblem,
+    search,
+)
 from blf_dsc_controller.identification.identify import Identified, identify_arm
 from blf_dsc_controller.identification.prior import base_matrix
 from blf_dsc_controller.identification.recording import Recording, rows_of
@@ -55,7 +60,7 @@ _DURATION, _UNSEEN = 30.0, 10.0  # s
 _EVERY = (1, 10)  # samples of 1 ms from state to state
 _LOAD = 2.0  # kg
 _AFTER = (1.0, 2.0, 3.0)  # s, from the pick-up to a reading
-_HARMONICS, _TORQUE, _SPEED, _RADIUS = 3, 0.8, 0.95, 0.07
+_HARMONICS, _RADIUS = 3, 0.07
 _SHRINK, _SHRINKS = 0.9, 20  # to an eighth
 _HEADS = {
     'arms': ('rate', 'torque error on unseen motion: URDF', 'identified', '95 % intervals', 'time'),
@@ -255,7 +260,7 @@ def _excited(name: str, starts: int) -> tuple[str, ...]:
     config = load_loop(name).controller
     clearance = clearance_of(config, _RADIUS, 0.0)
     problem = ExcitationProblem(
-        config, guess_of(config, None), _TORQUE, _HARMONICS, clearance, _SPEED
+        config, guess_of(config, None), TORQUE, _HARMONICS, clearance, SPEED
     )
     problem.evaluate(problem.parameters(problem.start(np.random.default_rng(0))))  # compiles
     begin = time.perf_counter()

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import textwrap
 from argparse import Namespace
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from tqdm import tqdm
@@ -79,74 +79,74 @@ def identify(options: Namespace) -> None:
         print(f'wrote {options.report}')
 
 
+def _interval(value: float, deviation: float, digits: str = '.4g') -> str:
+    return f'{value:{digits}} +- {_TWO_SIDED * deviation:.2g}'
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Yield an empty line and the rows of a table as lines; all but the first column are equal."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    yield ''
+    for row in rows:
+        cells = (f'{cell:{width}}' for cell, width in zip(row, widths, strict=True))
+        yield '  '.join(cells).rstrip()
+
+
 def _load(found: Identified) -> Iterator[str]:
     if found.picked_up is None:
         return
     (m, *centre), (m_spread, *spread) = found.load
-    at = ', '.join(
-        f'{1e3 * c:.1f} +- {1e3 * _TWO_SIDED * s:.2g}' for c, s in zip(centre, spread, strict=True)
-    )
+    at = ', '.join(_interval(1e3 * c, 1e3 * s, '.1f') for c, s in zip(centre, spread, strict=True))
     yield ''
     yield (
-        f'load from {found.picked_up:.1f} s on: {m:.3f} +- {_TWO_SIDED * m_spread:.2g} kg, its '
+        f'load from {found.picked_up:.1f} s on: {_interval(m, m_spread, ".3f")} kg, its '
         f'centre at {at} mm in {found.chain.tip}'
     )
 
 
 def _links(found: Identified) -> Iterator[str]:
-    names = [joint.link for joint in found.chain.joints]
-    width = max(map(len, names))
-    yield ''
-    yield f'{"body":{width}}  mass [kg]                     centre of mass [mm]'
-    variance = np.diag(found.covariance)
-    for i, (name, joint) in enumerate(zip(names, found.chain.joints, strict=True)):
+    rows = [('body', 'mass [kg]', 'centre of mass [mm]')]
+    for i, joint in enumerate(found.chain.joints):
         at = 10 * i
         m = found.values[at]
         # c = h / m:  dc = (dh - c dm) / m
         c = found.values[at + 1 : at + 4] / m
         D = np.column_stack((-c, np.eye(3))) / m
-        spread = np.diag(D @ found.covariance[at : at + 4, at : at + 4] @ D.T)
+        C = found.covariance[at : at + 4, at : at + 4]
         before = joint.inertia[1:4] / joint.inertia[0]
         centre = ', '.join(
-            f'{1e3 * a:.1f} -> {1e3 * b:.1f} +- {1e3 * s:.2g}'
-            for a, b, s in zip(before, c, _TWO_SIDED * np.sqrt(spread), strict=True)
+            f'{1e3 * old:.1f} -> {_interval(1e3 * new, 1e3 * s, ".1f")}'
+            for old, new, s in zip(before, c, np.sqrt(np.diag(D @ C @ D.T)), strict=True)
         )
-        mass = f'{joint.inertia[0]:.3f} -> {m:.3f} +- {_TWO_SIDED * np.sqrt(variance[at]):.2g}'
-        yield f'{name:{width}}  {mass:28}  {centre}'
+        mass = f'{joint.inertia[0]:.3f} -> {_interval(m, C[0, 0] ** 0.5, ".3f")}'
+        rows.append((joint.link, mass, centre))
+    return _aligned(rows)
 
 
 def _joints(found: Identified) -> Iterator[str]:
     n = len(found.chain.joints)
     names = [joint.name for joint in found.chain.joints]
-    width = max(map(len, names))
-    spread = _TWO_SIDED * np.sqrt(np.diag(found.covariance))
+    spread = np.sqrt(np.diag(found.covariance))
     terms = spread[10 * n : 17 * n].reshape(-1, n)
     shown = [k for k in range(len(JOINT_TERMS)) if found.joint_terms[k].any()]
-    yield ''
-    yield f'{"joint":{width}}' + ''.join(f'  {JOINT_TERMS[k]:22}' for k in shown).rstrip()
+    rows = [('joint', *(JOINT_TERMS[k] for k in shown))]
     for i, name in enumerate(names):
-        values = (
-            f'{found.joint_terms[k, i]:.4g} +- {terms[k, i]:.2g}' if found.joint_terms[k, i] else ''
-            for k in shown
-        )
-        yield f'{name:{width}}' + ''.join(f'  {value:22}' for value in values).rstrip()
+        values = ((found.joint_terms[k, i], terms[k, i]) for k in shown)
+        rows.append((name, *(_interval(v, s) if v else '' for v, s in values)))
+    yield from _aligned(rows)
     if found.coupling.any():
-        inertia, viscous, coulomb = (
-            f'{value:.4g} +- {s:.2g}'
-            for value, s in zip(found.coupling, spread[17 * n :], strict=False)
-        )
+        inertia, viscous, coulomb = map(_interval, found.coupling, spread[17 * n :])
         yield (
             f'one motor drives {names[-2]} and {names[-1]}: inertia {inertia} kg m^2, viscous '
             f'friction {viscous} and Coulomb friction {coulomb} act on both'
         )
-    delay, s = found.values[-1], spread[-1]
-    yield f'delay of the torques relative to the positions: {1e3 * delay:.2f} +- {1e3 * s:.2g} ms'
+    delay = _interval(1e3 * found.values[-1], 1e3 * spread[-1], '.2f')
+    yield f'delay of the torques relative to the positions: {delay} ms'
 
 
 def _base(found: Identified) -> Iterator[str]:
     P = found.parameters
-    n = len(found.chain.joints)
-    K = base_matrix(P, n)[: len(P.combinations)]
+    K = base_matrix(P, len(found.chain.joints))[: len(P.combinations)]
     before, after = K @ found.prior, K @ found.values
     prior, posterior = (
         np.einsum('ia,ab,ib->i', K, C, K) for C in (found.prior_covariance, found.covariance)
@@ -164,20 +164,21 @@ def _errors(found: Identified) -> Iterator[str]:
     begin, end = found.held_back
     yield ''
     yield f'torque error from {begin:.1f} to {end:.1f} s, which was held back [% of rms torque]:'
-    share = 100.0 * found.errors / found.torque
-    total = total_errors(found)
-    width = max(len(joint.name) for joint in found.chain.joints)
-    yield f'{"joint":{width}}      URDF  corrected  with all terms'
-    for joint, (before, after, full) in zip(found.chain.joints, share.T, strict=True):
-        yield f'{joint.name:{width}}  {before:8.2f}  {after:9.2f}  {full:8.2f}'
-    yield f'{"all":{width}}  {total[0]:8.2f}  {total[1]:9.2f}  {total[2]:8.2f}'
+    names = [joint.name for joint in found.chain.joints]
+    shares = np.vstack(((100.0 * found.errors / found.torque).T, total_errors(found)))
+    heads = ('    URDF', 'corrected', 'with all terms')
+    rows: list[tuple[str, ...]] = [('joint', *heads)]
+    for name, share in zip((*names, 'all'), shares, strict=True):
+        cells = (f'{x:{size}.2f}' for x, size in zip(share, (8, 9, 8), strict=True))
+        rows.append((name, *cells))
+    yield from list(_aligned(rows))[1:]
     if found.rest:
         yield f'{found.rest:.1f} s in which no joint moves were left out'
     moving = found.time.size * HOP
-    for joint, seconds in zip(found.chain.joints, found.lasting, strict=True):
+    for name, seconds in zip(names, found.lasting, strict=True):
         if seconds > _LASTING * moving:
             yield (
-                f'the residual of {joint.name} lasts ({seconds:.2g} s): it is a torque, not noise, '
+                f'the residual of {name} lasts ({seconds:.2g} s): it is a torque, not noise, '
                 'and may have shifted values beyond their intervals'
             )
     for name in found.still:
@@ -228,12 +229,12 @@ def _preset(options: Namespace) -> str:
     problem = exciting_reference.ExcitationProblem(
         config,
         guess_of(config, options.guess),
-        options.torque_fraction,
+        exciting_reference.TORQUE,
         options.harmonics,
         clearance_of(config, options.radius, options.floor),
-        options.speed_fraction,
+        exciting_reference.SPEED,
     )
-    parameters = problem.parameters(_search(problem, options.seed, options.starts))
+    parameters = problem.parameters(_search(problem, options.starts))
     for name in ('offset', 'amplitude'):
         parameters[name] = tuple(round(value, _DIGITS) for value in parameters[name])
     names = ('offset', 'amplitude', 'frequency', 'phase')
@@ -259,11 +260,8 @@ def _preset(options: Namespace) -> str:
         'The reference that excites the learning most within the limits of joints and torque: '
         f'{figures} with the configured reference.'
     )
-    command = (
-        f'blf_dsc excite PRESET.yaml --config {options.config} --torque-fraction '
-        f'{options.torque_fraction:g} --speed-fraction {options.speed_fraction:g} '
-        f'--harmonics {options.harmonics} --starts {options.starts} --seed {options.seed}'
-    )
+    command = f'blf_dsc excite PRESET.yaml --config {options.config}'
+    command += f' --harmonics {options.harmonics} --starts {options.starts}'
     if options.guess:
         command += f' --guess {" ".join(f"{value:g}" for value in options.guess)}'
     if config.model == 'urdf':
@@ -307,7 +305,7 @@ def clearance_of(config: ControllerConfig, radius: float, floor: float) -> Clear
     return Clearance(config.robot.chain(config.joints), radius, floor)
 
 
-def _search(problem: exciting_reference.ExcitationProblem, seed: int, starts: int) -> np.ndarray:
+def _search(problem: exciting_reference.ExcitationProblem, starts: int) -> np.ndarray:
     total = starts * exciting_reference.ITERATIONS
     with tqdm(total=total, desc='searching', unit='iteration', disable=None) as bar:
 
@@ -315,7 +313,7 @@ def _search(problem: exciting_reference.ExcitationProblem, seed: int, starts: in
             bar.set_postfix_str(f'best {best:.4g}' if best > -np.inf else '', refresh=False)
             bar.update(done - bar.n)
 
-        return exciting_reference.search(problem, seed, starts, show)
+        return exciting_reference.search(problem, 0, starts, show)
 
 
 def _unshown(config: ControllerConfig, remaining: np.ndarray) -> list[str]:

@@ -247,22 +247,8 @@ def _excite_options(parser: argparse.ArgumentParser) -> None:
         help='parameters P for computing the torque (learning.initial_estimate; for a URDF, with '
         'and without its payload)',
     )
-    option(
-        '--torque-fraction',
-        type=float,
-        default=0.8,
-        help='fraction of the torque limit to stay below (0.8)',
-    )
-    option(
-        '--speed-fraction',
-        type=float,
-        default=0.95,
-        help='fraction of limits.velocity and limits.acceleration to use; the rest is for the '
-        'approach (0.95)',
-    )
     option('--harmonics', type=int, default=3, help='number of harmonics of the window (3)')
     option('--starts', type=int, default=4, help='number of searches; the best result is kept (4)')
-    option('--seed', type=int, default=0, help='seed of the searches (0)')
     option('--radius', type=float, default=0.07, help='radius of the links of a URDF [m] (0.07)')
     option('--floor', type=float, default=0.0, help='height of the floor in the base frame [m] (0)')
 

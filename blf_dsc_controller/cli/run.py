@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import itertools
 import sys
-import time
 from argparse import Namespace
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -49,7 +48,8 @@ STOPPED = 5
 
 _FOLDER = 'closed_loop'
 _DURATION = 60.0  # s, if neither the file nor an option sets it
-_FORMAT = '{desc} |{bar}| {n:.1f}/{total:g} s [{elapsed}<{remaining}]{postfix}'
+_BAR = '{desc} |{bar}| {n:.1f}/{total:g} s [{elapsed}<{remaining}]{postfix}'
+_LINE = '{desc} {n:.1f}/{total:g} s{postfix}'
 _LINE_PERIOD = 10.0  # s between two lines if stderr is not a terminal
 
 
@@ -198,40 +198,22 @@ class Progress:
 
     def __init__(self, title: str, seconds: float) -> None:
         """Begin at 0 of `seconds`, which is 0 if the end is open."""
-        self._title, self._seconds = title, seconds
-        self._line = ''
-        self._due = time.monotonic() + _LINE_PERIOD
-        self._bar = tqdm(
-            total=seconds,
-            desc=title,
-            bar_format=_FORMAT,
-            mininterval=0.2,
-            disable=not sys.stderr.isatty(),
-        )
+        form, pause = (_BAR, 0.2) if sys.stderr.isatty() else (_LINE, _LINE_PERIOD)
+        self._seconds = seconds
+        self._bar = tqdm(total=seconds, desc=title, bar_format=form, mininterval=pause)
 
     def show(self, elapsed: float, status: str = '') -> None:
         """Show the elapsed time [s] and a short status."""
         self._bar.set_postfix_str(status, refresh=False)
-        self._bar.update(min(elapsed, self._seconds) - self._bar.n)
-        self._line = f'{self._title} {elapsed:.1f}/{self._seconds:g} s' + (status and f', {status}')
-        if time.monotonic() >= self._due:
-            self._print_line()
+        self._bar.update(min(elapsed, self._seconds or elapsed) - self._bar.n)
 
     def write(self, text: str) -> None:
         """Print a line without disturbing the bar."""
         self._bar.write(text, file=sys.stderr)
-        sys.stderr.flush()
 
     def close(self) -> None:
-        """Close the bar, or print the last line."""
+        """Show the last state."""
         self._bar.close()
-        self._print_line()
-
-    def _print_line(self) -> None:
-        if self._bar.disable and self._line:
-            print(self._line, file=sys.stderr, flush=True)
-            self._line = ''
-            self._due = time.monotonic() + _LINE_PERIOD
 
 
 class LoopProgress(Progress):

@@ -188,33 +188,47 @@ def _monitor(
 ) -> str:
     """Show the progress until the plant exits or a signal arrives; return a note on the recorder.
 
-    A loop that has begun continues without its recorder; its first message may arrive a bit later.
-    `show` starts the page and returns its address; it is called only after that message, since the
-    nodes wait for a subscriber, which must be the recorder.
+    `show` starts the page and returns its address; it is called only after the first message of
+    the loop, since the nodes wait for a subscriber, which must be the recorder.
     """
     recorder, *loop = nodes
-    ended, warned = inf, False
     with ProgressMonitor(config, interrupts) as monitor:
-        while loop[-1].is_running and not interrupts:
+
+        def goes_on() -> bool:
             for node in loop:
                 node.check()
-            if not monitor.has_begun:
-                for notice in itertools.chain(*(node.new_notices() for node in loop)):
-                    monitor.progress.write(notice)
-            if not recorder.is_running:
-                ended = min(ended, time.monotonic())
-                if monitor.has_begun and not warned:
-                    warned = True
-                    monitor.progress.write(
-                        f'{recorder.name} has ended: the loop continues unrecorded'
-                    )
-                if not monitor.has_begun and time.monotonic() > ended + FIRST_SIGN:
-                    recorder.check()
-            if monitor.has_begun and show is not None:
-                monitor.progress.write(f'the page: {show()}')
-                show = None
             monitor.wait(0.1)
+            return loop[-1].is_running and not interrupts
+
+        _wait_for_start(monitor, recorder, loop, goes_on)
+        if monitor.has_begun and show is not None:
+            monitor.progress.write(f'the page: {show()}')
+        is_recorded = True
+        while goes_on():
+            if is_recorded and not recorder.is_running:
+                is_recorded = False
+                monitor.progress.write(f'{recorder.name} has ended: the loop continues unrecorded')
     return '' if recorder.is_running else ' while the loop continued without it'
+
+
+def _wait_for_start(
+    monitor: ProgressMonitor,
+    recorder: NodeProcess,
+    loop: list[NodeProcess],
+    goes_on: Callable[[], bool],
+) -> None:
+    """Report what is compiled until the first message arrives, the loop ends or the recorder fails.
+
+    That message may arrive a bit after the recorder has ended.
+    """
+    ended = inf
+    while goes_on() and not monitor.has_begun:
+        for notice in itertools.chain(*(node.new_notices() for node in loop)):
+            monitor.progress.write(notice)
+        if not recorder.is_running:
+            ended = min(ended, time.monotonic())
+            if time.monotonic() > ended + FIRST_SIGN:
+                recorder.check()
 
 
 def _die_with_parent() -> None:

@@ -35,6 +35,9 @@ from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
 ITERATIONS = 150
 """Maximum number of iterations of a search."""
 
+TORQUE, SPEED = 0.8, 0.95
+"""Fractions of the limits of torque, and of velocity and acceleration, that `excite` uses."""
+
 _SAMPLES_PER_HARMONIC = 64
 _COARSE = 4  # samples per filtered row
 _MARGIN = 1e-3  # fraction of each limit, and m of room, for peaks between samples
