@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+import struct
+from collections import Counter
+
 import pytest
 import recorded_run
-from fault_rig import JOINTS, LOCKSTEP, MILLISECOND, Rig
+from fault_rig import JOINTS, MILLISECOND, Rig
 from fault_table import FAULTS, run
 from recorded_run import compared, of
 
 from blf_dsc_controller import __version__
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.telemetry import ControllerTelemetry
 from blf_dsc_controller.messages.journal import EventType, decode
@@ -19,6 +23,7 @@ from blf_dsc_controller.replay.verify import verify
 
 # Messages show neither a corrupted state of the law nor the end of a process.
 IN_MESSAGES = [fault for fault in FAULTS if 'poison' not in fault.inject.__qualname__]
+NAN = struct.pack('<d', float('nan'))
 DAMPED = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.02}  # no two torques alike
 
 
@@ -93,7 +98,9 @@ def eventful():
     plan = rig.guard.plan(Trajectory(JOINTS, (point,)), rig.guard.time + 0.02)
     rig.step(10)
     rig.guard.adopt(plan)
-    rig.step(100)
+    rig.step(50)
+    rig.guard.retune(change(rig.config, {'feedback.gain': (50.0, 25.0)}))
+    rig.step(50)
     rig.guard.deactivate()
     rig.step(30)
     rig.wait(100)  # the watchdog commands while the controller is inactive, too
@@ -122,8 +129,9 @@ def test_watchdog_torques_replay(tmp_path):
         'reset',
         'safe stop (bad message)',
     ]
-    assert [event.type for event in result.events].count(EventType.SILENCE) == 2
-    assert [event.type for event in result.events].count(EventType.TRAJECTORY) == 2
+    types = Counter(event.type for event in result.events)
+    assert (types[EventType.SILENCE], types[EventType.TRAJECTORY]) == (2, 2)
+    assert types[EventType.PARAMETERS] == 1
     assert compared(result)['commands'] == 2 * len(of(rig.entries, COMMANDS))
     states = len(of(rig.entries, JOINT_STATES))
     assert len(of(rig.entries, COMMANDS)) > states + 10
@@ -164,30 +172,84 @@ def test_unexpected_error_replays_as_a_stop(tmp_path):
     assert compared(result)['commands'] >= 2 * (50 + 30)
 
 
-def test_changed_stop_reason_is_a_difference(tmp_path):
-    """The recorded controller stopped where the replayed one does not."""
+def test_event_lost_by_the_recorder_ends_the_replay(tmp_path):
     rig = eventful()
-    for entry in of(rig.entries, JOURNAL):
-        event = decode(entry[3])
-        if event.content.get('reason') == 'bad message':
-            content = {**event.content, 'reason': 'stamp jump'}
-            entry[3] = event._replace(content=content).encode()
-    assert rig.verify(tmp_path).difference.field.startswith('stop: stamp jump (')
-
-
-def test_moved_stop_is_located(tmp_path):
-    rig = Recorder(DAMPED)
-    rig.step(50)
-    rig.deliver(b'')
-    rig.step(10)
     rig.publish_events()
-    stop = of(rig.entries, JOURNAL)[-1]
-    event = decode(stop[3])
-    later = event._replace(stamp=event.stamp + MILLISECOND, messages=event.messages + 1)
-    stop[3] = later.encode()
-    difference = rig.verify(tmp_path, clock='lockstep').difference
-    assert difference.stamp == LOCKSTEP + 49 * MILLISECOND
-    assert difference.field.startswith('used by the law (')
+    rig.entries.remove(of(rig.entries, JOURNAL)[3])
+    result = rig.verify(tmp_path)
+    assert result.difference is None
+    assert result.remarks == ('an event of the journal is not in the bag: the replay ends there',)
+
+
+def altered(event, **content):
+    return event._replace(content={**event.content, **content})
+
+
+def later(event):
+    return event._replace(stamp=event.stamp + MILLISECOND, messages=event.messages + 1)
+
+
+def other_point(event):
+    event.content['points'][0]['positions'][1] += 1e-9
+    return event
+
+
+def configured(name, value):
+    return lambda event: altered(event, parameters={**event.content['parameters'], name: value})
+
+
+@pytest.mark.parametrize(
+    ('kind', 'alter', 'topic', 'field'),
+    [
+        ('stop', lambda event: altered(event, reason='stamp jump'), TRACKING_ERROR, 'stop: '),
+        ('stop', later, TRACKING_ERROR, 'used by the law ('),
+        ('trajectory', later, TRACKING_ERROR, 'trajectory'),
+        ('trajectory', other_point, COMMANDS, 'effort of joint'),
+        ('configure', configured('safety.error_ratio', 1e-6), TRACKING_ERROR, 'used by the law ('),
+        ('silence', lambda event: altered(event, torques=3), TRACKING_ERROR, 'silence'),
+    ],
+)
+def test_changed_event_is_a_difference(tmp_path, kind, alter, topic, field):
+    """The recorded controller did something else than the replayed one."""
+    rig = eventful()
+    rig.publish_events()
+    entry, event = next(
+        (entry, event)
+        for entry in of(rig.entries, JOURNAL)[:: -1 if kind == 'stop' else 1]
+        for event in [decode(entry[3])]
+        if event.type == kind
+    )
+    entry[3] = alter(event).encode()
+    difference = rig.verify(tmp_path).difference
+    assert (difference.topic, difference.field[: len(field)]) == (topic.resolved, field)
+    if kind in ('stop', 'trajectory'):
+        assert abs(difference.stamp - event.stamp) <= MILLISECOND
+
+
+@pytest.mark.parametrize('part', [0.1, 0.5, 0.9])
+def test_flipped_bit_of_a_safe_torque_is_found(tmp_path, part):
+    rig = eventful()
+    safe = [k for k, entry in enumerate(of(rig.entries, TRACKING_ERROR)) if NAN in entry[3]]
+    number = safe[int(part * len(safe))]
+    entry = of(rig.entries, TRACKING_ERROR)[number]
+    entry[3] = entry[3][:-8] + bytes([entry[3][-8] ^ 1]) + entry[3][-7:]
+    difference = rig.verify(tmp_path).difference
+    assert (difference.topic, difference.field) == (TRACKING_ERROR.resolved, 'effort of joint2')
+    assert difference.recorded == pytest.approx(difference.replayed, abs=1e-12)
+
+
+def test_answers_missed_by_the_recorder_end_the_replay(tmp_path):
+    """Which states the law used is then not known."""
+    rig = Recorder()
+    rig.step(60)
+    rig.publish_events()
+    lost = of(rig.entries, TRACKING_ERROR)[40]
+    lost[3] = None
+    entries = [list(entry) for entry in rig.entries]
+    path = recorded_run.write(tmp_path / 'bag', entries, numbered=True, package_version=__version__)
+    result = verify(path)
+    assert (result.difference, result.samples) == (None, 40)
+    assert 'the recorder missed messages of /blf_dsc_controller/tracking' in result.remarks[0]
 
 
 def test_second_controller_in_a_bag_is_not_replayed(tmp_path):
