@@ -19,11 +19,10 @@ from sent_trajectory import JOINTS, SECOND, send, trajectory
 
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.messages.codecs import JointStateEncoder
-from blf_dsc_controller.messages.journal import EventType, decode
+from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
     JOINT_STATES,
-    JOURNAL,
     TRACKING_ERROR,
 )
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
@@ -70,27 +69,38 @@ class Recording:
         return self.path
 
 
-@pytest.fixture(scope='module')
-def moved(tmp_path_factory):
-    """Bag with two trajectories, the second one delayed, and a gain change in between."""
-    run = Recording(tmp_path_factory.mktemp('moved') / 'bag', **BRISK)
+def test_trajectories_and_gain_change_replay_where_they_took_effect(tmp_path):
+    """The second trajectory begins later; the journal holds both as they were sent."""
+    run = Recording(tmp_path / 'bag', **BRISK)
     run.run(200)
-    assert send(run.ros, run.law, trajectory(JOINTS, np.zeros(2), duration=1.0)) == ''
+    sent = trajectory(JOINTS, np.zeros(2), duration=1.0)
+    assert send(run.ros, run.law, sent) == ''
     run.run(300)
     run.change('feedback.gain', [50.0, 25.0])
     run.run(200)
     begin = run.law.guard.last_stamp + SECOND // 4
-    sent = trajectory(JOINTS[::-1], np.array([0.05, -0.1]), duration=0.5, fields=2, stamp=begin)
-    assert send(run.ros, run.law, sent) == ''
+    later = trajectory(JOINTS[::-1], np.array([0.05, -0.1]), duration=0.5, fields=2, stamp=begin)
+    assert send(run.ros, run.law, later) == ''
     run.run(600)
-    (run.path.parent / 'begin').write_text(str(begin))
-    return run.end()
+    result = verify(run.end())
+    assert (result.difference, result.remarks) == (None, ())
+    assert [event.type for event in result.events].count(EventType.PARAMETERS) == 1
+    assert result.samples >= 1300
+    assert compared(result)['commands'] == 2 * result.samples
+    assert compared(result)['reference'] == 4 * result.samples
+    first, second = (e.content for e in result.events if e.type is EventType.TRAJECTORY)
+    assert (tuple(first['joints']), tuple(second['joints'])) == (JOINTS, JOINTS[::-1])
+    errors = read_content(run.path).topics[TRACKING_ERROR].joint_states(JOINTS, ())
+    assert first['begin'] is None
+    assert second['begin'] == (begin - int(errors.stamp[0])) * 1e-9
+    for recorded, point in zip(first['points'], sent.points, strict=True):
+        np.testing.assert_array_equal(recorded['positions'], point.positions)
+        np.testing.assert_array_equal(recorded['accelerations'], point.accelerations)
 
 
-@pytest.fixture(scope='module')
-def stopped(tmp_path_factory):
-    """Bag with a pause, two safe stops (a gain changes in the first), activations and a reset."""
-    run = Recording(tmp_path_factory.mktemp('stopped') / 'bag', **DAMPED)
+def test_stops_ramps_and_activations_replay_with_identical_torques(tmp_path):
+    """A pause, two safe stops (a gain changes in the first), activations and a reset."""
+    run = Recording(tmp_path / 'bag', **DAMPED)
     run.run(100)
     deactivate(run.ros, run.law)
     run.run(600)  # past the ramp
@@ -116,55 +126,17 @@ def stopped(tmp_path_factory):
     run.ros.until(lambda: run.law.guard.supervisor.text)
     activate(run.ros, run.arm)
     run.run(50)
-    return run.end()
-
-
-def trajectories(bag):
-    """Trajectory events of a bag."""
-    events = [decode(entry[3]) for entry in of(recorded_run.messages(bag), JOURNAL)]
-    return [event for event in events if event.type is EventType.TRAJECTORY]
-
-
-def test_trajectories_and_gain_change_replay_where_they_took_effect(moved):
-    result = verify(moved)
-    assert result.difference is None
-    assert result.remarks == ()
-    assert [event.type for event in result.events].count(EventType.PARAMETERS) == 1
-    assert [event.type for event in result.events].count(EventType.TRAJECTORY) == 2
-    samples = result.samples
-    assert samples >= 1300
-    assert compared(result)['commands'] == 2 * samples
-    assert compared(result)['reference'] == 4 * samples
-
-
-def test_journal_holds_each_trajectory_as_sent(moved):
-    first, second = [event.content for event in trajectories(moved)]
-    assert (tuple(first['joints']), tuple(second['joints'])) == (JOINTS, JOINTS[::-1])
-    assert first['begin'] is None
-    errors = read_content(moved).topics[TRACKING_ERROR].joint_states(JOINTS, ())
-    start = int(errors.stamp[0])
-    begin = int((moved.parent / 'begin').read_text())
-    assert second['begin'] == (begin - start) * 1e-9
-    sent = trajectory(JOINTS, np.zeros(2), duration=1.0)
-    for recorded, point in zip(first['points'], sent.points, strict=True):
-        np.testing.assert_array_equal(recorded['positions'], point.positions)
-        np.testing.assert_array_equal(recorded['accelerations'], point.accelerations)
-
-
-def test_stops_ramps_and_activations_replay_with_identical_torques(stopped):
-    result = verify(stopped)
-    assert result.difference is None
-    assert result.remarks == ()
+    bag = run.end()
+    result = verify(bag)
+    assert (result.difference, result.remarks) == (None, ())
     assert [event.type for event in result.events].count(EventType.PARAMETERS) == 1
     assert ', '.join(result.transitions) == (
         'activate, deactivate, activate, safe stop (stamp jump), deactivate, '
         'activate, reset, safe stop (joint missing)'
     )
-    torques = len(of(recorded_run.messages(stopped), COMMANDS))
+    torques = len(of(recorded_run.messages(bag), COMMANDS))
     assert compared(result)['commands'] == 2 * torques
-    count = torques - result.samples
-    assert count >= 600 + 3 * 50
-    assert result.safe_torques == count
+    assert result.safe_torques == torques - result.samples >= 600 + 3 * 50
 
 
 def test_state_timeout_replays_with_its_torques(tmp_path):
