@@ -23,10 +23,8 @@ from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages.codecs import JointStateEncoder
-from blf_dsc_controller.messages.topics import FOREVER, JOINT_STATES, Quality
+from blf_dsc_controller.messages.topics import FOREVER, Quality
 from blf_dsc_controller.messages.types import definition
 from blf_dsc_controller.nodes import recorder_node
 from blf_dsc_controller.nodes.endpoints import quality_of
@@ -124,20 +122,10 @@ def test_messages_are_recorded_byte_for_byte(loop):
     assert before <= stamps[0] <= stamps[-1] <= after
 
 
-def test_only_chosen_topics_are_recorded(loop):
-    run = loop(topics=['chosen', '/never'])
-    chosen = run.source.create_publisher(JointState, 'chosen', 10)
-    other = run.source.create_publisher(JointState, 'other', 10)
-    run.spin_until(lambda: chosen.get_subscription_count() > 0)
-    chosen.publish(JointState())
-    run.spin_until_recorded(chosen=1)
-    assert other.get_subscription_count() == 0
-    assert [topic for topic, _, _ in run.messages()] == ['/chosen']
-
-
 def test_publishers_of_every_quality_are_recorded(loop):
-    """Latched before the recorder came, best effort, and both on one topic."""
-    run = loop()
+    """Latched before the recorder came, best effort, and both on one topic; not those of others."""
+    run = loop(topics=['bound', 'sensor', '/mixed', '/never'])
+    other = run.source.create_publisher(JointState, 'other', 10)
     policies = (
         {'durability': DurabilityPolicy.TRANSIENT_LOCAL},
         {'reliability': ReliabilityPolicy.BEST_EFFORT},
@@ -157,7 +145,10 @@ def test_publishers_of_every_quality_are_recorded(loop):
     for publisher in publishers:
         publisher.publish(JointState())
     run.spin_until_recorded(bound=1, sensor=1, mixed=2)
-    assert [b'early' in raw for topic, _, raw in run.messages() if topic == '/bound'] == [True]
+    assert other.get_subscription_count() == 0
+    found = run.messages()
+    assert sorted(topic for topic, _, _ in found) == ['/bound', '/mixed', '/mixed', '/sensor']
+    assert [b'early' in raw for topic, _, raw in found if topic == '/bound'] == [True]
 
 
 def test_quality_and_type_are_taken_from_the_graph(loop):
@@ -178,35 +169,15 @@ def test_quality_and_type_are_taken_from_the_graph(loop):
         found = {connection.topic: connection for connection in reader.connections}
     commands = found['/commands']
     assert str(seen.topic_type_hash) == commands.digest == definition(commands.msgtype)[1]
-    assert [one.durability.name for one in commands.ext.offered_qos_profiles] == ['TRANSIENT_LOCAL']
+    assert [each.durability.name for each in commands.ext.offered_qos_profiles] == [
+        'TRANSIENT_LOCAL'
+    ]
     # The graph knows neither history nor depth.
     assert quality_of(seen.qos_profile) == Quality(
         depth=0, durability='transient_local', history='unknown', deadline=FOREVER
     )
     assert found['/goals'].digest == str(seen_goals.topic_type_hash)
     assert 'geometry_msgs/Quaternion' in found['/goals'].msgdef.data
-
-
-def test_missing_type_is_warned_of_once(loop, monkeypatch, capfd):
-    def not_installed(type_name):
-        if type_name == JOINT_STATES.type:
-            raise ModuleNotFoundError
-        return original(type_name)
-
-    original = recorder_node.message_class
-    monkeypatch.setattr(recorder_node, 'message_class', not_installed)
-    run = loop()
-    run.source.create_publisher(JointState, 'joint_states', 10)
-    other = run.source.create_publisher(Float64MultiArray, 'commands', 10)
-    run.spin_until(lambda: other.get_subscription_count() > 0)
-    for _ in range(10):
-        run.recorder._discover()
-    other.publish(Float64MultiArray())
-    run.spin_until_recorded(commands=1)
-    assert '/joint_states' not in {topic for topic, _, _ in run.messages()}
-    output = capfd.readouterr().err
-    assert output.count('/joint_states is not recorded') == 1
-    assert 'its type sensor_msgs/msg/JointState is not installed here' in output
 
 
 def test_received_messages_are_on_disk_before_a_type_is_imported(loop, monkeypatch):
@@ -263,11 +234,3 @@ def test_messages_sent_before_the_recorder_connected_are_reported_as_lost(loop, 
     assert [(event.kind, event.text) for event in bag.events] == [
         ('lost', f'/joint_states: {lost}')
     ]
-
-
-def test_existing_folder_and_invalid_parameter_are_rejected(loop, tmp_path):
-    with pytest.raises(ConfigurationError, match='compression'):
-        loop(compression='zip')
-    (tmp_path / 'bag').mkdir()
-    with pytest.raises(BagError, match='bag exists already'):
-        loop()

@@ -49,7 +49,10 @@ def write(path, compression='none'):
 def chunks(data):
     """Start and end of each chunk of an intact file."""
     indexes = make_reader(BytesIO(data)).get_summary().chunk_indexes
-    return [(one.chunk_start_offset, one.chunk_start_offset + one.chunk_length) for one in indexes]
+    return [
+        (index.chunk_start_offset, index.chunk_start_offset + index.chunk_length)
+        for index in indexes
+    ]
 
 
 @pytest.fixture(scope='module', params=['none', 'zstd'])
@@ -178,8 +181,6 @@ def test_intact_bag_has_no_losses_and_is_not_modified(whole, tmp_path, capsys):
     assert 'none of the recorded messages was lost' in capsys.readouterr().out
     assert read(tmp_path / 'clean') == read(whole.parent)
     assert whole.read_bytes() == before
-    with pytest.raises(BagError, match='exists already'):
-        recover(whole.parent, tmp_path / 'clean')
 
 
 def test_files_of_a_split_bag_are_recovered_together(plain, tmp_path):
@@ -208,11 +209,7 @@ def test_bag_from_rosbags_writer_is_recovered(tmp_path, mode):
     assert read(recovery.path) == expected
 
 
-def test_nothing_to_recover_is_an_error_or_an_exit_code(plain, tmp_path, capsys):
-    with pytest.raises(BagError, match='there is no MCAP file'):
-        recover(tmp_path, tmp_path / 'clean')
-    assert main(['recover', str(tmp_path / 'nowhere')]) == 1
-    assert capsys.readouterr().err.startswith('blf_dsc recover: ')
+def test_nothing_to_recover_is_an_exit_code(plain, tmp_path, capsys):
     for k, data in enumerate([b'', plain.read_bytes()[: chunks(plain.read_bytes())[0][0]]]):
         assert main(['recover', str(damaged(tmp_path / f'{k}', data))]) == 1
         assert 'ALL LOST' in capsys.readouterr().out
