@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from struct import Struct
@@ -21,12 +20,10 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.stream_reader import get_chunk_data_stream
-from rosbags.interfaces import QosDurability
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader
 
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.messages.topics import HISTORY, STREAM, Quality
 from blf_dsc_controller.messages.types import typestore
 
 METADATA = 'metadata.yaml'
@@ -78,8 +75,6 @@ class OpenBag:
     Attributes:
         held: name and type, empty where unknown, of each topic.
         counts: number of messages of each topic.
-        offered: quality of service to publish each topic with.
-        times: of the first message and after the last [ns].
         facts: what a recorder of this package noted about the run; complete once all is read.
     """
 
@@ -91,47 +86,45 @@ class OpenBag:
         self.counts: Counter[str] = Counter()
         for each in every:
             self.counts[each.topic] += each.msgcount
-        self.offered = {each.topic: _quality(each.ext) for each in every}
-        self.times: tuple[int, int] = reader.start_time, reader.end_time
         self.facts: dict[str, str] = {}
         if isinstance(reader, Reader) and reader.compression_mode != 'message':
             storage: Any = reader.storage
             parts: list[Any] = storage.storages if path.is_dir() else [storage]
             self._files = [part.path for part in parts if part.path.suffix == '.mcap']
 
-    def messages(self, topics: Collection[str], start: int = 0) -> Messages:
-        """Yield the messages of `topics` from `start` [ns] on, nearly in order of reception.
+    def messages(self, topics: Collection[str]) -> Messages:
+        """Yield the messages of `topics`, nearly in order of reception.
 
         Raises:
             DamageError: their number is not the one that the bag states.
         """
         found: Counter[str] = Counter()
-        yield from (self._of_files if self._files else self._of_library)(topics, start, found)
-        for topic in (found | self.counts if self._files else topics) if start == 0 else ():
+        yield from (self._of_files if self._files else self._of_library)(topics, found)
+        for topic in found | self.counts if self._files else topics:
             if found[topic] != self.counts[topic]:
                 raise DamageError(
                     f'it holds {found[topic]} messages of {topic}, but counts {self.counts[topic]}'
                 )
 
-    def _of_files(self, topics: Collection[str], start: int, found: Counter[str]) -> Messages:
+    def _of_files(self, topics: Collection[str], found: Counter[str]) -> Messages:
         for path in self._files:
             names: dict[int, str] = {}
             with path.open('rb') as stream:
-                for record in _records(stream, start):
+                for record in _records(stream):
                     if isinstance(record, tuple):
                         number, sequence, received, _, raw = record
                         topic = names[number]
                         found[topic] += 1
-                        if topic in topics and received >= start:
+                        if topic in topics:
                             yield BagMessage(topic, received, raw, sequence)
                     elif isinstance(record, Channel):
                         names[record.id] = record.topic
                     elif isinstance(record, Metadata) and record.name == RECORD:
                         self.facts |= record.metadata
 
-    def _of_library(self, topics: Collection[str], start: int, found: Counter[str]) -> Messages:
+    def _of_library(self, topics: Collection[str], found: Counter[str]) -> Messages:
         chosen = [each for each in self._reader.connections if each.topic in topics]
-        for each, received, raw in self._reader.messages(chosen, start or None) if chosen else ():
+        for each, received, raw in self._reader.messages(chosen) if chosen else ():
             found[each.topic] += 1
             if isinstance(self._reader, Ros1Reader):
                 # ROS 1 and 2 serialise the common types alike, except for padding and `seq`.
@@ -139,8 +132,8 @@ class OpenBag:
             yield BagMessage(each.topic, received, bytes(raw))
 
 
-def _records(stream: BinaryIO, start: int) -> Iterator[StoredMessage | Schema | Channel | Metadata]:
-    """Yield the records of a file, without chunks that end before `start` [ns]."""
+def _records(stream: BinaryIO) -> Iterator[StoredMessage | Schema | Channel | Metadata]:
+    """Yield the records of a file."""
     stream.seek(MAGIC_SIZE)
     while len(head := stream.read(HEAD.size)) == HEAD.size:
         opcode, length = HEAD.unpack(head)
@@ -150,10 +143,10 @@ def _records(stream: BinaryIO, start: int) -> Iterator[StoredMessage | Schema | 
             stream.seek(length, 1)
         else:
             record = _KINDS[opcode].read(ReadDataStream(BytesIO(stream.read(length))))
-            if not isinstance(record, Chunk):
-                yield record
-            elif record.message_end_time >= start:
+            if isinstance(record, Chunk):
                 yield from records_in(record)
+            else:
+                yield record
 
 
 def records_in(chunk: Chunk) -> Iterator[StoredMessage | Schema | Channel]:
@@ -182,15 +175,6 @@ def message_of(content: bytes) -> StoredMessage:
     """Return a message from the content of its record; struct.error if that is too short."""
     number, sequence, received, published = _MESSAGE.unpack_from(content)
     return number, sequence, received, published, content[_MESSAGE.size :]
-
-
-def _quality(ext: Any) -> Quality:
-    """Return a reliable quality of service, latched as deep as the recorded publishers were."""
-    offered: Any = getattr(ext, 'offered_qos_profiles', ())
-    latched = [each.depth for each in offered if each.durability is QosDurability.TRANSIENT_LOCAL]
-    if bool(latched) or bool(getattr(ext, 'latching', 0)):
-        return replace(HISTORY, depth=max(latched, default=0) or HISTORY.depth)
-    return STREAM
 
 
 @contextmanager
