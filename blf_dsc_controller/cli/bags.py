@@ -14,9 +14,11 @@ import numpy as np
 from blf_dsc_controller.bags import recover as recovering
 from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.reader import RecordedRun, recorded_run
+from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import make_room, require_ros
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.journal import EventType
 
 if TYPE_CHECKING:
@@ -28,6 +30,8 @@ DIFFERENT = 3
 
 PARTIAL = 4
 """Exit code if all compared outputs are equal, but some outputs could not be compared."""
+
+_DISCOVERY = 1.0  # s, until subscribers have found the publishers
 
 
 def report(options: Namespace) -> None:
@@ -100,6 +104,9 @@ def recover(options: Namespace) -> int:
 
 def replay(options: Namespace) -> int:
     """Replay a bag in the mode selected by the options, and print the result."""
+    if options.play:
+        play(options)
+        return 0
     config = None
     if options.config is not None:
         config = load(locate(options.config), CONTROLLER, ControllerConfig)
@@ -121,6 +128,33 @@ def replay(options: Namespace) -> int:
     _print_speed(run.stamp.size, run.duration, time.perf_counter() - begin)
     print('\n'.join(_open_loop(found, config)))
     return 0
+
+
+def play(options: Namespace) -> None:
+    """Publish the messages of a bag until its end, or Ctrl-C."""
+    if not 0.0 <= options.rate < np.inf:
+        raise BlfDscError(f'--rate {options.rate:g}: expected a speed, or 0: as fast as possible')
+    if options.map or options.namespace or options.config:
+        raise BlfDscError('--play publishes the bag as it is: no --map, --namespace or --config')
+    require_ros()
+    import rclpy
+
+    from blf_dsc_controller.nodes.player_node import PlayerNode
+    from blf_dsc_controller.nodes.process import drain
+
+    rclpy.init(args=[], signal_handler_options=rclpy.SignalHandlerOptions.NO)
+    try:
+        with open_bag(options.bag) as bag:
+            node = PlayerNode(bag, options.topics, clock=options.clock)
+            seconds = (bag.times[1] - bag.times[0]) * 1e-9
+            print(f'playing {seconds:.3f} s: {", ".join(node.outputs)}', flush=True)
+            time.sleep(_DISCOVERY)
+            node.play(options.rate)
+            drain(node.outputs.values())
+    except KeyboardInterrupt:
+        pass
+    finally:
+        rclpy.try_shutdown()
 
 
 def _left_out(count: int) -> Iterator[str]:

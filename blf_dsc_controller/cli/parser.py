@@ -233,6 +233,11 @@ def _replay_options(parser: argparse.ArgumentParser) -> None:
     )
     _map(parser)
     _namespace(parser)
+    option = parser.add_argument_group('playing over ROS').add_argument
+    option('--play', action='store_true', help='publish the recorded topics')
+    option('--rate', type=float, default=1.0, help='speed; 0: as fast as possible (1)')
+    option('--topics', nargs='+', default=[], metavar='TOPIC', help='topics to play (all)')
+    option('--clock', action='store_true', help="publish the bag's time on /clock")
 
 
 def _excite_options(parser: argparse.ArgumentParser) -> None:
