@@ -20,6 +20,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.stream_reader import get_chunk_data_stream
+from rosbags.interfaces import QosDurability
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader
 
@@ -75,6 +76,8 @@ class OpenBag:
     Attributes:
         held: name and type, empty where unknown, of each topic.
         counts: number of messages of each topic.
+        latched: topics whose publishers keep messages for late subscribers.
+        times: of the first message and after the last [ns].
         facts: what a recorder of this package noted about the run; complete once all is read.
     """
 
@@ -86,6 +89,8 @@ class OpenBag:
         self.counts: Counter[str] = Counter()
         for each in every:
             self.counts[each.topic] += each.msgcount
+        self.latched = {each.topic for each in every if _is_latched(each.ext)}
+        self.times: tuple[int, int] = reader.start_time, reader.end_time
         self.facts: dict[str, str] = {}
         if isinstance(reader, Reader) and reader.compression_mode != 'message':
             storage: Any = reader.storage
@@ -175,6 +180,12 @@ def message_of(content: bytes) -> StoredMessage:
     """Return a message from the content of its record; struct.error if that is too short."""
     number, sequence, received, published = _MESSAGE.unpack_from(content)
     return number, sequence, received, published, content[_MESSAGE.size :]
+
+
+def _is_latched(ext: Any) -> bool:
+    offered: Any = getattr(ext, 'offered_qos_profiles', ())
+    kept = any(each.durability is QosDurability.TRANSIENT_LOCAL for each in offered)
+    return kept or bool(getattr(ext, 'latching', 0))
 
 
 @contextmanager

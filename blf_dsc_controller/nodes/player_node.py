@@ -13,7 +13,7 @@ from rclpy.publisher import Publisher
 
 from blf_dsc_controller.bags.sources import BagError, OpenBag
 from blf_dsc_controller.messages.codecs import encode_clock
-from blf_dsc_controller.messages.topics import CLOCK
+from blf_dsc_controller.messages.topics import CLOCK, HISTORY, STREAM
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 
 _CLOCK_PERIOD = 0.01  # s
@@ -64,7 +64,7 @@ class PlayerNode(Node):
 
     def _add(self, name: str, type_: str) -> None:
         try:
-            profile = qos_profile(self._bag.offered[name])
+            profile = qos_profile(HISTORY if name in self._bag.latched else STREAM)
             self.outputs[name] = self.create_publisher(message_class(type_), name, profile)
         except (ImportError, AttributeError):
             self.get_logger().warning(f'{name} is not played: {type_} is not installed here')
