@@ -109,105 +109,58 @@ LINK7 = PANDA_TEXT[PANDA_TEXT.index('<link name="panda_link7">') :]
 LINK7_INERTIAL = LINK7[LINK7.index('<inertial>') : LINK7.index('</inertial>')] + '</inertial>'
 WEIGHTLESS = changed(LINK7_INERTIAL, '').replace('<mass value="0.73" />', '<mass value="0" />')
 
-WRONG = {
-    'xacro that was not expanded': (
-        {'text': changed('<link name="panda_link8" />', '<link name="${name}_link8" />')},
-        'xacro FILE > robot.urdf',
-    ),
-    'xacro without its namespace': (
-        {'text': changed('<link name="panda_link8" />', '<xacro:hand />')},
-        'xacro FILE > robot.urdf',
-    ),
-    'a file that is no XML': ({'text': 'l1: 1.0'}, 'not a URDF, as it is not valid XML'),
-    'an SDF': ({'text': '<sdf />'}, 'is <robot>, not <sdf>'),
-    'an unknown tip': ({'tip': 'tool'}, "no link 'tool' for the tip: the links are panda_link0, "),
-    'an unknown base': ({'base': 'world'}, "no link 'world' for the base"),
-    'a tip that the base does not carry': (
-        {'base': 'panda_leftfinger', 'tip': 'panda_rightfinger'},
-        "ends at 'panda_link0' without reaching",
-    ),
-    'an unknown joint': (
+FIRST_JOINT = '"panda_joint1" type="revolute"'
+AXIS, MASS, LINK8 = '<axis xyz="0 0 1" />', '<mass value="0.73" />', '<link name="panda_link8" />'
+WRONG_TEXTS = (  # what is replaced, by what, and the remedy
+    (LINK8, '<link name="${name}_link8" />', 'xacro FILE > robot.urdf'),
+    (LINK8, '<xacro:hand />', 'xacro FILE > robot.urdf'),
+    (PANDA_TEXT, 'l1: 1.0', 'not a URDF, as it is not valid XML'),
+    (PANDA_TEXT, '<sdf />', 'is <robot>, not <sdf>'),
+    (AXIS, f'<mimic joint="j" />{AXIS}', "'panda_joint1' mimics"),
+    (FIRST_JOINT, FIRST_JOINT.replace('revolute', 'floating'), 'expected fixed, revolute'),
+    ('finger_joint1" type="prismatic"', 'finger_joint1" type="floating"', "on 'panda_hand' is fl"),
+    ('effort="87"', 'effort="-87"', 'has <limit effort="-87">: it is a magnitude, so give 87'),
+    ('velocity="2.175"', 'velocity="-2"', 'so give 2'),
+    (MASS, '<mass value="-0.73" />', "link 'panda_hand' has a mass of -0.73 kg"),
+    ('izz="0.0017"', 'izz="-0.0017"', 'none can be negative'),
+    (AXIS, '<axis xyz="0 0 0" />', 'is zero'),
+    ('upper="2.8973"', 'upper="-3"', 'empty range, -2.8973 to -3'),
+    (MASS, '<mass value="heavy" />', '<mass value="heavy">: expected 1 finite number'),
+    (AXIS, '<axis xyz="0 1" />', 'expected 3 finite number'),
+    (LINK8, '<link name="panda_link7" />', 'each link needs a unique name'),
+    (LINK8, '', "has the child 'panda_link8', but the links are"),
+    ('child link="panda_right', 'child link="panda_left', "'panda_leftfinger' is the child of two"),
+)
+WRONG_CHAINS = (
+    ({'tip': 'tool'}, "no link 'tool' for the tip: the links are panda_link0, "),
+    ({'base': 'world'}, "no link 'world' for the base"),
+    ({'base': 'panda_leftfinger', 'tip': 'panda_rightfinger'}, "ends at 'panda_link0' without rea"),
+    (
         {'joints': ('elbow', *PANDA[1:])},
-        "no joint 'elbow' in the URDF: its joints are panda_joint1, ",
+        "no joint 'elbow' in the URDF: its joints are",
     ),
-    'the wrong order': ({'joints': PANDA[::-1]}, 'panda_joint7, in this order; got panda_joint7'),
-    'a joint left out': ({'joints': PANDA[:6]}, 'panda_joint7, in this order'),
-    'a joint of another branch': (
-        {'joints': (*PANDA, 'panda_finger_joint1')},
-        'choose another base or tip',
-    ),
-    'no joint at all': ({'base': 'panda_hand', 'joints': ()}, 'are none'),
-    'a joint that mimics': (
-        {'text': changed('<axis xyz="0 0 1" />', '<mimic joint="j" /><axis xyz="0 0 1" />', 1)},
-        "'panda_joint1' mimics",
-    ),
-    'a floating joint': (
-        {'text': changed('"panda_joint1" type="revolute"', '"panda_joint1" type="floating"')},
-        "'panda_joint1' is floating; expected fixed, revolute",
-    ),
-    'a floating load': (
-        {'text': changed('finger_joint1" type="prismatic"', 'finger_joint1" type="floating"')},
-        "on 'panda_hand' is floating",
-    ),
-    'no mass': (
-        {
-            'text': WEIGHTLESS.replace('<mass value="0.015" />', '<mass value="0" />'),
-        },
+    ({'joints': PANDA[::-1]}, 'panda_joint7, in this order; got panda_joint7'),
+    ({'joints': PANDA[:6]}, 'panda_joint7, in this order'),
+    ({'joints': (*PANDA, 'panda_finger_joint1')}, 'choose another base or tip'),
+    ({'base': 'panda_hand', 'joints': ()}, 'are none'),
+    (
+        {'text': WEIGHTLESS.replace('<mass value="0.015" />', '<mass value="0" />')},
         'nor has anything fixed to them: panda_link7 (moved by panda_joint7): add',
     ),
-    'no <inertial> at all': (
+    (
         {'text': re.sub('<inertial>.*?</inertial>', '', PANDA_TEXT, flags=re.DOTALL)},
         'panda_link1 (moved by panda_joint1), panda_link2 (moved by panda_joint2), ',
     ),
-    'a negative effort': (
-        {'text': changed('effort="87"', 'effort="-87"')},
-        '\'panda_joint1\' has <limit effort="-87">: it is a magnitude, so give 87',
-    ),
-    'a negative velocity': ({'text': changed('velocity="2.175"', 'velocity="-2"')}, 'so give 2'),
-    'a negative mass': (
-        {'text': changed('<mass value="0.73" />', '<mass value="-0.73" />')},
-        "link 'panda_hand' has a mass of -0.73 kg",
-    ),
-    'a negative moment of inertia': (
-        {'text': changed('izz="0.0017"', 'izz="-0.0017"')},
-        'none can be negative',
-    ),
-    'no axis': ({'text': changed('<axis xyz="0 0 1" />', '<axis xyz="0 0 0" />')}, 'is zero'),
-    'no range': ({'text': changed('upper="2.8973"', 'upper="-3"')}, 'empty range, -2.8973 to -3'),
-    'a word as a number': (
-        {'text': changed('<mass value="0.73" />', '<mass value="heavy" />')},
-        '<mass value="heavy">: expected 1 finite number',
-    ),
-    'an axis of two numbers': (
-        {'text': changed('<axis xyz="0 0 1" />', '<axis xyz="0 1" />')},
-        'expected 3 finite number',
-    ),
-    'two links of a name': (
-        {'text': changed('<link name="panda_link8" />', '<link name="panda_link7" />')},
-        'each link needs a unique name',
-    ),
-    'a link that is not there': (
-        {'text': changed('<link name="panda_link8" />', '')},
-        "has the child 'panda_link8', but the links are",
-    ),
-    'a closed chain': (
-        {
-            'text': changed(
-                '<child link="panda_rightfinger" />', '<child link="panda_leftfinger" />'
-            )
-        },
-        "'panda_leftfinger' is the child of two joints",
-    ),
-}
+)
 
 
-@pytest.mark.parametrize('case', WRONG)
-def test_unusable_urdf_is_rejected_with_a_remedy(case):
-    changes, message = WRONG[case]
-    arguments = {'text': PANDA_TEXT, 'base': 'panda_link0', 'tip': 'panda_hand_tcp'}
-    with pytest.raises(UrdfError) as caught:
-        read_chain(**{**arguments, 'joints': PANDA, **changes})
-    assert message in str(caught.value)
+def test_unusable_urdf_is_rejected_with_a_remedy():
+    cases = [({'text': changed(old, new, 1)}, message) for old, new, message in WRONG_TEXTS]
+    arm = {'text': PANDA_TEXT, 'base': 'panda_link0', 'tip': 'panda_hand_tcp', 'joints': PANDA}
+    for changes, message in (*cases, *WRONG_CHAINS):
+        with pytest.raises(UrdfError) as caught:
+            read_chain(**arm | changes)
+        assert message in str(caught.value)
 
 
 def test_moments_below_zero_by_rounding_are_accepted():

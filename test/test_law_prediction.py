@@ -78,17 +78,6 @@ def test_filtered_identity_holds_up_to_the_square_of_the_sample_time():
     assert error[-1] < 1e-6 / 12.0 * 500.0
 
 
-def test_bias_column_absorbs_a_constant_disturbance():
-    rows = filtered_rows(1e-3)
-    X, u = rows[:, :, :-1].reshape(-1, 5), rows[:, :, -1].ravel()
-
-    with_columns = np.linalg.lstsq(X, u)[0]
-    without = np.linalg.lstsq(X[:, :3], u)[0]
-
-    np.testing.assert_allclose(with_columns, [*P, *BIAS], atol=2e-6)  # the trapezoid's error
-    assert np.abs(without - P).max() > 0.01
-
-
 def identity_error(torque_source):
     """Largest error of X theta = u while the actuator is three samples late."""
     law = controller(quick(torque_source=torque_source))
