@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import array
+import math
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -107,57 +108,34 @@ def test_unknown_name_suggests_the_closest():
     ('given', 'message'),
     [
         # ROS does not accept an integer for a double, nor does a run without ROS.
-        ({'speed': 1}, 'speed: got 1, but a double is expected: write 1.0 instead of 1'),
-        (
-            {'motor.gain': [1, 2]},
-            'motor.gain: got [1, 2], but a double array is expected: write 1.0 instead of 1',
-        ),
-        (
-            {'speed': '1.0'},
-            "speed: got '1.0', but a double is expected: write a number, without quotes",
-        ),
-        ({'speed': True}, 'speed: got true, but a double is expected'),
-        ({'steps': True}, 'steps: got true, but an integer is expected'),
-        ({'steps': 2.0}, 'steps: got 2.0, but an integer is expected'),
-        ({'armed': 1}, 'armed: got 1, but a bool is expected'),
-        ({'mode': 3}, "mode: got 3, but a string is expected: write '3' in quotes"),
-        ({'speed': None}, 'speed: got nothing, but a double is expected'),
-        (
-            {'motor.gain': 1.0},
-            'motor.gain: got 1.0, but a double array is expected: write a list, like [1.0, 2.0]',
-        ),
-        ({'axes': 'xy'}, "axes: got 'xy', but a string array is expected: write a list, like"),
-        ({'axes': ['x', 1]}, "axes: got ['x', 1], but a string array is expected: write '1' in"),
+        ({'speed': 1}, 'got 1, but a double is expected: write 1.0 instead of 1'),
+        ({'motor.gain': [1, 2]}, 'got [1, 2], but a double array is expected: write 1.0 instead'),
+        ({'speed': '1.0'}, "got '1.0', but a double is expected: write a number, without quotes"),
+        ({'speed': True}, 'got true, but a double is expected'),
+        ({'steps': True}, 'got true, but an integer is expected'),
+        ({'steps': 2.0}, 'got 2.0, but an integer is expected'),
+        ({'armed': 1}, 'got 1, but a bool is expected'),
+        ({'mode': 3}, "got 3, but a string is expected: write '3' in quotes"),
+        ({'speed': None}, 'got nothing, but a double is expected'),
+        ({'motor.gain': 1.0}, 'got 1.0, but a double array is expected: write a list, like [1.0'),
+        ({'axes': 'xy'}, "got 'xy', but a string array is expected: write a list, like"),
+        ({'axes': ['x', 1]}, "got ['x', 1], but a string array is expected: write '1' in"),
+        ({'speed': 0.0}, 'got 0.0, but it must be above 0 and below 10 m/s'),
+        ({'speed': 10.0}, 'got 10.0, but it must be above 0 and below 10 m/s'),
+        ({'steps': 0}, 'got 0, but it must be at least 1 and at most 5'),
+        ({'steps': 6}, 'got 6, but it must be at least 1 and at most 5'),
+        ({'mode': 'medium'}, "got 'medium', but it must be one of slow, fast"),
+        ({'motor.gain': [1.0, -0.5]}, 'got -0.5 at entry 2 of [1.0, -0.5], but it must be at le'),
+        ({'speed': float('nan')}, 'got nan, but a finite number is needed'),
+        ({'speed': float('inf')}, 'got inf, but a finite number is needed'),
+        ({'motor.gain': [-math.inf, 1.0]}, 'got -inf at entry 1 of [-inf, 1.0], but a finite'),
+        ({'axes': []}, 'got an empty list, but at least one entry is needed'),
     ],
 )
-def test_wrong_type_error_gives_the_value_and_the_remedy(given, message):
+def test_wrong_type_or_value_error_gives_the_value_and_the_remedy(given, message):
+    (name,) = given
     (problem,) = refused(given)
-    assert problem.startswith(message)
-
-
-@pytest.mark.parametrize(
-    ('given', 'message'),
-    [
-        ({'speed': 0.0}, 'speed: got 0.0, but it must be above 0 and below 10 m/s'),
-        ({'speed': 10.0}, 'speed: got 10.0, but it must be above 0 and below 10 m/s'),
-        ({'steps': 0}, 'steps: got 0, but it must be at least 1 and at most 5'),
-        ({'steps': 6}, 'steps: got 6, but it must be at least 1 and at most 5'),
-        ({'mode': 'medium'}, "mode: got 'medium', but it must be one of slow, fast"),
-        (
-            {'motor.gain': [1.0, -0.5]},
-            'motor.gain: got -0.5 at entry 2 of [1.0, -0.5], but it must be at least 0 N m',
-        ),
-        ({'speed': float('nan')}, 'speed: got nan, but a finite number is needed'),
-        ({'speed': float('inf')}, 'speed: got inf, but a finite number is needed'),
-        (
-            {'motor.gain': [float('-inf'), 1.0]},
-            'motor.gain: got -inf at entry 1 of [-inf, 1.0], but a finite number is needed',
-        ),
-        ({'axes': []}, 'axes: got an empty list, but at least one entry is needed'),
-    ],
-)
-def test_out_of_range_error_gives_the_range(given, message):
-    assert refused(given) == [message]
+    assert problem.startswith(f'{name}: {message}')
 
 
 def test_inclusive_limits_are_accepted():
@@ -197,6 +175,9 @@ def test_change_keeps_other_values_and_validates_the_result():
 
 
 DEFAULTS = LoopConfig(PlantConfig(), ControllerConfig(), RecorderConfig())
+
+
+TRUE_MODEL = {'law': 'model_based', 'truth.parameters': [1.0, 0.32, 0.4]}
 
 
 def problems_of(cls, given):
@@ -261,10 +242,7 @@ def test_joint_names_are_unique_and_the_arm_has_two(cls):
         ({'barrier.bound': [0.002, 0.0]}, 'barrier.bound: got 0.0 at entry 2'),
         ({'barrier.bound': [0.002]}, 'barrier.bound: got 1 entry, but 2 are needed (2 of joints)'),
         ({'feedback.gain': [-60.0, 20.0]}, 'feedback.gain: got -60.0 at entry 1'),
-        (
-            {'feedback.boundary_layer': 0.0},
-            'feedback.boundary_layer: got 0.0, but it must be above',
-        ),
+        ({'feedback.boundary_layer': 0.0}, 'feedback.boundary_layer: got 0.0, but it must be ab'),
         (
             {'reference.frequency': [1.0, 2.0], 'reference.phase': [0.0, 0.0]},
             'reference.amplitude: got 2 entries, but 4 are needed (2 of joints times 2 of ref',
@@ -280,27 +258,15 @@ def test_joint_names_are_unique_and_the_arm_has_two(cls):
             {'learning.initial_estimate': [3.0, 0.0, 4.0], 'learning.radius': 5.0},
             'learning.radius: got 5 kg m^2, but learning.initial_estimate has a norm of 5 kg',
         ),
-        (
-            {'law': 'model_based', 'truth.parameters': [1.0, 0.32, 0.4], 'learning.radius': 1.1},
-            'learning.radius: got 1.1 kg m^2, but truth.parameters have a norm of 1.12357 kg',
-        ),
-        (
-            {'learning.window': 0.009},
-            'learning.window: got 0.009 s, which is 9 samples of 0.001 s: between 10 and',
-        ),
+        (TRUE_MODEL | {'learning.radius': 1.1}, 'learning.radius: got 1.1 kg m^2, but truth.para'),
+        ({'learning.window': 0.009}, 'learning.window: got 0.009 s, which is 9 samples of 0.001'),
         ({'learning.window': 1000.001}, 'learning.window: got 1000 s, which is 1000001 samples'),
-        (
-            {'barrier.weight': [1000.0, 2e4]},
-            'barrier.slope_limit: got 20000 N m/rad for joint2, but it must be above barrier.w',
-        ),
+        ({'barrier.weight': [1e3, 2e4]}, 'barrier.slope_limit: got 20000 N m/rad for joint2, but'),
         (
             {'barrier.initial_bound': [0.003, 0.001], 'barrier.funnel_rate': 1.0},
             'barrier.initial_bound: got 0.001 rad for joint2, but it must be 0 (no funnel) or at',
         ),
-        (
-            {'truth.parameters': [1.0, 0.32]},
-            'truth.parameters: got 2 entries, but model two_link has 3 parameters',
-        ),
+        ({'truth.parameters': [1.0, 0.32]}, 'truth.parameters: got 2 entries, but model two_lin'),
         ({'barier.bound': [1.0, 1.0]}, 'barier.bound: unknown parameter, did you '),
     ],
 )
