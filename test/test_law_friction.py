@@ -70,3 +70,16 @@ def test_friction_is_not_forgotten_at_rest():
     law.state.latched[0] = 0.0
     friction.measure_flips(law.settings, law.state, 0.001)
     assert law.state.since_latch[0] == 0.0
+
+
+def test_other_friction_is_learned_within_some_reversals():
+    """However long the arm has moved before."""
+    law = controller_of(configured('recommended', 1.0, {'learning.coulomb': True}).controller)
+    settings, state = law.settings, law.state
+    state.latched[0] = 1.0
+    column = friction.first_coulomb(settings)
+    for k in range(30_000):
+        sign, coulomb = (-1.0) ** (k // 300), 1.0 if k < 24_000 else 2.0  # N m
+        state.filter2[0, column], state.filter2[0, -1] = sign, coulomb * sign
+        friction.measure_flips(settings, state, 0.001)
+    assert state.flip_sums[0, 0] / state.flip_sums[1, 0] == pytest.approx(2.0, abs=0.1)
