@@ -200,10 +200,10 @@ def come(sample: float, at: float, ramp: float) -> float:
 
 
 @inner
-def add(total: np.ndarray, fraction: float, one: np.ndarray) -> None:
+def add(total: np.ndarray, fraction: float, vector: np.ndarray) -> None:
     """Add a fraction of one vector to another."""
     for i in range(total.size):
-        total[i] += fraction * one[i]
+        total[i] += fraction * vector[i]
 
 
 @inner

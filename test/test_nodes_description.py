@@ -49,7 +49,7 @@ def test_topic_is_in_the_namespace_of_the_node_unless_it_begins_with_a_slash(ros
     ('publishers', 'hint'), [(0, 'nobody publishes there'), (1, 'may not be latched')]
 )
 def test_missing_urdf_is_reported_with_a_hint(ros, monkeypatch, publishers, hint):
-    monkeypatch.setattr(parameters, 'TIMEOUT', 1.0)
+    monkeypatch.setattr(parameters, 'TIMEOUT', 1)
     if publishers:
         publish(ros, 'robot_description', Quality(1, 'reliable', 'volatile'))
         ros.until(lambda: ros.tester.count_publishers('/robot_description') == 1)

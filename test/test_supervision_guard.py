@@ -170,7 +170,7 @@ def test_load_is_bounded_and_left_as_it_is_while_brakes_hold_the_arm():
     measurement = np.concatenate((Q, np.zeros(4)))
     ramp.last.take(1, measurement)
     for k in range(2, 300):
-        ramp.last.salvage(k * MILLISECOND, measurement, 50.0, 1e-3)
+        ramp.last.take_usable(k * MILLISECOND, measurement, 50.0, 1e-3)
         torque = ramp.advance(safety, settings(), 0.1 * P, 1e-3)
     load = [10.0, -2.0]  # half of the limit of 20 N m
     np.testing.assert_allclose(ramp.load, load, atol=0.1)  # the first torque before it was zero

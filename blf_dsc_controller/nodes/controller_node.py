@@ -349,8 +349,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if self.guard is None or self._load is None:
             return []
         remedy = '; to use it anyway, start the node with it'
-        doubts = [text + remedy for text in worsened(self.config, config, self._load)]
-        return self.guard.problems(config) + doubts
+        warnings = [text + remedy for text in worsened(self.config, config, self._load)]
+        return self.guard.problems(config) + warnings
 
     def _retune(self, config: ControllerConfig) -> None:
         self.config, guard = config, self.guard
@@ -376,7 +376,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if guard is not None and guard.watchdog.why_off and guard.start_stamp != self._warned_at:
             self._warned_at = guard.start_stamp
             found = self.get_publishers_info_by_topic(topics.JOINT_STATES.relative)
-            if any(one.node_name != topics.PLANT for one in found):  # the plant waits in lock-step
+            if any(each.node_name != topics.PLANT for each in found):  # which waits in lock-step
                 self.get_logger().warning(guard.watchdog.why_off)
 
     def _log_phase(self, guard: Guard) -> None:

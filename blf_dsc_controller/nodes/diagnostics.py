@@ -103,17 +103,17 @@ class ControllerStatus:
         """Whether there are events or a state to publish."""
         return bool(guard.journal.pending) or guard.supervisor.revision != self._revision
 
-    def report(self, life: str, guard: Guard | None, others: int) -> None:
+    def report(self, lifecycle: str, guard: Guard | None, others: int) -> None:
         """Publish diagnostics, new events and, if it has changed, the state.
 
         Args:
-            life: lifecycle state of the node.
+            lifecycle: state of the node.
             guard: None while the node is not configured.
             others: other publishers of torques.
         """
         if guard is not None:
             self.publish_events(guard)
-        state = self._state(life, guard)
+        state = self._state(lifecycle, guard)
         parts = [state]
         if guard is not None:
             parts += [self._loop(guard, others), self._learning(guard)]
@@ -121,9 +121,9 @@ class ControllerStatus:
                 parts.append(self._load(guard))
         self._diagnostics.publish(parts)
         stops = guard.supervisor.stops if guard else 0
-        if (state.message, life, stops) != self._published:
+        if (state.message, lifecycle, stops) != self._published:
             self._diagnostics.publish_state(state)
-            self._published = (state.message, life, stops)
+            self._published = (state.message, lifecycle, stops)
         self._revision = guard.supervisor.revision if guard else -1
 
     def publish_events(self, guard: Guard) -> None:
@@ -131,11 +131,11 @@ class ControllerStatus:
         while guard.journal.pending:
             self.journal.publish(guard.journal.pending.popleft().encode())
 
-    def _state(self, life: str, guard: Guard | None) -> DiagnosticStatus:
+    def _state(self, lifecycle: str, guard: Guard | None) -> DiagnosticStatus:
         supervisor = guard.supervisor if guard else Supervisor()
         level, message = _PHASES[supervisor.phase]
         values: dict[str, Any] = {PHASE: supervisor.phase, REASON: supervisor.reason}
-        values['lifecycle'] = life
+        values['lifecycle'] = lifecycle
         if guard is None:
             message = 'not configured'
         else:
@@ -197,9 +197,9 @@ class ControllerStatus:
             values['last model change'] = (
                 f'{state.change_time[0]:.3f} s after the start, by {residual:.3g} N m'
             )
-        values |= {f'{REJECTED}{one.column}': f'{one}' for one in self.rejected}
+        values |= {f'{REJECTED}{rejected.column}': f'{rejected}' for rejected in self.rejected}
         if self.rejected:
-            columns = ', '.join(one.column for one in self.rejected)
+            columns = ', '.join(rejected.column for rejected in self.rejected)
             return self._diagnostics.status('learning', WARN, f'not estimated: {columns}', values)
         return self._diagnostics.status('learning', OK, learning, values)
 

@@ -1,32 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Configurations as parameters: declared, read, changed at run time, and those of other nodes.
-
-The clients that read other nodes' parameters belong to a node that no executor spins, and the
-owner polls for responses: the EventsExecutor of these releases crashes when clients are created
-and destroyed.
-"""
+"""Configurations as parameters: declared, read, changed at run time, and those of other nodes."""
 
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
     ParameterDescriptor,
-    ParameterType,
     SetParametersResult,
 )
-from rcl_interfaces.srv import GetParameters, ListParameters
-from rclpy.client import Client
+from rcl_interfaces.srv import GetParameters
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.parameter import parameter_value_to_python
-from rclpy.serialization import deserialize_message
+from rclpy.wait_for_message import wait_for_message
 from std_msgs.msg import String
 
 from blf_dsc_controller.configuration.nodes import is_builtin, known_names
@@ -42,11 +34,8 @@ from blf_dsc_controller.configuration.schema import (
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages.topics import ROBOT_DESCRIPTION
 from blf_dsc_controller.nodes import process
-from blf_dsc_controller.nodes.endpoints import RawSubscriptions, parameter_overrides, take_response
+from blf_dsc_controller.nodes.endpoints import parameter_overrides, qos_profile
 from blf_dsc_controller.nodes.process import assigned, check_sections
-
-if TYPE_CHECKING:
-    from rclpy.node import Node
 
 Config = TypeVar('Config')
 
@@ -63,8 +52,8 @@ class FixedParameterError(ParameterNotDeclaredException):
     own exception on to `ros2 param set`.
     """
 
-    def __init__(self, one: Parameter) -> None:
-        Exception.__init__(self, f'{one.name} is {_fixed(one)}')
+    def __init__(self, parameter: Parameter) -> None:
+        Exception.__init__(self, f'{parameter.name} is {_fixed(parameter)}')
 
 
 def declare(node: Node, cls: type[Config]) -> Config:
@@ -78,14 +67,15 @@ def declare(node: Node, cls: type[Config]) -> Config:
         given['robot.urdf'] = wait_for_description(node, given['robot.urdf'].removeprefix(TOPIC))
     config = build(cls, given, node.get_fully_qualified_name())
     values = flatten(config)
-    for one in parameters(cls):
-        value = values[one.name]
+    for parameter in parameters(cls):
+        value = values[parameter.name]
         if value == ():
-            _declare_empty(node, one)
+            _declare_empty(node, parameter)
         else:
             typed = list(value) if isinstance(value, tuple) else value
-            node.declare_parameter(one.name, typed, descriptor(one), ignore_override=True)
-    fixed = {one.name: one for one in parameters(cls) if one.read_only}
+            described = descriptor(parameter)
+            node.declare_parameter(parameter.name, typed, described, ignore_override=True)
+    fixed = {parameter.name: parameter for parameter in parameters(cls) if parameter.read_only}
 
     def refuse_fixed(requested: list[RosParameter]) -> list[RosParameter]:
         for each in requested:
@@ -97,21 +87,22 @@ def declare(node: Node, cls: type[Config]) -> Config:
     return config
 
 
-def _declare_empty(node: Node, one: Parameter) -> None:
+def _declare_empty(node: Node, parameter: Parameter) -> None:
     """Declare an empty list by its type, since rclpy would infer a list of bytes.
 
     It is set as well: if any of several requested parameters is unset, rclpy's response is empty.
     """
-    kind, described = RosParameter.Type[one.kind.name], descriptor(one)
-    node.declare_parameter(one.name, kind, ignore_override=True)
-    node.set_parameters([RosParameter(one.name, kind, [])])
+    kind, described = RosParameter.Type[parameter.kind.name], descriptor(parameter)
+    node.declare_parameter(parameter.name, kind, ignore_override=True)
+    node.set_parameters([RosParameter(parameter.name, kind, [])])
     described.type = kind.value
-    node.set_descriptor(one.name, described)
+    node.set_descriptor(parameter.name, described)
 
 
 def read(node: Node, cls: type[Config]) -> Config:
     """Return the current configuration of a node that has declared it."""
-    given = {one.name: node.get_parameter(one.name).value for one in parameters(cls)}
+    names = [parameter.name for parameter in parameters(cls)]
+    given = {name: node.get_parameter(name).value for name in names}
     return build(cls, given, node.get_fully_qualified_name())
 
 
@@ -127,10 +118,10 @@ def on_change(
     and rejected with the reasons if that is invalid, or if `problems` finds that the node cannot
     accept it now. `apply` receives the new configuration once it is in effect, and must not fail.
     """
-    names = {one.name for one in parameters(cls)}
+    names = {parameter.name for parameter in parameters(cls)}
 
     def validate(requested: list[RosParameter]) -> SetParametersResult:
-        values = {one.name: one.value for one in requested if one.name in names}
+        values = {each.name: each.value for each in requested if each.name in names}
         if not values:
             return SetParametersResult(successful=True)
         try:
@@ -141,42 +132,42 @@ def on_change(
         return SetParametersResult(successful=not found, reason='\n'.join(found))
 
     def apply_changes(changed: list[RosParameter]) -> None:
-        if any(one.name in names for one in changed):
+        if any(each.name in names for each in changed):
             apply(read(node, cls))
 
     node.add_on_set_parameters_callback(validate)
     node.add_post_set_parameters_callback(apply_changes)
 
 
-def descriptor(one: Parameter) -> ParameterDescriptor:
+def descriptor(parameter: Parameter) -> ParameterDescriptor:
     """Return what `ros2 param describe` shows for a parameter.
 
     ROS only has inclusive ranges, so an excluded limit is rejected by `build` alone.
     """
-    symbol = f'{one.symbol}: ' if one.symbol else ''
-    unit = f' [{one.unit}]' if one.unit else ''
-    constraints = [one.allowed] if one.allowed else []
-    if one.length:
-        constraints.append('as many entries as ' + ' times '.join(one.length))
-    if one.read_only:
-        constraints.append(_fixed(one))
+    symbol = f'{parameter.symbol}: ' if parameter.symbol else ''
+    unit = f' [{parameter.unit}]' if parameter.unit else ''
+    constraints = [parameter.allowed] if parameter.allowed else []
+    if parameter.length:
+        constraints.append('as many entries as ' + ' times '.join(parameter.length))
+    if parameter.read_only:
+        constraints.append(_fixed(parameter))
     described = ParameterDescriptor(
-        description=f'{symbol}{one.description}{unit}',
-        read_only=bool(one.read_only),
+        description=f'{symbol}{parameter.description}{unit}',
+        read_only=bool(parameter.read_only),
         additional_constraints='; '.join(constraints),
     )
-    low = one.above if one.at_least is None else one.at_least
-    high = one.below if one.at_most is None else one.at_most
-    if one.kind in _RANGES and (low, high) != (None, None):
-        name, message, number, largest = _RANGES[one.kind]
+    low = parameter.above if parameter.at_least is None else parameter.at_least
+    high = parameter.below if parameter.at_most is None else parameter.at_most
+    if parameter.kind in _RANGES and (low, high) != (None, None):
+        name, message, number, largest = _RANGES[parameter.kind]
         from_value = -largest if low is None else number(low)
         to_value = largest if high is None else number(high)
         setattr(described, name, [message(from_value=from_value, to_value=to_value)])
     return described
 
 
-def _fixed(one: Parameter) -> str:
-    return f'fixed at the start: {one.read_only}'
+def _fixed(parameter: Parameter) -> str:
+    return f'fixed at the start: {parameter.read_only}'
 
 
 def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
@@ -185,10 +176,10 @@ def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
     rclpy does not show which section a value comes from, so parameters of any node of the package
     are accepted, as in a section for several nodes.
     """
-    own = {one.name: one.kind for one in parameters(cls)}
+    own = {parameter.name: parameter.kind for parameter in parameters(cls)}
     others = known_names() - own.keys()
     check_sections(sys.argv, node.get_fully_qualified_name())
-    given = {name: one.value for name, one in parameter_overrides(node).items()}
+    given = {name: parameter.value for name, parameter in parameter_overrides(node).items()}
     given |= assigned(sys.argv)
     return {
         name: [] if value is None and name in own and own[name].is_array else value
@@ -197,84 +188,19 @@ def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
     }
 
 
-Values = Mapping[str, Any]
+def values_of(names: Sequence[str], response: GetParameters.Response) -> dict[str, Any]:
+    """Return another node's parameters as configurations hold them.
 
-_WITHOUT_YAML = (ParameterType.PARAMETER_NOT_SET, ParameterType.PARAMETER_BYTE_ARRAY)
-
-
-class ParameterClient:
-    """Reads the parameters of each requested node once, as soon as its services are available.
-
-    `callback` is called with the full name of the node and the values of its parameters.
+    Raises ConfigurationError if it lacks one: then the response is empty.
     """
-
-    def __init__(self, callback: Callable[[str, Values], None]) -> None:
-        self._callback = callback
-        self._requests: dict[str, Iterator[Values | None]] = {}
-        self._known: set[str] = set()
-
-    @property
-    def pending(self) -> tuple[str, ...]:
-        """Nodes that have not responded yet."""
-        return tuple(self._requests)
-
-    def request(self, node: Node, name: str) -> None:
-        """Request the parameters of node `name` (full name) via `node`, which must not be spun."""
-        if name not in self._known:
-            self._known.add(name)
-            self._requests[name] = _values_of(node, name)
-
-    def poll(self) -> None:
-        """Send the requests that are possible now, and call `callback` for complete responses."""
-        for name in self.pending:
-            values = next(self._requests[name])
-            if values is not None:
-                del self._requests[name]
-                self._callback(name, values)
+    found = [parameter_value_to_python(value) for value in response.values]
+    if len(found) != len(names):
+        raise ConfigurationError(['the node has other parameters: is it of another version?'])
+    plain = (each if isinstance(each, bool | int | float | str) else tuple(each) for each in found)
+    return dict(zip(names, plain, strict=True))
 
 
-def _values_of(node: Node, name: str) -> Iterator[Values | None]:
-    """List the names, then get their values; yield None until the values have arrived.
-
-    If a parameter is declared but not set, rclpy's response is empty: the names are then requested
-    in halves, down to the unset one.
-    """
-    listing = node.create_client(ListParameters, f'{name}/list_parameters')
-    getting = node.create_client(GetParameters, f'{name}/get_parameters')
-    while not (listing.service_is_ready() and getting.service_is_ready()):
-        yield None
-    listed = yield from _call(listing, ListParameters.Request())
-    batches = [list(listed.result.names)]
-    found = {}
-    while batches:
-        names = batches.pop()
-        got = yield from _call(getting, GetParameters.Request(names=names))
-        if len(got.values) == len(names):
-            for parameter, value in zip(names, got.values, strict=True):
-                if value.type not in _WITHOUT_YAML:
-                    found[parameter] = _plain(value)
-        elif len(names) > 1:
-            middle = len(names) // 2
-            batches += [names[:middle], names[middle:]]
-    yield dict(sorted(found.items()))
-
-
-def _call(client: Client, request: Any) -> Any:
-    client.call_async(request)
-    while (response := take_response(client)) is None:
-        yield None
-    return response
-
-
-def _plain(value: Any) -> Any:
-    """Return the value as configurations hold it, with sequences as tuples."""
-    content = parameter_value_to_python(value)
-    return content if isinstance(content, (bool, int, float, str)) else tuple(content)
-
-
-TIMEOUT = 60.0  # s
-_POLL = 0.05  # s
-_SILENCE = 5.0  # s between two log lines
+TIMEOUT = 60  # s
 
 
 def wait_for_description(node: Node, name: str) -> str:
@@ -282,33 +208,20 @@ def wait_for_description(node: Node, name: str) -> str:
 
     Raises ConfigurationError if none is received within a minute.
     """
-    topic = node.resolve_topic_name(name)
-    hidden = RawSubscriptions(node, depth=1)
-    hidden.subscribe(topic, ROBOT_DESCRIPTION.type, [ROBOT_DESCRIPTION.offered], 0)
-    begin = time.monotonic()
-    try:
-        while not (messages := hidden.take()):
-            if process.interrupted():
-                raise SystemExit(0)
-            if time.monotonic() > begin + TIMEOUT:
-                raise ConfigurationError([_nothing(topic, hidden.node.count_publishers(topic))])
-            node.get_logger().info(
-                f'waiting for the URDF on {topic}', throttle_duration_sec=_SILENCE
-            )
-            time.sleep(_POLL)
-    finally:
-        hidden.close()
-    text: str = deserialize_message(messages[-1].raw, String).data
-    if not text.strip():
-        raise ConfigurationError([f'robot.urdf: the URDF on {topic} is empty: did xacro fail?'])
-    return text
-
-
-def _nothing(topic: str, publishers: int) -> str:
-    found = 'nobody publishes there'
+    topic, quality = node.resolve_topic_name(name), qos_profile(ROBOT_DESCRIPTION.offered)
+    for _ in range(TIMEOUT):
+        found, message = wait_for_message(String, node, topic, qos_profile=quality, time_to_wait=1)
+        if process.interrupted():
+            raise SystemExit(0)
+        if found and not message.data.strip():
+            problem = f'the URDF on {topic} is empty: did xacro fail?'
+            raise ConfigurationError([f'robot.urdf: {problem}'])
+        if found:
+            return str(message.data)
+        node.get_logger().info(f'waiting for the URDF on {topic}', throttle_duration_sec=5.0)
+    publishers, reason = node.count_publishers(topic), 'nobody publishes there'
     if publishers:
-        found = f'its {publishers} publisher(s) may not be latched (transient local)'
-    return (
-        f'robot.urdf: no URDF was received on {topic} within {TIMEOUT:g} s, and {found}: start '
-        'robot_state_publisher, correct the name, or give a file'
-    )
+        reason = f'its {publishers} publisher(s) may not be latched (transient local)'
+    problem = f'no URDF was received on {topic} within {TIMEOUT} s, and {reason}'
+    remedy = 'start robot_state_publisher, correct the name, or give a file'
+    raise ConfigurationError([f'robot.urdf: {problem}: {remedy}'])

@@ -214,7 +214,7 @@ def assigned(argv: Sequence[str]) -> dict[str, object]:
         name, _, value = rule.partition(':=')
         if option != '--params-file' and ':' not in name:
             (section,) = parse(f'/**:\n  ros__parameters:\n    {name}: {value}\n')
-            given |= {one: entry.value for one, entry in section.entries.items()}
+            given |= {key: entry.value for key, entry in section.entries.items()}
     return given
 
 

@@ -107,7 +107,7 @@ class BagRecorderNode(PlainNode):
         except (ImportError, AttributeError, UnknownTypeError):
             self._skip(topic, f'its type {types[0]} is not installed here')
             return
-        self._start(topic, types[0], [quality_of(one.qos_profile) for one in publishers])
+        self._start(topic, types[0], [quality_of(each.qos_profile) for each in publishers])
 
     def _start(self, topic: str, type_name: str, offered: list[Quality]) -> None:
         self._record(flush=True)

@@ -14,9 +14,12 @@ import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+from math import inf
 from typing import Any
 
 import numpy as np
+from rcl_interfaces.srv import GetParameters
+from rclpy.task import Future
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import WatchdogConfig, load
@@ -37,7 +40,7 @@ from blf_dsc_controller.nodes.endpoints import (
     message_class,
     qos_profile,
 )
-from blf_dsc_controller.nodes.parameters import ParameterClient, Values, declare
+from blf_dsc_controller.nodes.parameters import declare, values_of
 from blf_dsc_controller.nodes.process import PlainNode, drain, parameter_files, run
 from blf_dsc_controller.supervision.safe_torque import SecondLine
 
@@ -73,15 +76,16 @@ class WatchdogNode(PlainNode):
         quality = qos_profile(topic.offered)
         self._output = self.create_publisher(message_class(topic.type), topic.relative, quality)
         self._diagnostics = DiagnosticsPublisher(self, ())
-        self._client = ParameterClient(self._on_parameters)
         self._controller = f'{self.get_namespace().rstrip("/")}/{topics.CONTROLLER}'
+        self._names = [parameter.name for parameter in parameters(ControllerConfig)]
+        self._client = self.create_client(GetParameters, f'{self._controller}/get_parameters')
+        self._asked_at = -inf
         self._timer = create_steady_timer(self, _PERIOD, self._poll)
         create_steady_timer(self, _REPORT_PERIOD, self._report)
         if self._config.armed:
             files = parameter_files(sys.argv) or ['recommended']
             self._watch(load(files[-1], self._controller, ControllerConfig))
         else:
-            self._client.request(self._raw_subscriptions.node, self._controller)
             self.get_logger().info(f'waiting for {self._controller}')
 
     def close(self) -> None:
@@ -91,11 +95,17 @@ class WatchdogNode(PlainNode):
             drain([self._output])
         self._raw_subscriptions.close()
 
-    def _on_parameters(self, node: str, values: Values) -> None:
-        known = {one.name for one in parameters(ControllerConfig)}
-        given = {name: value for name, value in values.items() if name in known}
+    def _ask(self, now: float) -> None:
+        """Ask for the parameters of the controller, again if it has died over them."""
+        if now > self._asked_at + _REPORT_PERIOD and self._client.service_is_ready():
+            self._asked_at = now
+            request = GetParameters.Request(names=self._names)
+            self._client.call_async(request).add_done_callback(self._on_parameters)
+
+    def _on_parameters(self, response: Future) -> None:
         try:
-            config = build(ControllerConfig, given, node)
+            given = values_of(self._names, response.result())
+            config = build(ControllerConfig, given, self._controller)
         except ConfigurationError as error:
             self.failure, self.finished = error, True
             return
@@ -115,7 +125,7 @@ class WatchdogNode(PlainNode):
     def _poll(self) -> None:
         messages, now = self._raw_subscriptions.take(), self._steady() * 1e-9
         if self.line is None:
-            self._client.poll()
+            self._ask(now)
             return
         for message in messages:
             self._take(self.line, message, now)

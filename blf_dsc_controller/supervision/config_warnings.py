@@ -61,7 +61,7 @@ def config_warnings(
     settings = settings_of_config(config)
     load = load or reference_load(config, settings)
     found = [*_of_start(config, q), *_of_urdf(config, load)]
-    found += [one.text for one in _of_gains(config, load)]
+    found += [finding.text for finding in _of_gains(config, load)]
     if config.model == 'urdf' and config.law == 'blf_dsc':
         found += _of_errors(config, expected_errors(config, settings))
     if settings.surface != LINEAR and settings.kappa > 0.0 and settings.Gamma.any():
@@ -73,8 +73,12 @@ def config_warnings(
 
 def worsened(before: ControllerConfig, after: ControllerConfig, load: ReferenceLoad) -> list[str]:
     """Return the warnings on gains that are new or worse after a change."""
-    known = {one.of: one.excess for one in _of_gains(before, load)}
-    return [one.text for one in _of_gains(after, load) if one.excess > known.get(one.of, 1.0)]
+    known = {finding.of: finding.excess for finding in _of_gains(before, load)}
+    return [
+        finding.text
+        for finding in _of_gains(after, load)
+        if finding.excess > known.get(finding.of, 1.0)
+    ]
 
 
 def _of_start(config: ControllerConfig, q: Floats | None) -> Iterator[str]:
@@ -213,7 +217,7 @@ def _of_gains(config: ControllerConfig, load: ReferenceLoad) -> list[Finding]:
     found = [*_of_torque(config, load), *_of_feedback(config, settings, load, damping)]
     if settings.surface != LINEAR:
         found += _of_surface(config, settings, damping)
-    return [one for one in found if one.excess > 1.0]
+    return [finding for finding in found if finding.excess > 1.0]
 
 
 def _of_torque(config: ControllerConfig, load: ReferenceLoad) -> Iterator[Finding]:

@@ -201,7 +201,7 @@ class GuardedLaw:
     def _safe_at(self, stamp: int, measurement: Vector) -> Vector | None:
         """Return the safe torque for a state that the law has not used."""
         limit, dt = self.config.safety.velocity_limit, self.config.sample_time
-        self._safe_torque.last.salvage(stamp, measurement, limit, dt)
+        self._safe_torque.last.take_usable(stamp, measurement, limit, dt)
         return self._safe(dt)
 
     def _start(self, stamp: int, measurement: Vector) -> bool:

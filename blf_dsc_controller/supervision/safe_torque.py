@@ -51,7 +51,7 @@ class LastState:
         self.age = 0.0
         self._stamp = stamp
 
-    def salvage(
+    def take_usable(
         self, stamp: int, measurement: Vector, velocity_limit: float, period: float
     ) -> None:
         """Store the usable part of any other state, `period` [s] after the last.
@@ -86,7 +86,7 @@ class LastState:
 def model_torque(settings: Settings, estimate: Vector, *motion: Vector) -> Vector:
     """Return H(q, dq, dq, ddq) P^ (n,) [N m] of a motion q, dq, ddq (n,); at rest of q alone."""
     q, dq, ddq = motion if len(motion) > 1 else (*motion, *np.zeros((2, settings.n)))
-    (H,) = regressors_at(settings.model, *(one[np.newaxis] for one in (q, dq, dq, ddq)))
+    (H,) = regressors_at(settings.model, *(vector[np.newaxis] for vector in (q, dq, dq, ddq)))
     return np.asarray(H @ estimate[: settings.p])
 
 
@@ -273,7 +273,7 @@ class SecondLine:
     def state(self, stamp: int, measurement: Vector, now: float) -> None:
         """Take a joint state with its stamp [ns]; `measurement` is [q, dq, effort] (3 n,)."""
         limit = self.config.safety.velocity_limit
-        self._safe.last.salvage(stamp, measurement, limit, self.config.sample_time)
+        self._safe.last.take_usable(stamp, measurement, limit, self.config.sample_time)
         if stamp > self.stamp or self.stamp < 0:
             self._seen_at = now
         self.stamp = stamp
