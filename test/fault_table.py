@@ -15,7 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from fault_rig import JOINTS, MILLISECOND, Rig
 
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
 LEAD = 40  # fault-free samples before the fault
@@ -222,23 +224,13 @@ def reversed_motor(rig: Rig) -> None:
     rig.actuate = lambda raw: [Float64MultiArrayEncoder(2).encode(-np.frombuffer(raw[-16:], '<f8'))]
 
 
-def every_command(values: np.ndarray) -> Callable[[Rig], None]:
-    """Send these values to the plant instead of every command."""
-    raw = Float64MultiArrayEncoder(values.size).encode(values)
-
-    def inject(rig):
-        rig.actuate = lambda _: [raw]
-
-    return inject
-
-
-def one_command(values: np.ndarray) -> Callable[[Rig], None]:
-    """Replace one command."""
+def commanded(values: np.ndarray, *, always: bool) -> Callable[[Rig], None]:
+    """Send these values to the plant instead of the next command, or of all."""
     replaced = Float64MultiArrayEncoder(values.size).encode(values)
 
     def inject(rig):
         def actuate(_):
-            rig.actuate = lambda raw: [raw]
+            rig.actuate = rig.actuate if always else lambda raw: [raw]
             return [replaced]
 
         rig.actuate = actuate
@@ -257,16 +249,12 @@ def poisoned(what: str, value: float) -> Callable[[Rig], None]:
 
 def retuned(**changes) -> Callable[[Rig], None]:
     """Set parameters, bypassing every check."""
-    from blf_dsc_controller.configuration.schema import change
-
     given = {name.replace('__', '.'): value for name, value in changes.items()}
     return lambda rig: rig.guard.retune(change(rig.guard.config, given))
 
 
 def random_gains(rig: Rig) -> None:
     """Change all gains by up to a fifth in every sample, as `ros2 param set` does."""
-    from blf_dsc_controller.configuration.schema import change
-
     rng = np.random.default_rng(0)
     names = ('surface.gain', 'surface.mu', 'feedback.gain', 'barrier.weight', 'disturbance.gain')
     start = rig.guard.config
@@ -286,8 +274,6 @@ def random_gains(rig: Rig) -> None:
 
 def rejection(**changes) -> Callable[[Rig], None]:
     """Request a change that must be rejected."""
-    from blf_dsc_controller.configuration.schema import change
-
     given = {name.replace('__', '.'): value for name, value in changes.items()}
 
     def inject(rig):
@@ -300,7 +286,6 @@ def rejection(**changes) -> Callable[[Rig], None]:
 
 def replaced(*, possible: bool) -> Callable[[Rig], None]:
     """Send a trajectory every 30 ms, before the last one ends; too fast unless `possible`."""
-    from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
 
     def inject(rig):
         def sense(state):
@@ -342,9 +327,8 @@ def restarted_controller(rig: Rig) -> None:
 NAN, INF = np.nan, np.inf
 FAULTS = (
     Fault('position of joint1 is NaN', spoil('q', 0, NAN), R.NOT_FINITE),
-    Fault('position of joint2 is infinite', spoil('q', 1, INF), R.NOT_FINITE),
+    Fault('position of joint2 is minus infinity', spoil('q', 1, -INF), R.NOT_FINITE),
     Fault('velocity of joint1 is NaN', spoil('dq', 0, NAN), R.NOT_FINITE),
-    Fault('velocity of joint2 is minus infinity', spoil('dq', 1, -INF), R.NOT_FINITE),
     Fault('effort is NaN but not used', spoil('effort', 0, NAN), R.NONE),
     Fault(
         'effort is NaN and used for learning',
@@ -355,7 +339,6 @@ FAULTS = (
     Fault('position of joint1 jumps by 3 mrad', spoil('q', 0, 2.296), R.OUTSIDE_BOUND),
     Fault('position of joint2 is 1e300 rad', spoil('q', 1, 1e300), R.OUTSIDE_BOUND),
     Fault('velocity of joint1 is 60 rad/s', spoil('dq', 0, 60.0), R.VELOCITY),
-    Fault('velocity of joint2 is -1e300 rad/s', spoil('dq', 1, -1e300), R.VELOCITY),
     Fault('joints in another order', every(reordered), R.NONE),
     Fault('extra joints, one of them NaN', every(among_others), R.NONE),
     Fault('duplicate joint', once(duplicated), R.JOINT_DUPLICATED),
@@ -386,7 +369,6 @@ FAULTS = (
     Fault('every state sent four times', every(lambda s: [s.raw()] * 4), R.NONE),
     Fault('stamp stops advancing', same_stamp, R.STAMP_REPEATED, 5),
     Fault('stamp jumps back by 2 ms', shifted(-2 * MILLISECOND), R.STAMP_BACKWARD),
-    Fault('stamp jumps back by 0.5 s', shifted(-500 * MILLISECOND), R.STAMP_BACKWARD),
     Fault('stamp jumps ahead by 10 s', shifted(10**10), R.STAMP_JUMP),
     Fault('stamp is zero', once(lambda s: [s.raw(stamp=0)]), R.STAMP_MISSING),
     Fault('stamp before 1970', once(lambda s: [s.raw(stamp=-1)]), R.STAMP_MISSING),
@@ -428,7 +410,6 @@ FAULTS = (
         given={'safety.saturation_time': 0.01},
     ),
     Fault('an estimate is NaN', poisoned('estimate', NAN), R.ESTIMATE),
-    Fault('an estimate is infinite', poisoned('estimate', INF), R.ESTIMATE),
     Fault('the disturbance estimate is NaN', poisoned('disturbance', NAN), R.ESTIMATE),
     Fault('the surface filter is NaN', poisoned('alpha2', NAN), R.TORQUE),
     Fault(
@@ -442,11 +423,11 @@ FAULTS = (
     Fault('requested trajectory too fast', replaced(possible=False), R.NONE),
     Fault('requested bound below the error', rejection(barrier__bound=[1e-9, 1e-9]), R.NONE),
     Fault('requested torque limit below the torque', rejection(torque__limit=[1.0, 1.0]), R.NONE),
-    Fault('one command of the wrong length', one_command(np.zeros(3)), R.NONE),
-    Fault('one command without values', one_command(np.zeros(0)), R.NONE),
-    Fault('one command that is NaN', one_command(np.array([NAN, 1.0])), R.NONE),
-    Fault('one command that is infinite', one_command(np.array([1.0, INF])), R.NONE),
-    Fault('all commands are NaN', every_command(np.array([NAN, NAN])), R.OUTSIDE_BOUND, 80),
+    Fault('one command of the wrong length', commanded(np.zeros(3), always=False), R.NONE),
+    Fault('one command that is NaN', commanded(np.array([NAN, 1.0]), always=False), R.NONE),
+    Fault(
+        'all commands are NaN', commanded(np.array([NAN, NAN]), always=True), R.OUTSIDE_BOUND, 80
+    ),
     Fault('plant killed and restarted', restarted_plant, R.STAMP_BACKWARD),
     Fault(
         'controller killed and restarted outside the bound',

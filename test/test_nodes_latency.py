@@ -6,14 +6,6 @@ from __future__ import annotations
 from sim_plant.command_input import Latency
 
 
-def test_latency_of_a_torque_in_time_counts_from_its_state():
-    latency = Latency()
-    latency.state_published(0.0)
-    latency.torque_received(0.2)
-    assert latency.step(1.0) == 0.2
-    assert latency.late_steps == 0
-
-
 def test_latency_of_a_late_torque_includes_all_of_its_lateness():
     """A controller that is 2.5 samples late must not pass for one that is half a sample late."""
     latency = Latency()

@@ -12,7 +12,6 @@ from ros_rig import states
 
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.telemetry import disturbance_names
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
@@ -117,8 +116,3 @@ def test_plant_finishes_when_the_last_state_has_received_its_torque(ros):
         ros.until(lambda k=steps: node.finished or len(received) > k)
     assert node.finished
     assert len(received) == 4
-
-
-def test_invalid_parameter_is_named(ros):
-    with pytest.raises(ConfigurationError, match=r'arm\.m1: got -0\.5'):
-        ros.add(PlantNode, {'arm.m1': -0.5})

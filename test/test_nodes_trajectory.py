@@ -135,18 +135,13 @@ def test_moving_bound_is_published_at_every_sample(ros):
     np.testing.assert_allclose(published[:, 1], 0.002 + 0.008 * np.exp(-5.0 * t), rtol=1e-12)
 
 
-def long_trajectory(seconds):
-    message = trajectory(JOINTS, np.zeros(2), duration=0.1)
-    message.points[-1].time_from_start.sec = seconds
-    return message
-
-
 @pytest.mark.parametrize('watchdog', ['on', 'off'])
-@pytest.mark.parametrize('seconds', [100_000, 2_000_000_000])
-def test_too_long_trajectory_is_rejected_and_the_loop_continues(ros, sender, seconds, watchdog):
+def test_too_long_trajectory_is_rejected_and_the_loop_continues(ros, sender, watchdog):
     arm, law = ros.loop(None, {'safety__watchdog': watchdog, 'safety__state_timeout': 60.0})
     ros.run(arm, 20)
-    assert f'it takes {seconds:g} s, longer than 3600 s' in sender(law, long_trajectory(seconds))
+    message = trajectory(JOINTS, np.zeros(2), duration=0.1)
+    message.points[-1].time_from_start.sec = 2_000_000_000
+    assert 'it takes 2e+09 s, longer than 3600 s' in sender(law, message)
     ros.run(arm, 20)
     assert phase(law) is Phase.TRACKING
 

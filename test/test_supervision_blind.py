@@ -5,13 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from closed_loop_case import recommended
 from fault_rig import Rig
 from fault_table import named
 from plain_law import dynamics
 
-from blf_dsc_controller.supervision.safe_torque import SafeTorque
-from blf_dsc_controller.supervision.supervisor import Phase, Reason
+from blf_dsc_controller.supervision.supervisor import Phase
 
 HOLDING = {'safety.torque': 'hold_gravity'}
 LEARNED = HOLDING | {'learning.initial_estimate': [1.0, 0.32, 0.4]}
@@ -53,20 +51,6 @@ def test_controller_waits_silently_for_the_first_usable_state(safety, raw):
     assert rig.supervisor.phase is Phase.TRACKING
     assert not rig.guard.waiting_for
     assert len(rig.commands) == 2
-
-
-def test_missing_velocities_at_the_start_are_reported_with_their_remedy():
-    rig = Rig()
-    rig.deliver(rig.state().raw(dq=NAN))
-    assert 'set safety.velocity to estimated' in rig.guard.waiting_for
-
-
-def test_controller_that_was_refused_its_start_stays_silent():
-    rig = Rig({'approach.enabled': False})
-    rig.plant.state[1] += 0.1
-    rig.step(20)
-    assert rig.supervisor.reason is Reason.START_REJECTED
-    assert not rig.commands
 
 
 def test_unusable_states_after_a_reset_leave_the_safe_torque_in_force():
@@ -202,12 +186,3 @@ def test_arm_settles_after_a_deactivation():
     assert not rig.guard.is_settled  # on the ramp
     rig.step(3000)
     assert rig.guard.is_settled
-
-
-def test_observed_load_is_at_most_half_of_the_torque_limit():
-    settings, safe = recommended(), SafeTorque(2)
-    safe.last.q[:], safe.last.ddq = (np.pi / 2.0, 0.0), np.zeros(2)  # upright: no gravity
-    safe.commanded[:] = (20.0, -20.0)
-    for _ in range(1000):
-        safe.observe(settings, settings.initial_estimate, 1e-3)
-    np.testing.assert_allclose(safe.load, [10.0, -10.0])

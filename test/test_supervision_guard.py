@@ -11,11 +11,11 @@ from plain_law import dynamics
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.law.factory import controller_of, settings_of_config
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
 from blf_dsc_controller.supervision.checks import StateCheck, Watchdog
 from blf_dsc_controller.supervision.guard import LatePlanError
-from blf_dsc_controller.supervision.handover import apply_bumpless
+from blf_dsc_controller.supervision.handover import apply, apply_bumpless
 from blf_dsc_controller.supervision.safe_torque import LastState, SafeTorque, safe_torque
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
@@ -24,9 +24,7 @@ P = np.array([1.0, 0.32, 0.4])
 
 
 def settings(**given):
-    from blf_dsc_controller.law import factory
-
-    return factory.settings_of_config(change(ControllerConfig(), given))
+    return settings_of_config(change(ControllerConfig(), given))
 
 
 def weight(q):
@@ -95,22 +93,18 @@ def test_watchdog_detects_silence_if_it_checks_in_time():
     assert watchdog.silence(0.04) == pytest.approx(0.198)
 
 
-@pytest.mark.parametrize(('watchdog', 'live'), [('auto', True), ('on', False)])
-def test_silence_stops_with_wall_time_stamps_or_the_watchdog_on(watchdog, live):
+@pytest.mark.parametrize(
+    ('watchdog', 'live', 'stops'),
+    [('auto', True, True), ('on', False, True), ('auto', False, False), ('off', True, False)],
+)
+def test_silence_stops_with_wall_time_stamps_or_the_watchdog_on(watchdog, live, stops):
     rig = Rig({'safety.watchdog': watchdog}, live=live)
     rig.step(20)
-    rig.wait(60)
-    assert rig.supervisor.reason is Reason.STATE_TIMEOUT
-    assert rig.commands[-1].tolist() == [0.0, 0.0]
-
-
-@pytest.mark.parametrize(('watchdog', 'live'), [('auto', False), ('off', True)])
-def test_slow_lockstep_is_not_silence(watchdog, live):
-    rig = Rig({'safety.watchdog': watchdog}, live=live)
+    rig.wait(60 if stops else 5000)
+    assert (rig.supervisor.reason is Reason.STATE_TIMEOUT) == stops
+    assert rig.commands[-1].any() != stops
     rig.step(20)
-    rig.wait(5000)
-    rig.step(20)
-    assert rig.supervisor.phase is Phase.TRACKING
+    assert rig.supervisor.running != stops
 
 
 def test_torque_ramps_after_a_fault_if_configured():
@@ -122,16 +116,6 @@ def test_torque_ramps_after_a_fault_if_configured():
     ramp = np.array(rig.commands[-13:])
     np.testing.assert_allclose(ramp[:10], np.outer(np.linspace(0.9, 0.0, 10), last), atol=1e-12)
     assert not ramp[10:].any()
-
-
-def test_implausible_velocity_is_not_damped():
-    rig = Rig({'safety.torque': 'damping'})
-    rig.step(20)
-    state = rig.state()
-    torque = rig.deliver(state.raw(dq=np.array([60.0, 0.1])))
-    assert rig.supervisor.reason is Reason.VELOCITY
-    # The true one instead, from two positions; D is 2 and 1 N m s/rad.
-    np.testing.assert_allclose(torque, [-2.0 * state.dq[0], -0.1], rtol=0.05)
 
 
 def test_stopped_arm_is_held_by_the_learned_gravity():
@@ -228,14 +212,16 @@ def test_stamps_that_switch_off_the_watchdog_are_reported(watchdog, late, report
     assert (rig.supervisor.reason is Reason.STATE_TIMEOUT) == (not reported)
 
 
-@pytest.mark.parametrize('keep', [True, False])
-def test_estimates_are_kept_or_forgotten_as_configured(keep):
-    rig = Rig({'safety.keep_estimates': keep})
+@pytest.mark.parametrize(
+    ('keep', 'again'), [(True, 'activate'), (False, 'activate'), (False, 'reset')]
+)
+def test_estimates_are_kept_or_forgotten_as_configured(keep, again):
+    rig = Rig({'safety.keep_estimates': keep or again == 'reset'})
     rig.step(200)
     learned = rig.guard.controller.state.estimate.copy()
     window = rig.guard.controller.state.rows[0]
     rig.guard.deactivate()
-    rig.guard.activate()
+    rig.guard.activate() if again == 'activate' else rig.guard.reset()
     state = rig.guard.controller.state
     start = rig.guard.controller.settings.initial_estimate
     np.testing.assert_array_equal(state.estimate, learned if keep else start)
@@ -252,24 +238,10 @@ def test_estimates_before_a_fault_are_kept_but_not_the_window():
     assert not np.array_equal(rig.guard.controller.state.estimate, learned)
     rig.guard.deactivate()
     rig.guard.activate()
-    np.testing.assert_array_equal(rig.guard.controller.state.estimate, learned)
-    assert rig.guard.controller.state.rows[0] == 0.0
-
-
-def test_only_the_estimates_before_a_fault_are_kept():
-    """The window may hold what led to the fault: nothing else of the state survives."""
-    rig = Rig({'learning.window': 0.1, 'learning.settling_time': 0.0})
-    rig.step(200)
     controller = rig.guard.controller
-    estimate, disturbance = controller.state.estimate.copy(), controller.state.disturbance.copy()
-    assert controller.state.rows[0] == 100.0
-    rig.deliver(b'')
-    rig.guard.deactivate()
-    rig.guard.activate()
-    kept = controller.save()
-    controller.reset()
-    controller.state.estimate[:] = estimate
-    controller.state.disturbance[:] = disturbance
+    kept, disturbance = controller.save(), controller.state.disturbance.copy()
+    controller.reset()  # nothing else of the state survives
+    controller.state.estimate[:], controller.state.disturbance[:] = learned, disturbance
     np.testing.assert_array_equal(kept, controller.state_vector)
 
 
@@ -283,15 +255,6 @@ def test_reactivation_restarts_the_surface_filter_at_the_current_state():
     assert rig.guard.controller.samples == 0
     rig.step(1)
     assert np.abs(rig.guard.controller.sample.xi2).max() < 1e-3  # rad/s; it was at 0.3 rad/s
-
-
-def test_reset_clears_the_estimates():
-    rig = Rig()
-    rig.step(200)
-    rig.guard.reset()
-    state = rig.guard.controller.state
-    np.testing.assert_array_equal(state.estimate, rig.guard.controller.settings.initial_estimate)
-    assert not state.disturbance.any()
 
 
 def test_learning_waits_for_a_full_window_after_a_reset_in_motion():
@@ -317,15 +280,6 @@ def test_rejected_column_is_not_a_fault():
     assert rig.supervisor.phase is Phase.TRACKING
 
 
-def test_unexpected_error_causes_a_safe_stop():
-    rig = Rig()
-    rig.step(20)
-    torque = rig.guard.fail('ZeroDivisionError: x')
-    assert rig.supervisor.reason is Reason.FAILED
-    assert rig.supervisor.text == 'ZeroDivisionError: x'
-    assert torque.tolist() == [0.0, 0.0]
-
-
 NEW_GAINS = [
     {'feedback.gain': (120.0, 40.0)},
     {'surface.gain': (300.0, 75.0)},
@@ -335,7 +289,7 @@ NEW_GAINS = [
 ]
 
 
-def jump(given, *, bumpless, samples=1):
+def jump(given, *, bumpless, samples):
     """Largest change of a torque after a gain change, at the largest error of the start."""
     rig = Rig()
     rig.step(60)
@@ -344,27 +298,23 @@ def jump(given, *, bumpless, samples=1):
         assert rig.guard.problems(candidate) == []
         rig.guard.retune(candidate)
     else:
-        from blf_dsc_controller.supervision import handover
-
-        handover.apply(rig.guard.controller, candidate)
+        apply(rig.guard.controller, candidate)
     rig.step(samples)
     return np.abs(np.array(rig.commands[-samples:]) - rig.commands[-samples - 1]).max()
 
 
-@pytest.mark.parametrize('given', NEW_GAINS, ids=lambda given: next(iter(given)))
-def test_gain_change_is_bumpless(given):
-    """The torque changes about as little as from sample to sample without new gains."""
-    usual = jump({}, bumpless=True)
-    assert jump(given, bumpless=False) > 4.0 * usual
-    assert jump(given, bumpless=True) < 2.0 * usual
+@pytest.mark.parametrize(
+    ('given', 'samples', 'most'),
+    [*((given, 1, 2.0) for given in NEW_GAINS), *((given, 20, 1.2) for given in NEW_GAINS[1:3])],
+)
+def test_gain_change_is_bumpless(given, samples, most):
+    """The torque changes about as little as from sample to sample without new gains.
 
-
-@pytest.mark.parametrize('given', NEW_GAINS[1:3], ids=lambda given: next(iter(given)))
-def test_gain_change_causes_no_delayed_bump(given):
-    """Ten time constants of the surface filter later, what it absorbed must not come back."""
-    usual = jump({}, bumpless=True, samples=20)
-    assert jump(given, bumpless=False, samples=20) > 4.0 * usual
-    assert jump(given, bumpless=True, samples=20) < 1.2 * usual
+    What the surface filter absorbed does not come back after ten of its time constants.
+    """
+    usual = jump({}, bumpless=True, samples=samples)
+    assert jump(given, bumpless=False, samples=samples) > 4.0 * usual
+    assert jump(given, bumpless=True, samples=samples) < most * usual
 
 
 @pytest.mark.parametrize(
@@ -427,22 +377,16 @@ def test_plan_is_followed_from_its_start_time():
     assert rig.supervisor.phase is Phase.TRACKING
 
 
-def test_late_plan_is_rejected():
+def test_late_plan_and_that_from_a_replaced_reference_are_rejected():
     rig = Rig()
     rig.step(100)
-    plan = rig.guard.plan(to((2.1, 1.5), 1.0), rig.guard.time + 0.03)
+    late, replaced = (rig.guard.plan(to((2.1, 1.5), 1.0), rig.guard.time + 0.03) for _ in range(2))
     rig.step(31)
     with pytest.raises(LatePlanError):
-        rig.guard.adopt(plan)
-
-
-def test_plan_from_a_replaced_reference_is_rejected():
-    rig = Rig()
-    rig.step(100)
-    plan = rig.guard.plan(to((2.1, 1.5), 1.0), rig.guard.time + 0.03)
+        rig.guard.adopt(late)
     rig.guard.adopt(rig.guard.plan(to((2.0, 1.4), 1.0)))
     with pytest.raises(TrajectoryError, match='replaced while it was planned'):
-        rig.guard.adopt(plan)
+        rig.guard.adopt(replaced)
 
 
 def test_retuning_leaves_the_estimate_of_a_joint_without_integrator():
