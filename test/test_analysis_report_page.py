@@ -16,8 +16,7 @@ import recorded_run
 
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 
-from blf_dsc_controller.analysis.report import write_report
-from blf_dsc_controller.analysis.reported_bag import read_bags
+from blf_dsc_controller.analysis.report import read_bags, write_report
 
 pytestmark = [
     pytest.mark.skipif(chromium.find() is None, reason='there is no Chromium here'),
@@ -113,16 +112,4 @@ def test_dragging_zooms_all_time_panels(browser, pages):
         assert low == pytest.approx(1.0, abs=0.05)
         assert high == pytest.approx(2.0, abs=0.05)
     browser.screenshot(SHOTS / 'report_zoomed.png')
-    assert browser.errors == []
-
-
-def test_arm_is_animated(browser, pages):
-    show(browser, pages / 'one.html')
-    browser.value("document.getElementById('arm-play').click()")
-    browser.wait("document.getElementById('arm').dataset.time > 0.2")
-    picture = "document.getElementById('arm').toDataURL()"
-    first = browser.value(picture)
-    browser.wait(f'{picture} != {first!r}')
-    browser.value("document.getElementById('arm').scrollIntoView()")
-    browser.screenshot(SHOTS / 'report_arm.png')
     assert browser.errors == []

@@ -15,7 +15,7 @@ from test_analysis_figures import amount, lightened, pixels
 
 from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.panels import panels
-from blf_dsc_controller.analysis.reported_bag import read_bags
+from blf_dsc_controller.analysis.report import read_bags
 from blf_dsc_controller.analysis.style import ALARM
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run

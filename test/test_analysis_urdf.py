@@ -12,11 +12,9 @@ import pytest
 import recorded_run
 from test_law_urdf import panda
 
-from blf_dsc_controller.analysis.drawn_arm import arm_of_chain
 from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.metrics import estimates_of, measure
 from blf_dsc_controller.analysis.panels import panels
-from blf_dsc_controller.analysis.reported_bag import read_bags
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.schema import flatten
@@ -153,35 +151,8 @@ def test_arm_of_a_bag_comes_from_its_recorded_configuration(tmp_path):
     messages = recorded_run.messages(recorded_run.record(tmp_path / 'two_links', 0.1))
     bag = recorded_run.write(tmp_path / 'bag', configured(messages, flatten(config)))
     run = read_run(bag)
-    (reported,) = read_bags([bag])
-    assert reported.arm == arm_of_chain(config.robot.chain(config.joints))
     assert run.arm is not None
     assert run.arm.deviations == learned_arm(config).deviations
     # It learned parameters with other names: their error is a norm.
     assert estimates_of(run).torques is None
     assert read_run(tmp_path / 'two_links').arm is None
-
-
-def test_page_draws_the_arm_in_space():
-    chain = panda().robot.chain(panda().joints)
-    drawn = arm_of_chain(chain)
-    tip, rotation = np.zeros(3), np.eye(3)
-    for joint in drawn.joints:
-        tip = tip + rotation @ joint.offset
-        rotation = rotation @ joint.rotation
-    # Fully stretched upwards: 0.333, 0.316, 0.384 m up, flange and hand 0.2104 m down.
-    tip = tip + rotation @ drawn.tip
-    np.testing.assert_allclose(tip, [0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.2104], atol=1e-5)
-    assert drawn.joints[3].axis == [0.0, 0.0, 1.0]
-    assert not any(joint.slides for joint in drawn.joints)
-
-
-def test_page_reports_that_it_cannot_draw_the_recorded_arm(tmp_path):
-    messages = recorded_run.messages(recorded_run.record(tmp_path / 'two_links', 0.1))
-    values = flatten(panda())
-    values['robot.urdf'] = values['robot.urdf'].replace('<robot', '<gone')
-    (reported,) = read_bags([recorded_run.write(tmp_path / 'bag', configured(messages, values))])
-    (problem,) = [event.text for event in reported.events if event.kind == 'arm']
-    assert 'drawn as links in a plane' in problem
-    assert 'robot.urdf: not a URDF' in problem
-    assert len(reported.arm.joints) == 2

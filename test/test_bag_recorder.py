@@ -21,7 +21,7 @@ from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from blf_dsc_controller.analysis.reported_bag import read_bags
+from blf_dsc_controller.analysis.report import read_bags
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import FOREVER, Quality

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 
 from blf_dsc_controller.analysis.metrics import change_times, measure, true_change_times
-from blf_dsc_controller.analysis.panels import Line, Mark, Panel, panels
+from blf_dsc_controller.analysis.panels import Line, Mark, Panel, panels, thin
 from blf_dsc_controller.analysis.style import (
     ALARM,
     BLUE,
@@ -27,7 +27,6 @@ from blf_dsc_controller.analysis.style import (
     head,
     head_of_column,
 )
-from blf_dsc_controller.analysis.thinning import thin
 from blf_dsc_controller.messages.topics import DISTURBANCE
 from blf_dsc_controller.run import Run
 

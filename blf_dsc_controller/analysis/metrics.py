@@ -87,20 +87,19 @@ def estimates_of(run: Run) -> Estimates | None:
     """
     if run.learning is None:
         return None
-    names, rows = _parameters(run.learning.names), _samples(run.learning)
-    columns = np.array([run.learning.names.index(name) for name in names], np.intp)
+    names, truth, arm = _parameters(run.learning.names), run.truth, run.arm
+    step = -(-run.learning.stamp.size // _MOST)
+    rows = slice((run.learning.stamp.size - 1) % step, None, step)
     stamp = run.learning.stamp[rows]
-    at, estimate = run.time_of(stamp), run.learning.at(rows, columns)
-    truth, arm = run.truth, run.arm
+    estimate = run.learning.at(rows, _columns(run.learning, names))
     is_known = arm is not None and _parameters(arm.units) == names
     torques = _torques(run, arm.regressor) if arm and is_known else None
     theirs = () if truth is None else _parameters(truth.names)
 
     def true_of(names: Sequence[str]) -> Floats | None:
-        if truth is None or run.learning is None or set(names) != set(theirs):
+        if truth is None or set(names) != set(theirs):
             return None
-        columns = np.array([truth.names.index(name) for name in names], np.intp)
-        return truth.held(stamp, columns)
+        return truth.held(stamp, _columns(truth, names))
 
     true, base = true_of(names), None
     if true is not None and torques is not None:
@@ -109,13 +108,11 @@ def estimates_of(run: Run) -> Estimates | None:
         P = true_of(arm.base[0])
         base = None if P is None else (P, _torques(run, arm.base[1]))
     unlike = theirs if true is None and base is None else ()
-    return Estimates(names, at, estimate, true, unlike, torques, base)
+    return Estimates(names, run.time_of(stamp), estimate, true, unlike, torques, base)
 
 
-def _samples(learning: Series) -> slice:
-    """Return the rows of what was learned that are looked at: all, if the run is not long."""
-    step = -(-learning.stamp.size // _MOST)
-    return slice((learning.stamp.size - 1) % step, None, step)
+def _columns(series: Series, names: Sequence[str]) -> NDArray[np.intp]:
+    return np.array([series.names.index(name) for name in names], np.intp)
 
 
 def _torques(run: Run, regressor: Regressor) -> Floats:
@@ -233,9 +230,8 @@ def measure(run: Run) -> Metrics:
     latched = latch_time(run)
     estimates = estimates_of(run)
     learned = None if estimates is None else estimates.relative_error
-    if estimates is None or learned is None:
-        learning = dict.fromkeys(MOMENTS, math.nan), math.nan, math.nan, math.nan
-    else:
+    learning = dict.fromkeys(MOMENTS, math.nan), math.nan, math.nan, math.nan
+    if estimates is not None and learned is not None:
         at = estimates.time
         tail = rms(learned[at >= at[-1] - _TAIL])
         learning = _at_moments(at, learned), float(learned[-1]), tail, _settled(at, learned)
@@ -251,7 +247,7 @@ def measure(run: Run) -> Metrics:
         each(_peak, 'torque'),
         each(rms, 'torque'),
         each(_least, 'torque_limit'),
-        tuple(change / step for change in each(_rms_change, 'torque')),
+        tuple(change / step for change in each(lambda torque: rms(np.diff(torque)), 'torque')),
         _largest_ratio(run),
         violation,
         joint,
@@ -266,24 +262,22 @@ def _largest_ratio(run: Run) -> float:
     return float(np.fmax.reduce([_peak(error / bound) for error, bound in pairs]))
 
 
+def _reduced(values: Floats, reduce: Callable[[Floats], float]) -> float:
+    known = values[np.isfinite(values)]
+    return float(reduce(known)) if known.size else math.nan
+
+
 def rms(values: Floats) -> float:
     """Return the root mean square of the known values."""
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
-
-
-def _rms_change(values: Floats) -> float:
-    return rms(np.diff(values))
+    return _reduced(values, lambda known: np.sqrt(np.mean(known**2)))
 
 
 def _peak(values: Floats) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.abs(known).max()) if known.size else math.nan
+    return _reduced(values, lambda known: np.abs(known).max())
 
 
 def _least(values: Floats) -> float:
-    known = values[np.isfinite(values)]
-    return float(known.min()) if known.size else math.nan
+    return _reduced(values, np.min)
 
 
 def _at_moments(time: Floats, error: Floats) -> dict[int, float]:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The panels of runs, plotted by matplotlib in `figures` and by plotly in `report`."""
+"""The panels of runs, plotted by matplotlib in `figures` and by plotly in `report`.
+
+Long series are thinned for plotting, without losing a peak.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,6 @@ from blf_dsc_controller.analysis.metrics import (
     true_change_times,
 )
 from blf_dsc_controller.analysis.style import ALARM, INK, MUTED
-from blf_dsc_controller.analysis.thinning import drawable, envelope
 from blf_dsc_controller.messages.topics import (
     COMPUTE_TIME,
     DISTURBANCE,
@@ -50,6 +52,10 @@ _ROOM = 1.2  # limit of an axis as a multiple of the largest value
 _LEAST_ERROR = 1e-5  # %
 _PIECES = 300  # of a run, each with its largest error
 _LONG = 80_000  # samples
+
+
+PIECES = 1500
+_LARGEST = 1e100
 
 
 class Line(NamedTuple):
@@ -107,7 +113,7 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
             marks = (*marks, *(stops if panel.group in _STOPPED else ()))
             if panel.group in _CHANGED:
                 texts = (changed.pop(panel.group, ''), *[''] * len(changes))  # once
-                marks = (*marks, *(Mark(*one, INK) for one in zip(changes, texts, strict=False)))
+                marks = (*marks, *(Mark(*each, INK) for each in zip(changes, texts, strict=False)))
             found[panel.group, panel.title] = replace(
                 before,
                 lines=(*before.lines, *(line._replace(run=k) for line in panel.lines)),
@@ -134,11 +140,11 @@ def _thinned(line: Line) -> Line:
 
 def _stops(run: Run) -> Iterator[Mark]:
     """Yield the safe stops, each until the next start or the end."""
-    for time, one in run.timed_stops:
+    for time, stop in run.timed_stops:
         until = run.duration
-        if one.until is not None:
-            until = (one.until - int(run.stamp[0])) * 1e-9
-        yield Mark(time, f'stop: {one.reason}', ALARM, until=until)
+        if stop.until is not None:
+            until = (stop.until - int(run.stamp[0])) * 1e-9
+        yield Mark(time, f'stop: {stop.reason}', ALARM, until=until)
 
 
 def _motion(run: Run) -> Iterator[Panel]:
@@ -231,8 +237,8 @@ def _relative_error(estimates: Estimates) -> Iterator[Panel]:
     if estimates.relative_error is None:
         return
     error = np.maximum(100.0 * estimates.relative_error, _LEAST_ERROR)
-    one = Line('1 %', estimates.time, np.ones_like(error), MUTED, dashed=True)
-    lines = (Line('relative error', estimates.time, error), one)
+    limit = Line('1 %', estimates.time, np.ones_like(error), MUTED, dashed=True)
+    lines = (Line('relative error', estimates.time, error), limit)
     symbol, title = r'$\|\hat P - P\| \;/\; \|P\|$', 'relative parameter error'
     if estimates.torques is not None:
         symbol, title = r'$\|H\hat P - HP\| \;/\; \|HP\|$', 'torque error'
@@ -354,3 +360,40 @@ def _column(
         return []
     line = Line(name, run.time_of(series.stamp), series.column(column), **style)
     return [line if whole else _thinned(line)]
+
+
+def drawable(values: Floats) -> Floats:
+    """Return the values, with NaN for those that no axis can show, such as infinity."""
+    return np.where(np.abs(values) < _LARGEST, values, np.nan)
+
+
+def thin(time: Floats, values: Floats, pieces: int = PIECES) -> tuple[Floats, Floats]:
+    """Thin a series without losing a peak; a mostly constant one is reduced to its corners."""
+    values = drawable(values)
+    changes = np.flatnonzero(np.diff(values) != 0.0)
+    if changes.size < values.size // 100:
+        kept = np.unique(np.concatenate([[0], changes, changes + 1, [values.size - 1]]))
+        return time[kept], values[kept]
+    return envelope(time, values, pieces)
+
+
+def envelope(time: Floats, values: Floats, pieces: int = PIECES) -> tuple[Floats, Floats]:
+    """Return the lowest and highest sample of each piece of a series (N,), in order of time.
+
+    NaN is unknown; a piece without known values stays a gap. A series of at most two samples per
+    piece is returned unchanged.
+    """
+    if values.size <= 2 * pieces:
+        return time, values
+    edges = np.linspace(0, values.size, pieces + 1).astype(np.intp)[:-1]
+    low = _extreme(np.where(np.isnan(values), np.inf, values), edges, np.minimum)
+    high = _extreme(np.where(np.isnan(values), -np.inf, values), edges, np.maximum)
+    kept = np.sort(np.stack([low, high]), axis=0).T.ravel()
+    return time[kept], values[kept]
+
+
+def _extreme(values: Floats, edges: np.ndarray, reduction: np.ufunc) -> np.ndarray:
+    """Return the index of the first extreme sample of each piece."""
+    extremes = np.repeat(reduction.reduceat(values, edges), np.diff([*edges, values.size]))
+    found = np.where(values == extremes, np.arange(values.size), values.size)
+    return np.asarray(np.minimum.reduceat(found, edges))

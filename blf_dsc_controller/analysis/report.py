@@ -1,29 +1,168 @@
 # SPDX-License-Identifier: Apache-2.0
-"""HTML page of one or several bags, with the script of plotly (4.8 MB) embedded."""
+"""Bags with their events, and the HTML page of one or several (plotly, 4.8 MB, is embedded)."""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.analysis.metrics import change_times, latch_time, outside
 from blf_dsc_controller.analysis.page import Cell, write_page
-from blf_dsc_controller.analysis.panels import Panel, panels
-from blf_dsc_controller.analysis.reported_bag import ReportedBag
+from blf_dsc_controller.analysis.panels import PIECES, Panel, panels, thin
 from blf_dsc_controller.analysis.style import COLOURS, INK
 from blf_dsc_controller.analysis.summary import format_table, summarize
-from blf_dsc_controller.analysis.thinning import PIECES, thin
+from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
+from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.errors import MissingExtraError
+from blf_dsc_controller.messages.topics import DIAGNOSTICS
+from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Floats, Run
 
 _BINS = 200
 _TAIL = 99.9  # percentile up to which a histogram is drawn
 _DIGITS = 7
-_RATE = 50.0  # pictures of the arm per second
-_MOST_PICTURES = 6000
 _ALARMING = ('violation', 'stop', 'ERROR', 'lost')
+_LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
+_MOST_OF_A_KIND = 50
+_LONGEST = 1000  # characters of a parameter that is shown in full
+_AT_LIMIT = 1.0 - 1e-9
+
+
+class ReportedEvent(NamedTuple):
+    """An event of a run."""
+
+    time: float  # s since the first sample
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True)
+class ReportedBag:
+    """A bag with its name on the page."""
+
+    name: str
+    run: Run
+    content: Content
+    parameters: dict[str, str]  # `node name: parameter` to its value as text
+    events: list[ReportedEvent]  # by time
+
+
+def read_bags(
+    paths: Sequence[Path], namespace: str = '', names: NameMap = NO_NAMES
+) -> list[ReportedBag]:
+    """Read bags; each is named by its folder, with parent folders if that is ambiguous.
+
+    Raises:
+        BlfDscError: one of them cannot be read.
+    """
+    titles = zip(paths, _names(paths), strict=True)
+    return [_read(path, title, namespace, names) for path, title in titles]
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    parts = [path.resolve().parts[1:] for path in paths]
+    depth = 1 + all(part[-1] == 'bag' for part in parts)
+    while len({part[-depth:] for part in parts}) < len({*parts}):
+        depth += 1
+    names = ['/'.join(part[-depth:]) for part in parts]
+    return [
+        f'{name} ({names[: k + 1].count(name)})' if names.count(name) > 1 else name
+        for k, name in enumerate(names)
+    ]
+
+
+def _read(path: Path, name: str, namespace: str, names: NameMap) -> ReportedBag:
+    content = read_content(path, namespace, names)
+    run = recorded_run(content, names, namespace)
+    configured = content.configurations
+    lost = (
+        ReportedEvent(0.0, 'lost', f'{topic}: {text}') for topic, text in content.losses.items()
+    )
+    left_out = (ReportedEvent(0.0, 'left out', note) for note in run.notes)
+    events = (
+        *left_out, *_events(run), *_diagnosed(content, run), *_changed(content, run), *lost
+    )  # fmt: skip
+    return ReportedBag(
+        name,
+        run,
+        content,
+        parameters={
+            f'{node}: {parameter}': _shown(value)
+            for node in sorted(configured)
+            for parameter, value in sorted(configured[node].items())
+        },
+        events=sorted(events, key=lambda event: event.time),
+    )
+
+
+def _events(run: Run) -> Iterator[ReportedEvent]:
+    latched = latch_time(run)
+    if latched is not None:
+        yield ReportedEvent(latched, 'learning', 'first excited window: learning began')
+    for t in change_times(run):
+        yield ReportedEvent(t, 'learning', 'the arm has changed: learning restarted')
+    for column, reason in run.rejected.items():
+        text = reason or f'{column} is not estimated: its column was rejected'
+        yield ReportedEvent(run.duration, 'learning', text)
+    for t, stop in run.timed_stops:
+        yield ReportedEvent(t, 'stop', f'{stop.reason}: {stop.text}')
+    for i, joint in enumerate(run.joints):
+        violated = outside(run, i)
+        if violated is not None:
+            yield from _intervals(run, violated, 'violation', joint, 'outside its bound')
+        torque, limit = run.column('torque', i), run.column('torque_limit', i)
+        if torque is not None and limit is not None:
+            limited = np.abs(torque) >= _AT_LIMIT * limit
+            yield from _intervals(run, limited, 'saturation', joint, 'at its torque limit')
+
+
+def _intervals(
+    run: Run, holds: np.ndarray, kind: str, joint: str, what: str
+) -> Iterator[ReportedEvent]:
+    edges = np.diff(np.concatenate([[0], holds.astype(np.int8), [0]]))
+    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    times = run.time_of(run.stamp[begins])
+    for time, begin, end in list(zip(times, begins, ends, strict=True))[:_MOST_OF_A_KIND]:
+        yield ReportedEvent(float(time), kind, f'{joint} {what} for {end - begin} samples')
+    if begins.size > _MOST_OF_A_KIND:
+        text = f'{joint}: {begins.size - _MOST_OF_A_KIND} more intervals, not listed'
+        yield ReportedEvent(float(times[_MOST_OF_A_KIND]), kind, text)
+
+
+def _diagnosed(content: Content, run: Run) -> Iterator[ReportedEvent]:
+    """Yield each change of a level or message, at the time of the last sample received."""
+    shown: dict[str, tuple[int, str]] = {}
+    messages = content.topics.get(DIAGNOSTICS)
+    for received, raw in zip(messages.received, messages.raw, strict=True) if messages else ():
+        message: Any = typestore().deserialize_cdr(raw, DIAGNOSTICS.type)
+        k = int(np.searchsorted(run.received, received)) - 1
+        time = float(run.time[k]) if k >= 0 else (received - int(run.received[0])) * 1e-9
+        for status in message.status:
+            now = (int(status.level), str(status.message))
+            if shown.get(status.name) != now:
+                shown[status.name] = now
+                level = _LEVELS[min(now[0], len(_LEVELS) - 1)]
+                yield ReportedEvent(time, level, f'{status.name}: {now[1]}')
+
+
+def _changed(content: Content, run: Run) -> Iterator[ReportedEvent]:
+    """Yield each change of the simulated plant's parameters during the run."""
+    for change in content.changes:
+        time = (change['stamp'] - int(run.stamp[0])) * 1e-9
+        for parameter, value in () if change.get('configured') else change['parameters'].items():
+            yield ReportedEvent(time, 'plant', f'{parameter}: {_shown(value)}')
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, str) and len(value) > _LONGEST:  # a URDF
+        digest = zlib.crc32(value.encode())
+        return f'{value[:40]} ... ({len(value)} characters, CRC {digest:08x})'
+    return f'[{", ".join(map(_shown, value))}]' if isinstance(value, list) else f'{value}'
 
 
 def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
@@ -36,7 +175,7 @@ def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
         from plotly.offline import get_plotlyjs
     except ImportError:
         raise MissingExtraError('plotly', 'report', 'the page') from None
-    found = panels([bag.run for bag in bags])
+    found, seconds = panels([bag.run for bag in bags]), max(bag.run.duration for bag in bags)
     groups = dict.fromkeys(panel.group for panel in found)
     events = sorted(
         (event.time, k, event.kind, event.text)
@@ -56,14 +195,14 @@ def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
         'report.html',
         ' and '.join(bag.name for bag in bags),
         names=[bag.name for bag in bags],
-        seconds=max(bag.run.duration for bag in bags),
+        seconds=seconds,
         thinned=max(_period(bag.run) for bag in bags),
         versions=sorted({bag.content.version or 'another recorder' for bag in bags}),
-        links=[*groups, 'The arm', 'Events', 'Configuration'],
+        links=[*groups, 'Events', 'Configuration'],
         summaries=[
             (bag.name, colour(k), format_table(summarize(bag.run))) for k, bag in enumerate(bags)
         ],
-        data={'panels': plots(found, bags), 'arms': [arm(bag, k) for k, bag in enumerate(bags)]},
+        data={'panels': plots(found, bags), 'seconds': seconds},
         plotly=get_plotlyjs(),
         events=[
             (
@@ -140,30 +279,9 @@ def _histograms(panel: Panel, prefixes: Sequence[str]) -> Iterator[dict[str, Any
 
 
 def _numbers(values: Floats) -> list[float | None]:
-    return [float(f'{one:.{_DIGITS}g}') if np.isfinite(one) else None for one in values.tolist()]
+    return [float(f'{y:.{_DIGITS}g}') if np.isfinite(y) else None for y in values.tolist()]
 
 
 def colour(k: int) -> str:
     """Return the colour of the k-th bag."""
     return COLOURS[k % len(COLOURS)]
-
-
-def arm(bag: ReportedBag, k: int) -> dict[str, Any]:
-    """Return the joints of an arm and their positions, sampled for the animation."""
-    run = bag.run
-    pictures = int(min(_MOST_PICTURES, max(2.0, run.duration * _RATE)))
-    times = np.linspace(0.0, run.duration, pictures)
-    rows = np.minimum(np.searchsorted(run.time, times), run.stamp.size - 1)
-    position, reference = (
-        [] if angles is None else np.nan_to_num(angles).round(4).tolist()
-        for angles in (run.at('position', rows), run.at('reference', rows))
-    )
-    return {
-        'name': bag.name,
-        'colour': colour(k),
-        'joints': bag.arm.joints,
-        'tip': bag.arm.tip,
-        'time': times.round(4).tolist(),
-        'angles': position,
-        'reference': reference,
-    }

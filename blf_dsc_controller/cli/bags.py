@@ -36,8 +36,7 @@ _DISCOVERY = 1.0  # s, until subscribers have found the publishers
 
 def report(options: Namespace) -> None:
     """Write the HTML page of one or several bags."""
-    from blf_dsc_controller.analysis.report import write_report
-    from blf_dsc_controller.analysis.reported_bag import read_bags
+    from blf_dsc_controller.analysis.report import read_bags, write_report
 
     make_room(options.out, force=options.force)
     bags = read_bags(options.bags, options.namespace, NameMap.parse(options.map))

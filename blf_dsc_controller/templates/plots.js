@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// Draws the panels and the arm from the data of the page; nothing is loaded from elsewhere.
+// Draws the panels from the data of the page; nothing is loaded from elsewhere.
 'use strict';
 
 const data = JSON.parse(document.getElementById('data').textContent);
 const timePlots = [];
-const duration = Math.max(...data.arms.map((arm) => arm.time[arm.time.length - 1]));
+const duration = data.seconds;
 let following = false;
 
 // Legends are below: above they would cover the title, beside it take half of a narrow plot.
@@ -96,114 +96,4 @@ async function drawAll() {
   window.reportReady = performance.now();
 }
 
-const canvas = document.getElementById('arm');
-const slider = document.getElementById('arm-time');
-const clock = document.getElementById('arm-clock');
-const play = document.getElementById('arm-play');
-let playing = null;
-
-const plus = (a, b) => a.map((one, k) => one + b[k]);
-const times = (R, v) => R.map((row) => row.reduce((sum, one, k) => sum + one * v[k], 0));
-const product = (A, B) => A.map((row) => [0, 1, 2].map(
-  (k) => row.reduce((sum, one, j) => sum + one * B[j][k], 0)));
-
-function turn([x, y, z], angle) {
-  const [c, s] = [Math.cos(angle), Math.sin(angle)];
-  const d = 1 - c;
-  return [[c + d * x * x, d * x * y - s * z, d * x * z + s * y],
-    [d * x * y + s * z, c + d * y * y, d * y * z - s * x],
-    [d * x * z - s * y, d * y * z + s * x, c + d * z * z]];
-}
-
-// Base, joints and tip [m] in the base.
-function points(arm, positions) {
-  let R = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
-  const found = [[0, 0, 0]];
-  arm.joints.forEach(([rotation, offset, axis, slides], i) => {
-    let place = plus(found[i], times(R, offset));
-    R = product(R, rotation);
-    if (slides) place = plus(place, times(R, axis.map((one) => positions[i] * one)));
-    else R = product(R, turn(axis, positions[i]));
-    found.push(place);
-  });
-  return [...found, plus(found[found.length - 1], times(R, arm.tip))];
-}
-
-// Arms in a plane are seen from the front, others from above and aside; dragging turns the view.
-const planar = data.arms.every((arm) => arm.joints.every(
-  ([, offset, axis]) => offset[1] === 0 && offset[2] === 0 && axis[1] === -1));
-const view = planar ? {yaw: 0, pitch: 0} : {yaw: -0.6, pitch: 0.35};
-
-function seen([x, y, z]) {
-  const [c, s] = [Math.cos(view.yaw), Math.sin(view.yaw)];
-  const depth = s * x + c * y;
-  return [c * x - s * y, z * Math.cos(view.pitch) + depth * Math.sin(view.pitch)];
-}
-
-canvas.addEventListener('pointermove', (event) => {
-  if (!event.buttons) return;
-  view.yaw += 0.01 * event.movementX;
-  view.pitch += 0.01 * event.movementY;
-  showArm();
-});
-
-function drawArm(time) {
-  const scale = window.devicePixelRatio || 1;
-  const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-  canvas.width = width * scale;
-  canvas.height = height * scale;
-  const pen = canvas.getContext('2d');
-  pen.setTransform(scale, 0, 0, scale, 0, 0);
-  pen.clearRect(0, 0, width, height);
-  const reach = Math.max(...data.arms.map((arm) => [...arm.joints.map((joint) => joint[1]), arm.tip]
-    .reduce((sum, offset) => sum + Math.hypot(...offset), 0)));
-  const unit = 0.46 * Math.min(width, height) / reach;
-  const place = (point) => {
-    const [x, y] = seen(point);
-    return [width / 2 + unit * x, height / 2 - unit * y];
-  };
-  const line = (corners, colour, thickness) => {
-    pen.strokeStyle = colour;
-    pen.lineWidth = thickness;
-    pen.lineCap = pen.lineJoin = 'round';
-    pen.beginPath();
-    corners.map(place).forEach(([x, y]) => pen.lineTo(x, y));
-    pen.stroke();
-  };
-  line([[-reach, 0, 0], [reach, 0, 0]], '#e5e7eb', 1);
-  if (!planar) line([[0, -reach, 0], [0, reach, 0]], '#e5e7eb', 1);
-  for (const arm of data.arms) {
-    const last = arm.time.length - 1;
-    const k = Math.min(last, Math.round(time / arm.time[last] * last) || 0);
-    const corners = points(arm, arm.angles[k]);
-    line(corners, arm.colour, 6);
-    corners.map(place).forEach(([x, y]) => {
-      pen.fillStyle = arm.colour;
-      pen.beginPath();
-      pen.arc(x, y, 6, 0, 7);
-      pen.fill();
-    });
-    if (arm.reference.length) line(points(arm, arm.reference[k]), '#22272e', 1.5);
-  }
-  clock.textContent = `${time.toFixed(2)} s`;
-  canvas.dataset.time = time;
-}
-
-function showArm() { drawArm(slider.value / 1000 * duration); }
-
-play.addEventListener('click', () => {
-  playing = playing === null ? performance.now() - slider.value / 1000 * duration * 1e3 : null;
-  play.textContent = playing === null ? 'play' : 'pause';
-  const step = (now) => {
-    if (playing === null) return;
-    const time = ((now - playing) / 1e3) % duration;
-    slider.value = time / duration * 1000;
-    drawArm(Math.max(0, time));
-    requestAnimationFrame(step);
-  };
-  if (playing !== null) requestAnimationFrame(step);
-});
-slider.addEventListener('input', () => { playing = null; play.textContent = 'play'; showArm(); });
-window.addEventListener('resize', showArm);
-showArm();
 drawAll();

@@ -10,7 +10,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from blf_dsc_controller.analysis.reported_bag import read_bags
+from blf_dsc_controller.analysis.report import read_bags
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.messages.topics import LAMBDA_MIN, LOAD
 from blf_dsc_controller.run import Floats, Run, Series, Stamps
