@@ -7,7 +7,7 @@ Measurements begin when the window is full and latched.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from harness import Ratio, interleaved, ratio
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
-from blf_dsc_controller.configuration.schema import build, change, flatten, parameters
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.reference.terms import sampled
@@ -28,38 +28,13 @@ _ANY_EXCITATION = 1e-12
 """A threshold that every window passes, even short ones and those with many columns."""
 
 
-def two_link(**changes: Any) -> ControllerConfig:
-    """Return recommended settings that learn from any window."""
+def learning(name: str, **changes: Any) -> ControllerConfig:
+    """Return the controller of a preset, which learns from any window."""
     values = {
         'learning.excitation_threshold': _ANY_EXCITATION,
         'learning.change_detection': False,  # the states are noise, which no arm explains
     }
-    return build(ControllerConfig, values | {k.replace('__', '.'): v for k, v in changes.items()})
-
-
-def chain(n: int, **changes: Any) -> ControllerConfig:
-    """Return the same settings for a planar arm of n links, with a window of 1 s."""
-    default: Mapping[str, Any] = flatten(ControllerConfig())
-    values: dict[str, Any] = {'model': 'planar_chain', 'joints': [f'joint{i}' for i in range(n)]}
-    for param in parameters(ControllerConfig):
-        if param.length == ('joints',) and default[param.name]:
-            values[param.name] = [default[param.name][0]] * n
-    p = n * (n + 1) // 2
-    values |= {
-        'reference.amplitude': [0.3] * n,
-        'learning.initial_estimate': [0.5] * p,
-        'learning.adaptation_gain': [0.5] * p,
-        'learning.radius': float(p),
-        'learning.window': 1.0,
-        'torque.limit': [1e3] * n,
-    }
-    return two_link(**{name.replace('.', '__'): value for name, value in values.items()}, **changes)
-
-
-def of_urdf(preset: str) -> ControllerConfig:
-    """Return the controller of a preset with a URDF, which learns from any window."""
-    config = load_loop(preset).controller
-    return change(config, {'learning.change_detection': False})
+    return change(load_loop(name).controller, values | changes)
 
 
 def label(config: ControllerConfig) -> str:
@@ -101,21 +76,24 @@ def updates(config: ControllerConfig) -> Callable[[], int]:
 
 def measure() -> Iterator[Ratio]:
     """Measure the time per update relative to the two-link arm's."""
-    tones: dict[str, Any] = {'learning__viscous': True, 'learning__frequencies': [1.0, 2.0]}
+    tones = learning(
+        'recommended', **{'learning.viscous': True, 'learning.frequencies': [1.0, 2.0]}
+    )
+    arms = {name: learning(name) for name in ('panda', 'ur5e')}
     cases: dict[str, dict[str, ControllerConfig]] = {
         'joints and unknowns': {
-            label(config): config for config in (two_link(), chain(4), chain(7), chain(7, **tones))
-        },
-        'arms from a URDF': {
-            f'{name}: {label(of_urdf(name))}': of_urdf(name) for name in ('panda', 'ur5e')
+            f'{name}: {label(config)}': config
+            for name, config in {'two links': tones, **arms}.items()
         },
         'window': {
-            f'window of {samples} samples': two_link(learning__window=samples * _T)
+            f'window of {samples} samples': learning(
+                'recommended', **{'learning.window': samples * _T}
+            )
             for samples in (100, 100_000)
         },
     }
     for group, configs in cases.items():
-        contestants = {BASE: updates(two_link())}
+        contestants = {BASE: updates(learning('recommended'))}
         contestants |= {name: updates(config) for name, config in configs.items()}
         times = interleaved(contestants, _ROUNDS)
         for name, config in configs.items():

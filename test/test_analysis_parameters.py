@@ -56,7 +56,7 @@ def test_progress_compares_parameters_by_name(record, capsys):
         (('mass', 'length', 'other'), 'bound 0.50\n'),
     ):
         progress = LoopProgress(config.plant, shown)
-        progress.show_loop(10.0, 0.5, record.sample(-1).estimate[:3])
+        progress.show(10.0, 0.5, record.sample(-1).estimate[:3])
         progress.close()
         assert line in capsys.readouterr().err
 

@@ -54,14 +54,17 @@ def test_growth_is_written_as_a_table(monkeypatch, tmp_path):
     importlib.import_module('run').main()
     text = (tmp_path / 'RESULTS.md').read_text()
     assert '## growth with joints' in text
-    assert '| n = 7 joints, p = 70 unknowns (28 of the arm + 42 of disturbances) | **' in text
+    assert (
+        '| two links: n = 2 joints, p = 15 unknowns (3 of the arm + 12 of disturbances) | **'
+        in text
+    )
     assert (
         '| panda: n = 7 joints, p = 62 unknowns (48 of the arm + 14 of disturbances) | **' in text
     )
     assert '| window of 100000 samples | **' in text
     monkeypatch.setattr(growth, '_ANY_EXCITATION', 1e6)
     with pytest.raises(RuntimeError, match=r'p = 5 .* nothing is learned from the window'):
-        growth.updates(growth.two_link())
+        growth.updates(growth.learning('recommended'))
 
 
 @pytest.mark.skipif(shutil.which('cc') is None, reason='there is no C compiler')

@@ -138,7 +138,7 @@ def _run_offline(config: LoopConfig, bag: Path) -> None:
         n = len(record.config.joints)
         errors = abs(record.samples[:rows, 2 * n : 3 * n] / record.samples[:rows, 6 * n : 7 * n])
         estimate = record.controller.state.estimate[: len(parameters)]
-        progress.show_loop(record.stamps[rows - 1] * 1e-9, np.nanmax(errors), estimate)
+        progress.show(record.stamps[rows - 1] * 1e-9, np.nanmax(errors), estimate)
 
     with announced_compilation(print_notice):
         record = simulate(config.controller, config.plant, show)
@@ -193,19 +193,30 @@ def _report(out: Path) -> bool:
     return any(stop.stamp < last or stop.reason != Reason.STATE_TIMEOUT for stop in recorded.stops)
 
 
-class Progress:
-    """Progress over time: a bar on a terminal, otherwise (as in a log) a line every few seconds."""
+class LoopProgress:
+    """Progress over simulated time, with the largest |xi1| / k_c and the parameter error.
 
-    def __init__(self, title: str, seconds: float) -> None:
-        """Begin at 0 of `seconds`, which is 0 if the end is open."""
+    A bar on a terminal, otherwise (as in a log) a line every few seconds.
+    """
+
+    def __init__(self, config: PlantConfig, parameters: Sequence[str]) -> None:
+        """Begin at 0 s; `parameters` are the names of the estimates."""
+        self._order = parameter_order(parameters, config)
+        self._config = config
         form, pause = (_BAR, 0.2) if sys.stderr.isatty() else (_LINE, _LINE_PERIOD)
-        self._seconds = seconds
-        self._bar = tqdm(total=seconds, desc=title, bar_format=form, mininterval=pause)
+        self._bar = tqdm(
+            total=config.duration, desc='closed loop', bar_format=form, mininterval=pause
+        )
 
-    def show(self, elapsed: float, status: str = '') -> None:
-        """Show the elapsed time [s] and a short status."""
+    def show(self, elapsed: float, ratio: float, estimate: ArrayLike) -> None:
+        """Show the simulated time [s], the largest |xi1| / k_c so far, and P^ (p,)."""
+        P = parameters_of(self._config, elapsed)[self._order]
+        error = np.linalg.norm(np.asarray(estimate) - P) / np.linalg.norm(P)
+        status = f'max|xi1|/bound {ratio:.2f}'
+        if np.all(self._order >= 0) and not self._config.robot.urdf:  # else P has mixed units
+            status += f', parameter error {100 * error:.2f} %'
         self._bar.set_postfix_str(status, refresh=False)
-        self._bar.update(min(elapsed, self._seconds or elapsed) - self._bar.n)
+        self._bar.update(min(elapsed, self._config.duration) - self._bar.n)
 
     def write(self, text: str) -> None:
         """Print a line without disturbing the bar."""
@@ -214,25 +225,6 @@ class Progress:
     def close(self) -> None:
         """Show the last state."""
         self._bar.close()
-
-
-class LoopProgress(Progress):
-    """Progress over simulated time, with the largest |xi1| / k_c and the parameter error."""
-
-    def __init__(self, config: PlantConfig, parameters: Sequence[str]) -> None:
-        """Begin at 0 s; `parameters` are the names of the estimates."""
-        super().__init__('closed loop', config.duration)
-        self._order = parameter_order(parameters, config)
-        self._config = config
-
-    def show_loop(self, elapsed: float, ratio: float, estimate: ArrayLike) -> None:
-        """Show the simulated time [s], the largest |xi1| / k_c so far, and P^ (p,)."""
-        P = parameters_of(self._config, elapsed)[self._order]
-        error = np.linalg.norm(np.asarray(estimate) - P) / np.linalg.norm(P)
-        status = f'max|xi1|/bound {ratio:.2f}'
-        if np.all(self._order >= 0) and not self._config.robot.urdf:  # else P has mixed units
-            status += f', parameter error {100 * error:.2f} %'
-        self.show(elapsed, status)
 
 
 def precompile(options: Namespace) -> None:

@@ -274,7 +274,7 @@ class ProgressMonitor:
             self._start = stamp
         ratio = max(value for name, value in values.items() if name.startswith(RATIO))
         self._elapsed = stamp - self._start
-        self.progress.show_loop(self._elapsed, ratio, [values[name] for name in self._parameters])
+        self.progress.show(self._elapsed, ratio, [values[name] for name in self._parameters])
         return True
 
     def __enter__(self) -> ProgressMonitor:

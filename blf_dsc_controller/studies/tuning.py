@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tuning of the compared laws, all by the same procedure, objective and budget.
 
-    python -m blf_dsc_controller.studies.tuning proposed      config/paper_tuned.yaml
-    python -m blf_dsc_controller.studies.tuning comparison    config/comparison.yaml
-    python -m blf_dsc_controller.studies.tuning slotine_li    config/slotine_li.yaml
+    python -m blf_dsc_controller.studies.tuning proposed      # the gains of config/paper_tuned.yaml
+    python -m blf_dsc_controller.studies.tuning comparison    # of config/comparison.yaml
+    python -m blf_dsc_controller.studies.tuning slotine_li    # of config/slotine_li.yaml
 
 Common to all: the arm, its disturbance, reference, start, P^(0), sample time and torque limit; two
 runs of 30 s, with ideal and with realistic sensors (preset noisy); the objective; the number of
@@ -13,9 +13,7 @@ gains (slotine_li has fewer) and the ranges of shared ones; the optimiser, its s
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,10 +22,8 @@ from scipy.stats import qmc
 from tqdm import tqdm
 
 from blf_dsc_controller.analysis.metrics import Metrics, measure
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import PLANT, LoopConfig, format_value, load_loop
-from blf_dsc_controller.configuration.schema import change, flatten
-from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.configuration.schema import Value, change
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -57,9 +53,8 @@ class Gain(NamedTuple):
 class Task(NamedTuple):
     """A law to tune: its preset, fixed parameters and tuned gains."""
 
-    title: str
     preset: str
-    fixed: Mapping[str, object]
+    fixed: Mapping[str, Value]
     gains: tuple[Gain, ...]
 
 
@@ -84,24 +79,9 @@ _COMPARISON = (
     Gain('comparison.leakage', 1e-5, 1.0, length=0),
 )
 TASKS = {
-    'proposed': Task(
-        "The proposed law in the paper's own form (preset paper), its gains tuned",
-        'paper',
-        {},
-        _PROPOSED,
-    ),
-    'comparison': Task(
-        'The comparison controller (35), its gains tuned',
-        'recommended',
-        {'law': 'backstepping'},
-        _COMPARISON,
-    ),
-    'slotine_li': Task(
-        'The classical adaptive law of Slotine and Li, its gains tuned',
-        'recommended',
-        {'law': 'slotine_li'},
-        (*_SHARED, _SURFACE_OF_35),
-    ),
+    'proposed': Task('paper', {}, _PROPOSED),
+    'comparison': Task('recommended', {'law': 'backstepping'}, _COMPARISON),
+    'slotine_li': Task('recommended', {'law': 'slotine_li'}, (*_SHARED, _SURFACE_OF_35)),
 }
 
 
@@ -115,17 +95,17 @@ def bounded(cost: float) -> float:
     return min(float(cost), HOPELESS) if np.isfinite(cost) else HOPELESS
 
 
-def parameters_at(task: Task, exponents: Floats) -> dict[str, object]:
+def parameters_at(task: Task, exponents: Floats) -> dict[str, Value]:
     """Return the parameters of a point, whose coordinates are log10 of the gains."""
-    chosen: dict[str, object] = dict(task.fixed)
+    chosen: dict[str, Value] = dict(task.fixed)
     per_joint: dict[str, list[float]] = {}
     for gain, exponent in zip(task.gains, exponents, strict=True):
         value = value_at(exponent)
         if gain.joint >= 0:
             per_joint.setdefault(gain.name, [0.0, 0.0])[gain.joint] = value
         else:
-            chosen[gain.name] = [value] * gain.length if gain.length else value
-    return {**chosen, **per_joint}
+            chosen[gain.name] = (value,) * gain.length if gain.length else value
+    return chosen | {name: tuple(values) for name, values in per_joint.items()}
 
 
 def cost_of(metrics: Metrics, sample_time: float) -> float:
@@ -198,40 +178,15 @@ def tune(task: Task) -> tuple[Floats, float, int]:
         return search(cost, task.gains, POPULATION, GENERATIONS)
 
 
-def preset(name: str, exponents: Floats, value: float, evaluations: int) -> str:
-    """Return the text of the parameter file with the result, as changes to the defaults.
-
-    The truth, which the monitors use, is that of the preset paper.
-    """
-    task, defaults = TASKS[name], flatten(ControllerConfig())
-    base = flatten(load_loop(task.preset).controller)
-    truth = flatten(load_loop('paper').controller)
-    base |= {key: entry for key, entry in truth.items() if key.startswith('truth.')}
-    changes = {key: entry for key, entry in base.items() if entry != defaults[key]}
-    lines = ''.join(
-        f'    {key}: {format_value(tuple(entry) if isinstance(entry, list) else entry)}\n'  # type: ignore[arg-type]
-        for key, entry in {**changes, **parameters_at(task, exponents)}.items()
-    )
-    return (
-        f'# {task.title}.\n'
-        f'# Made by `python -m blf_dsc_controller.studies.tuning {name} FILE`:\n'
-        f'# {evaluations} evaluations, objective {value:.3f} (decades of error; less is better).\n'
-        f'\n/**/blf_dsc_controller:\n  ros__parameters:\n{lines}'
-    )
-
-
 def main() -> None:
-    """Tune one law and write its preset."""
-    options = argparse.ArgumentParser(prog='tune', description='Tune one of the compared laws.')
+    """Tune a law and print its gains, as they stand in its preset."""
+    options = argparse.ArgumentParser(prog='tune', description=__doc__.splitlines()[0])
     options.add_argument('law', choices=TASKS)
-    options.add_argument('out', type=Path, help='parameter file to write')
-    chosen = options.parse_args()
-    try:
-        exponents, value, evaluations = tune(TASKS[chosen.law])
-        chosen.out.write_text(preset(chosen.law, exponents, value, evaluations), encoding='utf-8')
-    except BlfDscError as error:
-        sys.exit(f'tune: {error}')
-    print(f'wrote {chosen.out}: objective {value:.4f} after {evaluations} evaluations')
+    task = TASKS[options.parse_args().law]
+    exponents, value, evaluations = tune(task)
+    print(f'# {evaluations} evaluations, objective {value:.3f} (decades of error; less is better)')
+    for name, entry in parameters_at(task, exponents).items():
+        print(f'{name}: {format_value(entry)}')
 
 
 if __name__ == '__main__':
