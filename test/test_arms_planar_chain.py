@@ -8,7 +8,7 @@ import pinocchio
 import pytest
 from closed_loop_case import MODEL, P, R
 from plain_law import dynamics
-from plants import ARM, points
+from plants import ARM
 from random_arm import CONFIG, PANDA, UR5E, configuration, pinocchio_model, random_urdf
 
 import sim_plant.arm as physics
@@ -171,11 +171,6 @@ def test_law_runs_on_three_links():
     assert controller.state.estimate.size == 6 + 3
 
 
-JOINTS = ('joint1', 'joint2')
-TEXT = urdf('arm', JOINTS, (1.0, 0.8), (1.0, 1.0), (0.0, 0.0))
-TWO_LINK = read_chain(TEXT, 'base_link', 'tip', JOINTS)
-
-
 def test_corners_and_axes_agree_with_pinocchio():
     text, joints = random_urdf(6, 5)
     chain = read_chain(text, 'base', 'tip', joints)
@@ -203,19 +198,6 @@ def test_tip_radius_is_the_sum_of_what_each_joint_moves_the_tip():
     ]
     reach = np.linalg.norm(np.subtract(*np.moveaxis(moved, 1, 0)), axis=1) / (2.0 * h)
     np.testing.assert_allclose(tip_radius(chain, q, bound), reach @ bound, rtol=1e-8)
-
-
-def test_straight_arm_attains_the_tip_radius():
-    chain = TWO_LINK
-    straight, errors = np.array([0.4, 0.0]), np.array([1e-6, 2e-6])
-    off = skeleton(chain, straight + errors)[0][-1] - skeleton(chain, straight)[0][-1]
-    np.testing.assert_allclose(np.linalg.norm(off), tip_radius(chain, straight, errors), rtol=1e-5)
-
-
-def test_arm_drawn_without_a_urdf_is_that_of_section_iv():
-    corners, axes = skeleton(TWO_LINK, np.array([0.7, -1.9]))
-    np.testing.assert_allclose(corners[1:], points(1.0, 0.8, (0.7, -1.9)), atol=1e-15)
-    np.testing.assert_allclose(axes, [[0.0, -1.0, 0.0]] * 2, atol=1e-15)
 
 
 def panda(radius=0.07, floor=0.0):

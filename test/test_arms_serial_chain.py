@@ -253,7 +253,10 @@ class Learned:
 @pytest.mark.parametrize('chain', [*CHAINS, ONE_JOINT])
 def test_initial_parameters_give_the_torques_of_the_base_parameters(chain):
     case = Learned(chain)
-    assert case.form.model.p == case.form.initial.size == len(case.form.model.parameter_units)
+    units = case.form.model.parameter_units
+    assert case.form.model.p == case.form.initial.size == len(units)
+    for unit, joint in zip(units, chain.joints, strict=False):  # rotors come first
+        assert unit == ('kg' if joint.kind == 'prismatic' else 'kg m^2')
     case.assert_same_torques(case.form.initial, chain.inertias, case.rotors)
 
 
@@ -314,13 +317,3 @@ def test_prior_is_wide_for_what_the_form_learns_and_tight_elsewhere():
     assert deviation['rotor7'] == pytest.approx(ROTORS * case.rotors[-1])
     assert deviation['load m'] == pytest.approx(RATED)
     assert deviation['links'] == pytest.approx(TRUSTED)
-
-
-def test_units_distinguish_prismatic_from_revolute_joints():
-    for chain in CHAINS[2:]:
-        model = Learned(chain).form.model
-        units = dict(zip(model.parameter_names, model.parameter_units, strict=True))
-        for i, joint in enumerate(chain.joints, 1):
-            prismatic = joint.kind == 'prismatic'
-            assert units[f'rotor{i}'] == ('kg' if prismatic else 'kg m^2')
-    assert Learned(PANDA_CHAIN).form.model.parameter_units[7:9] == ('kg', 'kg m')

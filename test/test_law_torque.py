@@ -10,13 +10,12 @@ from math import exp, pi, sin
 import numpy as np
 import pytest
 from arbitrary_case import arbitrary
-from closed_loop_case import REFERENCE, P, R, closed_loop, controller, plant, quick, recommended
+from closed_loop_case import P, R, closed_loop, controller, plant, quick, recommended
 from plain_law import PlainLaw, dynamics
 
 from blf_dsc_controller.law import barrier, surface
 from blf_dsc_controller.law.settings import COMPENSATIONS, EFFORT, UPDATES
 from blf_dsc_controller.law.torque import LEVEL_CUT, RATE_CUT, find_applied, saturate
-from blf_dsc_controller.reference import terms as reference
 
 BOUND, WEIGHT, LIMIT = 0.002, 1000.0, 2e4
 KNEE = barrier.knee(BOUND, WEIGHT, LIMIT)
@@ -171,36 +170,6 @@ def test_virtual_control_is_that_of_the_paper_without_its_singularity():
         assert ours(xi1) == dqr - mu * xi1
     for x in (1e-6, -5e-5, np.nextafter(1e-4, 0.0), 1e-4, 0.1, -2.0):
         assert surface.sinc(x) == pytest.approx(sin(x) / x, abs=3e-16)
-
-
-def test_law_follows_the_filter_from_the_first_virtual_control():
-    """alpha2(0) = beta2(0), then the solution for held beta2, at the mean rate alpha2'.
-
-    The virtual control scales the error with the bound: it adds xi1 k'/k.
-    """
-    settings = recommended(**NARROWING)
-    law = controller(settings)
-    qr, dqr, ddqr = np.zeros((3, 2))
-    random = np.random.default_rng(1)
-    alpha2 = None
-    for k in range(200):
-        t = k * 1e-3
-        reference.evaluate(REFERENCE, t, qr, dqr, ddqr)
-        xi1 = random.uniform(-0.0015, 0.0015, 2)
-        dq = dqr + random.normal(size=2)
-        law.update(t, 1e-3, np.concatenate([qr + xi1, dq, np.zeros(2)]))
-
-        s = pi * xi1**2 / (2.0 * bound(t) ** 2)
-        beta2 = -settings.K * bound(t) ** 2 / (xi1 * pi) * np.sin(s) * np.cos(s)
-        beta2 += dqr - settings.mu * xi1 + narrowing(t) * xi1
-        alpha2 = beta2 if alpha2 is None else alpha2
-
-        np.testing.assert_allclose(law.signals.beta2, beta2, atol=1e-12)
-        np.testing.assert_allclose(law.signals.xi2, dq - alpha2, atol=1e-12)
-        next_alpha2 = beta2 + (alpha2 - beta2) * exp(-1e-3 / settings.time_constant)
-        np.testing.assert_allclose(law.signals.dalpha2, (next_alpha2 - alpha2) / 1e-3, atol=1e-9)
-        alpha2 = next_alpha2
-        np.testing.assert_allclose(law.state.alpha2, alpha2, atol=1e-12)
 
 
 # The window is not a multiple of the interval, and learning lasts nearly a second. For so short
