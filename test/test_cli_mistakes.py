@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 import synthetic_bag
-from command import closed_loop, finished
+from command import finished
 from synthetic_bag import Synthetic
 
 from blf_dsc_controller.cli.main import main
@@ -206,12 +206,3 @@ def test_node_reports_what_is_wrong_with_its_arguments(tmp_path):
         assert run.returncode == 1
         assert expected in run.stderr
         assert 'Traceback' not in run.stderr
-
-
-def test_help_lists_the_options():
-    run = closed_loop('--help')
-    assert run.returncode == 0
-    assert 'usage: blf_dsc run' in run.stdout
-    assert 'Example:\n  blf_dsc run --config' in run.stdout
-    for option in ('--config', '--duration', '--mode', '--seed', '--offline', '--out'):
-        assert option in run.stdout

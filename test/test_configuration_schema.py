@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import array
 import math
-import subprocess
-import sys
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -302,15 +300,3 @@ def test_plant_and_controller_must_agree():
     other = DEFAULTS._replace(plant=change(DEFAULTS.plant, {'joints': ['joint1', 'elbow']}))
     (problem,) = other.problems()
     assert problem.startswith('joints: sim_plant has joint1, elbow, but blf_dsc_controller has')
-
-
-def test_configurations_load_without_ros():
-    program = (
-        'import sys; sys.modules.update(rclpy=None, rcl_interfaces=None, ament_index_python=None)\n'
-        'from blf_dsc_controller.configuration.nodes import load_loop, locate\n'
-        'print(load_loop(locate("noisy")).plant.actuator.delay)'
-    )
-    run = subprocess.run(
-        [sys.executable, '-c', program], capture_output=True, text=True, check=True
-    )
-    assert run.stdout == '1\n'

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from math import exp
-
 import numpy as np
 import pytest
 from arbitrary_case import arbitrary
@@ -26,30 +24,6 @@ from blf_dsc_controller.law.settings import EFFORT, PREDICTIONS
 from sim_plant.plant import plant_of
 
 BIAS = (0.3, -0.2)
-
-
-@pytest.mark.parametrize(('n', 'p'), [(1, 1), (2, 3), (3, 4)])
-def test_both_sides_are_filtered_by_two_exact_poles(n, p):
-    """Against the recursion written out, for any n and p: the same pole twice."""
-    settings, state, signals = arbitrary(5, n, p)
-    random = np.random.default_rng(6)
-    first, second = state.filter1.copy(), state.filter2.copy()
-    for _ in range(50):
-        dt = random.uniform(5e-4, 2e-3)
-        torque = random.normal(size=n)
-        Yp, rest = state.momentum.copy(), state.rest.copy()
-        signals.momentum[:] = random.normal(size=(n, p))
-        signals.rest[:] = random.normal(size=(n, settings.m))
-
-        prediction.filter_row(settings, state, signals, dt, torque)
-        prediction.remember(settings, state, signals)
-
-        X = (rest + signals.rest) / 2.0
-        X[:, :p] += (signals.momentum - Yp) / dt
-        gain = 1.0 - exp(-settings.pole * dt)
-        first = first + gain * (np.column_stack([X, torque]) - first)
-        second = second + gain * (first - second)
-        np.testing.assert_allclose(signals.row, second, atol=1e-9)  # the quotient is about 1e3
 
 
 def filtered_rows(sample_time, duration=2.0):
