@@ -138,25 +138,26 @@ def test_metadata_matches_rosbag2(tmp_path):
         'starting_time': {'nanoseconds_since_epoch': START},
         'duration': {'nanoseconds': 2 * MILLISECOND + 1},
     }
+    topics = [
+        {
+            'topic_metadata': {
+                'name': topic.resolved,
+                'type': topic.type,
+                'serialization_format': 'cdr',
+                'offered_qos_profiles': [quality],
+                'type_description_hash': hash_,
+            },
+            'message_count': 3,
+        }
+        for topic, hash_ in HASHES.items()
+    ]
     information = {
         'version': 9,
         'storage_identifier': 'mcap',
         'duration': period['duration'],
         'starting_time': period['starting_time'],
         'message_count': 6,
-        'topics_with_message_count': [
-            {
-                'topic_metadata': {
-                    'name': topic.resolved,
-                    'type': topic.type,
-                    'serialization_format': 'cdr',
-                    'offered_qos_profiles': [quality],
-                    'type_description_hash': hash_,
-                },
-                'message_count': 3,
-            }
-            for topic, hash_ in HASHES.items()
-        ],
+        'topics_with_message_count': topics,
         'compression_format': '',
         'compression_mode': '',
         'relative_file_paths': ['run_0.mcap'],

@@ -140,18 +140,8 @@ def test_rejected_columns_reach_the_summary_with_their_reason(rejecting_run):
     assert learning['final_relative_error'] < 0.5
 
 
-def test_run_without_rejected_columns(tmp_path):
-    config = configured('recommended', 8.0)
-    write_bag(tmp_path / 'bag', simulate(*config[1::-1]), config.controller, 'none')
-    run = read_run(tmp_path / 'bag')
-    assert summarize(run)['learning']['rejected_columns'] == {}
-    assert 'V barrier' not in run.monitor.names
-
-
 def test_monitors_are_drawn_from_the_bag(rejecting_run, tmp_path):
     path = tmp_path / 'monitors.png'
     assert path in draw(rejecting_run, tmp_path)
-    image = matplotlib.image.imread(path)
-    assert image.shape[1] > 1200
-    dark = (image[..., :3].max(axis=2) < 0.3).sum()
+    dark = (matplotlib.image.imread(path)[..., :3].max(axis=2) < 0.3).sum()
     assert dark > 1000  # the Lyapunov function is drawn in ink
