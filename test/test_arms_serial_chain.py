@@ -13,7 +13,13 @@ from blf_dsc_controller.arms.batch import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.chain_kernels import ROTOR
 from blf_dsc_controller.arms.forms import TRUSTED, learned_parameters
 from blf_dsc_controller.arms.inertia import INERTIA_NAMES, inertia_of, pseudo_inertia
-from blf_dsc_controller.arms.prior import CENTRE, ROTORS, prior_factor
+from blf_dsc_controller.arms.prior import (
+    CENTRE,
+    ROTORS,
+    deviations,
+    payload_inertia,
+    prior_factor,
+)
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.compiled.jit import kernel
@@ -216,6 +222,14 @@ def test_prior_without_payload_is_tighter():
     assert np.linalg.eigvalsh(loaded @ loaded.T - empty @ empty.T)[0] > -1e-12
     tool = base.model.parameter_names.index('m*cx6')
     assert np.linalg.norm(empty[tool]) == pytest.approx(0.365 * CENTRE)
+
+
+def test_prior_of_a_ball_is_the_same_in_every_direction():
+    J, turn = payload_inertia(2.0), np.eye(4)
+    turn[:3, :3] = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    ten = deviations(J, 0.3, CENTRE)
+    turned = np.transpose([inertia_of(turn @ pseudo_inertia(d) @ turn.T) for d in ten.T])
+    np.testing.assert_allclose(turned @ turned.T, ten @ ten.T, atol=1e-15)
 
 
 RATED = 3.0  # kg
