@@ -4,11 +4,9 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Iterator
-from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from numpy.typing import NDArray
 
@@ -43,56 +41,47 @@ _ROWS = 1 << 14
 _PARAMETER = 'kg m^2'  # of arms without a URDF
 
 
-class Column(NamedTuple):
-    """Values (N,), NaN where unknown, and their unit, empty if they have none."""
+def table(run: RecordedRun, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
+    """Return some rows of every series of a run by name and unit, as `torque joint1 [N m]`.
 
-    values: NDArray[Any]
-    unit: str
-
-
-def table(run: RecordedRun, rows: slice = slice(None)) -> dict[str, Column]:
-    """Return some rows of every series of a run by name, aligned to the stamps of its joint states.
-
-    `stamp` and `received` are integers, all others floats. Values published with each sample
-    are in the row of its stamp; those published less often (truth, timing, monitor) are held until
-    the next message.
+    They are aligned to the stamps of its joint states. `stamp` and `received` are integers, all
+    others floats, NaN where unknown. Values published with each sample are in the row of its stamp;
+    those published less often (truth, timing, monitor) are held until the next message.
     """
     stamp = run.stamp[rows]
-    columns = {
-        'stamp': Column(stamp, 'ns'),
-        'received': Column(run.received[rows], 'ns'),
-        'time': Column(run.time_of(stamp), 's'),
+    columns: dict[str, NDArray[Any]] = {
+        'stamp [ns]': stamp,
+        'received [ns]': run.received[rows],
+        'time [s]': run.time_of(stamp),
     }
     for field, unit in _FIELDS.items():
         values = run.at(field, rows) if run.holds(field) else None
         if values is not None:
-            for i, joint in enumerate(run.joints):
-                columns[f'{field} {joint}'] = Column(values[:, i], unit)
+            for joint, column in zip(run.joints, values.T, strict=True):
+                columns[f'{field} {joint} [{unit}]'] = column
     for topic in ('learning', 'truth', 'timing', 'monitor'):
         series = getattr(run, topic)
         if series is not None:
             values = (series.exact if topic == 'learning' else series.held)(stamp)
-            for j, name in enumerate(series.names):
-                columns[f'{topic} {name}'] = Column(values[:, j], _unit(name, run))
+            for name, column in zip(series.names, values.T, strict=True):
+                columns[f'{topic} {name} [{_unit(name, run)}]'] = column
     return columns
 
 
 def _unit(name: str, run: Run) -> str:
     """Return the unit of a named value; parameters of a URDF have their own."""
-    if name == topics.LAMBDA_MIN:
-        return '' if run.arm is not None else 's^-4'
     if run.arm is not None and name in run.arm.units:
         return run.arm.units[name] or '1'
+    if name == topics.LAMBDA_MIN and run.arm is None:
+        return 's^-4'
     known = [unit for beginning, unit in _VALUES.items() if name.startswith(beginning)]
-    return known[0] if known else '' if run.arm is not None else _PARAMETER
+    return known[0] if known else '1' if run.arm is not None else _PARAMETER
 
 
 def export(run: RecordedRun, path: Path) -> int:
     """Write the table as CSV or Parquet, by the suffix of `path`; return the number of columns.
 
     It is written block by block: a run may be larger than memory. Numbers are read back exactly.
-    Units are field metadata in Parquet; those of a CSV are in the data package beside it (see
-    `described`).
 
     Raises:
         BlfDscError: the suffix is neither .csv nor .parquet.
@@ -103,50 +92,29 @@ def export(run: RecordedRun, path: Path) -> int:
             f'{path} ends in neither .csv nor .parquet: the file extension selects the format'
         )
     blocks = (slice(begin, begin + _ROWS) for begin in range(0, run.stamp.size, _ROWS))
-    tables = (table(run, rows) for rows in blocks)
-    return (_write_csv if path.suffix == '.csv' else _write_parquet)(tables, path)
+    (_write_csv if path.suffix == '.csv' else _write_parquet)(
+        (table(run, rows) for rows in blocks), path
+    )
+    return len(table(run, slice(1)))
 
 
-def described(path: Path) -> Path:
-    """Return the path of a CSV's Frictionless data package: columns' names, types and units."""
-    return path.with_suffix('.datapackage.json')
-
-
-def _write_csv(tables: Iterator[dict[str, Column]], path: Path) -> int:
-    fields: list[dict[str, str]] = []
+def _write_csv(tables: Iterator[dict[str, NDArray[Any]]], path: Path) -> None:
     with path.open('w', encoding='utf-8', newline='') as stream:
         writer = csv.writer(stream)
-        for block in tables:
-            if not fields:
+        for k, block in enumerate(tables):
+            if k == 0:
                 writer.writerow(block)
-                for name, (values, unit) in block.items():
-                    type_ = 'integer' if values.dtype.kind == 'i' else 'number'
-                    fields.append({'name': name, 'type': type_} | ({'unit': unit} if unit else {}))
-            writer.writerows(zip(*(values.tolist() for values, _ in block.values()), strict=True))
-    resource = {
-        'name': 'run',
-        'path': path.name,
-        'profile': 'tabular-data-resource',
-        'schema': {'fields': fields, 'missingValues': ['', 'nan']},
-    }
-    text = json.dumps({'profile': 'tabular-data-package', 'resources': [resource]}, indent=1)
-    described(path).write_text(text + '\n', encoding='utf-8')
-    return len(fields)
+            writer.writerows(zip(*(values.tolist() for values in block.values()), strict=True))
 
 
-def _write_parquet(tables: Iterator[dict[str, Column]], path: Path) -> int:
+def _write_parquet(tables: Iterator[dict[str, NDArray[Any]]], path: Path) -> None:
     try:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError:
         raise MissingExtraError('pyarrow', 'parquet', 'writing Parquet') from None
-    first = next(tables)
-    schema = pa.schema(
-        pa.field(name, pa.from_numpy_dtype(values.dtype), metadata={'unit': unit} if unit else None)
-        for name, (values, unit) in first.items()
-    )
-    with parquet.ParquetWriter(path, schema) as writer:
-        for block in chain([first], tables):
-            arrays = [pa.array(values) for values, _ in block.values()]
-            writer.write_table(pa.table(arrays, schema=schema))
-    return len(schema)
+    first = pa.table(next(tables))
+    with parquet.ParquetWriter(path, first.schema) as writer:
+        writer.write_table(first)
+        for block in tables:
+            writer.write_table(pa.table(block))

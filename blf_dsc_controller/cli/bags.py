@@ -57,16 +57,12 @@ def _run(options: Namespace) -> RecordedRun:
 
 def export(options: Namespace) -> None:
     """Write a bag as a table."""
-    from blf_dsc_controller.bags.table import described
     from blf_dsc_controller.bags.table import export as export_run
 
-    out = options.out
-    make_room(out, *([described(out)] if out.suffix == '.csv' else ()), force=options.force)
+    make_room(options.out, force=options.force)
     run = _run(options)
     columns = export_run(run, options.out)
     print(f'wrote {options.out}: {run.stamp.size} rows of {columns} columns')
-    if options.out.suffix == '.csv':
-        print(f'wrote {described(options.out)}: their units')
 
 
 def plot(options: Namespace) -> None:
