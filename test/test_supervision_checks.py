@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 from closed_loop_case import controller, plant, recommended
 from fault_table import FAULTS, page, run
-from hypothesis import given
-from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import build
@@ -117,30 +115,6 @@ def test_only_finite_and_plausible_states_are_used_and_the_reasons_agree(
     if reason:
         states = StateCheck(['joint1', 'joint2'], DT)
         assert states.invalid(Safety(velocity_limit=50.0), measurement).reason is reason
-
-
-SAFETY = Safety()
-# Repeated, early, regular, jittering, missed and far too late; occasionally backwards.
-STEPS = st.sampled_from([0, 1, 499_999, 500_001, 1_000_000, 1_000_001, 1_499_999, 1_500_001])
-RARE_STEPS = st.sampled_from([2_000_000, 3_000_000, 41_000_000, 50_000_000, -1_000_000])
-
-
-class FullCheck(StateCheck):
-    """Checks each stamp in full."""
-
-    def _is_next(self, _stamp):
-        return False
-
-
-@given(steps=st.lists(STEPS | RARE_STEPS | st.just(1_000_000), max_size=60))
-def test_short_stamp_check_agrees_with_the_full_one(steps):
-    short, full = (cls(['joint1', 'joint2'], DT) for cls in (StateCheck, FullCheck))
-    stamp = 1_000_000_000
-    for step in steps:
-        stamp += step
-        faults = [states.check(SAFETY, stamp) for states in (short, full)]
-        assert faults[0] == faults[1]
-        assert vars(short) == vars(full)
 
 
 MILLISECOND = 1_000_000  # ns

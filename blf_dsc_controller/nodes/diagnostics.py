@@ -29,18 +29,15 @@ STALE = DiagnosticStatus.STALE
 
 
 class DiagnosticsPublisher:
-    """Publishes the statuses of a node and, given a topic for it, its latched state."""
+    """Publishes the statuses of a node."""
 
-    def __init__(
-        self, node: Node, joints: Sequence[str], state: topics.Topic | None = None
-    ) -> None:
+    def __init__(self, node: Node, joints: Sequence[str]) -> None:
         self._node = node
         self._name = node.get_fully_qualified_name().removeprefix('/')
         self._hardware = ' '.join(joints)
         self._diagnostics = node.create_publisher(
             DiagnosticArray, topics.DIAGNOSTICS.name, qos_profile(topics.DIAGNOSTICS.offered)
         )
-        self._state = create_publisher(node, state) if state else None
 
     def status(
         self, part: str, level: bytes, message: str, values: Mapping[str, Any]
@@ -59,11 +56,6 @@ class DiagnosticsPublisher:
         array = DiagnosticArray(status=list(statuses))
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._diagnostics.publish(array)
-
-    def publish_state(self, status: DiagnosticStatus) -> None:
-        """Publish the latched state, which late subscribers also receive."""
-        if self._state is not None:
-            self._state.publish(status)
 
 
 _PHASES = {
@@ -93,7 +85,8 @@ class ControllerStatus:
         self.rejected: tuple[RejectedColumn, ...] = ()
         self.trajectories: TrajectoryInput | None = None
         self._joints = tuple(joints)
-        self._diagnostics = DiagnosticsPublisher(node, joints, topics.STATE)
+        self._diagnostics = DiagnosticsPublisher(node, joints)
+        self._latched = create_publisher(node, topics.STATE)
         self._revision = -1
         self._published: tuple[str, str, int] | None = None
         self._logger = node.get_logger()
@@ -122,7 +115,7 @@ class ControllerStatus:
         self._diagnostics.publish(parts)
         stops = guard.supervisor.stops if guard else 0
         if (state.message, lifecycle, stops) != self._published:
-            self._diagnostics.publish_state(state)
+            self._latched.publish(state)
             self._published = (state.message, lifecycle, stops)
         self._revision = guard.supervisor.revision if guard else -1
 
@@ -147,6 +140,7 @@ class ControllerStatus:
 
     def _loop(self, guard: Guard, others: int) -> DiagnosticStatus:
         states, samples = guard.states, guard.samples
+        off = f'off: {guard.watchdog.why_off}'.removesuffix(': ')
         values = {
             'samples': guard.controller.samples,
             'repeated states ignored': states.repeated,
@@ -155,7 +149,7 @@ class ControllerStatus:
             'states missed': states.missed,
             'samples with a torque at its limit': samples.saturated,
             'messages for other joints': guard.foreign,
-            'watchdog on the steady clock': _watchdog(guard),
+            'watchdog on the steady clock': 'on' if guard.watchdog.on else off,
             **self._cuts(guard),
             **(self.trajectories.values if self.trajectories else {}),
         }
@@ -220,9 +214,3 @@ def chatter_of(guard: Guard, joints: Sequence[str]) -> str:
         'measured velocity is coarse or noisy. Lower the pole of the velocity filter and add '
         'its lag to robot.lag, whose gains are softer'
     )
-
-
-def _watchdog(guard: Guard) -> str:
-    why_off = guard.watchdog.why_off
-    off = f'off: {why_off}' if why_off else 'off'
-    return 'on' if guard.watchdog.on else off

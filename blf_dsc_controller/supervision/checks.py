@@ -49,7 +49,6 @@ class StateCheck:
         """`sample_time` is T [s]."""
         self._joints = tuple(joints)
         self._sample_time = sample_time
-        self._one_sample = (0.5e9 * sample_time, 1.5e9 * sample_time)  # ns
         self.repeated = 0
         self.restart()
 
@@ -69,20 +68,10 @@ class StateCheck:
 
         The stamp is in ns; the values are checked by the law (`law.checks.is_valid_state`).
         """
-        fault = None if self._is_next(stamp) else self._check_stamp(safety, stamp)
+        fault = self._check_stamp(safety, stamp)
         if fault is None:
             self._last_stamp = stamp
         return fault
-
-    def _is_next(self, stamp: int) -> bool:
-        """Whether a stamp is one sample after the last, with nothing to count."""
-        shortest, longest = self._one_sample
-        return (
-            shortest < stamp - self._last_stamp < longest
-            and self._last_stamp > 0
-            and self._repeats == 0
-            and self.missed_fraction == 0.0
-        )
 
     def _check_stamp(self, safety: Safety, stamp: int) -> Fault | None:
         if stamp <= 0:

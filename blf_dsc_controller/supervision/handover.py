@@ -52,17 +52,25 @@ def check_first_torque(
     torque = controller.trial(0.0, config.sample_time, measurement)
     if config.robot.urdf:
         _check_gravity(controller, config, measurement, torque)
+    q, _, effort = measurement.reshape(3, -1)
     step = np.array(config.torque.first_step)
     # Of an effort that only contains commands, a torque is held that this one replaces.
-    held = measurement.reshape(3, -1)[2] if config.robot.effort == 'commanded' else 0.0
+    held = effort if config.robot.effort == 'commanded' else 0.0
     excess = np.where(step > 0.0, np.abs(torque - held) - step, 0.0)
     worst = int(np.argmax(excess))
-    if excess[worst] > 0.0:
-        raise StartError(
-            f'the first torque would step to {torque[worst]:.4g} N m on joint '
-            f'{config.joints[worst]!r}, more than the {step[worst]:g} N m that its drive tolerates '
-            f'(torque.first_step){_gravity_of(controller, config, measurement, torque)}'
+    if excess[worst] <= 0.0:
+        return
+    text = (
+        f'the first torque would step to {torque[worst]:.4g} N m on joint '
+        f'{config.joints[worst]!r}, more than the {step[worst]:g} N m that its drive tolerates '
+        '(torque.first_step)'
+    )
+    if config.robot.urdf and _is_like(torque, _gravity(controller, q)):
+        text += (
+            ': it is the gravity of the URDF; if the drives compensate it themselves, set '
+            'robot.drive_compensates to gravity, or to gravity_and_friction'
         )
+    raise StartError(text)
 
 
 def _gravity(controller: Controller, q: Vector) -> Vector:
@@ -146,20 +154,6 @@ def _check_gravity(
         f'{torque[worst]:.4g} N m, would drop the arm. Release the brakes if they hold it, or set '
         'robot.drive_compensates to none, or robot.effort to commanded if the effort does not '
         f'contain what the drives add, or {_SEND}'
-    )
-
-
-def _gravity_of(
-    controller: Controller, config: ControllerConfig, measurement: Vector, torque: Vector
-) -> str:
-    """Return what a first torque is that resembles gravity, else an empty text."""
-    if not (
-        config.robot.urdf and _is_like(torque, _gravity(controller, measurement.reshape(3, -1)[0]))
-    ):
-        return ''
-    return (
-        ': it is the gravity of the URDF; if the drives compensate it themselves, set '
-        'robot.drive_compensates to gravity, or to gravity_and_friction'
     )
 
 

@@ -34,7 +34,8 @@ from blf_dsc_controller.reference.terms import sampled
 Floats = NDArray[np.float64]
 
 _SETTLED = 20.0  # time constants of the damping, for which the response is followed
-_BISECTIONS = 16
+
+
 _MOMENTS = 40  # of the reference
 _REVERSAL = 0.75  # of Coulomb friction: half of it too much at breakaway, with either sign
 
@@ -92,30 +93,6 @@ def transition(
     B = np.zeros((*A.shape[:-1], n))
     B[:, :n], B[:, n : 2 * n] = 0.5 * T**2 * free, T * free
     return A, B
-
-
-def growth(settings: Settings, loop: Loop, M: Floats, M0: Floats, stiffness: Floats) -> float:
-    """Return the largest factor by which errors grow from sample to sample; stable below 1."""
-    A, _ = transition(settings, loop, M, M0, stiffness)
-    return float(np.abs(np.linalg.eigvals(A)).max())
-
-
-def margins(settings: Settings, loop: Loop, M0: Floats, stiffness: Floats) -> tuple[float, float]:
-    """Return how many times lighter the arm, and how many seconds later the loop, may be."""
-
-    def largest(reach: float, *, lighter: bool) -> float:
-        low, high = 0.0, reach
-        for _ in range(_BISECTIONS):
-            middle = 0.5 * (low + high)
-            M = M0 / (1.0 + middle) if lighter else M0
-            slower = loop if lighter else loop._replace(lag=loop.lag + middle)
-            if growth(settings, slower, M, M0, stiffness) < 1.0:
-                low = middle
-            else:
-                high = middle
-        return low
-
-    return 1.0 + largest(9.0, lighter=True), largest(0.05, lighter=False)
 
 
 def peak_errors(settings: Settings, loop: Loop, M: Floats, M0: Floats, torque: Floats) -> Floats:
