@@ -311,5 +311,5 @@ def test_one_command_runs_the_simulated_driver_over_ros_and_replays_bit_for_bit(
     assert recorded.stops == ()
     replayed = verify(tmp_path / 'out' / 'bag')
     assert replayed.difference is None
-    left_out = [one.left_out for one in replayed.comparisons if one.left_out]
+    left_out = [each.left_out for each in replayed.comparisons if each.left_out]
     assert left_out == ['compute_time']

@@ -8,7 +8,7 @@ import time
 import traceback
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -59,14 +59,6 @@ _LONGEST_END = 3.0  # s from a signal to the end; ros2 launch sends the next sig
 _SILENT = 0.1  # s without joint states, after which nothing is left to bring to rest
 
 
-class _Ending(NamedTuple):
-    """The end of the process after a signal."""
-
-    since: float  # s, steady
-    messages: int  # joint states processed so far
-    seen_at: float  # s, when the last of them was
-
-
 class ControllerNode(LoopNode[ControllerConfig]):
     """Commands a torque on `~/commands` for each joint state, and publishes telemetry.
 
@@ -95,7 +87,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._heard = False  # whether there were any at the last count
         self._observed = self._started = False
         self._logged = Phase.INACTIVE, 0, False  # phase, stops, silenced
-        self._ending: _Ending | None = None  # since a signal
+        self._ends_at = 0.0  # s, at the latest, since a signal
+        self._last_seen = 0, 0.0  # joint states processed by then, and when the last was
         self._status = ControllerStatus(self, joints)
         parameters.on_change(self, ControllerConfig, self._retune, self._problems)
         self.start()
@@ -152,15 +145,14 @@ class ControllerNode(LoopNode[ControllerConfig]):
         guard = self.guard
         if guard is None or not guard.commanding or self.config.safety.torque == 'zero':
             return True
-        now, seen = time.monotonic(), guard.journal.messages
-        if self._ending is None:
-            self._ending = _Ending(now, seen, now)
+        now, messages = time.monotonic(), guard.journal.messages
+        if not self._ends_at:
+            self._ends_at = now + _LONGEST_END
             if guard.supervisor.running:
                 self.deactivate()
-        if seen > self._ending.messages:
-            self._ending = _Ending(self._ending.since, seen, now)
-        is_silent = now > self._ending.seen_at + _SILENT
-        return guard.is_settled or is_silent or now > self._ending.since + _LONGEST_END
+        if messages > self._last_seen[0]:
+            self._last_seen = messages, now
+        return guard.is_settled or now > min(self._last_seen[1] + _SILENT, self._ends_at)
 
     def _leave(self) -> None:
         """Command the torque that drivers may hold from now on, and release the guard."""

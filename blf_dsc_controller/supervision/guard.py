@@ -52,8 +52,24 @@ _REASONS: dict[type[codecs.MessageError], Reason] = {
 }
 
 
-class GuardedLaw:
-    """The law with its checks and safe torque; it records every start and stop in its journal.
+class LatePlanError(TrajectoryError):
+    """The time at which a trajectory should take effect passed while it was planned."""
+
+    def __init__(self, at: float, now: float) -> None:
+        super().__init__([f'it should begin at {at:.6g} s, but was planned only at {now:.6g} s'])
+
+
+class Plan(NamedTuple):
+    """A planned trajectory."""
+
+    trajectory: Trajectory
+    at: float  # s since the start, when it takes effect
+    before: np.ndarray  # packed reference that it continues
+    motion: BlendedReference
+
+
+class Guard:
+    """The law with its checks and safe torque; it records all events in its journal.
 
     `update`, `reject`, `watch` and `fail` return the torque (n,) [N m] to command, or None.
 
@@ -169,7 +185,8 @@ class GuardedLaw:
         torque = law.update(self._time_of(stamp), dt, measurement)
         self.compute_time = perf_counter() - before
         if law.flags & INVALID:
-            return self._reject(stamp, measurement)
+            self._stop(*self.states.invalid(self.config.safety, measurement))
+            return self._safe_at(stamp, measurement)
         last.take(stamp, measurement)
         self._advance_to(stamp)
         if is_first and self.commanding:
@@ -192,11 +209,6 @@ class GuardedLaw:
         """Go on waiting for a state to start from."""
         self.waiting_for = problem
         self.states.restart()
-
-    def _reject(self, stamp: int, measurement: Vector) -> Vector | None:
-        """Stop because of an invalid state."""
-        self._stop(*self.states.invalid(self.config.safety, measurement))
-        return self._safe_at(stamp, measurement)
 
     def _safe_at(self, stamp: int, measurement: Vector) -> Vector | None:
         """Return the safe torque for a state that the law has not used."""
@@ -342,26 +354,6 @@ class GuardedLaw:
         )
         self.journal.commands += torque is not None
         return torque
-
-
-class LatePlanError(TrajectoryError):
-    """The time at which a trajectory should take effect passed while it was planned."""
-
-    def __init__(self, at: float, now: float) -> None:
-        super().__init__([f'it should begin at {at:.6g} s, but was planned only at {now:.6g} s'])
-
-
-class Plan(NamedTuple):
-    """A planned trajectory."""
-
-    trajectory: Trajectory
-    at: float  # s since the start, when it takes effect
-    before: np.ndarray  # packed reference that it continues
-    motion: BlendedReference
-
-
-class Guard(GuardedLaw):
-    """The guarded law in operation; it records every event in its journal."""
 
     def activate(self) -> None:
         """Take command with the next state; estimates are kept if so configured."""
