@@ -20,13 +20,7 @@ from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.simulation.metrics import torque_rows
 from blf_dsc_controller.studies import arms as study
 from blf_dsc_controller.studies import laws
-from blf_dsc_controller.studies.arms import (
-    ROUGHEST,
-    Result,
-    cost_of,
-    table_of,
-    trial,
-)
+from blf_dsc_controller.studies.arms import ROUGHEST, Result, cost_of, table_of, trial
 from blf_dsc_controller.studies.laws import (
     CONTENDERS,
     INTERVALS,

@@ -13,13 +13,7 @@ from blf_dsc_controller.arms.batch import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.chain_kernels import ROTOR
 from blf_dsc_controller.arms.forms import TRUSTED, learned_parameters
 from blf_dsc_controller.arms.inertia import INERTIA_NAMES, inertia_of, pseudo_inertia
-from blf_dsc_controller.arms.prior import (
-    CENTRE,
-    ROTORS,
-    deviations,
-    payload_inertia,
-    prior_factor,
-)
+from blf_dsc_controller.arms.prior import CENTRE, ROTORS, deviations, payload_inertia, prior_factor
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.compiled.jit import kernel

@@ -12,12 +12,7 @@ import pytest
 
 from blf_dsc_controller.arms.model import arm_model
 from blf_dsc_controller.configuration.controller import MODELS, ControllerConfig, parameter_count
-from blf_dsc_controller.configuration.nodes import (
-    NODES,
-    LoopConfig,
-    RecorderConfig,
-    load_loop,
-)
+from blf_dsc_controller.configuration.nodes import NODES, LoopConfig, RecorderConfig, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import (
     Kind,

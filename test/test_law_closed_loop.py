@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from changes import run
 from closed_loop_case import (
     JOINTS,
     START,
@@ -22,7 +23,6 @@ from closed_loop_case import (
 from paper_case import EXACT, configured
 from plain_law import dynamics
 from scipy.integrate import solve_ivp
-from test_law_consistency import run
 
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.errors import OutsideBarrierError
@@ -117,7 +117,6 @@ def test_lyapunov_function_decreases_from_sample_to_sample(kappa, compensation):
         assert V[-1] < 0.1 * V[6000]
 
 
-TRUE = np.array([1.0, 0.32, 0.4])
 END = 0.5  # s
 K, MU, LAMBDA, KP, W, KC = 150.0, 20.0, 0.002, np.array([60.0, 20.0]), 1000.0, 0.002
 GAMMA, GAMMA3, KAPPA, RHO = 0.5, 100.0, 20.0, 1e-5
@@ -151,11 +150,11 @@ def derivative(t, y):
     dalpha2 = (surface(xi1, dqr) - alpha2) / LAMBDA
     H, H_r = regressor(q, dq, alpha2, dalpha2), regressor(qr, dqr, dqr, ddqr)
     barrier = W * xi1 / np.cos(np.pi * xi1**2 / (2.0 * KC**2)) ** 2
-    P0 = 0.5 * TRUE
+    P0 = 0.5 * P
     torque = H @ P0 + H_r @ (estimate - P0) + d3 - KP * xi2 - barrier
-    M, C, G = dynamics(TRUE, R, q, dq)
+    M, C, G = dynamics(P, R, q, dq)
     ddq = np.linalg.solve(M, torque - C @ dq - G - 0.1 - 0.1 * np.sin(t))
-    eps = np.linalg.solve(PHI + RHO * np.eye(3), PHI @ (TRUE - estimate))
+    eps = np.linalg.solve(PHI + RHO * np.eye(3), PHI @ (P - estimate))
     learned = GAMMA * KAPPA * eps
     update = learned - GAMMA * H_r.T @ xi2
     return np.concatenate([dq, ddq, dalpha2, update, -GAMMA3 * xi2 - H_r @ learned])
@@ -167,7 +166,7 @@ def continuous():
     start = np.array([2.293, 1.696])
     qr, dqr, _ = reference(0.0)
     alpha2 = surface(start - qr, dqr)
-    y = np.concatenate([start, np.zeros(2), alpha2, 0.5 * TRUE, np.zeros(2)])
+    y = np.concatenate([start, np.zeros(2), alpha2, 0.5 * P, np.zeros(2)])
     solution = solve_ivp(
         derivative, (0.0, END), y, method='LSODA', rtol=1e-10, atol=1e-13, t_eval=TIMES
     )
@@ -183,7 +182,7 @@ def sampled(dt):
     law: Controller = controller(settings)
     law.state.latched[0] = 1.0
     law.state.Phi[:] = PHI
-    law.state.b[:] = PHI @ TRUE
+    law.state.b[:] = PHI @ P
     law.state.factor[:] = PHI + RHO * np.eye(3)
     cholesky.factor(law.state.factor)
     arm = plant(sample_time=dt)

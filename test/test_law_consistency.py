@@ -4,19 +4,27 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import pytest
-from changes import BOUND, CHANGED, LIGHTER, OFF, ROWS, WINDOW, allowed, begin_of, end_of, payload
+from changes import (
+    BOUND,
+    CHANGED,
+    LIGHTER,
+    OFF,
+    ROWS,
+    WINDOW,
+    allowed,
+    begin_of,
+    end_of,
+    payload,
+    run,
+)
 from paper_case import NO_DISTURBANCE, configured
 
 from blf_dsc_controller import load_loop, simulate
-from blf_dsc_controller.analysis.metrics import estimates_of
 from blf_dsc_controller.law import consistency, excitation, window
-from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import controller_of
-from blf_dsc_controller.messages.topics import MODEL_CHANGES
 
 SENSORS = {
     'ideal': {},
@@ -33,36 +41,6 @@ SENSORS = {
     },
     'noisy velocity': {'sensor.velocity_noise': 1e-3, 'actuator.delay': 1},
 }
-
-
-class Loop(NamedTuple):
-    """A loop whose plant may have changed; the first axis is the sample."""
-
-    t: np.ndarray  # s
-    xi1: np.ndarray  # (., 2) rad
-    error: np.ndarray  # (.,) |P^ - P| / |P|, P of the plant at that time
-    torque: np.ndarray  # (., 2) N m
-    changes: np.ndarray  # (.,) detected so far
-    controller: Controller
-
-    def largest(self, begin):
-        """Largest |xi1| of each joint (2,) from a time on [rad]."""
-        return np.abs(self.xi1[self.t >= begin]).max(axis=0)
-
-
-def run(duration, plant=None, *, preset='recommended', law=None):
-    """Run a preset with changed parameters of the plant, events among them, and of the law."""
-    config = configured(preset, duration, law, plant)
-    record = simulate(config.controller, config.plant)
-    found = record.run()
-    return Loop(
-        found.time,
-        found.error,
-        estimates_of(found).relative_error,
-        found.torque,
-        found.learning.column(MODEL_CHANGES),
-        record.controller,
-    )
 
 
 CASES = [

@@ -12,15 +12,7 @@ import numba
 import numpy as np
 import pytest
 from arbitrary_case import arbitrary_settings
-from closed_loop_case import (
-    REFERENCE,
-    START,
-    closed_loop,
-    controller,
-    plant,
-    quick,
-    record,
-)
+from closed_loop_case import REFERENCE, START, R, closed_loop, controller, plant, quick, record
 from numba.core.runtime import _nrt_python, rtsys
 from paper_case import EXACT, NO_DISTURBANCE, P, configured, run
 from plain_law import dynamics
@@ -176,7 +168,6 @@ def test_interpreted_kernels_compute_the_same_torque():
 
 
 ROUNDING = 1e-10
-R = 9.8  # 1/s^2, g / l1
 UNEVEN = {
     'feedback.gain': [40.0, 25.0],
     'feedback.boundary_layer': 0.02,

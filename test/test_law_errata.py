@@ -223,9 +223,6 @@ def test_erratum_16_disturbance_reduces_the_effective_velocity_feedback():
     assert power > -0.5 * xi2 @ (settings.Kp * xi2)  # the printed rate is twice as fast
 
 
-NO_SINE = (0.0, 0.0)
-
-
 def test_erratum_1_prediction_error_enters_with_a_minus():
     """(20) prints -Gamma (H^T xi2 + kappa eps): learning then drives P^ to the projection ball."""
     settings = recommended()
@@ -243,7 +240,7 @@ def test_erratum_2_both_integrals_carry_the_same_factor():
     """(21) lacks the 1/tau_d of (22) and (24): the update then settles at P / tau_d."""
     settings = recommended()
     law = controller(settings)
-    record(law, plant(constant=(0.3, -0.2), amplitude=NO_SINE), 8.0)
+    record(law, plant(constant=(0.3, -0.2), amplitude=QUIET), 8.0)
     theta = np.array([*P, 0.3, -0.2])
     tau_d = settings.window * 1e-3
 

@@ -6,21 +6,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from arbitrary_case import arbitrary
-from closed_loop_case import (
-    P,
-    closed_loop,
-    controller,
-    plant,
-    quick,
-    recommended,
-)
+from closed_loop_case import P, R, closed_loop, controller, plant, quick, recommended
 from paper_case import NO_DISTURBANCE, configured, run
 from plain_law import dynamics
 from scipy.signal import cont2discrete
 
 from blf_dsc_controller.law import prediction
 from blf_dsc_controller.law.factory import controller_of
-from blf_dsc_controller.law.settings import EFFORT, PREDICTIONS
+from blf_dsc_controller.law.settings import EFFORT, LAMBDA, PREDICTIONS
 from sim_plant.plant import plant_of
 
 BIAS = (0.3, -0.2)
@@ -87,9 +80,7 @@ def test_learning_from_the_command_uses_the_saturated_torque(limit):
     assert worst < 0.01
 
 
-R = 9.8  # 1/s^2, g / l1
 ACCELERATION = PREDICTIONS.index('acceleration')
-LAMBDA = PREDICTIONS.index('lambda')
 
 
 @pytest.mark.parametrize('omega', [1.0, 30.0, 1000.0])

@@ -37,14 +37,7 @@ from blf_dsc_controller.studies.report import (
     worst_first,
     write_report,
 )
-from blf_dsc_controller.studies.runs import (
-    Span,
-    Store,
-    chunk_size,
-    compute,
-    run_chunk,
-    warm_up,
-)
+from blf_dsc_controller.studies.runs import Span, Store, chunk_size, compute, run_chunk, warm_up
 
 
 @pytest.fixture(scope='module')

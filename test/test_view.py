@@ -22,12 +22,7 @@ from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.view import address
 from blf_dsc_controller.view.address import free_port
-from blf_dsc_controller.view.arm import (
-    ShownArm,
-    planar_urdf,
-    with_cylinders,
-    with_known_meshes,
-)
+from blf_dsc_controller.view.arm import ShownArm, planar_urdf, with_cylinders, with_known_meshes
 from blf_dsc_controller.view.bag import BagPlayer
 from blf_dsc_controller.view.page import Page, bodies_of, plant_events
 
