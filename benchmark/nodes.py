@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes against null nodes, which answer or discard messages without decoding them.
+"""The controller's node against a null node, which answers without decoding messages.
 
-This process stands in for the plant or for a source of messages. Every contestant is restarted in
+This process stands in for the plant. Every contestant is restarted in
 each round, as a process of its own. The controller gets the joint states of a simulated run, first
 each as soon as the torque before has arrived, then one a millisecond.
 """
@@ -25,15 +25,12 @@ from blf_dsc_controller.configuration.controller import ControllerConfig, Teleme
 from blf_dsc_controller.configuration.nodes import CONTROLLER, LoopConfig, dump, load_loop
 from blf_dsc_controller.law.telemetry import PlantTelemetry
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.simulation.loop import simulate
 
 _ROUNDS = 3
 _STARTS = 2
 _STEPS = 2000  # of each mode
 _WARM_UP = 500
-_MESSAGES = 3000  # per topic of a recording, at 1 kHz
-_TOPICS = 5
 _START = 1_000_000_000
 _PERIOD = 1e-3  # s
 _SETTLING = 0.5  # s for discovery, or for a message to arrive
@@ -49,8 +46,6 @@ _GROUPS = {  # preset, title, contestants
 }
 _WARM = 'controller, warm cache'
 _COLD = 'controller, cold cache'
-_SUBSCRIBER = 'raw subscriber, nothing written'
-_RECORDERS = {'recorder': 'none', 'recorder, zstd': 'zstd'}
 _NULL_NODE = str(Path(__file__).with_name('null_node.py'))
 _CONTROLLER_NODE = ['-m', 'blf_dsc_controller.nodes.controller_node']
 _RECORDER_NODE = ['-m', 'blf_dsc_controller.nodes.recorder_node', '--ros-args', '-p']
@@ -267,63 +262,3 @@ def _first_torque(name: str, cache: str) -> float:
             return time.perf_counter() - begin
         finally:
             contestant.end()
-
-
-def measure_recording() -> Iterator[Ratio]:
-    """Measure the recorder's CPU time per message relative to the raw subscriber's."""
-    import rclpy
-
-    cpu: dict[str, list[float]] = {name: [] for name in (_SUBSCRIBER, *_RECORDERS)}
-    with own_graph(), tempfile.TemporaryDirectory() as folder:
-        context = rclpy.Context()
-        rclpy.init(context=context)
-        node: Any = rclpy.create_node('source', context=context)
-        try:
-            for k in range(_ROUNDS):
-                for name, spent in cpu.items():
-                    command = _recording(name, Path(folder, f'{k}-{name}'.replace(', ', '-')))
-                    spent.append(_cpu_of(node, Contestant(name, command)))
-        finally:
-            node.destroy_node()
-            rclpy.try_shutdown(context=context)
-    times = {name: np.array(values) for name, values in cpu.items()}
-    for name in _RECORDERS:
-        note = f'{1e6 * np.median(times[name]) / (_TOPICS * _MESSAGES):.1f} us a message here'
-        yield ratio('recording', f'{name}: CPU', _SUBSCRIBER, times[name], times[_SUBSCRIBER], note)
-
-
-def _recording(name: str, bag: Path) -> list[str]:
-    if name == _SUBSCRIBER:
-        return [_NULL_NODE, 'subscriber', *(f'topic{i}' for i in range(_TOPICS))]
-    return [*_RECORDER_NODE, f'output:={bag}', '-p', f'compression:={_RECORDERS[name]}']
-
-
-def _cpu_of(node: Any, contestant: Contestant) -> float:
-    """Return the CPU time [s] that a contestant spends on all messages."""
-    from sensor_msgs.msg import JointState
-
-    from blf_dsc_controller.nodes.endpoints import qos_profile
-
-    profile = qos_profile(topics.STREAM)
-    publishers = [node.create_publisher(JointState, f'topic{i}', profile) for i in range(_TOPICS)]
-    encoder = JointStateEncoder(('joint1', 'joint2'))
-    try:
-        wait_for(
-            lambda: all(publisher.get_subscription_count() == 1 for publisher in publishers),
-            f'the subscriptions of {contestant.name}',
-            [contestant],
-        )
-        time.sleep(_SETTLING)
-        before, begin = contestant.cpu_time(), time.perf_counter()
-        for k in range(_MESSAGES):
-            message = encoder.encode(k * 1_000_000, (1.0, 2.0), (3.0, 4.0), (5.0, 6.0))
-            for publisher in publishers:
-                publisher.publish(message)
-            time.sleep(max(0.0, begin + _PERIOD * (k + 1) - time.perf_counter()))
-        time.sleep(_SETTLING)
-        contestant.check()
-        return contestant.cpu_time() - before
-    finally:
-        contestant.end()
-        for publisher in publishers:
-            node.destroy_publisher(publisher)

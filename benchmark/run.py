@@ -24,7 +24,6 @@ _GROUPS = {  # module and function of each
     'growth': ('growth', 'measure'),
     'replay': ('offline', 'measure_replay'),
     'node': ('nodes', 'measure'),
-    'recording': ('nodes', 'measure_recording'),
     'startup': ('nodes', 'measure_start'),
 }
 _HERE = Path(__file__).parent

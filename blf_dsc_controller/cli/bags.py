@@ -152,11 +152,6 @@ def play(options: Namespace) -> None:
         rclpy.try_shutdown()
 
 
-def _left_out(count: int) -> Iterator[str]:
-    if count:
-        yield f'note: {count} states left out: not finite, or with unknown torques'
-
-
 def _print_speed(samples: int, seconds: float, took: float) -> None:
     print(f'{samples} samples, {seconds:.3f} s in {took:.2f} s: {seconds / took:.0f}x real time')
 
@@ -204,7 +199,8 @@ def _events(result: Verification) -> Iterator[str]:
 def _open_loop(found: WhatIf, config: ControllerConfig) -> Iterator[str]:
     yield 'OPEN LOOP: the arm moved under the recorded torques, not under these'
     yield f'recorded torque: {found.source}'
-    yield from _left_out(found.left_out)
+    if found.left_out:
+        yield f'note: {found.left_out} states left out: not finite, or with unknown torques'
     for i, joint in enumerate(config.joints):
         known = found.difference[np.isfinite(found.difference[:, i]), i]
         difference = (

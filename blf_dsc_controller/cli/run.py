@@ -65,9 +65,14 @@ def run(options: Namespace) -> int:
         recorder = {'output': str(out / 'bag'), 'clock': clock}
         config = config._replace(recorder=change(config.recorder, recorder))
         dump(out / 'config.yaml', config.by_node)
+        completed = True
         if options.offline:
             _run_offline(config, out / 'bag')
-        completed = options.offline or _run_over_ros(config, out, options)
+        else:
+            from blf_dsc_controller.cli.session import run_session
+
+            view_host = options.view_host if options.view else ''
+            completed = run_session(config, out, options.domain, view_host)
         try:
             stopped = _report(out)
         except BlfDscError as error:
@@ -146,13 +151,6 @@ def _run_offline(config: LoopConfig, bag: Path) -> None:
     for rejected in rejected_columns(record.controller, estimate_names(config.controller)):
         print(f'warning: {rejected}')
     write_bag(bag, record, config.controller, config.recorder.compression, config.plant)
-
-
-def _run_over_ros(config: LoopConfig, out: Path, options: Namespace) -> bool:
-    """Run the nodes; return False if a signal ended the run."""
-    from blf_dsc_controller.cli.session import run_session
-
-    return run_session(config, out, options.domain, options.view_host if options.view else '')
 
 
 def _check_view(options: Namespace) -> None:

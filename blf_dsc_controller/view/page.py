@@ -296,15 +296,14 @@ class Page:
         Off the truth or, where none is known, off what they were at the left end of the plot.
         """
         estimate = np.array([each.estimate for each in shown])
-        truth = shown[-1].truth if np.isfinite(shown[-1].truth).any() else estimate[0]
-        truth = np.array([each.truth for each in shown]) if truth is not estimate[0] else truth
+        truth = np.array([each.truth for each in shown])
+        truth = truth if np.isfinite(truth[-1]).any() else estimate[0]
         square = (100.0 * (estimate - truth) / self._prior) ** 2
-        rms = [
-            np.sqrt(np.nanmean(square[:, members], axis=1))
-            if np.isfinite(square[:, members]).any()
-            else np.full(len(shown), np.nan)
-            for members in self._bodies.values()
-        ]
+        with np.errstate(divide='ignore', invalid='ignore'):  # unknown: 0 / 0
+            rms = [
+                np.sqrt(np.nansum(square[:, k], axis=1) / np.isfinite(square[:, k]).sum(axis=1))
+                for k in self._bodies.values()
+            ]
         return np.array(rms)
 
     def _aim(self, camera: Any, width: float = inf) -> None:
