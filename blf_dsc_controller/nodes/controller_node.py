@@ -6,11 +6,11 @@ from __future__ import annotations
 import sys
 import time
 import traceback
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
+from rclpy.publisher import Publisher
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
@@ -29,7 +29,6 @@ from blf_dsc_controller.messages.codecs import (
 )
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
-from blf_dsc_controller.nodes.endpoints import subscription_count
 from blf_dsc_controller.nodes.lifecycle import POLL_PERIOD, LoopNode
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
 from blf_dsc_controller.supervision.checks import SAME_CLOCK, rate_mismatch
@@ -83,8 +82,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._arrivals: list[int] | None = []  # stamps before the start [ns]; None: measured
         self._checks = 0  # of the timer since the last of them
         self._warned_at = -1  # stamp of the start that the last warning was about
-        self._listeners: list[Callable[[], int]] = []  # count the subscribers of STREAMS
-        self._heard = False  # whether there were any at the last count
+        self._streams: list[Publisher] = []  # of STREAMS
+        self._heard = False  # whether they had subscribers at the last count
         self._observed = self._started = False
         self._logged = Phase.INACTIVE, 0, False  # phase, stops, silenced
         self._ends_at = 0.0  # s, at the latest, since a signal
@@ -107,8 +106,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.get_logger().warning(warning)
         outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
         if self.connect(outputs, topics.JOINT_STATES, self._on_joint_state):
-            streams = [self._outputs[topic] for topic in STREAMS if topic in outputs]
-            self._listeners = [subscription_count(publisher) for publisher in streams]
+            self._streams = [self._outputs[topic] for topic in STREAMS if topic in outputs]
             self._status.trajectories = TrajectoryInput(
                 self, len(self.config.joints), lambda: self.guard
             )
@@ -264,7 +262,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         sample, samples = controller.sample, controller.samples
         is_due = (samples - 1) % DECIMATION == 0
         if is_due:  # of what rarely changes
-            self._heard = any(count() for count in self._listeners)
+            self._heard = any(each.get_subscription_count() for each in self._streams)
             self._report_learning(guard)
             self._warn_of_rate(guard)
         if not self.config.telemetry.enabled:

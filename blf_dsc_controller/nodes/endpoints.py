@@ -147,28 +147,6 @@ def raw_publish(publisher: Publisher) -> Callable[[bytes], None]:
     return publish
 
 
-def subscription_count(publisher: Publisher) -> Callable[[], int]:
-    """Return a function that counts subscribers in a fifth of the time while the node exists."""
-    count: Callable[[], int] = publisher.handle.get_subscription_count
-    return count
-
-
-def take_messages(
-    subscription: Subscription, limit: int
-) -> Iterator[tuple[bytes, Mapping[str, int | None]]]:
-    """Take up to `limit` waiting messages from a subscription that no executor spins.
-
-    Each is serialised and comes with `source_timestamp` [ns], `received_timestamp` [ns] and
-    `publication_sequence_number`, which are None where the middleware does not know them.
-    """
-    take, type_ = subscription.handle.take_message, subscription.msg_type
-    for _ in range(limit):
-        taken = take(type_, True)  # noqa: FBT003 - serialised; positional in rclpy
-        if taken is None:
-            return
-        yield taken
-
-
 def take_response(client: Client) -> Any:
     """Take a response from a client that no executor spins; None if there is none yet."""
     type_: Any = client.srv_type
@@ -244,7 +222,12 @@ class RawSubscriptions:
         """Take the waiting messages, in the order in which they were received."""
         messages: list[RawMessage] = []
         for handle, subscription in self._subscriptions:
-            for raw, info in take_messages(subscription, _BATCH):
+            take, type_ = subscription.handle.take_message, subscription.msg_type
+            for _ in range(_BATCH):
+                taken = take(type_, True)  # noqa: FBT003 - serialised; positional in rclpy
+                if taken is None:
+                    break
+                raw, info = taken  # times and number are None if the middleware knows none
                 received = info['received_timestamp'] or time.time_ns()
                 published = info['source_timestamp'] or received
                 sequence = info['publication_sequence_number'] or 0

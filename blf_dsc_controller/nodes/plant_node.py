@@ -19,12 +19,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
-from math import cos, sin
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
+from geometry_msgs.msg import TransformStamped
 from rclpy.lifecycle import LifecycleNode
 from rclpy.timer import Timer
 from std_msgs.msg import Header, String
@@ -400,11 +399,6 @@ class Handshake:
         return True
 
 
-Quaternions = tuple[float, float, float, float]  # x, y, z, w
-Vector = tuple[float, float, float]
-_AXES: tuple[Vector, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
-
 class Frames:
     """Frames of the links of a URDF while its `joints` move; all others stay at 0.
 
@@ -412,84 +406,54 @@ class Frames:
     """
 
     def __init__(self, text: str, joints: Sequence[str]) -> None:
-        self._header_time = Time()
-        self._messages: list[TransformStamped] = []
-        self._moving: list[_MovingLink] = []
-        for link in links_of(text):
-            rest, origin = _origin(link.rpy), (*link.xyz.tolist(),)
-            axis = (*link.axis.tolist(),)
-            message = TransformStamped(
-                header=Header(stamp=self._header_time, frame_id=link.parent),
-                child_frame_id=link.name,
-                transform=Transform(translation=Vector3(), rotation=Quaternion()),
+        links = links_of(text)
+        self._time = Time()
+        self._messages = [
+            TransformStamped(
+                header=Header(stamp=self._time, frame_id=link.parent), child_frame_id=link.name
             )
-            _place(message.transform, origin, rest)
-            self._messages.append(message)
-            if link.joint in joints:
-                slide = _rotated(rest, axis) if link.kind == 'prismatic' else None
-                place = joints.index(link.joint)
-                moving = _MovingLink(message.transform, place, origin, rest, axis, slide)
-                self._moving.append(moving)
+            for link in links
+        ]
+        # The last entry of (q, 0) moves links that no joint moves.
+        self._joint = [joints.index(link.joint) if link.joint in joints else -1 for link in links]
+        angles = np.array([link.rpy for link in links])
+        roll, pitch, yaw = map(_about, np.eye(3), angles.T)
+        self._rotation = _product(yaw, _product(pitch, roll))
+        self._origin = np.array([link.xyz for link in links])
+        self._axis = np.array([link.axis for link in links])
+        self._turns = np.array([link.kind != 'prismatic' for link in links])
+        axis, inverse = np.insert(self._axis, 3, 0.0, axis=1), self._rotation * [-1, -1, -1, 1]
+        in_parent = _product(_product(self._rotation, axis), inverse)[:, :3]
+        self._slide = np.where(self._turns[:, None], 0.0, in_parent)
 
     def at(self, stamp: int, q: np.ndarray) -> list[TransformStamped]:
         """Return the frame of each link in its parent at q (n,) [rad, or m] and a stamp [ns]."""
-        self._header_time.sec, self._header_time.nanosec = divmod(stamp, 10**9)
-        for link in self._moving:
-            position = float(q[link.place])
-            if link.slide is None:
-                _place(
-                    link.transform, link.origin, _product(link.rest, _about(link.axis, position))
-                )
-            else:
-                x, y, z = (a + position * b for a, b in zip(link.origin, link.slide, strict=True))
-                _place(link.transform, (x, y, z), link.rest)
+        self._time.sec, self._time.nanosec = divmod(stamp, 10**9)
+        position = np.append(q, 0.0)[self._joint]
+        rotations = _product(self._rotation, _about(self._axis, self._turns * position))
+        origins = self._origin + position[:, None] * self._slide
+        for message, origin, rotation in zip(
+            self._messages, origins.tolist(), rotations.tolist(), strict=True
+        ):
+            at, turned = message.transform.translation, message.transform.rotation
+            at.x, at.y, at.z = origin
+            turned.x, turned.y, turned.z, turned.w = rotation
         return self._messages
 
 
-class _MovingLink(NamedTuple):
-    """A link whose joint moves; at 0, its frame is at `origin` and turned by `rest`."""
-
-    transform: Transform
-    place: int  # of the joint in q
-    origin: Vector
-    rest: Quaternions
-    axis: Vector
-    slide: Vector | None  # direction in the parent's frame; None if the link turns
+def _about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Return quaternions (k, 4), x, y, z and w, of angles (k,) about an axis or axes (k, 3)."""
+    half = 0.5 * angle[:, None]
+    return np.hstack((np.sin(half) * axis, np.cos(half)))
 
 
-def _place(transform: Transform, origin: Vector, by: Quaternions) -> None:
-    at, turned = transform.translation, transform.rotation
-    at.x, at.y, at.z = origin
-    turned.x, turned.y, turned.z, turned.w = by
-
-
-def _about(axis: Vector, angle: float) -> Quaternions:
-    s = sin(0.5 * angle)
-    return s * axis[0], s * axis[1], s * axis[2], cos(0.5 * angle)
-
-
-def _origin(rpy: np.ndarray) -> Quaternions:
-    """Return the rotation by roll, pitch and yaw about fixed axes, in this order."""
-    roll, pitch, yaw = (
-        _about(axis, angle) for axis, angle in zip(_AXES, rpy.tolist(), strict=True)
-    )
-    return _product(yaw, _product(pitch, roll))
-
-
-def _product(a: Quaternions, b: Quaternions) -> Quaternions:
-    (ax, ay, az, aw), (bx, by, bz, bw) = a, b
-    return (
-        aw * bx + bw * ax + ay * bz - az * by,
-        aw * by + bw * ay + az * bx - ax * bz,
-        aw * bz + bw * az + ax * by - ay * bx,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
-
-
-def _rotated(by: Quaternions, vector: Vector) -> Vector:
-    x, y, z, w = by
-    turned = _product(_product(by, (*vector, 0.0)), (-x, -y, -z, w))
-    return turned[:3]
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the products (k, 4) of quaternions (k, 4)."""
+    (ax, ay, az, aw), (bx, by, bz, bw) = a.T, b.T
+    x = aw * bx + bw * ax + ay * bz - az * by
+    y = aw * by + bw * ay + az * bx - ax * bz
+    z = aw * bz + bw * az + ax * by - ay * bx
+    return np.stack((x, y, z, aw * bw - ax * bx - ay * by - az * bz), axis=1)
 
 
 main = partial(process.run, PlantNode)
