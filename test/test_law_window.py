@@ -170,15 +170,6 @@ def evaluate_until_settled(case, t):
         excitation.update_excitation(*case, t, 1e-3, np.zeros(case[0].n))
 
 
-def test_inverse_iteration_finds_the_minimum_eigenvalue_and_eigenvector():
-    for case in map(excited_case, range(3)):
-        evaluate_until_settled(case, 0.0)
-        values, vectors = np.linalg.eigh(case.signals.Phi)
-        assert case.state.lambda_min[0] == pytest.approx(values[0], rel=1e-10)
-        assert abs(vectors[:, 0] @ case.state.min_eigenvector) == pytest.approx(1.0, rel=1e-10)
-        assert np.linalg.norm(case.state.min_eigenvector) == pytest.approx(1.0, rel=1e-14)
-
-
 def test_warm_started_iteration_tracks_the_minimum_eigenvalue_in_a_loop():
     """Never below it (a Rayleigh quotient cannot be), and close once the window has filled."""
     settings = quick()

@@ -156,14 +156,6 @@ def test_other_velocities_or_accelerations_at_a_point_cost_more_jerk():
                 assert jerk_cost(hermite(MOMENTS, other)) > least * (1.0 + 1e-6)
 
 
-def test_minimum_jerk_between_two_points_is_the_known_polynomial():
-    x = np.linspace(0.0, 1.0, 11)
-    step = states(minimum_jerk(np.array([0.0, 2.0]), np.array([[0.0, 1.0], [1.0, 3.0]])), 2.0 * x)
-    expected = 10.0 * x**3 - 15.0 * x**4 + 6.0 * x**5
-    np.testing.assert_allclose(step[:, 0, 0], expected, atol=1e-14)
-    np.testing.assert_allclose(step[:, 0, 1], 1.0 + 2.0 * expected, atol=1e-14)
-
-
 JOINTS = ('shoulder', 'elbow')
 LIMITS = ControllerConfig(
     JOINTS, limits=MotionLimits((-4.0, -3.0), (4.0, 3.0), (1.5, 1.5), (6.0, 6.0))
