@@ -70,7 +70,7 @@ def ideal(period, duration, law=None, **plant):
 
 def error_of(period):
     """Errors of computed torque with the true model, and those of e'' + k_d e' + k_p e = 0."""
-    loop = ideal(period, 0.2, REST)
+    loop = ideal(period, 0.1, REST)
     gains = {'position': 900.0, 'velocity': 50.0}
     errors, _ = simulate_with(loop, computed_torque, gains, friction=False)
     A = np.array([[0.0, 1.0], [-900.0, -50.0]])

@@ -26,6 +26,7 @@ from shaken_arm import (
 )
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
+from blf_dsc_controller.arms.batch import regressors_at
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.urdf import attached, read_chain
 from blf_dsc_controller.cli.identify import problems_of
@@ -266,11 +267,8 @@ def test_rows_hold_for_an_exact_motion(period, tolerance):
     delay = 0.004
     t = np.arange(0.0, 4.0, period)[:, None]
     speed = np.linspace(1.0, 3.0, 7)
-    torque, H = np.zeros((len(t), 7)), np.zeros((7, model.p))
-    for k, angle in enumerate(speed * (t - delay)):
-        dq = speed * np.cos(angle)
-        model.regressor(np.sin(angle), dq, dq, -(speed**2) * np.sin(angle), H)
-        torque[k] = H @ P
+    angle, dq = speed * (t - delay), speed * np.cos(speed * (t - delay))
+    torque = regressors_at(model, np.sin(angle), dq, dq, -(speed**2) * np.sin(angle)) @ P
     gap = np.zeros(len(t), dtype=bool)
     gap[len(t) // 2] = True
     rows = rows_of(Recording(PANDA, period, np.sin(speed * t), torque, gap, ''), model)

@@ -20,8 +20,8 @@ LAW = {'comparison': 'backstepping', 'comparison_detuned': 'backstepping'} | {
     name: name for name in ('model_based', 'slotine_li')
 }
 
-# Figures are drawn once for each law and each kind of arm; the others have the same panels.
-DRAWN = {'recommended', 'comparison', 'model_based', 'slotine_li', 'panda'}
+# Figures are drawn with and without a barrier, and of an arm from a URDF; others have no more.
+DRAWN = {'recommended', 'slotine_li', 'panda'}
 
 
 def offline(preset, out, duration):
