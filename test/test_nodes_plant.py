@@ -16,6 +16,7 @@ from blf_dsc_controller.law.telemetry import disturbance_names
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from blf_dsc_controller.nodes.plant_node import PlantNode
+from sim_plant.command_input import Latency
 from sim_plant.plant import parameter_names_of, plant_of
 
 TORQUE = (5.0, 3.0)  # N m
@@ -116,3 +117,30 @@ def test_plant_finishes_when_the_last_state_has_received_its_torque(ros):
         ros.until(lambda k=steps: node.finished or len(received) > k)
     assert node.finished
     assert len(received) == 4
+
+
+def test_latency_of_a_late_torque_includes_all_of_its_lateness():
+    """A controller that is 2.5 samples late must not pass for one that is half a sample late."""
+    latency = Latency()
+    latency.state_published(0.0)
+    assert latency.step(1.0) == 1.0  # no torque so far
+    latency.state_published(1.0)
+    assert latency.step(2.0) == 2.0
+    latency.state_published(2.0)
+    latency.torque_received(2.5)
+    assert latency.step(3.0) == 2.5
+    assert latency.late_steps == 2
+
+
+def test_longest_wait_of_a_sample_is_published_once():
+    latency = Latency()
+    latency.state_published(0.0)
+    latency.step(1.0)
+    latency.state_published(1.0)
+    latency.torque_received(1.75)  # late, for the state at 0.0
+    latency.torque_received(1.875)  # for the state at 1.0
+    assert latency.step(2.0) == 1.75
+    latency.state_published(2.0)
+    latency.torque_received(2.25)
+    assert latency.step(3.0) == 0.25
+    assert latency.late_steps == 1

@@ -1,14 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node's process ends cleanly, and so does the middleware in it, even if a shutdown fails."""
+"""A node's process ends cleanly, even if a shutdown fails; what it asks of the system."""
 
 from __future__ import annotations
 
+import ctypes
+import errno
+import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
+
+from blf_dsc_controller.configuration.schema import Realtime
+from blf_dsc_controller.nodes.process import request_realtime
 
 BROKEN = """
 import rclpy
@@ -65,3 +72,37 @@ def test_error_during_shutdown_leaves_neither_node_nor_context(error):
     assert process.stdout == 'destroyed\n0 False\n', process.stderr
     assert process.stderr.endswith('broken could not shut down cleanly: the middleware is gone\n')
     assert 'Traceback' not in process.stderr
+
+
+@pytest.mark.parametrize('refused', [False, True])
+def test_real_time_is_requested_for_all_threads_and_a_refusal_named_with_its_remedy(
+    monkeypatch, refused
+):
+    """Whether the system refuses depends on the user, so it is replaced here."""
+    scheduled, lines = set(), []
+
+    def schedule(thread, policy, parameters):
+        if refused:
+            raise PermissionError(errno.EPERM, 'Operation not permitted')
+        scheduled.add((thread, policy, parameters.sched_priority))
+
+    def mlockall(flags):
+        assert flags == 1 | 2  # MCL_CURRENT | MCL_FUTURE of Linux
+        ctypes.set_errno(errno.ENOMEM)
+        return -refused
+
+    monkeypatch.setattr(os, 'sched_setscheduler', schedule)
+    monkeypatch.setattr(ctypes, 'CDLL', lambda *_, **__: SimpleNamespace(mlockall=mlockall))
+    log = SimpleNamespace(info=lines.append, warning=lines.append)
+    request_realtime(Realtime(), log)
+    assert (scheduled, lines) == (set(), [])
+    request_realtime(Realtime(priority=50, lock_memory=True), log)
+    if not refused:
+        threads = {int(name) for name in os.listdir('/proc/self/task')}  # noqa: PTH208
+        assert scheduled == {(thread, os.SCHED_FIFO, 50) for thread in threads}
+        assert lines == ['running with SCHED_FIFO priority 50', 'memory locked']
+        return
+    assert 'priority 50 refused (Operation not permitted)' in lines[0]
+    assert 'rtprio' in lines[0]
+    assert 'locking memory refused (Cannot allocate memory)' in lines[1]
+    assert 'memlock' in lines[1]
