@@ -17,23 +17,17 @@ LARGEST = 1e4
 class TorqueInput:
     """The last valid `torque` (n,) [N m] of the n joints, and counts of rejected commands.
 
-    `wrong_length` and `impossible` count the rejected commands by cause, `problem` describes the
-    last one; `stale_steps` counts the steps for which the torque was too old.
+    `problem` describes the last rejected command; `stale_steps` counts the steps for which the
+    torque was too old.
     """
 
     def __init__(self, joints: tuple[str, ...]) -> None:
         self._joints = joints
         self.torque = np.zeros(len(joints))
         self.problem = ''
-        self.wrong_length = 0
-        self.impossible = 0
+        self.rejected = 0
         self.stale_steps = 0
         self._taken_at = 0
-
-    @property
-    def rejected(self) -> int:
-        """Number of rejected commands."""
-        return self.wrong_length + self.impossible
 
     def take(self, size: int, torque: NDArray[np.float64], sample: int) -> bool:
         """Store a command of `size` values, `torque` (n,), at a sample of the plant.
@@ -41,12 +35,12 @@ class TorqueInput:
         Returns whether it is valid; if not, `problem` describes why.
         """
         if size != self.torque.size:
-            self.wrong_length += 1
+            self.rejected += 1
             self.problem = f'command rejected: {size} values, {self.torque.size} expected'
             return False
         possible = np.abs(torque) <= LARGEST
         if not possible.all():
-            self.impossible += 1
+            self.rejected += 1
             names = ', '.join(np.array(self._joints)[~possible])
             self.problem = (
                 f'command rejected: {torque} N m (for {names}): '

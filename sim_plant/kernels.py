@@ -206,19 +206,13 @@ def step(plant: PlantSettings, now: PlantState, command: np.ndarray) -> None:
 
 
 @inner
-def true_parameters(plant: PlantSettings, now: PlantState, out: np.ndarray) -> None:
-    """Write P (p,) of this sample, payload included."""
-    motion = update_motion(plant, now)
-    motion.arm.fill_parameters(motion.payload, out)
-
-
-@inner
 def truth(plant: PlantSettings, now: PlantState, out: np.ndarray) -> None:
     """Write the noise-free truth [P, tau_dist, q, dq] (p + 3n,) of this sample."""
     n = plant.n
     t = now.sample[0] * plant.period_ns * 1e-9
-    true_parameters(plant, now, out)
-    disturbing_torque(update_motion(plant, now), t, now.x, part(out, plant.p, (n,)))
+    motion = update_motion(plant, now)
+    motion.arm.fill_parameters(motion.payload, out)
+    disturbing_torque(motion, t, now.x, part(out, plant.p, (n,)))
     for i in range(2 * n):
         out[plant.p + n + i] = now.x[i]
 

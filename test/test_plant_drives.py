@@ -187,14 +187,6 @@ def test_command_is_applied_exactly_delay_samples_later(delay):
 
 
 @pytest.mark.parametrize('delay', [0, 2])
-def test_effort_is_the_torque_of_the_last_interval(delay):
-    torques = commands(SAMPLES)
-    effort = run(plant(delay=delay), torques)[:, 4:]
-    assert (effort[: delay + 1] == 0).all()
-    assert (effort[delay + 1 :] == torques[: SAMPLES - delay - 1]).all()
-
-
-@pytest.mark.parametrize('delay', [0, 2])
 def test_torque_beyond_the_limit_of_its_joint_is_cut(delay):
     torques, limit = commands(SAMPLES), np.array([5.0, 1.5])
     cut = np.clip(torques, -limit, limit)
@@ -264,14 +256,6 @@ def test_noise_has_the_configured_standard_deviation():
     assert np.abs(noise.mean(axis=0) / noise.std(axis=0)).max() < 4 / np.sqrt(samples)
     off_diagonal = np.corrcoef(noise.T) - np.eye(4)
     assert np.abs(off_diagonal).max() < 4 / np.sqrt(samples)
-
-
-def test_seed_determines_the_noise():
-    def read(seed):
-        return run(plant(seed=seed, position_noise=1e-5), commands(50))
-
-    assert (read(3) == read(3)).all()
-    assert (read(3) != read(4))[:, :2].all()
 
 
 def test_compiled_draws_match_numpy():

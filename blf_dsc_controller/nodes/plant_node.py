@@ -316,8 +316,7 @@ class PlantNode(LoopNode[PlantConfig]):
         """Publish diagnostics; the level depends on what happened since the last report."""
         stale, rejected = self.input.stale_steps, self.input.rejected
         values = {
-            'commands of a wrong length': self.input.wrong_length,
-            'commands that were not finite or too large': self.input.impossible,
+            'rejected commands': rejected,
             'steps with a torque that was too old': stale,
             'late steps': self.latency.late_steps,
         }

@@ -22,7 +22,6 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms.batch import regressors_at
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
@@ -30,6 +29,7 @@ from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.settings import LINEAR
+from blf_dsc_controller.supervision.safe_torque import model_torque
 
 Vector = NDArray[np.float64]
 
@@ -65,20 +65,14 @@ def check_first_torque(
         f'{config.joints[worst]!r}, more than the {step[worst]:g} N m that its drive tolerates '
         '(torque.first_step)'
     )
-    if config.robot.urdf and _is_like(torque, _gravity(controller, q)):
+    if config.robot.urdf and _is_like(
+        torque, model_torque(controller.settings, controller.state.estimate, q)
+    ):
         text += (
             ': it is the gravity of the URDF; if the drives compensate it themselves, set '
             'robot.drive_compensates to gravity, or to gravity_and_friction'
         )
     raise StartError(text)
-
-
-def _gravity(controller: Controller, q: Vector) -> Vector:
-    """Return the torque (n,) of gravity by the present estimate [N m]."""
-    settings, rest = controller.settings, np.zeros((1, q.size))
-    (H,) = regressors_at(settings.model, q[np.newaxis], rest, rest, rest)
-    G: Vector = H @ controller.state.estimate[: settings.p]
-    return G
 
 
 def _is_like(torque: Vector, gravity: Vector) -> bool:
@@ -100,7 +94,7 @@ def check_support(controller: Controller, config: ControllerConfig, measurement:
     ):
         return
     q, dq, effort = measurement.reshape(3, -1)
-    gravity = _gravity(controller, q)
+    gravity = model_torque(controller.settings, controller.state.estimate, q)
     worst = int(np.argmax(np.where(limits > 0.0, 0.0, np.abs(gravity))))
     is_held = np.isfinite(effort).all() and _is_like(effort, gravity)  # which the check above sees
     matters = (
@@ -121,7 +115,7 @@ def _check_gravity(
 ) -> None:
     """Raise StartError if the arm would get gravity twice, or not at all."""
     q, dq, effort = measurement.reshape(3, -1)
-    gravity = _gravity(controller, q)
+    gravity = model_torque(controller.settings, controller.state.estimate, q)
     worst = int(np.argmax(np.abs(gravity)))
     matters = np.abs(gravity[worst]) > _MATTERS * config.torque.limit[worst]
     if not (matters and np.abs(dq).max() <= _AT_REST and np.isfinite(effort).all()):

@@ -136,7 +136,11 @@ def _motion(config: ControllerConfig) -> Floats:
         limits = config.limits.position_lower, config.limits.position_upper
         q = np.random.default_rng(0).uniform(*limits, (_MOMENTS, len(config.joints)))
         return np.stack((q, np.zeros_like(q), np.zeros_like(q)))
-    times = np.linspace(0.0, horizon(config), _MOMENTS, endpoint=False)
+    return _along(config, _MOMENTS)
+
+
+def _along(config: ControllerConfig, count: int) -> Floats:
+    times = np.linspace(0.0, horizon(config), count, endpoint=False)
     return np.moveaxis(sampled(reference_of(config), times), 1, 0)
 
 
@@ -175,8 +179,7 @@ class ReferenceLoad(NamedTuple):
 def reference_load(config: ControllerConfig, settings: Settings) -> ReferenceLoad:
     """Evaluate the dynamics along the reference, over its slowest period."""
     model, P = settings.model, settings.initial_estimate[: settings.p]
-    moments = np.linspace(0.0, horizon(config), _POINTS, endpoint=False)
-    q, dq, ddq = np.moveaxis(sampled(reference_of(config), moments), 1, 0)
+    q, dq, ddq = _along(config, _POINTS)
     torque = np.abs(regressors_at(model, q, dq, dq, ddq) @ P).max(axis=0)
     M = inertia_matrices(model, P, q)
     return ReferenceLoad(torque, M[np.linalg.eigvalsh(M)[:, 0] > 0.0])
