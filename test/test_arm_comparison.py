@@ -234,27 +234,21 @@ def test_figures_are_reproduced_from_the_gains_of_the_page(page, name):
     assert json.loads(json.dumps(again._asdict())) == found['runs'][0]
 
 
-@pytest.mark.parametrize(
-    ('name', 'text', 'problem'),
-    [
+def test_file_without_a_usable_law_is_rejected(tmp_path, capsys):
+    taken = f"{IMPORT}CONTENDERS = {{'pd_gravity': Contender('mine')}}"
+    for name, text, problem in (
         ('missing.py', None, 'expected a law of the study (proposed, '),
         ('law.txt', '', 'should end in .py'),
         ('broken.py', '1 / 0', 'cannot be imported: ZeroDivisionError'),
         ('empty.py', '', 'CONTENDERS must be a dict of Contender by name'),
-        (
-            'taken.py',
-            f"{IMPORT}CONTENDERS = {{'pd_gravity': Contender('mine')}}",
-            'has a law pd_gravity already',
-        ),
-    ],
-)
-def test_file_without_a_usable_law_is_rejected(tmp_path, capsys, name, text, problem):
-    if text is not None:
-        (tmp_path / name).write_text(text)
-    out = tmp_path / 'out'
-    assert main(['arms', '--laws', str(tmp_path / name), '--out', str(out)]) == 1
-    assert problem in capsys.readouterr().err
-    assert not out.exists()
+        ('taken.py', taken, 'has a law pd_gravity already'),
+    ):
+        if text is not None:
+            (tmp_path / name).write_text(text)
+        out = tmp_path / 'out'
+        assert main(['arms', '--laws', str(tmp_path / name), '--out', str(out)]) == 1
+        assert problem in capsys.readouterr().err
+        assert not out.exists()
 
 
 def test_laws_of_a_file_join_those_chosen_by_name(tmp_path, monkeypatch, capsys):

@@ -108,22 +108,6 @@ def test_node_compared_with_null_node(monkeypatch):
     ]
 
 
-def test_replay_compared_with_mcap_reader(monkeypatch):
-    replay = tiny(monkeypatch, 'offline', _LONG=0.1)
-    units = []
-
-    def counting(each, rounds):
-        units.extend(work() for work in each.values())
-        return measured(each, rounds)
-
-    measured = replay.interleaved
-    monkeypatch.setattr(replay, 'interleaved', counting)
-    assert len(contestants(list(replay.measure_replay()))) == 2
-    # 101 samples of five messages, two more in every tenth from the first on, the bound, three
-    # events of the journal, and the parameters of the plant.
-    assert units == 3 * [101 * 5 + 11 * 2 + 1 + 3 + 1]
-
-
 def test_dead_contestant_aborts_the_measurement(monkeypatch):
     nodes = tiny(monkeypatch, 'nodes', _STEPS=2, _WARM_UP=1, _NULL_NODE='-c')
     error = importlib.import_module('harness').ContestantError

@@ -120,28 +120,19 @@ def write_params(folder, plant='', controller=''):
     return path
 
 
-@pytest.mark.parametrize(
-    ('plant', 'controller', 'expected'),
-    [
+def test_invalid_configuration_is_rejected_before_anything_starts(tmp_path, capsys):
+    out, below = tmp_path / 'out', 'initial.position: [2.293, 0.1696]'
+    for plant, controller, expected in (
         ('', 'barier.bound: [0.1, 0.1]', 'barier.bound: unknown parameter'),
         ('', 'joints: [joint1, wrist]', 'joints: sim_plant has joint1, joint2'),
-        (
-            'initial.position: [2.293, 0.1696]',
-            'approach.enabled: false',
-            "joint 'joint2' starts -1.5265 rad",
-        ),
-    ],
-)
-def test_invalid_configuration_is_rejected_before_anything_starts(
-    tmp_path, capsys, plant, controller, expected
-):
-    out = tmp_path / 'out'
-    run = here(capsys, '--config', write_params(tmp_path, plant, controller), '--out', out)
-    assert run.returncode == 1
-    assert run.stderr.startswith('blf_dsc run: ')
-    assert expected in run.stderr
-    assert run.stdout == ''
-    assert not out.exists()
+        (below, 'approach.enabled: false', "joint 'joint2' starts -1.5265 rad"),
+    ):
+        run = here(capsys, '--config', write_params(tmp_path, plant, controller), '--out', out)
+        assert run.returncode == 1
+        assert run.stderr.startswith('blf_dsc run: ')
+        assert expected in run.stderr
+        assert run.stdout == ''
+        assert not out.exists()
 
 
 def test_results_are_never_overwritten(tmp_path, capsys, monkeypatch):
