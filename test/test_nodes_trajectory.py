@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from threading import Event
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from rclpy.serialization import serialize_message
-from ros_rig import torques
+from ros_rig import PATIENCE, torques
 from sent_trajectory import JOINTS, SECOND, inputs, send, trajectory, two_tones
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -21,6 +22,7 @@ from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import MessageError, joint_trajectory
 from blf_dsc_controller.nodes import process
+from blf_dsc_controller.reference.trajectory import plan_trajectory
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.supervisor import Phase
 
@@ -214,3 +216,22 @@ def test_uncaught_callback_error_causes_a_safe_stop(ros):
     assert ros.reset(law).success
     ros.run(arm, 20)
     assert phase(law) is not Phase.SAFE_STOP
+
+
+def test_trajectory_that_is_planned_too_late_is_planned_again_further_ahead(ros, monkeypatch):
+    begins, may_end = [], Event()
+
+    def plan(trajectory, before, at, config):
+        begins.append(at)
+        assert len(begins) > 1 or may_end.wait(PATIENCE)
+        return plan_trajectory(trajectory, before, at, config)
+
+    monkeypatch.setattr('blf_dsc_controller.supervision.guard.plan_trajectory', plan)
+    arm, law = ros.loop(None, BRISK | {'safety__watchdog': 'on', 'safety__state_timeout': 60.0})
+    ros.run(arm, 20)
+    raw = serialize_message(trajectory(JOINTS, np.zeros(2), duration=3.0))
+    inputs(law)._on_trajectory(raw)
+    ros.run(arm, 100)
+    may_end.set()
+    ros.until(lambda: inputs(law).accepted + inputs(law).rejected)
+    assert (inputs(law).accepted, len(begins) > 1) == (1, True)
