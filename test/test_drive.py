@@ -329,6 +329,10 @@ def test_friction_that_the_drive_compensates_is_not_fed_forward_a_second_time():
         ({'robot.drive_payload': -1.0} | HELD, 'drive_payload: got -1.0, but it must be at least'),
         (TOLD, 'robot.drive_payload: got 1.5 kg, but drive_compensates is none'),
         ({'robot.drive_payload_centre': [0.0]} | HELD, 'got 1 entry, but 3 are needed'),
+        (
+            {'robot.urdf': '', 'robot.tip': ''} | HELD,
+            'drive_compensates: got gravity, which needs ro',
+        ),
         ({'robot.effort': 'volts'}, "robot.effort: got 'volts', but it must be one of unknown"),
         (
             {'robot.effort': 'current', 'learning.torque_source': 'effort'},
@@ -342,8 +346,3 @@ def test_mistakes_give_one_line(given, problem):
     with pytest.raises(ConfigurationError, match=problem) as raised:
         build(ControllerConfig, PANDA | given)
     assert len(raised.value.problems) == 1
-
-
-def test_arm_without_urdf_has_no_model_of_its_drives():
-    with pytest.raises(ConfigurationError, match=r'drive_compensates: got gravity, which needs ro'):
-        build(ControllerConfig, HELD)

@@ -149,13 +149,6 @@ def test_packages_that_may_be_missing_are_launched_first(launched):
     assert set(packages[2:]) == {'blf_dsc_controller'}
 
 
-@pytest.mark.parametrize('preset', ['comparison', 'slotine_li'])
-def test_preset_applies_in_every_namespace(start, preset):
-    argv = ('blf_dsc_controller', '--ros-args', '-r', '__ns:=/left', '--params-file')
-    node = start(*argv, locate(preset))
-    assert node.config.law == {'comparison': 'backstepping'}.get(preset, preset)
-
-
 def test_command_line_parameter_overrides_a_file(start):
     argv = ('sim_plant', '--ros-args', '--params-file', locate('recommended'))
     given = ('-p', 'mode:=lockstep', '-p', 'arm.l2:=0.7', '-p', 'initial.position:=[2.29, 1.69]')

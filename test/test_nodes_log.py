@@ -26,7 +26,7 @@ from std_msgs.msg import Float64MultiArray
 from blf_dsc_controller.compiled import jit
 from blf_dsc_controller.compiled.jit import COMPILING
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
@@ -171,22 +171,6 @@ def test_each_compiled_kernel_is_announced_by_the_node_that_waits(ros, log, monk
     numbers = {part[-1]: int(part[2]) for part in parts}  # the plant's kernels come before
     assert list(numbers)[-2:] == ['first', 'second']
     assert sorted(numbers.values()) == list(range(1, len(parts) + 1))
-
-
-def test_repeatedly_stale_torques_do_not_flood_the_log(ros, log):
-    clock = FakeClock()
-    states = ros.listen(topics.JOINT_STATES)
-    commands = ros.publisher(topics.COMMANDS)
-    arm = ros.add(PlantNode, clock=clock)
-    ros.until(lambda: clock.advance(0.01) or states)
-    for _ in range(30):
-        before = arm.input.stale_steps
-        commands.publish(Float64MultiArrayEncoder(2).encode(np.zeros(2)))
-        ros.until(lambda: arm._has_torque)
-        ros.until(lambda before=before: clock.advance(0.01) or arm.input.stale_steps > before)
-    ros.until(lambda: log('sim_plant', 'the torque is too old'))
-    ros.spin(0.1)
-    assert len(log('sim_plant', 'the torque is too old')) < 30
 
 
 INTERRUPTED = """

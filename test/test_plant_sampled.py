@@ -60,13 +60,6 @@ def test_compiled_loop_and_python_calls_are_bit_identical(source, noise):
     assert arm.rng.bit_generator.state == other.rng.bit_generator.state
 
 
-def test_compiled_loop_without_noise_draws_no_random_numbers():
-    arm = plant()
-    before = arm.rng.bit_generator.state
-    compiled_run(arm.arm, arm.settings, arm.state, arm.rng, commands(10), np.empty((10, 6)))
-    assert arm.rng.bit_generator.state == before
-
-
 def test_sample_times_are_whole_nanoseconds():
     """The disturbance is evaluated at t_k = (k T_ns) 1e-9 s, to the last bit."""
     period_ns, load = 333_333, rough_disturbance()
@@ -111,12 +104,6 @@ def test_arm_stopped_for_excessive_speed_stays_stopped_when_restored():
     assert not after[-1, 2:4].any()
     arm.reset()
     assert not arm.is_broken
-
-
-def test_time_is_counted_in_whole_nanoseconds():
-    arm = plant()
-    run(arm, commands(3))
-    assert (arm.sample, arm.elapsed_ns) == (3, 3_000_000)
 
 
 @pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason='compares compiled code with Python')
