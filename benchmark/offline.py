@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from harness import Ratio, interleaved, ratio
 from mcap.reader import make_reader
+from scipy.integrate import RK45
 
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -75,16 +76,6 @@ CONTROLLER = ControllerConfig()
 PLANT = PlantConfig()
 T = PLANT.sample_time
 _ARM = PLANT.arm
-_A = (
-    np.array([]),
-    np.array([1 / 5]),
-    np.array([3 / 40, 9 / 40]),
-    np.array([44 / 45, -56 / 15, 32 / 9]),
-    np.array([19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729]),
-    np.array([9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656]),
-)
-_B = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
-_NODES = (0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0)
 
 
 class Reference:
@@ -264,12 +255,12 @@ def _integrated(
     k = np.zeros((6, 4))
 
     def step(t: float, torque: np.ndarray) -> None:
-        for stage, (a, c) in enumerate(zip(_A, _NODES, strict=True)):
-            y = x + T * (a @ k[:stage])
+        for stage, (a, c) in enumerate(zip(RK45.A, RK45.C, strict=True)):
+            y = x + T * (a[:stage] @ k[:stage])
             net = torque - disturbance(t + c * T)
             k[stage, :2] = y[2:]
             k[stage, 2:] = acceleration(y[:2], y[2:], net)
-        x[:] += T * (_B @ k)
+        x[:] += T * (RK45.B @ k)
 
     return run(duration, lambda: (x[:2].copy(), x[2:].copy()), step)
 
