@@ -129,4 +129,4 @@ class Run:
     @property
     def timed_stops(self) -> list[tuple[float, Stop]]:
         """Stops with their times [s]."""
-        return [((one.stamp - int(self.stamp[0])) * 1e-9, one) for one in self.stops]
+        return [((stop.stamp - int(self.stamp[0])) * 1e-9, stop) for stop in self.stops]

@@ -40,7 +40,7 @@ def granted(ros, names):
     for _, access, _, method in KINDS:
         shown = set()
         for name in names:
-            shown |= {one for one, _ in getattr(ask, method)(name, '/')}
+            shown |= {found for found, _ in getattr(ask, method)(name, '/')}
         found[access] = sorted(shown)
     return found
 
@@ -117,7 +117,7 @@ def read(path):
         for part in profile:
             ((kind, verdict),) = part.attrib.items()
             assert verdict == 'ALLOW'
-            access[kind] = [one.text for one in part]
+            access[kind] = [each.text for each in part]
         assert enclave.get('path') == '/' + profile.get('node')
         found[profile.get('node')] = access
     return found

@@ -57,7 +57,7 @@ def learned_parameters(
     """Return the parameters of a form for a rated payload [kg] and rotors (n,) [kg m^2, or kg]."""
     n, tip = len(chain.joints), chain.tip_placement
     phi = np.column_stack((chain.inertias, np.zeros(n)))
-    ten = np.array([inertia_of(tip @ pseudo_inertia(one) @ tip.T) for one in np.eye(ROTOR)])
+    ten = np.array([inertia_of(tip @ pseudo_inertia(e) @ tip.T) for e in np.eye(ROTOR)])
     unsure = np.where(rotors > 0.0, ROTORS * rotors, UNKNOWN_ROTOR)
     if form == 'base':
         L = prior_factor(chain, base, payload, unsure)

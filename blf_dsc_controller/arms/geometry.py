@@ -80,10 +80,10 @@ class Clearance:
         end = np.cumsum(length)
         pairs = [
             (a, b)
-            for a, one in enumerate(links)
+            for a, this in enumerate(links)
             for b, other in enumerate(links)
-            if min(length[one], length[other]) > _LEAST
-            and end[other] - length[other] - end[one] > 2.0 * radius
+            if min(length[this], length[other]) > _LEAST
+            and end[other] - length[other] - end[this] > 2.0 * radius
         ]
         self._first, self._second = np.array(pairs, dtype=int).reshape(-1, 2).T
 

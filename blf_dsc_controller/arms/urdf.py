@@ -145,7 +145,7 @@ def chain_joints(
 
 def moving_joints(text: str) -> tuple[str, ...]:
     """Return the names of all moving joints of a URDF."""
-    return tuple(name for name, one in _parse(text)[1].items() if one.get('type') in MOVING)
+    return tuple(name for name, joint in _parse(text)[1].items() if joint.get('type') in MOVING)
 
 
 class Link(NamedTuple):

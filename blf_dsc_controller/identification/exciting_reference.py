@@ -134,7 +134,7 @@ class ExcitationProblem:
         ratios = np.abs(np.stack((q - self._middle, dq, ddq, torque), axis=1)) / self._limits
         room = self._clearance.room(q) if self._clearance else np.zeros((len(q), 0))
         over = (ratios - 1.0 + _MARGIN, _MARGIN - room)
-        excess = sum((np.maximum(one, 0.0) ** 2).sum() for one in over) / len(q)
+        excess = sum((np.maximum(each, 0.0) ** 2).sum() for each in over) / len(q)
         mu = np.linalg.eigvalsh(self._relative_excitation(dq, rows))
         a = self._settings.prior_weight
         gain = np.log1p(np.maximum(mu, 0.0) / a).sum() if a > 0.0 else np.log(max(mu[0], 1e-12))

@@ -219,9 +219,9 @@ def encode_rejected_columns(stamp: int, columns: Sequence[RejectedColumn]) -> by
     status = types['diagnostic_msgs/msg/DiagnosticStatus'](
         level=1,  # WARN
         name=f'{topics.CONTROLLER}/learning',
-        message=f'not estimated: {", ".join(one.column for one in columns)}',
+        message=f'not estimated: {", ".join(each.column for each in columns)}',
         hardware_id='',
-        values=[key_value(f'{topics.REJECTED}{one.column}', f'{one}') for one in columns],
+        values=[key_value(f'{topics.REJECTED}{each.column}', f'{each}') for each in columns],
     )
     time = types['builtin_interfaces/msg/Time'](*divmod(stamp, NANOSECONDS))
     header = types['std_msgs/msg/Header'](stamp=time, frame_id='')
@@ -292,7 +292,7 @@ def run_of(
         monitor=monitor if controller.settings.truth_known else None,
         arm=learned_arm(config),
         learns=config.law == 'blf_dsc' and config.learning.weight > 0.0,
-        rejected={one.column: f'{one}' for one in rejected},
+        rejected={each.column: f'{each}' for each in rejected},
     )
 
 

@@ -136,6 +136,6 @@ class Journal:
         """Add an event that happens now."""
         if event is EventType.CONFIGURE:
             content |= {'format': FORMAT, 'machine': machine()}
-        one = Event(self._number, event, self.stamp, self.messages, self.commands, content)
+        noted = Event(self._number, event, self.stamp, self.messages, self.commands, content)
         self._number += 1
-        self.pending.append(one)
+        self.pending.append(noted)

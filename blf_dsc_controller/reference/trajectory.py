@@ -96,7 +96,7 @@ def plan_trajectory(
         if times[0] > t0:
             present = sampled(pack(n, before), np.array([t0]))[0]
             term = _from_state(present, t0, times, points, config)
-            blended = max((one.settled for one in before if one.fade > 0.0), default=now)
+            blended = max((each.settled for each in before if each.fade > 0.0), default=now)
             motion = BlendedReference(pack(n, [*before, term]), min(blended, t0))
         else:
             motion = blend(before, _through_points(times, points), t0, config)
