@@ -49,7 +49,7 @@ STOPPED = 5
 _FOLDER = 'closed_loop'
 _DURATION = 60.0  # s, if neither the file nor an option sets it
 _BAR = '{desc} |{bar}| {n:.1f}/{total:g} s [{elapsed}<{remaining}]{postfix}'
-_LINE = '{desc} {n:.1f}/{total:g} s{postfix}'
+_LINE = '{desc} {n:.1f}/{total:g} s{postfix}\n'
 _LINE_PERIOD = 10.0  # s between two lines if stderr is not a terminal
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -278,27 +278,27 @@ class ControllerConfig(Sampled):
         weighs = {'learning.weighing': robot.learn == 'base' and is_filtered}
         return {'model': 'urdf', **weighs, **tuning.gains_of(arm, period, bound)}
 
-    def problems(self) -> list[str]:
+    def problems(self) -> Iterator[str]:
         """Check the parameters against each other, joints and estimates against the model."""
         needed = MODELS[self.model]
         count = parameter_count(needed or len(self.joints))
         if self.model == 'urdf':
             count = learned_of(self.robot, self.robot.chain(self.joints)).model.p
         elif self.robot.learn != 'base':
-            return [f'robot.learn: got {self.robot.learn}, but model {self.model} learns base only']
+            yield f'robot.learn: got {self.robot.learn}, but model {self.model} learns base only'
+            return
         learning, learned = self.learning, (self.model, self.robot.learn, self.learning.prediction)
         if learning.weighing and learned != ('urdf', 'base', 'filtered'):
             needs = 'model urdf, robot.learn base and learning.prediction filtered'
-            return [f'learning.weighing: got true with {", ".join(learned)}, but needs {needs}']
-        by_current = self.robot.effort == 'current' and self.learning.torque_source == 'effort'
-        return [
-            *joint_problems(self.joints, f'model {self.model}', needed),
-            *(['learning.torque_source: got effort, but robot.effort is current'] * by_current),
-            *(f'robot.{problem}' for problem in self.robot.problems()),
-            *self.sample_time_problems(),
-            *self.reference.problems(),
-            *self.limits.problems(self.joints),
-            *self.barrier.problems(self.joints),
-            *self.truth.problems(self.law, self.model, count, self.learning.radius),
-            *self.learning.problems(self.sample_time, self.model, count),
-        ]
+            yield f'learning.weighing: got true with {", ".join(learned)}, but needs {needs}'
+            return
+        yield from joint_problems(self.joints, f'model {self.model}', needed)
+        if self.robot.effort == 'current' and self.learning.torque_source == 'effort':
+            yield 'learning.torque_source: got effort, but robot.effort is current'
+        yield from (f'robot.{problem}' for problem in self.robot.problems())
+        yield from self.sample_time_problems()
+        yield from self.reference.problems()
+        yield from self.limits.problems(self.joints)
+        yield from self.barrier.problems(self.joints)
+        yield from self.truth.problems(self.law, self.model, count, self.learning.radius)
+        yield from self.learning.problems(self.sample_time, self.model, count)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Literal
@@ -42,26 +43,25 @@ class Barrier:
             initial or bound for initial, bound in zip(self.initial_bound, self.bound, strict=True)
         )
 
-    def problems(self, joints: tuple[str, ...]) -> list[str]:
+    def problems(self, joints: tuple[str, ...]) -> Iterator[str]:
         """Check the weight against the slope limit, and the bounds of the funnel."""
-        slopes = [
-            f'barrier.slope_limit: got {limit:g} N m/rad for {joint}, but it must be above '
-            f'barrier.weight, {weight:g} N m/rad'
-            for joint, weight, limit in zip(joints, self.weight, self.slope_limit, strict=True)
-            if limit <= weight
-        ]
-        bounds = [
-            f'barrier.initial_bound: got {initial:g} rad for {joint}, but it must be 0 (no funnel) '
-            f'or at least barrier.bound, {bound:g} rad'
-            for joint, initial, bound in zip(joints, self.initial_bound, self.bound, strict=True)
-            if 0.0 < initial < bound
-        ]
+        for joint, weight, limit in zip(joints, self.weight, self.slope_limit, strict=True):
+            if limit <= weight:
+                yield (
+                    f'barrier.slope_limit: got {limit:g} N m/rad for {joint}, but it must be above '
+                    f'barrier.weight, {weight:g} N m/rad'
+                )
+        for joint, initial, bound in zip(joints, self.initial_bound, self.bound, strict=True):
+            if 0.0 < initial < bound:
+                yield (
+                    f'barrier.initial_bound: got {initial:g} rad for {joint}, but it must be 0 '
+                    f'(no funnel) or at least barrier.bound, {bound:g} rad'
+                )
         if self.funnel_rate == 0.0 and self.widest != self.bound:
-            bounds.append(
+            yield (
                 'barrier.funnel_rate: got 0 1/s, but barrier.initial_bound must narrow to '
                 'barrier.bound: give the rate'
             )
-        return slopes + bounds
 
 
 @dataclass(frozen=True)
@@ -168,23 +168,20 @@ class KnownArm:
     phase: PerJoint = _known((0.0, 0.0), 'phase of the sinusoidal part', 'rad')
     feed_forward: bool = _known(False, 'compensate the known disturbance; model_based always does')
 
-    def problems(self, law: str, model: str, count: int, radius: float) -> list[str]:
+    def problems(self, law: str, model: str, count: int, radius: float) -> Iterator[str]:
         """Check that the parameters fit the model and the ball, and are given if required."""
-        given = len(self.parameters)
+        given, norm = len(self.parameters), math.hypot(*self.parameters)
         if law == 'model_based' and given == 0:
-            return ['truth.parameters: got none, but the law model_based needs them']
-        norm = math.hypot(*self.parameters)
-        if law == 'model_based' and norm >= radius:
-            reason = (
+            yield 'truth.parameters: got none, but the law model_based needs them'
+        elif law == 'model_based' and norm >= radius:
+            yield (
                 f'learning.radius: got {radius:g} kg m^2, but truth.parameters have a norm of '
                 f'{norm:.6g} kg m^2, and the law model_based would shrink them to the ball: the '
                 'radius must be larger'
             )
-            return [reason]
-        if given in (0, count):
-            return []
-        entries = counted(given, 'entry', 'entries')
-        return [f'truth.parameters: got {entries}, but model {model} has {count} parameters']
+        elif given not in (0, count):
+            entries = counted(given, 'entry', 'entries')
+            yield f'truth.parameters: got {entries}, but model {model} has {count} parameters'
 
 
 _size = partial(parameter, read_only='it sets the memory size of the learning')
@@ -292,25 +289,23 @@ class Learning:
         'command', 'torque to learn from: the limited command, or the effort of the joint states'
     )
 
-    def problems(self, sample_time: float, model: str, count: int) -> list[str]:
+    def problems(self, sample_time: float, model: str, count: int) -> Iterator[str]:
         """Check the size of the window, and the initial estimate against the model and the ball."""
-        problems = []
         samples, (fewest, most) = round(self.window / sample_time), _SAMPLES
         if not fewest <= samples <= most:
-            problems.append(
+            yield (
                 f'learning.window: got {self.window:g} s, which is {samples} samples of '
                 f'{sample_time:g} s: between {fewest} and {most} are allowed'
             )
         if len(self.initial_estimate) != count:
             entries = counted(len(self.initial_estimate), 'entry', 'entries')
-            problems.append(
+            yield (
                 f'learning.initial_estimate: got {entries}, but model {model} has {count} '
                 'parameters'
             )
         norm = math.hypot(*self.initial_estimate)
         if norm >= self.radius:
-            problems.append(
+            yield (
                 f'learning.radius: got {self.radius:g} kg m^2, but learning.initial_estimate has '
                 f'a norm of {norm:.6g} kg m^2: the radius must be larger'
             )
-        return problems

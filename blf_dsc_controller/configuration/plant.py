@@ -8,7 +8,7 @@ frame: x to the right, z upwards. Deviations from the URDF are unknown to the co
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -54,12 +54,6 @@ class Wall:
     normal: Vector = parameter((0.0, 0.0, 1.0), 'direction in which the wall pushes')
     stiffness: float = non_negative(0.0, 'force per penetration depth; 0: no wall', 'N/m')
     damping: float = non_negative(0.0, 'force per velocity into the wall', 'N s/m')
-
-    def problems(self) -> list[str]:
-        """Require a non-zero normal."""
-        if any(self.normal):
-            return []
-        return ['wall.normal: got [0.0, 0.0, 0.0], but a direction is needed']
 
 
 @dataclass(frozen=True)
@@ -323,28 +317,28 @@ class PlantConfig(Sampled):
             ),
         }
 
-    def problems(self) -> list[str]:
+    def problems(self) -> Iterator[str]:
         """Check the joints, the sample time and the duration."""
         needed = None if self.robot.urdf else 2
-        problems = joint_problems(self.joints, 'the simulated arm', needed)
-        problems += self.sample_time_problems() + self.wall.problems()
+        yield from joint_problems(self.joints, 'the simulated arm', needed)
+        yield from self.sample_time_problems()
+        if not any(self.wall.normal):
+            yield 'wall.normal: got [0.0, 0.0, 0.0], but a direction is needed'
         if self.truth != Truth() and not self.robot.urdf:
-            problems.append('truth: it applies only to a URDF: give robot.urdf, or change arm')
+            yield 'truth: it applies only to a URDF: give robot.urdf, or change arm'
         if self.drive != Drive() and self.robot.drive_compensates == 'none':
-            problems.append('drive: without robot.drive_compensates the drives need no model')
-        problems += [f'robot.{problem}' for problem in self.robot.problems()]
+            yield 'drive: without robot.drive_compensates the drives need no model'
+        for problem in self.robot.problems():
+            yield f'robot.{problem}'
         published = self.sensor.published_joints
         if published and (lacking := [name for name in self.joints if name not in published]):
-            problems.append(f'sensor.published_joints: {", ".join(lacking)} of `joints` is missing')
+            yield f'sensor.published_joints: {", ".join(lacking)} of `joints` is missing'
         if len(set(published)) < len(published):
-            problems.append('sensor.published_joints: a name is repeated')
+            yield 'sensor.published_joints: a name is repeated'
         if self.actuator.ripple > 0.0 and not all(self.actuator.torque_limit):
-            problems.append(
-                'actuator.ripple: it is a fraction of the rated torque: give actuator.torque_limit'
-            )
+            yield 'actuator.ripple: a fraction of the rated torque: give actuator.torque_limit'
         if 0.0 < self.duration < self.sample_time:
-            problems.append(
+            yield (
                 f'duration: got {self.duration:g} s, shorter than one sample of '
                 f'{self.sample_time:g} s (0 runs until stopped)'
             )
-        return problems

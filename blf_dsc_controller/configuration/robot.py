@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -104,17 +104,17 @@ class Robot:
         omittable=True,
     )
 
-    def problems(self) -> list[str]:
+    def problems(self) -> Iterator[str]:
         """Check that there is something to learn, and a model of what the drives add."""
-        found = []
         if self.learn == 'payload' and self.payload == 0.0:
-            found += ['payload: got 0 kg, but learn: payload needs the mass that the arm may carry']
+            yield 'payload: got 0 kg, but learn: payload needs the mass that the arm may carry'
         if self.drive_compensates != 'none' and not self.urdf:
-            found += [f'drive_compensates: got {self.drive_compensates}, which needs robot.urdf']
+            yield f'drive_compensates: got {self.drive_compensates}, which needs robot.urdf'
         if self.drive_compensates == 'none' and self.drive_payload:
-            known = f'drive_payload: got {self.drive_payload:g} kg, but drive_compensates is none: '
-            found += [known + 'the drives reckon with no payload']
-        return found
+            yield (
+                f'drive_payload: got {self.drive_payload:g} kg, but drive_compensates is none: the '
+                'drives reckon with no payload'
+            )
 
     @property
     def text(self) -> str:

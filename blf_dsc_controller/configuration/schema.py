@@ -352,21 +352,19 @@ class Sampled:
         """The sample time in nanoseconds, the unit of the stamps."""
         return round(self.sample_time * 1e9)
 
-    def sample_time_problems(self) -> list[str]:
+    def sample_time_problems(self) -> Iterator[str]:
         """Require whole nanoseconds, or stamps would drift from the time in the law."""
-        if abs(self.sample_time * 1e9 - self.sample_time_ns) <= _ROUNDING * self.sample_time_ns:
-            return []
-        got = f'got {self.sample_time!r} s, not a whole number of nanoseconds'
-        return [f'sample_time: {got}: write {self.sample_time_ns * 1e-9:.9f}']
+        if abs(self.sample_time * 1e9 - self.sample_time_ns) > _ROUNDING * self.sample_time_ns:
+            got = f'got {self.sample_time!r} s, not a whole number of nanoseconds'
+            yield f'sample_time: {got}: write {self.sample_time_ns * 1e-9:.9f}'
 
 
-def joint_problems(joints: tuple[str, ...], arm: str, needed: int | None) -> list[str]:
+def joint_problems(joints: tuple[str, ...], arm: str, needed: int | None) -> Iterator[str]:
     """Require distinct names, since joints are matched by name, and as many as the arm needs."""
-    repeated = sorted({name for name in joints if joints.count(name) > 1})
-    problems = [f'joints: the name {name!r} is repeated' for name in repeated]
+    for name in sorted({name for name in joints if joints.count(name) > 1}):
+        yield f'joints: the name {name!r} is repeated'
     if '' in joints:
-        problems.append('joints: a name is empty')
+        yield 'joints: a name is empty'
     if needed is not None and len(joints) != needed:
         got = counted(len(joints), 'name', 'names')
-        problems.append(f'joints: got {got}, but {arm} has {needed} joints')
-    return problems
+        yield f'joints: got {got}, but {arm} has {needed} joints'
