@@ -20,6 +20,7 @@ from blf_dsc_controller.messages.codecs import (
     JointStateEncoder,
     MessageError,
 )
+from blf_dsc_controller.supervision.checks import PERIOD
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.command_input import TorqueInput
 from sim_plant.plant import plant_of
@@ -113,7 +114,7 @@ class Rig:
             self.wall += MILLISECOND
             if self.steady >= self.next_watch:
                 self._command(self.guard.watch())
-                self.next_watch = self.steady + self.guard.watchdog.next_check * 1e9
+                self.next_watch = self.steady + PERIOD * 1e9
 
     def clear_fault(self):
         """Remove the fault, and reset arm and controller as the nodes' services do."""

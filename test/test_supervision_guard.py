@@ -82,15 +82,15 @@ def test_missed_states_are_averaged():
 
 
 def test_watchdog_detects_silence_if_it_checks_in_time():
-    times = iter([0, 10, 41, 51, 200, 208])  # ms
+    times = iter([0, 5, 13, 40, 48, 200, 208])  # ms
     watchdog = Watchdog(lambda: next(times) * MILLISECOND, lambda: 0)
     assert watchdog.silence(0.04) == 0.0  # no state has come yet
     watchdog.restart()
-    assert watchdog.silence(0.04) == 0.0
-    assert watchdog.next_check == pytest.approx(0.01)  # 1 ms after the earliest timeout
-    assert watchdog.silence(0.04) == pytest.approx(0.041)
-    assert watchdog.silence(0.04) == 0.0  # the watchdog itself was asleep
-    assert watchdog.silence(0.04) == pytest.approx(0.198)
+    assert watchdog.silence(0.034) == 0.0  # the limit is not over
+    assert watchdog.silence(0.034) == 0.0  # the watchdog itself was asleep
+    assert watchdog.silence(0.034) == pytest.approx(0.043)
+    assert watchdog.silence(0.034) == 0.0  # again
+    assert watchdog.silence(0.034) == pytest.approx(0.203)
 
 
 @pytest.mark.parametrize(

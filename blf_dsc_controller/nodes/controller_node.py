@@ -29,7 +29,7 @@ from blf_dsc_controller.messages.codecs import (
 )
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
-from blf_dsc_controller.nodes.lifecycle import POLL_PERIOD, LoopNode
+from blf_dsc_controller.nodes.lifecycle import LoopNode
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
 from blf_dsc_controller.supervision.checks import SAME_CLOCK, rate_mismatch
 from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
@@ -224,7 +224,6 @@ class ControllerNode(LoopNode[ControllerConfig]):
             return True
         self._arrivals.append(stamp)
         self._pending, self._checks = raw, 0
-        self._poll_in(POLL_PERIOD)
         if len(self._arrivals) <= _MEASURED:
             return True
         period = float(np.median(np.diff(self._arrivals))) * 1e-9
@@ -313,13 +312,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
         limit = guard.controller.settings.torque_limit
         self._publish(self._telemetry.bound(stamp, bound, limit))
 
-    def _poll_in(self, wait: float) -> None:
-        self._poll_timer.timer_period_ns = int(1e9 * wait)
-        self._poll_timer.reset()
-
     def _on_poll(self) -> None:
-        """Check for missing states, and set the timer to the next check, as waking up is costly."""
-        wait, guard = POLL_PERIOD, self.guard
+        """Check for missing states; a timer reset by its own callback would multiply under load."""
+        guard = self.guard
         if guard is not None:
             self._checks += 1
             measures = self._arrivals and self._checks < _PATIENCE
@@ -329,9 +324,6 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 self._on_joint_state(raw)
             self._command(guard.watch())
             self._report_if_changed(guard)
-            if self._pending is None:
-                wait = guard.watchdog.next_check
-        self._poll_in(wait)
 
     # Changes of the configuration, and reports.
 

@@ -31,10 +31,10 @@ from blf_dsc_controller.nodes.endpoints import (
     raw_publish,
     wrap_change_state,
 )
+from blf_dsc_controller.supervision.checks import PERIOD
 
 Config = TypeVar('Config', ControllerConfig, PlantConfig)
 
-POLL_PERIOD = 0.01  # s
 _DIAGNOSTICS_PERIOD = 1.0  # s
 _RECORDER = 'record'  # in the names bag_recorder and rosbag2_recorder
 
@@ -160,7 +160,7 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
 
     def start(self) -> None:
         """Start timers and services, and the node itself if `autostart` is set."""
-        self._poll_timer = create_steady_timer(self, POLL_PERIOD, self._on_poll)
+        create_steady_timer(self, PERIOD, self._on_poll)
         create_steady_timer(self, _DIAGNOSTICS_PERIOD, self._on_second)
         self.create_service(Trigger, '~/reset', self._on_reset)
         if self.config.autostart:

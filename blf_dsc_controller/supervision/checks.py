@@ -343,12 +343,12 @@ class Velocity:
 
 
 PERIOD = 0.008
-"""Time [s] between two checks of the steady clock during a silence."""
+"""Time [s] between two checks of the steady clock."""
 
 SAME_CLOCK = 60.0
 """Time [s] that a live stamp may differ from this computer's clock."""
 
-_MARGIN = 0.001  # s past the limit, for a state in transit
+_IN_TRANSIT = 0.001  # s past the limit, for a state on its way
 
 
 class Watchdog:
@@ -360,7 +360,6 @@ class Watchdog:
     Attributes:
         on: whether a silence leads to a stop.
         why_off: why it is off although safety.watchdog is `auto`; else empty.
-        next_check: time [s] from the last check to the next.
         torques: number commanded in the current silence.
     """
 
@@ -368,7 +367,6 @@ class Watchdog:
         """`steady` and `wall` are the clocks [ns]."""
         self.on = False
         self.why_off = ''
-        self.next_check = PERIOD
         self.torques = 0
         self._steady, self._wall = steady, wall
         self._last_state = -1
@@ -397,8 +395,7 @@ class Watchdog:
     def silence(self, limit: float) -> float:
         """Return the length of a silence [s] if it exceeds `limit` [s], else 0."""
         now = self._steady()
-        is_late = (now - self._last_check) * _NANO > self.next_check + PERIOD
+        is_late = (now - self._last_check) * _NANO > 2.0 * PERIOD
         self._last_check = now
         silent = (now - self._last_state) * _NANO if self._last_state >= 0 else 0.0
-        self.next_check = limit - silent + _MARGIN if silent <= limit else PERIOD
-        return silent if silent > limit and not is_late else 0.0
+        return silent if silent > limit + _IN_TRANSIT and not is_late else 0.0

@@ -293,7 +293,7 @@ class Guard:
         return self._safe_without_state(self.config.sample_time)
 
     def watch(self) -> Vector | None:
-        """Return a torque during a silence, else None; call it after `watchdog.next_check` [s]."""
+        """Return a torque during a silence, else None; call it every PERIOD."""
         limit = self.config.sample_time + self.config.safety.state_timeout
         silent = self.watchdog.silence(limit)
         if silent == 0.0 or not (self.watchdog.on and self.commanding):
