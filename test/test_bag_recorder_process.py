@@ -15,13 +15,9 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-import rclpy
 from foreign_readers import messages_on_disk, read
-from own_domain import own_domain
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from ros_rig import RosRig
 from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
 from small_disk import small_disk
@@ -39,44 +35,29 @@ KEPT = QoSProfile(depth=5000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 TOPICS = ('a', 'b', 'c', 'd', 'e')
 
 
-class Rig:
-    """A node that publishes, and recorders in processes of their own."""
+class Rig(RosRig):
+    """Publishers of the test on five topics, and recorders in processes of their own."""
 
-    def __init__(self, topics=('a',)):
-        self.context, self.topics, self.processes = Context(), topics, []
-        self.environment = {**os.environ, 'ROS_DOMAIN_ID': str(own_domain())}
-        rclpy.init(context=self.context, domain_id=int(self.environment['ROS_DOMAIN_ID']))
-        self.node = Node('source', context=self.context)
-        self.publishers = [self.node.create_publisher(JointState, each, KEPT) for each in topics]
-        self._executor = SingleThreadedExecutor(context=self.context)
+    def __init__(self):
+        super().__init__()
+        self.processes = []
+        create = self.tester.create_publisher
+        self.publishers = [create(JointState, topic, KEPT) for topic in TOPICS]
 
-    def start(self, output, **parameters):
-        """Start a recorder."""
-        given = {'output': output, 'topics': f'[{", ".join(self.topics)}]', **parameters}
-        words = [word for name, value in given.items() for word in ('-p', f'{name}:={value}')]
-        self.processes.append(
-            subprocess.Popen(
-                [*RECORDER, *words], stderr=subprocess.PIPE, text=True, env=self.environment
-            )
-        )
-        return self.processes[-1]
-
-    def start_odd(self, *topics):
-        """Start an odd_participant.py that publishes topics such as `b=foo::bar::Name`."""
-        command = [sys.executable, ODD_PARTICIPANT, *topics]
-        self.processes.append(subprocess.Popen(command, env=self.environment))
-
-    def record(self, output, **parameters):
-        """Start a recorder and wait until it has subscribed."""
-        process = self.start(output, **parameters)
-        self.wait_for(lambda: all(each.get_subscription_count() for each in self.publishers))
+    def start(self, command, **options):
+        """Start a process in the domain of the test."""
+        environment = {**os.environ, 'ROS_DOMAIN_ID': str(self.context.get_domain_id())}
+        process = subprocess.Popen(command, env=environment, text=True, **options)
+        self.processes.append(process)
         return process
 
-    def wait_for(self, condition):
-        deadline = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < deadline, 'still waiting'
-            rclpy.spin_once(self.node, timeout_sec=0.01, executor=self._executor)
+    def record(self, output, topics=TOPICS):
+        """Start a recorder, and wait until it has subscribed."""
+        words = ('-p', f'output:={output}', '-p', f'topics:=[{", ".join(topics)}]')
+        process = self.start([*RECORDER, *words], stderr=subprocess.PIPE)
+        wanted = [each for each in self.publishers if each.topic_name[1:] in topics]
+        self.until(lambda: all(each.get_subscription_count() for each in wanted))
+        return process
 
     def publish(self, *numbers):
         """Publish messages with these numbers as stamps [ns] on every topic."""
@@ -91,6 +72,7 @@ class Rig:
         """Stop a recorder by a signal; return its exit code and output."""
         process.send_signal(number)
         _, output = process.communicate(timeout=PATIENCE)
+        assert 'Traceback' not in output
         return process.returncode, output
 
     def close(self):
@@ -98,22 +80,14 @@ class Rig:
             if process.poll() is None:
                 process.kill()
                 process.communicate()
-        self._executor.shutdown()
-        self.node.destroy_node()
-        self.context.try_shutdown()
+        super().close()
 
 
 @pytest.fixture
 def rig():
-    rigs = []
-
-    def make(*arguments):
-        rigs.append(Rig(*arguments))
-        return rigs[-1]
-
-    yield make
-    for each in rigs:
-        each.close()
+    ros = Rig()
+    yield ros
+    ros.close()
 
 
 def counts(bag):
@@ -123,7 +97,6 @@ def counts(bag):
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_signal_completes_the_bag(rig, tmp_path, number):
-    rig = rig(TOPICS)
     process = rig.record(tmp_path / 'bag')
     rig.publish(*range(2000))
     for publisher in rig.publishers:
@@ -132,19 +105,17 @@ def test_signal_completes_the_bag(rig, tmp_path, number):
     assert code == 0, output
     assert counts(tmp_path / 'bag') == {f'/{topic}': 2000 for topic in TOPICS}
     assert all(f'/{topic}: 2000 messages, 0 missed' in output for topic in TOPICS)
-    assert 'Traceback' not in output
     assert 'invalid' not in output  # a context that was shut down
 
 
 def test_signal_before_any_message_leaves_an_empty_bag_that_is_not_overwritten(rig, tmp_path):
-    rig = rig(('a',))
-    process = rig.start(tmp_path / 'bag', topics='[never]')
-    rig.wait_for((tmp_path / 'bag').exists)
+    process = rig.record(tmp_path / 'bag', ['never'])
+    rig.until((tmp_path / 'bag').exists)
     code, output = rig.end(process, signal.SIGTERM)
     assert code == 0, output
     assert counts(tmp_path / 'bag') == {}
     assert '/never: never appeared' in output
-    process = rig.start(tmp_path / 'bag')
+    process = rig.record(tmp_path / 'bag', ['never'])
     _, output = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1
     assert f'{tmp_path / "bag"} exists already' in output
@@ -152,16 +123,14 @@ def test_signal_before_any_message_leaves_an_empty_bag_that_is_not_overwritten(r
 
 
 def test_all_is_on_disk_while_the_recorder_runs(rig, tmp_path):
-    rig = rig(TOPICS)
     rig.record(tmp_path / 'bag')
     rig.publish(*range(1000))  # then no message follows to flush it
-    rig.wait_for(lambda: messages_on_disk(tmp_path / 'bag' / 'bag_0.mcap') == 5000)
+    rig.until(lambda: messages_on_disk(tmp_path / 'bag' / 'bag_0.mcap') == 5000)
 
 
 def test_full_disk_stops_the_recorder_with_one_error_and_a_whole_bag(rig, tmp_path):
-    rig = rig()
     with small_disk(tmp_path / 'disk', 18) as disk:
-        process = rig.record(disk / 'bag')
+        process = rig.record(disk / 'bag', 'a')
         deadline = time.monotonic() + PATIENCE
         while process.poll() is None:
             assert time.monotonic() < deadline, 'still recording'
@@ -175,20 +144,20 @@ def test_full_disk_stops_the_recorder_with_one_error_and_a_whole_bag(rig, tmp_pa
 
 
 def test_unknown_message_packages_are_not_imported_and_do_not_stop_the_recorder(rig, tmp_path):
-    rig = rig()
-    process = rig.record(tmp_path / 'bag', topics='[a, b, c, d, e]')
-    names = {'b': 'unittest::__main__::X', 'c': 'foo::X', 'd': 'unittest::msg::X', 'e': 'X'}
-    rig.start_odd(*(f'{topic}={name}' for topic, name in names.items()))
+    process = rig.record(tmp_path / 'bag', ['a', 'f', 'g', 'h', 'i'])
+    names = {'f': 'unittest::__main__::X', 'g': 'foo::X', 'h': 'unittest::msg::X', 'i': 'X'}
+    odd = [sys.executable, ODD_PARTICIPANT]
+    rig.start([*odd, *(f'{topic}={name}' for topic, name in names.items())])
     output = wait_for_lines(process, [f'/{topic} is not recorded: its type' for topic in names])
-    assert output.count('/c is not recorded') == 1
-    assert '/b is not recorded: its type unittest/__main__/X is not installed here' in output
-    assert '/c is not recorded: its type foo/X is not installed here' in output
+    assert output.count('/g is not recorded') == 1
+    assert '/f is not recorded: its type unittest/__main__/X is not installed here' in output
+    assert '/g is not recorded: its type foo/X is not installed here' in output
     rig.publish(1)
-    rig.start_odd('f=std_msgs::msg::\udce4')  # not UTF-8
+    rig.start([*odd, 'j=std_msgs::msg::\udce4'])  # not UTF-8
     wait_for_lines(process, ['the name of a topic or type is not UTF-8'])
     rig.publish(2)
     encoded = ENCODER.encode(1, [1, 2], [3, 4], [5, 6])[12:]  # after the stamp
-    rig.wait_for(lambda: (tmp_path / 'bag' / 'bag_0.mcap').read_bytes().count(encoded) == 2)
+    rig.until(lambda: (tmp_path / 'bag' / 'bag_0.mcap').read_bytes().count(encoded) == 2)
     assert rig.end(process, signal.SIGINT)[0] == 0
     assert [topic for topic, _, _ in read(tmp_path / 'bag')] == ['/a', '/a']
 
@@ -206,7 +175,6 @@ def wait_for_lines(process, expected):
 @pytest.mark.parametrize('k', range(KILLS))
 def test_kill_loses_nothing_that_was_written(k, rig, tmp_path):
     """How soon it is written: see test_data_is_flushed_periodically."""
-    rig = rig(TOPICS)
     process = rig.record(tmp_path / 'bag')
     rig.publish(*range(random.Random(k).randrange(50, MOST)))  # noqa: S311
     written = messages_on_disk(tmp_path / 'bag' / 'bag_0.mcap')
