@@ -45,64 +45,43 @@ DRIVERS = {
 }
 
 
+NO_OR_YES = ['false', 'true']
+ARGUMENTS = {  # default, choices and description
+    'config': (
+        '',
+        None,
+        'parameter file for all nodes, or a preset; empty: that of the driver, or recommended',
+    ),
+    'driver': (
+        '',
+        ['', *DRIVERS],
+        'driver of an arm, whose topics are used; empty: the simulated arm',
+    ),
+    'simulated': ('false', NO_OR_YES, 'start the simulated arm with the topics of the driver'),
+    'mode': (
+        '',
+        ['', 'realtime', 'lockstep'],
+        'step on the wall clock, or wait for each torque; empty: as configured',
+    ),
+    'namespace': ('', None, 'of all nodes; in a file, the key /**/NODE matches any namespace'),
+    'bag': ('', None, 'folder to record into, which must not exist yet; empty: no recording'),
+    'rviz': ('false', NO_OR_YES, 'show the arm in RViz'),
+}
+
+
 def generate_launch_description() -> LaunchDescription:
     """Declare the arguments; `--show-args` lists them."""
-    return LaunchDescription(
-        [
-            DeclareLaunchArgument(
-                'config',
-                default_value='',
-                description='parameter file for all nodes, or the name of a preset; empty: that of '
-                'the driver, or recommended',
-            ),
-            DeclareLaunchArgument(
-                'driver',
-                default_value='',
-                choices=['', *DRIVERS],
-                description='driver of an arm, whose topics are used; empty: the simulated arm',
-            ),
-            DeclareLaunchArgument(
-                'simulated',
-                default_value='false',
-                choices=['false', 'true'],
-                description='start the simulated arm with the topics of the driver',
-            ),
-            DeclareLaunchArgument(
-                'mode',
-                default_value='',
-                choices=['', 'realtime', 'lockstep'],
-                description='step on the wall clock, or wait for each torque; empty: as configured',
-            ),
-            DeclareLaunchArgument(
-                'namespace',
-                default_value='',
-                description='namespace of all nodes; in a parameter file, the key /**/NODE '
-                'matches a node in any namespace',
-            ),
-            DeclareLaunchArgument(
-                'bag',
-                default_value='',
-                description='folder to record into, which must not exist yet; empty: no recording',
-            ),
-            DeclareLaunchArgument(
-                'rviz',
-                default_value='false',
-                choices=['false', 'true'],
-                description='show the arm in RViz',
-            ),
-            OpaqueFunction(function=nodes),
-        ]
-    )
+    declared = [
+        DeclareLaunchArgument(name, default_value=default, choices=choices, description=text)
+        for name, (default, choices, text) in ARGUMENTS.items()
+    ]
+    return LaunchDescription([*declared, OpaqueFunction(function=nodes)])
 
 
 def nodes(context: LaunchContext) -> list[Node]:
     """Create the nodes once the arguments are known."""
-    config, mode, namespace, bag, rviz, robot, simulated = (
-        LaunchConfiguration(name).perform(context)
-        for name in (
-            *('config', 'mode', 'namespace', 'bag', 'rviz'),
-            *('driver', 'simulated'),
-        )
+    config, robot, simulated, mode, namespace, bag, rviz = (
+        LaunchConfiguration(name).perform(context) for name in ARGUMENTS
     )
     driver = DRIVERS.get(robot)
     file = str(locate(config or (driver.config if driver else 'recommended')))
