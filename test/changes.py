@@ -6,15 +6,8 @@ Each violated the bound of the preset `recommended` before learning checked its 
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from paper_case import configured
-
-from blf_dsc_controller.analysis.metrics import estimates_of
-from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.messages.topics import MODEL_CHANGES
-from blf_dsc_controller.simulation.loop import simulate
+import paper_case
 
 BOUND = 2e-3  # rad
 WINDOW = 2.0 * np.pi  # s
@@ -108,31 +101,6 @@ def end_of(row):
     return round(float(np.max(begin + duration + ramp)) + 2.0 * WINDOW, 3)
 
 
-class Loop(NamedTuple):
-    """A loop whose plant may have changed; the first axis is the sample."""
-
-    t: np.ndarray  # s
-    xi1: np.ndarray  # (., 2) rad
-    error: np.ndarray  # (.,) |P^ - P| / |P|, P of the plant at that time
-    torque: np.ndarray  # (., 2) N m
-    changes: np.ndarray  # (.,) detected so far
-    controller: Controller
-
-    def largest(self, begin):
-        """Largest |xi1| of each joint (2,) from a time on [rad]."""
-        return np.abs(self.xi1[self.t >= begin]).max(axis=0)
-
-
 def run(duration, plant=None, *, preset='recommended', law=None):
     """Run a preset with changed parameters of the plant, events among them, and of the law."""
-    config = configured(preset, duration, law, plant)
-    record = simulate(config.controller, config.plant)
-    found = record.run()
-    return Loop(
-        found.time,
-        found.error,
-        estimates_of(found).relative_error,
-        found.torque,
-        found.learning.column(MODEL_CHANGES),
-        record.controller,
-    )
+    return paper_case.run(paper_case.configured(preset, duration, law, plant))

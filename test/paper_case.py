@@ -10,6 +10,7 @@ import numpy as np
 
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -45,15 +46,23 @@ class Loop(NamedTuple):
     estimate: np.ndarray  # (., m)
     lyapunov: np.ndarray  # (., 4)
     latched: np.ndarray  # (.,)
+    changes: np.ndarray  # (.,) of the arm, detected so far
+    P: np.ndarray  # (., 3) of the plant at that time
+    controller: Controller
 
     @property
     def parameter_error(self) -> np.ndarray:
         """|P^ - P| / |P| of each sample."""
-        return np.linalg.norm(self.estimate[:, :3] - P, axis=1) / np.linalg.norm(P)
+        off = np.linalg.norm(self.estimate[:, :3] - self.P, axis=1)
+        return off / np.linalg.norm(self.P, axis=1)
 
     def error_at(self, t: float) -> float:
         """Return the relative parameter error at a time [s]."""
         return float(self.parameter_error[np.abs(self.t - t).argmin()])
+
+    def largest(self, begin: float) -> np.ndarray:
+        """Largest |xi1| of each joint (2,) from a time on [rad]."""
+        return np.abs(self.xi1[self.t >= begin]).max(axis=0)
 
 
 def run(config: LoopConfig) -> Loop:
@@ -61,5 +70,6 @@ def run(config: LoopConfig) -> Loop:
     record = simulate(config.controller, config.plant, supervised=False)
     columns = sample_of(np.arange(record.samples.shape[1]), record.controller.settings)
     names = ('xi1', 'xi2', 'torque', 'estimate', 'lyapunov')
-    parts = (record.samples[:, getattr(columns, name)] for name in names)
-    return Loop(record.stamps * 1e-9, *parts, record.samples[:, columns.latched[0]])
+    parts = [record.samples[:, getattr(columns, name)] for name in names]
+    parts += [record.samples[:, getattr(columns, name)[0]] for name in ('latched', 'changes')]
+    return Loop(record.stamps * 1e-9, *parts, record.truths[:, :3], record.controller)

@@ -221,8 +221,8 @@ def test_first_latch_disturbs_neither_the_tracking_nor_the_disturbance_estimate(
     off, late = (
         np.abs(loop.controller.state.disturbance - true).max() for loop in (bumpless, paper)
     )
-    assert bumpless.error[np.searchsorted(bumpless.t, LATCH - 0.1)] > 0.1
-    assert bumpless.error[-1] < 1e-3
+    assert bumpless.parameter_error[np.searchsorted(bumpless.t, LATCH - 0.1)] > 0.1
+    assert bumpless.parameter_error[-1] < 1e-3
     assert bumpless.largest(LATCH).max() < 0.02e-3
     assert paper.largest(LATCH).max() > 0.4e-3
     assert off < 0.02

@@ -61,7 +61,7 @@ def test_bound_holds_when_the_arm_changes(name, sensors):
     quantisation = 0.5 * plant.get('sensor.resolution', 0.0)
     assert np.all(learning.largest(begin) <= allowed(row, without.largest(begin)) + quantisation)
     assert learning.changes[-1] >= 1.0
-    assert learning.error[-1] < 0.01
+    assert learning.parameter_error[-1] < 0.01
 
 
 def test_change_detection_has_no_effect_without_a_change():
@@ -91,7 +91,7 @@ def test_estimate_does_not_drift_at_rest_with_noise():
     excited, the estimate is held from then on.
     """
     standing = run(60.0, preset='noisy', law={'reference.type': 'hold'})
-    assert np.ptp(standing.error[standing.t > WINDOW + 0.1]) == 0.0
+    assert np.ptp(standing.parameter_error[standing.t > WINDOW + 0.1]) == 0.0
     assert np.all(standing.largest(1.0) < 0.5 * BOUND)
 
 
@@ -108,7 +108,7 @@ def test_column_rejected_at_rest_is_readmitted_in_motion():
     constant = {'disturbance.constant': [0.3, -0.2], 'disturbance.amplitude': [0.0, 0.0]}
     moved = run(45.0, constant, law=law)
     assert np.all(moved.controller.state.active == 1.0)
-    assert moved.error[-1] < 0.01
+    assert moved.parameter_error[-1] < 0.01
 
 
 def test_rejected_column_stays_zero_and_is_checked_again():
