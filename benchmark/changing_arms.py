@@ -11,6 +11,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from harness import table_lines
+
 from blf_dsc_controller.cli.main import main as blf_dsc
 from blf_dsc_controller.studies.monte_carlo import Study
 from blf_dsc_controller.studies.report import Summary, draw_pairs, exceptions, summarize
@@ -60,9 +62,8 @@ def row(title: str, summary: Summary) -> tuple[str, ...]:
 def report(found: dict[str, tuple[Study, Columns]], folder: Path) -> str:
     """Return the table, and the command of each exception."""
     summaries = {name: summarize(*each) for name, each in found.items()}
-    rows = [_HEADER, ('---',) * len(_HEADER)]
-    rows += [row(STUDIES[name], summary) for name, summary in summaries.items()]
-    lines = [f'| {" | ".join(each)} |' for each in rows]
+    rows = (row(STUDIES[name], summary) for name, summary in summaries.items())
+    lines = [*table_lines(_HEADER, rows)]
     for name, summary in summaries.items():
         for run, what, command in exceptions(summary['pairs'], folder / name):
             lines += ['', f'{STUDIES[name]}, run {run}: {what}', '', f'    {command}']

@@ -66,10 +66,16 @@ def interleaved(contestants: Mapping[str, Callable[[], int]], rounds: int) -> di
     return {name: np.array(values) for name, values in seconds.items()}
 
 
+def table_lines(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """Yield the lines of a Markdown table."""
+    for row in itertools.chain([heads, ['---'] * len(heads)], rows):
+        yield f'| {" | ".join(row)} |'
+
+
 def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print a Markdown table, each row as soon as it is known."""
-    for row in itertools.chain([heads, ['---'] * len(heads)], rows):
-        print(f'| {" | ".join(row)} |', flush=True)
+    for line in table_lines(heads, rows):
+        print(line, flush=True)
 
 
 class ContestantError(BlfDscError):

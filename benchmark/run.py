@@ -14,7 +14,7 @@ import platform
 from itertools import groupby
 from pathlib import Path
 
-from harness import Ratio
+from harness import Ratio, table_lines
 
 from blf_dsc_controller import __version__
 
@@ -50,17 +50,21 @@ def machine() -> str:
 
 def table(rows: list[Ratio]) -> str:
     """Return Markdown with a table for each group."""
-    parts = []
+    lines: list[str] = []
     for group, members in groupby(rows, key=lambda row: row.group):
-        parts.append(
-            f'\n## {group}\n\n| what | ratio | range | to | |\n| --- | --- | --- | --- | --- |'
-        )
-        parts += [
-            f'| {row.what} | **{row.median:.3g}** | {row.low:.3g} to {row.high:.3g} '
-            f'| {row.baseline} | {row.note} |'
+        cells = (
+            (
+                row.what,
+                f'**{row.median:.3g}**',
+                f'{row.low:.3g} to {row.high:.3g}',
+                row.baseline,
+                row.note,
+            )
             for row in members
-        ]
-    return '\n'.join(parts) + '\n'
+        )
+        heads = ('what', 'ratio', 'range', 'to', '')
+        lines += ['', f'## {group}', '', *table_lines(heads, cells)]
+    return '\n'.join(lines) + '\n'
 
 
 def main() -> None:

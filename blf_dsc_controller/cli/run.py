@@ -201,7 +201,8 @@ class LoopProgress:
         """Begin at 0 s; `parameters` are the names of the estimates."""
         self._order = parameter_order(parameters, config)
         self._config = config
-        form, pause = (_BAR, 0.2) if sys.stderr.isatty() else (_LINE, _LINE_PERIOD)
+        self._is_bar = sys.stderr.isatty()
+        form, pause = (_BAR, 0.2) if self._is_bar else (_LINE, _LINE_PERIOD)
         self._bar = tqdm(
             total=config.duration, desc='closed loop', bar_format=form, mininterval=pause
         )
@@ -218,7 +219,10 @@ class LoopProgress:
 
     def write(self, text: str) -> None:
         """Print a line without disturbing the bar."""
-        self._bar.write(text, file=sys.stderr)
+        if self._is_bar:
+            self._bar.write(text, file=sys.stderr)
+        else:
+            print_notice(text)
 
     def close(self) -> None:
         """Show the last state."""

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from math import inf
 from pathlib import Path
 
@@ -146,34 +146,26 @@ class NodeProcess:
 
 
 def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, view_host: str) -> bool:
-    nodes: list[NodeProcess] = []
-    views: list[NodeProcess] = []
     interrupts: list[int] = []
-    remark = ''
-    handlers = {
-        number: signal.signal(number, lambda number, _: interrupts.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        try:
-            loop_of_nodes = [_LOOP] if config.plant.mode == 'lockstep' else [CONTROLLER, PLANT]
-            for name in (RECORDER, *loop_of_nodes):
-                nodes.append(NodeProcess(name, params_file, logs))  # noqa: PERF401 - those that started are stopped
+    with ExitStack() as ending:  # stops the nodes in reverse, then restores the handlers
+        for number in (signal.SIGINT, signal.SIGTERM):
+            handler = signal.signal(number, lambda number, _: interrupts.append(number))
+            ending.callback(signal.signal, number, handler)
 
-            def show() -> str:
-                port = free_port(view_host, _VIEW_PORT)
-                given = ('-p', f'host:={view_host}', '-p', f'port:={port}')
-                views.append(NodeProcess(VIEW, params_file, logs, *given))
-                return url_of(view_host, port)
+        def started(name: str, *arguments: str) -> NodeProcess:
+            node = NodeProcess(name, params_file, logs, *arguments)
+            ending.callback(node.stop)
+            return node
 
-            remark = _monitor(config, nodes, interrupts, show if view_host else None)
-        finally:
-            for node in reversed(nodes + views):
-                node.stop()
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-    recorder, *loop = nodes
+        def show() -> str:
+            port = free_port(view_host, _VIEW_PORT)
+            started(VIEW, '-p', f'host:={view_host}', '-p', f'port:={port}')
+            return url_of(view_host, port)
+
+        recorder = started(RECORDER)
+        names = [_LOOP] if config.plant.mode == 'lockstep' else [CONTROLLER, PLANT]
+        loop = [started(name) for name in names]
+        remark = _monitor(config, recorder, loop, interrupts, show if view_host else None)
     for node in loop:
         node.check()
     recorder.check(remark)
@@ -182,7 +174,8 @@ def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, view_host: str
 
 def _monitor(
     config: LoopConfig,
-    nodes: list[NodeProcess],
+    recorder: NodeProcess,
+    loop: list[NodeProcess],
     interrupts: list[int],
     show: Callable[[], str] | None,
 ) -> str:
@@ -191,7 +184,6 @@ def _monitor(
     `show` starts the page and returns its address; it is called only after the first message of
     the loop, since the nodes wait for a subscriber, which must be the recorder.
     """
-    recorder, *loop = nodes
     with ProgressMonitor(config, interrupts) as monitor:
 
         def goes_on() -> bool:
