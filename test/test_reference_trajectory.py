@@ -366,12 +366,12 @@ def test_goal_with_much_time_is_not_overshot_by_more_than_the_braking_distance(
     np.testing.assert_array_equal(dqr[-1], (0.0, 0.0))
 
 
-def test_point_that_needs_all_its_time_for_braking_is_still_reached():
-    """The gentle braking of 0.7 s does not fit, but braking all the way does."""
-    motion = plan_trajectory(
-        trajectory((np.array([[0.3, 0.0]]),), times=(0.45,)), moving((1.4, 0.0)), 0.0, LIMITS
-    )
-    np.testing.assert_allclose(at(motion.vector, 0.45), [(0.3, 0.0), (0, 0), (0, 0)], atol=1e-9)
+@pytest.mark.parametrize(('speed', 'goal', 'time'), [(1.4, 0.3, 0.45), (0.6, 0.9, 1.0)])
+def test_point_that_needs_more_time_for_braking_is_still_reached(speed, goal, time):
+    """The gentle braking does not fit, or leaves too little time; up to all the time there is."""
+    sent = trajectory((np.array([[goal, 0.0]]),), times=(time,))
+    motion = plan_trajectory(sent, moving((speed, 0.0)), 0.0, LIMITS)
+    np.testing.assert_allclose(at(motion.vector, time), [(goal, 0.0), (0, 0), (0, 0)], atol=1e-9)
 
 
 def test_trajectory_that_begins_after_a_blend_is_settled_with_that_blend():
