@@ -7,6 +7,8 @@ import math
 import re
 import subprocess
 import sys
+import sysconfig
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from blf_dsc_controller.configuration import files
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import parse, parse_scalar
 from blf_dsc_controller.configuration.nodes import (
@@ -30,7 +33,7 @@ from blf_dsc_controller.configuration.nodes import (
 )
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.messages import topics
 
 
@@ -336,3 +339,39 @@ def test_documented_file_for_a_real_arm_is_valid(file):
     effort_controller = yaml.safe_load(of_ros2_control)['effort_controller']
     assert list(config.joints) == effort_controller['ros__parameters']['joints']
     assert config.safety.torque == 'hold_gravity'
+
+
+def installed(prefix):
+    """Create the share folder of an installation below `prefix`."""
+    folder = prefix / 'share' / 'blf_dsc_controller'
+    (folder / 'config').mkdir(parents=True)
+    (folder / 'config' / 'recommended.yaml').touch()
+    return folder
+
+
+def test_files_are_those_of_the_source_tree_then_of_ros_then_of_pip(tmp_path, monkeypatch):
+    """And never those of the current folder."""
+    here, workspace = tmp_path / 'here', tmp_path / 'workspace'
+    installed(here)
+    (here / 'config').mkdir()
+    (here / 'config' / 'recommended.yaml').touch()
+    workspace.mkdir()  # of ROS, without the package at first
+    monkeypatch.chdir(here)
+    monkeypatch.setattr(files, '_CHECKOUT', tmp_path / 'checkout')
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(workspace))
+    monkeypatch.setattr(sysconfig, 'get_path', lambda _name, scheme: str(tmp_path / scheme))
+    with pytest.raises(BlfDscError, match='install the package again') as error:
+        files.share_folder()
+    assert str(here) not in str(error.value)
+    for scheme in (sysconfig.get_preferred_scheme('user'), sysconfig.get_default_scheme()):
+        own = installed(tmp_path / scheme)
+        assert files.share_folder() == own
+    if find_spec('ament_index_python'):
+        packages = workspace / 'share/ament_index/resource_index/packages'
+        packages.mkdir(parents=True)
+        (packages / 'blf_dsc_controller').touch()
+        own = installed(workspace)
+        assert files.share_folder() == own
+    (tmp_path / 'checkout/config').mkdir(parents=True)
+    (tmp_path / 'checkout/setup.py').touch()
+    assert files.share_folder() == tmp_path / 'checkout'

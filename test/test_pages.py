@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""README and doc/: their code runs, their parameter files load, their commands exist."""
+"""README and doc/: code runs, files load, commands exist; the site is whole and loads nothing."""
 
 from __future__ import annotations
 
 import argparse
 import ast
 import contextlib
+import importlib
 import importlib.util
 import io
 import re
@@ -14,6 +15,7 @@ import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 from markdown_it import MarkdownIt
@@ -237,3 +239,60 @@ def subcommand(name):
         if isinstance(action, argparse._SubParsersAction):
             return action.choices[name]
     raise AssertionError
+
+
+DOC = ROOT / 'doc'
+sys.path.append(str(DOC))
+links = importlib.import_module('links')
+
+
+@pytest.fixture(scope='module')
+def site(tmp_path_factory):
+    """Every page of the site, built as by `make docs`."""
+    out = tmp_path_factory.mktemp('site')
+    sphinx = [sys.executable, '-m', 'sphinx', '-q', '-W', '--keep-going', '-n', str(DOC), str(out)]
+    built = subprocess.run(sphinx, check=False, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    return links.read_pages(out)
+
+
+@pytest.mark.nightly
+def test_site_has_every_page_and_no_dead_link(site):
+    names = {path.stem for path in site}
+    assert {path.stem for path in DOC.iterdir() if path.suffix in ('.md', '.rst')} <= names
+    assert not list(links.dead_links(site))
+    page = next(page for path, page in site.items() if path.stem == 'index')
+    page.links += ['nowhere.html', '#nothing', 'https://example.org/elsewhere']
+    assert list(links.dead_links(site)) == ['index.html: nowhere.html', 'index.html: #nothing']
+
+
+@pytest.mark.nightly
+def test_site_loads_no_external_resources(site):
+    for path, page in site.items():
+        for url in page.loaded:
+            assert not urlsplit(url).netloc, (path.name, url)
+            assert url.startswith(('#', 'data:')) or (path.parent / urlsplit(url).path).exists()
+    (folder,) = {path.parent for path in site if path.name == 'index.html'}
+    for sheet in folder.rglob('*.css'):
+        assert not re.search(r'(url\(|@import)\s*["\']?(https?:)?//', sheet.read_text()), sheet
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize('name', OUTSIDE)
+def test_links_outside_the_site_are_valid(name, site):
+    page = ROOT / name
+    anchors = {path.stem: parsed.anchors for path, parsed in site.items()}
+    for link in re.findall(r'\]\(([^)\s]+)\)', page.read_text()):
+        url = urlsplit(link)
+        if not url.scheme:
+            target = page.parent / url.path
+            assert target.exists(), link
+            assert not url.fragment or url.fragment in anchors[target.stem], link
+
+
+@pytest.mark.nightly
+def test_every_picture_has_a_make_command():
+    text = (DOC / 'figures.md').read_text()
+    shown = {path.name for folder in ('doc', 'benchmark') for path in (ROOT / folder).glob('*.png')}
+    rows = re.findall(r'^\| \S*?([\w-]+\.png)\S* \| `make (\w+)', text, re.MULTILINE)
+    assert {picture for picture, _ in rows} == shown
