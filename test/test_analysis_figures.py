@@ -57,8 +57,10 @@ def test_a_change_of_the_arm_is_drawn_from_close_by(tmp_path):
         assert amount(image, colour) > 500
 
 
-def test_draw_writes_both_figures(run, tmp_path):
+def test_draw_writes_both_figures_and_leaves_none_open(run, tmp_path):
+    before = dict(rcParams)
     assert draw(run, tmp_path) == [tmp_path / 'tracking.png', tmp_path / 'parameters.png']
+    assert (dict(rcParams), plt.get_fignums()) == (before, [])  # no changed settings
     tracking = pixels(tmp_path / 'tracking.png')
     parameters = pixels(tmp_path / 'parameters.png')
     # Wide enough for readable labels on a page.
@@ -159,13 +161,6 @@ def test_gaps_and_a_single_sample_are_drawn(run, tmp_path):
         },
     )
     assert draw(single, tmp_path)
-
-
-def test_drawing_leaves_no_open_figures_and_no_changed_settings(run, tmp_path):
-    before = dict(rcParams)
-    draw(run, tmp_path)
-    assert dict(rcParams) == before
-    assert plt.get_fignums() == []
 
 
 @given(st.integers(1, 400), st.integers(1, 50), st.randoms(use_true_random=False))

@@ -65,6 +65,7 @@ def test_every_panel_is_drawn_without_errors(browser, pages, name):
     assert drawn >= 12  # two joints, each with error, position, torque; parameters; excitation
     lines = browser.value("document.querySelectorAll('.scatterlayer path.js-line').length")
     assert lines > drawn
+    assert browser.value('performance.getEntriesByType("resource").length') == 0
     browser.screenshot(SHOTS / f'report_{name}.png')
     browser.screenshot(SHOTS / f'report_{name}_whole.png', whole=True)
     assert browser.errors == []
@@ -88,11 +89,6 @@ def test_page_fits_the_window_and_legends_cover_no_title_or_axis(browser, pages,
     )
     assert covered == []
     browser.screenshot(SHOTS / f'report_{name}_{width}.png', whole=True)
-
-
-def test_page_loads_no_external_resources(browser, pages):
-    show(browser, pages / 'one.html')
-    assert browser.value('performance.getEntriesByType("resource").length') == 0
 
 
 def test_dragging_zooms_all_time_panels(browser, pages):

@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import synthetic_bag
-from fault_rig import JOINTS, Rig
 from synthetic_bag import MILLISECOND, START, Synthetic
 from test_analysis_figures import amount, lightened, pixels
 
@@ -19,12 +18,8 @@ from blf_dsc_controller.analysis.report import read_bags
 from blf_dsc_controller.analysis.style import ALARM
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.messages.topics import (
-    BOUND,
-    JOINT_STATES,
     JOURNAL,
     LEARNING,
     REFERENCE,
@@ -57,9 +52,7 @@ def test_stop_outside_the_bound_is_a_violation_at_the_stamp_of_the_last_state(tm
     assert tracking['held'] is False
     assert tracking['first_violation'] == {'time_s': pytest.approx(STOP_S), 'joint': 'elbow'}
     (stop,) = tracking['stops']
-    assert stop['time_s'] == pytest.approx(STOP_S)
-    assert stop['stamp_ns'] == START + 2345 * MILLISECOND
-    assert stop['reason'] == 'error past the bound'
+    assert (stop['time_s'], stop['stamp_ns']) == (pytest.approx(STOP_S), START + 2345 * MILLISECOND)
     table = format_table(summarize(run))
     assert 'bound       VIOLATED, first by elbow at 2.345 s' in table
     assert "stopped     at 2.345 s, error past the bound: joint 'elbow' is +0.0023 rad" in table
@@ -74,7 +67,7 @@ def test_stop_for_another_reason_keeps_the_bound_held_until_then(tmp_path):
     assert 'stopped     at 2.345 s, velocity not plausible' in table
 
 
-def test_figures_and_page_show_the_stop(tmp_path, capsys):
+def test_figures_and_page_show_the_stop(tmp_path):
     path = stopped(tmp_path)
     run = read_run(path)
     shown = [panel for panel in panels([run]) if panel.group in ('Motion', 'Tracking', 'Torque')]
@@ -93,13 +86,6 @@ def test_figures_and_page_show_the_stop(tmp_path, capsys):
     (event,) = (event for event in bag.events if event.kind == 'stop')
     assert event.time == pytest.approx(STOP_S)
     assert event.text.startswith("error past the bound: joint 'elbow'")
-    pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
-    assert main(['report', str(path), '--out', str(tmp_path / 'page.html')]) == 0
-    page = (tmp_path / 'page.html').read_text()
-    assert 'bound       VIOLATED, first by elbow at 2.345 s' in page
-    assert 'held by every joint' not in page
-    assert main(['plot', str(path), '--out', str(tmp_path / 'plot')]) == 0
-    assert 'VIOLATED' in capsys.readouterr().out
 
 
 def test_stop_is_shaded_until_the_controller_restarts(tmp_path):
@@ -118,30 +104,3 @@ def test_stop_is_shaded_until_the_controller_restarts(tmp_path):
     assert plot['marks'] == [
         (pytest.approx(1.0), 'stop: velocity not plausible', ALARM, pytest.approx(1.8))
     ]
-
-
-def test_push_out_of_the_bound_is_reported_for_a_guarded_loop(tmp_path):
-    rig = Rig()
-    states, bound = JointStateEncoder(JOINTS), JointStateEncoder(JOINTS, ('position', 'effort'))
-    errors = JointStateEncoder(JOINTS)
-    limits = bound.encode(START, [0.002] * 2, (), [20.0] * 2)
-    messages = [(BOUND, START, limits)]
-    for k in range(400):
-        rig.push[:] = (60.0, 0.0) if k > 300 else (0.0, 0.0)
-        state = rig.state()
-        rig.step()
-        at = state.stamp
-        messages.append((JOINT_STATES, at, states.encode(at, state.q, state.dq, state.effort)))
-        if rig.guard.has_sample:
-            sample = rig.guard.controller.sample
-            raw = errors.encode(at, sample.xi1, sample.xi2, sample.torque)
-            messages.append((TRACKING_ERROR, at, raw))
-    events = rig.guard.journal.pending
-    messages += [(JOURNAL, max(event.stamp, START), event.encode()) for event in events]
-    assert rig.supervisor.reason is Reason.OUTSIDE_BOUND
-    run = read_run(synthetic_bag.write(tmp_path / 'bag', messages))
-    assert np.nanmax(np.abs(run.error)) < 0.002
-    tracking = summarize(run)['tracking']
-    assert tracking['held'] is False
-    assert tracking['first_violation']['joint'] == 'joint1'
-    assert 0.3 < tracking['first_violation']['time_s'] < 0.4

@@ -31,6 +31,8 @@ def test_tracking(run):
     summary = summarize(run)
     assert summary['duration_s'] == pytest.approx(9.999)
     assert summary['samples'] == SAMPLES
+    counts = [summary['messages'][topic.resolved] for topic in (JOINT_STATES, TRUTH, BOUND)]
+    assert counts == [SAMPLES, SAMPLES / 10, 1]
     assert summary['tracking']['held'] is True
     assert summary['tracking']['first_violation'] is None
     shoulder, elbow = (summary['tracking']['joints'][joint] for joint in JOINTS)
@@ -109,13 +111,6 @@ def test_timing(run):
     assert summarize(slow)['timing']['rate_hz'] == pytest.approx(500.0)
 
 
-def test_messages_are_counted(run):
-    messages = summarize(run)['messages']
-    assert messages[JOINT_STATES.resolved] == SAMPLES
-    assert messages[TRUTH.resolved] == SAMPLES / 10
-    assert messages[BOUND.resolved] == 1
-
-
 def test_unknown_values_are_null_and_never_nan(run, tmp_path):
     optional = ('reference', 'error', 'bound', 'torque_limit', 'learning', 'truth', 'timing')
     unknown = dict.fromkeys(optional) | {'torque': np.full_like(run.torque, np.nan)}
@@ -127,23 +122,17 @@ def test_unknown_values_are_null_and_never_nan(run, tmp_path):
     assert set(summary['tracking']['joints']['elbow'].values()) == {None}
 
 
-def summary_without(topic, folder):
+@pytest.mark.parametrize('topic', [TRUTH, LEARNING])
+def test_truth_and_learning_are_optional_in_a_bag(tmp_path, topic):
     messages = [entry for entry in Synthetic(100).messages() if entry[0] is not topic]
-    return summarize(read_run(synthetic_bag.write(folder / 'bag', messages)))
-
-
-def test_estimates_are_summarized_without_the_truth(tmp_path):
-    learning = summary_without(TRUTH, tmp_path)['learning']
-    assert learning['final_relative_error'] is None
-    assert learning['true'] is None
+    summary = summarize(read_run(synthetic_bag.write(tmp_path / 'bag', messages)))
+    if topic is LEARNING:
+        assert (summary['learning'], summary['compute_time_us']) == (None, None)
+        return
+    learning = summary['learning']
+    assert (learning['final_relative_error'], learning['true']) == (None, None)
     assert list(learning['final_estimate']) == list(PARAMETERS)
     assert learning['latch_time_s'] is None  # the run is too short
-
-
-def test_learning_is_optional_in_a_bag(tmp_path):
-    summary = summary_without(LEARNING, tmp_path)
-    assert summary['learning'] is None
-    assert summary['compute_time_us'] is None
 
 
 def test_unmeasured_compute_time_is_null(run):
@@ -154,22 +143,22 @@ def test_unmeasured_compute_time_is_null(run):
     assert summarize(unmeasured)['compute_time_us'] is None
 
 
-def test_table_shows_the_widest_bound(run):
-    bound = run.bound.copy()
+def test_table_shows_what_is_unusual(run):
+    """A wide bound, late steps, a violation, an unknown bound."""
+    bound, late = run.bound.copy(), run.timing.values.copy()
     bound[:100, 1] = 0.0123
-    table = format_table(summarize(dataclasses.replace(run, bound=bound)))
-    assert '\nat widest   elbow 12.3 mrad\n' in table
-    assert 'at widest' not in format_table(summarize(run))
-
-
-def test_table_warns_of_late_steps(run):
-    timing = run.timing
-    late = timing.values.copy()
-    late[-1, timing.names.index(LATE_STEPS)] = 0.02 * SAMPLES
-    slow = dataclasses.replace(run, timing=dataclasses.replace(timing, values=late))
-    table = format_table(summarize(slow))
-    assert '200 late steps: the computer was too busy for real time' in table
-    assert 'too busy' not in format_table(summarize(run))
+    late[-1, run.timing.names.index(LATE_STEPS)] = 0.02 * SAMPLES
+    timing = dataclasses.replace(run.timing, values=late)
+    unknown = {'error': None, 'learning': None, 'timing': None}
+    usual = format_table(summarize(run))
+    for changes, line in (
+        ({'bound': bound}, '\nat widest   elbow 12.3 mrad\n'),
+        ({'timing': timing}, '200 late steps: the computer was too busy for real time'),
+        ({'error': run.error + 1.0}, 'VIOLATED, first by shoulder at 0.000 s'),
+        (unknown, 'bound       unknown'),
+    ):
+        assert line in format_table(summarize(dataclasses.replace(run, **changes)))
+        assert line not in usual
 
 
 def test_table_shows_the_summary(run):
@@ -207,15 +196,6 @@ def test_learning_begins_only_in_a_law_that_learns(changes, line, source, tmp_pa
     summary = summarize(run)
     assert f'learning    {line}' in format_table(summary)
     assert (summary['learning']['latch_time_s'] is None) == bool(changes)
-
-
-def test_table_shows_a_violation_and_an_unknown_bound(run):
-    error = run.error + 1.0
-    assert 'VIOLATED, first by shoulder at 0.000 s' in format_table(
-        summarize(dataclasses.replace(run, error=error))
-    )
-    partial = dataclasses.replace(run, error=None, learning=None, timing=None)
-    assert 'bound       unknown' in format_table(summarize(partial))
 
 
 def test_simulation_and_its_bag_have_the_same_metrics(tmp_path):
