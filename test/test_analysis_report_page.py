@@ -31,10 +31,10 @@ SHOTS = Path(os.environ.get('BROWSER_SHOTS') or tempfile.gettempdir())
 def pages(tmp_path_factory):
     SHOTS.mkdir(exist_ok=True)
     folder = tmp_path_factory.mktemp('pages')
-    one = recorded_run.record(folder / 'one', 4.0)
+    first = recorded_run.record(folder / 'one', 4.0)
     other = recorded_run.record(folder / 'other', 4.0, **{'feedback.gain': [30.0, 10.0]})
-    write_report(read_bags([one]), folder / 'one.html')
-    write_report(read_bags([one, other]), folder / 'both.html')
+    write_report(read_bags([first]), folder / 'one.html')
+    write_report(read_bags([first, other]), folder / 'both.html')
     return folder
 
 

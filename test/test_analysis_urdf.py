@@ -30,16 +30,16 @@ P = np.array([2.0, 3.0, 5.0])  # kg m^2, kg m, and one without effect on the tor
 
 def pendulum(_q, _dq, _v, a):
     """Regressor of a pendulum whose gravity does not depend on its angle."""
-    one = np.ones_like(a)
-    return np.stack((a, one, 0.0 * one), axis=-1)
+    ones = np.ones_like(a)
+    return np.stack((a, ones, 0.0 * ones), axis=-1)
 
 
 def run_of(estimate, true=P, regressor=pendulum):
     """One joint following sin t with these estimates, (3,) or (N, 3)."""
     stamp = np.arange(TIME.size) * PERIOD
     names = ('Izz1', 'm*cx1', 'Ixx1')
-    one = np.ones((TIME.size, 1))
-    learned = np.hstack((np.broadcast_to(estimate, (TIME.size, 3)), one, one))
+    ones = np.ones((TIME.size, 1))
+    learned = np.hstack((np.broadcast_to(estimate, (TIME.size, 3)), ones, ones))
     q = np.sin(TIME)[:, np.newaxis]
     return Run(
         joints=('joint1',),
@@ -50,8 +50,8 @@ def run_of(estimate, true=P, regressor=pendulum):
         torque=0 * q,
         reference=q,
         error=0 * q,
-        bound=one,
-        torque_limit=one,
+        bound=ones,
+        torque_limit=ones,
         learning=Series((*names, LAMBDA_MIN, LATCHED), stamp, learned),
         truth=Series(names, stamp, np.broadcast_to(true, (TIME.size, 3))),
         arm=LearnedArm(

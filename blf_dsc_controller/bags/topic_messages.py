@@ -219,8 +219,8 @@ class StoredSeries(Series):
         return self._of.field(0, rows, columns)
 
 
-class _LikeMessages:
-    """Messages of one layout, in a table: number, received, sequence, stamp, then all values."""
+class _Group:
+    """Messages of a layout, in a table: number, received, sequence, stamp, then all values."""
 
     def __init__(self, raw: bytes, layout: Layout, *, is_stamped: bool) -> None:
         self.layout, self.pattern, self._is_stamped = layout, Pattern(raw, layout), is_stamped
@@ -255,7 +255,7 @@ class TopicMessages:
         self._find = {JOINT_STATE: joint_state_layout, FLOAT64_MULTI_ARRAY: array_layout}.get(
             type_name
         )
-        self._likes: list[_LikeMessages] = []
+        self._groups: list[_Group] = []
         self._unreadable: dict[int, MessageError] = {}
         self._waiting: list[BagMessage] = []
 
@@ -276,24 +276,24 @@ class TopicMessages:
         begin, first = 0, self.size - len(waiting)
         while begin < len(waiting):
             end = begin + 1
-            like = self._like(waiting[begin].raw, first + begin)
-            if like is not None:
-                while end < len(waiting) and like.pattern.fits(waiting[end].raw):
+            group = self._group_of(waiting[begin].raw, first + begin)
+            if group is not None:
+                while end < len(waiting) and group.pattern.fits(waiting[end].raw):
                     end += 1
-                like.add(first + begin, waiting[begin:end])
+                group.add(first + begin, waiting[begin:end])
             begin = end
 
-    def _like(self, raw: bytes, number: int) -> _LikeMessages | None:
-        for like in self._likes:
-            if like.pattern.fits(raw):
-                return like
+    def _group_of(self, raw: bytes, number: int) -> _Group | None:
+        for group in self._groups:
+            if group.pattern.fits(raw):
+                return group
         try:
             layout: Any = self._find and self._find(raw)
         except MessageError as error:
             self._unreadable[number] = error
             return None
-        self._likes.append(_LikeMessages(raw, layout, is_stamped=self.type == JOINT_STATE))
-        return self._likes[-1]
+        self._groups.append(_Group(raw, layout, is_stamped=self.type == JOINT_STATE))
+        return self._groups[-1]
 
     def joint_states(
         self,
@@ -309,17 +309,17 @@ class TopicMessages:
             UnreadableMessageError: a message cannot be decoded and `errors` is None, or none can.
         """
         unreadable, parts, foreign = dict(self._unreadable), [], None
-        for like in self._likes:
+        for group in self._groups:
             try:
-                places = joint_state_columns(like.layout, names, required)
+                places = joint_state_columns(group.layout, names, required)
             except MessageError as error:
                 if isinstance(error, MissingJointError) and error.is_foreign(names):
                     foreign = foreign or error
                 else:
-                    numbers = JointStates((), like.table, np.empty((3, 0), np.intp)).number
+                    numbers = JointStates((), group.table, np.empty((3, 0), np.intp)).number
                     unreadable.update(dict.fromkeys(numbers.tolist(), error))
             else:
-                parts.append(JointStates(names, like.table, places))
+                parts.append(JointStates(names, group.table, places))
         if not parts and foreign is not None and not unreadable:
             unreadable[0] = foreign
         if unreadable and (errors is None or not parts):
@@ -339,25 +339,25 @@ class TopicMessages:
             UnreadableMessageError: a message cannot be decoded, or has other values.
         """
         self.layout()
-        size = self._likes[0].layout.arrays[0].size
-        if len(self._likes) > 1 or self._unreadable or max(columns) >= size:
+        size = self._groups[0].layout.arrays[0].size
+        if len(self._groups) > 1 or self._unreadable or max(columns) >= size:
             error = MessageError(f'not every message holds the same {size} values')
             raise UnreadableMessageError(self.name, *min([*self._unreadable.items(), (0, error)]))
         places = np.full((3, len(columns)), -1)
         places[2] = columns
         names = [f'{k}' for k in columns]
-        return JointStates(names, self._likes[0].table, places)
+        return JointStates(names, self._groups[0].table, places)
 
     def layout(self) -> Layout:
         """Return the layout of the first message; UnreadableMessageError if it has none."""
-        if 0 in self._unreadable or not self._likes:
+        if 0 in self._unreadable or not self._groups:
             raise UnreadableMessageError(self.name, 0, self._unreadable[0])
-        return self._likes[0].layout
+        return self._groups[0].layout
 
     def name_lists(self) -> list[tuple[str, ...]]:
         """Return the different lists of names; UnreadableMessageError as `layout`."""
         self.layout()
-        return list(dict.fromkeys(like.layout.names for like in self._likes))
+        return list(dict.fromkeys(group.layout.names for group in self._groups))
 
     def joint_names(self) -> tuple[str, ...]:
         """Return the longest list of names in a message; UnreadableMessageError if it is empty."""

@@ -212,13 +212,13 @@ class ReplayedMessages:
             return
         names = [f'{JOINT_STATE_FIELDS[k]} of {joint}' for k in fields for joint in joints]
         self._compare(result, names, recorded, replayed, fields, keys)
-        rest = (result.recorded - result.values) // len(joints)
-        if topic is COMMANDS and rest:
+        unreached = (result.recorded - result.values) // len(joints)
+        if topic is COMMANDS and unreached:
             # The last command of a node that shuts down normally is zero and belongs to no state.
-            if rest == 1 and not recorded.field(2, slice(-1, None)).any():
+            if unreached == 1 and not recorded.field(2, slice(-1, None)).any():
                 result.recorded -= len(joints)
             else:
-                result.left_out = f'{rest} torques that the replay does not reach'
+                result.left_out = f'{unreached} torques that the replay does not reach'
 
     def _compare(
         self,
