@@ -24,7 +24,7 @@ import numpy as np
 
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law import window
+from blf_dsc_controller.law import adaptation, window
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Signals, State
 
@@ -68,7 +68,19 @@ def detect_change(settings: Settings, state: State, signals: Signals, t: float, 
         state.changes[0] += 1.0
         state.change_time[0] = t
         state.contradiction[0] = state.recent_residual[0]
+        if state.rows[0] < settings.window:
+            take_back(settings, state, signals)
         forget_window(settings, state)
+
+
+@inner
+def take_back(settings: Settings, state: State, signals: Signals) -> None:
+    """Return to the estimate before the last change, bumplessly."""
+    for j in range(settings.m):
+        signals.work[j] = state.estimate[j]
+        state.estimate[j] = state.anchor[j]
+    if settings.bumpless == 1:
+        adaptation.hand_over(settings, state, signals)
 
 
 @inner
