@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 from harness import table_lines
+from scipy.stats import binomtest
 
 from blf_dsc_controller.cli.main import main as blf_dsc
 from blf_dsc_controller.studies.monte_carlo import Study
@@ -30,6 +31,8 @@ _HEADER = (
     'runs',
     'bound kept with learning / without',
     'broken only with / only without',
+    'of those kept without, 95 % interval',
+    'near the bound: error larger / smaller with',
     'largest error at most 1.3 times that without',
     'factor: median, 99.9 %, largest',
     'rms error with / without [mrad]',
@@ -41,13 +44,17 @@ def row(title: str, summary: Summary) -> tuple[str, ...]:
     """Return the row of a study in the table."""
     pairs = summary['pairs']
     kept, factor, median = pairs['kept'], pairs['factor'], pairs['median']
+    broken = len(pairs['broken_only_with'])
+    interval = binomtest(broken, max(1, kept['without'])).proportion_ci(method='exact')
     share = 100.0 * (1.0 - len(pairs['above']) / max(1, kept['without']))
     shown = (factor[name] for name in ('median', 'p99.9', 'max'))
     return (
         title,
         f'{summary["runs"]}',
         f'{kept["with"]} / {kept["without"]}',
-        f'{len(pairs["broken_only_with"])} / {len(pairs["broken_only_without"])}',
+        f'{broken} / {len(pairs["broken_only_without"])}',
+        f'{100.0 * interval.low:.2f} to {100.0 * interval.high:.2f} %',
+        ' / '.join(f'{count}' for count in pairs['near'].values()),
         f'{share:.2f} %',
         ', '.join('infinite' if value is None else f'{value:.2f}' for value in shown),
         *(

@@ -217,18 +217,28 @@ def test_window_is_latched_up_to_four_times_the_least_residual(learned, ratio, a
     np.testing.assert_allclose(np.diag(signals.Phi) - before, expected, rtol=1e-6, atol=1e-12)
 
 
-@pytest.mark.parametrize(('ratio', 'changes'), [(7.9, 0.0), (8.1, 1.0)])
-def test_change_is_detected_from_eight_times_the_residual_on(learned, ratio, changes):
+@pytest.mark.parametrize(
+    ('ratio', 'rows', 'changes', 'taken_back'),
+    [(7.9, 0.5, 0.0, False), (8.1, 1.0, 1.0, False), (8.1, 0.5, 1.0, True)],
+)
+def test_change_is_detected_from_eight_times_the_residual_on(
+    learned, ratio, rows, changes, taken_back
+):
+    """What a window taught before it was full is taken back, and the torque stays the same."""
     controller, residual = learned
     saved = controller.save()
-    state, signals = controller.state, controller.signals
+    settings, state, signals = controller.settings, controller.state, controller.signals
     signals.row[:] = 0.0
     signals.row[0, -1] = np.sqrt(ratio * residual)
-    state.residual[0], state.latched[0] = residual, 1.0
-    consistency.detect_change(controller.settings, state, signals, 8.0, 0.1)
+    state.residual[0], state.latched[0], state.rows[0] = residual, 1.0, rows * settings.window
+    state.anchor[:] = 0.9 * state.estimate
+    before, torque = state.estimate.copy(), signals.H @ state.estimate + state.disturbance
+    consistency.detect_change(settings, state, signals, 8.0, 0.1)
     assert state.changes[0] == changes
+    np.testing.assert_array_equal(state.estimate, 0.9 * before if taken_back else before)
     # The next, partial windows are pulled to the estimate from before.
     assert np.array_equal(state.anchor, state.estimate) == (changes == 1.0)
+    np.testing.assert_allclose(signals.H @ state.estimate + state.disturbance, torque, atol=1e-12)
     controller.restore(saved)
 
 

@@ -16,8 +16,9 @@ halved since, since parts of a period never agree about a lasting disturbance.  
 contradict the latched solution (their mean square error over 0.1 s exceeds eight times r^2) mean
 that the arm has changed: window, filters and latch are cleared, and learning restarts.  Until the
 new window is full, it does not average out disturbances, so its solution is pulled to the estimate
-before the change, most strongly in weakly excited directions; likewise, a full window with an
-unusually large residual is pulled to an earlier solution, kept once per window.
+before the change, most strongly in weakly excited directions, and if rows contradict it that early,
+what it taught is taken back: it did not predict what it was not fitted to.  Likewise, a full window
+with an unusually large residual is pulled to an earlier solution, kept once per window.
 """
 
 import numpy as np

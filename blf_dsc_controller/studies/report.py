@@ -69,6 +69,7 @@ ALLOWED = 1.3
 LAWS = {'': 'with', WITHOUT: 'without'}
 """The laws of a study of pairs: what they are called, by the prefix of their columns."""
 
+_NEAR = (0.8, 1.2)  # times the bound
 _PANELS_OF_INFLUENCE = 6
 _MOST_DOTS = 20_000
 _SHOWN = (0.03, 2.0)  # |xi1| / k_c; what is beyond is drawn at these
@@ -112,13 +113,17 @@ def compare(study: Study, results: Columns) -> Summary:
     """Compare the runs of a study of pairs, with learning and without it.
 
     `factor` is the largest settled error with learning over that without; None: infinite. It and
-    the medians are of the runs that keep the bound without.
+    the medians are of the runs that keep the bound without. `near` counts the runs that come near
+    the bound without learning, with a largest error that is at least 1 % larger or smaller with it.
     """
     kept, without = (results[f'{law}outcome'] == KEPT for law in LAWS)
     factors = error_factor(study, results)[without]
     above = np.flatnonzero(~(factors <= ALLOWED))
     quantiles = np.quantile(factors, list(_FACTORS.values()), method='higher')
+    largest, before = (worst_of(study, results, 'max_error_ratio', law) for law in LAWS)
+    change = (largest / before)[(_NEAR[0] <= before) & (before <= _NEAR[1])]
     return {
+        'near': {'larger': int((change >= 1.01).sum()), 'smaller': int((change <= 0.99).sum())},
         'kept': {'with': int(kept.sum()), 'without': int(without.sum())},
         'broken_only_with': results['run'][without & ~kept].tolist(),
         'broken_only_without': results['run'][kept & ~without].tolist(),
