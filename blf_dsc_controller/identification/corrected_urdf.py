@@ -96,20 +96,17 @@ def _elements(raw: bytes) -> dict[tuple[str, str, str], _Element]:
     def begin(tag: str, attributes: dict[str, str]) -> None:
         at = parser.CurrentByteIndex
         match = _TAG.match(raw, at)
-        end = at if match is None else match.end()
-        stack.append((tag, attributes.get('name', ''), (at, end)))
+        name = attributes.get('name', '') if stack else ''
+        stack.append((tag, name, (at, match.end() if match else at)))
 
     def end(_: str) -> None:
         at = parser.CurrentByteIndex
-        tag, name, opening = stack[-1]
+        tag, name, opening = stack.pop()
         closing = opening if at == opening[1] else (at, raw.index(b'>', at) + 1)
-        if len(stack) == 1:
-            found[tag, '', ''] = _Element(opening, closing)
-        elif len(stack) == 2:
+        if len(stack) < 2:
             found[tag, name, ''] = _Element(opening, closing)
-        elif len(stack) == 3:
+        elif len(stack) == 2:
             found[stack[1][0], stack[1][1], tag] = _Element(opening, closing)
-        stack.pop()
 
     parser.StartElementHandler, parser.EndElementHandler = begin, end
     parser.Parse(raw, True)  # noqa: FBT003 - positional only

@@ -73,6 +73,7 @@ _NEAR = (0.8, 1.2)  # times the bound
 _PANELS_OF_INFLUENCE = 6
 _MOST_DOTS = 20_000
 _SHOWN = (0.03, 2.0)  # |xi1| / k_c; what is beyond is drawn at these
+_FEW_DECADES = 1e3
 _RATIO = r'max $|\xi_1| \; / \; k_c$'
 _PERCENT = FuncFormatter(lambda value, _: f'{100 * value:g} %')
 
@@ -268,7 +269,7 @@ def draw_pairs(studies: dict[str, tuple[Study, Columns]], path: Path) -> None:
         lost = (results['outcome'] != KEPT) & (results[f'{WITHOUT}outcome'] == KEPT)
         x, y = (np.clip(values, *_SHOWN) for values in (x, y))
         chosen = np.flatnonzero(~lost)[:_MOST_DOTS]
-        largest.plot(x[chosen], y[chosen], '.', ms=3, color=colour, alpha=0.6, mew=0, label=title)
+        largest.plot(x[chosen], y[chosen], '.', ms=4, color=colour, alpha=0.6, mew=0, label=title)
         largest.plot(x[lost], y[lost], 'o', ms=5, color=ALARM, mew=0)
     ends = np.array(_SHOWN)
     largest.loglog(ends, ends, color=MUTED, lw=1.0, label='equal')
@@ -314,9 +315,11 @@ def _boxes(axes: Axes, name: str, unit: float, studies: dict[str, tuple[Study, C
 
 
 def _logarithmic(axes: Axes) -> None:
-    """Make an axis logarithmic, with plain numbers at 1, 2 and 5 of each decade."""
+    """Make the x axis of drawn data logarithmic, with plain numbers at 1, or 1, 2, 5."""
     axes.set_xscale('log')
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    low, high = axes.get_xlim()
+    subs = (1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)
+    axes.xaxis.set_major_locator(LogLocator(subs=subs))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
     axes.xaxis.set_minor_formatter(NullFormatter())
 
@@ -330,12 +333,12 @@ def _histogram(axes: Axes, columns: dict[str, Floats]) -> None:
     low, high = float(everything.min()), float(everything.max())
     spaced = np.geomspace if low > 0.0 else np.linspace
     edges = spaced(low, max(1.01 * high, low + 1e-9), 11 + min(50, everything.size // 40))
-    if low > 0.0:
-        _logarithmic(axes)
     for (label, values), colour in zip(known.items(), COLOURS, strict=False):
         shares = np.histogram(values, edges)[0] / max(1, values.size)
         axes.stairs(shares, edges, fill=True, color=colour, alpha=0.22)
         axes.stairs(shares, edges, color=colour, lw=1.4, label=label)
+    if low > 0.0:
+        _logarithmic(axes)
     axes.yaxis.set_major_formatter(_PERCENT)
     axes.set_ylabel('fraction of runs')
 
