@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the nodes log, how to continue after a stop, and how their processes end."""
+"""What the nodes log and warn of, how to continue after a stop, and how their processes end."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from fake_clock import FakeClock
 from plain_law import dynamics
 from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from ros_rig import START, deactivate, shutdown, torques
+from ros_rig import JOINTS, START, deactivate, shutdown, torques
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -32,6 +32,8 @@ from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.supervision.supervisor import Phase
 
+# Transient local, to get from /rosout what was logged before discovery. rcl keeps one publisher
+# for each logger name, so the nodes of each test are in a namespace of their own.
 KEPT = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PLAIN = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
 ZERO = (0.0, 0.0)
@@ -52,6 +54,15 @@ def log(ros):
         ]
 
     return logged
+
+
+def driver(ros, space):
+    """Stand in for an arm: subscribe to commands; return the publisher of joint states."""
+    commands = f'/{space}/blf_dsc_controller/commands'
+    ros.tester.create_subscription(Float64MultiArray, commands, lambda _: None, 1)
+    states = ros.tester.create_publisher(JointState, f'/{space}/joint_states', 50)
+    ros.until(states.get_subscription_count)
+    return states
 
 
 def test_each_phase_is_logged_and_after_a_stop_how_to_continue(ros, log):
@@ -75,13 +86,10 @@ def test_each_phase_is_logged_and_after_a_stop_how_to_continue(ros, log):
 
 def test_log_suggests_resetting_the_controller_without_a_simulated_arm(ros, log):
     ros.add(ControllerNode, namespace='real')
-    driver = (Float64MultiArray, '/real/blf_dsc_controller/commands', lambda _: None, 1)
-    ros.tester.create_subscription(*driver)
-    states = ros.tester.create_publisher(JointState, '/real/joint_states', 1)
-    ros.until(states.get_subscription_count)
+    states = driver(ros, 'real')
     states.publish(b'')
     ros.until(lambda: log('real', 'not started, waiting for a usable joint state: '))
-    states.publish(JointStateEncoder(('joint1', 'joint2')).encode(10**9, START, ZERO, ZERO))
+    states.publish(JointStateEncoder(JOINTS).encode(10**9, START, ZERO, ZERO))
     ros.until(lambda: log('real', 'tracking'))
     states.publish(b'')
     ros.until(lambda: log('real', '', FATAL))
@@ -91,11 +99,7 @@ def test_log_suggests_resetting_the_controller_without_a_simulated_arm(ros, log)
 
 def test_a_stop_is_logged_once(ros, log):
     node = ros.add(ControllerNode, {'safety.torque': 'hold_gravity'}, namespace='once')
-    driver = (Float64MultiArray, '/once/blf_dsc_controller/commands', lambda _: None, 1)
-    ros.tester.create_subscription(*driver)
-    states = ros.tester.create_publisher(JointState, '/once/joint_states', 50)
-    ros.until(states.get_subscription_count)
-    encoder = JointStateEncoder(('joint1', 'joint2'))
+    states, encoder = driver(ros, 'once'), JointStateEncoder(JOINTS)
     for k in (0, 1, 2, 60, 61, 62):
         states.publish(encoder.encode(10**9 + k * 10**6, START, ZERO, ZERO))
         ros.until(lambda k=k: node.guard.journal.stamp == 10**9 + k * 10**6)
@@ -171,6 +175,75 @@ def test_each_compiled_kernel_is_announced_by_the_node_that_waits(ros, log, monk
     numbers = {part[-1]: int(part[2]) for part in parts}  # the plant's kernels come before
     assert list(numbers)[-2:] == ['first', 'second']
     assert sorted(numbers.values()) == list(range(1, len(parts) + 1))
+
+
+def test_rejected_columns_are_logged_and_diagnosed_with_the_reason(ros, log):
+    """On the paper's reference, cos t on both joints is indistinguishable from m2 l2^2."""
+    diagnostics = ros.listen(topics.DIAGNOSTICS)
+    cosine = {'learning.frequencies': [1.0], 'learning.bias': False}
+    ros.add(ControllerNode, cosine, namespace='rejected')
+    arm = ros.add(PlantNode, {'mode': 'lockstep', 'duration': 7.0}, namespace='rejected')
+
+    def rejected():
+        return [
+            (status.message, value)
+            for array in diagnostics
+            for status in array.status
+            for value in status.values
+            if value.key.startswith('rejected cos 1 rad/s')
+        ]
+
+    ros.until(lambda: arm.finished and rejected())
+    message, value = rejected()[-1]
+    assert message.startswith('not estimated: cos 1 rad/s')
+    assert 'cannot distinguish it from m2*l2^2' in value.value
+    (warning,) = log('rejected', 'is not estimated')  # once, not in every sample
+    assert 'cannot distinguish it from m2*l2^2' in warning
+
+
+def test_configuration_warnings_are_logged_before_the_first_state(ros, log):
+    ros.add(ControllerNode, {'learning.window': 5.0}, namespace='warned')
+    ros.until(lambda: log('warned', 'learning.window: 5 s'))
+
+
+@pytest.mark.parametrize('simulated', [True, False])
+def test_stamps_that_disable_the_watchdog_cause_one_warning_except_in_lockstep(ros, log, simulated):
+    space = f'unwatched_{simulated}'
+    law = ros.add(ControllerNode, namespace=space)
+    if simulated:
+        ros.add(PlantNode, {'mode': 'lockstep'}, namespace=space)
+    else:
+        driver(ros, space).publish(JointStateEncoder(JOINTS).encode(10**9, START, ZERO, ZERO))
+    ros.until(lambda: law.guard.start_stamp > 0 and law._warned_at == law.guard.start_stamp)
+    ros.spin(0.3)
+    assert len(log(space, 'a silence is not detected')) == (not simulated)
+
+
+@pytest.mark.parametrize('kind', [ControllerNode, PlantNode])
+def test_second_publisher_on_the_same_topic_is_reported(ros, log, kind):
+    space, diagnostics = f'others_{kind.__name__}', ros.listen(topics.DIAGNOSTICS)
+    first = ros.add(kind, namespace=space)
+    second = ros.add(kind, namespace=space)
+    ros.until(lambda: first.others == second.others == 1)
+    is_plant = kind is PlantNode
+    name = 'joint_states' if is_plant else 'blf_dsc_controller/commands'
+    does = 'publishes joint states' if is_plant else 'commands torques'
+    ros.until(lambda: log(space, f'another node publishes on /{space}/{name}, too'))
+    ros.until(
+        lambda: any(
+            status.message == f'another node {does}, too'
+            for array in diagnostics
+            for status in array.status
+        )
+    )
+    ros.kill(second)
+    ros.until(lambda: first.others == 0)
+
+
+def test_joint_states_at_too_high_a_rate_are_reported(ros, log):
+    ros.add(ControllerNode, namespace='often')
+    ros.add(PlantNode, mode='lockstep', sample_time=0.0005, namespace='often')
+    ros.until(lambda: log('often', 'joint states come every 0.0005 s, but'))
 
 
 INTERRUPTED = """
