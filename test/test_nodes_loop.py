@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -10,8 +12,11 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from fake_clock import FakeClock
 from random_arm import random_urdf
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.parameter import Parameter
 from rclpy.time import Time
 from ros_rig import simulated_torques, states, torques
+from test_plant_events import ALL_KINDS
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.messages import topics
@@ -21,7 +26,9 @@ from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import reference_of
 
 MILLISECOND = 1_000_000  # ns
+PUSHED = {'load.payload': 0.2, 'load.torque': [0.4, -0.3], 'sensor.offset': [1e-5, 0.0]}
 OBSERVED = {'wait_for_subscribers': 1}
+ARM = {'robot.urdf': random_urdf(3, seed=5)[0], 'robot.tip': 'tip'}
 NOISY = {'sensor.position_noise': 1e-5, 'sensor.velocity': 'differenced', 'actuator.delay': 1}
 
 
@@ -36,33 +43,30 @@ def run_lockstep(ros, plant, controller=None):
     ros.until(lambda: arm.finished and len(commands) >= samples)
     ros.until(lambda: len(joint_states) >= samples)
     assert len(truth) == (samples - 1) // 10 + 1
-    return torques(commands), states(joint_states)[0]
+    return torques(commands), states(joint_states, arm.config.joints)[0]
 
 
-@pytest.mark.parametrize(
-    'plant',
-    [{'duration': 10.0}, {'duration': 2.0, 'seed': 5, **NOISY}],
-    ids=['learning', 'noise, differenced velocity and delay'],
-)
-def test_lockstep_torques_match_the_offline_run_bit_for_bit(ros, plant):
-    over_ros, stamps = run_lockstep(ros, plant)
-    np.testing.assert_array_equal(over_ros, simulated_torques(plant))
+CASES = {
+    'learning': ({'duration': 10.0}, {}),
+    'noise, differenced velocity and delay': ({'duration': 2.0, 'seed': 5, **NOISY}, {}),
+    'all kinds of events': ({'duration': 0.2, **ALL_KINDS}, {}),
+    'three joints of a URDF with a truth of their own, and a payload': (
+        ARM
+        | {'duration': 3.0, 'truth.mass_deviation': 0.3, 'actuator.delay': 1}
+        | {'events.begin': [2.0], 'events.payload': [0.3]},
+        ARM | {'learning.window': 1.0},
+    ),
+}
+
+
+@pytest.mark.parametrize(('plant', 'law'), CASES.values(), ids=CASES)
+def test_lockstep_torques_match_the_offline_run_bit_for_bit(ros, plant, law):
+    over_ros, stamps = run_lockstep(ros, plant, law)
+    np.testing.assert_array_equal(over_ros, simulated_torques(plant, law))
+    eventless = {name: value for name, value in plant.items() if not name.startswith('events.')}
+    same = eventless == plant or (over_ros == simulated_torques(eventless, law)).all()
+    assert same == (eventless == plant)
     np.testing.assert_array_equal(stamps, LOCKSTEP_START + MILLISECOND * np.arange(len(stamps)))
-
-
-def test_urdf_arm_over_ros_matches_the_offline_run_bit_for_bit(ros):
-    """Three joints of different kinds, with an event and everything that a window learns."""
-    arm = {'robot.urdf': random_urdf(3, seed=5)[0], 'robot.tip': 'tip'}
-    plant = arm | {'duration': 3.0, 'truth.mass_deviation': 0.3, 'actuator.delay': 1}
-    plant |= {'events.begin': [2.0], 'events.payload': [0.3]}
-    learner = arm | {'learning.window': 1.0, 'telemetry.enabled': False}
-    commands = ros.listen(topics.COMMANDS)
-    node, _ = ros.loop(plant, learner | OBSERVED)
-    ros.until(lambda: node.finished and len(commands) >= 3001)
-
-    over_ros = torques(commands)
-    np.testing.assert_array_equal(over_ros, simulated_torques(plant, learner))
-    assert np.abs(over_ros[2100] - over_ros[1900]).max() > 0.01  # it carries a payload now
 
 
 def test_nodes_on_simulated_time_follow_the_clock_of_the_plant(ros):
@@ -120,3 +124,27 @@ def test_plant_counts_real_time_in_whole_samples(ros):
     # Two of the three steps had no torque yet; nothing counts after the last step.
     np.testing.assert_array_equal(late_steps, np.clip(np.arange(300) - 100, 0, 2))
     assert late_steps[-1] == plant.latency.late_steps
+
+
+def test_parameter_change_takes_effect_at_the_published_sample(ros):
+    changes = ros.listen(topics.CHANGES)
+    commands = ros.listen(topics.COMMANDS)
+    ros.listen(topics.JOINT_STATES)
+    ros.listen(topics.TRUTH)
+    arm = ros.add(PlantNode, {'mode': 'lockstep', 'duration': 1.0, **OBSERVED})
+    ros.add(ControllerNode, OBSERVED | {'telemetry.enabled': False})
+    ros.until(lambda: arm.plant.sample > 50)
+    request = SetParametersAtomically.Request()
+    request.parameters = [Parameter(k, value=v).to_parameter_msg() for k, v in PUSHED.items()]
+    response = ros.call(SetParametersAtomically, '/sim_plant/set_parameters_atomically', request)
+    assert response.result.successful, response.result.reason
+    ros.until(lambda: arm.finished and len(commands) == 1001)
+
+    configured, change = [json.loads(message.data) for message in changes]
+    assert configured['configured']
+    assert change['parameters'] == PUSHED
+    at = (change['stamp'] - LOCKSTEP_START) * 1e-9
+    assert 0.05 < at < 1.0
+    load = {f'events.{name.partition(".")[2]}': np.ravel(v).tolist() for name, v in PUSHED.items()}
+    expected = simulated_torques({'duration': 1.0, 'events.begin': [at], **load})
+    np.testing.assert_array_equal(torques(commands), expected)
