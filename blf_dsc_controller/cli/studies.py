@@ -51,8 +51,10 @@ def arms(options: Namespace) -> None:
     for arm, results in found.items():
         print(f'{arm}: worst of {options.truths} runs: {", ".join(COLUMNS)}, in mrad and %')
         for name, result in results.items():
-            worst = ' '.join(f'{value:8.3g}' for value in result.columns().max(axis=1))
-            print(f'{label_of(name):<45}{worst}')
+            worst = (
+                f'{x:8.3g}' if np.isfinite(x) else '       -' for x in result.columns().max(axis=1)
+            )
+            print(f'{label_of(name):<45}{" ".join(worst)}')
     print(f'wrote {options.out / "index.html"}')
 
 
