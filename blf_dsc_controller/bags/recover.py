@@ -35,7 +35,7 @@ from blf_dsc_controller.bags.sources import (
 )
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.files import load_yaml
-from blf_dsc_controller.messages.types import Definition, UnknownTypeError, definition
+from blf_dsc_controller.messages.types import Definition
 
 _CHUNK = Struct('<BQQQQII')  # up to the length of the compression's name
 _KINDS: dict[int, Any] = {
@@ -161,12 +161,9 @@ class _Copy:
         if channel.topic in earlier:
             self._handles[number] = 1 + earlier.index(channel.topic)
             return True
-        text, hash_ = schema.data.decode(errors='replace'), channel.metadata.get('topic_type_hash')
-        known, offered = Definition(text, hash_ or '', schema.encoding), None
-        if not (text and hash_):
-            with suppress(UnknownTypeError):
-                standard = definition(schema.name)
-                known = Definition(text, standard.hash, schema.encoding) if text else standard
+        hash_ = channel.metadata.get('topic_type_hash', '')
+        known = Definition(schema.data.decode(errors='replace'), hash_, schema.encoding)
+        offered: Any = None
         with suppress(yaml.YAMLError):
             offered = load_yaml(channel.metadata.get('offered_qos_profiles', ''))
         self._handles[number] = self._bag.add_topic(

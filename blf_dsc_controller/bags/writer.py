@@ -37,7 +37,7 @@ class DiskFullError(BagError):
         self.messages = messages
         super().__init__(
             f'the disk is full: recording into {path} has ended with {messages} messages, which '
-            'are complete and readable; make room, or split and move bags while they are recorded'
+            'are complete and readable; make room before the next recording'
         )
 
 
