@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from fault_rig import JOINTS, MILLISECOND, Rig
 
-from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.configuration.schema import change, flatten
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
@@ -247,23 +247,22 @@ def poisoned(what: str, value: float) -> Callable[[Rig], None]:
     return inject
 
 
+def dotted(changes):
+    return {name.replace('__', '.'): value for name, value in changes.items()}
+
+
 def retuned(**changes) -> Callable[[Rig], None]:
     """Set parameters, bypassing every check."""
-    given = {name.replace('__', '.'): value for name, value in changes.items()}
-    return lambda rig: rig.guard.retune(change(rig.guard.config, given))
+    return lambda rig: rig.guard.retune(change(rig.guard.config, dotted(changes)))
 
 
 def random_gains(rig: Rig) -> None:
     """Change all gains by up to a fifth in every sample, as `ros2 param set` does."""
-    rng = np.random.default_rng(0)
+    rng, start = np.random.default_rng(0), flatten(rig.guard.config)
     names = ('surface.gain', 'surface.mu', 'feedback.gain', 'barrier.weight', 'disturbance.gain')
-    start = rig.guard.config
 
     def sense(state):
-        scale = rng.uniform(0.8, 1.2, (len(names), 2))
-        values = [start.surface.gain, start.surface.mu, start.feedback.gain]
-        values += [start.barrier.weight, start.disturbance.gain]
-        given = {n: tuple(v * s) for n, v, s in zip(names, values, scale, strict=True)}
+        given = {name: tuple(start[name] * rng.uniform(0.8, 1.2, 2)) for name in names}
         candidate = change(rig.guard.config, given)
         if not rig.guard.problems(candidate):
             rig.guard.retune(candidate)
@@ -274,12 +273,11 @@ def random_gains(rig: Rig) -> None:
 
 def rejection(**changes) -> Callable[[Rig], None]:
     """Request a change that must be rejected."""
-    given = {name.replace('__', '.'): value for name, value in changes.items()}
 
     def inject(rig):
-        problems = rig.guard.problems(change(rig.guard.config, given))
+        problems = rig.guard.problems(change(rig.guard.config, dotted(changes)))
         assert problems
-        assert all(problem.startswith(tuple(given)) for problem in problems)
+        assert all(problem.startswith(tuple(dotted(changes))) for problem in problems)
 
     return inject
 
