@@ -38,6 +38,7 @@ MESSAGES = 'messages '
 MAGIC_SIZE = 8
 HEAD = Struct('<BQ')  # opcode and content length, at the start of each record
 _MESSAGE = Struct('<HIQQ')
+_MESSAGE_CODE = int(Opcode.MESSAGE)  # compared for each message: an enumeration is slow
 _LARGEST_CHUNK = 1 << 29  # bytes, unpacked
 _KINDS: dict[int, Any] = {
     Opcode.CHUNK: Chunk,
@@ -161,19 +162,18 @@ def records_in(chunk: Chunk) -> Iterator[StoredMessage | Schema | Channel]:
     stream, size = get_chunk_data_stream(chunk, validate_crc=True)
     if size != chunk.uncompressed_size:
         raise DamageError(f'a chunk of {chunk.uncompressed_size} bytes unpacks to {size}')
-    records, at = stream.read(size), 0
+    records, at, message = stream.read(size), 0, _MESSAGE.unpack_from
     while at < size:
         opcode, length = HEAD.unpack_from(records, at)
-        content = records[at + HEAD.size : at + HEAD.size + length]
-        if len(content) < length:
+        begin, at = at + HEAD.size, at + HEAD.size + length
+        if at > size:
             raise DamageError('a record does not match its length')
-        if opcode == Opcode.MESSAGE:
-            yield message_of(content)
+        if opcode == _MESSAGE_CODE:
+            yield *message(records, begin), records[begin + _MESSAGE.size : at]
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            yield _KINDS[opcode].read(ReadDataStream(BytesIO(content)))
+            yield _KINDS[opcode].read(ReadDataStream(BytesIO(records[begin:at])))
         else:
             raise DamageError(f'unknown record type {opcode} in a chunk')
-        at += HEAD.size + length
 
 
 def message_of(content: bytes) -> StoredMessage:
