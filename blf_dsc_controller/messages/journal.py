@@ -12,13 +12,12 @@ import os
 import platform
 from collections import deque
 from collections.abc import Mapping
-from contextlib import suppress
 from enum import Enum
 from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numba
+from llvmlite.binding import get_host_cpu_features
 
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import JOURNAL
@@ -38,22 +37,15 @@ def machine() -> dict[str, str]:
 
     The C library chooses its functions by the processor's features, which GLIBC_TUNABLES can mask.
     """
-    with suppress(OSError):
-        for line in Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines():
-            name, _, value = line.partition(':')
-            if name.strip() in ('flags', 'Features'):
-                features = {'fma', 'fma4', 'avx2', 'avx512f', 'asimd', 'sve'}
-                found = ' '.join(sorted(features.intersection(value.split())))
-                break
-        else:
-            found = ''
-        return {
-            'processor': f'{platform.machine()} {found}'.strip(),
-            'libc': ' '.join(platform.libc_ver()),
-            'tunables': os.environ.get('GLIBC_TUNABLES', ''),
-            'numba': numba.__version__,
-        }
-    return {}
+    features = get_host_cpu_features()
+    known = ('avx2', 'avx512f', 'fma', 'fma4', 'neon', 'sve')
+    named = (name for name in known if features.get(name))
+    return {
+        'processor': ' '.join((platform.machine(), *named)),
+        'libc': ' '.join(platform.libc_ver()),
+        'tunables': os.environ.get('GLIBC_TUNABLES', ''),
+        'numba': numba.__version__,
+    }
 
 
 class EventType(str, Enum):
