@@ -277,7 +277,7 @@ def _add_studies(command: _Command) -> None:
     option('--seed', type=int, help='seed of the study (as configured)')
     engines, computing = ('processes', 'dask'), 'engine that computes the runs (processes)'
     option('--engine', choices=engines, default='processes', help=computing)
-    option('--workers', type=_positive, help='number of workers (one per core)')
+    option('--workers', type=_positive, help='number of workers (one per core of this computer)')
     option('--address', default='', help='scheduler of a dask cluster (a local one)')
     option('--chunk', type=_positive, help='runs handed to a worker at a time')
     option('--report', type=Path, metavar='DIR', help='only report the study in this folder')

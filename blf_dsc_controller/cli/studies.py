@@ -31,6 +31,7 @@ from blf_dsc_controller.studies.runs import KEPT, Columns, Span, Store, require_
 
 _PAUSE_IN_A_LOG = 10.0  # s between two updates of the bar
 _AHEAD = 3  # chunks submitted for each worker
+_AHEAD_OF_A_CLUSTER = 1000
 
 
 def paper(options: Namespace) -> None:
@@ -82,8 +83,9 @@ def _run_study(options: Namespace) -> None:
                 warm_up(study)
             is_dask = options.engine == 'dask'
             engine = runs.dask(workers, options.address) if is_dask else runs.processes(workers)
-            with engine as executor:
-                _compute(store, spans, executor, _AHEAD * workers)
+            with engine as executor:  # how many workers a cluster has may change
+                most = _AHEAD_OF_A_CLUSTER if options.address else _AHEAD * workers
+                _compute(store, spans, executor, most)
         _report(store)
 
 
