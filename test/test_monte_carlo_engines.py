@@ -164,9 +164,9 @@ def test_killed_study_resumes(tmp_path):
     ]
     command += ['--workers', '2', '--chunk', '1']
     mark = str(uuid.uuid4())
-    with subprocess.Popen(
-        command, env={**os.environ, 'MARK': mark}, stderr=subprocess.DEVNULL
-    ) as process:
+    # What a killed process leaves goes with the logs of the suite.
+    marked = {**os.environ, 'MARK': mark, 'TMPDIR': os.environ['ROS_LOG_DIR']}
+    with subprocess.Popen(command, env=marked, stderr=subprocess.DEVNULL) as process:
         until(lambda: (out / 'runs').is_dir() and len(list((out / 'runs').glob('r*'))) >= 3)
         process.send_signal(signal.SIGKILL)
     until(lambda: not processes_with(mark))  # its workers have ended too
