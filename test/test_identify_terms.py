@@ -356,3 +356,30 @@ def test_links_after_the_last_joint_are_fixed_or_held():
     assert fixed == ['panda_link8', 'panda_hand', 'panda_hand_tcp']
     assert held[3, 3] == pytest.approx(0.03)  # two fingers
     assert attached((CONFIG / 'ur5e.urdf').read_text(), 'wrist_3_link', ())[0][-1] == 'tool0'
+
+
+def test_other_readers_see_only_the_new_inertias_and_friction(tmp_path):
+    """Frames, limits and names as before, in pinocchio, MuJoCo and yourdfpy."""
+    yourdfpy = pytest.importorskip('yourdfpy', reason='needs pip install blf_dsc_controller[view]')
+    inertias = changed(PANDA_CHAIN, np.random.default_rng(5))
+    text = corrected_urdf(PANDA_TEXT, PANDA_CHAIN, inertias, np.full(7, 0.5), np.full(7, 0.2), '')
+    before, after = (pinocchio_model(each, PANDA) for each in (PANDA_TEXT, text))
+    assert list(before.names) == list(after.names)
+    for old, new in zip(before.jointPlacements, after.jointPlacements, strict=True):
+        np.testing.assert_array_equal(old.homogeneous, new.homogeneous)
+    for limit in ('upperPositionLimit', 'velocityLimit', 'effortLimit'):
+        np.testing.assert_array_equal(getattr(before, limit), getattr(after, limit))
+    masses = [body.mass for body in list(after.inertias)[1:]]
+    np.testing.assert_allclose(masses, inertias[:, 0], rtol=1e-9)
+    old, new = (mujoco.MjModel.from_xml_string(each) for each in (PANDA_TEXT, text))
+    np.testing.assert_array_equal(old.jnt_range, new.jnt_range)
+    np.testing.assert_allclose(new.dof_damping[:7], 0.5)
+    np.testing.assert_allclose(new.dof_frictionloss[:7], 0.2)
+    (tmp_path / 'arm.urdf').write_text(text)
+    robot = yourdfpy.URDF.load(str(tmp_path / 'arm.urdf'), load_meshes=False)
+    assert robot.validate()
+    for joint, inertia in zip(PANDA_CHAIN.joints, inertias, strict=True):
+        fingers = attached(PANDA_TEXT, joint.link, PANDA)[1][3, 3]
+        assert robot.link_map[joint.link].inertial.mass == pytest.approx(inertia[0] - fingers)
+        assert float(robot.joint_map[joint.name].dynamics.damping) == pytest.approx(0.5)
+        assert robot.joint_map[joint.name].limit.upper == pytest.approx(joint.upper)
