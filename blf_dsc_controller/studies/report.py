@@ -274,7 +274,7 @@ def draw_pairs(studies: dict[str, tuple[Study, Columns]], path: Path) -> None:
     ends = np.array(_SHOWN)
     largest.loglog(ends, ends, color=MUTED, lw=1.0, label='equal')
     largest.loglog(ends, ALLOWED * ends, color=MUTED, lw=1.0, ls=':', label=f'{ALLOWED:g} times')
-    _logarithmic(largest)
+    _logarithmic(largest, both=True)
     largest.axhline(1.0, color=INK, ls='--', lw=1.0, label='bound')
     largest.axvline(1.0, color=INK, ls='--', lw=1.0)
     largest.set_xlabel(f'{_RATIO} without learning')
@@ -314,14 +314,15 @@ def _boxes(axes: Axes, name: str, unit: float, studies: dict[str, tuple[Study, C
     _logarithmic(axes)
 
 
-def _logarithmic(axes: Axes) -> None:
-    """Make the x axis of drawn data logarithmic, with plain numbers at 1, or 1, 2, 5."""
+def _logarithmic(axes: Axes, *, both: bool = False) -> None:
+    """Make the x axis, or both, of drawn data logarithmic, with plain numbers at 1, or 1, 2, 5."""
     axes.set_xscale('log')
-    low, high = axes.get_xlim()
-    subs = (1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)
-    axes.xaxis.set_major_locator(LogLocator(subs=subs))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    for axis in (axes.xaxis, axes.yaxis)[: 1 + both]:
+        low, high = axis.get_view_interval()
+        subs = (1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)
+        axis.set_major_locator(LogLocator(subs=subs))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
+        axis.set_minor_formatter(NullFormatter())
 
 
 def _histogram(axes: Axes, columns: dict[str, Floats]) -> None:
