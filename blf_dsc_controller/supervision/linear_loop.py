@@ -34,8 +34,6 @@ from blf_dsc_controller.reference.terms import sampled
 Floats = NDArray[np.float64]
 
 _SETTLED = 20.0  # time constants of the damping, for which the response is followed
-
-
 _MOMENTS = 40  # of the reference
 _REVERSAL = 0.75  # of Coulomb friction: half of it too much at breakaway, with either sign
 
