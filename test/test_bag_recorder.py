@@ -12,7 +12,6 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from foreign_readers import messages_on_disk, read
 from nav_msgs.msg import Goals
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_rig import RosRig
 from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -27,13 +26,6 @@ from blf_dsc_controller.nodes.endpoints import quality_of
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 
 ENCODER = JointStateEncoder(['joint1', 'joint2'])
-
-
-@pytest.fixture
-def ros():
-    rig = RosRig()
-    yield rig
-    rig.close()
 
 
 @pytest.fixture
