@@ -114,7 +114,7 @@ PARTS = st.one_of(
 def names(name):
     """Names of types, topics and joints."""
     from blf_dsc_controller.bags.content import NameMap
-    from blf_dsc_controller.messages.types import UnknownTypeError
+    from blf_dsc_controller.messages.codecs import UnknownTypeError
     from blf_dsc_controller.nodes.endpoints import message_class, register_definition
 
     with bounded('names'):
@@ -157,7 +157,7 @@ def secret():
     return folder
 
 
-READ = ('export', 'replay', 'replay --config', 'recover', 'part')
+READ = ('export', 'replay', 'recover', 'part')
 DRAW = ('report', 'plot')
 WAYS = st.sampled_from((*READ * 5, *DRAW))
 
@@ -165,12 +165,11 @@ WAYS = st.sampled_from((*READ * 5, *DRAW))
 def read(bag, way):
     """Read a bag in one of several ways."""
     out = bag.parent / f'out_{len(tried)}'
-    name, _, option = way.partition(' ')
     if way == 'part':
         with contextlib.suppress(BlfDscError), open_bag(bag) as opened:
             list(opened.messages(opened.counts, 1_050_000_000))
-    elif name == 'replay':
-        command('replay', bag, *((option, 'recommended') if option else ()))
+    elif way == 'replay':
+        command('replay', bag)
     elif way == 'report':
         command('report', bag, '--out', out / 'page.html')
     elif way == 'export':
@@ -345,7 +344,6 @@ def parameters(data, preset):
         path = inside / 'given.yaml'
         path.write_bytes(damaged(data, text))
         with bounded('parameters'):
-            command('replay', base(), '--config', path)
             from blf_dsc_controller.configuration.nodes import load_loop
 
             with contextlib.suppress(BlfDscError):

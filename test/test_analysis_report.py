@@ -16,8 +16,8 @@ from synthetic_bag import JOINTS, START, Synthetic
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.analysis.report import plots, read_bags, write_report
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.topics import CHANGES, JOINT_STATES
-from blf_dsc_controller.messages.types import typestore
 
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 

@@ -18,9 +18,8 @@ from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.analysis.report import read_bags
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.codecs import JointStateEncoder, definition
 from blf_dsc_controller.messages.topics import FOREVER, Quality
-from blf_dsc_controller.messages.types import definition
 from blf_dsc_controller.nodes import recorder_node
 from blf_dsc_controller.nodes.endpoints import quality_of
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode

@@ -14,16 +14,15 @@ from mcap.writer import Writer
 from rosbags.rosbag2 import Reader
 
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.codecs import JointStateEncoder, definition
 from blf_dsc_controller.messages.topics import JOINT_STATE
-from blf_dsc_controller.messages.types import definition
 
 pytestmark = pytest.mark.usefixtures('blank_pictures')
 
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 
 ODD = ['/odd', 'my_msgs/msg/Odd', 5, b'\0\1\0\0\7\0\0\0']  # of a package that does not exist
-COMMANDS = ('replay', 'replay --config', 'report', 'export', 'plot')
+COMMANDS = ('replay', 'report', 'export', 'plot')
 
 
 @pytest.fixture(scope='module')
@@ -40,12 +39,11 @@ def copy(bag, tmp_path):
 def run(command, bag, folder):
     """Run a command on a bag and return its exit code."""
     options = {
-        'replay --config': ['--config', 'recommended'],
         'report': ['--out', str(folder / 'page.html')],
         'export': ['--out', str(folder / 'table.csv')],
         'plot': ['--out', str(folder / 'plots')],
     }
-    return main([command.split()[0], str(bag), *options.get(command, [])])
+    return main([command, str(bag), *options.get(command, [])])
 
 
 @pytest.fixture
@@ -56,7 +54,7 @@ def all_say(tmp_path, capsys):
         for command in sorted({*COMMANDS} - {*but}):
             assert run(command, bag, tmp_path) == 1, command
             out, error = capsys.readouterr()
-            assert error.startswith(f'blf_dsc {command.split()[0]}: '), command
+            assert error.startswith(f'blf_dsc {command}: '), command
             assert [word for word in words if word not in error] == [], (command, error)
             assert out == ''
 
@@ -130,7 +128,7 @@ def test_joint_states_without_joint_names(tmp_path, all_say):
     raw = JointStateEncoder(()).encode(1, [], [], [])
     nameless = [['/joint_states', JOINT_STATE, k, raw] for k in range(9)]
     path = recorded_run.write(tmp_path / 'bag', nameless)
-    all_say(path, 'it names no joint', but=('replay', 'replay --config'))
+    all_say(path, 'it names no joint', but=('replay',))
 
 
 @pytest.mark.parametrize('schema', [('', b''), ('ros2msg', b'{{ no definition'), None])
@@ -156,8 +154,8 @@ def test_missing_definition_of_another_topic_loses_no_other_message(
 
 def test_types_of_this_package_need_no_definition(bag, tmp_path, recovered):
     file = write_mcap(tmp_path / 'bag', recorded_run.messages(bag), lambda _: ('', b''))
-    assert run('replay --config', file, tmp_path) == 0
-    assert run('replay --config', recovered(file)[2], tmp_path) == 0
+    for each in (file, recovered(file)[2]):
+        assert run('replay', each, tmp_path) == 0
 
 
 def test_topics_of_unknown_type(bag, tmp_path, all_say, recovered):

@@ -21,7 +21,7 @@ from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import UnreadableMessageError
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.codecs import JointStateEncoder, typestore
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
@@ -32,7 +32,6 @@ from blf_dsc_controller.messages.topics import (
     REFERENCE,
     TRACKING_ERROR,
 )
-from blf_dsc_controller.messages.types import typestore
 
 SAMPLES = 200
 JOINT_NAMES = {joint: joint for joint in JOINTS}

@@ -18,9 +18,12 @@ from blf_dsc_controller.bags.recover import recover
 from blf_dsc_controller.bags.sources import BagError, open_bag
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.codecs import (
+    Float64MultiArrayEncoder,
+    JointStateEncoder,
+    typestore,
+)
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES
-from blf_dsc_controller.messages.types import typestore
 
 EXAMPLES = int(os.environ.get('BLF_DSC_EXAMPLES', '60'))
 START = 1_734_000_000_000_000_000

@@ -19,9 +19,13 @@ from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.recover import recover
 from blf_dsc_controller.bags.sources import BagError, open_bag
 from blf_dsc_controller.bags.writer import BagWriter, DiskFullError, Losses
-from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.codecs import (
+    Definition,
+    Float64MultiArrayEncoder,
+    JointStateEncoder,
+    UnknownTypeError,
+)
 from blf_dsc_controller.messages.topics import BOUND, COMMANDS, JOINT_STATES, STREAM, Quality
-from blf_dsc_controller.messages.types import Definition, UnknownTypeError
 
 START = 1_734_000_000_000_000_000
 MILLISECOND = 1_000_000

@@ -37,7 +37,6 @@ def test_chunk_that_declares_too_large_a_size_is_not_unpacked(bag, tmp_path, cap
     file.write_bytes(data[:size] + declared.to_bytes(8, 'little') + data[size + 8 :])
     for command in (
         ('replay', file),
-        ('replay', file, '--config', 'recommended'),
         ('report', file, '--out', tmp_path / 'page.html'),
         ('export', file, '--out', tmp_path / 'table.csv'),
         ('plot', file, '--out', tmp_path / 'plots'),

@@ -18,8 +18,8 @@ from blf_dsc_controller.messages.codecs import (
     MissingJointError,
     ShortArrayError,
     encode_clock,
+    typestore,
 )
-from blf_dsc_controller.messages.types import typestore
 
 STAMP = 1_734_000_123_456_789_012
 NAMES = st.lists(st.text('abé/_ ', max_size=9), min_size=1, max_size=8, unique=True)

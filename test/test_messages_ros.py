@@ -21,10 +21,10 @@ from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateDecoder,
     JointStateEncoder,
+    definition,
     joint_state_layout,
 )
 from blf_dsc_controller.messages.topics import TOPICS
-from blf_dsc_controller.messages.types import definition
 from blf_dsc_controller.nodes.endpoints import message_class
 
 STAMP = 1_734_000_123_456_789_012

@@ -13,8 +13,8 @@ from synthetic_bag import START, Synthetic
 
 from blf_dsc_controller.bags.sources import BagError, open_bag
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.topics import ROBOT_DESCRIPTION
-from blf_dsc_controller.messages.types import typestore
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 PATIENCE = 300.0  # s, timeout of waits that should take a moment

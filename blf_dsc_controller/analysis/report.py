@@ -19,8 +19,8 @@ from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.errors import MissingExtraError
+from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.topics import DIAGNOSTICS
-from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Floats, Run
 
 _BINS = 200

@@ -17,6 +17,7 @@ from blf_dsc_controller.bags.topic_messages import TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import Event, EventType, decode
 from blf_dsc_controller.messages.topics import (
     CHANGES,
@@ -30,7 +31,6 @@ from blf_dsc_controller.messages.topics import (
     TOPICS,
     Topic,
 )
-from blf_dsc_controller.messages.types import typestore
 
 _OF_INTEREST = (*(topic for topic in TOPICS if topic is not CLOCK), CHANGES)
 _KEPT = frozenset(topic.leaf for topic in TOPICS if topic.offered.depth > 1)
@@ -153,7 +153,7 @@ class Content:
         if values is None:
             raise BagError(
                 f'{self.path} does not hold the configuration of a controller: it was recorded by '
-                'something else, or without the controller; pass one, as in --config recommended'
+                'something else, or without the controller'
             )
         source = f'{self.path}, {JOURNAL.resolved}'
         if self.version != __version__:

@@ -21,6 +21,7 @@ from blf_dsc_controller.bags.topic_messages import (
 )
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
@@ -29,7 +30,6 @@ from blf_dsc_controller.messages.topics import (
     JOINT_STATES,
     TRACKING_ERROR,
 )
-from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Floats, LearnedArm, Rows, Run, Series, Stop
 
 _MOST_FALLS = 10  # of the stamps, by resets of a simulator

@@ -35,7 +35,7 @@ from blf_dsc_controller.bags.sources import (
 )
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.files import load_yaml
-from blf_dsc_controller.messages.types import Definition
+from blf_dsc_controller.messages.codecs import Definition
 
 _CHUNK = Struct('<BQQQQII')  # up to the length of the compression's name
 _KINDS: dict[int, Any] = {

@@ -25,7 +25,7 @@ from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader
 
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.messages.types import typestore
+from blf_dsc_controller.messages.codecs import typestore
 
 METADATA = 'metadata.yaml'
 RECORD = 'blf_dsc_controller'

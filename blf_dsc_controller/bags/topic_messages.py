@@ -22,9 +22,7 @@ from blf_dsc_controller.messages.codecs import (
     Layout,
     MessageError,
     MissingJointError,
-    Pattern,
     array_layout,
-    joint_state_columns,
     joint_state_layout,
 )
 from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
@@ -222,14 +220,13 @@ class StoredSeries(Series):
 class _Group:
     """Messages of a layout, in a table: number, received, sequence, stamp, then all values."""
 
-    def __init__(self, raw: bytes, layout: Layout, *, is_stamped: bool) -> None:
-        self.layout, self.pattern, self._is_stamped = layout, Pattern(raw, layout), is_stamped
-        self._grid = layout.grid
-        self.table = Columns(_VALUES + self._grid.size)
+    def __init__(self, layout: Layout, *, is_stamped: bool) -> None:
+        self.layout, self._is_stamped = layout, is_stamped
+        self.table = Columns(_VALUES + layout.places.size)
 
     def add(self, first: int, messages: Sequence[BagMessage]) -> None:
         """Decode messages of this layout with the numbers from `first` on."""
-        count, size, double = len(messages), self.pattern.size, self.pattern.double
+        count, size, double = len(messages), self.layout.size, self.layout.double
         rows = np.zeros((count, self.table.width), np.int64)
         rows[:, _NUMBER] = first + np.arange(count)
         rows[:, _RECEIVED] = [each.received for each in messages]
@@ -240,7 +237,7 @@ class _Group:
             stamp = np.ndarray(count, kind, joined, STAMP_OFFSET, (size,))
             rows[:, _STAMP] = stamp['s'].astype(np.int64) * NANOSECONDS + stamp['ns']
         grid = np.ndarray((count, (size - ORIGIN) // 8), double, joined, ORIGIN, (size, 8))
-        rows[:, _VALUES:] = grid[:, self._grid].astype(np.float64).view(np.int64)
+        rows[:, _VALUES:] = grid[:, self.layout.places].astype(np.float64).view(np.int64)
         self.table.append(rows)
 
 
@@ -278,21 +275,21 @@ class TopicMessages:
             end = begin + 1
             group = self._group_of(waiting[begin].raw, first + begin)
             if group is not None:
-                while end < len(waiting) and group.pattern.fits(waiting[end].raw):
+                while end < len(waiting) and group.layout.fits(waiting[end].raw):
                     end += 1
                 group.add(first + begin, waiting[begin:end])
             begin = end
 
     def _group_of(self, raw: bytes, number: int) -> _Group | None:
         for group in self._groups:
-            if group.pattern.fits(raw):
+            if group.layout.fits(raw):
                 return group
         try:
             layout: Any = self._find and self._find(raw)
         except MessageError as error:
             self._unreadable[number] = error
             return None
-        self._groups.append(_Group(raw, layout, is_stamped=self.type == JOINT_STATE))
+        self._groups.append(_Group(layout, is_stamped=self.type == JOINT_STATE))
         return self._groups[-1]
 
     def joint_states(
@@ -311,7 +308,7 @@ class TopicMessages:
         unreadable, parts, foreign = dict(self._unreadable), [], None
         for group in self._groups:
             try:
-                places = joint_state_columns(group.layout, names, required)
+                places = group.layout.columns(names, required)
             except MessageError as error:
                 if isinstance(error, MissingJointError) and error.is_foreign(names):
                     foreign = foreign or error

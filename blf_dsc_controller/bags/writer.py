@@ -18,9 +18,8 @@ from mcap.writer import CompressionType, Writer
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.sources import MESSAGES, METADATA, RECORD, VERSION, BagError
-from blf_dsc_controller.messages.codecs import NANOSECONDS
+from blf_dsc_controller.messages.codecs import NANOSECONDS, Definition, definition
 from blf_dsc_controller.messages.topics import FOREVER, Quality
-from blf_dsc_controller.messages.types import Definition, definition
 
 _COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
 _CHUNK_SIZE = 1 << 20

@@ -16,14 +16,11 @@ from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.reader import RecordedRun, recorded_run
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import make_room, require_ros
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.journal import EventType
 
 if TYPE_CHECKING:
     from blf_dsc_controller.replay.verify import Verification
-    from blf_dsc_controller.replay.what_if import WhatIf
 
 DIFFERENT = 3
 """Exit code if the replay differs from the bag."""
@@ -98,39 +95,29 @@ def recover(options: Namespace) -> int:
 
 
 def replay(options: Namespace) -> int:
-    """Replay a bag in the mode selected by the options, and print the result."""
+    """Replay a bag and print what is equal, or publish it."""
     if options.play:
         play(options)
         return 0
-    config = None
-    if options.config is not None:
-        config = load(locate(options.config), CONTROLLER, ControllerConfig)
-    names = NameMap.parse(options.map)
+    from blf_dsc_controller.replay.verify import verify
+
     begin = time.perf_counter()
-    if config is None:
-        from blf_dsc_controller.replay.verify import verify
-
-        result = verify(options.bag, options.namespace, names)
-        _print_speed(result.samples, result.duration, time.perf_counter() - begin)
-        print('\n'.join(_verification(result)))
-        if result.difference is not None:
-            return DIFFERENT
-        return PARTIAL if result.compared < 1.0 else 0
-    from blf_dsc_controller.replay.what_if import what_if
-
-    found = what_if(options.bag, config, options.namespace, names)
-    run = found.run
-    _print_speed(run.stamp.size, run.duration, time.perf_counter() - begin)
-    print('\n'.join(_open_loop(found, config)))
-    return 0
+    result = verify(options.bag, options.namespace, NameMap.parse(options.map))
+    seconds, took = result.duration, time.perf_counter() - begin
+    speed = f'{seconds:.3f} s in {took:.2f} s: {seconds / took:.0f}x real time'
+    print(f'{result.samples} samples, {speed}')
+    print('\n'.join(_verification(result)))
+    if result.difference is not None:
+        return DIFFERENT
+    return PARTIAL if result.compared < 1.0 else 0
 
 
 def play(options: Namespace) -> None:
     """Publish the messages of a bag until its end, or Ctrl-C."""
     if not 0.0 <= options.rate < np.inf:
         raise BlfDscError(f'--rate {options.rate:g}: expected a speed, or 0: as fast as possible')
-    if options.map or options.namespace or options.config:
-        raise BlfDscError('--play publishes the bag as it is: no --map, --namespace or --config')
+    if options.map or options.namespace:
+        raise BlfDscError('--play publishes the bag as it is: no --map or --namespace')
     require_ros()
     import rclpy
 
@@ -150,10 +137,6 @@ def play(options: Namespace) -> None:
         pass
     finally:
         rclpy.try_shutdown()
-
-
-def _print_speed(samples: int, seconds: float, took: float) -> None:
-    print(f'{samples} samples, {seconds:.3f} s in {took:.2f} s: {seconds / took:.0f}x real time')
 
 
 def _verification(result: Verification) -> Iterator[str]:
@@ -194,26 +177,6 @@ def _events(result: Verification) -> Iterator[str]:
     if result.passed_over:
         yield f'{result.passed_over} states skipped: the controller did not use them'
     yield from (f'note: {remark}' for remark in result.remarks)
-
-
-def _open_loop(found: WhatIf, config: ControllerConfig) -> Iterator[str]:
-    yield 'OPEN LOOP: the arm moved under the recorded torques, not under these'
-    yield f'recorded torque: {found.source}'
-    if found.left_out:
-        yield f'note: {found.left_out} states left out: not finite, or with unknown torques'
-    for i, joint in enumerate(config.joints):
-        known = found.difference[np.isfinite(found.difference[:, i]), i]
-        difference = (
-            f'differs from the recorded one by rms {np.sqrt(np.mean(known**2)):.4g}, '
-            f'max {np.abs(known).max():.4g} N m'
-            if known.size
-            else 'cannot be compared: no torque was recorded'
-        )
-        at_limit = np.mean(np.abs(found.run.torque[:, i]) >= config.torque.limit[i])
-        yield (
-            f'{joint}: torque {difference}; at its limit {100 * at_limit:.3g} % of the time; '
-            f'max |xi1| / bound {found.error_ratio[i]:.3g}'
-        )
 
 
 def view(options: Namespace) -> int:

@@ -110,11 +110,10 @@ def _add_bags(command: _Command) -> None:
         'and compare every output bit for bit; or with --play, publish it. Exit code: 0 all '
         'outputs are bit-equal, 3 some differ, 4 some could not be compared and the others are '
         'bit-equal, 1 an error.',
-        'run1/bag --config my.yaml',
+        'run1/bag',
         _NAMES,
     )
     option('bag', type=Path, help=_BAG)
-    option('--config', help='parameter file or preset: show what it would have commanded')
     option('--play', action='store_true', help='publish the recorded topics over ROS')
     option('--rate', type=float, default=1.0, help='speed of it; 0: as fast as possible (1)')
     option('--topics', nargs='+', default=[], metavar='TOPIC', help='topics to play (all)')

@@ -120,7 +120,7 @@ def identify_bag(
     *,
     pick_up: bool = False,
 ) -> Identified:
-    """Identify the arm of a bag from its URDF; path, namespace and names as for `what_if`.
+    """Identify the arm of a bag from its URDF; path, namespace and names as for `read_run`.
 
     `effort` says what the efforts are: the whole torque, the torque without that of gravity, or the
     commanded torque instead of them; `gains` [N m/A] turn currents into torques.  A load is

@@ -28,9 +28,9 @@ from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateEncoder,
     encode_clock,
+    typestore,
 )
 from blf_dsc_controller.messages.topics import LYAPUNOV_TERMS
-from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Floats, LearnedArm, Run, Series, Stamps
 
 Message: TypeAlias = tuple[topics.Topic, bytes]

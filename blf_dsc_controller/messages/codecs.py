@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of the control loop to bytes and back, in about a microsecond.
+"""Definitions of messages, and those of the control loop to bytes and back, in a microsecond.
 
 Plain CDR, version 1, as ROS 2 sends it: two bytes for the byte order, two unused, then the fields,
 each number aligned to its own size, from the fifth byte on. Padding bytes, and bytes after the
@@ -10,6 +10,7 @@ same names and lengths. Messages of all other types are left to the library rosb
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Collection, Sequence
 from operator import itemgetter
 from struct import Struct, unpack_from
@@ -17,10 +18,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
-from blf_dsc_controller.messages.types import typestore
 from blf_dsc_controller.run import Floats
 
 NANOSECONDS = 1_000_000_000
@@ -31,6 +33,37 @@ STAMP_OFFSET = 4  # of a message that starts with a std_msgs/Header
 JOINT_STATE_FIELDS = ('position', 'velocity', 'effort')
 _BYTE_ORDERS = {b'\x00\x00': '>', b'\x00\x01': '<'}
 _STAMP = Struct('<iI')
+
+
+class UnknownTypeError(BlfDscError):
+    """A message type without a known definition."""
+
+    def __init__(self, type_name: str) -> None:
+        super().__init__(
+            f'unknown message type {type_name!r}: its definition is needed to record it'
+        )
+
+
+class Definition(NamedTuple):
+    """Definition of a message type, empty where it is unknown."""
+
+    text: str  # with those of all nested types
+    hash: str  # RIHS01_...
+    encoding: str = 'ros2msg'
+
+
+@functools.cache
+def typestore() -> Typestore:
+    """Return the types of Jazzy's common interfaces; further types can be registered there."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def definition(type_name: str) -> Definition:
+    """Return the definition of a message type; UnknownTypeError if it is not in the store."""
+    if type_name not in typestore().fielddefs:
+        raise UnknownTypeError(type_name)
+    text, _md5 = typestore().generate_msgdef(type_name, ros_version=2)
+    return Definition(text, typestore().hash_rihs01(type_name))
 
 
 class MessageError(BlfDscError):
@@ -70,20 +103,34 @@ class Doubles(NamedTuple):
     size: int
 
 
-class Layout(NamedTuple):
-    """Byte order of a message, names in it, and positions of its arrays."""
+class Layout:
+    """What is the same in all messages of one sender: size, byte order, names, array sizes.
 
-    byte_order: str
-    begin: int  # offset of what follows the stamp
-    names: tuple[str, ...]
-    arrays: tuple[Doubles, ...]
+    Attributes:
+        names: in the message.
+        arrays: where its arrays are.
+        places: indices of all their values in a grid of doubles that starts at ORIGIN.
+        size: of the message [bytes].
+        double: type of a value.
+    """
 
-    @property
-    def grid(self) -> NDArray[np.intp]:
-        """Indices of the values of all arrays in a grid of doubles that starts at ORIGIN."""
-        return np.concatenate([
-            (array.offset - ORIGIN) // 8 + np.arange(array.size) for array in self.arrays
+    def __init__(
+        self, raw: bytes | bytearray, begin: int, names: tuple[str, ...], *arrays: Doubles
+    ) -> None:
+        """Take a message of which the bytes from `begin` to its first values are not numbers."""
+        self.names, self.arrays = names, arrays
+        self.size, self.double = len(raw), np.dtype(_BYTE_ORDERS[bytes(raw[:2])] + 'f8')
+        self.places = np.concatenate([
+            (array.offset - ORIGIN) // 8 + np.arange(array.size) for array in arrays
         ])  # fmt: skip
+        first, *others = (array.size_offset for array in arrays)
+        sizes = (slice(at, at + 4) for at in others)
+        self._parts_of = itemgetter(slice(2), slice(begin, first + 4), *sizes)
+        self._parts = self._parts_of(raw)
+
+    def fits(self, raw: bytes) -> bool:
+        """Return whether a message has this layout."""
+        return len(raw) == self.size and self._parts_of(raw) == self._parts
 
     def indices_of(self, joints: Sequence[str]) -> list[int]:
         """Return the index of each joint among the names.
@@ -102,20 +149,27 @@ class Layout(NamedTuple):
                 )
         return [self.names.index(joint) for joint in joints]
 
+    def columns(self, joints: Sequence[str], required: Collection[str]) -> NDArray[np.intp]:
+        """Return which of all values are position, velocity and effort of n `joints`, (3, n).
 
-class Pattern:
-    """What is the same in all messages of one layout: size, byte order, names, array sizes."""
+        A field that is not `required` and is empty has -1.
 
-    def __init__(self, raw: bytes, layout: Layout) -> None:
-        first, *others = (array.size_offset for array in layout.arrays)
-        sizes = (slice(at, at + 4) for at in others)
-        self.size, self.double = len(raw), np.dtype(layout.byte_order + 'f8')
-        self._parts_of = itemgetter(slice(2), slice(layout.begin, first + 4), *sizes)
-        self._parts = self._parts_of(raw)
-
-    def fits(self, raw: bytes) -> bool:
-        """Return whether a message has this layout."""
-        return len(raw) == self.size and self._parts_of(raw) == self._parts
+        Raises:
+            MissingJointError, DuplicatedJointError: as in `indices_of`.
+            ShortArrayError: an array differs in length from the names.
+        """
+        indices, begin = np.array(self.indices_of(joints), dtype=np.intp), 0
+        columns = np.full((3, indices.size), -1)
+        for row, field, array in zip(columns, JOINT_STATE_FIELDS, self.arrays, strict=True):
+            if array.size == len(self.names):
+                row[:] = begin + indices
+            elif array.size or field in required:
+                raise ShortArrayError(
+                    f'`{field}` of the message holds {array.size} values for {len(self.names)} '
+                    'names: publish one value for each name'
+                )
+            begin += array.size
+        return columns
 
 
 class _Cursor:
@@ -184,8 +238,8 @@ def joint_state_layout(raw: bytes | bytearray) -> Layout:
     cursor.time()
     cursor.text()
     names = cursor.texts()
-    arrays = tuple(cursor.doubles() for _ in JOINT_STATE_FIELDS)
-    return Layout(cursor.byte_order, STAMP_OFFSET + _STAMP.size, names, arrays)
+    arrays = (cursor.doubles() for _ in JOINT_STATE_FIELDS)
+    return Layout(raw, STAMP_OFFSET + _STAMP.size, names, *arrays)
 
 
 def joint_state_stamp(raw: bytes) -> int:
@@ -201,32 +255,7 @@ def array_layout(raw: bytes | bytearray) -> Layout:
         cursor.unsigned()
         cursor.unsigned()
     cursor.unsigned()
-    return Layout(cursor.byte_order, ORIGIN, (), (cursor.doubles(),))
-
-
-def joint_state_columns(
-    layout: Layout, joints: Sequence[str], required: Collection[str]
-) -> NDArray[np.intp]:
-    """Return which of all values are position, velocity and effort of n `joints`, (3, n).
-
-    A field that is not `required` and is empty has -1.
-
-    Raises:
-        MissingJointError, DuplicatedJointError: as in `indices_of`.
-        ShortArrayError: an array differs in length from the names.
-    """
-    columns, begin = np.array(layout.indices_of(joints), dtype=np.intp), 0
-    places = np.full((3, columns.size), -1)
-    for row, field, array in zip(places, JOINT_STATE_FIELDS, layout.arrays, strict=True):
-        if array.size == len(layout.names):
-            row[:] = begin + columns
-        elif array.size or field in required:
-            raise ShortArrayError(
-                f'`{field}` of the message holds {array.size} values for {len(layout.names)} '
-                'names: publish one value for each name'
-            )
-        begin += array.size
-    return places
+    return Layout(raw, ORIGIN, (), cursor.doubles())
 
 
 class TrajectoryContent(NamedTuple):
@@ -240,7 +269,8 @@ class TrajectoryContent(NamedTuple):
 def joint_trajectory(raw: bytes) -> TrajectoryContent:
     """Read a trajectory_msgs/JointTrajectory; MessageError as above.
 
-    Decoding by rclpy would block all other threads, for 10 ms with a thousand points.
+    Decoding by rclpy would block all other threads, for 10 ms with a thousand points, and rosbags
+    rejects the bytes that rclpy may add at the end.
     """
     cursor = _Cursor(raw)
     stamp = cursor.time()
@@ -323,19 +353,19 @@ class _Decoder:
 
     def __init__(self, size: int) -> None:
         self.values = np.full(size, np.nan)
-        self._pattern: Pattern | None = None
+        self._layout: Layout | None = None
 
     def _learn(self, raw: bytes, layout: Layout, columns: NDArray[np.intp]) -> None:
         """Store a layout, and which of its values are read; -1 for NaN."""
-        self._pattern = Pattern(raw, layout)
+        self._layout, self._double = layout, layout.double
         self._count = (len(raw) - ORIGIN) // 8
         self._known = np.flatnonzero(columns >= 0)
-        self._places = layout.grid[columns[self._known]]
-        self._stamp = Struct(layout.byte_order + 'iI')
+        self._places = layout.places[columns[self._known]]
+        self._stamp = Struct(layout.double.byteorder + 'iI')
         self.values[:] = np.nan
 
     def _fill(self, raw: bytes) -> None:
-        grid = np.frombuffer(raw, self._pattern.double, self._count, ORIGIN)  # type: ignore[union-attr]
+        grid = np.frombuffer(raw, self._double, self._count, ORIGIN)
         self.values[self._known] = grid[self._places]
 
 
@@ -361,12 +391,11 @@ class JointStateDecoder(_Decoder):
         """Fill the arrays from a serialised message and return its stamp [ns].
 
         Raises:
-            MessageError: as `joint_state_layout` and `joint_state_columns`.
+            MessageError: as `joint_state_layout` and `Layout.columns`.
         """
-        if self._pattern is None or not self._pattern.fits(raw):
+        if self._layout is None or not self._layout.fits(raw):
             layout = joint_state_layout(raw)
-            columns = joint_state_columns(layout, self._joints, self._required)
-            self._learn(raw, layout, columns.ravel())
+            self._learn(raw, layout, layout.columns(self._joints, self._required).ravel())
         self._fill(raw)
         seconds, nanoseconds = self._stamp.unpack_from(raw, STAMP_OFFSET)
         return int(seconds * NANOSECONDS + nanoseconds)
@@ -385,7 +414,7 @@ class Float64MultiArrayDecoder(_Decoder):
         Raises:
             MessageError: as `array_layout`.
         """
-        if self._pattern is None or not self._pattern.fits(raw):
+        if self._layout is None or not self._layout.fits(raw):
             layout = array_layout(raw)
             (array,) = layout.arrays
             if array.size != self.values.size:

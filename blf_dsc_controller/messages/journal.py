@@ -20,8 +20,8 @@ import numba
 from llvmlite.binding import get_host_cpu_features
 
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.topics import JOURNAL
-from blf_dsc_controller.messages.types import typestore
 
 OUTSIDE_BOUND = 'error past the bound'
 """Reason for a stop: the error left its bound."""

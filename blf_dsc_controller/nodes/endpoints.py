@@ -35,8 +35,8 @@ from rclpy.timer import Timer
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_msg
 
+from blf_dsc_controller.messages.codecs import UnknownTypeError, typestore
 from blf_dsc_controller.messages.topics import Quality, Topic
-from blf_dsc_controller.messages.types import UnknownTypeError, typestore
 
 _MESSAGE = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)')
 

@@ -12,9 +12,8 @@ from typing import Any
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.writer import BagWriter, DiskFullError, Losses, statistics
 from blf_dsc_controller.configuration.nodes import RecorderConfig
-from blf_dsc_controller.messages.codecs import MessageError, joint_state_stamp
+from blf_dsc_controller.messages.codecs import MessageError, UnknownTypeError, joint_state_stamp
 from blf_dsc_controller.messages.topics import JOINT_STATES, Quality
-from blf_dsc_controller.messages.types import UnknownTypeError
 from blf_dsc_controller.nodes.endpoints import (
     RawMessage,
     RawSubscriptions,

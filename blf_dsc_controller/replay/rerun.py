@@ -8,20 +8,23 @@ Both together give the exact order of messages and events; what was dropped has 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from blf_dsc_controller.bags.topic_messages import JointStates
+from blf_dsc_controller.bags.sources import BagMessage
+from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.law.factory import estimate_names
+from blf_dsc_controller.law.telemetry import DECIMATION, ControllerTelemetry, Message, Monitor
 from blf_dsc_controller.messages.codecs import MessageError
 from blf_dsc_controller.messages.journal import Event, EventType
-from blf_dsc_controller.messages.topics import TRACKING_ERROR
+from blf_dsc_controller.messages.topics import TRACKING_ERROR, Topic
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
-from blf_dsc_controller.replay.comparison import Difference, ReplayedMessages
-from blf_dsc_controller.run import Floats, Stamps
+from blf_dsc_controller.run import Floats
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Reason
 
@@ -30,6 +33,77 @@ _UNREADABLE = frozenset(
 )
 _EXTERNAL = (Reason.STATE_TIMEOUT, Reason.FAILED)
 _BLOCK = 4096  # states in memory
+
+
+class Outputs:
+    """What a guard's node would have published.
+
+    Attributes:
+        samples, safe_torques: number of samples of the law, and of torques that are not the law's.
+        first, last: stamps [ns] of its first and last sample; -1 before the first.
+        topics: messages of each topic, received at the stamp of their state.
+    """
+
+    def __init__(self, guard: Guard, topics: Collection[Topic]) -> None:
+        self._guard, self._joints = guard, guard.config.joints
+        self._estimates = estimate_names(guard.config)
+        self._telemetry = ControllerTelemetry(self._joints, self._estimates, 1)
+        self.samples = self.safe_torques = 0
+        self.first = self.last = -1
+        self._bound = b''
+        self._sent: Counter[Topic] = Counter()
+        self.topics = {topic: TopicMessages(topic.resolved, topic.type) for topic in topics}
+
+    def _add(self, stamp: int, message: Message, number: int = 0) -> None:
+        topic, raw = message
+        self._sent[topic] += 1
+        added = BagMessage(topic.resolved, stamp, raw, number or self._sent[topic])
+        self.topics[topic].add(added)
+
+    def add_sample(self, stamp: int) -> None:
+        """Add the last sample of the law, for the state with this stamp [ns]."""
+        guard, controller = self._guard, self._guard.controller
+        sample = controller.sample
+        if self.first < 0:
+            self.first = stamp
+        self.last, self.samples = stamp, self.samples + 1
+        if controller.samples == 1:
+            self._monitor = Monitor(self._joints, self._estimates, controller.settings)
+            self._bound = b''
+        if sample.bound.tobytes() != self._bound:
+            self.add_bound(stamp, sample.bound)
+        for message in self._telemetry.sample(stamp, sample, 0.0):
+            self._add(stamp, message)
+        if (controller.samples - 1) % DECIMATION == 0:
+            ratio = guard.samples.ratio
+            self._add(stamp, self._monitor.message(stamp, sample, ratio, sample.bound))
+
+    def add_bound(self, stamp: int, bound: Floats) -> None:
+        """Add a bound [rad], published with this stamp [ns]."""
+        self._bound = bound.tobytes()
+        limit = self._guard.controller.settings.torque_limit
+        self._add(stamp, self._telemetry.bound(stamp, bound, limit))
+
+    def add_command(self, stamp: int, torque: Floats, *, is_answer: bool, is_certain: bool) -> None:
+        """Add a commanded torque (n,) [N m] after a state with this stamp [ns].
+
+        `is_answer`: it answers a message. One that is not certain is not compared.
+        """
+        guard = self._guard
+        self.safe_torques += not guard.has_sample
+        if is_answer and not guard.has_sample:
+            self._sent[TRACKING_ERROR] += not is_certain
+            if is_certain:
+                self._add(stamp, self._telemetry.answer(stamp, torque))
+        if is_certain:
+            self._add(stamp, self._telemetry.command(torque), guard.journal.commands)
+
+
+class Departure(NamedTuple):
+    """Where a replayed controller started, stopped or accepted otherwise than the recorded one."""
+
+    what: str
+    stamp: int  # ns
 
 
 class Rerun:
@@ -49,33 +123,32 @@ class Rerun:
         states: JointStates,
         errors: Mapping[int, MessageError],
         answers: JointStates,
+        topics: Collection[Topic],
     ) -> None:
-        """Start with `config`; `errors` maps the number of each unreadable state to its error."""
+        """Start with `config`; `errors` maps the number of each unreadable state to its error.
+
+        The outputs on `topics` are kept.
+        """
         self.events: list[Event] = []
         self.passed_over = 0
-        self.departure: Difference | None = None
+        self.departure: Departure | None = None
         self.end = ''
         self._guard = Guard(config, lambda: 0, lambda: 0)
         self._guard.journal.pending.clear()
-        self._states, self._errors = states, errors
+        self._states = states
         self._values, self._loaded = np.empty((0, 3, 0)), range(0)
-        # All messages in order: row of the state, and its stamp; -1 for unreadable ones.
-        self._stamp = states.stamp
-        self._number: Stamps | None = None
-        self._row: NDArray[np.intp] | None = None
-        if errors:
-            number = np.concatenate([states.number, np.array(list(errors), dtype=np.int64)])
-            order = np.argsort(number, kind='stable')
-            self._number, self._row = number[order], np.where(order < states.size, order, -1)
-            unknown = np.full(len(errors), -1, dtype=np.int64)
-            self._stamp = np.concatenate([states.stamp, unknown])[order]
+        # All messages in order: row of the state, or of an error after them, whose stamp is -1.
+        numbers = np.append(states.number, np.array([*errors], dtype=np.int64))
+        self._row = np.argsort(numbers, kind='stable').astype(np.int32)
+        self._stamp = np.append(states.stamp, np.full(len(errors), -1))[self._row]
+        self._unreadable = dict(enumerate(errors.values(), states.size))
         self._answered = answers.stamp
         self._gap = _first_gap(answers)
         self._answer = 0  # number of answers reached
         self._position = -1  # of the last message processed or passed over
         self._last = -1  # stamp of the last answer
         self._failed = False
-        self.outputs = ReplayedMessages(self._guard)
+        self.outputs = Outputs(self._guard, topics)
 
     def run(self, events: Sequence[Event]) -> None:
         """Process the joint states with the events after the configuration, in order."""
@@ -107,7 +180,7 @@ class Rerun:
             return False
         if self._answer == self._gap:
             self.end = f'the recorder missed messages of {TRACKING_ERROR.resolved}'
-        if self._answer >= self._gap or self._answer >= self._answered.size:
+        if self._answer >= min(self._gap, self._answered.size):
             return False
         stamp = int(self._answered[self._answer])
         k = self._find(stamp)
@@ -167,10 +240,9 @@ class Rerun:
     def _process(self, k: int) -> None:
         guard, outputs, stamp = self._guard, self.outputs, int(self._stamp[k])
         self.passed_over += k - self._position - 1
-        self._position = k
-        row = k if self._row is None else int(self._row[k])
-        if row < 0 and self._number is not None:
-            torque = guard.reject(self._errors[int(self._number[k])])
+        self._position, row = k, int(self._row[k])
+        if row in self._unreadable:
+            torque = guard.reject(self._unreadable[row])
             stamp = guard.journal.stamp
         else:
             torque = guard.update(stamp, self._measurement(row))
@@ -217,14 +289,17 @@ class Rerun:
             self._depart(f'{event.type}: {_reason(event)}' if is_stop else event.type, event.stamp)
 
     def _act(self, event: Event) -> None:
+        """Do what caused an event, unless a message did."""
         guard, content = self._guard, event.content
-        if event.type is EventType.STOP:
-            self._stop(event)
-        elif event.type in (EventType.ACTIVATE, EventType.RESET):
-            self._failed = False
-            (guard.activate if event.type is EventType.ACTIVATE else guard.reset)()
-        elif event.type is EventType.DEACTIVATE:
-            guard.deactivate()
+        if _reason(event) is Reason.STATE_TIMEOUT:
+            self._command(event.stamp, guard.time_out(content['text']))
+        elif _reason(event) is Reason.FAILED:
+            guard.journal.stamp = event.stamp
+            self._command(event.stamp, guard.fail(content['text']))
+            self._failed = True  # nothing shows how far the law got
+        elif event.type in (EventType.ACTIVATE, EventType.RESET, EventType.DEACTIVATE):
+            self._failed &= event.type is EventType.DEACTIVATE
+            getattr(guard, event.type.value)()
         elif event.type is EventType.RELEASE:
             torque = guard.release()
             guard.journal.commands += torque is not None  # after the event's count
@@ -243,16 +318,6 @@ class Rerun:
                 self._command(event.stamp, guard.time_out(''))
             guard.end_silence()
 
-    def _stop(self, event: Event) -> None:
-        """Repeat a stop that no message caused."""
-        guard, text = self._guard, event.content['text']
-        if _reason(event) is Reason.STATE_TIMEOUT:
-            self._command(event.stamp, guard.time_out(text))
-        elif _reason(event) is Reason.FAILED:
-            guard.journal.stamp = event.stamp
-            self._command(event.stamp, guard.fail(text))
-            self._failed = True  # nothing shows how far the law got
-
     def _report_departure(self, own: Event, event: Event | None) -> None:
         """Note that the controller started or stopped differently from the recorded one."""
         text = own.content['text'] if own.type is EventType.STOP else own.type
@@ -261,9 +326,7 @@ class Rerun:
         self._depart(f'{what} ({text})', own.stamp)
 
     def _depart(self, what: str, stamp: int) -> None:
-        if self.departure is None:
-            time = (stamp - max(self.outputs.first, 0)) * 1e-9
-            self.departure = Difference(TRACKING_ERROR.resolved, what, stamp, time, 1.0, 0.0)
+        self.departure = self.departure or Departure(what, stamp)
 
 
 def _first_gap(answers: JointStates) -> int:
@@ -284,5 +347,5 @@ def _reason(event: Event | None) -> Reason:
     return Reason(event.content['reason']) if event and is_stop else Reason.NONE
 
 
-def _key(event: Event | None) -> tuple[EventType, int, Reason] | None:
-    return (event.type, event.stamp, _reason(event)) if event else None
+def _key(event: Event) -> tuple[EventType, int, Reason]:
+    return event.type, event.stamp, _reason(event)

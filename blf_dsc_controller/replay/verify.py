@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,23 +12,88 @@ import numpy as np
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
-from blf_dsc_controller.bags.topic_messages import JointStates
+from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.messages.codecs import MessageError
+from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS, MessageError
 from blf_dsc_controller.messages.journal import FORMAT, Event, EventType, machine
 from blf_dsc_controller.messages.topics import (
+    BOUND,
+    COMMANDS,
+    COMPUTE_TIME,
     DIAGNOSTICS,
+    FLOAT64_MULTI_ARRAY,
     FOREVER,
     JOINT_STATES,
     JOURNAL,
+    LEARNING,
+    MONITOR,
+    REFERENCE,
     STATE,
     TRACKING_ERROR,
+    Topic,
 )
-from blf_dsc_controller.replay.comparison import Comparison, Difference
 from blf_dsc_controller.replay.rerun import Rerun
+from blf_dsc_controller.run import Floats, Stamps
 
+_BLOCK = 4096  # messages compared at once
+_COMPARED = {  # topic: fields
+    COMMANDS: (2,),
+    TRACKING_ERROR: (0, 1, 2),
+    REFERENCE: (0, 1),
+    LEARNING: (0,),
+    MONITOR: (0,),
+    BOUND: (0, 2),
+}
 _TRANSITIONS = (EventType.ACTIVATE, EventType.DEACTIVATE, EventType.RESET, EventType.STOP)
+
+
+class Difference(NamedTuple):
+    """The first number of a topic that differs."""
+
+    topic: str
+    field: str
+    stamp: int  # ns
+    time: float  # s since the first state
+    recorded: float
+    replayed: float
+
+    def __str__(self) -> str:
+        return (
+            f'{self.time:.6f} s (stamp {self.stamp} ns), {self.topic}, {self.field}: '
+            f'recorded {self.recorded!r}, replayed {self.replayed!r}'
+        )
+
+
+@dataclass
+class Comparison:
+    """Result of comparing one topic."""
+
+    topic: str  # name in the bag
+    recorded: int  # numbers in the bag that a complete replay would give
+    values: int = 0  # numbers compared
+    difference: Difference | None = None
+    largest: float = 0.0  # difference of two numbers; infinite if only one of them is finite
+    left_out: str = ''  # what was not compared, and why
+
+    def add(
+        self, stamp: Stamps, start: int, names: Sequence[str], recorded: Floats, replayed: Floats
+    ) -> None:
+        """Compare tables (N, names) with the stamps (N,) of a run that began at `start`."""
+        self.values += recorded.size
+        bits = np.ascontiguousarray(recorded).view(np.int64)
+        unlike = bits != np.ascontiguousarray(replayed).view(np.int64)
+        unlike &= ~(np.isnan(recorded) & np.isnan(replayed))
+        if not unlike.any():
+            return
+        with np.errstate(invalid='ignore', over='ignore'):
+            sizes = np.abs(recorded[unlike] - replayed[unlike])
+        self.largest = max(self.largest, float(np.nan_to_num(sizes, nan=np.inf).max()))
+        if self.difference is None:
+            k, j = np.argwhere(unlike)[0]
+            pair = float(recorded[k, j]), float(replayed[k, j])
+            time = (int(stamp[k]) - start) * 1e-9
+            self.difference = Difference(self.topic, names[j], int(stamp[k]), time, *pair)
 
 
 class Verification(NamedTuple):
@@ -85,16 +151,20 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
             f'{start} ns, so its outputs cannot be reproduced: start the recorder first'
         )
     answers = _before(content.topics[TRACKING_ERROR].joint_states(config.joints, ()), until)
-    run = Rerun(config, _before(states, until), errors, answers)
+    run = Rerun(config, _before(states, until), errors, answers, _COMPARED)
     run.run(events[1:])
-    outputs = run.outputs
-    comparisons = tuple(outputs.compare(content, answers))
-    if not (run.departure or any(found.values for found in comparisons)):
+    comparisons = tuple(_compared(content, run, answers, config.joints))
+    differences = [found.difference for found in comparisons if found.difference]
+    outputs, departure = run.outputs, run.departure
+    if departure is not None:
+        time = (departure.stamp - max(outputs.first, 0)) * 1e-9
+        topic = TRACKING_ERROR.resolved
+        differences.insert(0, Difference(topic, *departure, time, 1.0, 0.0))
+    elif not any(found.values for found in comparisons):
         raise _nothing_to_compare(content)
-    differences = [run.departure, *(found.difference for found in comparisons)]
     return Verification(
-        outputs.count,
-        outputs.duration,
+        outputs.samples,
+        (outputs.last - outputs.first) * 1e-9,
         run.passed_over,
         comparisons,
         tuple(
@@ -103,7 +173,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
         tuple(run.events),
         outputs.safe_torques,
         (*_remarks(content, run.end or end, newer), *_other_machine(events[0])),
-        min((found for found in differences if found), key=lambda found: found.stamp, default=None),
+        min(differences, key=lambda found: found.stamp, default=None),
     )
 
 
@@ -121,8 +191,7 @@ def _events(content: Content) -> tuple[list[Event], int, str]:
     if events[0].content.get('format', 1) < FORMAT:
         raise BlfDscError(
             f'{content.path} was recorded by an earlier version, whose controller did not say '
-            'which states it used, so that it cannot be replayed; report, plot, export and '
-            'replay --config read it'
+            'which states it used, so that it cannot be replayed; report, plot and export read it'
         )
     if len(begins) > 1:
         return events[: begins[1]], content.events[begins[1]][0], 'another controller was started'
@@ -139,9 +208,100 @@ def _nothing_to_compare(content: Content) -> BlfDscError:
     listing = ''.join(f'\n  {name} ({count})' for name, count in content.message_counts.items())
     return BlfDscError(
         f'{content.path} lacks the messages of the controller or its journal, so '
-        f'there is nothing to compare; it holds:{listing}\nTo see what a configuration would '
-        'command, use --config'
+        f'there is nothing to compare; it holds:{listing}'
     )
+
+
+# Comparison.
+
+
+def _compared(
+    content: Content, run: Rerun, answers: JointStates, joints: Sequence[str]
+) -> Iterator[Comparison]:
+    """Yield the comparison of each topic in a bag; `answers` are those of tracking errors."""
+    for topic, fields in _COMPARED.items():
+        messages, own = content.topics.get(topic), run.outputs.topics[topic]
+        own.decode()
+        if messages is None:
+            continue
+        result = Comparison(messages.name, messages.size * len(joints) * len(fields))
+        try:
+            if own.size:
+                _compare(topic, messages, own, answers, joints, result, run.outputs.first)
+        except BlfDscError as error:  # unreadable, or in an unknown order
+            result.left_out = f'{error}'
+        yield result
+
+
+def _compare(
+    topic: Topic,
+    messages: TopicMessages,
+    own: TopicMessages,
+    answers: JointStates,
+    joints: Sequence[str],
+    result: Comparison,
+    start: int,
+) -> None:
+    """Compare the messages of the same stamp or number; those that have other stamps differ."""
+    fields = _COMPARED[topic]
+    if topic in (LEARNING, MONITOR):
+        names = _shared_names(messages, own, result)
+        recorded, replayed = (each.joint_states(names, ('position',)) for each in (messages, own))
+    else:
+        names = [f'{JOINT_STATE_FIELDS[k]} of {joint}' for k in fields for joint in joints]
+        recorded, replayed = (_of_joints(each, joints) for each in (messages, own))
+    if topic is TRACKING_ERROR:
+        recorded = answers
+    if topic in (REFERENCE, LEARNING, MONITOR):
+        recorded, replayed = recorded.by_stamp(), replayed.by_stamp()
+        keys, wanted = recorded.stamp, replayed.stamp
+    else:
+        keys, wanted = _numbers(topic, recorded, answers.size), replayed.sequence
+    index = np.minimum(np.searchsorted(keys, wanted), keys.size - 1)
+    known = np.flatnonzero(keys[index] == wanted)
+    theirs, ours = recorded.select(index[known]), replayed.select(known)
+    stamp, has_moved = ours.received, theirs.stamp != ours.stamp
+    for begin in range(0, known.size, _BLOCK):
+        rows = slice(begin, begin + _BLOCK)
+        pair = [np.hstack([states.field(k, rows) for k in fields]) for states in (theirs, ours)]
+        pair[1][has_moved[rows]] = np.inf
+        result.add(stamp[rows], start, names, *pair)
+    unreached = (result.recorded - result.values) // len(joints) if topic is COMMANDS else 0
+    # The last command of a node that shuts down normally is zero and belongs to no state.
+    if unreached == 1 and not recorded.field(2, slice(-1, None)).any():
+        result.recorded -= len(joints)
+    elif unreached:
+        result.left_out = f'{unreached} torques that the replay does not reach'
+
+
+def _of_joints(messages: TopicMessages, joints: Sequence[str]) -> JointStates:
+    if messages.type == FLOAT64_MULTI_ARRAY:
+        return messages.arrays(range(len(joints)))
+    return messages.joint_states(joints, ())
+
+
+def _shared_names(messages: TopicMessages, own: TopicMessages, result: Comparison) -> list[str]:
+    """Return the names of values that both have; note the others as left out."""
+    recorded, replayed = messages.joint_names(), own.joint_names()
+    shared = [name for name in replayed if name in recorded and name != COMPUTE_TIME]
+    both = dict.fromkeys((*replayed, *recorded))
+    result.left_out = ', '.join(name for name in both if name not in shared)
+    result.recorded = messages.size * len(shared)
+    return shared
+
+
+def _numbers(topic: Topic, recorded: JointStates, answers: int) -> Stamps:
+    """Return the numbers of messages among those of their publisher; BlfDscError if unknown."""
+    if topic is not COMMANDS or not recorded.sequence.any():
+        if topic is COMMANDS and recorded.size < answers:  # of another recorder
+            raise BlfDscError('some are missing, and they have neither stamps nor numbers')
+        return np.arange(1, recorded.size + 1)
+    if (np.diff(recorded.sequence) <= 0).any():
+        raise BlfDscError('they are of several publishers')
+    return recorded.sequence
+
+
+# Remarks.
 
 
 def _remarks(content: Content, end: str, newer: Sequence[str]) -> Iterator[str]:
