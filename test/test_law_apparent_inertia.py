@@ -37,10 +37,14 @@ def test_panda_keeps_its_bound_whatever_its_rotors_are(factor, sample_time):
     assert np.abs(run.error / run.bound).max() < 1.0
 
 
-@pytest.mark.parametrize(('factor', 'sample_time'), [(0.2, 0.001), (0.4, 0.002)])
-def test_ur5e_keeps_its_bound_with_light_rotors(factor, sample_time):
-    run = ran('ur5e', factor, sample_time=sample_time).run()
+@pytest.mark.parametrize(
+    ('preset', 'factor', 'sample_time', 'most'),
+    [('ur5e', 0.2, 0.001, 1.0), ('ur5e', 0.4, 0.002, 1.0), ('fr3', 0.1, 0.001, 0.8)],
+)
+def test_other_arms_keep_their_bounds_with_light_rotors(preset, factor, sample_time, most):
+    run = ran(preset, factor, sample_time=sample_time).run()
     assert not run.stops
+    assert np.abs(run.error / run.bound).max() < most
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ _SLOW = 0.06  # lower end, likewise
 _MEMORY = 0.02  # s, of the two powers that are compared
 _CLEAR = 0.1  # their ratio: noise has 0.005, an oscillation 100
 _EVIDENCE = 0.05  # s (rad/s^2)^2, times the inertia: least sum of z a that shows anything
-_RELEASE = 0.05  # s, in which the arm settles on its first torque
+_RELEASE = 0.02  # s, in which the arm settles on its first torque
 
 # Rows of `State.lags`: poles of the torque, those of the acceleration, and the last samples.
 _HELD, _DRIVE, _SENSOR, _TORQUE1, _TORQUE2, _TORQUE_MEAN = range(6)
