@@ -9,6 +9,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from blf_dsc_controller.studies.runs import run_chunk
@@ -135,9 +136,16 @@ def test_changes_are_reported_in_one_table(tmp_path, monkeypatch):
         for name in ('study', 'results')
     )
     results = results()
-    results['outcome'][:] = results['without.outcome'][:] = 'kept'
-    results['outcome'][1] = 'violated'
-    written = changes.report({'monte_carlo_events': (study, results)}, tmp_path)
+    noise = changes.Store(tmp_path / 'monte_carlo_events_noise').results()
+    errors = [name for name in noise if name.startswith('max_error_ratio')]
+    for name in errors:  # the same arms, but not the same runs
+        assert (noise[name] != results[f'without.{name}']).any()
+        np.testing.assert_allclose(noise[name], results[f'without.{name}'], rtol=0.3)
+    for outcomes in (results['outcome'], results['without.outcome'], noise['outcome']):
+        outcomes[:] = 'kept'
+    results['outcome'][1] = noise['outcome'][2] = 'violated'
+    written = changes.report({'monte_carlo_events': (study, results, noise)}, tmp_path)
+    assert ' | 1 / 0, 100.00 % | ' in written
     assert '| two links | 3 | 2 / 3 | 1 / 0 | ' in written
     assert 'two links, run 1: breaks the bound only with learning\n' in written
     assert f'--reproduce {tmp_path / "monte_carlo_events"} 1 --out ' in written

@@ -72,6 +72,9 @@ class MonteCarloConfig:
 
     runs: int = parameter(1000, 'closed loops to run', at_least=1, at_most=100_000_000)
     seed: int = parameter(0, 'run i is determined by this seed and i alone', at_least=0)
+    noise_seed: int = parameter(
+        0, 'another number: the same arms and motions, with other sensor noise', at_least=0
+    )
     pairs: bool = parameter(
         default=False,
         description='run each plant with learning and without it (learning.weight: 0)',
@@ -240,7 +243,8 @@ def random_numbers(study: Study, index: int) -> RandomNumbers:
     values = tuple(
         variation.distribution.at(bits(variation.column) / 2**53) for variation in study.variations
     )
-    return RandomNumbers(index, bits('seed'), values)
+    noise = study.settings.noise_seed
+    return RandomNumbers(index, bits(f'seed {noise}' if noise else 'seed'), values)
 
 
 def origin_of(controller: Controller) -> Origin:
