@@ -14,9 +14,11 @@ from blf_dsc_controller.configuration.nodes import load, load_loop, locate
 from blf_dsc_controller.configuration.robot import read_urdf
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
-from blf_dsc_controller.supervision.linear_loop import reference_load, windows_along
+from blf_dsc_controller.supervision.config_warnings import (
+    config_warnings,
+    reference_load,
+    worsened,
+)
 
 BOUND = 0.002  # rad
 
@@ -44,7 +46,6 @@ def test_presets_cause_no_warnings(preset):
         ('learning.weight', {'learning.update': 'gradient'}),
         ('disturbance.leakage', {'disturbance.leakage': 11.0}),
         ('disturbance.leakage', {'disturbance.leakage': 11.0, 'learning.weight': 0.0}),
-        ('learning.excitation_threshold', {'learning.excitation_threshold': 0.5}),
         ('learning.window', {'learning.window': 5.0}),
         ('learning.settling_time', {'learning.settling_time': 0.1}),
         (
@@ -93,26 +94,6 @@ def test_reference_load_predicts_the_torque_of_the_run():
     config, torque = loop.controller, np.abs(run(loop).torque[1000:])
     load = reference_load(config, settings_of_config(config))
     np.testing.assert_allclose(load.torque, torque.max(axis=0), rtol=2e-3)
-
-
-@pytest.mark.parametrize('preset', ['recommended', 'two_tone', 'excitation'])
-def test_predicted_excitation_matches_the_window_of_the_controller(preset):
-    """With columns and filters; the loop's window is along q, within a milliradian of qr."""
-    loop = configured(preset, 14.0)
-    windows = windows_along(loop.controller, settings_of_config(loop.controller))
-    record = simulate(loop.controller, loop.plant, supervised=False)
-    least = np.linalg.eigvalsh(windows)[:, 0].max()
-    assert least == pytest.approx(record.sample(-1).lambda_min[0], rel=0.02)
-
-
-def test_rejection_of_a_column_is_predicted():
-    """lambda_min is 0.26 for P alone, 0.0056 with the bias columns: in between one is rejected."""
-    for threshold, is_rejected in ((0.005, False), (0.05, True)):
-        changes = {'learning.excitation_threshold': threshold}
-        found = [text for text in warnings(changes) if 'a column will be rejected' in text]
-        assert bool(found) == is_rejected
-        estimate = run(configured('recommended', 8.0, changes)).estimate[-1]
-        assert np.isnan(estimate).any() == is_rejected
 
 
 def test_too_large_column_gain_overflows_as_warned():

@@ -2,6 +2,16 @@
 """Warnings before the start: gains, limits and windows that are valid but cannot work well.
 
 They are based on the initial parameter estimate, which is a guess. doc/tuning.md derives them.
+
+*The sampled loop at small errors.* About a motion that the law follows, learning aside, the law is
+linear in the errors, and so is the arm with its inertia M of that posture.  From one sample to the
+next the errors of n joints follow x+ = A x + B d with, for each joint,
+
+    x = [q, dq, drive torque, torque of the last sample, q of the last sample, filtered dq,
+         alpha2, d^3]
+
+where d [N m] is the torque that the model lacks.  Torques arrive a sample late and pass the drives,
+velocities are differences of positions behind a filter; each of both lags is half of `robot.lag`.
 """
 
 from __future__ import annotations
@@ -13,22 +23,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.arms.batch import free_inertias, inertia_matrices, regressors_at
 from blf_dsc_controller.arms.inertia import pseudo_inertia
 from blf_dsc_controller.arms.tuning import SAMPLES, UNKNOWN_EFFORT, loop_delay
-from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.robot import Robot, implausible_friction
+from blf_dsc_controller.configuration.robot import implausible_friction, learned_of
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.settings import FILTERED, LINEAR, NEWTON, Settings
+from blf_dsc_controller.law.surface import filter_gain
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
-from blf_dsc_controller.supervision.linear_loop import (
-    ExpectedErrors,
-    ReferenceLoad,
-    expected_errors,
-    reference_load,
-    windows_along,
-)
 
 Floats = NDArray[np.float64]
 
@@ -60,14 +64,14 @@ def config_warnings(
     """
     settings = settings_of_config(config)
     load = load or reference_load(config, settings)
-    found = [*_of_start(config, q), *_of_urdf(config, load)]
+    found = [] if q is None else [*_of_start(config, q)]
+    if config.model == 'urdf':
+        found += _of_urdf(config, load)
     found += [finding.text for finding in _of_gains(config, load)]
     if config.model == 'urdf' and config.law == 'blf_dsc':
         found += _of_errors(config, expected_errors(config, settings))
     if settings.surface != LINEAR and settings.kappa > 0.0 and settings.Gamma.any():
-        windows = windows_along(config, settings)
-        found += _of_update(config, settings, windows)
-        found += _of_window(config, settings, windows)
+        found += _of_learning(config, settings, load)
     return found
 
 
@@ -81,8 +85,8 @@ def worsened(before: ControllerConfig, after: ControllerConfig, load: ReferenceL
     ]
 
 
-def _of_start(config: ControllerConfig, q: Floats | None) -> Iterator[str]:
-    if q is None or config.reference.type == 'hold':
+def _of_start(config: ControllerConfig, q: Floats) -> Iterator[str]:
+    if config.reference.type == 'hold':
         return
     ((qr, _, _),) = sampled(reference_of(config), np.zeros(1))
     for joint, error, bound in zip(config.joints, q - qr, config.barrier.widest, strict=True):
@@ -94,44 +98,9 @@ def _of_start(config: ControllerConfig, q: Floats | None) -> Iterator[str]:
 
 
 def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
-    """Check for impossible inertias, and for defaults from the URDF that are hardly intended."""
-    if config.model != 'urdf':
-        return
+    """Check for figures that nobody can have measured, and for defaults that are hardly meant."""
     robot, barrier = config.robot, config.barrier
     chain = robot.chain(config.joints)
-    yield from _of_placeholders(robot, chain)
-    for joint, limit in zip(chain.joints, config.torque.limit, strict=True):
-        moments = np.linalg.eigvalsh(pseudo_inertia(joint.inertia))
-        if moments[0] < -_IMPOSSIBLE * moments[-1]:
-            yield (
-                f'robot.urdf: the inertia of what {joint.name} moves ({joint.link}) is impossible: '
-                f'one moment is larger than the sum of the other two: are they in kg m^2, about '
-                f'the centre of mass?'
-            )
-        if math.isinf(joint.effort) and limit == UNKNOWN_EFFORT:
-            yield (
-                f'torque.limit: {joint.name} has no effort in the URDF: {limit:g} N m is assumed; '
-                f'set the torque that its drive can withstand'
-            )
-    for name, acceleration in zip(
-        config.joints, config.torque.limit / load.free_inertia, strict=True
-    ):
-        if acceleration < _SLUGGISH:
-            yield (
-                f'robot.urdf: at its torque limit {name} accelerates at only {acceleration:.2g} '
-                f'rad/s^2: are masses in kg, moments of inertia in kg m^2 and lengths in m?'
-            )
-    for name, widest, bound in zip(config.joints, barrier.widest, barrier.bound, strict=True):
-        if widest > _FUNNEL * bound:
-            yield (
-                f'barrier.initial_bound: {name} begins with a bound of {widest:.3g} rad, which '
-                f'narrows to {bound:g}: with gains for robot.lag of {robot.lag:g} s it would sag '
-                f'that far under an undeclared load of {robot.payload:g} kg (robot.payload)'
-            )
-
-
-def _of_placeholders(robot: Robot, chain: Chain) -> Iterator[str]:
-    """Check for figures of the URDF that nobody can have measured."""
     if chain.pointlike:
         yield (
             f'robot.urdf: {", ".join(chain.pointlike)}: a mass without moments of inertia (all '
@@ -150,10 +119,42 @@ def _of_placeholders(robot: Robot, chain: Chain) -> Iterator[str]:
             f'{", ".join(joints)} or more: it is hardly real, so none of it is compensated before '
             f'it is learned; give robot.viscous and robot.coulomb'
         )
+    for i, joint in enumerate(chain.joints):
+        limit = config.torque.limit[i]
+        moments = np.linalg.eigvalsh(pseudo_inertia(joint.inertia))
+        if moments[0] < -_IMPOSSIBLE * moments[-1]:
+            yield (
+                f'robot.urdf: the inertia of what {joint.name} moves ({joint.link}) is impossible: '
+                f'one moment is larger than the sum of the other two: are they in kg m^2, about '
+                f'the centre of mass?'
+            )
+        if math.isinf(joint.effort) and limit == UNKNOWN_EFFORT:
+            yield (
+                f'torque.limit: {joint.name} has no effort in the URDF: {limit:g} N m is assumed; '
+                f'set the torque that its drive can withstand'
+            )
+        acceleration = limit / load.free_inertia[i]
+        if acceleration < _SLUGGISH:
+            yield (
+                f'robot.urdf: at its torque limit {joint.name} accelerates at only '
+                f'{acceleration:.2g} rad/s^2: are masses in kg, moments of inertia in kg m^2 and '
+                f'lengths in m?'
+            )
+        widest, bound = barrier.widest[i], barrier.bound[i]
+        if widest > _FUNNEL * bound:
+            yield (
+                f'barrier.initial_bound: {joint.name} begins with a bound of {widest:.3g} rad, '
+                f'which narrows to {bound:g}: with gains for robot.lag of {robot.lag:g} s it would '
+                f'sag that far under an undeclared load of {robot.payload:g} kg (robot.payload)'
+            )
 
 
 def expectation(config: ControllerConfig) -> str:
-    """Return the largest errors to expect of an arm of a URDF, in a sentence."""
+    """Return the largest errors to expect of an arm of a URDF, in a sentence.
+
+    With it the lightest drives with which friction alone stays within the bound: the gains follow
+    the inertia that the law measures (`apparent_inertia`), so errors grow with its inverse.
+    """
     settings = settings_of_config(config)
     errors = expected_errors(config, settings)
     usual, most = (1e3 * float(each.max()) for each in errors)
@@ -162,7 +163,10 @@ def expectation(config: ControllerConfig) -> str:
         f'{usual:.2g} mrad by friction and unmodelled torque; {most:.2g} mrad of {joint} when '
         f'{config.robot.payload:g} kg are picked up in motion'
     )
-    lightest = lightest_drives(settings, errors)
+    drives = settings.joint_inertia - settings.link_inertia
+    least = settings.joint_inertia * errors.unmodelled / settings.bound - settings.link_inertia
+    lightest = np.zeros_like(drives)  # of the inertia assumed; where it is given, nothing is
+    np.divide(least, drives, out=lightest, where=settings.unsure_rotor > 0.0)
     worst = int(lightest.argmax())
     if lightest[worst] <= 0.0:
         return text
@@ -170,19 +174,6 @@ def expectation(config: ControllerConfig) -> str:
         f'{text}; perhaps past the bound if the drive of {config.joints[worst]} has less than '
         f'{lightest[worst]:.2g} of the inertia assumed: then give robot.rotor_inertia'
     )
-
-
-def lightest_drives(settings: Settings, errors: ExpectedErrors) -> Floats:
-    """Return the rotor inertia (n,) over the assumed with which friction alone reaches the bound.
-
-    The gains follow the inertia that the law measures (`apparent_inertia`), and so the errors grow
-    with its inverse.  Negative: never; zero where the inertia is given.
-    """
-    drives = settings.joint_inertia - settings.link_inertia
-    excess = settings.joint_inertia * errors.unmodelled / settings.bound - settings.link_inertia
-    lightest: Floats = np.zeros_like(drives)
-    np.divide(excess, drives, out=lightest, where=settings.unsure_rotor > 0.0)
-    return lightest
 
 
 def _of_errors(config: ControllerConfig, errors: ExpectedErrors) -> Iterator[str]:
@@ -214,13 +205,15 @@ def _of_errors(config: ControllerConfig, errors: ExpectedErrors) -> Iterator[str
 def _of_gains(config: ControllerConfig, load: ReferenceLoad) -> list[Finding]:
     settings = settings_of_config(config)
     damping = np.maximum(load.damping(settings), 1e-12)
-    found = [*_of_torque(config, load), *_of_feedback(config, settings, load, damping)]
+    found = [*_of_feedback(config, settings, load, damping)]
     if settings.surface != LINEAR:
         found += _of_surface(config, settings, damping)
     return [finding for finding in found if finding.excess > 1.0]
 
 
-def _of_torque(config: ControllerConfig, load: ReferenceLoad) -> Iterator[Finding]:
+def _of_feedback(
+    config: ControllerConfig, settings: Settings, load: ReferenceLoad, damping: Floats
+) -> Iterator[Finding]:
     for joint, need, limit in zip(config.joints, load.torque, config.torque.limit, strict=True):
         yield Finding(
             f'torque of {joint}',
@@ -229,11 +222,6 @@ def _of_torque(config: ControllerConfig, load: ReferenceLoad) -> Iterator[Findin
             f'reference alone needs up to {need:.3g} N m: no bound can be kept with less, and '
             f'a quarter more is recommended for errors and disturbances',
         )
-
-
-def _of_feedback(
-    config: ControllerConfig, settings: Settings, load: ReferenceLoad, damping: Floats
-) -> Iterator[Finding]:
     rate = load.rate(settings)
     product = rate * config.sample_time
     yield Finding(
@@ -285,41 +273,21 @@ def _of_surface(config: ControllerConfig, settings: Settings, damping: Floats) -
         )
 
 
-def _of_update(config: ControllerConfig, settings: Settings, windows: Floats) -> Iterator[str]:
-    T = config.sample_time
+def _of_learning(
+    config: ControllerConfig, settings: Settings, load: ReferenceLoad
+) -> Iterator[str]:
+    learning = config.learning
     rate, what = float(settings.Gamma.max()), 'kappa Gamma T'
     if settings.update != NEWTON:
-        scale = np.sqrt(settings.Gamma)
-        rate = float(np.linalg.eigvalsh(windows * np.outer(scale, scale))[:, -1].max())
+        scale = np.sqrt(settings.Gamma[: settings.p])
+        rate = float(np.linalg.eigvalsh(load.excitation * np.outer(scale, scale))[-1])
         what = 'kappa lambda_max(Gamma Phi) T'
-    step = settings.kappa * rate * T
+    step = settings.kappa * rate * config.sample_time
     if step > 1.0:
         yield (
             f'learning.weight: {what} is {step:.2g}: the estimate overshoots above 1 and '
             f'diverges above 2: lower learning.weight, or learning.adaptation_gain and '
             f'learning.column_gain'
-        )
-
-
-def _of_window(config: ControllerConfig, settings: Settings, windows: Floats) -> Iterator[str]:
-    learning = config.learning
-    p = settings.p
-    windows = windows + settings.prior_weight * settings.information
-    alone, together = (
-        float(np.linalg.eigvalsh(Phi)[:, 0].max()) for Phi in (windows[:, :p, :p], windows)
-    )
-    if alone < settings.sigma:
-        yield (
-            f'learning.excitation_threshold: the reference excites the parameters by '
-            f'{alone:.2g} at best, below the threshold of {settings.sigma:g}: nothing will be '
-            f'learned from the prediction error'
-        )
-    elif together < settings.sigma:
-        yield (
-            f'learning.excitation_threshold: the reference excites the parameters and disturbance '
-            f'columns together by {together:.2g} at best, below the threshold of '
-            f'{settings.sigma:g}: a column will be rejected, and the disturbance that it '
-            f'describes will be attributed to the parameters'
         )
     if config.reference.type == 'sinusoids':
         for frequency in config.reference.frequency:
@@ -338,3 +306,155 @@ def _of_window(config: ControllerConfig, settings: Settings, windows: Floats) ->
             f'of the prediction error ({pole:g} rad/s): the initial transient is still in the '
             f'first windows'
         )
+
+
+# What the reference needs of the arm, followed exactly with the initial estimate.
+
+_POINTS = 400  # along the reference
+_LONGEST = 120.0  # s of the reference
+
+
+class ReferenceLoad(NamedTuple):
+    """Torque, inertia and excitation along the reference."""
+
+    torque: Floats  # largest magnitude (n,), N m
+    inertia: Floats  # M, where positive definite (k, n, n), kg m^2
+    excitation: Floats  # mean of H^T H (p, p)
+
+    def rate(self, settings: Settings) -> float:
+        """Return the largest eigenvalue of M^-1 K_p + omega_v, 1/s."""
+        Kp = np.diag(settings.Kp)[np.newaxis]  # numpy 1 reads a lone matrix as vectors
+        roots = np.linalg.eigvals(np.linalg.solve(self.inertia, Kp))
+        return float(np.abs(roots).max(initial=0.0)) + settings.damping_rate
+
+    @property
+    def free_inertia(self) -> Floats:
+        """Smallest inertia (n,) of each joint with the others free, kg m^2."""
+        least: Floats = free_inertias(self.inertia).min(axis=0, initial=np.inf)
+        return least
+
+    def damping(self, settings: Settings) -> Floats:
+        """Return the smallest damping (n,) of each joint with the others free, N m s/rad."""
+        rate = settings.damping_rate
+        damped = rate * self.free_inertia if rate > 0.0 else 0.0
+        return settings.Kp + damped
+
+
+def reference_load(config: ControllerConfig, settings: Settings) -> ReferenceLoad:
+    """Evaluate the dynamics along the reference, over its slowest period."""
+    model, P = settings.model, settings.initial_estimate[: settings.p]
+    q, dq, ddq = _along(config, _POINTS)
+    H = regressors_at(model, q, dq, dq, ddq)
+    M = inertia_matrices(model, P, q)
+    return ReferenceLoad(
+        torque=np.abs(H @ P).max(axis=0),
+        inertia=M[np.linalg.eigvalsh(M)[:, 0] > 0.0],
+        excitation=np.einsum('kni,knj->ij', H, H) / _POINTS,
+    )
+
+
+def _along(config: ControllerConfig, count: int) -> Floats:
+    """Return q, dq, ddq (3, k, n) over the whole reference, at most `_LONGEST`."""
+    frequencies = [w for w in config.reference.frequency if w > 0.0]
+    end = 2.0 * np.pi / min(frequencies, default=1.0)
+    if config.reference.type == 'waypoints':
+        end = max(config.reference.times)
+    times = np.linspace(0.0, min(end, _LONGEST), count, endpoint=False)
+    return np.moveaxis(sampled(reference_of(config), times), 1, 0)
+
+
+# The sampled loop at small errors.
+
+_RESPONSE = 20.0  # time constants of the damping, for which the response is followed
+_MOMENTS = 40  # of the reference
+_REVERSAL = 0.75  # of Coulomb friction: half of it too much at breakaway, with either sign
+
+
+class Loop(NamedTuple):
+    """What the loop at small errors depends on besides the gains."""
+
+    sample_time: float  # s
+    lag: float  # s, of velocity filter and drives together
+
+
+def transition(
+    settings: Settings, loop: Loop, M: Floats, M0: Floats, stiffness: Floats
+) -> tuple[Floats, Floats]:
+    """Return A (k, 8 n, 8 n) and B (k, 8 n, n) for the inertias M and M0 of the model (k, n, n).
+
+    `stiffness` (n,) [N m/rad] is the slope of the barrier.
+    """
+    T, n = loop.sample_time, settings.n
+    decay = np.exp(-T / max(0.5 * loop.lag, 1e-9))  # of the drives
+    mean = (1.0 - decay) * 0.5 * loop.lag / T  # of the drives' transient over the sample
+    rate = settings.K / 2.0 + settings.mu
+    g = filter_gain(settings.time_constant, T)
+    # Rows of x, and of what the law computes in terms of x: alpha2', xi2 and the torque.
+    q, dq, drive, last, before, speed, alpha2, d3 = np.eye(8 * n).reshape(8, n, 8 * n)
+    measured = speed + (1.0 - decay) * ((q - before) / T - speed)
+    beta2 = -rate[:, None] * q
+    dalpha2 = g * (beta2 - alpha2) / T
+    xi2 = measured - alpha2
+    torque = (
+        M0 @ (dalpha2 - settings.damping_rate * xi2)
+        - settings.Kp[:, None] * xi2
+        - stiffness[:, None] * q
+        + d3
+    )
+    applied = mean * drive + (1.0 - mean) * last  # mean over the sample
+    free = np.linalg.inv(M)
+    push = free @ applied
+    rows = [
+        q + T * dq + 0.5 * T**2 * push,
+        dq + T * push,
+        decay * drive + (1.0 - decay) * last,
+        torque,
+        q,
+        measured,
+        alpha2 + T * dalpha2,
+        d3 - T * settings.gamma[:, None] * xi2,
+    ]
+    A = np.concatenate(np.broadcast_arrays(*rows), axis=1)
+    B = np.zeros((*A.shape[:-1], n))
+    B[:, :n], B[:, n : 2 * n] = 0.5 * T**2 * free, T * free
+    return A, B
+
+
+def _peak_errors(settings: Settings, loop: Loop, M: Floats, M0: Floats, torque: Floats) -> Floats:
+    """Return the largest errors (k, n) [rad] after a step of the torque d (k, n) [N m]."""
+    A, B = transition(settings, loop, M, M0, settings.weight)
+    push = (B @ torque[..., None])[..., 0]
+    x, largest = np.zeros_like(push), np.zeros_like(torque)
+    rate = max(settings.damping_rate, 1.0)
+    for _ in range(round(_RESPONSE / rate / loop.sample_time)):
+        x = (A @ x[..., None])[..., 0] + push
+        largest = np.maximum(largest, np.abs(x[:, : settings.n]))
+    return largest
+
+
+class ExpectedErrors(NamedTuple):
+    """Largest errors (n,) [rad] along the reference, before anything is learned of their cause."""
+
+    unmodelled: Floats  # of learning.residual_floor and friction at a reversal
+    pick_up: Floats  # when robot.payload is picked up in motion
+
+
+def expected_errors(config: ControllerConfig, settings: Settings) -> ExpectedErrors:
+    """Return the errors to expect from an arm of a URDF, by the linear loop without the barrier."""
+    model, robot = settings.model, config.robot
+    chain = robot.chain(config.joints)
+    if config.reference.type == 'hold':  # at rest anywhere
+        limits = config.limits.position_lower, config.limits.position_upper
+        q = np.random.default_rng(0).uniform(*limits, (_MOMENTS, len(config.joints)))
+        dq = ddq = np.zeros_like(q)
+    else:
+        q, dq, ddq = _along(config, _MOMENTS)
+    P0 = settings.initial_estimate[: settings.p]
+    load = robot.payload * learned_of(robot, chain).load
+    M0, M = (inertia_matrices(model, P, q) for P in (P0, P0 + load))
+    loop = Loop(config.sample_time, robot.lag)
+    floor = np.array(config.learning.residual_floor)
+    floor += _REVERSAL * np.array(robot.friction(chain)['coulomb'])
+    unmodelled = _peak_errors(settings, loop, M0, M0, np.broadcast_to(floor, q.shape))
+    pick_up = _peak_errors(settings, loop, M, M0, regressors_at(model, q, dq, dq, ddq) @ load)
+    return ExpectedErrors(unmodelled.max(axis=0), pick_up.max(axis=0))
