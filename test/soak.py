@@ -30,7 +30,7 @@ from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointSt
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from blf_dsc_controller.supervision.supervisor import Phase
+from blf_dsc_controller.supervision.checks import Phase
 
 START = (2.293, 1.696)
 PAGE = os.sysconf('SC_PAGE_SIZE')

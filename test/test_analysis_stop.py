@@ -25,7 +25,7 @@ from blf_dsc_controller.messages.topics import (
     REFERENCE,
     TRACKING_ERROR,
 )
-from blf_dsc_controller.supervision.supervisor import Reason
+from blf_dsc_controller.supervision.checks import Reason
 
 STOP_S = 2.345
 LATE = 40 * MILLISECOND  # from the stamp of a message to its reception

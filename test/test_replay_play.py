@@ -48,7 +48,7 @@ def test_bag_is_played_in_its_time_and_order_byte_for_byte(bag, context):
     from sensor_msgs.msg import JointState
     from std_msgs.msg import String
 
-    from blf_dsc_controller.nodes.player_node import PlayerNode
+    from blf_dsc_controller.nodes.recorder_node import PlayerNode
 
     listener = rclpy.create_node('listener', context=context)
     executor = rclpy.executors.SingleThreadedExecutor(context=context)
@@ -120,7 +120,7 @@ def test_invalid_option_is_rejected_in_one_line(bag, capfd, options, message):
 
 
 def test_bag_without_messages_is_reported_as_empty(tmp_path, context):
-    from blf_dsc_controller.nodes.player_node import PlayerNode
+    from blf_dsc_controller.nodes.recorder_node import PlayerNode
 
     path = recorded_run.write(tmp_path / 'bag', [])
     with open_bag(path) as opened, pytest.raises(BagError, match='empty'):

@@ -9,7 +9,7 @@ from fault_rig import Rig
 from fault_table import named
 from plain_law import dynamics
 
-from blf_dsc_controller.supervision.supervisor import Phase
+from blf_dsc_controller.supervision.checks import Phase
 
 HOLDING = {'safety.torque': 'hold_gravity'}
 LEARNED = HOLDING | {'learning.initial_estimate': [1.0, 0.32, 0.4]}

@@ -30,15 +30,17 @@ from blf_dsc_controller.supervision import handover
 from blf_dsc_controller.supervision.checks import (
     PERIOD,
     SKIP,
+    Phase,
+    Reason,
     SampleCheck,
     StateCheck,
+    Supervisor,
     Velocity,
     Watchdog,
     rate_mismatch,
 )
 from blf_dsc_controller.supervision.handover import check_first_torque, check_support
 from blf_dsc_controller.supervision.safe_torque import SafeTorque, limit_first_torque
-from blf_dsc_controller.supervision.supervisor import Phase, Reason, Supervisor
 
 Vector = NDArray[np.float64]
 _NANO = 1e-9
@@ -54,9 +56,6 @@ _REASONS: dict[type[codecs.MessageError], Reason] = {
 
 class LatePlanError(TrajectoryError):
     """The time at which a trajectory should take effect passed while it was planned."""
-
-    def __init__(self, at: float, now: float) -> None:
-        super().__init__([f'it should begin at {at:.6g} s, but was planned only at {now:.6g} s'])
 
 
 class Plan(NamedTuple):
@@ -249,12 +248,11 @@ class Guard:
         self._stop(Reason.START_REJECTED, str(error))
 
     def _resumes(self, stamp: int, q: Vector, dq: Vector) -> bool:
-        controller, t = self.controller, self._time_of(stamp)
+        law, t = self.controller, self._time_of(stamp)
         if not self._resumable or stamp <= self.last_stamp:
             return False
-        bound = controller.bound_at(t)
         try:
-            check_takeover(self.config, bound, q, dq, controller.reference_vector, t)
+            check_takeover(self.config, law.bound_at(t), q, dq, law.reference_vector, t)
         except StartError:
             return False
         return True
@@ -408,10 +406,14 @@ class Guard:
         """
         self._check_running()
         if planned.before is not self.controller.reference_vector:
-            problem = 'the reference was replaced while it was planned: send it again'
-            raise TrajectoryError([problem])
+            raise TrajectoryError(
+                ['the reference was replaced while it was planned: send it again']
+            )
         if planned.at < self.time:
-            raise LatePlanError(planned.at, self.time)
+            text = (
+                f'it should begin at {planned.at:.6g} s, but was planned only at {self.time:.6g} s'
+            )
+            raise LatePlanError([text])
         joints, points, begin = planned.trajectory
         given = [point._asdict() for point in points]
         self._note(EventType.TRAJECTORY, joints=joints, points=given, begin=begin, at=planned.at)

@@ -50,9 +50,11 @@ def check_first_torque(
     if config.safety.first_torque == 'send':
         return
     torque = controller.trial(0.0, config.sample_time, measurement)
+    q, dq, effort = measurement.reshape(3, -1)
+    gravity = np.zeros_like(q)
     if config.robot.urdf:
-        _check_gravity(controller, config, measurement, torque)
-    q, _, effort = measurement.reshape(3, -1)
+        gravity = model_torque(controller.settings, controller.state.estimate, q)
+        _check_gravity(config, dq, effort, gravity, torque)
     step = np.array(config.torque.first_step)
     # Of an effort that only contains commands, a torque is held that this one replaces.
     held = effort if config.robot.effort == 'commanded' else 0.0
@@ -65,9 +67,7 @@ def check_first_torque(
         f'{config.joints[worst]!r}, more than the {step[worst]:g} N m that its drive tolerates '
         '(torque.first_step)'
     )
-    if config.robot.urdf and _is_like(
-        torque, model_torque(controller.settings, controller.state.estimate, q)
-    ):
+    if _is_like(torque, gravity):
         text += (
             ': it is the gravity of the URDF; if the drives compensate it themselves, set '
             'robot.drive_compensates to gravity, or to gravity_and_friction'
@@ -85,21 +85,16 @@ def check_support(controller: Controller, config: ControllerConfig, measurement:
 
     It may be brakes, or drives that compensate gravity, to which gravity would be added.
     """
-    robot, limits = config.robot, np.array(config.torque.first_step)
-    if (
-        not robot.urdf
-        or robot.drive_compensates != 'none'
-        or robot.effort in ('whole', 'current')
-        or config.safety.first_torque == 'send'
-    ):
+    robot = config.robot
+    is_known = robot.drive_compensates != 'none' or robot.effort in ('whole', 'current')
+    if not robot.urdf or is_known or config.safety.first_torque == 'send':
         return
     q, dq, effort = measurement.reshape(3, -1)
     gravity = model_torque(controller.settings, controller.state.estimate, q)
-    worst = int(np.argmax(np.where(limits > 0.0, 0.0, np.abs(gravity))))
+    is_limited = np.array(config.torque.first_step) > 0.0
+    worst = int(np.argmax(np.where(is_limited, 0.0, np.abs(gravity))))
+    matters = not is_limited[worst] and abs(gravity[worst]) > _MATTERS * config.torque.limit[worst]
     is_held = np.isfinite(effort).all() and _is_like(effort, gravity)  # which the check above sees
-    matters = (
-        limits[worst] == 0.0 and np.abs(gravity[worst]) > _MATTERS * config.torque.limit[worst]
-    )
     if matters and not is_held and not np.abs(dq).max() > _AT_REST:
         raise StartError(
             f'what holds the arm? It rests, its gravity is {gravity[worst]:.4g} N m on joint '
@@ -111,18 +106,18 @@ def check_support(controller: Controller, config: ControllerConfig, measurement:
 
 
 def _check_gravity(
-    controller: Controller, config: ControllerConfig, measurement: Vector, torque: Vector
+    config: ControllerConfig, dq: Vector, effort: Vector, gravity: Vector, torque: Vector
 ) -> None:
     """Raise StartError if the arm would get gravity twice, or not at all."""
-    q, dq, effort = measurement.reshape(3, -1)
-    gravity = model_torque(controller.settings, controller.state.estimate, q)
     worst = int(np.argmax(np.abs(gravity)))
     matters = np.abs(gravity[worst]) > _MATTERS * config.torque.limit[worst]
     if not (matters and np.abs(dq).max() <= _AT_REST and np.isfinite(effort).all()):
         return
-    robot, joint = config.robot, config.joints[worst]
-    holds, is_commanded = _is_like(effort, gravity), robot.effort == 'commanded'
-    if robot.drive_compensates == 'none' and holds and not is_commanded:
+    compensates, joint = config.robot.drive_compensates, config.joints[worst]
+    holds, is_commanded = _is_like(effort, gravity), config.robot.effort == 'commanded'
+    if compensates == 'none':
+        if not holds or is_commanded:
+            return
         raise StartError(
             f'gravity twice: the first torque would be {torque[worst]:.4g} N m on joint {joint!r}, '
             f'but it rests with an effort of {effort[worst]:.4g} N m before any command: '
@@ -130,25 +125,21 @@ def _check_gravity(
             'of another or an earlier controller holds the arm (set robot.effort to commanded if '
             f'the effort never contains anything else, or {_SEND})'
         )
-    is_unloaded = np.linalg.norm(effort) <= _NOTICED * np.linalg.norm(gravity)
-    fits = not holds if is_commanded else not is_unloaded
-    if robot.drive_compensates == 'none' or fits:
-        return
-    drives = f'robot.drive_compensates is {robot.drive_compensates}'
-    if is_commanded:
+    no_gravity = f'no gravity: robot.drive_compensates is {compensates}, but joint {joint!r} rests'
+    if is_commanded and holds:
         raise StartError(
-            f'no gravity: {drives}, but joint {joint!r} rests with a commanded effort of '
-            f'{effort[worst]:.4g} N m where none should be needed: set it to none, or '
-            'robot.effort to whole if the effort contains what the drives add, or, if a torque of '
-            f'another controller holds the arm, {_SEND}'
+            f'{no_gravity} with a commanded effort of {effort[worst]:.4g} N m where none should be '
+            'needed: set it to none, or robot.effort to whole if the effort contains what the '
+            f'drives add, or, if a torque of another controller holds the arm, {_SEND}'
         )
-    raise StartError(
-        f'no gravity: {drives}, but joint {joint!r} rests with an effort of {effort[worst]:.4g} '
-        f'N m where the drives should hold {gravity[worst]:.4g} N m: the first torque, '
-        f'{torque[worst]:.4g} N m, would drop the arm. Release the brakes if they hold it, or set '
-        'robot.drive_compensates to none, or robot.effort to commanded if the effort does not '
-        f'contain what the drives add, or {_SEND}'
-    )
+    if not is_commanded and np.linalg.norm(effort) <= _NOTICED * np.linalg.norm(gravity):
+        raise StartError(
+            f'{no_gravity} with an effort of {effort[worst]:.4g} N m where the drives should hold '
+            f'{gravity[worst]:.4g} N m: the first torque, {torque[worst]:.4g} N m, would drop the '
+            'arm. Release the brakes if they hold it, or set robot.drive_compensates to none, or '
+            f'robot.effort to commanded if the effort does not contain what the drives add, or '
+            f'{_SEND}'
+        )
 
 
 _STABLE = 2.0  # x += -a x diverges for a >= 2

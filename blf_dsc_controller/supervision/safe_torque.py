@@ -6,7 +6,6 @@ It is computed from the last usable state; ramps lead from the last torque to it
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -105,19 +104,25 @@ def friction_torque(settings: Settings, estimate: Vector, dq: Vector) -> Vector:
 
 
 def safe_torque(
-    safety: Safety, settings: Settings, last: LastState, estimate: Vector, load: Vector
+    safety: Safety,
+    settings: Settings,
+    last: LastState,
+    estimate: Vector,
+    load: Vector,
+    scale: Vector | float = 1.0,
 ) -> Vector:
     """Return the safe torque (n,) [N m], within the torque limit and always finite.
 
     It is zero, damping -D dq, or damping plus gravity H(q, 0, 0, 0) P^ and `load` (n,) [N m] as far
-    as the drive does not add them, and fades to zero while no usable state arrives.
+    as the drive does not add them, and fades to zero while no usable state arrives. D is the
+    configured damping times `scale` (n,).
     """
     torque = np.zeros(settings.n)
     if last.age >= safety.fade_time:
         return torque
     with np.errstate(over='ignore', invalid='ignore'):  # checked below
         if safety.torque != 'zero':
-            torque -= np.array(safety.damping) * last.dq
+            torque -= scale * np.array(safety.damping) * last.dq
         if safety.torque == 'hold_gravity':
             torque += model_torque(settings, estimate, last.q) + load
             torque -= added_torque(settings, last.q)
@@ -186,8 +191,7 @@ class SafeTorque:
             return None
         if safety.torque == 'hold_gravity':
             self.observe(settings, estimate, dt)
-        damped = replace(safety, damping=tuple(self.scale * np.array(safety.damping)))
-        goal = safe_torque(damped, settings, self.last, estimate, self.load)
+        goal = safe_torque(safety, settings, self.last, estimate, self.load, self.scale)
         self._elapsed += dt
         if self._elapsed < self._duration:
             goal = self._start + self._elapsed / self._duration * (goal - self._start)
@@ -257,6 +261,7 @@ class SecondLine:
         self.silence = 0.0
         self._timeout = timeout
         self._settings = settings_of_config(config)
+        self._estimate = self._settings.initial_estimate
         self._safe = SafeTorque(self._settings.n)
         self._safe.longest_step = config.sample_time
         self.stamp = self._commanded_stamp = -1  # the second: before the last torque
@@ -265,10 +270,6 @@ class SecondLine:
         self._knows_torque = False
         self._armed = armed
         model_torque(self._settings, self._estimate, np.zeros(self._settings.n))
-
-    @property
-    def _estimate(self) -> Vector:
-        return self._settings.initial_estimate
 
     def state(self, stamp: int, measurement: Vector, now: float) -> None:
         """Take a joint state with its stamp [ns]; `measurement` is [q, dq, effort] (3 n,)."""
