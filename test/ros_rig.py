@@ -141,13 +141,26 @@ class RosRig:
         return self.call(ChangeState, name, request).success
 
 
+class FakeClock:
+    """Steady clock [ns]."""
+
+    def __init__(self):
+        self.now = 10**9
+
+    def __call__(self):
+        return self.now
+
+    def advance(self, seconds):
+        self.now += round(1e9 * seconds)
+
+
 class Arm:
     """A stand-in for the arm: sends joint states to a controller and receives its torques."""
 
     def __init__(self, ros, names=JOINTS):
         self._ros = ros
         self._publisher = ros.publisher(topics.JOINT_STATES)
-        self._commands = ros.listen(topics.COMMANDS)
+        self.commands = ros.listen(topics.COMMANDS)
         self._encoder = JointStateEncoder(names)
 
     def torque_for(self, k, position, velocity=None, *, encoder=None):
@@ -158,10 +171,10 @@ class Arm:
             1_000_000_000 + k * 1_000_000, position, velocity, np.zeros(size)
         )
         self._ros.until(lambda: self._publisher.get_subscription_count() > 0)
-        before = len(self._commands)
+        before = len(self.commands)
         self._publisher.publish(raw)
-        self._ros.until(lambda: len(self._commands) > before)
-        return torques(self._commands)[-1]
+        self._ros.until(lambda: len(self.commands) > before)
+        return torques(self.commands)[-1]
 
 
 def torques(messages):

@@ -108,20 +108,5 @@ def policy(found):
     return HEAD + ET.tostring(root, encoding='unicode') + '\n'
 
 
-def read(path):
-    """Return what a policy grants, in the form of `live`."""
-    found = {}
-    for enclave in ET.parse(path).getroot().iter('enclave'):  # noqa: S314 - our own file
-        (profile,) = enclave.iter('profile')
-        access = {kind: [] for _, kind, _, _ in KINDS}
-        for part in profile:
-            ((kind, verdict),) = part.attrib.items()
-            assert verdict == 'ALLOW'
-            access[kind] = [each.text for each in part]
-        assert enclave.get('path') == '/' + profile.get('node')
-        found[profile.get('node')] = access
-    return found
-
-
 if __name__ == '__main__':
     Path(sys.argv[1]).write_text(policy(live()), encoding='utf-8')

@@ -122,7 +122,7 @@ def test_sros2_policy_grants_each_node_exactly_what_it_uses(tmp_path):
     live = tmp_path / 'policy.xml'
     subprocess.run([sys.executable, sros2_graph.__file__, live], check=True, capture_output=True)
     hint = 'run: python test/sros2_graph.py config/sros2_policy.xml'
-    assert sros2_graph.read(CONFIG / 'sros2_policy.xml') == sros2_graph.read(live), hint
+    assert (CONFIG / 'sros2_policy.xml').read_text() == live.read_text(), hint
 
 
 def test_viewer_configurations_name_existing_topics():

@@ -8,8 +8,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from fake_clock import FakeClock
-from ros_rig import activate, cleanup, configure, deactivate, shutdown, torques, values
+from ros_rig import FakeClock, activate, cleanup, configure, deactivate, shutdown, torques, values
 
 import blf_dsc_controller.nodes.plant_node
 from blf_dsc_controller.messages import topics

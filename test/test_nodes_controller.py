@@ -10,16 +10,17 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from fake_clock import FakeClock
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
-from ros_rig import JOINTS, START, Arm, torques
+from rclpy.timer import Timer
+from ros_rig import JOINTS, START, Arm, FakeClock, torques
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import OutsideBarrierError
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.nodes import process
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 
 ZERO = (0.0, 0.0)
@@ -46,7 +47,9 @@ def test_state_with_a_missing_joint_stops_the_arm_and_names_the_joint(ros):
     assert 'joint1, joint3' in node.guard.supervisor.text
 
 
-def test_safe_torque_is_repeated_when_the_arm_falls_silent(ros):
+def test_safe_torque_is_repeated_when_the_arm_falls_silent(ros, monkeypatch):
+    """By a timer that its callback never resets: with no time left, those would multiply."""
+    monkeypatch.setattr(Timer, 'reset', None)
     clock = FakeClock()
     node = ros.add(ControllerNode, {'safety.watchdog': 'on'}, clock=clock)
     arm = Arm(ros)
@@ -59,6 +62,30 @@ def test_safe_torque_is_repeated_when_the_arm_falls_silent(ros):
     before = len(commands)
     ros.until(lambda: clock.advance(0.01) or len(commands) >= before + 20)
     np.testing.assert_array_equal(torques(commands)[-1], ZERO)
+
+
+@pytest.mark.parametrize('where', ['in the law', 'in another callback'])
+def test_unexpected_error_is_answered_with_the_safe_torque_at_once(ros, where):
+    """No other state comes, and a driver would hold the last torque."""
+    node, arm = ros.add(ControllerNode), Arm(ros)
+    assert arm.torque_for(0, START).any()
+
+    def fail(*_):
+        raise ZeroDivisionError('of the test')
+
+    if where == 'in the law':
+        node.guard.update, update = fail, node.guard.update
+        torque = arm.torque_for(1, START)
+        node.guard.update = update
+    else:
+        timer = node.create_timer(0.0, lambda: timer.cancel() or fail())
+        while len(arm.commands) == 1:
+            process.spin_once(ros.executor, node)
+        torque = torques(arm.commands)[-1]
+    np.testing.assert_array_equal(torque, ZERO)
+    assert node.guard.supervisor.text == 'ZeroDivisionError: of the test'
+    assert ros.reset(node).success
+    assert arm.torque_for(2, START).any()
 
 
 @pytest.mark.parametrize(('period', 'starts'), [(10, False), (1, True)])

@@ -15,11 +15,10 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from command import finished
-from fake_clock import FakeClock
 from plain_law import dynamics
 from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from ros_rig import JOINTS, START, deactivate, shutdown, torques
+from ros_rig import JOINTS, START, FakeClock, deactivate, shutdown, torques
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -115,11 +114,14 @@ def test_leaving_node_commands_the_safe_torque_last(ros):
     """A driver holds it: zero would drop the arm. In motion, the arm is brought to rest first."""
     commands = ros.listen(topics.COMMANDS)
     given = {'safety.torque': 'hold_gravity', 'learning.initial_estimate': [1.0, 0.32, 0.4]}
-    arm, law = ros.loop(PLAIN, given)
+    clock = FakeClock()
+    arm, law = ros.loop(PLAIN, given, clock=clock)
+    ros.until(lambda: clock.advance(0.01) or arm.plant.sample > 0)
     ros.run(arm, 500)
     assert np.abs(arm.plant.measure()[2:4]).min() > 0.1
     ros.until(law.ready_to_end)
     assert np.abs(arm.plant.measure()[2:4]).max() < 0.05
+    ros.run(arm, 500)
     law.close()
     ros.until(lambda: not ros.spin(0.1))
     gravity = dynamics((1.0, 0.32, 0.4), 9.8, arm.plant.measure()[:2], ZERO)[2]

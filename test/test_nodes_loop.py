@@ -10,12 +10,11 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from fake_clock import FakeClock
 from random_arm import random_urdf
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.time import Time
-from ros_rig import simulated_torques, states, torques
+from ros_rig import FakeClock, simulated_torques, states, torques
 from test_plant_events import ALL_KINDS
 
 from blf_dsc_controller.configuration.controller import ControllerConfig

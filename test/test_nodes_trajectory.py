@@ -21,7 +21,6 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import MessageError, joint_trajectory
-from blf_dsc_controller.nodes import process
 from blf_dsc_controller.reference.trajectory import plan_trajectory
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.checks import Phase
@@ -197,25 +196,6 @@ def test_trajectory_planned_in_the_background_joins_without_a_jump(ros, sender):
     velocities = np.array([message.velocity for message in references])
     assert np.abs(np.diff(velocities, axis=0)).max() < 4.1e-3  # 4 rad/s^2 for a millisecond
     assert law.guard.samples.ratio.max() < 1.0
-
-
-def test_uncaught_callback_error_causes_a_safe_stop(ros):
-    commands = ros.listen(topics.COMMANDS)
-    arm, law = ros.loop()
-    ros.run(arm, 20)
-
-    def fail():
-        timer.cancel()
-        raise ZeroDivisionError('of the test')
-
-    timer = law.create_timer(0.0, fail)
-    while phase(law) is not Phase.SAFE_STOP:
-        process.spin_once(ros.executor, law)
-    assert law.guard.supervisor.text == 'ZeroDivisionError: of the test'
-    ros.until(lambda: not torques(commands)[-1].any())
-    assert ros.reset(law).success
-    ros.run(arm, 20)
-    assert phase(law) is not Phase.SAFE_STOP
 
 
 def test_trajectory_that_is_planned_too_late_is_planned_again_further_ahead(ros, monkeypatch):

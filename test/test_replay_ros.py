@@ -11,10 +11,9 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import recorded_run
-from fake_clock import FakeClock
 from rclpy.parameter import Parameter
 from recorded_run import compared, of
-from ros_rig import RosRig, activate, configure, deactivate
+from ros_rig import FakeClock, RosRig, activate, configure, deactivate
 from sent_trajectory import JOINTS, SECOND, send, trajectory
 
 from blf_dsc_controller.bags.content import read_content

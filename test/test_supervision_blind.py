@@ -158,14 +158,18 @@ def test_joint_that_is_really_too_fast_is_damped_most():
     np.testing.assert_allclose(torque, [-2.0, -0.1])  # D is 2 and 1 N m s/rad
 
 
+@pytest.mark.parametrize('on_a_ramp', [False, True])
 @pytest.mark.parametrize('safety', ['hold_gravity', 'damping', 'zero'])
-def test_last_torque_is_the_safe_torque_of_an_arm_at_rest(safety):
+def test_last_torque_is_the_safe_torque_of_an_arm_at_rest(safety, on_a_ramp):
     """A driver may hold it for ever: it is not damped, and there is no ramp any more."""
-    rig = moving({'safety.torque': safety})
+    rig = moving({'safety.torque': safety, 'safety.deactivation_ramp': 10.0})
+    if on_a_ramp:
+        rig.guard.deactivate()
     torque = rig.guard.release()
-    P = rig.guard.samples.estimate[:3]
-    gravity = dynamics(P, 9.8, rig.guard._safe_torque.last.q, (0.0, 0.0))[2]
-    np.testing.assert_allclose(torque, gravity if safety == 'hold_gravity' else [0.0, 0.0])
+    samples, q = rig.guard.samples, rig.guard._safe_torque.last.q
+    holding = dynamics(samples.estimate[:3], 9.8, q, (0.0, 0.0))[2] + samples.disturbance
+    np.testing.assert_allclose(torque, holding if safety == 'hold_gravity' else [0.0, 0.0])
+    assert np.abs(samples.disturbance).min() > 0.01
 
 
 def test_arm_settles_after_a_deactivation():

@@ -93,12 +93,23 @@ def test_watchdog_detects_silence_if_it_checks_in_time():
 
 
 @pytest.mark.parametrize(
-    ('watchdog', 'live', 'stops'),
-    [('auto', True, True), ('on', False, True), ('auto', False, False), ('off', True, False)],
+    ('watchdog', 'late', 'why_off', 'stops'),
+    [
+        ('auto', 0.0, '', True),
+        ('auto', 59.0, '', True),
+        ('auto', 61.0, '61 s behind', False),
+        ('auto', -61.0, '61 s ahead of', False),
+        ('on', 61.0, '', True),
+        ('off', 0.0, '', False),
+    ],
 )
-def test_silence_stops_with_wall_time_stamps_or_the_watchdog_on(watchdog, live, stops):
-    rig = Rig({'safety.watchdog': watchdog}, live=live)
+def test_silence_stops_if_stamps_are_live_or_the_watchdog_is_on(watchdog, late, why_off, stops):
+    """Of stamps that are `late` by some seconds; what is switched off says why."""
+    rig = Rig({'safety.watchdog': watchdog}, live=True)
+    rig.base -= int(late * 1e9)
     rig.step(20)
+    assert why_off in rig.guard.watchdog.why_off
+    assert bool(rig.guard.watchdog.why_off) == bool(why_off)
     rig.wait(60 if stops else 5000)
     assert (rig.supervisor.reason is Reason.STATE_TIMEOUT) == stops
     assert rig.commands[-1].any() != stops
@@ -117,32 +128,20 @@ def test_torque_ramps_after_a_fault_if_configured():
     assert not ramp[10:].any()
 
 
-def test_stopped_arm_is_held_by_the_learned_gravity():
-    """With the true parameters, gravity is held and damping stops the remaining motion."""
-    learned = {'learning.initial_estimate': P.tolist(), 'safety.torque': 'hold_gravity'}
-    rig = Rig(learned, plant={'disturbance.constant': [0.0, 0.0]})
-    rig.step(20)
-    rig.deliver(b'')
-    start = rig.state().q
-    rig.step(500)
-    assert rig.supervisor.phase is Phase.SAFE_STOP
-    np.testing.assert_allclose(rig.commands[-1], weight(rig.state().q), atol=0.1)
-    # With zero torque it falls by 1.5 rad in that time; the sinusoid of 0.1 N m is not held.
-    assert np.abs(rig.state().q - start).max() < 0.05
-
-
-@pytest.mark.parametrize('estimate', [0.5 * P, 1.5 * P], ids=['half', 'half as much again'])
-def test_stopped_arm_rests_although_its_model_is_wrong(estimate):
-    """The safe torque observes what the model lacks."""
-    start = {'learning.initial_estimate': estimate.tolist(), 'safety.torque': 'hold_gravity'}
-    rig = Rig(start | {'learning.weight': 0.0})
+@pytest.mark.parametrize(('factor', 'angle'), [(1.0, 0.1), (0.5, 0.2), (1.5, 0.2)])
+def test_stopped_arm_rests_although_its_model_may_be_wrong(factor, angle):
+    """The safe torque observes what the model lacks; with zero torque the arm falls by 1.5 rad."""
+    estimate = {'learning.initial_estimate': (factor * P).tolist(), 'learning.weight': 0.0}
+    rig = Rig(estimate | {'safety.torque': 'hold_gravity'}, plant={'disturbance.constant': [0, 0]})
     rig.step(500)
     assert (np.abs(rig.state().dq) > 0.1).all()
     rig.deliver(b'')
     start = rig.state().q
     rig.step(3000)
-    assert np.abs(rig.state().q - start).max() < 0.2
+    assert rig.supervisor.phase is Phase.SAFE_STOP
+    assert np.abs(rig.state().q - start).max() < angle
     assert np.abs(rig.state().dq).max() < 0.02
+    np.testing.assert_allclose(rig.commands[-1], weight(rig.state().q), atol=0.15)
 
 
 def test_load_is_bounded_and_left_as_it_is_while_brakes_hold_the_arm():
@@ -194,21 +193,6 @@ def test_rate_limit_applies_from_the_torque_before_an_activation(again):
     assert rig.guard.controller.state.rate_cuts.min() >= 1.0
     # The law learns from what was commanded.
     np.testing.assert_array_equal(rig.guard.controller.state.torque, rig.commands[-1])
-
-
-@pytest.mark.parametrize(
-    ('watchdog', 'late', 'reported'),
-    [('auto', 61.0, True), ('auto', 59.0, False), ('auto', -61.0, True), ('on', 61.0, False)],
-)
-def test_stamps_that_switch_off_the_watchdog_are_reported(watchdog, late, reported):
-    rig = Rig({'safety.watchdog': watchdog}, live=True)
-    rig.base -= int(late * 1e9)
-    rig.step(2)
-    assert rig.supervisor.phase is Phase.TRACKING
-    why = rig.guard.watchdog.why_off
-    assert (f'{late:.4g} s behind' in why if late > 0 else 'ahead of' in why) == reported
-    rig.wait(100)
-    assert (rig.supervisor.reason is Reason.STATE_TIMEOUT) == (not reported)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import sys
-import time
 import traceback
 from functools import partial
 from typing import Any
@@ -146,7 +145,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         guard = self.guard
         if guard is None or not guard.commanding or self.config.safety.torque == 'zero':
             return True
-        now, messages = time.monotonic(), guard.journal.messages
+        now, messages = self._steady() * 1e-9, guard.journal.messages
         if not self._ends_at:
             self._ends_at = now + _LONGEST_END
             if guard.supervisor.running:

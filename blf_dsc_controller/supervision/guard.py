@@ -449,6 +449,8 @@ class Guard:
         self.has_sample = False  # the last torque is not the law's
         if not self.commanding or self.silenced:
             return None
+        if self.supervisor.running:
+            self._safe_torque.load[:] = self.samples.disturbance
         return self._safe_torque.leave(
             self.config.safety, self.controller.settings, self.samples.estimate
         )
