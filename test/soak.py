@@ -11,7 +11,6 @@ import gc
 import os
 import sys
 from collections import Counter
-from dataclasses import dataclass, field
 from pathlib import Path
 
 # Before anything of ROS is imported.
@@ -20,89 +19,75 @@ os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 101))
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 import numpy as np
-from fault_rig import JOINTS, LOCKSTEP
+from fault_rig import LOCKSTEP
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
-from ros_rig import RosRig, activate, deactivate
+from ros_rig import JOINTS, START, RosRig, activate, deactivate
 
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.supervision.checks import Phase
 
-START = (2.293, 1.696)
 PAGE = os.sysconf('SC_PAGE_SIZE')
 
 
-def memory():
-    """Return the resident memory of this process [MB]."""
-    gc.collect()
-    return int(Path('/proc/self/statm').read_text().split()[1]) * PAGE / 1e6
-
-
-def handles():
-    """Return the number of open files and sockets of this process."""
-    return len(list(Path('/proc/self/fd').iterdir()))
-
-
-@dataclass
-class Report:
-    """Result of a soak test."""
-
-    samples: int = 0
-    faults: Counter = field(default_factory=Counter)
-    reasons: Counter = field(default_factory=Counter)
-    memory: list = field(default_factory=list)  # MB, after each fault
-    handles: list = field(default_factory=list)
-    worst: float = 0.0  # largest |xi1| / k_c outside of faults
-
-
 class Soak:
-    """The loop and its faults."""
+    """The loop and its faults, with what was seen of them."""
 
     def __init__(self, seed):
         self.ros = RosRig()
         self.rng = np.random.default_rng(seed)
-        self.report = Report()
-        self.states = self._publisher(topics.JOINT_STATES)
-        self.commands = self._publisher(topics.COMMANDS)
+        self.states = self.ros.publisher(topics.JOINT_STATES)
+        self.commands = self.ros.publisher(topics.COMMANDS)
         self.arm, self.law = self.ros.loop()
-        self.base = 0
-
-    def _publisher(self, topic):
-        node = self.ros.tester
-        kind = message_class(topic.type)
-        return node.create_publisher(kind, topic.relative, qos_profile(topic.offered))
+        self.samples = 0  # outside of faults
+        self.worst = 0.0  # largest |xi1| / k_c outside of faults
+        self.faults, self.reasons = Counter(), Counter()
+        self.memory, self.handles = [], []  # MB, and open files and sockets, after each fault
 
     def run(self, samples):
         """Run for a total of `samples`, not counting those during faults."""
-        while self.report.samples < samples:
+        while self.samples < samples:
             count = int(self.rng.integers(1000, 4000))
             self.ros.run(self.arm, count)
             assert self.law.guard.supervisor.running, self.law.guard.supervisor.text
-            self.report.samples += count
-            self.report.worst = max(self.report.worst, float(self.law.guard.samples.ratio.max()))
+            self.samples += count
+            self.worst = max(self.worst, float(self.law.guard.samples.ratio.max()))
             fault = self.rng.choice(FAULTS)
-            self.report.faults[fault.__name__] += 1
+            self.faults[fault.__name__] += 1
             fault(self)
             self.ros.spin(0.02)
             self.recover()
-            self.report.memory.append(memory())
-            self.report.handles.append(handles())
-        return self.report
+            gc.collect()
+            pages = int(Path('/proc/self/statm').read_text().split()[1])
+            self.memory.append(pages * PAGE / 1e6)
+            self.handles.append(len(list(Path('/proc/self/fd').iterdir())))
 
     def recover(self):
         """Reset the loop if it has stopped, and wait until it tracks."""
         supervisor = self.law.guard.supervisor
-        self.report.reasons[supervisor.reason] += 1
+        self.reasons[supervisor.reason] += 1
         if supervisor.phase is Phase.SAFE_STOP or self.arm.plant.sample == 0:
             assert self.ros.reset(self.arm).success
         self.ros.until(lambda: self.law.guard.supervisor.phase is Phase.TRACKING)
 
-    def close(self):
-        self.ros.close()
+    def judge(self):
+        """Print what was seen; fail if the bound was left or anything grew."""
+        quarter = max(1, len(self.memory) // 4)
+        growth, extra = (x[-1] - x[quarter] for x in (self.memory, self.handles))
+        for line in (
+            f'{self.samples} samples, {sum(self.faults.values())} faults',
+            f'{dict(self.faults)}\n{dict(self.reasons)}',
+            f'largest error against the bound outside of them: {self.worst:.2f}',
+            f'since the first quarter: {growth:+.1f} MB, {extra:+d} handles',
+        ):
+            print(line, file=sys.stderr)
+        assert self.worst < 1.0
+        # Every restarted node costs the middleware about 50 kB, and the heap takes time to settle.
+        assert growth < 0.02 * len(self.memory) + 10.0
+        assert extra <= 0
 
 
 def rogue_state(soak):
@@ -165,46 +150,19 @@ def reset_one(soak):
 
 
 FAULTS = (
-    rogue_state,
-    rogue_state,
-    rogue_command,
-    push,
-    new_gains,
-    kill_controller,
-    kill_plant,
-    pause_both,
-    reset_one,
+    *(rogue_state, rogue_state, rogue_command, push, new_gains),
+    *(kill_controller, kill_plant, pause_both, reset_one),
 )
 
 
-def soak(samples, seed=0):
-    """Run and return the report."""
-    running = Soak(seed)
-    try:
-        return running.run(samples)
-    finally:
-        running.close()
-
-
-def main():
+if __name__ == '__main__':
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument('--minutes', type=float, default=30.0, help='of the plant (30)')
     options.add_argument('--seed', type=int, default=0)
     given = options.parse_args()
-    report = soak(round(given.minutes * 60_000), given.seed)
-    quarter = max(1, len(report.memory) // 4)
-    growth = report.memory[-1] - report.memory[quarter]
-    extra = report.handles[-1] - report.handles[quarter]
-    print(f'{report.samples} samples, {sum(report.faults.values())} faults', file=sys.stderr)
-    for what in (report.faults, report.reasons):
-        print(dict(what), file=sys.stderr)
-    print(f'largest error against the bound outside of them: {report.worst:.2f}', file=sys.stderr)
-    print(f'since the first quarter: {growth:+.1f} MB, {extra:+d} handles', file=sys.stderr)
-    assert report.worst < 1.0
-    # Every restarted node costs the middleware about 50 kB, and the heap takes time to settle.
-    assert growth < 0.02 * len(report.memory) + 10.0
-    assert extra <= 0
-
-
-if __name__ == '__main__':
-    main()
+    soak = Soak(given.seed)
+    try:
+        soak.run(round(given.minutes * 60_000))
+    finally:
+        soak.ros.close()
+    soak.judge()
