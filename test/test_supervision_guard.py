@@ -128,11 +128,13 @@ def test_torque_ramps_after_a_fault_if_configured():
     assert not ramp[10:].any()
 
 
-@pytest.mark.parametrize(('factor', 'angle'), [(1.0, 0.1), (0.5, 0.2), (1.5, 0.2)])
+@pytest.mark.parametrize(('factor', 'angle'), [(1.0, 0.12), (0.5, 0.2), (1.5, 0.2)])
 def test_stopped_arm_rests_although_its_model_may_be_wrong(factor, angle):
     """The safe torque observes what the model lacks; with zero torque the arm falls by 1.5 rad."""
     estimate = {'learning.initial_estimate': (factor * P).tolist(), 'learning.weight': 0.0}
-    rig = Rig(estimate | {'safety.torque': 'hold_gravity'}, plant={'disturbance.constant': [0, 0]})
+    rig = Rig(
+        estimate | {'safety.torque': 'hold_gravity'}, plant={'disturbance.constant': [0.0, 0.0]}
+    )
     rig.step(500)
     assert (np.abs(rig.state().dq) > 0.1).all()
     rig.deliver(b'')
