@@ -88,7 +88,7 @@ expect: $(READY) ## Recompute the figures of doc/arms.md for the presets panda a
 	@$(RUN) benchmark/what_to_expect.py
 
 bench: $(READY)-bench ## Run the benchmarks (GROUPS=offline for one group), into benchmark/RESULTS.md
-	@$(RUN) benchmark/run.py $(GROUPS)
+	@$(RUN) benchmark/harness.py $(GROUPS)
 
 soak: $(READY)-test ## Run half an hour of plant time (MINUTES) with a fault every few seconds
 	@$(RUN) test/soak.py --minutes "$(MINUTES)"

@@ -1,14 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ratios of interleaved measurements, and contestants that run as processes.
+"""Run all benchmarks and write a table: python benchmark/harness.py [GROUP ...] [--out FOLDER].
 
-On a shared machine only interleaved measurements can be compared.
+Each figure is the ratio of interleaved measurements: on a shared machine only they can be compared.
+Contestants may be processes.
 """
 
 from __future__ import annotations
 
+import argparse
+import datetime as dt
 import gc
+import importlib.metadata
 import itertools
 import os
+import platform
+import re
 import signal
 import subprocess
 import sys
@@ -16,12 +22,25 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import groupby
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller import __version__
 from blf_dsc_controller.errors import BlfDscError
 
+_GROUPS = {  # module and function of each
+    'offline': ('offline', 'measure'),
+    'montecarlo': ('offline', 'measure_study'),
+    'growth': ('offline', 'measure_growth'),
+    'replay': ('offline', 'measure_replay'),
+    'node': ('nodes', 'measure'),
+    'startup': ('nodes', 'measure_start'),
+}
+_HERE = Path(__file__).parent
+_PACKAGES = ('numpy', 'numba', 'scipy', 'mujoco', 'pin', 'ros-jazzy-rclpy')
 _START_UP = 120.0  # s, including compilation of kernels
 _ENDING = 20.0  # s from SIGINT to the end
 _TAIL = 2000  # characters of stderr quoted in an error
@@ -33,10 +52,10 @@ class Ratio(NamedTuple):
 
     group: str
     what: str  # the contestant
-    baseline: str
     median: float  # of the ratios of all rounds; a round measures both within seconds
     low: float
     high: float
+    baseline: str
     note: str = ''
 
 
@@ -44,9 +63,8 @@ def ratio(
     group: str, what: str, baseline: str, mine: np.ndarray, theirs: np.ndarray, note: str = ''
 ) -> Ratio:
     """Return the ratio of two interleaved series (rounds,)."""
-    each = mine / theirs
-    median, low, high = float(np.median(each)), float(each.min()), float(each.max())
-    return Ratio(group, what, baseline, median, low, high, note)
+    low, median, high = np.quantile(mine / theirs, (0.0, 0.5, 1.0)).tolist()
+    return Ratio(group, what, median, low, high, baseline, note)
 
 
 def interleaved(contestants: Mapping[str, Callable[[], int]], rounds: int) -> dict[str, np.ndarray]:
@@ -145,3 +163,58 @@ def own_graph() -> Iterator[None]:
     with own_domain() as domain:
         os.environ.update({'ROS_DOMAIN_ID': str(domain), **localhost_environment()})
         yield
+
+
+def machine() -> str:
+    """Describe the machine and the versions, without the host name."""
+    models = re.findall(r'model name\s*:\s*(.*)', Path('/proc/cpuinfo').read_text())
+    model = models[0] if models else 'unknown processor'
+    versions = [f'Python {platform.python_version()}', f'blf_dsc_controller {__version__}']
+    for package in _PACKAGES:
+        try:
+            versions.append(f'{package} {importlib.metadata.version(package)}')
+        except importlib.metadata.PackageNotFoundError:
+            versions.append(f'{package} absent')
+    return f'{model}, {os.cpu_count()} cores, {platform.system()}; {", ".join(versions)}'
+
+
+def table(rows: list[Ratio]) -> str:
+    """Return Markdown with a table for each group."""
+    lines: list[str] = []
+    for group, members in groupby(rows, key=lambda row: row.group):
+        cells = (
+            (row.what, f'**{row.median:.3g}**', f'{row.low:.3g} to {row.high:.3g}', *row[-2:])
+            for row in members
+        )
+        lines += ['', f'## {group}', '']
+        lines += table_lines(('what', 'ratio', 'range', 'to', ''), cells)
+    return '\n'.join(lines) + '\n'
+
+
+def main() -> None:
+    """Run the groups and write RESULTS.md."""
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument('groups', nargs='*', metavar='GROUP', help=', '.join(_GROUPS))
+    options.add_argument('--out', type=Path, default=_HERE, help='folder for the results')
+    chosen = options.parse_args()
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    rows: list[Ratio] = []
+    for name in chosen.groups or _GROUPS:
+        print(f'measuring: {name}', flush=True)
+        module, function = _GROUPS[name]
+        for row in getattr(importlib.import_module(module), function)():
+            print(f'  {row.what}: {row.median:.3g} times {row.baseline}  {row.note}', flush=True)
+            rows.append(row)
+    today = dt.datetime.now(dt.timezone.utc).date()
+    text = (
+        '# Results of the benchmarks\n\n'
+        f'Written by `make bench` on {today}. Every figure is a ratio of two things measured in '
+        'turns in\nthe same run: median and range of its rounds. Absolute times are notes about '
+        f'one machine.\n\n{machine()}\n' + table(rows)
+    )
+    (chosen.out / 'RESULTS.md').write_text(text, encoding='utf-8')
+    print(f'written: {chosen.out / "RESULTS.md"}')
+
+
+if __name__ == '__main__':
+    main()

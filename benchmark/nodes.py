@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from harness import Contestant, ContestantError, Ratio, own_graph, ratio, wait_for
@@ -35,6 +35,7 @@ _START = 1_000_000_000
 _PERIOD = 1e-3  # s
 _SETTLING = 0.5  # s for discovery, or for a message to arrive
 _PATIENCE = 60.0  # s for one torque
+_RATE = 'steps a second'
 _NULL = 'null node'
 _QUIET = 'controller, telemetry off'
 _UNHEARD = 'controller, telemetry on, no subscriber'
@@ -49,14 +50,6 @@ _COLD = 'controller, cold cache'
 _NULL_NODE = str(Path(__file__).with_name('null_node.py'))
 _CONTROLLER_NODE = ['-m', 'blf_dsc_controller.nodes.controller_node']
 _RECORDER_NODE = ['-m', 'blf_dsc_controller.nodes.recorder_node', '--ros-args', '-p']
-
-
-class Run(NamedTuple):
-    """A contestant in a round and a mode."""
-
-    latency: np.ndarray  # (_STEPS,) s, from state published to torque received
-    elapsed: float  # s
-    cpu: float  # s of the node's process
 
 
 class StandIn:
@@ -102,16 +95,20 @@ class StandIn:
         self._wait_for(lambda: self.node.count_publishers(self.commands) == 1, contestants)
         self._spin_for(_SETTLING)
         first, self.has_torque = next(self.messages), False
-        end = time.perf_counter() + _PATIENCE
-        while not self.has_torque:
-            if time.perf_counter() > end:
-                raise ContestantError(f'{contestants[-1].name}: no torque for the first state')
-            contestants[-1].check()
+
+        def send() -> None:
             self.publisher.publish(first)
             self._spin_for(_SETTLING)
 
-    def play(self, node: Contestant, period: float) -> Run:
-        """Publish states, one per `period` [s] or, if 0, each after the previous torque."""
+        what = f'the first torque of {contestants[-1].name}'
+        wait_for(lambda: self.has_torque, what, contestants, send)
+
+    def play(self, node: Contestant, period: float) -> dict[str, float]:
+        """Publish states, one per `period` [s] or, if 0, each after the previous torque.
+
+        Returns latencies [s], from state published to torque received, CPU [s] of the node's
+        process, and steps a second.
+        """
         latency = np.zeros(_WARM_UP + _STEPS)
         begin, busy = time.perf_counter(), node.cpu_time()
         for k in range(latency.size):
@@ -129,8 +126,9 @@ class StandIn:
                     node.check()
                     raise ContestantError(f'{node.name}: no torque for state {k}')
             latency[k] = time.perf_counter() - sent
-        elapsed = time.perf_counter() - begin
-        return Run(latency[_WARM_UP:], elapsed, node.cpu_time() - busy)
+        rate, cpu = _STEPS / (time.perf_counter() - begin), node.cpu_time() - busy
+        median, most = np.percentile(latency[_WARM_UP:], (50.0, 99.9)).tolist()
+        return {'median latency': median, 'p99.9 latency': most, 'CPU': cpu, _RATE: rate}
 
     def _spin_for(self, seconds: float) -> None:
         end = time.perf_counter() + seconds
@@ -162,38 +160,28 @@ def measure() -> Iterator[Ratio]:
     for preset, (group, names) in _GROUPS.items():
         loop = load_loop(preset)
         states = _recorded_states(loop)
-        real: dict[str, list[Run]] = {name: [] for name in names}
-        lockstep: dict[str, list[Run]] = {name: [] for name in names}
+        real: list[dict[str, dict[str, float]]] = []  # a round: figures by contestant
+        lockstep: list[dict[str, dict[str, float]]] = []
         with own_graph(), tempfile.TemporaryDirectory() as folder, closing(StandIn(())) as arm:
             for k in range(_ROUNDS):
+                real.append({})
+                lockstep.append({})
                 for name in names:
                     path = Path(folder, f'{k}-{name}'.replace(' ', '_'))
                     arm.messages = iter(states)
                     with _started(name, loop.controller, path) as contestants:
                         arm.greet(contestants)
-                        lockstep[name].append(arm.play(contestants[-1], 0.0))
-                        real[name].append(arm.play(contestants[-1], _PERIOD))
+                        lockstep[k][name] = arm.play(contestants[-1], 0.0)
+                        real[k][name] = arm.play(contestants[-1], _PERIOD)
                         for contestant in contestants:
                             contestant.check()
                     arm.left_alone()
-        for what, figure in (
-            ('median latency', lambda run: np.median(run.latency)),
-            ('p99.9 latency', lambda run: np.percentile(run.latency, 99.9)),
-            ('CPU', lambda run: run.cpu),
-        ):
-            yield from _beside_null(f'{group}, real time at 1 kHz', what, real, figure)
-        yield from _beside_null(
-            f'{group}, lock-step', 'steps a second', lockstep, lambda run: _STEPS / run.elapsed
-        )
-
-
-def _beside_null(
-    group: str, what: str, runs: dict[str, list[Run]], figure: Callable[[Run], float]
-) -> Iterator[Ratio]:
-    values = {name: np.array([figure(run) for run in each]) for name, each in runs.items()}
-    for name in [*values][1:]:
-        here = f'{np.median(values[name]):.0f} here' if what == 'steps a second' else ''
-        yield ratio(group, f'{name}: {what}', _NULL, values[name], values[_NULL], here)
+        shown = [(f'{group}, real time at 1 kHz', what, real) for what in [*real[0][_NULL]][:-1]]
+        for title, what, rounds in [*shown, (f'{group}, lock-step', _RATE, lockstep)]:
+            values = {name: np.array([each[name][what] for each in rounds]) for name in names}
+            for name in names[1:]:
+                here = f'{np.median(values[name]):.0f} here' if what == _RATE else ''
+                yield ratio(title, f'{name}: {what}', _NULL, values[name], values[_NULL], here)
 
 
 @contextmanager

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Offline loop and study against the same in C, numpy, MuJoCo, pinocchio; replay against a reader.
+"""Offline loop and study against C, numpy, MuJoCo, pinocchio; growth; replay against a reader.
 
 The C reference is compiled on demand and called through ctypes. The peers run the recommended
 configuration: all hold the torque over the sample and apply the disturbance, only the integration
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import ctypes
 import importlib.util
+import itertools
 import subprocess
 import sys
 import tempfile
@@ -31,37 +32,38 @@ from scipy.integrate import RK45
 
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import locate
+from blf_dsc_controller.configuration.nodes import load_loop, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import controller_of, settings_of_config
+from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies import runs
-from blf_dsc_controller.studies.monte_carlo import (
-    Study,
-    load_study,
-    origin_of,
-    plant_with,
-    random_numbers,
-)
-from blf_dsc_controller.studies.runs import Span, run_chunk, warm_up
+from blf_dsc_controller.studies.monte_carlo import Study, draw, load_study, plant_with
+from blf_dsc_controller.studies.runs import run_chunk, warm_up
 from sim_plant.sensors import generator
 
 sys.path.append(str(Path(__file__).parents[1] / 'test'))
 from plain_law import PlainLaw, dynamics
 
+_ROOT = Path(__file__).parents[1]
 PACKAGE = 'blf_dsc_controller'
 C = 'C -O3'
+_TWO_LINKS = 'two-link arm, p = 5'
 _LONG = 60.0  # s
 _SHORT = 8.0  # s, long enough for learning to begin
 _AGREEMENT = 10.0  # s
 _ROUNDS = 5
+_GROWTH_ROUNDS = 9
+_UPDATES = 2000
+_NOISE = (1e-4, 0.05)  # rad, rad/s, added to the reference to excite every column
+_ANY_EXCITATION = 1e-12  # a threshold that every window passes, short ones and of many columns
 _DURATION = 10.0  # s
 _RUNS = 50  # per round against C
 _CHUNKS = 50  # per round on processes
 _CHUNK = 4  # runs; few, so that the first to finish waits for at most one chunk
-_C_LOOP = 'C -O3, in a loop'
 _CHUNKED = 'run_chunk'
 _READER = 'mcap reader, messages as bytes'
 _ERRORS = ('max_error_ratio', 'rms_error_rad')
@@ -75,7 +77,6 @@ State = Callable[[], tuple[np.ndarray, np.ndarray]]
 CONTROLLER = ControllerConfig()
 PLANT = PlantConfig()
 T = PLANT.sample_time
-_ARM = PLANT.arm
 
 
 class Reference:
@@ -92,8 +93,8 @@ class Reference:
             command = ['cc', *FLAGS, '-shared', '-fPIC', '-o', str(library), str(SOURCE), '-lm']
             subprocess.run(command, check=True)
             self._run = ctypes.CDLL(str(library)).run
-        vectors = [ctypes.c_void_p] * 3
-        self._run.argtypes = (ctypes.c_void_p, ctypes.c_long, ctypes.c_long, *vectors)
+        vector, integer = ctypes.c_void_p, ctypes.c_long
+        self._run.argtypes = (vector, integer, integer, vector, vector, vector)
 
     def rows(self, controller: ControllerConfig, plant: PlantConfig) -> np.ndarray:
         """Return rows (samples, 9) of a noise-free run, without the sample at `duration`."""
@@ -126,14 +127,14 @@ class Reference:
         return run_all
 
     def _call(
-        self, settings: ctypes.Structure, samples: int, settled: int, *vectors: np.ndarray | None
+        self, settings: np.ndarray, samples: int, settled: int, *vectors: np.ndarray | None
     ) -> None:
         addresses = (None if vector is None else vector.ctypes.data for vector in vectors)
-        if self._run(ctypes.byref(settings), samples, settled, *addresses) != 0:
+        if self._run(settings.ctypes.data, samples, settled, *addresses) != 0:
             raise MemoryError
 
 
-def _settings(controller: ControllerConfig, plant: PlantConfig) -> ctypes.Structure:
+def _settings(controller: ControllerConfig, plant: PlantConfig) -> np.ndarray:
     """Lay out `struct settings` of the C file: the same fields in order, integers as long."""
     law = settings_of_config(controller)
     arm, torque, reference = plant.arm, plant.disturbance, controller.reference
@@ -160,16 +161,11 @@ def _settings(controller: ControllerConfig, plant: PlantConfig) -> ctypes.Struct
         'differenced': int(plant.sensor.velocity == 'differenced'),
         'delay': plant.actuator.delay,
     }
-    fields = {
-        name: ctypes.c_long if isinstance(value, int) else ctypes.c_double
+    kinds = [
+        (name, np.int64 if isinstance(value, int) else np.float64, np.shape(value))
         for name, value in values.items()
-    }
-    sizes = {name: len(value) for name, value in values.items() if np.ndim(value)}
-    kinds = [(name, kind * sizes[name] if name in sizes else kind) for name, kind in fields.items()]
-    settings: ctypes.Structure = type('Settings', (ctypes.Structure,), {'_fields_': kinds})(
-        *(tuple(value) if np.ndim(value) else value for value in values.values())
-    )
-    return settings
+    ]
+    return np.array([tuple(values.values())], np.dtype(kinds))
 
 
 def disturbance(t: float) -> np.ndarray:
@@ -204,20 +200,11 @@ def numpy_loop(duration: float) -> np.ndarray:
 
 
 def pinocchio_loop(duration: float) -> np.ndarray:
-    """Run the arm by pinocchio's articulated-body algorithm, a Dormand-Prince step in numpy."""
+    """Run the arm of our URDF by pinocchio's articulated-body algorithm, a DP5 step in numpy."""
     import pinocchio
 
-    model = pinocchio.Model()
-    parent = 0
-    offset = 0.0
-    for name, length, mass in (('joint1', _ARM.l1, _ARM.m1), ('joint2', _ARM.l2, _ARM.m2)):
-        placement = pinocchio.SE3(np.eye(3), np.array([offset, 0.0, 0.0]))
-        parent = model.addJoint(parent, pinocchio.JointModelRZ(), placement, name)
-        tip = np.array([length, 0.0, 0.0])
-        inertia = pinocchio.Inertia(mass, tip, np.zeros((3, 3)))
-        model.appendBodyToJoint(parent, inertia, pinocchio.SE3.Identity())
-        offset = length
-    model.gravity.linear = np.array([0.0, -_ARM.gravity, 0.0])
+    model = pinocchio.buildModelFromUrdf(str(_ROOT / 'config/two_link.urdf'))
+    model.gravity.linear = np.array([0.0, 0.0, -PLANT.arm.gravity])
     data = model.createData()
 
     def acceleration(q: np.ndarray, dq: np.ndarray, torque: np.ndarray) -> np.ndarray:
@@ -227,16 +214,10 @@ def pinocchio_loop(duration: float) -> np.ndarray:
 
 
 def mujoco_loop(duration: float) -> np.ndarray:
-    """Run the arm by MuJoCo's RK4 at the sample time, with the disturbance held over it."""
+    """Run the arm of the example by MuJoCo's RK4 at the sample time, with the disturbance held."""
     import mujoco
 
-    model = mujoco.MjModel.from_xml_string(
-        f"""<mujoco><option timestep="{T}" integrator="RK4" gravity="0 {-_ARM.gravity} 0"/>
-        <worldbody><body><joint axis="0 0 1"/><geom type="sphere" size="0.01" mass="{_ARM.m1}"
-        pos="{_ARM.l1} 0 0" contype="0" conaffinity="0"/><body pos="{_ARM.l1} 0 0"><joint
-        axis="0 0 1"/><geom type="sphere" size="0.01" mass="{_ARM.m2}" pos="{_ARM.l2} 0 0"
-        contype="0" conaffinity="0"/></body></body></worldbody></mujoco>"""
-    )
+    model = mujoco.MjModel.from_xml_path(str(_ROOT / 'examples/mujoco_plant/arm.xml'))
     data = mujoco.MjData(model)
     data.qpos[:] = PLANT.initial.position
     data.qvel[:] = PLANT.initial.velocity
@@ -248,9 +229,7 @@ def mujoco_loop(duration: float) -> np.ndarray:
     return run(duration, lambda: (data.qpos.copy(), data.qvel.copy()), step)
 
 
-def _integrated(
-    duration: float, acceleration: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-) -> np.ndarray:
+def _integrated(duration: float, acceleration: Callable[..., np.ndarray]) -> np.ndarray:
     x = np.concatenate((PLANT.initial.position, PLANT.initial.velocity))
     k = np.zeros((6, 4))
 
@@ -281,8 +260,20 @@ _PEERS = {
 
 def measure() -> Iterator[Ratio]:
     """Measure the time per simulated millisecond against C and, where installed, the peers."""
-    yield from _beside_c()
-    yield from _beside_peers()
+    reference, plant = Reference(), replace(PLANT, duration=_LONG)
+    contestants = {PACKAGE: _package(_LONG), C: lambda: len(reference.rows(CONTROLLER, plant))}
+    times = interleaved(contestants, 4 * _ROUNDS)  # short rounds
+    note = f'largest difference {disagreement():.0e}'
+    yield ratio('closed loop offline', PACKAGE, C, times[PACKAGE], times[C], note)
+
+    contestants = {PACKAGE: _package(_SHORT)}
+    for name, (module, loop, _) in _PEERS.items():
+        if importlib.util.find_spec(module) is not None:
+            contestants[name] = partial(lambda loop: len(loop(_SHORT)), loop)
+    times = interleaved(contestants, _ROUNDS)
+    for name in [*contestants][1:]:
+        note = _PEERS[name][2]
+        yield ratio('closed loop offline', name, PACKAGE, times[name], times[PACKAGE], note)
 
 
 def disagreement() -> float:
@@ -300,42 +291,28 @@ def _package(duration: float) -> Callable[[], int]:
     return lambda: simulate(CONTROLLER, plant, supervised=False).stamps.size
 
 
-def _beside_c() -> Iterator[Ratio]:
-    reference = Reference()
-    plant = replace(PLANT, duration=_LONG)
-    contestants = {
-        PACKAGE: _package(_LONG),
-        C: lambda: len(reference.rows(CONTROLLER, plant)),
-    }
-    times = interleaved(contestants, 4 * _ROUNDS)  # short rounds
-    yield ratio(
-        'closed loop offline',
-        PACKAGE,
-        C,
-        times[PACKAGE],
-        times[C],
-        f'largest difference {disagreement():.0e}',
-    )
-
-
-def _beside_peers() -> Iterator[Ratio]:
-    contestants = {PACKAGE: _package(_SHORT)}
-    notes = {}
-    for name, (module, loop, note) in _PEERS.items():
-        if importlib.util.find_spec(module) is not None:
-            contestants[name] = partial(lambda loop: len(loop(_SHORT)), loop)
-            notes[name] = note
-    times = interleaved(contestants, _ROUNDS)
-    for name, note in notes.items():
-        yield ratio('closed loop offline', name, PACKAGE, times[name], times[PACKAGE], note)
-
-
 def measure_study() -> Iterator[Ratio]:
     """Measure runs per second relative to C, and to one process."""
     study = preset()
     warm_up(study)
-    yield from _study_beside_c(study)
-    yield from _processes(study)
+    reference = _reference_of(study)
+    with runs.processes(1) as single, runs.processes(2) as double:
+        pairs: dict[str, dict[str, Callable[[], int]]] = {
+            f'{_CHUNKED}: runs a second, of a core': {
+                _CHUNKED: lambda: run_chunk(study, 0, _RUNS)['run'].size,
+                'C -O3, in a loop': lambda: len(reference()),
+            },
+            'two processes: runs a second': {
+                'two': partial(_computed, study, double),
+                'one process': partial(_computed, study, single),
+            },
+        }
+        for what, contestants in pairs.items():
+            mine, theirs = (1.0 / times for times in interleaved(contestants, _ROUNDS).values())
+            note = f'{np.median(mine):.0f} runs of {_DURATION:g} s a second here'
+            if _CHUNKED in what:
+                note += f'; errors differ by at most {study_disagreement(study):.0e} of themselves'
+            yield ratio('monte carlo', what, [*contestants][1], mine, theirs, note)
 
 
 def preset() -> Study:
@@ -358,41 +335,13 @@ def study_disagreement(study: Study) -> float:
 
 
 def _reference_of(study: Study) -> Callable[[], np.ndarray]:
-    origin = origin_of(controller_of(study.controller))
-    plants = [plant_with(study, random_numbers(study, run), origin) for run in range(_RUNS)]
+    plants = [plant_with(study, draw(study, run)) for run in range(_RUNS)]
     return Reference().study(study.controller, plants, study.settings.settled_after)
 
 
-def _study_beside_c(study: Study) -> Iterator[Ratio]:
-    reference = _reference_of(study)
-    contestants = {
-        _CHUNKED: lambda: run_chunk(study, 0, _RUNS)['run'].size,
-        _C_LOOP: lambda: len(reference()),
-    }
-    rates = {name: 1.0 / times for name, times in interleaved(contestants, _ROUNDS).items()}
-    note = (
-        f'{np.median(rates[_CHUNKED]):.0f} runs of {_DURATION:g} s a second here; '
-        f'errors differ by at most {study_disagreement(study):.0e} of themselves'
-    )
-    what = f'{_CHUNKED}: runs a second, of a core'
-    yield ratio('monte carlo', what, _C_LOOP, rates[_CHUNKED], rates[_C_LOOP], note)
-
-
-def _processes(study: Study) -> Iterator[Ratio]:
-    with runs.processes(1) as one_process, runs.processes(2) as two_processes:
-        contestants = {
-            'one': partial(_computed, study, one_process),
-            'two': partial(_computed, study, two_processes),
-        }
-        single, double = interleaved(contestants, _ROUNDS).values()
-    note = f'{np.median(1.0 / double):.0f} runs a second here; the pools were started before'
-    what = 'two processes: runs a second'
-    yield ratio('monte carlo', what, 'one process', 1.0 / double, 1.0 / single, note)
-
-
 def _computed(study: Study, executor: Executor) -> int:
-    spans = [Span(k * _CHUNK, _CHUNK) for k in range(_CHUNKS)]
-    runs.compute(study, spans, executor, 6, lambda *_: None)
+    chunks = [range(k * _CHUNK, (k + 1) * _CHUNK) for k in range(_CHUNKS)]
+    runs.compute(study, chunks, executor, 6, lambda *_: None)
     return _CHUNK * _CHUNKS
 
 
@@ -415,11 +364,11 @@ def measure_replay() -> Iterator[Ratio]:
             'messages read and decoded': lambda: sum(read_content(bag).message_counts.values()),
             'bag replayed through the law and compared': replayed,
         }
-        times = interleaved(contestants, _ROUNDS)
+        rates = {name: 1.0 / times for name, times in interleaved(contestants, _ROUNDS).items()}
     for name in [*contestants][1:]:
-        note = f'{1e-3 / np.median(times[name]):.0f} thousand messages a second here'
+        note = f'{1e-3 * np.median(rates[name]):.0f} thousand messages a second here'
         what = f'{name}: messages a second'
-        yield ratio('replay', what, _READER, 1.0 / times[name], 1.0 / times[_READER], note)
+        yield ratio('replay', what, _READER, rates[name], rates[_READER], note)
 
 
 def _iterated(bag: Path) -> int:
@@ -427,3 +376,70 @@ def _iterated(bag: Path) -> int:
     (file,) = bag.glob('*.mcap')
     with file.open('rb') as stream:
         return sum(1 for _ in make_reader(stream).iter_messages(log_time_order=False))
+
+
+def learning(name: str, **changes: Any) -> ControllerConfig:
+    """Return the controller of a preset, which learns from any window."""
+    values = {
+        'learning.excitation_threshold': _ANY_EXCITATION,
+        'learning.change_detection': False,  # the states are noise, which no arm explains
+    }
+    return change(load_loop(name).controller, values | changes)
+
+
+def label(config: ControllerConfig) -> str:
+    """Describe the size of the problem; its p counts all estimates, the m of the law."""
+    law = controller_of(config).settings
+    columns = f'{law.p} of the arm + {law.m - law.p} of disturbances'
+    return f'n = {law.n} joints, p = {law.m} unknowns ({columns})'
+
+
+def updates(config: ControllerConfig) -> Callable[[], int]:
+    """Return a function that does some thousand updates along the reference with a full window.
+
+    Raises RuntimeError if nothing is learned from that window.
+    """
+    controller = controller_of(config)
+    law = controller.settings
+    full = round(law.learning_start / T) + law.window + law.interval
+    ahead = full + (_GROWTH_ROUNDS + 1) * _UPDATES
+    reference = sampled(controller.reference_vector, T * np.arange(ahead + 1))
+    noise = np.random.default_rng(0).standard_normal((ahead + 1, 2, law.n))
+    states = np.zeros((ahead + 1, 3, law.n))
+    states[:, :2] = reference[:, :2] + noise * np.array(_NOISE)[:, np.newaxis]
+    clock = itertools.count()
+
+    def update(count: int) -> int:
+        for k in itertools.islice(clock, count):
+            controller.update(k * T, T, states[k].ravel())
+        return count
+
+    update(full)
+    if not controller.sample.latched[0] or not np.isfinite(controller.state_vector).all():
+        raise RuntimeError(f'{label(config)}: nothing is learned from the window')
+    return lambda: update(_UPDATES)
+
+
+def measure_growth() -> Iterator[Ratio]:
+    """Measure the time per update relative to the two-link arm's, once the window is full."""
+    tones = {'learning.viscous': True, 'learning.frequencies': [1.0, 2.0]}
+    arms = {'two links': learning('recommended', **tones)}
+    arms |= {name: learning(name) for name in ('panda', 'ur5e')}
+    groups = {
+        'joints and unknowns': {f'{name}: {label(law)}': law for name, law in arms.items()},
+        'window': {
+            f'window of {n} samples': learning('recommended', **{'learning.window': n * T})
+            for n in (100, 100_000)
+        },
+    }
+    for group, configs in groups.items():
+        contestants = {_TWO_LINKS: updates(learning('recommended'))}
+        contestants |= {name: updates(config) for name, config in configs.items()}
+        times = interleaved(contestants, _GROWTH_ROUNDS)
+        for name, config in configs.items():
+            memory = controller_of(config).state_vector.nbytes / 1e6
+            update = 1e6 * np.median(times[name])
+            note = f'{update:.1f} us an update here, {memory:.1f} MB of state'
+            yield ratio(
+                f'growth with {group}', name, _TWO_LINKS, times[name], times[_TWO_LINKS], note
+            )

@@ -19,7 +19,7 @@ import numpy as np
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.simulation.loop import START, Record, simulate
-from blf_dsc_controller.simulation.metrics import another_motion, torque_error, torque_rows
+from blf_dsc_controller.studies.runs import another_motion, torque_error, torque_rows
 from blf_dsc_controller.supervision.guard import Guard
 
 PRESETS = ('panda', 'ur5e')
@@ -66,7 +66,7 @@ def in_mujoco(name: str, seed: int, changes: Mapping[str, Any]) -> np.ndarray:
     guard.activate()
     errors = np.zeros(17_000)
     for k in range(errors.size):
-        arm.step(guard.update(START + k * 1_000_000, np.concatenate(arm.measure(), axis=None)))
+        arm.step(guard.update(START + k * 1_000_000, arm.measure()))
         errors[k] = 1e3 * np.abs(guard.controller.sample.xi1).max()
     return errors
 

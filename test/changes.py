@@ -30,11 +30,7 @@ def push(joint, torque, seconds, begin=CHANGED):
     """Return parameters of a plant with a torque [N m] on a joint for some seconds."""
     torques = [0.0, 0.0]
     torques[joint] = torque
-    return {
-        'events.begin': [begin],
-        'events.duration': [seconds],
-        'events.torque': torques,
-    }
+    return {'events.begin': [begin], 'events.duration': [seconds], 'events.torque': torques}
 
 
 def several(*events):
@@ -86,19 +82,24 @@ def allowed(row, without):
     return np.maximum(1.3 * without, GENTLE if 'events.ramp' in row else 0.0)
 
 
+def _times(row):
+    """Return begin, duration and ramp of each event of a row [s]."""
+    begin = np.array(row['events.begin'])
+    return begin, *(
+        np.array(row.get(f'events.{name}', 0.0 * begin)) for name in ('duration', 'ramp')
+    )
+
+
 def begin_of(row):
     """Return the time of the first change of a row after its start [s]."""
-    begin = np.array(row['events.begin'])
-    times = np.concatenate([begin, begin + row.get('events.duration', 0.0 * begin)])
+    begin, duration, _ = _times(row)
+    times = np.concatenate([begin, begin + duration])
     return float(times[times > 0.0].min())
 
 
 def end_of(row):
     """Return the time two windows after the last change of a row [s], in whole samples."""
-    begin = np.array(row['events.begin'])
-    duration = np.array(row.get('events.duration', 0.0 * begin))
-    ramp = np.array(row.get('events.ramp', 0.0 * begin))
-    return round(float(np.max(begin + duration + ramp)) + 2.0 * WINDOW, 3)
+    return round(float(np.max(sum(_times(row)))) + 2.0 * WINDOW, 3)
 
 
 def run(duration, plant=None, *, preset='recommended', law=None):

@@ -116,13 +116,9 @@ class Record(NamedTuple):
 
 def record(law: Controller, arm: Plant, duration: float) -> Record:
     """Run a loop and record what the tests need."""
+    signals, state = law.signals, law.state
     rows = [
-        (
-            sample.t,
-            law.signals.xi1.copy(),
-            law.signals.torque.copy(),
-            law.state.estimate.copy(),
-        )
+        (sample.t, signals.xi1.copy(), signals.torque.copy(), state.estimate.copy())
         for sample in closed_loop(law, arm, duration)
     ]
     return Record(*map(np.array, zip(*rows, strict=True)))

@@ -17,7 +17,6 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.reference import terms
 from blf_dsc_controller.reference.approach import reference_of
-from blf_dsc_controller.simulation.metrics import torque_rows
 from blf_dsc_controller.studies import arms as study
 from blf_dsc_controller.studies import laws
 from blf_dsc_controller.studies.arms import ROUGHEST, Result, cost_of, table_of, trial
@@ -32,6 +31,7 @@ from blf_dsc_controller.studies.laws import (
     run,
     simulate_with,
 )
+from blf_dsc_controller.studies.runs import torque_rows
 
 IDEAL = {
     'truth.mass_deviation': 0.0,
@@ -97,25 +97,20 @@ def test_computed_torque_with_the_true_model_follows_a_moving_reference():
     assert np.ptp(torques, axis=0).max() > 5.0
 
 
-def resting(gains, **plant):
-    start = {'initial.position': list(HOLD)}
-    loop = ideal(1e-3, 3.0, REST, **start | plant)
-    return joint_inertia(loop.controller), simulate_with(loop, pd_gravity, gains, friction=False)
-
-
-def test_gravity_compensation_holds_the_arm_at_rest():
-    _, (errors, torques) = resting({})
-    assert np.abs(errors).max() < 1e-10  # rad, from rounding
-    assert np.abs(torques[0]).max() > 10.0
-
-
-def test_integrator_removes_the_static_error_of_a_push():
+def test_gravity_compensation_holds_the_arm_and_the_integrator_removes_the_error_of_a_push():
     push = np.array([3.0, -2.0, 1.0, 0.3, -0.2, 0.1])  # N m
     gains = {'position': 900.0, 'velocity': 50.0}
-    inertia, (errors, _) = resting(gains, **{'load.torque': push.tolist()})
-    np.testing.assert_allclose(errors[-1], push / (900.0 * inertia), rtol=1e-2)
-    _, (integrated, _) = resting(gains | {'integral': 5000.0}, **{'load.torque': push.tolist()})
-    assert np.all(np.abs(integrated[-1]) < 1e-3 * np.abs(errors[-1]))
+    found = []
+    for given, torque in (({}, 0.0 * push), (gains, push), (gains | {'integral': 5000.0}, push)):
+        start = {'initial.position': list(HOLD), 'load.torque': torque.tolist()}
+        loop = ideal(1e-3, 3.0, REST, **start)
+        found.append(simulate_with(loop, pd_gravity, given, friction=False))
+    (resting, torques), (pushed, _), (integrated, _) = found
+    assert np.abs(resting).max() < 1e-10  # rad, from rounding
+    assert np.abs(torques[0]).max() > 10.0
+    static = push / (900.0 * joint_inertia(loop.controller))
+    np.testing.assert_allclose(pushed[-1], static, rtol=1e-2)
+    assert np.all(np.abs(integrated[-1]) < 1e-3 * np.abs(pushed[-1]))
 
 
 def test_known_friction_is_compensated_along_the_reference():
@@ -238,7 +233,7 @@ def test_file_without_a_usable_law_is_rejected(tmp_path, capsys):
     taken = f"{IMPORT}CONTENDERS = {{'pd_gravity': Contender('mine')}}"
     for name, text, problem in (
         ('missing.py', None, 'expected a law of the study (proposed, '),
-        ('law.txt', '', 'should end in .py'),
+        ('json.py', '', 'there is another module of this name'),
         ('broken.py', '1 / 0', 'cannot be imported: ZeroDivisionError'),
         ('empty.py', '', 'CONTENDERS must be a dict of Contender by name'),
         ('taken.py', taken, 'has a law pd_gravity already'),

@@ -31,13 +31,12 @@ from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies import runs as engines
 from blf_dsc_controller.studies.report import (
     influence,
-    plant_of_run,
     reproduce,
     summarize,
     worst_first,
     write_report,
 )
-from blf_dsc_controller.studies.runs import Span, Store, chunk_size, compute, run_chunk, warm_up
+from blf_dsc_controller.studies.runs import Store, chunk_size, compute, run_chunk, warm_up
 
 
 @pytest.fixture(scope='module')
@@ -52,15 +51,8 @@ def undisturbed(a_study):
     return whole(a_study)
 
 
-def spans(size):
-    return [Span(first, min(size, RUNS - first)) for first in range(0, RUNS, size)]
-
-
-def joined(parts):
-    """Results of all chunks in the order of the runs."""
-    assert sorted(parts) == sorted(set(parts))
-    chunks = [parts[span] for span in sorted(parts)]
-    return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
+def chunks(size):
+    return [range(first, min(first + size, RUNS)) for first in range(0, RUNS, size)]
 
 
 def local_dask():
@@ -81,36 +73,37 @@ def local_dask():
 def test_every_executor_gives_the_same_results(a_study, undisturbed, make, size):
     parts = {}
     with make() as executor:
-        compute(a_study, spans(size), executor, 3, parts.__setitem__)
-    assert same(joined(parts), undisturbed)
+        compute(a_study, chunks(size), executor, 3, parts.__setitem__)
+    found = [parts[runs] for runs in chunks(size)]
+    assert same({name: np.concatenate([c[name] for c in found]) for name in found[0]}, undisturbed)
 
 
 def test_killed_worker_is_named_and_what_was_kept_is_complete(a_study, undisturbed):
     parts = {}
     with engines.processes(2) as executor:
 
-        def keep(span, columns):
+        def keep(runs, columns):
             if not parts:
                 os.kill(next(iter(executor._processes)), signal.SIGKILL)
-            parts[span] = columns
+            parts[runs] = columns
 
         with pytest.raises(BlfDscError, match=r'a worker was lost .* The same command resumes'):
-            compute(a_study, spans(1), executor, 4, keep)
+            compute(a_study, chunks(1), executor, 4, keep)
     assert 1 <= len(parts) < RUNS
-    for span, columns in parts.items():
-        assert columns['rms_error_rad.joint1'] == undisturbed['rms_error_rad.joint1'][span.first]
+    for runs, columns in parts.items():
+        assert columns['rms_error_rad.joint1'] == undisturbed['rms_error_rad.joint1'][runs.start]
 
 
 def test_error_in_a_run_is_not_taken_for_a_lost_worker(a_study):
     with ThreadPoolExecutor(2) as executor, pytest.raises(ZeroDivisionError):
-        compute(a_study, spans(1), executor, 6, lambda *_: 1 / 0)
+        compute(a_study, chunks(1), executor, 6, lambda *_: 1 / 0)
 
 
-@pytest.mark.parametrize(('runs', 'workers'), [(1, 8), (10_000, 2), (10**8, 64)])
-def test_chunks_are_few_but_enough_for_all_workers(runs, workers):
-    size = chunk_size(runs, workers)
-    assert 1 <= size <= 1000  # a crash costs about ten seconds of work
-    assert runs / size >= min(runs, 20 * workers)
+def test_chunks_are_few_but_enough_for_all_workers():
+    for runs, workers in ((1, 8), (10_000, 2), (10**8, 64)):
+        size = chunk_size(runs, workers)
+        assert 1 <= size <= 1000  # a crash costs about ten seconds of work
+        assert runs / size >= min(runs, 20 * workers)
 
 
 TIMEOUT = 300.0  # s; the machine may be busy, and kernels may have to be compiled
@@ -123,7 +116,7 @@ def store(tmp_path):
 
 def filled(store, *ranges):
     for first, runs in ranges:
-        store.keep(Span(first, runs), run_chunk(store.study, first, runs))
+        store.keep(range(first, first + runs), run_chunk(store.study, first, runs))
     return store
 
 
@@ -153,17 +146,8 @@ def processes_with(mark):
 def test_killed_study_resumes(tmp_path):
     loop = LOOP.replace('duration: 0.3', 'duration: 3.0')
     path, out = write(tmp_path, loop + STUDY), tmp_path / 'out'
-    command = [
-        sys.executable,
-        '-m',
-        'blf_dsc_controller',
-        'monte-carlo',
-        '--config',
-        path,
-        '--out',
-        out,
-    ]
-    command += ['--workers', '2', '--chunk', '1']
+    command = [sys.executable, '-m', 'blf_dsc_controller', 'monte-carlo', '--config', path]
+    command += ['--out', out, '--workers', '2', '--chunk', '1']
     mark = str(uuid.uuid4())
     # What a killed process leaves goes with the logs of the suite.
     marked = {**os.environ, 'MARK': mark, 'TMPDIR': os.environ['ROS_LOG_DIR']}
@@ -191,21 +175,15 @@ def test_killed_study_resumes(tmp_path):
 
 def test_missing_runs_are_found_between_completed_ones(store):
     filled(store, (3, 4), (10, 1))
-    assert store.done() == [Span(3, 4), Span(10, 1)]
     missing = store.missing(5)
-    assert missing[:3] == [Span(0, 3), Span(7, 3), Span(11, 5)]
-    runs = [i for first, count in missing for i in range(first, first + count)]
-    assert sorted([*runs, 3, 4, 5, 6, 10]) == list(range(RUNS))
+    assert missing[:3] == [range(3), range(7, 10), range(11, 16)]
+    assert sorted([*(run for runs in missing for run in runs), 3, 4, 5, 6, 10]) == [*range(RUNS)]
 
 
 def test_results_can_be_read_with_pyarrow_alone(store):
     filled(store, (12, 12), (0, 12))
-    table = pyarrow.parquet.read_table(store.folder / 'runs')
-    assert table['run'].to_pylist() == list(range(RUNS))
-    expected = whole(store.study)
-    assert table.column_names == list(expected)
-    assert table['outcome'].to_pylist() == expected['outcome'].tolist()
-    assert table['plant.arm.m2'].to_pylist() == expected['plant.arm.m2'].tolist()
+    table, expected = pyarrow.parquet.read_table(store.folder / 'runs'), whole(store.study)
+    assert same({name: table[name].to_numpy() for name in table.column_names}, expected)
     assert same(store.results(), expected)
 
 
@@ -213,7 +191,6 @@ def test_other_study_or_version_is_rejected_and_the_difference_is_named(
     tmp_path, store, monkeypatch
 ):
     for before, after, difference in (
-        ('runs: 24', 'runs: 25', r'monte_carlo.runs: there 24, here 25'),
         ('m2: uniform(0.3', 'm2: uniform(0.2', r'arm.m2: there uniform\(0.3, 0.7\), here uniform'),
         ('arm.m2', 'arm.m1', r'arm.m2: there uniform\(0.3, 0.7\), here nothing'),
         ('duration: 0.3', 'duration: 0.4', r'sim_plant.duration: there 0.3, here 0.4'),
@@ -233,10 +210,8 @@ def test_folder_without_a_study_is_left_alone(tmp_path, capsys):
     out = tmp_path / 'thesis'
     out.mkdir()
     (out / 'chapter1.txt').write_text('In the beginning')
-    with pytest.raises(BlfDscError, match='holds no study'):
-        Store.create_or_open(out, study(tmp_path))
     assert main(['monte-carlo', '--config', str(write(tmp_path)), '--out', str(out)]) == 1
-    assert 'choose another folder' in capsys.readouterr().err
+    assert 'holds no study: choose another folder' in capsys.readouterr().err
     assert [path.name for path in out.iterdir()] == ['chapter1.txt']
 
 
@@ -251,7 +226,7 @@ def test_folder_is_locked_and_a_damaged_file_in_it_is_named(store):
         filled(store, (0, 2))
     (part,) = (store.folder / 'runs').iterdir()
     part.write_bytes(part.read_bytes()[:-20])
-    with pytest.raises(BlfDscError, match=f'{part.name} cannot be read .*remove it'):
+    with pytest.raises(BlfDscError, match=f'cannot be read .*{part.name}.*remove'):
         store.results()
 
 
@@ -259,7 +234,7 @@ def test_folder_is_locked_and_a_damaged_file_in_it_is_named(store):
 def whole_store(tmp_path_factory):
     folder = tmp_path_factory.mktemp('study')
     created = Store.create_or_open(folder / 'my study', study(folder))
-    created.keep(Span(0, RUNS), whole(created.study))
+    created.keep(range(RUNS), whole(created.study))
     return created
 
 
@@ -302,24 +277,20 @@ def test_influence_detects_that_both_ends_are_bad(whole_store):
 
 def test_report_is_written(whole_store):
     summary, written = write_report(whole_store)
-    assert [path.name for path in written] == [
-        'report.html',
-        'distributions.png',
-        'influence.png',
-        'summary.json',
-    ]
+    assert [path.name for path in written] == ['report.html', 'distributions.png', 'summary.json']
     assert json.loads((whole_store.folder / 'summary.json').read_text()) == summary
     results = whole_store.results()
     kept = int((results['outcome'] == 'kept').sum())
     text = (whole_store.folder / 'report.html').read_text()
     assert f'({kept} of 24; 95 % confidence:' in text
-    assert text.count('src="data:image/png;base64,') == 2
-    for picture in ('distributions.png', 'influence.png'):
-        assert matplotlib.image.imread(whole_store.folder / picture).shape[1] > 1200
+    assert text.count('src="data:image/png;base64,') == 1
+    assert matplotlib.image.imread(written[1]).shape[1] > 1200
 
 
 @pytest.mark.usefixtures('blank_pictures')
-def test_commands_in_the_report_reproduce_the_worst_runs(whole_store, tmp_path, monkeypatch):
+def test_commands_in_the_report_reproduce_the_worst_runs(
+    whole_store, tmp_path, monkeypatch, capsys
+):
     write_report(whole_store)
     page = html.unescape((whole_store.folder / 'report.html').read_text())
     commands = re.findall(r'>blf_dsc (monte-carlo --reproduce .*?)<', page)
@@ -338,11 +309,12 @@ def test_commands_in_the_report_reproduce_the_worst_runs(whole_store, tmp_path, 
     np.testing.assert_allclose(peak, expected, rtol=1e-15)
     # The run can also be repeated from its configuration.
     loop = load_loop(out / 'config.yaml')
-    assert loop.plant == plant_of_run(whole_store.study, run)
     again = simulate(loop.controller, loop.plant, supervised=False)
     np.testing.assert_array_equal(again.measurements[:, :2], bag.position)
-    # An existing folder is not overwritten.
+    # An existing folder is not overwritten, and there are no more runs.
     assert main(arguments) == 1
+    assert main([*arguments[:3], '24']) == 1
+    assert 'has no run 24' in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures('blank_pictures')
@@ -351,7 +323,7 @@ def test_run_that_differs_from_its_stored_results_is_reported(whole_store, tmp_p
     other = Store.create_or_open(folder, whole_store.study)
     results = whole_store.results()
     results['max_error_ratio.joint2'] = np.nextafter(results['max_error_ratio.joint2'], 2.0)
-    other.keep(Span(0, RUNS), results)
+    other.keep(range(RUNS), results)
     (tmp_path / 'run').mkdir()
     with pytest.raises(BlfDscError, match=r'run 4 differs .*\n.*max_error_ratio.joint2'):
         reproduce(other, 4, tmp_path / 'run')
@@ -377,20 +349,14 @@ def test_pairs_are_compared_and_exceptions_are_reproduced(tmp_path, capsys):
     assert summarize(a_study, results)['pairs']['factor']['max'] is None
 
     pairs_store = Store.create_or_open(tmp_path / 'pairs', a_study)
-    pairs_store.keep(Span(0, 4), truth)
+    pairs_store.keep(range(4), truth)
     reproduce(pairs_store, 2, make_folder(tmp_path / 'run'))
     for folder in (tmp_path / 'run', tmp_path / 'run/without_learning'):
         assert (folder / 'bag').is_dir()
     assert load_loop(tmp_path / 'run/without_learning/config.yaml').controller.learning.weight == 0
-    pairs_store.keep(Span(0, 4), results)
+    pairs_store.keep(range(4), results)
     assert main(['monte-carlo', '--report', str(tmp_path / 'pairs')]) == 0
     assert '1 broke it only with learning, 1 only without' in capsys.readouterr().out
     page = html.unescape((tmp_path / 'pairs/report.html').read_text())
     assert 'breaks the bound only with learning' in page
     assert 'largest error more than 1.3 times' in page
-
-
-def test_missing_run_is_reported(whole_store, tmp_path, capsys):
-    out = str(tmp_path / 'run')
-    assert main(['monte-carlo', '--reproduce', str(whole_store.folder), '24', '--out', out]) == 1
-    assert 'has no run 24' in capsys.readouterr().err

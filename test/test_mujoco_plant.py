@@ -15,8 +15,6 @@ pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
 
 from plain_law import dynamics
 from plants import commands
-from plants import run as measurements
-from ros_rig import RosRig
 from test_plant_events import ALL_KINDS
 
 from blf_dsc_controller.configuration.nodes import load_loop
@@ -74,27 +72,19 @@ def test_mujoco_arm_has_the_inertia_and_gravity_of_the_model(example):
 def test_events_move_it_like_the_simulated_plant(example, kind, tolerance):
     names = ('events.begin', 'events.duration', 'events.ramp', f'events.{kind}', f'{kind}.')
     given = {name: value for name, value in ALL_KINDS.items() if name.startswith(names)}
-    ours, without = (simulated_angles(events) for events in (given, {}))
-    theirs = angles_of(example.MujocoArm(build(PlantConfig, given)))
+    ours, theirs, without = (
+        measured(make(build(PlantConfig, events)), commands(200))[:, :2]
+        for make, events in ((plant_of, given), (example.MujocoArm, given), (plant_of, {}))
+    )
     np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=tolerance)
     assert np.abs(ours - without).max() > 3.0 * tolerance
-
-
-def simulated_angles(given):
-    """Measured angles (200, 2) of the simulated plant under the usual torques."""
-    return measurements(plant_of(build(PlantConfig, given)), commands(200))[:, :2]
-
-
-def angles_of(arm):
-    """Measured angles (200, 2) of the MuJoCo arm under the same torques."""
-    return measured(arm, commands(200))[:, :2]
 
 
 def measured(arm, torques):
     """Measurements (samples, 3 n) of either arm under these torques."""
     rows = []
     for torque in torques:
-        rows.append(np.concatenate(arm.measure(), axis=None))
+        rows.append(arm.measure().copy())
         arm.step(torque)
     return np.array(rows)
 
@@ -126,26 +116,33 @@ def test_urdf_arm_moves_like_the_simulated_plant(example, name):
     given = URDFS[name] | REAL
     n = len(build(PlantConfig, given).joints)
     given['disturbance.viscous'] = [1.0] * n
-    theirs, ours = (swing(make, given) for make in (example.MujocoArm, plant_of))
+    theirs, ours, without = swings(example, given, URDFS[name])
     np.testing.assert_allclose(theirs[:, :n], ours[:, :n], rtol=0.0, atol=1e-5)
     np.testing.assert_allclose(theirs[:, n : 2 * n], ours[:, n : 2 * n], rtol=0.0, atol=1e-2)
     np.testing.assert_array_equal(theirs[:, 2 * n :], ours[:, 2 * n :])
-    assert np.abs(ours - swing(plant_of, URDFS[name]))[:, :n].max() > 0.05
+    assert np.abs(ours - without)[:, :n].max() > 0.05
 
 
 @pytest.mark.parametrize(
-    ('given', 'tolerance'),  # rad, after 0.3 s
+    ('name', 'value', 'tolerance'),  # rad, after 0.3 s
     [
-        ({'actuator.ripple': 0.01}, 4e-4),  # held over a sample here
-        ({'disturbance.stribeck': 0.5, 'disturbance.coulomb': [1.0] * 7}, 4e-3),  # dry here
+        ('actuator.ripple', 0.01, 4e-4),  # held over a sample here
+        ('disturbance.stribeck', 0.5, 4e-3),  # dry here
     ],
 )
-def test_ripple_and_stribeck_friction_match_the_simulated_plant(example, given, tolerance):
-    _, *others = given.items()
-    without = URDFS['panda'] | dict(others)
-    theirs, ours = (swing(make, without | given) for make in (example.MujocoArm, plant_of))
-    np.testing.assert_allclose(theirs[:, :7], ours[:, :7], rtol=0.0, atol=tolerance)
-    assert np.abs(ours - swing(plant_of, without))[:, :7].max() > 3.0 * tolerance
+def test_ripple_and_stribeck_friction_match_the_simulated_plant(example, name, value, tolerance):
+    arm = URDFS['panda'] | ({'disturbance.coulomb': [1.0] * 7} if 'stribeck' in name else {})
+    theirs, ours, without = (each[:, :7] for each in swings(example, arm | {name: value}, arm))
+    np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=tolerance)
+    assert np.abs(ours - without).max() > 3.0 * tolerance
+
+
+def swings(example, given, without):
+    """Measurements (300, 3 n) with all joints swinging: of both arms, and of ours without."""
+    t = 1e-3 * np.arange(300)[:, None]
+    for make, values in ((example.MujocoArm, given), (plant_of, given), (plant_of, without)):
+        config = build(PlantConfig, values)
+        yield measured(make(config), 0.1 * np.sin(20.0 * t) * config.actuator.torque_limit)
 
 
 def test_closed_loop_runs_the_same_with_both_plants(example):
@@ -166,30 +163,19 @@ def close_loop(config, arm, samples):
     guard.activate()
     rows = []
     for k in range(samples):
-        measurement = np.concatenate(arm.measure(), axis=None)
-        rows.append(measurement[: len(config.joints)])
+        measurement = arm.measure()
+        rows.append(measurement[: len(config.joints)].copy())
         arm.step(guard.update(START + k * 1_000_000, measurement))
     assert guard.supervisor.phase is Phase.TRACKING
     return np.array(rows)
 
 
-def swing(make, given):
-    """Measurements (300, 3 n) of an arm whose joints all swing."""
-    config = build(PlantConfig, given)
-    t = 1e-3 * np.arange(300)[:, None]
-    return measured(make(config), 0.1 * np.sin(20.0 * t) * config.actuator.torque_limit)
-
-
-def test_controller_keeps_the_bound_and_learns_the_parameters(example):
-    ros = RosRig()
-    try:
-        law = ros.add(ControllerNode, telemetry__enabled=False)
-        arm = ros.add(example.MujocoPlant)
-        ros.until(lambda: arm.steps >= 8000 or law.guard.supervisor.text)
-        assert law.guard.supervisor.phase is Phase.TRACKING, law.guard.supervisor.text
-        assert law.guard.samples.ratio.max() < 1.0
-        # Learning begins after 6.8 s, with half of each parameter missing; a second later an error
-        # of 0.1 % is left with our own plant, which holds its torque the same way.
-        np.testing.assert_allclose(law.guard.controller.state.estimate[:3], P, rtol=0.01)
-    finally:
-        ros.close()
+def test_controller_keeps_the_bound_and_learns_the_parameters(example, ros):
+    law = ros.add(ControllerNode, telemetry__enabled=False)
+    arm = ros.add(example.MujocoPlant)
+    ros.until(lambda: arm.steps >= 8000 or law.guard.supervisor.text)
+    assert law.guard.supervisor.phase is Phase.TRACKING, law.guard.supervisor.text
+    assert law.guard.samples.ratio.max() < 1.0
+    # Learning begins after 6.8 s, with half of each parameter missing; a second later an error
+    # of 0.1 % is left with our own plant, which holds its torque the same way.
+    np.testing.assert_allclose(law.guard.controller.state.estimate[:3], P, rtol=0.01)

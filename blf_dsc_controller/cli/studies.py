@@ -27,7 +27,7 @@ from blf_dsc_controller.studies.report import (
     reproduce_command,
     write_report,
 )
-from blf_dsc_controller.studies.runs import KEPT, Columns, Span, Store, require_pyarrow, warm_up
+from blf_dsc_controller.studies.runs import KEPT, Columns, Store, require_pyarrow, warm_up
 
 _PAUSE_IN_A_LOG = 10.0  # s between two updates of the bar
 _AHEAD = 3  # chunks submitted for each worker
@@ -77,35 +77,35 @@ def _run_study(options: Namespace) -> None:
     store = Store.create_or_open(options.out or Path('monte_carlo'), study)
     with store.locked():
         workers = options.workers or runs.cores()
-        spans = store.missing(options.chunk or runs.chunk_size(study.settings.runs, workers))
-        if spans:
+        chunks = store.missing(options.chunk or runs.chunk_size(study.settings.runs, workers))
+        if chunks:
             with announced_compilation(print_notice):
                 warm_up(study)
             is_dask = options.engine == 'dask'
             engine = runs.dask(workers, options.address) if is_dask else runs.processes(workers)
             with engine as executor:  # how many workers a cluster has may change
                 most = _AHEAD_OF_A_CLUSTER if options.address else _AHEAD * workers
-                _compute(store, spans, executor, most)
+                _compute(store, chunks, executor, most)
         _report(store)
 
 
-def _compute(store: Store, spans: list[Span], executor: Executor, most: int) -> None:
+def _compute(store: Store, chunks: list[range], executor: Executor, most: int) -> None:
     total = store.study.settings.runs
-    done = total - sum(span.runs for span in spans)
+    done = total - sum(map(len, chunks))
     if done:
         print(f'{done} of {total} runs are done already', file=sys.stderr)
     lost = 0
     pause = 0.5 if sys.stderr.isatty() else _PAUSE_IN_A_LOG
     with tqdm(total=total, initial=done, unit='run', desc='monte carlo', mininterval=pause) as bar:
 
-        def keep(span: Span, columns: Columns) -> None:
+        def keep(done: range, columns: Columns) -> None:
             nonlocal lost
-            store.keep(span, columns)
+            store.keep(done, columns)
             lost += int(np.count_nonzero(columns['outcome'] != KEPT))
             bar.set_postfix_str(f'{lost} did not keep the bound', refresh=False)
-            bar.update(span.runs)
+            bar.update(len(done))
 
-        runs.compute(store.study, spans, executor, most, keep)
+        runs.compute(store.study, chunks, executor, most, keep)
 
 
 def _report(store: Store) -> None:

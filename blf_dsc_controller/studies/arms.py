@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -18,7 +19,6 @@ from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Floats
-from blf_dsc_controller.simulation.metrics import another_motion, torque_rows
 from blf_dsc_controller.studies.laws import (
     CONTENDERS,
     DURATION,
@@ -28,6 +28,7 @@ from blf_dsc_controller.studies.laws import (
     load_laws,
     run,
 )
+from blf_dsc_controller.studies.runs import another_motion, torque_rows
 from blf_dsc_controller.studies.tuning import bounded, search, value_at
 
 POPULATION = 16
@@ -130,54 +131,38 @@ def compare(
     `laws` are as in `chosen_laws`.
     """
     names = chosen_laws(laws)
-    files = [Path(law).resolve() for law in laws if law not in names]
     loops = {arm: [trial(arm, seed) for seed in range(truths + 1)] for arm in arms}
     tuned = sum(bool(CONTENDERS[name].gains) for name in names)
     each = tuned * POPULATION * (generations + 1) + len(names) * truths
-    results: Results = {}
+    results: Results = {arm: {} for arm in arms}
     with (
         tqdm(total=len(arms) * each, unit='run') as bar,
-        ProcessPoolExecutor(initializer=_load_all, initargs=(files,)) as pool,
+        ProcessPoolExecutor(initializer=chosen_laws, initargs=(laws,)) as pool,
     ):
 
-        def computed(
-            function: Callable[[Floats], float], points: Iterable[Floats]
-        ) -> Iterator[float]:
+        def computed(function: Callable[[Any], Any], points: Iterable[Any]) -> Iterator[Any]:
             for value in pool.map(function, points):
                 bar.update()
                 yield value
 
-        for arm in arms:
-            unseen = torque_rows(trial(arm, _UNSEEN).controller)
-            if not results:  # compile now; the workers inherit or load the result
-                for name in {str(CONTENDERS[name].law): name for name in names}.values():
-                    least = {gain.name: gain.least for gain in CONTENDERS[name].gains}
-                    run(name, loops[arm][0], least, unseen)
-            results[arm] = {}
-            for name in names:
-                bar.set_description(f'{arm} {name}')
-                gains, cost = {}, None
-                if tuned_gains := CONTENDERS[name].gains:
-                    point, cost, _ = search(
-                        partial(tuning_cost, name=name, loop=loops[arm][0], unseen=unseen),
-                        tuned_gains,
-                        POPULATION,
-                        generations,
-                        workers=computed,
-                        updating='deferred',
-                    )
-                    gains = values_of(name, point)
-                runs = partial(run, name, values=gains, unseen=unseen)
-                figures = list(pool.map(runs, loops[arm][1:]))
-                bar.update(truths)
-                results[arm][name] = Result(gains, cost, figures)
+        unseen = {arm: torque_rows(trial(arm, _UNSEEN).controller) for arm in arms}
+        for name in {str(CONTENDERS[name].law): name for name in names}.values():
+            least = {gain.name: gain.least for gain in CONTENDERS[name].gains}
+            run(
+                name, loops[arms[0]][0], least, unseen[arms[0]]
+            )  # the workers load what it compiles
+        for arm, name in itertools.product(arms, names):
+            bar.set_description(f'{arm} {name}')
+            gains, cost = {}, None
+            if searched := CONTENDERS[name].gains:
+                of_gains = partial(tuning_cost, name=name, loop=loops[arm][0], unseen=unseen[arm])
+                options = {'workers': computed, 'updating': 'deferred'}
+                point, cost, _ = search(of_gains, searched, POPULATION, generations, **options)
+                gains = values_of(name, point)
+            runs = partial(run, name, values=gains, unseen=unseen[arm])
+            results[arm][name] = Result(gains, cost, list(computed(runs, loops[arm][1:])))
     _write(folder, results, truths, generations)
     return results
-
-
-def _load_all(files: Sequence[Path]) -> None:
-    for file in files:
-        load_laws(file)
 
 
 def label_of(name: str) -> str:
@@ -188,36 +173,32 @@ def label_of(name: str) -> str:
 
 def table_of(laws: dict[str, Result]) -> list[list[str | Cell]]:
     """Return a header and a row for each contender: median / worst of its runs, best marked."""
-    rows: list[list[str | Cell]] = [['law', *_titles(), 'bound kept', 'roughness [%]', 'gains']]
+    titles = (f'{name} [{"mrad" if name in INTERVALS else "%"}]' for name in COLUMNS)
+    rows: list[list[str | Cell]] = [['law', *titles, 'bound kept', 'roughness [%]', 'gains']]
     best = np.nanmin([result.columns().max(axis=1) for result in laws.values()], axis=0)
     for name, result in laws.items():
-        row: list[str | Cell] = [label_of(name)]
+        cells: list[str | Cell] = []
         for values, least in zip(result.columns(), best, strict=True):
             text = f'{np.median(values):.2f} / {values.max():.2f}'
             style = 'good' if values.max() == least else 'number'
-            row.append('-' if np.isnan(values[0]) else Cell(text, style))
+            cells.append('-' if np.isnan(values[0]) else Cell(text, style))
         kept = sum(figures.ratio < 1.0 for figures in result.runs)
-        rough = max(figures.roughness for figures in result.runs)
+        rough = 100.0 * max(figures.roughness for figures in result.runs)
         gains = ', '.join(f'{gain} {value:g}' for gain, value in result.gains.items())
-        rows.append(
-            [*row, f'{kept} of {len(result.runs)}', f'{100.0 * rough:.1f}', gains or 'rule']
-        )
+        bound = f'{kept} of {len(result.runs)}'
+        rows.append([label_of(name), *cells, bound, f'{rough:.1f}', gains or 'rule'])
     return rows
 
 
-def _titles() -> list[str]:
-    return [f'{name} [{"mrad" if name in INTERVALS else "%"}]' for name in COLUMNS]
-
-
 def _write(folder: Path, results: Results, truths: int, generations: int) -> None:
-    plain = {
+    numbers = {
         arm: {
             name: {**result._asdict(), 'runs': [figures._asdict() for figures in result.runs]}
             for name, result in laws.items()
         }
         for arm, laws in results.items()
     }
-    (folder / 'figures.json').write_text(json.dumps(plain, indent=1) + '\n', encoding='utf-8')
+    (folder / 'figures.json').write_text(json.dumps(numbers, indent=1) + '\n', encoding='utf-8')
     write_page(
         folder / 'index.html',
         'arms.html',

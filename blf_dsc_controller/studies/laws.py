@@ -16,7 +16,7 @@ the law.  The integrators are held while any torque is saturated.  `load_laws` a
 from __future__ import annotations
 
 import functools
-import importlib.util
+import importlib
 import sys
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -33,14 +33,15 @@ from blf_dsc_controller.compiled.layout import Array, part, view
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.robot import parameters_of
-from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.configuration.schema import change, flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import model_of
 from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import plan_start
+from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.simulation.metrics import torque_error
+from blf_dsc_controller.studies.runs import torque_error
 from blf_dsc_controller.studies.tuning import Gain
 from sim_plant import kernels as plants
 from sim_plant.arm import Arm
@@ -284,12 +285,11 @@ def law_changes(
             'learning.excitation_threshold': 1e9,
             'learning.change_detection': False,
         }
+    present = flatten(config)
     for gain in contender.gains:
-        group, _, field = gain.name.partition('.')
-        present, value = getattr(getattr(config, group), field), values[gain.name]
-        per_entry = joint_inertia(config) if gain.inertial else np.ones(np.size(present))
-        each = value * per_entry
-        changes[gain.name] = each.tolist() if isinstance(present, tuple) else value
+        per_joint = joint_inertia(config) if gain.inertial else np.ones(np.size(present[gain.name]))
+        each = values[gain.name] * per_joint
+        changes[gain.name] = each.tolist() if np.ndim(present[gain.name]) else each.item()
         if gain.name == 'barrier.weight':
             limit = np.maximum(config.barrier.slope_limit, _STIFFEST * each)
             changes['barrier.slope_limit'] = limit.tolist()
@@ -303,43 +303,35 @@ def joint_inertia(config: ControllerConfig) -> np.ndarray:
     return over_postures(chain, parameters_of(robot, chain), robot.payload, P0, *limits)[0]
 
 
-def run(name: str, loop: LoopConfig, values: Mapping[str, float], unseen: np.ndarray) -> Figures:
+def run(name: str, loop: LoopConfig, values: Mapping[str, float], unseen: Floats) -> Figures:
     """Run a contender with `values` of its gains by name.
 
     `unseen` (k, p) are the rows of H on which the learned model is evaluated.
     """
-    contender = CONTENDERS[name]
+    contender, config = CONTENDERS[name], loop.controller
+    model: tuple[float, ...] = ()
     with np.errstate(all='ignore'):  # a run that diverges has figures too
         if isinstance(contender.law, str):
-            errors, torques, model = _simulate_named(contender, loop, values, unseen)
-        else:
-            errors, torques = simulate_with(
-                loop, contender.law, values, friction=contender.friction
+            config = change(config, law_changes(contender, config, values))
+            record = simulate(config, loop.plant, supervised=False)
+            samples = sample_columns(record.samples, record.controller.settings)
+            errors, torques, p = record.true_errors(), samples.torque, unseen.shape[1]
+            model = tuple(
+                torque_error(unseen, samples.estimate[row, :p], record.truths[row, :p])
+                for row in (round(_BEFORE / config.sample_time), -1)
             )
-            model = ()
+        else:
+            friction = contender.friction
+            errors, torques = simulate_with(loop, contender.law, values, friction=friction)
         time = np.arange(len(errors)) * loop.plant.sample_time
         peaks = [
-            np.abs(errors[(time >= begin) & (time < end)]).max(initial=0.0)
+            float(np.abs(errors[(time >= begin) & (time < end)]).max(initial=0.0))
             for begin, end in INTERVALS.values()
         ]
-        change = np.diff(torques, axis=0) / loop.controller.torque.limit
-        rough = np.sqrt(np.mean(change**2, axis=0)).max()
-    ratio = np.abs(errors / loop.controller.barrier.bound).max()
-    return Figures(tuple(map(float, peaks)), float(ratio), float(rough), model)
-
-
-def _simulate_named(
-    contender: Contender, loop: LoopConfig, values: Mapping[str, float], unseen: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, tuple[float, ...]]:
-    config = change(loop.controller, law_changes(contender, loop.controller, values))
-    record = simulate(config, loop.plant, supervised=False)
-    samples = sample_columns(record.samples, record.controller.settings)
-    p = record.controller.settings.p
-    model = tuple(
-        torque_error(unseen, samples.estimate[row, :p], record.truths[row, :p])
-        for row in (round(_BEFORE / config.sample_time), -1)
-    )
-    return record.true_errors(), samples.torque, model
+        steps = np.diff(torques, axis=0) / config.torque.limit
+        rough = np.sqrt(np.mean(steps**2, axis=0)).max()
+    ratio = np.abs(errors / config.barrier.bound).max()
+    return Figures(tuple(peaks), float(ratio), float(rough), model)
 
 
 def load_laws(path: Path) -> list[str]:
@@ -347,17 +339,15 @@ def load_laws(path: Path) -> list[str]:
 
     Raises BlfDscError if it has none, if it cannot be imported, or if a name is taken.
     """
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None:
-        raise BlfDscError(f'{path} is no Python file: its name should end in .py')
-    module = sys.modules.get(path.stem)
-    if module is None or getattr(module, '__file__', '') != str(path):
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[path.stem] = module
-        try:
-            spec.loader.exec_module(module)
-        except Exception as error:
-            raise BlfDscError(f'{path} cannot be imported: {error!r}') from error
+    sys.path.insert(0, str(path.parent))
+    try:
+        module = importlib.import_module(path.stem)
+    except Exception as error:
+        raise BlfDscError(f'{path} cannot be imported: {error!r}') from error
+    finally:
+        sys.path.remove(str(path.parent))
+    if getattr(module, '__file__', '') != str(path):
+        raise BlfDscError(f'{path}: there is another module of this name: rename the file')
     added: dict[str, Contender] = getattr(module, 'CONTENDERS', {})
     if not added or not all(isinstance(each, Contender) for each in added.values()):
         raise BlfDscError(f'{path}: CONTENDERS must be a dict of Contender by name')

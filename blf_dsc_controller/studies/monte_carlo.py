@@ -20,31 +20,22 @@ time from the beginning of the event before, or from the start.
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import itertools
 import math
 import operator
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from hashlib import blake2b
 from pathlib import Path
 from statistics import NormalDist
-from typing import Annotated, Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import (
-    CONTROLLER,
-    PLANT,
-    LoopConfig,
-    dump,
-    format_value,
-    load_loop,
-    read,
-)
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, load_loop, read
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import (
     Kind,
@@ -56,8 +47,10 @@ from blf_dsc_controller.configuration.schema import (
     parameters,
     unknown,
 )
+from blf_dsc_controller.configuration.schema import Value as Setting
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.run import Floats
 
 WITHOUT = 'without.'
 """Prefix of the columns of a run without learning."""
@@ -93,21 +86,17 @@ class MonteCarloConfig:
         may_be_empty=True,
     )
 
-    def duration_problems(self, duration: float) -> list[str]:
-        """Return the problems with times after the end of a run of this duration [s]."""
+    def duration_problems(self, duration: float) -> Iterator[str]:
+        """Yield the problems with times after the end of a run of this duration [s]."""
         if duration == 0.0:
-            return ['sim_plant.duration: got 0 s, but every run must end: give its duration']
-        problems = [
-            f'moments: got {moment:g} s at entry {entry}, but a run ends at {duration:g} s'
-            for entry, moment in enumerate(self.moments, 1)
-            if moment > duration
-        ]
+            yield 'sim_plant.duration: got 0 s, but every run must end: give its duration'
+            return
+        for entry, moment in enumerate(self.moments, 1):
+            if moment > duration:
+                where = f'at entry {entry}, but a run ends at {duration:g} s'
+                yield f'moments: got {moment:g} s {where}'
         if self.settled_after >= duration:
-            problems.append(
-                f'settled_after: got {self.settled_after:g} s, but a run ends at {duration:g} s'
-            )
-        repeated = sorted({moment for moment in self.moments if self.moments.count(moment) > 1})
-        return problems + [f'moments: {moment:g} s is repeated' for moment in repeated]
+            yield f'settled_after: got {self.settled_after:g} s, but a run ends at {duration:g} s'
 
 
 @dataclass(frozen=True)
@@ -125,28 +114,21 @@ class Study:
             return {'': self.controller}
         return {'': self.controller, WITHOUT: change(self.controller, {'learning.weight': 0.0})}
 
-    def by_node(self) -> dict[str, Any]:
-        """Return the configurations by node name."""
-        return {PLANT: self.plant, CONTROLLER: self.controller, _NODE: self.settings}
-
-    def flat(self) -> dict[str, object]:
-        """Return every value by node and name, with the distributions as written."""
-        values: dict[str, object] = {
-            f'{node}.{name}': value
-            for node, config in self.by_node().items()
-            for name, value in flatten(config).items()
-        }
-        return values | {f'{_NODE}.{_VARY}{name}': text for name, text in self.varied().items()}
-
-    def varied(self) -> dict[str, str | tuple[str, ...]]:
-        """Return the distributions as written, in a list for each list parameter."""
-        texts: dict[str, str | tuple[str, ...]] = {}
+    def values(self) -> dict[str, dict[str, Setting]]:
+        """Return every value by node and name, as `dumps` takes them; distributions as written."""
+        own = flatten(self.settings)
         for variation in self.variations:
-            text = str(variation.distribution)
-            texts[variation.name] = (
-                text if variation.entry < 0 else (*texts.get(variation.name, ()), text)
-            )
-        return texts
+            name, text = f'{_VARY}{variation.name}', str(variation.distribution)
+            before = cast('tuple[str, ...]', own.get(name, ()))
+            own[name] = text if variation.entry < 0 else (*before, text)
+        return {PLANT: flatten(self.plant), CONTROLLER: flatten(self.controller), _NODE: own}
+
+    @cached_property
+    def origin(self) -> tuple[Floats, Floats, Floats]:
+        """What a start is relative to: qr [rad], dqr [rad/s] and the bound [rad] at time 0."""
+        controller = controller_of(self.controller)
+        qr, dqr, _ = controller.reference_at(0.0)
+        return qr, dqr, controller.bound_at(0.0)
 
 
 def load_study(path: str | Path, overrides: Mapping[str, object] | None = None) -> Study:
@@ -162,17 +144,15 @@ def load_study(path: str | Path, overrides: Mapping[str, object] | None = None) 
     except ConfigurationError as error:
         problems += error.problems
     given, lines = _read_section(path)
-    varied = {name.removeprefix(_VARY): given[name] for name in given if name.startswith(_VARY)}
-    others = {name: given[name] for name in given if not name.startswith(_VARY)}
-    own: list[str] = []
-    try:
-        settings = build(MonteCarloConfig, {**others, **(overrides or {})})
-    except ConfigurationError as error:
-        own += error.problems
+    varied = {name.removeprefix(_VARY): given.pop(name) for name in lines if name.startswith(_VARY)}
     if loop is None:  # the number of events is unknown
         varied = {name: text for name, text in varied.items() if not name.startswith('events.')}
     variations, found = read_variations(varied, loop.plant if loop else PlantConfig())
-    own += [f'{_VARY}{problem}' for problem in found]
+    own = [f'{_VARY}{problem}' for problem in found]
+    try:
+        settings = build(MonteCarloConfig, {**given, **(overrides or {})})
+    except ConfigurationError as error:
+        own += error.problems
     if loop and settings:
         own += settings.duration_problems(loop.plant.duration)
     for problem in own:
@@ -184,15 +164,6 @@ def load_study(path: str | Path, overrides: Mapping[str, object] | None = None) 
     if problems or loop is None or settings is None:
         raise ConfigurationError(problems, str(path))
     return Study(loop.controller, loop.plant, settings, variations)
-
-
-def write_study(study: Study, path: Path) -> None:
-    """Write a study so that `load_study` returns the same one."""
-    dump(path, study.by_node())
-    with path.open('a', encoding='utf-8') as file:
-        file.writelines(
-            f'    {_VARY}{name}: {format_value(text)}\n' for name, text in study.varied().items()
-        )
 
 
 def _read_section(path: str | Path) -> tuple[dict[str, Any], dict[str, int]]:
@@ -213,76 +184,56 @@ def _read_section(path: str | Path) -> tuple[dict[str, Any], dict[str, int]]:
     return {name: entry.value for name, entry in entries.items()}, lines
 
 
-class Origin(NamedTuple):
-    """Reference and bound at time 0, to which a start is relative."""
-
-    qr: np.ndarray  # (n,) rad
-    dqr: np.ndarray  # (n,) rad/s
-    bound: np.ndarray  # (n,) rad
+Drawn = float | int | str
 
 
-class RandomNumbers(NamedTuple):
-    """The random numbers of one run."""
-
-    run: int
-    seed: int  # of the sensor noise
-    values: tuple[Value, ...]  # of the variations, in their order
-
-
-def random_numbers(study: Study, index: int) -> RandomNumbers:
-    """Return those of run `index`, from the seed of the study and the index alone.
+def draw(study: Study, run: int) -> dict[str, Drawn]:
+    """Return what is random in a run by column, from the seed of the study and its number alone.
 
     Each variation has its own random number, by its name and regardless of what else varies: two
     studies with the same seed that differ in one distribution have otherwise the same arms.
     """
 
     def bits(name: str) -> int:
-        text = f'{study.settings.seed} {index} {name}'
+        text = f'{study.settings.seed} {run} {name}'
         return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), 'big') >> 11
 
-    values = tuple(
-        variation.distribution.at(bits(variation.column) / 2**53) for variation in study.variations
-    )
     noise = study.settings.noise_seed
-    return RandomNumbers(index, bits(f'seed {noise}' if noise else 'seed'), values)
+    drawn: dict[str, Drawn] = {'run': run, 'seed': bits(f'seed {noise}' if noise else 'seed')}
+    for variation in study.variations:
+        drawn[variation.column] = variation.distribution.at(bits(variation.column) / 2**53)
+    return drawn
 
 
-def origin_of(controller: Controller) -> Origin:
-    """Return the origin of a controller that has not begun."""
-    qr, dqr, _ = controller.reference_at(0.0)
-    return Origin(qr, dqr, controller.bound_at(0.0))
-
-
-def plant_with(study: Study, numbers: RandomNumbers, origin: Origin) -> PlantConfig:
-    """Return the plant configuration of a run; `origin` is that of the study's controller."""
+def plant_with(study: Study, drawn: Mapping[str, Drawn]) -> PlantConfig:
+    """Return the plant configuration of a run."""
     changes: dict[str, dict[str, Any]] = {}
-    for variation, value in zip(study.variations, numbers.values, strict=True):
+    for variation in study.variations:
         group, _, field = variation.name.partition('.')
-        section = changes.setdefault(group, {})
+        section, value = changes.setdefault(group, {}), drawn[variation.column]
         section[field] = value if variation.entry < 0 else (*section.get(field, ()), value)
     relative = changes.pop('initial', {})
-    start: dict[str, Any] = {}
-    if 'error' in relative:
-        start['position'] = tuple((origin.qr + origin.bound * relative['error']).tolist())
-    if 'velocity_error' in relative:
-        start['velocity'] = tuple((origin.dqr + relative['velocity_error']).tolist())
+    if relative:
+        qr, dqr, bound = study.origin
+        start = changes['initial'] = {}
+        if 'error' in relative:
+            start['position'] = tuple((qr + bound * relative['error']).tolist())
+        if 'velocity_error' in relative:
+            start['velocity'] = tuple((dqr + relative['velocity_error']).tolist())
     if 'gap' in changes.get('events', {}):
         changes['events']['begin'] = tuple(np.cumsum(changes['events'].pop('gap')).tolist())
     groups = {
-        group: dataclasses.replace(getattr(study.plant, group), **section)
-        for group, section in (changes | {'initial': start}).items()
+        group: replace(getattr(study.plant, group), **section) for group, section in changes.items()
     }
-    return dataclasses.replace(study.plant, seed=numbers.seed, **groups)
+    return replace(study.plant, seed=int(drawn['seed']), **groups)
 
-
-Value = float | int | str
 
 TAIL = 4.0
 """Standard deviations from the mean at which a normal distribution is cut off."""
 
 _NORMAL = NormalDist()
 _CUT = _NORMAL.cdf(-TAIL)
-_INVERSES: dict[str, Callable[..., Value]] = {
+_INVERSES: dict[str, Callable[..., Drawn]] = {
     'uniform(low, high)': lambda u, low, high: low + u * (high - low),
     'loguniform(low, high)': lambda u, low, high: min(
         high, low * math.exp(u * math.log(high / low))
@@ -305,17 +256,6 @@ _EXPECTED = {
 """What arguments are, and the distributions, for each kind of parameter."""
 
 _CALL = re.compile(r'\s*(\w+)\s*\((.*)\)\s*')
-_GROUPS = (
-    'arm.',
-    'truth.',
-    'disturbance.',
-    'sensor.',
-    'actuator.',
-    'load.',
-    'wall.',
-    'events.',
-)
-_REALTIME = ('actuator.command_timeout', 'actuator.without_command')
 
 
 @dataclass(frozen=True)
@@ -323,19 +263,19 @@ class Distribution:
     """A distribution of values of one kind."""
 
     written: str  # a key of _INVERSES
-    arguments: tuple[Value, ...]
+    arguments: tuple[Drawn, ...]
 
     @property
     def name(self) -> str:
         """Name before the parenthesis."""
         return self.written.partition('(')[0]
 
-    def at(self, u: float) -> Value:
+    def at(self, u: float) -> Drawn:
         """Return the value below which the fraction `u`, in [0, 1), of all draws lies."""
         return _INVERSES[self.written](u, *self.arguments)
 
     @property
-    def extremes(self) -> tuple[Value, ...]:
+    def extremes(self) -> tuple[Drawn, ...]:
         """Lowest and highest value, or all values of a choice."""
         if self.written == _MAYBE:
             return (0.0, *self.arguments[1:])
@@ -382,34 +322,13 @@ def _problem(written: str, arguments: tuple[float, ...]) -> str:
     return ''
 
 
-def _argument(word: str, kind: Kind) -> Value:
+def _argument(word: str, kind: Kind) -> Drawn:
     if kind is Kind.INTEGER:
         return int(word)
     value = float(word) if kind is Kind.DOUBLE else word
     if value == '' or (isinstance(value, float) and not math.isfinite(value)):
         raise ValueError
     return value
-
-
-@dataclass(frozen=True)
-class RelativeStart:
-    """Start of a run relative to the reference."""
-
-    error: Annotated[tuple[float, ...], 'joints'] = parameter(
-        (), 'fraction of the bound', above=-1.0, below=1.0
-    )
-    velocity_error: Annotated[tuple[float, ...], 'joints'] = parameter(
-        (), 'velocity error', unit='rad/s'
-    )
-
-
-@dataclass(frozen=True)
-class RelativeEvents:
-    """Events of a run, one after the other."""
-
-    gap: Annotated[tuple[float, ...], 'events.begin'] = parameter(
-        (), 'time since the event before began', unit='s', at_least=0.0
-    )
 
 
 @dataclass(frozen=True)
@@ -422,28 +341,27 @@ class Variation:
     distribution: Distribution
 
 
-@functools.cache
+_GROUPS = (
+    *('arm.', 'truth.', 'disturbance.', 'sensor.', 'actuator.', 'load.', 'wall.', 'events.'),
+)
+_REALTIME = ('actuator.command_timeout', 'actuator.without_command')
+
+
+@cache
 def variable_parameters() -> Mapping[str, Parameter]:
-    """Return every parameter that may vary, by name."""
-    found = [param for param in parameters(PlantConfig) if param.name.startswith(_GROUPS)]
-    for group, relative in (('initial', RelativeStart), ('events', RelativeEvents)):
-        found += [replace(param, name=f'{group}.{param.name}') for param in parameters(relative)]
-    return {
-        param.name: param
-        for param in found
-        if param.name not in _REALTIME and param.kind.element in _EXPECTED
-    }
-
-
-def entries(param: Parameter, plant: PlantConfig) -> tuple[str, ...]:
-    """Return the names of the entries of a list parameter, by joint or number; else ()."""
-    if not param.kind.is_array:
-        return ()
-    each = []
-    for name in param.length or (param.name,):
-        count = int(name) if name.isdigit() else len(operator.attrgetter(name)(plant))
-        each.append(plant.joints if name == 'joints' else tuple(map(str, range(1, count + 1))))
-    return tuple('.'.join(names) for names in itertools.product(*each))
+    """Return every parameter that may vary, by name; those of a relative start and events last."""
+    found = [
+        param
+        for param in parameters(PlantConfig)
+        if param.name.startswith(_GROUPS) and param.name not in _REALTIME
+    ]
+    relative = Parameter((), '', kind=Kind.DOUBLE_ARRAY, length=('joints',))
+    found += [
+        replace(relative, name='initial.error', above=-1.0, below=1.0),
+        replace(relative, name='initial.velocity_error', unit='rad/s'),
+        replace(relative, name='events.gap', unit='s', at_least=0.0, length=('events.begin',)),
+    ]
+    return {param.name: param for param in found if param.kind.element in _EXPECTED}
 
 
 def read_variations(
@@ -459,15 +377,18 @@ def read_variations(
     for name, param in known.items():
         if name in given:
             try:
-                found += _variations_of(param, given[name], entries(param, plant))
+                found += _variations_of(param, given[name], plant)
             except ValueError as error:
                 problems.append(f'{name}: {error}')
     return tuple(found), problems
 
 
-def _variations_of(param: Parameter, given: object, names: tuple[str, ...]) -> list[Variation]:
+def _variations_of(param: Parameter, given: object, plant: PlantConfig) -> Iterator[Variation]:
+    column = f'plant.{param.name}'
     if not param.kind.is_array:
-        return [Variation(param.name, -1, f'plant.{param.name}', _distribution(param, given))]
+        yield Variation(param.name, -1, column, _distribution(param, given))
+        return
+    names = _entries(param, plant)
     if not names:
         raise ValueError('got a distribution, but there are no events: give events.begin')
     each = list(given) if isinstance(given, (list, tuple)) else [given] * len(names)
@@ -478,10 +399,17 @@ def _variations_of(param: Parameter, given: object, names: tuple[str, ...]) -> l
             f'got {len(each)} distributions, but there are {len(names)} entries '
             f'({", ".join(names)}): give one for each, or a single one for all'
         )
-    return [
-        Variation(param.name, i, f'plant.{param.name}.{name}', _distribution(param, text))
-        for i, (name, text) in enumerate(zip(names, each, strict=True))
-    ]
+    for i, (name, text) in enumerate(zip(names, each, strict=True)):
+        yield Variation(param.name, i, f'{column}.{name}', _distribution(param, text))
+
+
+def _entries(param: Parameter, plant: PlantConfig) -> tuple[str, ...]:
+    """Return the names of the entries of a list parameter, by joint or number."""
+    each = []
+    for name in param.length or (param.name,):
+        count = int(name) if name.isdigit() else len(operator.attrgetter(name)(plant))
+        each.append(plant.joints if name == 'joints' else tuple(map(str, range(1, count + 1))))
+    return tuple('.'.join(names) for names in itertools.product(*each))
 
 
 def _distribution(param: Parameter, text: object) -> Distribution:

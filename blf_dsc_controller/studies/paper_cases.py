@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
@@ -40,7 +41,6 @@ class Case:
     law: Mapping[str, object] = field(default_factory=dict)
     plant: Mapping[str, object] = field(default_factory=dict)
     duration: float = DURATION
-    keep_run: bool = True
 
     def loop(self) -> LoopConfig:
         """Return the configuration of the case."""
@@ -106,23 +106,25 @@ BOUND = 0.002  # rad
 Changes = tuple[Mapping[str, object], Mapping[str, object]]
 
 
-@dataclass(frozen=True)
-class Sweep:
-    """A condition, its values, and the changes of law and plant for each value."""
+class Sweep(NamedTuple):
+    """A condition with its unit, its values, and the changes of law and plant for each value."""
 
-    name: str
     label: str
     values: tuple[float, ...]
     changes: Callable[[float], Changes]
-    logarithmic: bool = True
     laws: tuple[str, ...] = tuple(LAWS)
+
+    @property
+    def name(self) -> str:
+        """Name of the condition."""
+        return self.label.partition(' [')[0]
 
     def cases(self) -> Iterator[Case]:
         """Yield a case for every law and value, named after both."""
         for law in self.laws:
             for value in self.values:
                 name = case_name(self.name, law, value)
-                yield Case(name, name, law, *self.changes(value), SWEEP_DURATION, keep_run=False)
+                yield Case(name, name, law, *self.changes(value), SWEEP_DURATION)
 
 
 def case_name(sweep: str, law: str, value: float) -> str:
@@ -137,65 +139,50 @@ def _differenced(**sensor: float) -> Changes:
 
 SWEEPS = (
     Sweep(
-        'sample time',
         'sample time [ms]',
         (0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0),
         lambda value: ({'sample_time': value * 1e-3}, {'sample_time': value * 1e-3}),
     ),
     Sweep(
-        'delay',
-        'delay of the torque [samples]',
+        'delay [samples]',
         (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0),
         lambda value: ({}, {'actuator.delay': int(value)}),
-        logarithmic=False,
     ),
     Sweep(
-        'encoder',
         'encoder [bits a turn]',
         (12.0, 13.0, 14.0, 15.0, 16.0, 18.0, 20.0),
         lambda value: _differenced(resolution=2.0 * math.pi / 2.0**value),
-        logarithmic=False,
     ),
     Sweep(
-        'noise',
-        'noise of the positions [µrad]',
+        'noise [µrad]',
         (1.0, 3.0, 10.0, 30.0, 100.0, 300.0),
         lambda value: _differenced(position_noise=value * 1e-6),
     ),
     Sweep(
-        'torque limit',
         'torque limit [N m]',
         (9.0, 9.5, 10.0, 10.5, 11.0, 12.0, 14.0, 20.0),
         lambda value: ({'torque.limit': [value, value]}, {}),
-        logarithmic=False,
     ),
     Sweep(
-        'initial error',
         'initial error [of the bound]',
         (0.0, 0.25, 0.5, 0.75, 0.9, 0.99),
         lambda value: ({}, {'initial.position': [start + value * BOUND for start in START]}),
-        logarithmic=False,
     ),
     Sweep(
-        'initial parameters',
-        'initial estimate [of the truth]',
+        'initial parameters [of the truth]',
         (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0),
         lambda value: ({'learning.initial_estimate': [value * each for each in P]}, {}),
-        logarithmic=False,
     ),
     Sweep(
-        'disturbance frequency',
-        'frequency of the disturbance [rad/s]',
+        'disturbance frequency [rad/s]',
         (0.1, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 100.0),
         lambda value: ({}, {'disturbance.frequency': [value, value]}),
     ),
     Sweep(
-        'window',
-        'excitation window [s]',
+        'window [s]',
         (1.0, 2.0, 3.0, 4.0, 5.0, 2.0 * math.pi, 8.0, 10.0, 4.0 * math.pi),
         lambda value: ({'learning.window': value}, {}),
-        logarithmic=False,
-        laws=('recommended', 'paper_tuned'),
+        ('recommended', 'paper_tuned'),
     ),
 )
 
@@ -213,13 +200,21 @@ class Results(NamedTuple):
         (values,) = (each.values for each in SWEEPS if each.name == sweep)
         return [value for value in values if self.metrics[case_name(sweep, law, value)].held]
 
+    def ratios(self, *names: str) -> list[float]:
+        """Return the largest |xi1| / k_c of each case."""
+        return [self.metrics[name].max_error_ratio for name in names]
+
+    def parameter_errors(self, *names: str) -> list[float]:
+        """Return the relative parameter error of each case after 60 s."""
+        return [self.metrics[name].parameter_error[60] for name in names]
+
 
 def run_case(case: Case) -> tuple[Metrics, Run | None]:
-    """Simulate a case; return its metrics and, if the case keeps it, the run."""
+    """Simulate a case; return its metrics and, unless it belongs to a sweep, the run."""
     loop = case.loop()
     with np.errstate(all='ignore'):  # a run that diverges has metrics too
         run = simulate(loop.controller, loop.plant, supervised=False).run()
-        return measure(run), run if case.keep_run else None
+        return measure(run), run if case.duration == DURATION else None
 
 
 def run_all() -> Results:
@@ -229,14 +224,11 @@ def run_all() -> Results:
     """
     results = Results({}, {})
     with ProcessPoolExecutor() as pool, tqdm(total=len(CASES), desc='runs', unit='run') as bar:
-        for case, (metrics, run) in zip(CASES, _computed(pool), strict=True):
+        first = iter([run_case(CASES[0])])
+        found = itertools.chain(first, pool.map(run_case, CASES[1:]))
+        for case, (metrics, run) in zip(CASES, found, strict=True):
             results.metrics[case.name] = metrics
             if run is not None:
                 results.runs[case.name] = run
             bar.update()
     return results
-
-
-def _computed(pool: ProcessPoolExecutor) -> Iterator[tuple[Metrics, Run | None]]:
-    yield run_case(CASES[0])
-    yield from pool.map(run_case, CASES[1:])

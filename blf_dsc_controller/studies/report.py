@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from scipy.stats import binomtest, rankdata
+from scipy.stats import binomtest, kruskal, rankdata
 
 from blf_dsc_controller.analysis.figures import draw as draw_run
 from blf_dsc_controller.analysis.page import Cell, write_page
@@ -25,23 +24,15 @@ from blf_dsc_controller.analysis.style import (
     Picture,
     head,
 )
+from blf_dsc_controller.analysis.summary import plain, write_summary
 from blf_dsc_controller.analysis.summary import summarize as summarize_run
-from blf_dsc_controller.analysis.summary import write_summary
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, dump
-from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.studies.monte_carlo import (
-    WITHOUT,
-    Study,
-    origin_of,
-    plant_with,
-    random_numbers,
-)
+from blf_dsc_controller.studies.monte_carlo import WITHOUT, Study, draw, plant_with
 from blf_dsc_controller.studies.runs import (
     DIVERGED,
     KEPT,
@@ -70,11 +61,11 @@ LAWS = {'': 'with', WITHOUT: 'without'}
 """The laws of a study of pairs: what they are called, by the prefix of their columns."""
 
 _NEAR = (0.8, 1.2)  # times the bound
-_PANELS_OF_INFLUENCE = 6
 _MOST_DOTS = 20_000
 _SHOWN = (0.03, 2.0)  # |xi1| / k_c; what is beyond is drawn at these
 _FEW_DECADES = 1e3
 _RATIO = r'max $|\xi_1| \; / \; k_c$'
+_MODEL = r'$\|\hat P - P\| \;/\; \|P\|$ [%]'
 _PERCENT = FuncFormatter(lambda value, _: f'{100 * value:g} %')
 
 
@@ -84,30 +75,43 @@ def summarize(study: Study, results: Columns) -> Summary:
     The Wilson interval, unlike p +- z sqrt(p (1 - p) / n), does not shrink to a point if all runs
     kept the bound, and never leaves [0, 1].
     """
-    outcomes = results['outcome']
-    runs = outcomes.size
-    kept = int((outcomes == KEPT).sum())
+    outcomes = results['outcome'].tolist()
+    runs, kept = len(outcomes), outcomes.count(KEPT)
     interval = binomtest(kept, runs).proportion_ci(_CONFIDENCE, method='wilson')
     others = ('run', 'seed', 'outcome', f'{WITHOUT}outcome')
     figures = [name for name in results if name not in others and not name.startswith(_DRAWN)]
-    return {
-        'runs': runs,
-        'planned': study.settings.runs,
-        'seed': study.settings.seed,
-        'duration_s': study.plant.duration,
-        'outcomes': {outcome: int((outcomes == outcome).sum()) for outcome in OUTCOMES},
-        'kept': {
-            'fraction': kept / runs,
-            'low': float(interval.low),
-            'high': float(interval.high),
-            'confidence': _CONFIDENCE,
-            'interval': 'Wilson',
-        },
-        'pairs': compare(study, results) if study.settings.pairs else None,
-        'figures': {name: _quantiles(results[name]) for name in figures},
-        'influence': influence(study, results),
-        'worst': [_one_run(study, results, row) for row in worst_first(study, results)[:_WORST]],
-    }
+    worst = [
+        {
+            'run': int(results['run'][row]),
+            'outcome': outcomes[row],
+            'max_error_ratio': {
+                joint: results[f'max_error_ratio.{joint}'][row] for joint in study.plant.joints
+            },
+            'first_violation_s': results['first_violation_s'][row],
+        }
+        for row in worst_first(study, results)[:_WORST]
+    ]
+    summary: Summary = plain(
+        {
+            'runs': runs,
+            'planned': study.settings.runs,
+            'seed': study.settings.seed,
+            'duration_s': study.plant.duration,
+            'outcomes': {outcome: outcomes.count(outcome) for outcome in OUTCOMES},
+            'kept': {
+                'fraction': kept / runs,
+                'low': interval.low,
+                'high': interval.high,
+                'confidence': _CONFIDENCE,
+                'interval': 'Wilson',
+            },
+            'pairs': compare(study, results) if study.settings.pairs else None,
+            'figures': {name: _quantiles(results[name]) for name in figures},
+            'influence': influence(study, results),
+            'worst': worst,
+        }
+    )
+    return summary
 
 
 def compare(study: Study, results: Columns) -> Summary:
@@ -117,40 +121,37 @@ def compare(study: Study, results: Columns) -> Summary:
     the medians are of the runs that keep the bound without. `near` counts the runs that come near
     the bound without learning, with a largest error that is at least 1 % larger or smaller with it.
     """
+
+    def both(name: str) -> list[Floats]:
+        return [worst_of(study, results, name, law) for law in LAWS]
+
     kept, without = (results[f'{law}outcome'] == KEPT for law in LAWS)
-    factors = error_factor(study, results)[without]
+    settled, settled_without = both('settled_error_ratio')
+    factors = (settled / settled_without)[without]
     above = np.flatnonzero(~(factors <= ALLOWED))
     quantiles = np.quantile(factors, list(_FACTORS.values()), method='higher')
-    largest, before = (worst_of(study, results, 'max_error_ratio', law) for law in LAWS)
+    largest, before = both('max_error_ratio')
     change = (largest / before)[(_NEAR[0] <= before) & (before <= _NEAR[1])]
+    medians = {
+        'rms_error_rad': both('rms_error_rad'),
+        'torque_error': [results[f'{law}torque_error.end'] for law in LAWS],
+    }
     return {
         'near': {'larger': int((change >= 1.01).sum()), 'smaller': int((change <= 0.99).sum())},
         'kept': {'with': int(kept.sum()), 'without': int(without.sum())},
         'broken_only_with': results['run'][without & ~kept].tolist(),
         'broken_only_without': results['run'][kept & ~without].tolist(),
-        'factor': {
-            name: factor if math.isfinite(factor) else None
-            for name, factor in zip(_FACTORS, quantiles.tolist(), strict=True)
-        },
+        'factor': dict(zip(_FACTORS, quantiles.tolist(), strict=True)),
         'allowed': ALLOWED,
         'above': results['run'][without][above[np.argsort(-factors[above])]].tolist(),
         'median': {
-            'rms_error_rad': {
-                label: _median(worst_of(study, results, 'rms_error_rad', law)[without])
-                for law, label in LAWS.items()
-            },
-            'torque_error': {
-                label: _median(results[f'{law}torque_error.end'][without])
-                for law, label in LAWS.items()
-            },
+            name: {
+                label: np.median(known) if (known := _finite(values[without])).size else None
+                for label, values in zip(LAWS.values(), each, strict=True)
+            }
+            for name, each in medians.items()
         },
     }
-
-
-def error_factor(study: Study, results: Columns) -> Floats:
-    """Return the largest settled error of each run with learning over that without."""
-    name = 'settled_error_ratio'
-    return worst_of(study, results, name) / worst_of(study, results, name, WITHOUT)
 
 
 def worst_of(study: Study, results: Columns, name: str, law: str = '') -> Floats:
@@ -167,94 +168,209 @@ def worst_first(study: Study, results: Columns) -> np.ndarray:
 def influence(study: Study, results: Columns) -> dict[str, float]:
     """Return the fraction of the variance of the largest |xi1| / k_c due to each drawn number.
 
-    This is the correlation ratio of the ranks over groups of equal size, corrected for chance:
-    unlike a correlation, it also shows if both ends of a range are bad. Strongest first; numbers
-    that are the same in all runs are left out.
+    This is the correlation ratio of the ranks over groups of equal size, corrected for chance, from
+    the statistic of Kruskal and Wallis: unlike a correlation, it also shows if both ends of a range
+    are bad. Strongest first; numbers that are the same in all runs are left out.
     """
-    ranks = rankdata(worst_of(study, results, 'max_error_ratio'))
+    ratios = worst_of(study, results, 'max_error_ratio')
     found = {
-        variation.column.removeprefix(_DRAWN): _explained(results[variation.column], ranks)
+        variation.column.removeprefix(_DRAWN): _explained(results[variation.column], ratios)
         for variation in study.variations
         if np.unique(results[variation.column]).size > 1
     }
     return dict(sorted(found.items(), key=lambda item: -item[1]))
 
 
-def _explained(values: np.ndarray, ranks: Floats) -> float:
+def _explained(values: np.ndarray, ratios: Floats) -> float:
     groups = np.unique(values, return_inverse=True)[1]
     if groups.max() >= _GROUPS:
-        groups = np.minimum(_GROUPS * rankdata(values) / (values.size + 1), _GROUPS - 1).astype(int)
-    counts = np.bincount(groups)
-    within = ranks.var() * ranks.size
-    within -= float((np.bincount(groups, ranks) ** 2 / np.maximum(counts, 1)).sum())
-    within += ranks.size * ranks.mean() ** 2
-    freedom = ranks.size - np.count_nonzero(counts)
-    if freedom <= 0 or ranks.var() == 0.0:
+        groups = (_GROUPS * rankdata(values) / (values.size + 1)).astype(int)
+    parts = [ratios[groups == group] for group in np.unique(groups)]
+    freedom = ratios.size - len(parts)
+    if freedom <= 0 or np.unique(ratios).size == 1:
         return 0.0
-    return max(0.0, float(1.0 - (within / freedom) / ranks.var(ddof=1)))
+    H = kruskal(*parts).statistic  # n - 1 times the correlation ratio of the ranks
+    return max(0.0, float(1.0 - (ratios.size - 1 - H) / freedom))
 
 
-def _median(values: np.ndarray) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else None
+def _finite(values: Floats) -> Floats:
+    return values[np.isfinite(values)]
 
 
-def _quantiles(values: np.ndarray) -> Summary | None:
-    known = values[np.isfinite(values)]
+def _quantiles(values: Floats) -> Summary | None:
+    known = _finite(values)
     if known.size == 0:
         return None
-    quantiles = {name: float(np.quantile(known, q)) for name, q in _QUANTILES.items()}
-    return {**quantiles, 'known': int(known.size)}
+    quantiles = np.quantile(known, list(_QUANTILES.values())).tolist()
+    return {**dict(zip(_QUANTILES, quantiles, strict=True)), 'known': known.size}
 
 
-def _one_run(study: Study, results: Columns, row: int) -> Summary:
-    run = {name: np.asarray(values[row]).item() for name, values in results.items()}
-    known = {name: None if value != value else value for name, value in run.items()}  # noqa: PLR0124
+def write_report(store: Store) -> tuple[Summary, list[Path]]:
+    """Write report.html with its figures, and summary.json, of the finished runs.
+
+    Returns the summary and the paths; raises BlfDscError if there are no results yet.
+    """
+    study, results, folder = store.study, store.results(), store.folder
+    summary = summarize(study, results)
+    figures = [folder / 'distributions.png']
+    _draw_distributions(study, results, figures[0])
+    if study.settings.pairs:
+        figures.append(folder / 'pairs.png')
+        draw_pairs({'': (study, results)}, figures[-1])
+    tables = _tables(study, summary, folder)
+    title = f'Monte Carlo study: {summary["runs"]} runs of {summary["duration_s"]:g} s'
+    page, numbers = folder / 'report.html', folder / 'summary.json'
+    values = {'headline': headline(summary), 'summary': summary, 'figures': figures}
+    write_page(page, 'study.html', title, **values, **tables)
+    write_summary(summary, numbers)
+    return summary, [page, *figures, numbers]
+
+
+def _tables(study: Study, summary: Summary, folder: Path) -> dict[str, list[Any]]:
+    """Return the rows of the tables of the page."""
     return {
-        'run': run['run'],
-        'outcome': run['outcome'],
-        'max_error_ratio': {
-            joint: known[f'max_error_ratio.{joint}'] for joint in study.plant.joints
-        },
-        'first_violation_s': known['first_violation_s'],
+        'outcomes': [(name, f'{n}', OUTCOMES[name]) for name, n in summary['outcomes'].items()],
+        'quantiles': [
+            ('', *_QUANTILES),
+            *(
+                (Cell(name, 'code'), *(_number(values[quantile]) for quantile in _QUANTILES))
+                for name, values in summary['figures'].items()
+                if values is not None
+            ),
+        ],
+        'worst': [
+            (
+                f'{run["run"]}',
+                run['outcome'],
+                ', '.join(_number(ratio) for ratio in run['max_error_ratio'].values()),
+                _number(run['first_violation_s']),
+                Cell(reproduce_command(folder, run['run']), 'code'),
+            )
+            for run in summary['worst']
+        ],
+        'exceptions': [
+            (run, what, Cell(command, 'code'))
+            for run, what, command in exceptions(summary['pairs'], folder)
+        ],
+        'varied': [
+            (
+                Cell(name := variation.column.removeprefix(_DRAWN), 'code'),
+                Cell(f'{variation.distribution}', 'code'),
+                _percent(summary['influence'].get(name, 0.0)),
+            )
+            for variation in study.variations
+        ],
     }
 
 
-def draw_study(study: Study, results: Columns, folder: Path) -> list[Path]:
-    """Draw distributions.png, pairs.png of pairs, influence.png if anything varies."""
-    paths = [folder / 'distributions.png']
-    _draw_distributions(study, results, paths[0])
-    if study.settings.pairs:
-        paths.append(folder / 'pairs.png')
-        draw_pairs({'': (study, results)}, paths[-1])
-    strongest = influence(study, results)
-    if strongest:
-        paths.append(folder / 'influence.png')
-        _draw_influence(study, results, strongest, paths[-1])
-    return paths
+def exceptions(pairs: Summary | None, folder: Path) -> list[tuple[str, str, str]]:
+    """Return the run, what is wrong with it and its command for each exception of a comparison."""
+    if pairs is None:
+        return []
+    broken = pairs['broken_only_with']
+    above = [run for run in pairs['above'] if run not in broken]
+    what = f'largest error more than {ALLOWED:g} times that without learning'
+    return [
+        (f'{run}', words, reproduce_command(folder, run))
+        for runs, words in ((broken, 'breaks the bound only with learning'), (above, what))
+        for run in runs
+    ]
+
+
+def headline(summary: Summary) -> str:
+    """Return the result in one sentence; of pairs, in three."""
+    kept, pairs = summary['kept'], summary['pairs']
+    text = (
+        f'{_percent(kept["fraction"])} of the runs kept the bound '
+        f'({summary["outcomes"]["kept"]} of {summary["runs"]}; {100 * kept["confidence"]:g} % '
+        f'confidence: {_percent(kept["low"])} to {_percent(kept["high"])})'
+    )
+    if pairs is None:
+        return text
+    without, factor = pairs['kept']['without'], pairs['factor']
+    return (
+        f'{text}, {without} without learning. {len(pairs["broken_only_with"])} broke it only with '
+        f'learning, {len(pairs["broken_only_without"])} only without. Of the {without}, the '
+        f'largest error was at most {ALLOWED:g} times that without learning in '
+        f'{_percent(1.0 - len(pairs["above"]) / max(1, without))} (99.9 %: '
+        f'{_number(factor["p99.9"])} times, largest: {_number(factor["max"])})'
+    )
+
+
+def reproduce_command(folder: Path, run: int) -> str:
+    """Return the command that repeats a run and records it."""
+    out = shlex.quote(f'{folder.name}-run-{run}')
+    return f'blf_dsc monte-carlo --reproduce {shlex.quote(str(folder))} {run} --out {out}'
+
+
+def reproduce(store: Store, run: int, out: Path) -> Summary:
+    """Repeat a run of the study and write config.yaml, bag, figures and summary to `out`.
+
+    The one without learning, of a study of pairs, goes to `out/without_learning`.
+
+    Raises BlfDscError if the run has no results, or if they are not reproduced bit for bit;
+    StartError if the controller rejects its start.
+    """
+    study, results = store.study, store.results()
+    if run not in results['run']:
+        raise BlfDscError(f'{store.folder} has no run {run}: it has {results["run"].size} runs')
+    row = int((results['run'] == run).argmax())
+    plant, unseen = plant_with(study, draw(study, run)), rows_of_another_motion(study)
+    summaries = []
+    for prefix, law in study.laws().items():
+        folder = out / 'without_learning' if prefix else out
+        folder.mkdir(exist_ok=True)
+        dump(folder / 'config.yaml', {PLANT: plant, CONTROLLER: law})
+        record = simulate(law, plant, supervised=False)
+        write_bag(folder / 'bag', record, law, 'none')
+        recorded = read_run(folder / 'bag')
+        summaries.append(summarize_run(recorded))
+        write_summary(summaries[-1], folder / 'summary.json')
+        draw_run(recorded, folder)
+        here = figures_of(study, record, plant, unseen)
+        different = differences({name: results[f'{prefix}{name}'][row] for name in here}, here)
+        if different:
+            raise BlfDscError(
+                f'run {run} differs from the stored one: was it computed on another kind of '
+                f'machine, or by another version?{different}'
+            )
+    return summaries[0]
+
+
+def _number(value: float | None) -> str:
+    return '-' if value is None else f'{value:.4g}'
+
+
+def _percent(fraction: float) -> str:
+    return f'{100 * fraction:.4g} %'
 
 
 def _draw_distributions(study: Study, results: Columns, path: Path) -> None:
-    runs, kept = results['outcome'].size, int((results['outcome'] == KEPT).sum())
-    title = f'{runs} runs: {100 * kept / runs:.4g} % kept the bound'
+    """Draw the fraction of runs up to each error: largest, rms, and of the parameters."""
+    share = _percent(np.mean(results['outcome'] == KEPT))
+    title = f'{results["outcome"].size} runs: {share} kept the bound'
     picture = Picture(1, 3, title, (5.2, 3.6), share_time=False)
-    ratio, rms, error = picture.axes[0]
-    joints = study.plant.joints
-    _histogram(
-        ratio,
-        {joint: np.minimum(results[f'max_error_ratio.{joint}'], _SHOWN[1]) for joint in joints},
-    )
-    ratio.axvline(1.0, color=ALARM, lw=1.4, label='bound')
-    ratio.set_xlabel(_RATIO)
-    head(ratio, 'largest error')
-    _histogram(rms, {joint: 1e3 * results[f'rms_error_rad.{joint}'] for joint in joints})
-    rms.set_xlabel(r'rms $\xi_1$ [mrad]')
-    head(rms, f'error from {study.settings.settled_after:g} s on')
-    labels = [*(f'{moment:g} s' for moment in study.settings.moments), 'end']
-    columns = zip(labels, error_columns(study), strict=True)
-    _histogram(error, {label: 1e2 * results[name] for label, name in columns})
-    error.set_xlabel(r'$\|\hat P - P\| \;/\; \|P\|$ [%]')
-    head(error, 'relative parameter error')
+    moments = [*(f'{moment:g} s' for moment in study.settings.moments), 'end']
+    settled = f'error from {study.settings.settled_after:g} s on'
+    for axes, name, unit, label, title in (
+        (picture.axes[0, 0], 'max_error_ratio', 1.0, _RATIO, 'largest error'),
+        (picture.axes[0, 1], 'rms_error_rad', 1e3, r'rms $\xi_1$ [mrad]', settled),
+        (picture.axes[0, 2], '', 1e2, _MODEL, 'relative parameter error'),
+    ):
+        columns = {joint: f'{name}.{joint}' for joint in study.plant.joints}
+        if not name:
+            columns = dict(zip(moments, error_columns(study), strict=True))
+        for (text, column), colour in zip(columns.items(), COLOURS, strict=False):
+            known = np.sort(unit * _finite(results[column]))
+            if label == _RATIO:
+                known = np.minimum(known, _SHOWN[1])
+            axes.plot(known, np.linspace(0.0, 1.0, known.size), color=colour, label=text)
+        _logarithmic(axes)
+        axes.yaxis.set_major_formatter(_PERCENT)
+        axes.set_xlabel(label)
+        axes.set_ylabel('fraction of runs below')
+        head(axes, title)
+    picture.axes[0, 0].axvline(1.0, color=ALARM, lw=1.4)
     picture.save(path)
 
 
@@ -323,197 +439,3 @@ def _logarithmic(axes: Axes, *, both: bool = False) -> None:
         axis.set_major_locator(LogLocator(subs=subs))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
         axis.set_minor_formatter(NullFormatter())
-
-
-def _histogram(axes: Axes, columns: dict[str, Floats]) -> None:
-    """Draw several distributions over common bins, logarithmic if all values are positive."""
-    known = {label: values[np.isfinite(values)] for label, values in columns.items()}
-    everything = np.concatenate(list(known.values()))
-    if everything.size == 0:
-        return
-    low, high = float(everything.min()), float(everything.max())
-    spaced = np.geomspace if low > 0.0 else np.linspace
-    edges = spaced(low, max(1.01 * high, low + 1e-9), 11 + min(50, everything.size // 40))
-    for (label, values), colour in zip(known.items(), COLOURS, strict=False):
-        shares = np.histogram(values, edges)[0] / max(1, values.size)
-        axes.stairs(shares, edges, fill=True, color=colour, alpha=0.22)
-        axes.stairs(shares, edges, color=colour, lw=1.4, label=label)
-    if low > 0.0:
-        _logarithmic(axes)
-    axes.yaxis.set_major_formatter(_PERCENT)
-    axes.set_ylabel('fraction of runs')
-
-
-def _draw_influence(
-    study: Study, results: Columns, influences: dict[str, float], path: Path
-) -> None:
-    strongest = list(influences.items())[:_PANELS_OF_INFLUENCE]
-    columns = min(3, len(strongest))
-    rows = -(-len(strongest) // columns)
-    title = 'What the largest error depends on most'
-    picture = Picture(rows, columns, title, (4.4, 3.2), share_time=False)
-    ratios = np.minimum(worst_of(study, results, 'max_error_ratio'), _SHOWN[1])
-    is_kept = results['outcome'] == KEPT
-    kept, lost = np.flatnonzero(is_kept)[:_MOST_DOTS], np.flatnonzero(~is_kept)
-    logarithmic = [v.column for v in study.variations if v.distribution.name == 'loguniform']
-    for axes, (name, fraction) in zip(picture.axes.flat, strongest, strict=False):
-        values = results[f'{_DRAWN}{name}']
-        axes.plot(values[kept], ratios[kept], '.', ms=4, color=BLUE, alpha=0.5, mew=0)
-        axes.plot(values[lost], ratios[lost], '.', ms=6, color=ALARM, mew=0)
-        if f'{_DRAWN}{name}' in logarithmic:
-            _logarithmic(axes)
-        axes.axhline(1.0, color=INK, lw=1.0, ls='--')
-        axes.set_xlabel(name, color=MUTED)
-        axes.set_ylabel(_RATIO)
-        head(axes, f'explains {100 * fraction:.0f} %')
-    for axes in picture.axes.flat[len(strongest) :]:
-        axes.set_visible(False)
-    picture.save(path)
-
-
-def write_report(store: Store) -> tuple[Summary, list[Path]]:
-    """Write report.html with its figures, and summary.json, of the finished runs.
-
-    Returns the summary and the paths; raises BlfDscError if there are no results yet.
-    """
-    results = store.results()
-    summary = summarize(store.study, results)
-    figures = draw_study(store.study, results, store.folder)
-    path = store.folder / 'report.html'
-    _write_page(path, store.study, summary, figures)
-    write_summary(summary, store.folder / 'summary.json')
-    return summary, [path, *figures, store.folder / 'summary.json']
-
-
-def headline(summary: Summary) -> str:
-    """Return the result in one sentence; of pairs, in three."""
-    kept, pairs = summary['kept'], summary['pairs']
-    text = (
-        f'{_percent(kept["fraction"])} of the runs kept the bound '
-        f'({summary["outcomes"]["kept"]} of {summary["runs"]}; {100 * kept["confidence"]:g} % '
-        f'confidence: {_percent(kept["low"])} to {_percent(kept["high"])})'
-    )
-    if pairs is None:
-        return text
-    without, factor = pairs['kept']['without'], pairs['factor']
-    return (
-        f'{text}, {without} without learning. {len(pairs["broken_only_with"])} broke it only with '
-        f'learning, {len(pairs["broken_only_without"])} only without. Of the {without}, the '
-        f'largest error was at most {ALLOWED:g} times that without learning in '
-        f'{_percent(1.0 - len(pairs["above"]) / max(1, without))} (99.9 %: '
-        f'{_number(factor["p99.9"])} times, largest: {_number(factor["max"])})'
-    )
-
-
-def reproduce_command(folder: Path, run: int) -> str:
-    """Return the command that repeats a run and records it."""
-    out = shlex.quote(f'{folder.name}-run-{run}')
-    return f'blf_dsc monte-carlo --reproduce {shlex.quote(str(folder))} {run} --out {out}'
-
-
-def plant_of_run(study: Study, run: int) -> PlantConfig:
-    """Return the plant configuration of a run."""
-    return plant_with(study, random_numbers(study, run), origin_of(controller_of(study.controller)))
-
-
-def reproduce(store: Store, run: int, out: Path) -> Summary:
-    """Repeat a run of the study and write config.yaml, bag, figures and summary to `out`.
-
-    The one without learning, of a study of pairs, goes to `out/without_learning`.
-
-    Raises BlfDscError if the run has no results, or if they are not reproduced bit for bit;
-    StartError if the controller rejects its start.
-    """
-    results = store.results()
-    if run not in results['run']:
-        raise BlfDscError(f'{store.folder} has no run {run}: it has {results["run"].size} runs')
-    study = store.study
-    plant = plant_of_run(study, run)
-    unseen = rows_of_another_motion(study)
-    row = int((results['run'] == run).argmax())
-    summaries = []
-    for prefix, law in study.laws().items():
-        folder = out / 'without_learning' if prefix else out
-        folder.mkdir(exist_ok=True)
-        dump(folder / 'config.yaml', {PLANT: plant, CONTROLLER: law})
-        record = simulate(law, plant, supervised=False)
-        write_bag(folder / 'bag', record, law, 'none')
-        recorded = read_run(folder / 'bag')
-        summaries.append(summarize_run(recorded))
-        write_summary(summaries[-1], folder / 'summary.json')
-        draw_run(recorded, folder)
-        here = figures_of(study, record, plant, unseen)
-        different = differences({name: results[f'{prefix}{name}'][row] for name in here}, here)
-        if different:
-            raise BlfDscError(
-                f'run {run} differs from the stored one: was it computed on another kind of '
-                f'machine, or by another version?{different}'
-            )
-    return summaries[0]
-
-
-def _write_page(path: Path, study: Study, summary: Summary, figures: list[Path]) -> None:
-    folder = path.parent
-    varied = [(each.column.removeprefix(_DRAWN), each.distribution) for each in study.variations]
-    worst = [
-        (
-            f'{run["run"]}',
-            run['outcome'],
-            ', '.join(_number(ratio) for ratio in run['max_error_ratio'].values()),
-            _number(run['first_violation_s']),
-            Cell(reproduce_command(folder, run['run']), 'code'),
-        )
-        for run in summary['worst']
-    ]
-    write_page(
-        path,
-        'study.html',
-        f'Monte Carlo study: {summary["runs"]} runs of {summary["duration_s"]:g} s',
-        headline=headline(summary),
-        summary=summary,
-        outcomes=[(name, f'{n}', OUTCOMES[name]) for name, n in summary['outcomes'].items()],
-        figures=figures,
-        quantiles=[
-            ('', *_QUANTILES),
-            *(
-                (Cell(name, 'code'), *(_number(values[quantile]) for quantile in _QUANTILES))
-                for name, values in summary['figures'].items()
-                if values is not None
-            ),
-        ],
-        worst=worst,
-        exceptions=[
-            (run, what, Cell(command, 'code'))
-            for run, what, command in exceptions(summary['pairs'], folder)
-        ],
-        varied=[
-            (
-                Cell(name, 'code'),
-                Cell(str(distribution), 'code'),
-                _percent(summary['influence'].get(name, 0.0)),
-            )
-            for name, distribution in varied
-        ],
-    )
-
-
-def exceptions(pairs: Summary | None, folder: Path) -> list[tuple[str, str, str]]:
-    """Return the run, what is wrong with it and its command for each exception of a comparison."""
-    if pairs is None:
-        return []
-    broken = pairs['broken_only_with']
-    above = [run for run in pairs['above'] if run not in broken]
-    what = f'largest error more than {ALLOWED:g} times that without learning'
-    return [
-        (f'{run}', words, reproduce_command(folder, run))
-        for runs, words in ((broken, 'breaks the bound only with learning'), (above, what))
-        for run in runs
-    ]
-
-
-def _number(value: float | None) -> str:
-    return '-' if value is None else f'{value:.4g}'
-
-
-def _percent(fraction: float) -> str:
-    return f'{100 * fraction:.4g} %'

@@ -15,7 +15,6 @@ other, a few ahead of the workers, so the memory needed does not grow with the n
 
 from __future__ import annotations
 
-import dataclasses
 import fcntl
 import itertools
 import json
@@ -35,36 +34,36 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import contextmanager
+from dataclasses import replace
 from math import nan
 from multiprocessing import connection
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 import blf_dsc_controller
+from blf_dsc_controller.arms.batch import regressors_at
 from blf_dsc_controller.compiled.jit import cache_folder
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import dump
 from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError, StartError
-from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.law.factory import controller_of, model_of
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.messages.journal import Journal
+from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.limits import MotionError
+from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import Record, new_record, run_alone, run_loop
-from blf_dsc_controller.simulation.metrics import another_motion, torque_error, torque_rows
-from blf_dsc_controller.studies.monte_carlo import (
-    Origin,
-    Study,
-    load_study,
-    origin_of,
-    plant_with,
-    random_numbers,
-    write_study,
-)
+from blf_dsc_controller.studies.monte_carlo import Drawn, Study, draw, load_study, plant_with
 from sim_plant.plant import Plant, parameter_order, plant_of
 
 _UNSEEN = 1000  # seed of the motion on which the torque of the learned model is judged
+_ROWS = 200  # postures of that motion
+_ROWS_FOR = 15.0  # s
 
 KEPT = 'kept'
 VIOLATED = 'violated'
@@ -78,7 +77,7 @@ OUTCOMES = {
 }
 """Possible outcomes of a run."""
 
-Row = dict[str, float | int | str]
+Row = dict[str, Drawn]
 Columns = dict[str, np.ndarray]
 """Results by column name, one entry per run."""
 
@@ -103,11 +102,11 @@ def run_chunk(study: Study, first: int, count: int) -> Columns:
         for prefix, config in study.laws().items()
     }
     unseen = rows_of_another_motion(study)
-    rows = [_run(study, index, records, unseen) for index in range(first, first + count)]
+    rows = [_run(study, run, records, unseen) for run in range(first, first + count)]
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-def rows_of_another_motion(study: Study) -> np.ndarray | None:
+def rows_of_another_motion(study: Study) -> Floats | None:
     """Return rows of H (k, p) of a motion that is never run; None without sinusoids."""
     law = study.controller
     if law.reference.type != 'sinusoids':
@@ -115,11 +114,35 @@ def rows_of_another_motion(study: Study) -> np.ndarray | None:
     return torque_rows(another_motion(law, _UNSEEN))
 
 
+def another_motion(config: ControllerConfig, seed: int) -> ControllerConfig:
+    """Return a configuration with other signs and phases of the reference's sinusoids."""
+    random, reference = np.random.default_rng(seed), config.reference
+    signs = random.choice((-1.0, 1.0), len(reference.amplitude))
+    motion = {
+        'reference.amplitude': (signs * reference.amplitude).tolist(),
+        'reference.phase': random.uniform(0.0, 2.0 * np.pi, len(reference.phase)).tolist(),
+    }
+    return change(config, motion)
+
+
+def torque_rows(config: ControllerConfig) -> np.ndarray:
+    """Return the rows of H(q, q', q', q'') (k, p) along the configured reference."""
+    model = model_of(config)
+    times = np.linspace(0.0, _ROWS_FOR, _ROWS)
+    q, dq, ddq = np.moveaxis(sampled(reference_of(config), times), 1, 0)
+    return regressors_at(model, q, dq, dq, ddq).reshape(_ROWS * model.n, -1)
+
+
+def torque_error(rows: np.ndarray, estimate: np.ndarray, P: np.ndarray) -> float:
+    """Return the torque error of a learned model on such rows, relative to their torque."""
+    return float(np.linalg.norm(rows @ (estimate - P)) / np.linalg.norm(rows @ P))
+
+
 def warm_up(study: Study) -> None:
     """Compile what the workers run, so that they find it in the cache."""
-    plant = dataclasses.replace(study.plant, duration=study.plant.sample_time)
-    settings = dataclasses.replace(study.settings, settled_after=0.0, moments=())
-    run_chunk(dataclasses.replace(study, plant=plant, settings=settings), 0, 1)
+    plant = replace(study.plant, duration=study.plant.sample_time)
+    settings = replace(study.settings, settled_after=0.0, moments=())
+    run_chunk(replace(study, plant=plant, settings=settings), 0, 1)
 
 
 def figures_of(study: Study, record: Record, plant: PlantConfig, unseen: Floats | None) -> Row:
@@ -128,25 +151,20 @@ def figures_of(study: Study, record: Record, plant: PlantConfig, unseen: Floats 
     Nothing counts from the first number on that is not finite. `unseen` are the rows of H of
     another motion.
     """
-    settings, t = record.controller.settings, record.stamps * 1e-9
-    n, at = settings.n, sample_of(np.arange(record.samples.shape[1]), settings)
-    xi1, torque, bound, latched = (
-        record.samples[:, part.astype(np.intp)]
-        for part in (at.xi1, at.torque, at.bound, at.latched)
+    law, t = record.controller.settings, record.stamps * 1e-9
+    at, efforts = sample_of(np.arange(record.samples.shape[1]), law), 2 * law.n
+    xi1, bound, torque, latched, estimate = (
+        record.samples[:, columns.astype(np.intp)]
+        for columns in (at.xi1, at.bound, at.torque, at.latched, at.estimate[: law.p])
     )
     finite = np.isfinite(record.measurements).all(axis=1) & np.isfinite(torque).all(axis=1)
     end = t.size if finite.all() else int(finite.argmin())
-    error = np.abs(xi1[:end])
-    ratio = error / bound[:end]
-    outside = np.flatnonzero((error >= bound[:end]).any(axis=1))
+    error, bound = np.abs(xi1[:end]), bound[:end]
+    outside = np.flatnonzero((error >= bound).any(axis=1))
     violation = outside[0] if outside.size else end  # where a number is not finite, if at all
     latch = np.flatnonzero(latched[:end])
-    limit = [
-        min(law, motor or law)
-        for law, motor in zip(
-            study.controller.torque.limit, plant.actuator.torque_limit, strict=True
-        )
-    ]
+    motors = np.array(plant.actuator.torque_limit)  # 0: as strong as the law assumes
+    limit = np.where(motors > 0.0, np.minimum(law.torque_limit, motors), law.torque_limit)
     row: Row = {
         'outcome': DIVERGED if end < t.size else VIOLATED if outside.size else KEPT,
         'first_violation_s': float(t[violation]) if violation < t.size else nan,
@@ -158,38 +176,34 @@ def figures_of(study: Study, record: Record, plant: PlantConfig, unseen: Floats 
         for moment in (study.settings.settled_after, *study.settings.moments)
     )
     for i, joint in enumerate(study.plant.joints):
-        late, effort = error[settled:, i], np.abs(record.measurements[:end, 2 * n + i])
-        row[f'max_error_ratio.{joint}'] = float(ratio[:, i].max(initial=0.0))
-        row[f'settled_error_ratio.{joint}'] = float(ratio[settled:, i].max()) if late.size else nan
+        ratio, late = error[:, i] / bound[:, i], error[settled:, i]
+        effort = np.abs(record.measurements[:end, efforts + i])
+        row[f'max_error_ratio.{joint}'] = float(ratio.max(initial=0.0))
+        row[f'settled_error_ratio.{joint}'] = float(ratio[settled:].max()) if late.size else nan
         row[f'rms_error_rad.{joint}'] = float(np.sqrt(np.mean(late**2))) if late.size else nan
         row[f'peak_torque_nm.{joint}'] = float(effort.max(initial=0.0))
-    order = parameter_order(settings.model.parameter_names, plant)
-    estimates = record.samples[:, at.estimate[: settings.p].astype(np.intp)]
-    for name, sample in zip(error_columns(study), (*moments, t.size - 1), strict=True):
-        P = record.truths[sample, order]
-        known = sample < end and order.min() >= 0
-        off = np.linalg.norm(estimates[sample] - P) / np.linalg.norm(P) if known else nan
+    order = parameter_order(law.model.parameter_names, plant)
+    is_known = order.min() >= 0
+    for name, k in zip(error_columns(study), (*moments, t.size - 1), strict=True):
+        P = record.truths[k, order]
+        is_finite = is_known and k < end
+        off = np.linalg.norm(estimate[k] - P) / np.linalg.norm(P) if is_finite else nan
         row[name] = float(off)
     row['torque_error.end'] = nan
-    if unseen is not None and order.min() >= 0:
-        row['torque_error.end'] = torque_error(unseen, estimates[-1], record.truths[-1, order])
+    if is_known and unseen is not None:
+        row['torque_error.end'] = torque_error(unseen, estimate[-1], record.truths[-1, order])
     return row
 
 
-def error_columns(study: Study) -> Iterator[str]:
-    """Yield the column names of the parameter errors, the final one last."""
-    for moment in study.settings.moments:
-        yield f'parameter_error.{moment:g}_s'
-    yield 'parameter_error.end'
+def error_columns(study: Study) -> list[str]:
+    """Return the column names of the parameter errors, the final one last."""
+    moments = (f'parameter_error.{moment:g}_s' for moment in study.settings.moments)
+    return [*moments, 'parameter_error.end']
 
 
-def _run(study: Study, index: int, records: dict[str, Record], unseen: Floats | None) -> Row:
-    origin = origin_of(records[''].controller)
-    numbers = random_numbers(study, index)
-    row: Row = {'run': numbers.run, 'seed': numbers.seed}
-    for variation, value in zip(study.variations, numbers.values, strict=True):
-        row[variation.column] = value
-    config = plant_with(study, numbers, origin)
+def _run(study: Study, run: int, records: dict[str, Record], unseen: Floats | None) -> Row:
+    row = draw(study, run)
+    config = plant_with(study, row)
     plant = plant_of(config)
     for prefix, record in records.items():
         plant.reset()
@@ -200,26 +214,20 @@ def _run(study: Study, index: int, records: dict[str, Record], unseen: Floats | 
                 found = figures_of(study, record, config, unseen)
         except (StartError, MotionError):
             plant.reset()
-            found = _rejected(study, record, plant, origin)
+            found = _rejected(study, record, plant)
         row |= {f'{prefix}{name}': value for name, value in found.items()}
     return row
 
 
-def _rejected(study: Study, record: Record, plant: Plant, origin: Origin) -> Row:
+def _rejected(study: Study, record: Record, plant: Plant) -> Row:
     """Return the columns of a run that does not begin, with |xi1(0)| / k_c."""
-    q = plant.measure()[: plant.joints]
+    qr, _, bound = study.origin
+    ratios = np.abs(plant.measure()[: plant.joints] - qr) / bound
     with np.errstate(all='ignore'):
         found: Row = dict.fromkeys(figures_of(study, record, study.plant, None), nan)
-    for joint, ratio in zip(study.plant.joints, np.abs(q - origin.qr) / origin.bound, strict=True):
-        found[f'max_error_ratio.{joint}'] = float(ratio)
+    for joint, ratio in zip(study.plant.joints, ratios.tolist(), strict=True):
+        found[f'max_error_ratio.{joint}'] = ratio
     return found | {'outcome': REJECTED, 'first_violation_s': 0.0}
-
-
-class Span(NamedTuple):
-    """Runs `first` to `first + runs - 1`."""
-
-    first: int
-    runs: int
 
 
 def require_pyarrow() -> Any:
@@ -282,7 +290,7 @@ class Store:
             _create(folder, study)
         store = cls(folder)
         different = differences(store._versions, versions())
-        different = different or differences(store.study.flat(), study.flat())
+        different = different or differences(_flat(store.study), _flat(study))
         if different:
             raise BlfDscError(
                 f'{folder} holds another study, which is neither resumed nor overwritten: '
@@ -307,11 +315,10 @@ class Store:
                 unfinished.unlink()
             yield
 
-    def keep(self, span: Span, columns: Columns) -> None:
-        """Write the results of a span of runs atomically, even if the process is killed."""
+    def keep(self, runs: range, columns: Columns) -> None:
+        """Write the results of consecutive runs atomically, even if the process is killed."""
         pa = require_pyarrow()
-        last = span.first + span.runs - 1
-        path = self.folder / _RUNS / f'runs-{span.first:09d}-{last:09d}.parquet'
+        path = self.folder / _RUNS / f'runs-{runs.start:09d}-{runs[-1]:09d}.parquet'
         unfinished = path.with_name(f'.{path.name}.{os.getpid()}')
         with unfinished.open('wb') as file:
             pa.parquet.write_table(pa.table(columns), file)
@@ -319,19 +326,15 @@ class Store:
             os.fsync(file.fileno())
         unfinished.replace(path)
 
-    def done(self) -> list[Span]:
-        """Return the runs that have results, in order."""
-        found = (_PART.fullmatch(path.name) for path in (self.folder / _RUNS).iterdir())
-        bounds = sorted((int(match[1]), int(match[2])) for match in found if match)
-        return [Span(first, last - first + 1) for first, last in bounds]
-
-    def missing(self, size: int) -> list[Span]:
+    def missing(self, size: int) -> list[range]:
         """Return the runs without results, in chunks of at most `size`."""
-        edges = [Span(0, 0), *self.done(), Span(self.study.settings.runs, 0)]
+        names = sorted(path.name for path in (self.folder / _RUNS).iterdir())
+        done = [(int(m[1]), int(m[2]) + 1) for m in map(_PART.fullmatch, names) if m]
+        ends, runs = [0, *(end for _, end in done)], self.study.settings.runs
         return [
-            Span(first, min(size, after.first - first))
-            for before, after in itertools.pairwise(edges)
-            for first in range(before.first + before.runs, after.first, size)
+            range(first, min(first + size, begin))
+            for end, begin in zip(ends, [*(begin for begin, _ in done), runs], strict=True)
+            for first in range(end, begin, size)
         ]
 
     def results(self) -> Columns:
@@ -340,22 +343,21 @@ class Store:
         Raises BlfDscError if there are none yet, or if a file is damaged.
         """
         pa = require_pyarrow()
-        paths = sorted(
-            path for path in (self.folder / _RUNS).iterdir() if _PART.fullmatch(path.name)
-        )
-        if not paths:
+        if not any((self.folder / _RUNS).glob('runs-*')):
             raise BlfDscError(f'{self.folder} has no results yet')
-        tables = []
-        for path in paths:
-            try:
-                tables.append(pa.parquet.read_table(path))
-            except (OSError, pa.ArrowException) as error:
-                raise BlfDscError(
-                    f'{path} cannot be read ({error}): remove it and start the study again '
-                    'to recompute these runs'
-                ) from None
-        whole = pa.concat_tables(tables).sort_by('run')
+        try:
+            whole = pa.parquet.read_table(self.folder / _RUNS).sort_by('run')
+        except (OSError, pa.ArrowException) as error:
+            raise BlfDscError(
+                f'the results cannot be read ({error}): remove that file and start the study '
+                'again to recompute its runs'
+            ) from None
         return {name: np.asarray(whole[name].to_numpy()) for name in whole.column_names}
+
+
+def _flat(study: Study) -> dict[str, object]:
+    nodes = study.values().items()
+    return {f'{node}.{name}': value for node, values in nodes for name, value in values.items()}
 
 
 def _create(folder: Path, study: Study) -> None:
@@ -363,7 +365,7 @@ def _create(folder: Path, study: Study) -> None:
     unfinished = folder.with_name(f'.{folder.name}.{os.getpid()}')
     shutil.rmtree(unfinished, ignore_errors=True)
     (unfinished / _RUNS).mkdir(parents=True)
-    write_study(study, unfinished / _STUDY)
+    dump(unfinished / _STUDY, study.values())
     text = json.dumps(versions(), indent=2) + '\n'
     (unfinished / _VERSIONS).write_text(text, encoding='utf-8')
     unfinished.rename(folder)
@@ -407,20 +409,20 @@ def chunk_size(runs: int, workers: int) -> int:
 
 def compute(
     study: Study,
-    spans: Iterable[Span],
+    chunks: Iterable[range],
     executor: Executor,
     most: int,
-    keep: Callable[[Span, Columns], None],
+    keep: Callable[[range, Columns], None],
 ) -> None:
-    """Compute all `spans` and pass each with its results to `keep` as soon as it is done.
+    """Compute all `chunks` and pass each with its results to `keep` as soon as it is done.
 
     At most `most` are submitted at a time.  Raises BlfDscError if a worker is lost.
     """
-    waiting, handed = iter(spans), dict[Future[Columns], Span]()
+    waiting, handed = iter(chunks), dict[Future[Columns], range]()
     try:
         while True:
-            for span in itertools.islice(waiting, most - len(handed)):
-                handed[executor.submit(run_chunk, study, *span)] = span
+            for runs in itertools.islice(waiting, most - len(handed)):
+                handed[executor.submit(run_chunk, study, runs.start, len(runs))] = runs
             if not handed:
                 return
             for future in wait(handed, return_when=FIRST_COMPLETED).done:

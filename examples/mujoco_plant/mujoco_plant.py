@@ -4,12 +4,13 @@
 It publishes `joint_states` in a different joint order than the controller's and with a gripper
 among them, and takes one step per torque on `blf_dsc_controller/commands` (lock-step).
 Its parameters are those of `sim_plant`; the arm comes from arm.xml or from a URDF that MuJoCo
-reads. Encoders and drives are those of `sim_plant`, all mechanics are MuJoCo's.
+reads. Encoders, drives and the schedule of events are those of `sim_plant`, all mechanics are
+MuJoCo's.
 """
 
 from __future__ import annotations
 
-import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,10 @@ from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.nodes import parameters
-from sim_plant.drives import DriveState, actuate
-from sim_plant.plant import plant_settings
-from sim_plant.sensors import EncoderReading, generator, is_noisy, sense
+from sim_plant.drives import actuate
+from sim_plant.kernels import state_of
+from sim_plant.motion import update_acting
+from sim_plant.plant import plant_of, plant_settings
 
 FIRST_STAMP = 1.0  # s
 REPEAT = 1.0  # s, before an unanswered state is published again
@@ -84,76 +86,48 @@ class MujocoArm:
         self.data.qvel[:] = config.initial.velocity
         self._tip = self.model.body(PAYLOAD if config.robot.urdf else TIP)
         self._mass = self._tip.mass[0]
-        self._sample = 0
-        self._noise = generator(config.seed)
         self._settings = plant_settings(config)
-        self._reading = EncoderReading(-np.ones(1), *np.zeros((1, 2 * self.n)), *self._zeros(2))
-        ring = self._zeros(config.actuator.delay)
-        self._drives = DriveState(*self._zeros(3), ring)
+        self._plant = plant_of(config)  # for all but its motion
+        self._now = state_of(self._plant.state, self._settings)
 
-    def _zeros(self, rows: int) -> np.ndarray:
-        return np.zeros((rows, self.n))
+    def change(self, config: PlantConfig) -> None:
+        """Take over other loads, events and friction."""
+        self.config, self._settings = config, plant_settings(config)
+        self._plant.change(self._settings)
 
-    def measure(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return measured angles [rad], velocities [rad/s], last torques [N m], (n,) each."""
-        reading = self._reading
-        if reading.sample[0] != self._sample:
-            if is_noisy(self._settings.encoders):
-                self._noise.standard_normal(out=reading.noise)
-            if self.config.actuator.torque_noise > 0.0:
-                self._noise.standard_normal(out=self._drives.noise)
-            offset = self.config.sensor.offset + self._sum('offset', self.n)
-            state = self.data.qpos, self.data.qvel, offset
-            period = self.config.sample_time
-            sense(self._settings.encoders, self._sample, period, *state, reading)
-        return reading.position, reading.velocity, self._drives.applied
+    def measure(self) -> np.ndarray:
+        """Return a view (3 n,) of measured angles [rad], velocities [rad/s], torques [N m]."""
+        self._now.x[: 2 * self.n] = np.concatenate((self.data.qpos, self.data.qvel))
+        return self._plant.measure()
 
     def step(self, torque: np.ndarray) -> None:
         """Take a step with this torque (n,) [N m] and the loads that act at its start."""
-        load, friction, data = self.config.load, self.config.disturbance, self.data
-        self._tip.mass[0] = self._mass + load.payload + self._sum('payload', 1)[0]
-        viscous = friction.viscous + self._sum('viscous', self.n)
-        coulomb = np.maximum(friction.coulomb + self._sum('coulomb', self.n), 0.0)
+        settings, now, data = self._settings, self._now, self.data
+        friction, acting = settings.disturbance, now.acting
+        update_acting(friction, settings.load, settings.schedule, now.sample[0], acting)
+        self._tip.mass[0] = self._mass + acting.payload[0]
         speed = data.qvel / friction.stribeck_velocity
-        self.model.dof_damping[:] = np.maximum(viscous, 0.0)
-        self.model.dof_frictionloss[:] = coulomb * (1.0 + friction.stribeck * np.exp(-(speed**2)))
-        force = load.force + self._sum('force', 3) + self._wall_force(self._tip.id)
-        data.xfrc_applied[self._tip.id, :3] = force
-        phase = np.multiply(friction.frequency, data.time) + friction.phase
-        disturbance = friction.constant + friction.amplitude * np.sin(phase)
-        ripple = self._settings.disturbance.ripple
-        disturbance += ripple * np.sin(self.config.actuator.ripple_cycles * data.qpos)
-        actuate(self._settings.drives, self._sample, torque, self._drives)
-        pushed = load.torque + self._sum('torque', self.n) - disturbance
-        data.qfrc_applied[:] = self._drives.applied + pushed
+        self.model.dof_damping[:] = acting.viscous
+        self.model.dof_frictionloss[:] = acting.coulomb
+        self.model.dof_frictionloss *= 1.0 + friction.stribeck * np.exp(-(speed**2))
+        data.xfrc_applied[self._tip.id, :3] = acting.force + self._wall_force(self._tip.id)
+        wave = friction.amplitude * np.sin(friction.frequency * data.time + friction.phase)
+        ripple = friction.ripple * np.sin(friction.ripple_frequency * data.qpos)
+        actuate(settings.drives, int(now.sample[0]), torque, now.drives)
+        data.qfrc_applied[:] = now.drives.applied - (acting.constant + wave + ripple)
         mujoco.mj_step(self.model, data)
-        self._sample += 1
-
-    def _sum(self, name: str, size: int) -> np.ndarray:
-        """Return the sum (size,) of one effect over the active events."""
-        events = self.config.events
-        if not getattr(events, name):
-            return np.zeros(size)
-        begin, none = np.array(events.begin), (0.0,) * len(events.begin)
-        duration, ramp = np.array(events.duration or none), np.array(events.ramp or none)
-        since = self.data.time - begin + 1e-9  # s, with a margin for rounding of the time
-        after = np.where(duration > 0.0, since - duration, -np.inf)
-        ramp = np.maximum(ramp, 1e-12)
-        present = np.clip(since / ramp, 0.0, 1.0) - np.clip(after / ramp, 0.0, 1.0)
-        return np.asarray(present @ np.reshape(getattr(events, name), (begin.size, size)))
+        now.sample[0] += 1.0
 
     def _wall_force(self, tip: int) -> np.ndarray:
         """Return the force (3,) [N] of the wall on the tip, the last link's centre of mass."""
-        wall = self.config.wall
+        wall, velocity = self._settings.wall, np.zeros(6)  # angular, linear
         if wall.stiffness == 0.0:
             return np.zeros(3)
         mujoco.mj_forward(self.model, self.data)
-        normal = np.array(wall.normal) / np.linalg.norm(wall.normal)
-        velocity = np.zeros(6)  # angular, linear
         mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_BODY, tip, velocity, 0)
-        depth = normal @ (wall.point - self.data.xipos[tip])
-        force = wall.stiffness * depth - wall.damping * (normal @ velocity[3:])
-        return np.asarray(max(force, 0.0) * normal if depth > 0.0 else np.zeros(3))
+        depth = wall.normal @ (wall.point - self.data.xipos[tip])
+        force = wall.stiffness * depth - wall.damping * (wall.normal @ velocity[3:])
+        return np.asarray(max(force, 0.0) * wall.normal if depth > 0.0 else np.zeros(3))
 
 
 class MujocoPlant(Node):
@@ -167,7 +141,7 @@ class MujocoPlant(Node):
     def __init__(self, **options: Any) -> None:
         super().__init__('mujoco_plant', **options)
         self.arm = MujocoArm(parameters.declare(self, PlantConfig))
-        parameters.on_change(self, PlantConfig, self._reconfigure)
+        parameters.on_change(self, PlantConfig, self.arm.change)
         self.steps = 0
         joints = self.arm.config.joints
         self._names = (*joints[:0:-1], 'gripper', joints[0])  # the gripper is not simulated
@@ -176,9 +150,6 @@ class MujocoPlant(Node):
             Float64MultiArray, 'blf_dsc_controller/commands', self._on_command, 1
         )
         self._unanswered = self.create_timer(REPEAT, self._publish)
-
-    def _reconfigure(self, config: PlantConfig) -> None:
-        self.arm.config = config
 
     def _on_command(self, message: Float64MultiArray) -> None:
         torque = np.array(message.data)
@@ -194,27 +165,24 @@ class MujocoPlant(Node):
         nanoseconds = round((FIRST_STAMP + self.arm.data.time) * 1e9)
         message = JointState(name=list(self._names))
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 10**9)
-        for name, values in zip(
-            ('position', 'velocity', 'effort'), self.arm.measure(), strict=True
-        ):
+        kinds = zip(
+            ('position', 'velocity', 'effort'), self.arm.measure().reshape(3, -1), strict=True
+        )
+        for kind, values in kinds:
             of = dict(zip(self.arm.config.joints, values.tolist(), strict=True))
-            setattr(message, name, [of.get(joint, 0.0) for joint in self._names])
+            setattr(message, kind, [of.get(joint, 0.0) for joint in self._names])
         self._states.publish(message)
 
 
-def main() -> int:
+def main() -> None:
     """Run the node until it is interrupted."""
     rclpy.init()
     node = MujocoPlant()
-    try:
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
+    node.destroy_node()
+    rclpy.try_shutdown()
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()
